@@ -1,0 +1,17 @@
+"""Errors that are a user's to mend: each message names the value, the cause and the way out."""
+
+
+class RlftsimError(Exception):
+    """Base of every error this package raises on purpose; the command line prints it as one line without a traceback."""
+
+
+class DataError(RlftsimError):
+    """A file, record or scenario cannot be used: says which file, which record and why."""
+
+
+class ConfigError(RlftsimError, ValueError):
+    """A setting contradicts another one or lies outside its range: says which and what to set instead."""
+
+
+class CheckpointError(RlftsimError):
+    """A checkpoint or run folder is damaged or does not fit: says which key or file and what to do."""

@@ -1,0 +1,1 @@
+"""What happened: recorded scenarios, however they were stored."""
