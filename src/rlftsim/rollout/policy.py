@@ -50,7 +50,7 @@ class DecisionDistribution(Protocol):
         """Decisions [..., *event] from uniform noise in [0, 1); never a gradient."""
         ...
 
-    def log_prob(self, decision: Tensor, sampling: Sampling = Sampling()) -> Float[Tensor, "..."]:  # noqa: B008
+    def log_prob(self, decision: Tensor, sampling: Sampling = Sampling()) -> Float[Tensor, "..."]:
         """Log-probability under the distribution that `sampling` draws from, event axes summed."""
         ...
 
