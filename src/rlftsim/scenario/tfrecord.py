@@ -124,7 +124,9 @@ def _header_damage(header: bytes, bytes_left: int, record: int) -> str | None:
     if record == 0 and header.startswith(_GZIP_MAGIC):
         return "not a TFRecord file but a gzip-compressed one: unpack it with gunzip first"
     if len(header) < _HEADER.size:
-        return "not a TFRecord file: too short" if record == 0 else "truncated: the file ends inside the record's header"
+        return (
+            "not a TFRecord file: too short" if record == 0 else "truncated: the file ends inside the record's header"
+        )
     length, crc = _HEADER.unpack(header)
     if crc != masked_crc32c(header[:8]):
         if record == 0:

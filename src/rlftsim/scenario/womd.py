@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 from google.protobuf.message import DecodeError
-from jaxtyping import Float32
 
 from rlftsim.errors import DataError
 from rlftsim.scenario import womd_pb2
@@ -49,7 +48,9 @@ def find_tfrecords(source: str | os.PathLike[str]) -> list[Path]:
     if path.is_dir():
         files = sorted(file for file in path.rglob("*") if _TFRECORD_NAME.search(file.name) and file.is_file())
         if not files:
-            raise DataError(f"{path}: no tfrecord file in this folder (names like x.tfrecord or x.tfrecord-00000-of-00010)")
+            raise DataError(
+                f"{path}: no tfrecord file in this folder (names like x.tfrecord or x.tfrecord-00000-of-00010)"
+            )
         return files
     files = sorted(Path(name) for name in glob.glob(str(source), recursive=True) if os.path.isfile(name))
     if not files:
@@ -107,7 +108,9 @@ def scenario_from_bytes(record: bytes) -> Scenario:
     try:
         message = womd_pb2.Scenario.FromString(record)
     except DecodeError as error:
-        raise DataError("not a WOMD Scenario message: the bytes cannot be parsed (files in tf.Example format are not read)") from error
+        raise DataError(
+            "not a WOMD Scenario message: the bytes cannot be parsed (files in tf.Example format are not read)"
+        ) from error
     if not message.scenario_id or not message.tracks:
         missing = "tracks" if message.scenario_id else "scenario_id"
         raise DataError(f"not a WOMD Scenario message, or an empty one: it has no {missing}")
@@ -131,14 +134,27 @@ def _read_tracks(message: womd_pb2.Scenario) -> Tracks:
     num_steps = len(message.tracks[0].states)
     for track in message.tracks:
         if len(track.states) != num_steps:
-            raise DataError(f"track {track.id} has {len(track.states)} states, track {message.tracks[0].id} has {num_steps}")
+            raise DataError(
+                f"track {track.id} has {len(track.states)} states, track {message.tracks[0].id} has {num_steps}"
+            )
     if num_steps not in (HISTORY_STEPS, TOTAL_STEPS):
         raise DataError(
             f"{num_steps} steps instead of {TOTAL_STEPS} (or {HISTORY_STEPS} in a test split): take WOMD's 9-second files, not the 20-second ones"
         )
     states = np.array(
         [
-            (s.center_x, s.center_y, s.center_z, s.length, s.width, s.height, s.heading, s.velocity_x, s.velocity_y, s.valid)
+            (
+                s.center_x,
+                s.center_y,
+                s.center_z,
+                s.length,
+                s.width,
+                s.height,
+                s.heading,
+                s.velocity_x,
+                s.velocity_y,
+                s.valid,
+            )
             for track in message.tracks
             for s in track.states
         ]
@@ -169,7 +185,9 @@ def _check_finite(values: np.ndarray, valid: np.ndarray, object_id: np.ndarray) 
     if bad.any():
         track, step = np.argwhere(bad)[0]
         kind = "position" if not np.isfinite(values[track, step, :3]).all() else "size, heading or velocity"
-        raise DataError(f"track {object_id[track]} has a NaN or infinite {kind} at step {step}, where it is marked valid")
+        raise DataError(
+            f"track {object_id[track]} has a NaN or infinite {kind} at step {step}, where it is marked valid"
+        )
 
 
 def _read_ego_index(message: womd_pb2.Scenario, tracks: Tracks) -> int:
@@ -245,7 +263,9 @@ def _read_map(features: Sequence[womd_pb2.MapFeature]) -> MapFeatures:
     bad = np.flatnonzero(~np.isfinite(points).all(1))
     if len(bad):
         owner = np.searchsorted(offsets, bad[0], side="right") - 1
-        raise DataError(f"map feature {feature_id[owner]} has a NaN or infinite point (its point {bad[0] - offsets[owner]})")
+        raise DataError(
+            f"map feature {feature_id[owner]} has a NaN or infinite point (its point {bad[0] - offsets[owner]})"
+        )
     return MapFeatures(
         feature_id=feature_id,
         feature_type=np.array([kind for kind, _ in typed_points], np.int8),
