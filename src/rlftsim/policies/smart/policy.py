@@ -239,6 +239,7 @@ class SmartPolicy(nn.Module):
             class_id=class_id,
             agent_features=decoder.embed_agents(class_id, scenarios.size),
             token_features=decoder.embed_tokens(self.vocabulary.end_corners()),
+            relations=decoder.relations(),
         )
 
     def _recorded_steps(self, tokens: AgentTokens, steps: slice) -> TokenSteps:
