@@ -1,0 +1,1 @@
+"""How real it is: the official realism meta-metric."""

@@ -1,0 +1,1 @@
+"""One file a reward: rollouts in, one number per rollout out."""
