@@ -1,7 +1,7 @@
 """Who takes part in the metric: the simulated agents' states in rollouts and in the log.
 
 Simulated agents are all tracks valid at the current step, in track order; evaluated ones are the ego and the tracks to
-predict, by ascending object id. Sizes and types are those of the current step for all steps, in the log too. Frame: world.
+predict, by ascending object id. Sizes and types are those of the current step for all steps, in the log too. World frame.
 """
 
 from collections.abc import Sequence
@@ -158,9 +158,7 @@ def match_agents(expected: Int64[np.ndarray, "A"], given: Int64[np.ndarray, "A"]
     return order[np.searchsorted(given[order], expected)]
 
 
-def join_history(
-    agents: LoggedAgents, states: SimulatedStates, history_steps: int, where: str
-) -> Trajectories:
+def join_history(agents: LoggedAgents, states: SimulatedStates, history_steps: int, where: str) -> Trajectories:
     """Rollouts in track order, with the last `history_steps` logged steps (up to the current one) in front.
 
     Shapes: [N, A, history_steps + 80].

@@ -68,7 +68,7 @@ class MetricConfig:
     offroad_indication: BernoulliConfig
     traffic_light_violation: BernoulliConfig
     time_to_collision_vehicles_only: bool = True
-    """Score time to collision on evaluated vehicles only (today's code) or on all evaluated agents (the code of 2024)."""
+    """Score time to collision on evaluated vehicles only (code of 2025) or on all evaluated agents (code of 2024)."""
     reports_traffic_lights: bool = True
     """Whether the official result of that year has traffic light fields."""
 

@@ -28,12 +28,10 @@ from rlftsim.realism.interactive import (
 from rlftsim.realism.kinematic import compute_ground_speed, compute_kinematics, shrink_validity
 from rlftsim.realism.map_based import (
     RoadEdges,
-    Signals,
     build_road_edges,
-    build_signals,
     compute_distance_to_road_edge,
-    compute_traffic_light_violation,
 )
+from rlftsim.realism.traffic_lights import Signals, build_signals, compute_traffic_light_violation
 from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, HISTORY_STEPS, Scenario
 
 MissingMap = Literal["error", "neutral"]
@@ -59,6 +57,9 @@ class ComputeConfig:
     def pairs_on(self, device: torch.device) -> int:
         """The bound for a device."""
         return self.max_pairs or (1 << 17 if device.type == "cpu" else 1 << 24)
+
+
+DEFAULT_COMPUTE = ComputeConfig()
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +124,7 @@ def build_scenario_log(
     device: torch.device | str = "cpu",
     *,
     missing_map: MissingMap = "error",
-    compute: ComputeConfig = ComputeConfig(),
+    compute: ComputeConfig = DEFAULT_COMPUTE,
 ) -> ScenarioLog:
     """Everything of the metric that depends on the scenario alone: agents, packed map, log features.
 
@@ -163,14 +164,14 @@ def scenario_log(
     device: torch.device | str = "cpu",
     *,
     missing_map: MissingMap = "error",
-    compute: ComputeConfig = ComputeConfig(),
+    compute: ComputeConfig = DEFAULT_COMPUTE,
 ) -> ScenarioLog:
     """`build_scenario_log`, remembered for the last 64 scenarios (by identity)."""
     return _cached_scenario_log(scenario, torch.device(device), missing_map, compute)
 
 
 def compute_features(
-    log: ScenarioLog, states: SimulatedStates, *, compute: ComputeConfig = ComputeConfig()
+    log: ScenarioLog, states: SimulatedStates, *, compute: ComputeConfig = DEFAULT_COMPUTE
 ) -> Features:
     """Features of rollouts, on their device, which must be the log's.
 

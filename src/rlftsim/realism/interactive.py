@@ -97,7 +97,7 @@ def _find_nearest_candidates(agents: PlanarAgents) -> _Pairs:
 def _compute_core_corners(
     agents: PlanarAgents, state: Int64[Tensor, "P"], agent: Int64[Tensor, "P"]
 ) -> tuple[Float[Tensor, "4 P"], Float[Tensor, "4 P"], Float[Tensor, "P"]]:
-    """World x and y of the corners of the cores (boxes shrunk by their rounding), counter-clockwise, and the rounding."""
+    """World x and y of the corners of the cores (boxes less their rounding), counter-clockwise, and the rounding."""
     length, width = agents.length[agent], agents.width[agent]
     rounding = CORNER_ROUNDING * torch.minimum(length, width) / 2
     half_length, half_width = (length - 2 * rounding) / 2, (width - 2 * rounding) / 2
@@ -110,7 +110,9 @@ def _compute_core_corners(
     return x, y, rounding
 
 
-def _start_at_lowest(x: Float[Tensor, "4 P"], y: Float[Tensor, "4 P"]) -> tuple[Float[Tensor, "4 P"], Float[Tensor, "4 P"]]:
+def _start_at_lowest(
+    x: Float[Tensor, "4 P"], y: Float[Tensor, "4 P"]
+) -> tuple[Float[Tensor, "4 P"], Float[Tensor, "4 P"]]:
     first = y.argmin(0, keepdim=True)
     order = (first + torch.arange(4, device=x.device)[:, None]) % 4
     return x.gather(0, order), y.gather(0, order)

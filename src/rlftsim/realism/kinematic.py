@@ -1,7 +1,7 @@
 """Speeds and accelerations as the official evaluator takes them: central differences that ignore validity.
 
 Source: Waymo Open Sim Agents Challenge, evaluator of 2025. Everything is float32; the step is 0.1 s. A difference at
-step t needs t - 1 and t + 1 and is NaN where one of them is missing, so speeds lose one step at each end and accelerations two.
+step t needs t - 1 and t + 1 and is NaN where one of them is missing: speeds lose one step at each end, accelerations two.
 """
 
 import math
@@ -62,7 +62,7 @@ def compute_kinematics(
 
 
 def compute_ground_speed(x: Float[Tensor, "... T"], y: Float[Tensor, "... T"]) -> Float[Tensor, "... T"]:
-    """Speed in the plane, m/s, NaN at both ends: what time to collision uses (height left out, unlike `linear_speed`)."""
+    """Speed in the plane, m/s, NaN at both ends: for time to collision, which leaves height out."""
     dx, dy = compute_central_difference(x), compute_central_difference(y)
     return (dx * dx + dy * dy).sqrt() / STEP_S
 

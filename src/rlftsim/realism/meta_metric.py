@@ -16,6 +16,7 @@ from rlftsim.errors import DataError
 from rlftsim.realism.agents import SimulatedStates
 from rlftsim.realism.config import FEATURE_NAMES, METRIC_2025, SUB_SCORES, MetricConfig
 from rlftsim.realism.features import (
+    DEFAULT_COMPUTE,
     ComputeConfig,
     Features,
     MissingMap,
@@ -29,9 +30,9 @@ from rlftsim.scenario.types import Scenario
 
 @dataclass(frozen=True, eq=False)
 class RealismResult:
-    """Scores of one scenario (no leading axis) or of several (leading axis B). Likelihoods and scores: higher is better.
+    """Scores of one scenario (no leading axis) or of several (leading axis B).
 
-    N counts repeated rollouts too.
+    Likelihoods and meta-metrics: higher is better. N counts repeated rollouts too.
     """
 
     scenario_ids: tuple[str, ...]
@@ -88,9 +89,7 @@ class RealismResult:
 
     def _official_metrics(self) -> dict[str, Tensor]:
         reported = [
-            name
-            for name in FEATURE_NAMES
-            if self.config.reports_traffic_lights or name != "traffic_light_violation"
+            name for name in FEATURE_NAMES if self.config.reports_traffic_lights or name != "traffic_light_violation"
         ]
         return {
             "metametric": self.meta_metric,
@@ -190,7 +189,7 @@ def score(
     config: MetricConfig = METRIC_2025,
     *,
     missing_map: MissingMap = "error",
-    compute: ComputeConfig = ComputeConfig(),
+    compute: ComputeConfig = DEFAULT_COMPUTE,
 ) -> RealismResult:
     """Scores of one scenario's rollouts, on the rollouts' device.
 
@@ -216,7 +215,7 @@ def score_batch(
     config: MetricConfig = METRIC_2025,
     *,
     missing_map: MissingMap = "error",
-    compute: ComputeConfig = ComputeConfig(),
+    compute: ComputeConfig = DEFAULT_COMPUTE,
 ) -> RealismResult:
     """Scores of B scenarios with N rollouts each, stacked: [B], [B, F] and [B, N].
 

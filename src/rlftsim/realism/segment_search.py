@@ -154,7 +154,7 @@ def _search_block(
     groups: Float[Tensor, "G Q D"], segments: ChunkedSegments, rule: DistanceRule, max_pairs: int
 ) -> Int64[Tensor, "n"]:
     """Keys of one block of groups, n = G Q."""
-    num_groups, group_size, _ = groups.shape
+    group_size = groups.shape[1]
     points, axes = groups.flatten(0, 1), groups.permute(2, 0, 1)
     num_chunks = segments.low.shape[1]
     listed = min(LISTED_CHUNKS, num_chunks)
@@ -195,8 +195,6 @@ def find_nearest_segment(
     """
     num_chunks = segments.low.shape[1]
     per_group = max(num_chunks, groups.shape[1] * max(LISTED_CHUNKS, CHUNK_SEGMENTS))
-    keys = [
-        _search_block(block, segments, rule, max_pairs) for block in groups.split(max(1, max_pairs // per_group))
-    ]
+    keys = [_search_block(block, segments, rule, max_pairs) for block in groups.split(max(1, max_pairs // per_group))]
     packed = torch.cat(keys).view(groups.shape[:2]) & ((1 << _KEY_SHIFT) - 1)
     return segments.first_segment[packed // CHUNK_SEGMENTS] + packed % CHUNK_SEGMENTS
