@@ -168,7 +168,7 @@ class DatasetWriter:
         self.folder = Path(folder)
         if self.folder.exists() and (not self.folder.is_dir() or any(self.folder.iterdir())):
             raise DataError(f"{self.folder} is not an empty folder: choose another one or delete it")
-        self._temporary = self.folder.with_name(f".{self.folder.name}.{os.getpid()}.tmp")
+        self._temporary = self.folder.absolute().with_name(f".{self.folder.name}.{os.getpid()}.tmp")
         self._scenarios_per_shard = scenarios_per_shard
         self._licence_note = licence_note
         self._provenance = dict(provenance or {})
@@ -271,7 +271,7 @@ def write_index_and_manifest(
 ) -> Manifest:
     """Write the index of the given shards, then the manifest. Of scenarios with the same id the first stays in the index."""
     entries = sorted(entries, key=lambda entry: entry.file)
-    table, duplicates = _build_index(folder, entries)
+    table, duplicates = build_index(folder, entries)
     with_temporary_name(folder / INDEX, lambda path: pq.write_table(table, path, compression="zstd"))
     manifest = Manifest(
         shards=tuple(entries),
@@ -295,6 +295,11 @@ def read_manifest(folder: str | os.PathLike[str]) -> Manifest:
     folder = Path(folder)
     if (folder / INCOMPLETE).exists():
         raise DataError(f"the conversion to {folder} was not finished: run the same convert command again, it goes on")
+    return parse_manifest(folder)
+
+
+def parse_manifest(folder: Path) -> Manifest:
+    """Manifest of a data set as `read_manifest` gives it, even where a conversion is unfinished."""
     try:
         values = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -336,7 +341,8 @@ def with_temporary_name(path: Path, write: Callable[[Path], object]) -> None:
     os.replace(temporary, path)
 
 
-def _build_index(folder: Path, entries: list[ShardEntry]) -> tuple[pa.Table, list[SkippedRecord]]:
+def build_index(folder: Path, entries: Iterable[ShardEntry]) -> tuple[pa.Table, list[SkippedRecord]]:
+    """Index of the given shards, read from them, and the scenarios left out because an earlier one has the same id."""
     tables, duplicates, first_place = [], [], {}
     for entry in entries:
         rows = ShardReader(folder / entry.file).index_rows()

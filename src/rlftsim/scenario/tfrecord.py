@@ -22,6 +22,8 @@ OnError = Literal["stop", "skip"]
 
 _HEADER = struct.Struct("<QI")
 _FOOTER = struct.Struct("<I")
+RECORD_OVERHEAD_BYTES = _HEADER.size + _FOOTER.size
+"""What a record takes in the file beside its own bytes."""
 _MASK_DELTA = 0xA282EAD8
 _GZIP_MAGIC = b"\x1f\x8b"
 

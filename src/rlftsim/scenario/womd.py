@@ -84,15 +84,32 @@ def read_scenario_file(
 ) -> Iterator[tuple[int, Scenario]]:
     """Read one tfrecord file as `read_scenarios` does; yields the number of the record, from 0, with its scenario."""
     for record, data in read_records(path, on_error=on_error, report=report):
-        try:
-            scenario = scenario_from_bytes(data)
-        except DataError as error:
-            skipped = SkippedRecord(str(path), record, str(error))
-            if on_error == "stop":
-                raise DataError(str(skipped)) from error
-            report(skipped)
-            continue
-        yield record, scenario
+        scenario = scenario_or_report(path, record, data, on_error=on_error, report=report)
+        if scenario is not None:
+            yield record, scenario
+
+
+def scenario_or_report(
+    path: str | os.PathLike[str],
+    record: int,
+    data: bytes,
+    *,
+    on_error: OnError,
+    report: Callable[[SkippedRecord], None],
+) -> Scenario | None:
+    """Scenario of record number `record` of a file; None if it is bad, which is reported.
+
+    Raises:
+        DataError: under "stop", the record is bad: names file, record and cause.
+    """
+    try:
+        return scenario_from_bytes(data)
+    except DataError as error:
+        skipped = SkippedRecord(str(path), record, str(error))
+        if on_error == "stop":
+            raise DataError(str(skipped)) from error
+        report(skipped)
+        return None
 
 
 def scenario_from_bytes(record: bytes) -> Scenario:
