@@ -99,7 +99,7 @@ def verify_dataset(folder: str | os.PathLike[str]) -> list[Finding]:
     """
     folder = Path(folder)
     manifest = read_manifest(folder)
-    damage, content = [], []
+    damage, content, seen = [], [], set()
     for entry in manifest.shards:
         path = folder / entry.file
         if not path.exists():
@@ -107,7 +107,7 @@ def verify_dataset(folder: str | os.PathLike[str]) -> list[Finding]:
         elif hash_file(path) != entry.sha256:
             damage.append(Finding(Problem.DAMAGED_SHARD, entry.file, "its checksum does not match: convert again"))
         else:
-            content.extend(_check_shard(path, entry.file))
+            content.extend(_check_shard(path, entry.file, seen))
     if not damage:
         damage.extend(_check_index(folder, manifest))
     return damage + [f for f in content if f.problem.is_damage] + [f for f in content if not f.problem.is_damage]
@@ -159,7 +159,8 @@ def check_scenario(scenario: Scenario) -> Iterator[Finding]:
             yield Finding(problem, scenario.scenario_id, detail)
 
 
-def _check_shard(path: Path, name: str) -> Iterator[Finding]:
+def _check_shard(path: Path, name: str, seen: set[str]) -> Iterator[Finding]:
+    """Findings in one shard; scenarios whose id was seen before are in no index and not looked at again."""
     try:
         reader = ShardReader(path)
     except DataError as error:
@@ -171,7 +172,9 @@ def _check_shard(path: Path, name: str) -> Iterator[Finding]:
         except DataError as error:
             yield Finding(Problem.DAMAGED_SHARD, name, str(error))
         else:
-            yield from check_scenario(scenario)
+            if scenario.scenario_id not in seen:
+                yield from check_scenario(scenario)
+            seen.add(scenario.scenario_id)
 
 
 def _check_index(folder: Path, manifest: Manifest) -> Iterator[Finding]:
