@@ -231,7 +231,7 @@ def test_bytes_of_another_kind_are_refused(record):
 
 
 def test_twenty_second_scenarios_are_refused_with_the_way_out(make_message):
-    with pytest.raises(DataError, match="201 steps instead of 91.*9-second files"):
+    with pytest.raises(DataError, match=r"201 steps instead of 91 .*9-second files"):
         parse(make_message(num_steps=201))
 
 

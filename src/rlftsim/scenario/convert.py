@@ -1,7 +1,8 @@
 """Tfrecord files to a data set: one shard per file, in parallel, resumable.
 
-A shard that is done has a receipt beside it, written after it, that says what it was made from. A later run takes over a shard whose
-receipt, source and checksum agree and makes the others anew, so it does not matter when a run was interrupted or how.
+A shard that is done has a receipt beside it, written after it, that says what it was made from. A later run takes over
+a shard whose receipt, source and checksum agree and makes the others anew, so it does not matter when a run was
+interrupted or how.
 """
 
 import json
@@ -102,21 +103,22 @@ def convert(
 ) -> ConvertReport:
     """Convert WOMD tfrecord files to a data set that needs them no more.
 
-    Interrupted in any way, the same call goes on where it was. A data set may be added to by converting other files to it; a
-    source that changed is converted again. The same sources give the same bytes.
+    Interrupted in any way, the same call goes on where it was. A data set may be added to by converting other files to
+    it; a source that changed is converted again. The same sources give the same bytes.
 
     Args:
         source: tfrecord file, folder or glob, as in `find_tfrecords`.
         destination: folder of the data set: new, empty, or a data set or unfinished conversion of ours.
-        split: name of the split; None = training, validation or testing by the name of the file or its folder, else "unknown".
+        split: name of the split; None = training, validation or testing by the name of the file or its folder, else
+            "unknown".
         on_error: "skip" leaves bad files and records out and reports them, "stop" raises at the first.
         jobs: processes that work at the same time; None = one per usable core.
         licence_note: what the manifest of a new data set says about the licence.
         show_progress: whether to draw a progress bar with the time left on stderr.
 
     Raises:
-        DataError: nothing to read, nothing readable in it, or a destination with something else in it; under "stop" also the first
-            bad file or record.
+        DataError: nothing to read, nothing readable in it, or a destination with something else in it; under "stop"
+            also the first bad file or record.
     """
     folder = Path(destination)
     _check_destination(folder)
@@ -232,9 +234,10 @@ def _convert_file(task: _Task, advance: Callable[[int], None], is_stopped: Calla
         _Stopped: as asked for.
     """
     size, digest = task.source.stat().st_size, hash_file(task.source)
-    if _is_finished(task, size, digest):
+    finished = _finished_entry(task, size, digest)
+    if finished is not None:
         advance(size)
-        return _Outcome(task.known, reused=True)
+        return _Outcome(finished, reused=True)
     skipped: list[SkippedRecord] = []
     try:
         num_rows = _write_shard(task, skipped, advance, is_stopped)
@@ -254,13 +257,14 @@ def _convert_file(task: _Task, advance: Callable[[int], None], is_stopped: Calla
     return _Outcome(entry, reused=False)
 
 
-def _is_finished(task: _Task, size: int, digest: str) -> bool:
+def _finished_entry(task: _Task, size: int, digest: str) -> ShardEntry | None:
+    """Entry of the task's shard if it is there, whole, and made from this very source."""
     entry = task.known
     if entry is None or (entry.source_bytes, entry.source_sha256, entry.split) != (size, digest, task.split):
-        return False
+        return None
     if entry.skipped and task.on_error == "stop":
-        return False
-    return hash_file(task.folder / task.shard) == entry.sha256
+        return None
+    return entry if hash_file(task.folder / task.shard) == entry.sha256 else None
 
 
 def _write_shard(

@@ -87,9 +87,9 @@ class DatasetStats:
 def verify_dataset(folder: str | os.PathLike[str]) -> list[Finding]:
     """Check every shard and every scenario of a data set.
 
-    Damage: shards missing or not as the manifest says, index and manifest that do not belong together. Doubtful content: a lane with
-    two states at a step, consecutive valid positions that imply more than 60 m/s, no lanes or no road edges, nobody to evaluate
-    beside the ego.
+    Damage: shards missing or not as the manifest says, index and manifest that do not belong together. Doubtful
+    content: a lane with two states at a step, consecutive valid positions that imply more than 60 m/s, no lanes or no
+    road edges, nobody to evaluate beside the ego.
 
     Returns:
         What was found, empty if all is well; damage first.

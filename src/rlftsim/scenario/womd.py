@@ -1,7 +1,7 @@
 """Waymo Open Motion Dataset: TFRecord files of `Scenario` messages to `Scenario` objects, without TensorFlow.
 
-World coordinates become float32 here and nowhere else: the official evaluator rounds them so before it does anything. What a record
-stores where a state is not valid is kept as it is.
+World coordinates become float32 here and nowhere else: the official evaluator rounds them so before it does anything.
+What a record stores where a state is not valid is kept as it is.
 """
 
 import glob
@@ -115,12 +115,12 @@ def scenario_or_report(
 def scenario_from_bytes(record: bytes) -> Scenario:
     """Scenario of one serialized WOMD `Scenario` message with 91 steps, or 11 as in the test splits.
 
-    Map, lights, tracks to predict and objects of interest may be missing. Map features of a kind that WOMD did not have when this was
-    written are left out.
+    Map, lights, tracks to predict and objects of interest may be missing. Map features of a kind that WOMD did not
+    have when this was written are left out.
 
     Raises:
-        DataError: the bytes are no such message; there is no ego or it is not valid at step 10; a valid state or a map point is not
-            finite; the number of steps is another one; a track to predict does not exist.
+        DataError: the bytes are no such message; there is no ego or it is not valid at step 10; a valid state or a map
+            point is not finite; the number of steps is another one; a track to predict does not exist.
     """
     try:
         message = womd_pb2.Scenario.FromString(record)
@@ -156,7 +156,8 @@ def _read_tracks(message: womd_pb2.Scenario) -> Tracks:
             )
     if num_steps not in (HISTORY_STEPS, TOTAL_STEPS):
         raise DataError(
-            f"{num_steps} steps instead of {TOTAL_STEPS} (or {HISTORY_STEPS} in a test split): take WOMD's 9-second files, not the 20-second ones"
+            f"{num_steps} steps instead of {TOTAL_STEPS} (or {HISTORY_STEPS} in a test split): "
+            "take WOMD's 9-second files, not the 20-second ones"
         )
     states = np.array(
         [
