@@ -230,6 +230,11 @@ def test_bytes_of_another_kind_are_refused(record):
         scenario_from_bytes(record)
 
 
+def test_an_id_that_is_no_text_is_refused(make_message):
+    with pytest.raises(DataError, match="its scenario_id is b"):
+        scenario_from_bytes(make_message().SerializeToString() + b"\x2a\x02\xff\xfe")
+
+
 def test_twenty_second_scenarios_are_refused_with_the_way_out(make_message):
     with pytest.raises(DataError, match=r"201 steps instead of 91 .*9-second files"):
         parse(make_message(num_steps=201))

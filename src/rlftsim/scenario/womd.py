@@ -131,6 +131,8 @@ def scenario_from_bytes(record: bytes) -> Scenario:
     if not message.scenario_id or not message.tracks:
         missing = "tracks" if message.scenario_id else "scenario_id"
         raise DataError(f"not a WOMD Scenario message, or an empty one: it has no {missing}")
+    if not isinstance(message.scenario_id, str):  # the parser hands out bytes where they are not UTF-8
+        raise DataError(f"not a WOMD Scenario message, or a damaged one: its scenario_id is {message.scenario_id!r}")
     tracks = _read_tracks(message)
     num_steps = tracks.valid.shape[1]
     ego_index = _read_ego_index(message, tracks)
