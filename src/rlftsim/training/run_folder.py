@@ -21,9 +21,10 @@ from typing import Any
 
 from torch.utils.tensorboard import SummaryWriter
 
+from rlftsim import __version__
 from rlftsim.errors import CheckpointError
 
-PACKAGES = ("rlftsim", "torch", "numpy", "pyarrow", "lightning-fabric", "safetensors")
+PACKAGES = ("torch", "numpy", "pyarrow", "lightning-fabric", "safetensors")
 
 
 def to_plain(config: Any) -> Any:
@@ -51,7 +52,7 @@ def describe_environment() -> dict[str, Any]:
         "command": " ".join(sys.argv),
         "python": platform.python_version(),
         "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
-        "packages": {name: version(name) for name in PACKAGES},
+        "packages": {"rlftsim": __version__, **{name: version(name) for name in PACKAGES}},
         "commit": _commit(),
     }
 
