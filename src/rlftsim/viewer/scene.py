@@ -17,7 +17,6 @@ from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.types import (
     CURRENT_STEP,
     HISTORY_STEPS,
-    TOTAL_STEPS,
     LightStates,
     MapFeatures,
     MapFeatureType,
