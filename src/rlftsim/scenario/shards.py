@@ -1,0 +1,302 @@
+"""Arrow shards: files of scenarios, one row each, every array an encoded column, memory-mapped for random access.
+
+A shard also holds its rows of the index, so the index can be rebuilt from the shards alone. Each row has a checksum over its encoded
+arrays that is checked whenever the row is read.
+"""
+
+import hashlib
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, fields
+from pathlib import Path
+
+import google_crc32c
+import numpy as np
+import pyarrow as pa
+
+from rlftsim.errors import DataError
+from rlftsim.scenario.codec import decode_array, encode_array
+from rlftsim.scenario.index_row import IndexRow, compute_index_row
+from rlftsim.scenario.types import LaneTopology, LightStates, MapFeatures, Scenario, Tracks
+
+SCHEMA_VERSION = 1
+_ROWS_PER_BATCH = 16
+
+# Every array of a scenario and its dtype, in the order of the columns. `.x` and the like: one component of a vector per column,
+# because the components lie on different grids.
+_ARRAY_DTYPES: Mapping[str, str] = {
+    "timestamps_s": "float64",
+    "tracks_to_predict": "int32",
+    "difficulty": "int8",
+    "objects_of_interest": "int64",
+    "tracks.object_id": "int64",
+    "tracks.object_type": "int8",
+    "tracks.valid": "bool",
+    "tracks.position.x": "float32",
+    "tracks.position.y": "float32",
+    "tracks.position.z": "float32",
+    "tracks.heading": "float32",
+    "tracks.velocity.x": "float32",
+    "tracks.velocity.y": "float32",
+    "tracks.size.length": "float32",
+    "tracks.size.width": "float32",
+    "tracks.size.height": "float32",
+    "map.feature_id": "int64",
+    "map.feature_type": "int8",
+    "map.offsets": "int64",
+    "map.points.x": "float32",
+    "map.points.y": "float32",
+    "map.points.z": "float32",
+    "topology.entry_lanes": "int64",
+    "topology.exit_lanes": "int64",
+    "topology.neighbors": "int64",
+    "topology.boundaries": "int64",
+    "topology.stop_sign_lanes": "int64",
+    "topology.speed_limit_mph": "float32",
+    "topology.interpolating": "bool",
+    "lights.step": "int32",
+    "lights.lane_id": "int64",
+    "lights.state": "int8",
+    "lights.stop_point.x": "float32",
+    "lights.stop_point.y": "float32",
+    "lights.stop_point.z": "float32",
+}
+_INDEX_TYPES = {str: pa.string(), int: pa.int32()}
+INDEX_FIELDS = tuple(pa.field(field.name, _INDEX_TYPES[field.type]) for field in fields(IndexRow))
+_SCHEMA = pa.schema(
+    [
+        *INDEX_FIELDS,
+        pa.field("source_record", pa.int32()),
+        pa.field("ego_index", pa.int32()),
+        pa.field("checksum", pa.uint32()),
+        *(pa.field(name, pa.binary()) for name in _ARRAY_DTYPES),
+    ],
+    metadata={"format": "rlftsim scenarios", "schema_version": str(SCHEMA_VERSION)},
+)
+
+
+class ShardWriter:
+    """Writes one shard under a temporary name; `close` gives it its own. A shard that is not closed never gets it.
+
+    Args:
+        path: the shard. An existing one is replaced on `close`.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = Path(path)
+        self.num_rows = 0
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self._temporary = self.path.with_name(f"{self.path.name}.{os.getpid()}.tmp")
+        self._file = open(self._temporary, "wb")  # noqa: SIM115 (closed by close and discard)
+        self._writer = pa.ipc.new_file(self._file, _SCHEMA)
+        self._pending: list[dict[str, object]] = []
+
+    def add(self, scenario: Scenario, split: str, source_record: int | None = None) -> None:
+        """Append a scenario.
+
+        Raises:
+            DataError: an array of the scenario has another dtype than `types.py` says.
+        """
+        row = _row_of(scenario, split, source_record)
+        self._pending.append(row)
+        self.num_rows += 1
+        if len(self._pending) == _ROWS_PER_BATCH:
+            self._flush()
+
+    def close(self) -> None:
+        """Finish the shard: only now does it appear under its name."""
+        self._flush()
+        self._writer.close()
+        self._file.flush()
+        os.fsync(self._file.fileno())
+        self._file.close()
+        os.replace(self._temporary, self.path)
+
+    def discard(self) -> None:
+        """Throw away what was written."""
+        self._file.close()
+        self._temporary.unlink(missing_ok=True)
+
+    def _flush(self) -> None:
+        if self._pending:
+            self._writer.write_batch(pa.RecordBatch.from_pylist(self._pending, schema=_SCHEMA))
+            self._pending = []
+
+
+class ShardReader:
+    """Random access to the scenarios of a shard, memory-mapped.
+
+    Args:
+        path: the shard.
+
+    Raises:
+        DataError: the file is missing, damaged, or of another schema version.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = Path(path)
+        try:
+            self._table = pa.ipc.open_file(pa.memory_map(str(path))).read_all()
+        except (OSError, pa.ArrowException) as error:
+            cause = "is missing" if not self.path.exists() else f"is damaged ({error})"
+            raise DataError(f"shard {self.path} {cause}: {_WAY_OUT}") from error
+        if self._table.schema.names != _SCHEMA.names:
+            raise DataError(f"shard {self.path} was written with another schema version: convert again")
+
+    def __len__(self) -> int:
+        return self._table.num_rows
+
+    def index_rows(self) -> pa.Table:
+        """Columns of `IndexRow` and `source_record`, one row per scenario; a copy in memory."""
+        names = [field.name for field in INDEX_FIELDS]
+        try:
+            columns = {name: self._table[name].to_pylist() for name in [*names, "source_record"]}
+        except (OSError, UnicodeDecodeError, pa.ArrowException) as error:
+            raise DataError(f"shard {self.path} is damaged ({error}): {_WAY_OUT}") from error
+        return pa.table(columns, schema=pa.schema([*INDEX_FIELDS, pa.field("source_record", pa.int32())]))
+
+    def row_bytes(self, row: int) -> int:
+        """Size of the encoded arrays of a row in bytes."""
+        return sum(0 if data is None else len(data) for data in self._encoded(row).values())
+
+    def read(self, row: int) -> Scenario:
+        """Decode a row.
+
+        Raises:
+            DataError: the row is damaged.
+        """
+        try:
+            encoded = self._encoded(row)
+            if _checksum(encoded) != self._table["checksum"][row].as_py():
+                raise ValueError("its checksum does not match")
+            arrays = {name: None if data is None else decode_array(data) for name, data in encoded.items()}
+            scenario_id = self._table["scenario_id"][row].as_py()
+            return _from_arrays(scenario_id, self._table["ego_index"][row].as_py(), arrays)
+        except (ValueError, OSError, pa.ArrowException) as error:
+            raise DataError(f"shard {self.path}: row {row} is damaged ({error}): {_WAY_OUT}") from error
+
+    def _encoded(self, row: int) -> dict[str, pa.Buffer | None]:
+        return {name: self._table[name][row].as_buffer() for name in _ARRAY_DTYPES}
+
+
+_WAY_OUT = "delete the file and run the conversion or generation that made it again"
+
+
+def hash_file(path: str | os.PathLike[str]) -> str:
+    """SHA-256 of a file's bytes in hexadecimal."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _row_of(scenario: Scenario, split: str, source_record: int | None) -> dict[str, object]:
+    arrays = _to_arrays(scenario)
+    for name, dtype in _ARRAY_DTYPES.items():
+        array = arrays[name]
+        if array is not None and array.dtype != dtype:
+            raise DataError(f"scenario {scenario.scenario_id}: {name} is {array.dtype}, it must be {dtype}")
+    encoded = {name: None if array is None else encode_array(array) for name, array in arrays.items()}
+    return {
+        **asdict(compute_index_row(scenario, split)),
+        "source_record": source_record,
+        "ego_index": scenario.ego_index,
+        "checksum": _checksum(encoded),
+        **encoded,
+    }
+
+
+def _checksum(encoded: Mapping[str, bytes | pa.Buffer | None]) -> int:
+    crc = 0
+    for data in encoded.values():
+        if data is not None:
+            crc = google_crc32c.extend(crc, bytes(data))
+    return crc
+
+
+def _to_arrays(scenario: Scenario) -> dict[str, np.ndarray | None]:
+    """Arrays in the order of the columns, alike along their last axis; tables are transposed."""
+    tracks, features, lights = scenario.tracks, scenario.map_features, scenario.lights
+    topology = features.topology
+    return {
+        "timestamps_s": scenario.timestamps_s,
+        "tracks_to_predict": scenario.tracks_to_predict,
+        "difficulty": scenario.difficulty,
+        "objects_of_interest": scenario.objects_of_interest,
+        "tracks.object_id": tracks.object_id,
+        "tracks.object_type": tracks.object_type,
+        "tracks.valid": tracks.valid,
+        "tracks.position.x": tracks.position[..., 0],
+        "tracks.position.y": tracks.position[..., 1],
+        "tracks.position.z": tracks.position[..., 2],
+        "tracks.heading": tracks.heading,
+        "tracks.velocity.x": tracks.velocity[..., 0],
+        "tracks.velocity.y": tracks.velocity[..., 1],
+        "tracks.size.length": tracks.size[..., 0],
+        "tracks.size.width": tracks.size[..., 1],
+        "tracks.size.height": tracks.size[..., 2],
+        "map.feature_id": features.feature_id,
+        "map.feature_type": features.feature_type,
+        "map.offsets": features.offsets,
+        "map.points.x": features.points[:, 0],
+        "map.points.y": features.points[:, 1],
+        "map.points.z": features.points[:, 2],
+        "topology.entry_lanes": topology.entry_lanes.T,
+        "topology.exit_lanes": topology.exit_lanes.T,
+        "topology.neighbors": topology.neighbors.T,
+        "topology.boundaries": topology.boundaries.T,
+        "topology.stop_sign_lanes": topology.stop_sign_lanes.T,
+        "topology.speed_limit_mph": topology.speed_limit_mph,
+        "topology.interpolating": topology.interpolating,
+        "lights.step": lights.step,
+        "lights.lane_id": lights.lane_id,
+        "lights.state": lights.state,
+        "lights.stop_point.x": lights.stop_point[:, 0],
+        "lights.stop_point.y": lights.stop_point[:, 1],
+        "lights.stop_point.z": lights.stop_point[:, 2],
+    }
+
+
+def _from_arrays(scenario_id: str, ego_index: int, arrays: Mapping[str, np.ndarray]) -> Scenario:
+    def vector(name: str, components: str) -> np.ndarray:
+        return np.stack([arrays[f"{name}.{component}"] for component in components.split()], axis=-1)
+
+    def table(name: str) -> np.ndarray:
+        return np.ascontiguousarray(arrays[f"topology.{name}"].T)
+
+    return Scenario(
+        scenario_id=scenario_id,
+        timestamps_s=arrays["timestamps_s"],
+        tracks=Tracks(
+            object_id=arrays["tracks.object_id"],
+            object_type=arrays["tracks.object_type"],
+            position=vector("tracks.position", "x y z"),
+            heading=arrays["tracks.heading"],
+            velocity=vector("tracks.velocity", "x y"),
+            size=vector("tracks.size", "length width height"),
+            valid=arrays["tracks.valid"],
+        ),
+        map_features=MapFeatures(
+            feature_id=arrays["map.feature_id"],
+            feature_type=arrays["map.feature_type"],
+            points=vector("map.points", "x y z"),
+            offsets=arrays["map.offsets"],
+            topology=LaneTopology(
+                entry_lanes=table("entry_lanes"),
+                exit_lanes=table("exit_lanes"),
+                neighbors=table("neighbors"),
+                boundaries=table("boundaries"),
+                stop_sign_lanes=table("stop_sign_lanes"),
+                speed_limit_mph=arrays["topology.speed_limit_mph"],
+                interpolating=arrays["topology.interpolating"],
+            ),
+        ),
+        lights=LightStates(
+            step=arrays["lights.step"],
+            lane_id=arrays["lights.lane_id"],
+            state=arrays["lights.state"],
+            stop_point=vector("lights.stop_point", "x y z"),
+        ),
+        ego_index=ego_index,
+        tracks_to_predict=arrays["tracks_to_predict"],
+        difficulty=arrays["difficulty"],
+        objects_of_interest=arrays["objects_of_interest"],
+    )

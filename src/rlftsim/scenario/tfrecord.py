@@ -1,0 +1,138 @@
+"""TFRecord framing: length, masked checksum of the length, bytes, masked checksum of the bytes.
+
+    uint64 length | uint32 crc(length) | length bytes | uint32 crc(bytes)        little-endian, crc = masked crc32c
+
+A damaged checksum of the bytes costs one record. A damaged length costs the rest of the file, because only the length says where
+the next record starts.
+"""
+
+import logging
+import os
+import struct
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO, Literal
+
+import google_crc32c
+
+from rlftsim.errors import DataError
+
+OnError = Literal["stop", "skip"]
+
+_HEADER = struct.Struct("<QI")
+_FOOTER = struct.Struct("<I")
+_MASK_DELTA = 0xA282EAD8
+_GZIP_MAGIC = b"\x1f\x8b"
+
+
+@dataclass(frozen=True)
+class SkippedRecord:
+    """Something of a file that could not be read."""
+
+    file: str
+    record: int
+    """Number of the record in its file, from 0. Where the rest of the file is lost: the first one lost."""
+    cause: str
+
+    def __str__(self) -> str:
+        return f"{self.file}: record {self.record}: {self.cause}"
+
+
+def log_skipped(skipped: SkippedRecord) -> None:
+    """Say what was skipped as a warning of the logger `rlftsim`."""
+    logging.getLogger("rlftsim").warning("skipped %s", skipped)
+
+
+def masked_crc32c(data: bytes) -> int:
+    """Checksum of `data` as TFRecord files store it, in [0, 2**32)."""
+    crc = google_crc32c.value(data)
+    return (((crc >> 15) | (crc << 17)) + _MASK_DELTA) & 0xFFFFFFFF
+
+
+def write_records(path: str | os.PathLike[str], records: Iterable[bytes]) -> int:
+    """Write `records` as a TFRecord file, replacing what was there.
+
+    Returns:
+        Number of records written.
+    """
+    count = 0
+    with open(path, "wb") as file:
+        for record in records:
+            length = struct.pack("<Q", len(record))
+            file.write(length + _FOOTER.pack(masked_crc32c(length)) + record + _FOOTER.pack(masked_crc32c(record)))
+            count += 1
+    return count
+
+
+def read_records(
+    path: str | os.PathLike[str], *, on_error: OnError = "stop", report: Callable[[SkippedRecord], None] = log_skipped
+) -> Iterator[tuple[int, bytes]]:
+    """Read a TFRecord file record by record, checking both checksums of each.
+
+    Args:
+        path: the file.
+        on_error: "stop" raises at the first damage; "skip" reports it and goes on with the next record, if that can be found.
+        report: called with each skipped record, only under "skip".
+
+    Yields:
+        Number of the record in the file, from 0, and its bytes.
+
+    Raises:
+        DataError: under "stop", damage: names file, record and cause. Always: the file does not exist or cannot be opened.
+    """
+    path = Path(path)
+    try:
+        file = open(path, "rb")  # noqa: SIM115 (the with follows; only the opening is guarded)
+    except OSError as error:
+        raise DataError(f"{path}: cannot be opened: {error.strerror}") from error
+    with file:
+        size = os.fstat(file.fileno()).st_size
+        record = 0
+        while file.tell() < size or size == 0:
+            data, cause = _read_one(file, size, record)
+            if cause is not None:
+                skipped = SkippedRecord(str(path), record, cause)
+                if on_error == "stop":
+                    raise DataError(str(skipped))
+                report(skipped)
+                if data is None:
+                    return
+            elif data is not None:
+                yield record, data
+            record += 1
+
+
+def _read_one(file: BinaryIO, size: int, record: int) -> tuple[bytes | None, str | None]:
+    """Next record and what is wrong with it; no bytes = the rest of the file cannot be read."""
+    start = file.tell()
+    header = file.read(_HEADER.size)
+    damage = _header_damage(header, size - start, record)
+    if damage is not None:
+        return None, damage
+    length = _HEADER.unpack(header)[0]
+    data = file.read(length)
+    (crc,) = _FOOTER.unpack(file.read(_FOOTER.size))
+    if crc != masked_crc32c(data):
+        return data, f"damaged: the checksum of its {length} bytes does not match"
+    return data, None
+
+
+def _header_damage(header: bytes, bytes_left: int, record: int) -> str | None:
+    if bytes_left == 0:
+        return "the file is empty"
+    if record == 0 and header.startswith(_GZIP_MAGIC):
+        return "not a TFRecord file but a gzip-compressed one: unpack it with gunzip first"
+    if len(header) < _HEADER.size:
+        return (
+            "not a TFRecord file: too short" if record == 0 else "truncated: the file ends inside the record's header"
+        )
+    length, crc = _HEADER.unpack(header)
+    if crc != masked_crc32c(header[:8]):
+        if record == 0:
+            return "not a TFRecord file, or damaged at its start: the checksum of the first length does not match"
+        return "damaged: the checksum of its length does not match; the rest of the file is lost"
+    needed = _HEADER.size + length + _FOOTER.size
+    if needed > bytes_left:
+        return f"truncated: the record needs {needed} bytes, the file has {bytes_left} left"
+    return None
