@@ -37,6 +37,10 @@ _SIZES = {
 }
 
 
+VEHICLES_PER_LANE_AND_S = {"city": (0.018, 0.04), "quiet": (0.035, 0.07), "freeway": (0.25, 0.45)}
+"""Range of the vehicles that enter per second and lane; much more is gridlock within minutes."""
+
+
 def draw_size(rng: np.random.Generator, kind: str) -> tuple[float, float, float]:
     """Length, width and height in metres of one road user of a kind such as "car" or "pedestrian"."""
     length, width, height = (
@@ -86,8 +90,8 @@ def _vehicle_trips(rng: np.random.Generator, plan: StreetPlan, types: list[RoadU
     weight = {"arterial": 1.6, "collector": 1.0, "residential": 0.6, "freeway": 1.0, "ramp": 0.5}
     sources = [street for street in plan.streets if street.from_node in fringe]
     sinks = [street for street in plan.streets if street.to_node in fringe]
-    per_lane = rng.uniform(0.15, 0.36) if plan.kind == "freeway" else rng.uniform(0.025, 0.065)
-    bicycles = 0.0 if plan.kind == "freeway" else rng.uniform(0.02, 0.08)
+    per_lane = rng.uniform(*VEHICLES_PER_LANE_AND_S[plan.kind])
+    bicycles = 0.0 if plan.kind == "freeway" else rng.uniform(0.01, 0.06)
     motor = [kind.type_id for kind in types if kind.object_type == ObjectType.VEHICLE]
     cycles = [kind.type_id for kind in types if kind.object_type == ObjectType.CYCLIST]
     trips = []
@@ -114,7 +118,7 @@ def _walks(rng: np.random.Generator, plan: StreetPlan) -> list[tuple[float, str]
     attraction = rng.gamma(0.5, 1.0, len(streets)) + 0.05
     attraction /= attraction.sum()
     walks = []
-    for time in _poisson_times(rng, rng.uniform(0.06, 0.45)):
+    for time in _poisson_times(rng, rng.uniform(0.04, 0.26)):
         start, goal = rng.choice(streets, 2, replace=False, p=attraction)
         size = int(rng.choice([1, 2, 3], p=[0.75, 0.2, 0.05]))
         for member in range(size):

@@ -38,8 +38,9 @@ from rlftsim.scenario.types import STEP_S, Scenario
 
 GENERATOR_VERSION = 1
 LICENCE_NOTE = "CC0-1.0: synthetic scenarios, no rights reserved."
-FREEWAY_EVERY = 8
-"""One network in so many is a freeway, and gives half as many scenarios as a city."""
+KINDS = ("city", "quiet", "city", "freeway", "city", "city", "quiet", "city")
+"""Kinds of the networks in turn; a freeway gives half as many scenarios as the others."""
+LOTS_PER_STREET = {"city": 0.3, "quiet": 0.2, "freeway": 0.0}
 MAX_ATTEMPTS = 6
 _NUM_STEPS = round((sumo.SIMULATED_S - sumo.DISCARDED_S) / STEP_S)
 
@@ -91,7 +92,7 @@ def plan_networks(request: SyntheticRequest) -> list[NetworkTask]:
     for split_number, (split, share) in enumerate(request.shares.items()):
         total = round(request.num_scenarios * share)
         count = max(1, round(total / request.scenarios_per_network))
-        kinds = ["freeway" if k % FREEWAY_EVERY == FREEWAY_EVERY // 2 - 1 else "city" for k in range(count)]
+        kinds = [KINDS[k % len(KINDS)] for k in range(count)]
         weights = np.array([0.5 if kind == "freeway" else 1.0 for kind in kinds])
         bounds = np.rint(np.append(0.0, np.cumsum(weights)) / weights.sum() * total).astype(int)
         tasks += [
@@ -105,7 +106,7 @@ def simulate_world(kind: str, seed: tuple[int, ...], folder: Path) -> World:
     """Draw a network, let SUMO fill it with traffic, and turn what comes out into bodies, lights and a map.
 
     Args:
-        kind: "city" or "freeway".
+        kind: "city", "quiet" or "freeway".
         seed: decides everything, for a given version of SUMO.
         folder: existing folder for SUMO's files.
 
@@ -114,7 +115,7 @@ def simulate_world(kind: str, seed: tuple[int, ...], folder: Path) -> World:
         RlftsimError: a program of SUMO failed.
     """
     rng = np.random.default_rng(seed)
-    plan = draw_city_plan(rng) if kind == "city" else draw_freeway_plan(rng)
+    plan = draw_freeway_plan(rng) if kind == "freeway" else draw_city_plan(rng, quiet=kind == "quiet")
     layout = "opposites" if rng.random() < 0.75 else "incoming"
     network_file = sumo.compile_network(plan, folder, layout)
     network = read_network(network_file, plan)
@@ -126,7 +127,7 @@ def simulate_world(kind: str, seed: tuple[int, ...], folder: Path) -> World:
     bodies = read_vehicles(vehicles_file, network, types, rng)
     bodies += read_pedestrians(persons_file, rng)
     bodies += park_in_strips(rng, network, _NUM_STEPS)
-    bodies += park_in_lots(rng, network, network_map.drivable, _NUM_STEPS, 0.5 if kind == "city" else 0.0)
+    bodies += park_in_lots(rng, network, network_map.drivable, _NUM_STEPS, LOTS_PER_STREET[kind])
     return World(
         name="/".join(map(str, seed)),
         bodies=tuple(bodies),

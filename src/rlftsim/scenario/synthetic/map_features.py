@@ -18,6 +18,7 @@ FREEWAY_LIMIT_MPS = 24.0
 SOLID_BEFORE_JUNCTION_M = 25.0
 KERB_RADIUS_M = 4.5
 OPEN_END_M = 22.0
+MOUTH_M = 4.0
 MEDIAN_AREA_PER_PERIMETER_M = 4.0
 
 
@@ -79,18 +80,30 @@ def _strip(shape: Float[np.ndarray, "n 2"], left_m: float, right_m: float) -> An
 
 
 def _street_strips(network: Network) -> dict[str, Any]:
-    """Paved strip of each street as compiled: all lanes but sidewalks, plus the gutter on the right."""
+    """Paved strip of each street as compiled: all lanes but sidewalks."""
     strips = {}
     for street in network.plan.streets:
         if network.plan.kind == "freeway":  # as planned, so that no gap is left where segments meet
-            strips[street.street_id] = _strip(street.points, 0.3, street.roadway_width_m + street.gutter_m)
+            strips[street.street_id] = _strip(street.points, 0.3, street.roadway_width_m)
             continue
         paved = [k for k, lane in enumerate(street.lanes) if lane.kind != "sidewalk"]
         leftmost = network.lane((street.street_id, paved[-1]))
         left = leftmost.width_m / 2 + (0.3 if street.reverse_id is None else 0.05)
-        right = street.roadway_width_m - leftmost.width_m / 2 + street.gutter_m
+        right = street.roadway_width_m - leftmost.width_m / 2
         strips[street.street_id] = _strip(leftmost.shape, left, right)
     return strips
+
+
+def _mouth(network: Network, street: Street, node_id: str) -> Any:
+    """Roadway of a street continued straight into a junction, without its parking strip, so that kerbs meet there."""
+    leftmost = network.lane((street.street_id, len(street.lanes) - 1))
+    end = leftmost.shape[-2:] if street.to_node == node_id else leftmost.shape[:2]
+    along = (end[1] - end[0]) / max(float(np.linalg.norm(end[1] - end[0])), 1e-6)
+    line = np.stack(
+        [end[1], end[1] + MOUTH_M * along] if street.to_node == node_id else [end[0] - MOUTH_M * along, end[0]]
+    )
+    width = sum(lane.width_m for lane in street.lanes if lane.kind not in ("sidewalk", "parking"))
+    return _strip(line, leftmost.width_m / 2, width - leftmost.width_m / 2)
 
 
 def _junction_area(network: Network, node_id: str, strips: dict[str, Any]) -> Any:
@@ -113,6 +126,11 @@ def _junction_area(network: Network, node_id: str, strips: dict[str, Any]) -> An
         for street in network.plan.streets
         if node_id in (street.from_node, street.to_node)
     ]
+    parts += [
+        _mouth(network, street, node_id).intersection(shape)
+        for street in network.plan.streets
+        if node_id in (street.from_node, street.to_node)
+    ]
     area = shapely.union_all(parts)
     rounded = area.buffer(KERB_RADIUS_M).buffer(-KERB_RADIUS_M)
     return shapely.union_all([area, rounded.intersection(shape.buffer(5.0))])
@@ -124,14 +142,14 @@ def compute_drivable_area(network: Network) -> Any:
     strips = _street_strips(network)
     fringe = {node.node_id for node in network.plan.fringe_nodes}
     parts = list(strips.values()) + [shapely.Polygon(taper) for taper in network.plan.tapers]
-    if network.plan.kind == "city":
+    if network.plan.kind != "freeway":
         parts += [
             _junction_area(network, node.node_id, strips)
             for node in network.plan.nodes
             if node.node_id not in fringe and node.node_id in network.junction_shapes
         ]
     area = shapely.union_all(parts).buffer(0.3).buffer(-0.3)
-    return area if network.plan.kind == "city" else area.buffer(2.0).buffer(-4.0).buffer(2.0)
+    return area if network.plan.kind != "freeway" else area.buffer(2.0).buffer(-4.0).buffer(2.0)
 
 
 def oriented_rings(area: Any) -> list[tuple[Float[np.ndarray, "n 2"], bool]]:
@@ -222,7 +240,7 @@ def _line_features(network: Network) -> list[tuple[MapFeatureType, np.ndarray]]:
     for street in network.plan.streets:
         lanes = [network.lane((street.street_id, k)) for k in range(len(street.lanes))]
         driven = [lane for lane in lanes if lane.kind in ("travel", "bicycle")]
-        solid_tail = network.plan.kind == "city" and street.to_node not in fringe
+        solid_tail = network.plan.kind != "freeway" and street.to_node not in fringe
         for lane, left in zip(driven, driven[1:], strict=False):
             rows += _between_lanes(street, lane, left, solid_tail)
         rows += _separator(street, driven[-1])
@@ -244,7 +262,7 @@ def _stop_points(network: Network) -> list[tuple[str, np.ndarray, list[Connector
         street = outermost.street
         assert street is not None
         right = sum(x.width_m for x in street.lanes[: outermost.index] if x.kind != "sidewalk")
-        border = offset_polyline(outermost.shape, -(outermost.width_m / 2 + right + street.gutter_m + 0.6))
+        border = offset_polyline(outermost.shape, -(outermost.width_m / 2 + right + 0.6))
         rows.append((street_id, border[-1], connectors))
     return rows
 

@@ -61,7 +61,7 @@ def park_in_strips(rng: np.random.Generator, network: Network, num_steps: int) -
     cars = []
     for lane in network.lanes.values():
         if lane.kind == "parking":
-            cars += park_along(rng, lane.shape, float(rng.uniform(0.25, 0.95)), num_steps)
+            cars += park_along(rng, lane.shape, float(rng.uniform(0.2, 0.85)), num_steps)
     return cars
 
 
@@ -99,7 +99,7 @@ def park_in_lots(
     for street in network.plan.streets:
         for _ in range(int(rng.poisson(lots_per_street))):
             occupancy, square = rng.uniform(0.3, 0.95), bool(rng.random() < 0.75)
-            setback = street.gutter_m + rng.uniform(8.5, 20.0)
+            setback = rng.uniform(8.5, 20.0)
             rows = [setback, setback + (rng.uniform(5.6, 6.2) if square else rng.uniform(8, 10))]
             for row in rows[: int(rng.integers(1, 3))]:
                 for place, heading in _row_of_places(rng, street, row, square):

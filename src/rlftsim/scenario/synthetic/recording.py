@@ -23,7 +23,7 @@ class _LaneRuler:
 
     def __init__(self, lanes: dict[str, Lane]) -> None:
         self._lanes = lanes
-        self._along: dict[str, Float[np.ndarray, "n"]] = {}
+        self._along: dict[str, Float[np.ndarray, n]] = {}
 
     def points_at(self, lane_id: str, positions_m: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 2"]:
         """Points at SUMO's positions, which count the lane's nominal length, not that of its shape."""
@@ -79,9 +79,7 @@ def _lane_path(ruler: _LaneRuler, lanes: dict[str, Lane], rows: dict[str, np.nda
     return LanePath(first_step, centre, direction, rows["vehicle_speed"], tuple(changes), tuple(distances))
 
 
-def read_vehicles(
-    path: Path, network: Network, types: dict[str, RoadUserType], rng: np.random.Generator
-) -> list[Body]:
+def read_vehicles(path: Path, network: Network, types: dict[str, RoadUserType], rng: np.random.Generator) -> list[Body]:
     """Bodies of all motor vehicles and bicycles in the vehicles' trajectory file."""
     names = ("timestep_time", "vehicle_id", "vehicle_type", "vehicle_speed", "vehicle_pos", "vehicle_lane")
     table = _read_table(path, names)
@@ -133,5 +131,3 @@ def read_signals(path: Path, junction: str) -> SignalStates:
     """Signal states of a junction from the first recorded step on."""
     found = re.findall(r'time="([\d.]+)"[^>]*state="([^"]*)"', path.read_text())
     return SignalStates(junction, tuple(state for time, state in found if float(time) >= DISCARDED_S - 1e-6))
-
-

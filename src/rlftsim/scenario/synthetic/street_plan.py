@@ -10,12 +10,13 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-LaneKind = Literal["sidewalk", "parking", "bicycle", "travel"]
+LaneKind = Literal["sidewalk", "gutter", "parking", "bicycle", "travel"]
+"""A gutter is the paved width between the outermost usable lane and the road edge; nobody may use it, as the parking strip."""
 Control = Literal["traffic_light", "allway_stop", "priority_stop", "right_before_left", "priority", "dead_end"]
 StreetClass = Literal["arterial", "collector", "residential", "freeway", "ramp"]
 
 MAX_RADIUS_M = 485.0
-"""No node lies farther from (0, 0): world coordinates then share one binary exponent after the offset that is added on writing."""
+"""No node lies farther from (0, 0)."""
 _PRIORITY = {"freeway": 12, "ramp": 8, "arterial": 9, "collector": 6, "residential": 3}
 
 
@@ -51,8 +52,6 @@ class Street:
     lanes: tuple[PlannedLane, ...]
     speed_mps: float
     priority: int
-    gutter_m: float
-    """Paved width between the outermost lane and the road edge."""
     reverse_id: str | None = None
     """The opposite direction sharing the left border; None beside a median or where there is none."""
 
@@ -76,7 +75,7 @@ class Connection:
 class StreetPlan:
     """Everything the network compiler needs, and what it would forget."""
 
-    kind: Literal["city", "freeway"]
+    kind: Literal["city", "quiet", "freeway"]
     nodes: tuple[Node, ...]
     streets: tuple[Street, ...]
     connections: tuple[Connection, ...] = ()
@@ -117,10 +116,11 @@ class _LineProfile:
     priority: int
 
 
-def _draw_profile(rng: np.random.Generator, street_class: StreetClass, is_column: bool) -> _LineProfile:
+def _draw_profile(rng: np.random.Generator, street_class: StreetClass, is_column: bool, quiet: bool) -> _LineProfile:
+    """Profile of a line of a class; streets of a quiet quarter have at most two lanes per direction."""
     lanes, low, high = {
-        "arterial": (int(rng.integers(2, 4)), 14.5, 19.0),
-        "collector": (int(rng.integers(1, 3)), 11.0, 15.0),
+        "arterial": (2 if quiet else int(rng.integers(2, 4)), 15.0, 19.5),
+        "collector": (1 if quiet else int(rng.integers(1, 3)), 11.0, 15.6),
         "residential": (1, 9.0, 11.2),
     }[street_class]
     bicycle_share = {"arterial": 0.25, "collector": 0.33, "residential": 0.0}[street_class]
@@ -172,9 +172,9 @@ def _curve(rng: np.random.Generator, start: np.ndarray, end: np.ndarray) -> Floa
     return points + bulge[:, None] * np.array([-direction[1], direction[0]])
 
 
-def _draw_lanes(rng: np.random.Generator, profile: _LineProfile) -> tuple[PlannedLane, ...]:
-    parking_share = {"arterial": 0.08, "collector": 0.5, "residential": 0.9}[profile.street_class]
-    lanes = [PlannedLane("sidewalk", float(rng.uniform(1.6, 2.6)))]
+def _draw_lanes(rng: np.random.Generator, profile: _LineProfile, gutter_m: float) -> tuple[PlannedLane, ...]:
+    parking_share = {"arterial": 0.06, "collector": 0.4, "residential": 0.75}[profile.street_class]
+    lanes = [PlannedLane("sidewalk", float(rng.uniform(1.6, 2.6))), PlannedLane("gutter", gutter_m)]
     if rng.random() < parking_share:
         lanes.append(PlannedLane("parking", 2.3))
     if profile.bicycle:
@@ -183,9 +183,7 @@ def _draw_lanes(rng: np.random.Generator, profile: _LineProfile) -> tuple[Planne
     return tuple(lanes)
 
 
-def _both_directions(
-    rng: np.random.Generator, profile: _LineProfile, start: Node, end: Node
-) -> tuple[Street, Street]:
+def _both_directions(rng: np.random.Generator, profile: _LineProfile, start: Node, end: Node) -> tuple[Street, Street]:
     """The two directions of one street, each with its own strip of parking."""
     middle = _curve(rng, start.position, end.position)
     gutter = float(rng.uniform(0.3, 2.0))
@@ -196,10 +194,9 @@ def _both_directions(
         to_node=end.node_id,
         points=offset_polyline(middle, -profile.median_m / 2),
         street_class=profile.street_class,
-        lanes=_draw_lanes(rng, profile),
+        lanes=_draw_lanes(rng, profile, gutter),
         speed_mps=profile.speed_mps,
         priority=profile.priority,
-        gutter_m=gutter,
         reverse_id=None if profile.median_m else ids[1],
     )
     backward = replace(
@@ -208,7 +205,7 @@ def _both_directions(
         from_node=end.node_id,
         to_node=start.node_id,
         points=offset_polyline(middle[::-1], -profile.median_m / 2),
-        lanes=_draw_lanes(rng, profile),
+        lanes=_draw_lanes(rng, profile, gutter),
         reverse_id=None if profile.median_m else ids[0],
     )
     return forward, backward
@@ -267,7 +264,9 @@ def _stub_ends(
     """Where traffic enters: (node, outer end, line) for the two ends of every line."""
     columns, rows = grid.shape[:2]
     ends = [((i, j), (i, inner), i) for i in range(columns) for j, inner in ((0, 1), (rows - 1, rows - 2))]
-    ends += [((i, j), (inner, j), columns + j) for j in range(rows) for i, inner in ((0, 1), (columns - 1, columns - 2))]
+    ends += [
+        ((i, j), (inner, j), columns + j) for j in range(rows) for i, inner in ((0, 1), (columns - 1, columns - 2))
+    ]
     stubs = []
     for outer, inner, line in ends:
         if classes[line] != "arterial" and rng.random() < 0.25:
@@ -278,16 +277,19 @@ def _stub_ends(
     return stubs
 
 
-def draw_city_plan(rng: np.random.Generator) -> StreetPlan:
+def draw_city_plan(rng: np.random.Generator, quiet: bool = False) -> StreetPlan:
     """Irregular grid of arterials, collectors and residential streets with stubs where traffic enters.
+
+    Args:
+        rng: decides everything.
+        quiet: a quarter of minor streets, at most one arterial, hardly any lights.
 
     Returns:
         A connected plan; every node but the fringe has a control fitting the classes that meet there.
     """
     columns, rows = int(rng.integers(3, 5)), int(rng.integers(3, 5))
-    quiet = rng.random() < 0.35
     classes = _draw_classes(rng, columns + rows, quiet)
-    profiles = [_draw_profile(rng, kind, line < columns) for line, kind in enumerate(classes)]
+    profiles = [_draw_profile(rng, kind, line < columns, quiet) for line, kind in enumerate(classes)]
     grid = _draw_grid(rng, columns, rows)
     links = _draw_links(rng, columns, rows, classes)
     stubs = _stub_ends(rng, grid, classes)
@@ -303,7 +305,7 @@ def draw_city_plan(rng: np.random.Generator) -> StreetPlan:
         (i, j): Node(
             f"n{i}{j}",
             grid[i, j] * shrink,
-            _draw_control(rng, (classes[i], classes[columns + j]), int(degree[i, j]), 0.3 if quiet else 1.0),
+            _draw_control(rng, (classes[i], classes[columns + j]), int(degree[i, j]), 0.2 if quiet else 1.0),
         )
         for i in range(columns)
         for j in range(rows)
@@ -314,7 +316,7 @@ def draw_city_plan(rng: np.random.Generator) -> StreetPlan:
         streets += _both_directions(rng, profiles[line], inner[a], inner[b])
     for node, (a, _, line) in zip(fringe, stubs, strict=True):
         streets += _both_directions(rng, profiles[line], node, inner[a])
-    return StreetPlan("city", (*inner.values(), *fringe), tuple(streets))
+    return StreetPlan("quiet" if quiet else "city", (*inner.values(), *fringe), tuple(streets))
 
 
 # --- freeway -------------------------------------------------------------------------------------------------------------------
@@ -354,10 +356,10 @@ class _Carriageway:
             to_node=f"{self.name}n{index + 1}",
             points=self.inner_border(self.cuts_m[index], self.cuts_m[index + 1]),
             street_class="freeway",
-            lanes=(PlannedLane("travel", self.width_m),) * (self.lanes + extra_lanes),
+            lanes=(PlannedLane("gutter", self.gutter_m),)
+            + (PlannedLane("travel", self.width_m),) * (self.lanes + extra_lanes),
             speed_mps=self.speed_mps,
             priority=_PRIORITY["freeway"],
-            gutter_m=self.gutter_m,
         )
 
     def taper(self, at_m: float, towards_m: float) -> Float[np.ndarray, "3 2"]:
@@ -385,25 +387,24 @@ def _ramp(rng: np.random.Generator, way: _Carriageway, on: bool) -> Street:
         to_node=inner if on else outer,
         points=points,
         street_class="ramp",
-        lanes=(PlannedLane("travel", way.width_m),),
+        lanes=(PlannedLane("gutter", way.gutter_m), PlannedLane("travel", way.width_m)),
         speed_mps=float(rng.uniform(16, 20)),
         priority=_PRIORITY["ramp"],
-        gutter_m=way.gutter_m,
     )
 
 
 def _carriageway_connections(way: _Carriageway) -> list[Connection]:
-    """Through lanes straight on; lane 0 of segments 1 and 3 belongs to the ramps."""
+    """Through lanes straight on; lane 1 (lane 0 is the gutter) of segments 1 and 3 belongs to the ramps."""
     name = way.name
     links = []
-    for lane in range(way.lanes):
+    for lane in range(1, way.lanes + 1):
         links.append(Connection(f"{name}0", f"{name}1", lane, lane + 1))
         links.append(Connection(f"{name}1", f"{name}2", lane + 1, lane))
         links.append(Connection(f"{name}2", f"{name}3", lane, lane + 1))
         links.append(Connection(f"{name}3", f"{name}4", lane + 1, lane))
-    links.append(Connection(f"{name}onramp", f"{name}1", 0, 0))
-    links.append(Connection(f"{name}2", f"{name}3", 0, 0))
-    links.append(Connection(f"{name}3", f"{name}offramp", 0, 0))
+    links.append(Connection(f"{name}onramp", f"{name}1", 1, 1))
+    links.append(Connection(f"{name}2", f"{name}3", 1, 1))
+    links.append(Connection(f"{name}3", f"{name}offramp", 1, 1))
     return links
 
 

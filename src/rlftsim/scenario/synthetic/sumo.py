@@ -82,7 +82,7 @@ def _edges_xml(plan: StreetPlan) -> str:
 def _nodes_xml(plan: StreetPlan) -> str:
     rows = [
         f'  <node id="{node.node_id}" x="{node.position[0]:.3f}" y="{node.position[1]:.3f}" type="{node.control}"'
-        + (' radius="7"/>' if plan.kind == "city" else "/>")
+        + (' radius="7"/>' if plan.kind != "freeway" else "/>")
         for node in plan.nodes
     ]
     return "\n".join(["<nodes>", *rows, "</nodes>"])
@@ -113,7 +113,7 @@ def compile_network(plan: StreetPlan, folder: Path, signal_layout: str = "opposi
     if plan.connections:
         (folder / "plan.con.xml").write_text(_connections_xml(plan))
         options += ["--connection-files", folder / "plan.con.xml"]
-    if plan.kind == "city":
+    if plan.kind != "freeway":
         options += ["--crossings.guess", "--crossings.guess.speed-threshold", 22, "--walkingareas"]
     network = folder / "network.net.xml"
     _run(

@@ -36,6 +36,7 @@ EGO_TO_END_M = 95.0
 EGO_TO_EGO_M = 70.0
 MAP_BEYOND_RANGE_M = 20.0
 PREDICT_WITHIN_M = 70.0
+MAX_PREDICTED_PEDESTRIANS = 2
 POSITION_GRID_PER_M = 512
 HEADING_GRID_PER_RAD = 4096
 VELOCITY_GRID_PER_MPS = 256
@@ -79,8 +80,17 @@ def _slice_body(body: Body, start: int) -> tuple[int, int, int] | None:
     return (first, last, start + first - body.first_step) if last > first else None
 
 
-def _look(bodies: list[Body], start: int, ego: Body, range_m: float) -> _View:
-    """All bodies within `range_m` of the ego at any step; the ego comes last."""
+def _see(distance_m: Float[np.ndarray, "n"], range_m: float, rng: np.random.Generator) -> Bool[np.ndarray, "n"]:
+    """Steps at which a body is seen: those within range, less now and then a spell behind something, the more likely the farther."""
+    seen = distance_m < range_m
+    if rng.random() < 0.5 * np.clip(distance_m.mean() / range_m, 0.0, 1.0):
+        begin = int(rng.integers(-20, TOTAL_STEPS))
+        seen[max(0, begin) : max(0, begin + int(rng.integers(5, 50)))] = False
+    return seen
+
+
+def _look(bodies: list[Body], start: int, ego: Body, range_m: float, rng: np.random.Generator) -> _View:
+    """All bodies the ego sees at any step of the window; the ego comes last."""
     ego_slice = slice(start - ego.first_step, start - ego.first_step + TOTAL_STEPS)
     ego_path = ego.position[ego_slice]
     kept, arrays = [], []
@@ -90,7 +100,10 @@ def _look(bodies: list[Body], start: int, ego: Body, range_m: float) -> _View:
             continue
         first, last, index = span
         own = slice(index, index + last - first)
-        near = np.linalg.norm(body.position[own] - ego_path[first:last], axis=1) < range_m
+        distance = np.linalg.norm(body.position[own] - ego_path[first:last], axis=1)
+        if distance.min() > range_m:
+            continue
+        near = _see(distance, range_m, rng) if body is not ego else np.ones(TOTAL_STEPS, bool)
         if not near.any():
             continue
         position, heading = np.zeros((TOTAL_STEPS, 2)), np.zeros(TOTAL_STEPS)
@@ -142,7 +155,7 @@ def choose_tracks_to_predict(view: _View, rng: np.random.Generator, drivable: An
     ]
     travelled = np.minimum(view.travelled_m, 40.0)
     rank = {
-        k: travelled[k] * (1.0 if view.bodies[k].object_type == ObjectType.VEHICLE else 2.5) + rng.normal(0, 8.0)
+        k: travelled[k] * (1.0 if view.bodies[k].object_type == ObjectType.VEHICLE else 2.0) + rng.normal(0, 8.0)
         for k in candidates
     }
     wanted = int(rng.choice([2, 3, 4, 5, 6, 7, 8], p=[0.14, 0.18, 0.2, 0.16, 0.13, 0.1, 0.09]))
@@ -150,9 +163,14 @@ def choose_tracks_to_predict(view: _View, rng: np.random.Generator, drivable: An
     standing = [k for k in candidates if travelled[k] <= 1.0]
     order = ([standing[0]] if standing and rng.random() < 0.5 else []) + moving + standing
     chosen: list[int] = []
+    pedestrians = 0
     for k in dict.fromkeys(order):
-        if len(chosen) < wanted and _is_on_road(view, k, drivable):
+        is_pedestrian = view.bodies[k].object_type == ObjectType.PEDESTRIAN
+        if len(chosen) == wanted or (is_pedestrian and pedestrians == MAX_PREDICTED_PEDESTRIANS):
+            continue
+        if _is_on_road(view, k, drivable):
             chosen.append(k)
+            pedestrians += is_pedestrian
     return sorted(chosen)
 
 
@@ -202,9 +220,7 @@ def _label(view: _View, world: World, rng: np.random.Generator) -> Tracks:
     for k, body in enumerate(view.bodies):
         if not body.is_parked:
             noise = draw_label_noise(rng)
-            position[k], heading[k], velocity[k] = add_label_noise(
-                rng, noise, position[k], heading[k], velocity[k]
-            )
+            position[k], heading[k], velocity[k] = add_label_noise(rng, noise, position[k], heading[k], velocity[k])
     size = np.array([body.size for body in view.bodies])
     z = world.cropper.ground.height_at(position) + size[:, None, 2] / 2
     heading = np.arctan2(np.sin(heading), np.cos(heading))
@@ -213,7 +229,10 @@ def _label(view: _View, world: World, rng: np.random.Generator) -> Tracks:
         object_id=np.cumsum(rng.integers(1, 9, len(view.bodies))).astype(np.int64),
         object_type=np.array([body.object_type for body in view.bodies], np.int8),
         position=np.concatenate(
-            [on_grid(position * valid[..., None], POSITION_GRID_PER_M), on_grid(z * valid, HEIGHT_GRID_PER_M)[..., None]],
+            [
+                on_grid(position * valid[..., None], POSITION_GRID_PER_M),
+                on_grid(z * valid, HEIGHT_GRID_PER_M)[..., None],
+            ],
             axis=-1,
         ),
         heading=on_grid(heading * valid, HEADING_GRID_PER_RAD),
@@ -258,7 +277,7 @@ def _choose_egos(world: World, start: int, rng: np.random.Generator) -> list[Bod
 def cut_scenario(world: World, start: int, ego: Body, rng: np.random.Generator) -> Scenario | None:
     """Scenario that begins at step `start` of the recording as `ego` sees it, or None if it fails a gate."""
     range_m = float(rng.uniform(65.0, 95.0))
-    view = _look(list(world.bodies), start, ego, range_m)
+    view = _look(list(world.bodies), start, ego, range_m, rng)
     drivable = world.cropper.network_map.drivable
     if not _passes_gates(view, rng) or not _is_on_road(view, len(view.bodies) - 1, drivable):
         return None
