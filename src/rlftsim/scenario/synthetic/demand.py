@@ -37,7 +37,7 @@ _SIZES = {
 }
 
 
-VEHICLES_PER_LANE_AND_S = {"city": (0.018, 0.04), "quiet": (0.035, 0.07), "freeway": (0.25, 0.45)}
+VEHICLES_PER_LANE_AND_S = {"city": (0.022, 0.045), "quiet": (0.04, 0.075), "freeway": (0.25, 0.4)}
 """Range of the vehicles that enter per second and lane; much more is gridlock within minutes."""
 
 
@@ -84,6 +84,16 @@ def _poisson_times(rng: np.random.Generator, rate_per_s: float) -> np.ndarray:
     return np.sort(rng.uniform(0, SIMULATED_S, count))
 
 
+def _reachable_nodes(plan: StreetPlan, start: str) -> set[str]:
+    reached, frontier = set(), [start]
+    while frontier:
+        here = frontier.pop()
+        if here not in reached:
+            reached.add(here)
+            frontier += [street.to_node for street in plan.streets if street.from_node == here]
+    return reached
+
+
 def _vehicle_trips(rng: np.random.Generator, plan: StreetPlan, types: list[RoadUserType]) -> list[tuple[float, str]]:
     """Trips from fringe to fringe, more of them on wide and important streets."""
     fringe = {node.node_id for node in plan.fringe_nodes}
@@ -97,7 +107,8 @@ def _vehicle_trips(rng: np.random.Generator, plan: StreetPlan, types: list[RoadU
     trips = []
     for source in sources:
         lanes = sum(lane.kind == "travel" for lane in source.lanes)
-        goals = [sink for sink in sinks if sink.to_node != source.from_node]
+        reachable = _reachable_nodes(plan, source.from_node)
+        goals = [sink for sink in sinks if sink.to_node != source.from_node and sink.to_node in reachable]
         shares = np.array([weight[goal.street_class] * len(goal.lanes) for goal in goals])
         for time in _poisson_times(rng, per_lane * lanes * weight[source.street_class]):
             goal = goals[int(rng.choice(len(goals), p=shares / shares.sum()))]
@@ -118,7 +129,7 @@ def _walks(rng: np.random.Generator, plan: StreetPlan) -> list[tuple[float, str]
     attraction = rng.gamma(0.5, 1.0, len(streets)) + 0.05
     attraction /= attraction.sum()
     walks = []
-    for time in _poisson_times(rng, rng.uniform(0.04, 0.26)):
+    for time in _poisson_times(rng, rng.uniform(0.05, 0.33)):
         start, goal = rng.choice(streets, 2, replace=False, p=attraction)
         size = int(rng.choice([1, 2, 3], p=[0.75, 0.2, 0.05]))
         for member in range(size):

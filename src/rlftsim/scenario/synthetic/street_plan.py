@@ -138,7 +138,7 @@ def _draw_profile(rng: np.random.Generator, street_class: StreetClass, is_column
 def _draw_classes(rng: np.random.Generator, num_lines: int, quiet: bool) -> list[StreetClass]:
     """Class of every line; a quiet quarter has at most one arterial, so it needs no lights."""
     names: list[StreetClass] = ["arterial", "collector", "residential"]
-    shares = [0.0, 0.42, 0.58] if quiet else [0.36, 0.34, 0.30]
+    shares = [0.0, 0.42, 0.58] if quiet else [0.40, 0.33, 0.27]
     classes = [names[int(k)] for k in rng.choice(3, num_lines, p=shares)]
     if quiet and rng.random() < 0.6:
         classes[int(rng.integers(num_lines))] = "arterial"
@@ -250,9 +250,9 @@ def _draw_control(
     if kinds == {"arterial"}:
         return "traffic_light" if draw < lights else "allway_stop"
     if kinds == {"arterial", "collector"}:
-        return "traffic_light" if draw < 0.5 * lights else "priority_stop"
+        return "traffic_light" if draw < 0.55 * lights else "priority_stop"
     if kinds == {"collector"}:
-        return "traffic_light" if draw < 0.2 * lights else "allway_stop" if draw < 0.7 else "priority_stop"
+        return "traffic_light" if draw < 0.3 * lights else "allway_stop" if draw < 0.7 else "priority_stop"
     if kinds == {"residential"}:
         return "allway_stop" if draw < 0.35 else "priority_stop" if draw < 0.65 else "right_before_left"
     return "allway_stop" if kinds == {"collector", "residential"} and draw < 0.35 else "priority_stop"
@@ -403,7 +403,6 @@ def _carriageway_connections(way: _Carriageway) -> list[Connection]:
         links.append(Connection(f"{name}2", f"{name}3", lane, lane + 1))
         links.append(Connection(f"{name}3", f"{name}4", lane + 1, lane))
     links.append(Connection(f"{name}onramp", f"{name}1", 1, 1))
-    links.append(Connection(f"{name}2", f"{name}3", 1, 1))
     links.append(Connection(f"{name}3", f"{name}offramp", 1, 1))
     return links
 

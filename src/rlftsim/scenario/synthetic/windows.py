@@ -31,6 +31,8 @@ from rlftsim.scenario.types import (
     Tracks,
 )
 
+FIRST_START = 20
+"""Smoothing over time bends the very first steps of a recording."""
 WINDOW_EVERY_STEPS = 100
 EGO_TO_END_M = 95.0
 EGO_TO_EGO_M = 70.0
@@ -122,9 +124,10 @@ def _passes_gates(view: _View, rng: np.random.Generator) -> bool:
     if not moving[-1] and rng.random() >= 0.15:
         return False
     for index in np.flatnonzero(moving):
-        body, valid = view.bodies[index], view.valid[index]
-        is_vehicle = body.object_type != ObjectType.PEDESTRIAN
-        if not moves_plausibly(view.position[index, valid], view.heading[index, valid], is_vehicle):
+        seen = np.flatnonzero(view.valid[index])
+        span = slice(seen[0], seen[-1] + 1)  # also where it is hidden for a while
+        is_vehicle = view.bodies[index].object_type != ObjectType.PEDESTRIAN
+        if not moves_plausibly(view.position[index, span], view.heading[index, span], is_vehicle):
             return False
     vehicles = [k for k, body in enumerate(view.bodies) if body.object_type == ObjectType.VEHICLE]
     sizes = [view.bodies[k].size for k in vehicles]
@@ -302,7 +305,7 @@ def cut_scenario(world: World, start: int, ego: Body, rng: np.random.Generator) 
 
 def cut_scenarios(world: World, rng: np.random.Generator) -> Iterator[Scenario]:
     """Scenarios of a world in random order, no two of them overlapping in time and place; those that fail a gate are left out."""
-    starts = rng.permutation(np.arange(0, world.num_steps - TOTAL_STEPS, WINDOW_EVERY_STEPS))
+    starts = rng.permutation(np.arange(FIRST_START, world.num_steps - TOTAL_STEPS, WINDOW_EVERY_STEPS))
     for start in starts.tolist():
         for ego in _choose_egos(world, start, rng):
             scenario = cut_scenario(world, start, ego, rng)
