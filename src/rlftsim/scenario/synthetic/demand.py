@@ -37,7 +37,7 @@ _SIZES = {
 }
 
 
-VEHICLES_PER_LANE_AND_S = {"city": (0.022, 0.045), "quiet": (0.04, 0.075), "freeway": (0.25, 0.4)}
+VEHICLES_PER_LANE_AND_S = {"city": (0.02, 0.04), "quiet": (0.04, 0.075), "freeway": (0.25, 0.4)}
 """Range of the vehicles that enter per second and lane; much more is gridlock within minutes."""
 
 
@@ -129,7 +129,7 @@ def _walks(rng: np.random.Generator, plan: StreetPlan) -> list[tuple[float, str]
     attraction = rng.gamma(0.5, 1.0, len(streets)) + 0.05
     attraction /= attraction.sum()
     walks = []
-    for time in _poisson_times(rng, rng.uniform(0.05, 0.33)):
+    for time in _poisson_times(rng, rng.uniform(0.04, 0.24)):
         start, goal = rng.choice(streets, 2, replace=False, p=attraction)
         size = int(rng.choice([1, 2, 3], p=[0.75, 0.2, 0.05]))
         for member in range(size):

@@ -40,7 +40,7 @@ GENERATOR_VERSION = 1
 LICENCE_NOTE = "CC0-1.0: synthetic scenarios, no rights reserved."
 KINDS = ("city", "quiet", "city", "freeway", "city", "city", "city", "city")
 """Kinds of the networks in turn; a freeway gives half as many scenarios as the others."""
-LOTS_PER_STREET = {"city": 0.3, "quiet": 0.2, "freeway": 0.0}
+LOTS_PER_STREET = {"city": 0.35, "quiet": 0.22, "freeway": 0.0}
 MAX_ATTEMPTS = 6
 _NUM_STEPS = round((sumo.SIMULATED_S - sumo.DISCARDED_S) / STEP_S)
 

@@ -2,6 +2,7 @@
 
 from collections import defaultdict
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -209,9 +210,20 @@ def _split_before_end(points: np.ndarray, tail_m: float) -> tuple[np.ndarray, np
     return fine[: cut + 1], fine[cut:]
 
 
-def _between_lanes(street: Street, lane: Lane, left: Lane, solid_tail: bool) -> list[tuple[MapFeatureType, np.ndarray]]:
-    line = offset_polyline(resample(lane.shape, 2.0), lane.width_m / 2)
-    if "bicycle" in (lane.kind, left.kind):
+def _left_border(network: Network, lane: Lane) -> Float[np.ndarray, "n 2"]:
+    """Line along the left of a lane. On a freeway as planned, so that lines do not break where segments meet."""
+    street = lane.street
+    assert street is not None
+    if network.plan.kind == "freeway":
+        return offset_polyline(street.points, -sum(other.width_m for other in street.lanes[lane.index + 1 :]))
+    return offset_polyline(resample(lane.shape, 2.0), lane.width_m / 2)
+
+
+def _between_lanes(
+    line: Float[np.ndarray, "n 2"], beside_bicycles: bool, solid_tail: bool
+) -> list[tuple[MapFeatureType, np.ndarray]]:
+    """Line between two lanes of one direction, solid where nobody should change any more."""
+    if beside_bicycles:
         return [(MapFeatureType.LINE_SOLID_SINGLE_WHITE, resample(line))]
     if not solid_tail:
         return [(MapFeatureType.LINE_BROKEN_SINGLE_WHITE, resample(line))]
@@ -220,18 +232,15 @@ def _between_lanes(street: Street, lane: Lane, left: Lane, solid_tail: bool) -> 
     return [(MapFeatureType.LINE_BROKEN_SINGLE_WHITE, body), *rows] if len(body) > 1 else rows
 
 
-def _separator(street: Street, leftmost: Lane) -> list[tuple[MapFeatureType, np.ndarray]]:
+def _separator(street: Street, line: Float[np.ndarray, "n 2"]) -> list[tuple[MapFeatureType, np.ndarray]]:
     """Line to the left of a direction: between the directions, or along a median."""
-    line = resample(offset_polyline(resample(leftmost.shape, 2.0), leftmost.width_m / 2))
     if street.reverse_id is None:
-        return [] if street.street_class == "ramp" else [(MapFeatureType.LINE_SOLID_SINGLE_YELLOW, line)]
+        return [] if street.street_class == "ramp" else [(MapFeatureType.LINE_SOLID_SINGLE_YELLOW, resample(line))]
     if street.street_id > street.reverse_id:
         return []
-    kind = {
-        "arterial": MapFeatureType.LINE_SOLID_DOUBLE_YELLOW,
-        "collector": MapFeatureType.LINE_SOLID_DOUBLE_YELLOW,
-    }.get(street.street_class, MapFeatureType.LINE_BROKEN_SINGLE_YELLOW)
-    return [(kind, line)]
+    is_minor = street.street_class == "residential"
+    kind = MapFeatureType.LINE_BROKEN_SINGLE_YELLOW if is_minor else MapFeatureType.LINE_SOLID_DOUBLE_YELLOW
+    return [(kind, resample(line))]
 
 
 def _line_features(network: Network) -> list[tuple[MapFeatureType, np.ndarray]]:
@@ -241,12 +250,11 @@ def _line_features(network: Network) -> list[tuple[MapFeatureType, np.ndarray]]:
         lanes = [network.lane((street.street_id, k)) for k in range(len(street.lanes))]
         driven = [lane for lane in lanes if lane.kind in ("travel", "bicycle")]
         solid_tail = network.plan.kind != "freeway" and street.to_node not in fringe
-        for lane, left in zip(driven, driven[1:], strict=False):
-            rows += _between_lanes(street, lane, left, solid_tail)
-        rows += _separator(street, driven[-1])
+        for lane, left in pairwise(driven):
+            rows += _between_lanes(_left_border(network, lane), "bicycle" in (lane.kind, left.kind), solid_tail)
+        rows += _separator(street, _left_border(network, driven[-1]))
         if street.street_class == "freeway":
-            outer = offset_polyline(resample(driven[0].shape, 2.0), -driven[0].width_m / 2)
-            rows.append((MapFeatureType.LINE_SOLID_SINGLE_WHITE, resample(outer)))
+            rows.append((MapFeatureType.LINE_SOLID_SINGLE_WHITE, resample(_left_border(network, lanes[0]))))
     return rows
 
 

@@ -61,7 +61,7 @@ def park_in_strips(rng: np.random.Generator, network: Network, num_steps: int) -
     cars = []
     for lane in network.lanes.values():
         if lane.kind == "parking":
-            cars += park_along(rng, lane.shape, float(rng.uniform(0.2, 0.85)), num_steps)
+            cars += park_along(rng, lane.shape, float(rng.uniform(0.25, 0.9)), num_steps)
     return cars
 
 

@@ -121,7 +121,7 @@ def _draw_profile(rng: np.random.Generator, street_class: StreetClass, is_column
     lanes, low, high = {
         "arterial": (2 if quiet else int(rng.integers(2, 4)), 15.0, 19.5),
         "collector": (1 if quiet else int(rng.integers(1, 3)), 11.0, 15.6),
-        "residential": (1, 9.0, 11.2),
+        "residential": (1, 9.5, 12.0),
     }[street_class]
     bicycle_share = {"arterial": 0.25, "collector": 0.33, "residential": 0.0}[street_class]
     return _LineProfile(
