@@ -1,0 +1,1 @@
+"""Who decides: models that implement `rollout.policy`."""

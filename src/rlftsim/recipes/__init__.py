@@ -1,0 +1,1 @@
+"""Named full configurations: functions that return dataclasses, no logic."""

@@ -1,0 +1,1 @@
+"""What may happen: the closed loop, the policy interface and policies without weights."""

@@ -1,0 +1,1 @@
+"""Motion as words: vocabularies and the tokens of agents and maps."""

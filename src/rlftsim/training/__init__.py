@@ -1,0 +1,1 @@
+"""How it learns: pre-training and closed-loop fine-tuning."""

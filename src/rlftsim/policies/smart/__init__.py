@@ -1,0 +1,1 @@
+"""SMART: next-motion-token prediction."""

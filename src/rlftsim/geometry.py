@@ -1,0 +1,50 @@
+"""The plane: angles, frames and boxes as pure functions on tensors. Metres, radians, counter-clockwise, headings in [-pi, pi)."""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+def wrap_angle(angle: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
+    """The same angle in [-pi, pi)."""
+    return torch.remainder(angle + math.pi, 2 * math.pi) - math.pi
+
+
+def heading_vector(heading: Float[Tensor, "..."]) -> Float[Tensor, "... 2"]:
+    """Unit vector that points along a heading."""
+    return torch.stack([heading.cos(), heading.sin()], dim=-1)
+
+
+def rotate(vector: Float[Tensor, "... 2"], angle: Float[Tensor, "..."]) -> Float[Tensor, "... 2"]:
+    """Vectors turned counter-clockwise by an angle each."""
+    cos, sin = angle.cos(), angle.sin()
+    x, y = vector[..., 0], vector[..., 1]
+    return torch.stack([cos * x - sin * y, sin * x + cos * y], dim=-1)
+
+
+def angle_between(first: Float[Tensor, "... 2"], second: Float[Tensor, "... 2"]) -> Float[Tensor, "..."]:
+    """Signed angle from the first vector to the second; 0 where one of them is the zero vector."""
+    cross = first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
+    dot = (first * second).sum(-1)
+    return torch.atan2(cross, dot)
+
+
+def box_corners(
+    position: Float[Tensor, "*shape 2"],
+    heading: Float[Tensor, "*shape"],
+    length: Float[Tensor, "*#shape"],
+    width: Float[Tensor, "*#shape"],
+) -> Float[Tensor, "*shape 4 2"]:
+    """Corners of a box: left-front, right-front, right-back, left-back."""
+    along = torch.stack([length, length, -length, -length], dim=-1) / 2
+    across = torch.stack([width, -width, -width, width], dim=-1) / 2
+    corners = torch.stack([along, across], dim=-1)
+    return rotate(corners, heading[..., None]) + position[..., None, :]
+
+
+def pose_of_corners(corners: Float[Tensor, "... 4 2"]) -> tuple[Float[Tensor, "... 2"], Float[Tensor, "..."]]:
+    """Position (mean of the corners) and heading (left-back to left-front) of boxes made by `box_corners`."""
+    along = corners[..., 0, :] - corners[..., 3, :]
+    return corners.mean(-2), torch.atan2(along[..., 1], along[..., 0])

@@ -1,0 +1,72 @@
+"""Sizes and radii of a SMART model."""
+
+from dataclasses import dataclass
+
+from rlftsim.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class SmartConfig:
+    """SMART's architecture. The defaults are SMART-tiny (7 M parameters)."""
+
+    dim: int = 128
+    """Width of all features (D)."""
+    num_heads: int = 8
+    head_dim: int = 16
+    num_map_layers: int = 3
+    num_decoder_layers: int = 6
+    num_frequencies: int = 64
+    """Learned frequencies an input of the Fourier embeddings."""
+    map_radius_m: float = 10.0
+    """Between map tokens."""
+    agent_map_radius_m: float = 30.0
+    agent_radius_m: float = 60.0
+    history_tokens: int = 6
+    """Token steps (0.5 s) an agent looks back."""
+    max_map_neighbors: int | None = 100
+    """Nearest map tokens a map token attends to; None = all within the radius."""
+    max_agent_map_neighbors: int | None = None
+    """Nearest map tokens an agent attends to; None = all within the radius."""
+    max_agent_neighbors: int | None = None
+    """Nearest agents an agent attends to; None = all within the radius."""
+    dropout: float = 0.1
+    history_drop: float = 0.1
+    """Share of (agent, step) pairs that are hidden from the attention over time, in pre-training only."""
+    first_motion_is_position: bool = False
+    """The public code takes an agent's position as the motion vector of its first token. True repeats that, for parity."""
+
+    def __post_init__(self) -> None:
+        for name in ("dim", "num_heads", "head_dim", "num_map_layers", "num_decoder_layers", "history_tokens"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"{name} must be at least 1, got {getattr(self, name)}.")
+        if not 0 <= self.dropout < 1 or not 0 <= self.history_drop < 1:
+            raise ConfigError(
+                f"dropout and history_drop are shares in [0, 1), got {self.dropout} and {self.history_drop}."
+            )
+
+
+def smart_tiny() -> SmartConfig:
+    """7 001 024 parameters."""
+    return SmartConfig()
+
+
+def smart_mini() -> SmartConfig:
+    """3 433 984 parameters."""
+    return SmartConfig(num_heads=4, head_dim=8, num_map_layers=2, num_decoder_layers=4)
+
+
+def smart_nano() -> SmartConfig:
+    """1 161 344 parameters."""
+    return SmartConfig(
+        dim=64, num_heads=4, head_dim=8, num_map_layers=2, num_decoder_layers=4,
+        agent_map_radius_m=20.0, agent_radius_m=20.0, history_tokens=4,
+    )  # fmt: skip
+
+
+def smart_demo() -> SmartConfig:
+    """Small enough to train on two CPU cores in minutes."""
+    return SmartConfig(
+        dim=64, num_heads=4, head_dim=16, num_map_layers=1, num_decoder_layers=2, num_frequencies=16,
+        agent_map_radius_m=30.0, agent_radius_m=30.0, history_tokens=4,
+        max_map_neighbors=16, max_agent_map_neighbors=24, max_agent_neighbors=12,
+    )  # fmt: skip

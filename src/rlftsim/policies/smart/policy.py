@@ -1,0 +1,334 @@
+"""SMART as a policy: a token of half a second for every agent, sixteen times."""
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Bool, Float, Int64
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from rlftsim.errors import CheckpointError
+from rlftsim.geometry import box_corners, rotate, wrap_angle
+from rlftsim.goals.types import Goals
+from rlftsim.policies.layers import normalize
+from rlftsim.policies.smart.config import SmartConfig
+from rlftsim.policies.smart.distribution import TokenDistribution
+from rlftsim.policies.smart.network import Past, Scene, SmartNetwork, TokenSteps
+from rlftsim.rollout.types import AgentStates, Rollouts
+from rlftsim.scenario.batch import ScenarioBatch
+from rlftsim.tokens.agent_tokens import HISTORY_TOKENS, AgentTokens, class_boxes, nearest_tokens, tokenize_agents
+from rlftsim.tokens.map_tokens import tokenize_map
+from rlftsim.tokens.vocabulary import STEPS_PER_TOKEN, Vocabulary, class_of_type
+
+NEVER = -1e9
+FORMAT = "rlftsim-smart-1"
+
+
+@dataclass(frozen=True, eq=False)
+class SmartContext:
+    """What does not depend on what agents will do, once per scenario."""
+
+    scene: Scene
+    past: Past
+    """Of the two history tokens, with a single rollout."""
+    features: Float[Tensor, "B A D"]
+    """Decoder features at the current step; zeros for padding."""
+    position: Float[Tensor, "B A 2"]
+    """Where the history tokens led."""
+    heading: Float[Tensor, "B A"]
+    object_type: Int64[Tensor, "B A"]
+    agent_mask: Bool[Tensor, "B A"]
+
+
+@dataclass(frozen=True, eq=False)
+class SmartState:
+    """Simulations under way. Steps that the network has not seen yet wait in `pending`; looking at them happens at most once."""
+
+    position: Float[Tensor, "B N A 2"]
+    heading: Float[Tensor, "B N A"]
+    past: Past
+    pending: TokenSteps | None
+    poses: Float[Tensor, "B N A 5 3"] | None = None
+    draws: Tensor | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class TeacherForced:
+    """Predictions along recorded tracks and what they should have said."""
+
+    logits: Float[Tensor, "R V"]
+    target: Int64[Tensor, "R"]
+    """Token that came next."""
+    target_mask: Bool[Tensor, "R"]
+    """True = the next state was recorded and the agent is trained on."""
+
+
+class SmartPolicy(nn.Module):
+    """Next-token traffic model: its weights, its vocabulary and nothing else.
+
+    The vocabulary is a value, not a weight: it is saved beside the weights and never trained.
+    """
+
+    steps_per_decision = STEPS_PER_TOKEN
+    noise_size = 1
+    initial_noise_size = 0
+
+    def __init__(self, config: SmartConfig, vocabulary: Vocabulary):
+        super().__init__()
+        self.config = config
+        self.vocabulary = vocabulary
+        self.network = SmartNetwork(config, vocabulary.num_tokens)
+
+    def _apply(self, fn, recurse: bool = True):
+        """Moves to a device take the vocabulary along."""
+        super()._apply(fn, recurse)
+        self.vocabulary = self.vocabulary.to(next(self.parameters()).device)
+        return self
+
+    # ---- the policy interface -------------------------------------------------------------------------------------
+
+    def encode(self, scenarios: ScenarioBatch) -> SmartContext:
+        """Map features, history tokens and what the decoder made of them."""
+        tokens = tokenize_agents(scenarios, self.vocabulary)
+        scene = self._scene(scenarios)
+        history = self._recorded_steps(tokens, slice(0, HISTORY_TOKENS))
+        rows, past = self.network.decoder(scene, history, None)
+        features = _place(rows, history.valid)[:, 0, :, -1]
+        return SmartContext(
+            scene=scene,
+            past=past,
+            features=features,
+            position=tokens.position[:, :, HISTORY_TOKENS - 1],
+            heading=tokens.heading[:, :, HISTORY_TOKENS - 1],
+            object_type=scenarios.object_type,
+            agent_mask=scenarios.agent_mask,
+        )
+
+    def begin(self, context: SmartContext, num_rollouts: int, goals: Goals | None, noise: Tensor) -> SmartState:
+        """The current step, N times, without copies of the history."""
+
+        def repeated(v: Tensor) -> Tensor:
+            return v[:, None].expand(-1, num_rollouts, *v.shape[1:])
+
+        return SmartState(
+            repeated(context.position), repeated(context.heading), context.past.repeat(num_rollouts), pending=None
+        )
+
+    def decide(self, context: SmartContext, state: SmartState) -> TokenDistribution:
+        """The next token of every agent."""
+        mask = context.agent_mask[:, None].expand(state.heading.shape)
+        features, _ = self._look(context, state)
+        return self._distribution(context, features[mask], mask)
+
+    def advance(
+        self,
+        context: SmartContext,
+        state: SmartState,
+        decision: Int64[Tensor, "B N A"],
+        forced: AgentStates | None = None,
+    ) -> SmartState:
+        """Place the chosen token's five poses at the current state."""
+        poses = self._unroll(context, state, decision)
+        if forced is not None:
+            imposed = forced.valid.all(-1)
+            held = torch.cat([forced.position, forced.heading[..., None]], -1)
+            poses = torch.where(imposed[..., None, None], held, poses)
+            decision = self._rename(context, state, decision, poses[..., -1, :], imposed)
+        position, heading = poses[..., -1, :2], poses[..., -1, 2]
+        block = TokenSteps(
+            position=position[..., None, :],
+            heading=heading[..., None],
+            motion=(position - state.position)[..., None, :],
+            token_id=decision[..., None],
+            valid=context.agent_mask[:, None, :, None].expand(*heading.shape, 1),
+        )
+        seen = state.__dict__.get("seen")
+        if seen is not None:
+            past, pending = seen[1], block
+        else:
+            past, pending = state.past, block if state.pending is None else state.pending.then(block)
+        return SmartState(position, heading, past, pending, poses)
+
+    def score(self, context: SmartContext, rollouts: Rollouts) -> TokenDistribution:
+        """Replay the decisions without the network, then look at all steps at once."""
+        state = self.begin(context, rollouts.num_rollouts, rollouts.goals, rollouts.log_prob)
+        num_decisions = rollouts.decision.shape[3]
+        for index in range(num_decisions - 1):
+            start = index * STEPS_PER_TOKEN
+            forced = rollouts.forced and rollouts.forced.steps(start, start + STEPS_PER_TOKEN)
+            state = self.advance(context, state, rollouts.decision[..., index], forced)
+        first = context.features[:, None, :, None].expand(*state.heading.shape, 1, -1)
+        features = first
+        if state.pending is not None:
+            rows, _ = self.network.decoder(context.scene, state.pending, state.past)
+            features = torch.cat([first, _place(rows, state.pending.valid)], 3)
+        mask = context.agent_mask[:, None, :, None].expand(rollouts.decision.shape)
+        return self._distribution(context, features[mask], mask)
+
+    # ---- pre-training ---------------------------------------------------------------------------------------------
+
+    def teacher_forced(self, scenarios: ScenarioBatch, trained: Bool[Tensor, "B A"]) -> TeacherForced:
+        """Predict every next token along the recorded tracks.
+
+        Args:
+            scenarios: with their future.
+            trained: True = the agent's predictions count; the others are context.
+        """
+        tokens = tokenize_agents(scenarios, self.vocabulary)
+        steps = self._recorded_steps(tokens, slice(0, -1))
+        hidden = None
+        if self.training and self.config.history_drop:
+            hidden = torch.rand(steps.valid.shape, device=steps.valid.device) < self.config.history_drop
+        rows, _ = self.network.decoder(self._scene(scenarios), steps, None, hidden)
+        decides = steps.valid.clone()
+        decides[..., : HISTORY_TOKENS - 1] = False
+        counts = (tokens.valid[..., 1:] & trained[..., None])[:, None][decides]
+        logits = self._logits(rows[decides[steps.valid]], scenarios.object_type, decides)
+        return TeacherForced(logits, tokens.token_id[:, None, :, 1:][decides], counts)
+
+    def fine_tuned_parts(self) -> tuple[nn.Module, ...]:
+        """What closed-loop fine-tuning trains: the decoder's attention and the head, as the public CAT-K code does."""
+        decoder = self.network.decoder
+        return decoder.time_layers, decoder.map_layers, decoder.agent_layers, decoder.head
+
+    # ---- files ----------------------------------------------------------------------------------------------------
+
+    def save_pretrained(self, folder: Path, *, card: str = "") -> None:
+        """Write config.json, model.safetensors, vocabulary.safetensors and README.md (the card) into a folder."""
+        folder.mkdir(parents=True, exist_ok=True)
+        self.vocabulary.to("cpu").save(folder / "vocabulary.safetensors")
+        partial = folder / "model.safetensors.partial"
+        save_file({k: v.detach().cpu().contiguous() for k, v in self.network.state_dict().items()}, partial)
+        partial.replace(folder / "model.safetensors")
+        (folder / "README.md").write_text(card or "A SMART traffic model. Origin unknown.\n")
+        partial = folder / "config.json.partial"
+        partial.write_text(json.dumps({"format": FORMAT, **asdict(self.config)}, indent=1) + "\n")
+        partial.replace(folder / "config.json")
+
+    @classmethod
+    def from_pretrained(cls, folder: Path) -> "SmartPolicy":
+        """Read what `save_pretrained` wrote.
+
+        Raises:
+            CheckpointError: a missing or damaged file, or keys and shapes that do not fit: names them all.
+        """
+        try:
+            values = json.loads((folder / "config.json").read_text())
+            if values.pop("format", None) != FORMAT:
+                raise CheckpointError(f"{folder}/config.json: not a SMART model of this version.")
+            weights = load_file(folder / "model.safetensors")
+            policy = cls(SmartConfig(**values), Vocabulary.load(folder / "vocabulary.safetensors"))
+        except FileNotFoundError as error:
+            raise CheckpointError(f"{folder}: not a model folder, {Path(error.filename).name} is missing.") from None
+        except (json.JSONDecodeError, TypeError, SafetensorError, OSError) as error:
+            raise CheckpointError(f"{folder}: damaged model folder ({error}): write it again.") from None
+        load_strictly(policy.network, weights, source=str(folder))
+        return policy
+
+    # ---- parts ----------------------------------------------------------------------------------------------------
+
+    def _scene(self, scenarios: ScenarioBatch) -> Scene:
+        tokens = tokenize_map(scenarios, self.vocabulary.map_prototypes)
+        class_id = class_of_type(scenarios.object_type)
+        decoder = self.network.decoder
+        return Scene(
+            map_position=tokens.position,
+            map_heading=tokens.heading,
+            map_mask=tokens.token_mask,
+            map_features=normalize(self.network.map_encoder(tokens, self.vocabulary.map_prototypes)),
+            class_id=class_id,
+            agent_features=decoder.embed_agents(class_id, scenarios.size),
+            token_features=decoder.embed_tokens(self.vocabulary.end_corners()),
+            relations=decoder.relations(),
+        )
+
+    def _recorded_steps(self, tokens: AgentTokens, steps: slice) -> TokenSteps:
+        """A block of recorded token steps, as a single rollout."""
+        position = tokens.position
+        before = torch.cat([torch.zeros_like(position[:, :, :1]), position[:, :, :-1]], 2)
+        motion = position - before
+        if not self.config.first_motion_is_position:
+            known = torch.cat([torch.zeros_like(tokens.valid[..., :1]), tokens.valid[..., :-1]], -1)
+            motion = torch.where(known[..., None], motion, 0.0)
+        else:
+            motion[:, :, 0] = 0.0
+        fields = (position, tokens.heading, motion, tokens.token_id, tokens.valid)
+        return TokenSteps(*(v[:, None, :, steps] for v in fields))
+
+    def _look(self, context: SmartContext, state: SmartState) -> tuple[Float[Tensor, "B N A D"], Past]:
+        """Decoder features at the state's last step, and the past that includes it. Remembered on the state."""
+        if "seen" not in state.__dict__:
+            if state.pending is None:
+                features = context.features[:, None].expand(*state.heading.shape, -1)
+                seen = (features, state.past)
+            else:
+                rows, past = self.network.decoder(context.scene, state.pending, state.past)
+                seen = (_place(rows, state.pending.valid)[..., -1, :], past)
+            state.__dict__["seen"] = seen
+        return state.__dict__["seen"]
+
+    def _distribution(
+        self, context: SmartContext, features: Float[Tensor, "R D"], mask: Bool[Tensor, "*batch"]
+    ) -> TokenDistribution:
+        return TokenDistribution(self._logits(features, context.object_type, mask), mask)
+
+    def _logits(
+        self, features: Float[Tensor, "R D"], object_type: Int64[Tensor, "B A"], mask: Bool[Tensor, "B N A *L"]
+    ) -> Float[Tensor, "R V"]:
+        """Logits of the elements of a mask, tokens that a class lacks ruled out."""
+        place = mask.nonzero(as_tuple=True)
+        class_id = class_of_type(object_type)[place[0], place[2]]
+        logits = self.network.decoder.head(features).float()
+        return logits.masked_fill(~self.vocabulary.token_mask[class_id], NEVER)
+
+    def _unroll(
+        self, context: SmartContext, state: SmartState, decision: Int64[Tensor, "B N A"]
+    ) -> Float[Tensor, "B N A 5 3"]:
+        """The five poses of the chosen tokens, placed at the current state. Padding stands still."""
+        class_id = class_of_type(context.object_type)[:, None].expand(decision.shape)
+        local = self.vocabulary.poses()[class_id, decision]  # [B, N, A, 5, 3]
+        position = state.position[..., None, :] + rotate(local[..., :2], state.heading[..., None])
+        heading = wrap_angle(state.heading[..., None] + local[..., 2])
+        return torch.cat([position, heading[..., None]], -1)
+
+    def _rename(
+        self,
+        context: SmartContext,
+        state: SmartState,
+        decision: Int64[Tensor, "B N A"],
+        end: Float[Tensor, "B N A 3"],
+        imposed: Bool[Tensor, "B N A"],
+    ) -> Int64[Tensor, "B N A"]:
+        """Tokens nearest to what was imposed, so that imposed agents are seen as if they had chosen it."""
+        length, width = class_boxes(context.object_type)
+        corners = box_corners(end[..., :2], end[..., 2], length[:, None], width[:, None])
+        local = rotate(corners - state.position[..., None, :], -state.heading[..., None])
+        class_id = class_of_type(context.object_type)[:, None].expand(imposed.shape)
+        return torch.where(imposed, nearest_tokens(local, class_id, imposed, self.vocabulary), decision)
+
+
+def _place(rows: Float[Tensor, "R D"], valid: Bool[Tensor, "*batch"]) -> Float[Tensor, "*batch D"]:
+    """Rows at the places of a mask, zeros elsewhere."""
+    return rows.new_zeros(*valid.shape, rows.shape[-1]).masked_scatter(valid[..., None], rows)
+
+
+def load_strictly(module: nn.Module, weights: dict[str, Tensor], *, source: str) -> None:
+    """Load weights; refuse, with the whole list, missing or unknown keys and wrong shapes.
+
+    Raises:
+        CheckpointError: anything differs.
+    """
+    own = module.state_dict()
+    problems = [f"missing {k}" for k in sorted(own.keys() - weights.keys())]
+    problems += [f"unknown {k}" for k in sorted(weights.keys() - own.keys())]
+    problems += [
+        f"{k} has shape {tuple(weights[k].shape)} instead of {tuple(own[k].shape)}"
+        for k in sorted(own.keys() & weights.keys())
+        if own[k].shape != weights[k].shape
+    ]
+    if problems:
+        raise CheckpointError(f"{source}: {len(problems)} weights do not fit this model: {'; '.join(problems)}.")
+    module.load_state_dict(weights)

@@ -1,0 +1,180 @@
+"""Who takes part in the metric: the simulated agents' states in rollouts and in the log.
+
+Simulated agents are all tracks valid at the current step, in track order; evaluated ones are the ego and the tracks to
+predict, by ascending object id. Sizes and types are those of the current step for all steps, in the log too. World frame.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+
+from rlftsim.errors import DataError
+from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, TOTAL_STEPS, ObjectType, Scenario
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedStates:
+    """Future states of one scenario's simulated agents in N rollouts, world frame, float32, one device.
+
+    Every agent exists at all T = 80 steps. Agents may come in any order, named by `object_id`.
+    """
+
+    object_id: Int64[np.ndarray, "A"]
+    """Kept on the host: matching agents must not wait for a device."""
+    x: Float[Tensor, "N A T"]
+    y: Float[Tensor, "N A T"]
+    z: Float[Tensor, "N A T"]
+    heading: Float[Tensor, "N A T"]
+    repeat: int = 1
+    """Each rollout stands for this many identical ones: 32 equal rollouts are scored at the cost of one."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "object_id", np.asarray(self.object_id, np.int64))
+        expected = (*self.x.shape[:1], len(self.object_id), FUTURE_STEPS)
+        for name in ("x", "y", "z", "heading"):
+            values = getattr(self, name)
+            if tuple(values.shape) != expected or values.dtype != torch.float32:
+                raise DataError(
+                    f"Simulated {name} must be float32 of shape [N, A = {len(self.object_id)}, T = {FUTURE_STEPS}], "
+                    f"got {values.dtype} {list(values.shape)}: one row per object id, 80 steps at 10 Hz."
+                )
+        if self.repeat < 1 or expected[0] < 1:
+            raise DataError(f"At least one rollout is needed, got {expected[0]} x repeat {self.repeat}.")
+
+    @property
+    def device(self) -> torch.device:
+        """Where the rollouts live; the metric is computed there."""
+        return self.x.device
+
+    @property
+    def num_rollouts(self) -> int:
+        """Number of rollouts stood for, N x repeat."""
+        return self.x.shape[0] * self.repeat
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectories:
+    """States of agents over time, world frame, float32."""
+
+    x: Float[Tensor, "... A T"]
+    y: Float[Tensor, "... A T"]
+    z: Float[Tensor, "... A T"]
+    heading: Float[Tensor, "... A T"]
+
+    def of_agents(self, index: Int64[Tensor, "E"]) -> "Trajectories":
+        """Those of the agents at `index`."""
+        return Trajectories(*(values.index_select(-2, index) for values in self.fields))
+
+    def from_step(self, first: int) -> "Trajectories":
+        """The steps from `first` on (negative: counted from the end)."""
+        return Trajectories(*(values[..., first:] for values in self.fields))
+
+    @property
+    def fields(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """x, y, z, heading."""
+        return self.x, self.y, self.z, self.heading
+
+
+@dataclass(frozen=True, eq=False)
+class LoggedAgents:
+    """The simulated agents of a scenario as recorded, on a device."""
+
+    object_id: Int64[np.ndarray, "A"]
+    """Track order."""
+    evaluated: Int64[Tensor, "E"]
+    """Indices of the evaluated agents among the simulated ones, by ascending object id."""
+    evaluated_object_id: Int64[np.ndarray, "E"]
+    evaluated_object_type: Int64[np.ndarray, "E"]
+    is_vehicle: Bool[Tensor, "E"]
+    size: Float[Tensor, "A 3"]
+    """Length, width, height at the current step."""
+    trajectories: Trajectories
+    """[A, 91]; as stored where invalid."""
+    valid: Bool[Tensor, "A 91"]
+
+    @property
+    def future_valid(self) -> Bool[Tensor, "E T"]:
+        """Log validity of the evaluated agents at the future steps."""
+        return self.valid.index_select(0, self.evaluated)[:, CURRENT_STEP + 1 :]
+
+
+def build_logged_agents(scenario: Scenario, device: torch.device) -> LoggedAgents:
+    """Cut the simulated agents out of a scenario.
+
+    Raises:
+        DataError: the scenario has no recorded future, or nobody to evaluate.
+    """
+    if not scenario.has_future:
+        raise DataError(
+            f"Scenario {scenario.scenario_id} records {scenario.num_steps} steps: without its future (steps 11 to 90, "
+            "withheld in a test split) it cannot be scored. Use training or validation data."
+        )
+    tracks, simulated, evaluated = scenario.tracks, scenario.simulated_indices, scenario.evaluated_indices
+    if len(evaluated) == 0:
+        raise DataError(f"Scenario {scenario.scenario_id} has no evaluated agent that is valid at the current step.")
+    states = np.concatenate([tracks.position, tracks.heading[..., None]], axis=-1)[simulated, :TOTAL_STEPS]
+    fields = torch.from_numpy(np.ascontiguousarray(np.moveaxis(states, -1, 0))).to(device)
+    object_type = tracks.object_type[evaluated].astype(np.int64)
+    return LoggedAgents(
+        object_id=tracks.object_id[simulated].astype(np.int64),
+        evaluated=torch.from_numpy(np.searchsorted(simulated, evaluated)).to(device),
+        evaluated_object_id=tracks.object_id[evaluated].astype(np.int64),
+        evaluated_object_type=object_type,
+        is_vehicle=torch.from_numpy(object_type == ObjectType.VEHICLE).to(device),
+        size=torch.from_numpy(tracks.size[simulated, CURRENT_STEP]).to(device),
+        trajectories=Trajectories(*fields.unbind(0)),
+        valid=torch.from_numpy(tracks.valid[simulated, :TOTAL_STEPS]).to(device),
+    )
+
+
+def _shorten(ids: Sequence[int]) -> str:
+    listed = ", ".join(str(object_id) for object_id in ids[:8])
+    return f"{listed}, ... ({len(ids)} in all)" if len(ids) > 8 else listed
+
+
+def match_agents(expected: Int64[np.ndarray, "A"], given: Int64[np.ndarray, "A"], where: str) -> Int64[np.ndarray, "A"]:
+    """Index into `given` of each expected object id.
+
+    Raises:
+        DataError: an agent is missing, unknown or listed twice; the message names `where` and the ids.
+    """
+    if np.array_equal(expected, given):
+        return np.arange(len(expected))
+    order = np.argsort(given, kind="stable")
+    missing = sorted(set(expected.tolist()) - set(given.tolist()))
+    unknown = sorted(set(given.tolist()) - set(expected.tolist()))
+    if missing or unknown or len(given) != len(expected):
+        parts = [f"missing {_shorten(missing)}"] if missing else []
+        parts += [f"not simulated in this scenario {_shorten(unknown)}"] if unknown else []
+        parts += [] if parts else ["an object id is listed twice"]
+        raise DataError(
+            f"Rollouts of scenario {where} must hold every track valid at the current step and no other: "
+            f"object ids {'; '.join(parts)}."
+        )
+    return order[np.searchsorted(given[order], expected)]
+
+
+def join_history(agents: LoggedAgents, states: SimulatedStates, history_steps: int, where: str) -> Trajectories:
+    """Rollouts in track order, with the last `history_steps` logged steps (up to the current one) in front.
+
+    Shapes: [N, A, history_steps + 80].
+
+    Raises:
+        DataError: the rollouts' agents are not the scenario's (`where` names it).
+    """
+    order = match_agents(agents.object_id, states.object_id, where)
+    is_same = bool((order == np.arange(len(order))).all())
+    index = None if is_same else torch.from_numpy(order).to(states.device)
+    first = CURRENT_STEP + 1 - history_steps
+
+    def join(log: Tensor, future: Tensor) -> Tensor:
+        future = future if index is None else future.index_select(1, index)
+        history = log[:, first : CURRENT_STEP + 1].expand(future.shape[0], -1, -1)
+        return torch.cat([history, future], dim=-1)
+
+    simulated = (states.x, states.y, states.z, states.heading)
+    return Trajectories(*(join(log, future) for log, future in zip(agents.trajectories.fields, simulated)))

@@ -1,0 +1,166 @@
+"""What the realism meta-metric counts: ranges, bins, pseudocounts and weights of each year's challenge.
+
+A metric year is one entry here. The numbers are those of the challenge's published configuration files; the order of
+the features is the one of `FEATURE_NAMES` wherever a tensor has a feature axis F.
+"""
+
+from dataclasses import dataclass
+
+from rlftsim.errors import ConfigError
+
+HISTOGRAM_FEATURES = (
+    "linear_speed",
+    "linear_acceleration",
+    "angular_speed",
+    "angular_acceleration",
+    "distance_to_nearest_object",
+    "time_to_collision",
+    "distance_to_road_edge",
+)
+BERNOULLI_FEATURES = ("collision_indication", "offroad_indication", "traffic_light_violation")
+FEATURE_NAMES = HISTOGRAM_FEATURES + BERNOULLI_FEATURES
+"""Order of the feature axis F."""
+
+SUB_SCORES = {
+    "kinematic": ("linear_speed", "linear_acceleration", "angular_speed", "angular_acceleration"),
+    "interactive": ("distance_to_nearest_object", "collision_indication", "time_to_collision"),
+    "map_based": ("distance_to_road_edge", "offroad_indication", "traffic_light_violation"),
+}
+"""Families of features and their members."""
+
+
+@dataclass(frozen=True)
+class HistogramConfig:
+    """Equal-width bins over [low, high] with additive smoothing; `low` and `high` carry the feature's own unit."""
+
+    low: float
+    high: float
+    num_bins: int
+    weight: float
+    pseudocount: float = 0.1
+
+    def __post_init__(self) -> None:
+        if not self.low < self.high or self.num_bins < 1 or self.pseudocount <= 0:
+            raise ConfigError(f"A histogram needs low < high, num_bins >= 1 and pseudocount > 0, got {self}.")
+
+
+@dataclass(frozen=True)
+class BernoulliConfig:
+    """Two outcomes with additive smoothing; 0.001 is the default of the official message, not written in its files."""
+
+    weight: float
+    pseudocount: float = 0.001
+
+
+@dataclass(frozen=True)
+class MetricConfig:
+    """One year's meta-metric: speeds in m/s and rad/s, accelerations in m/s² and rad/s², distances in m, time in s."""
+
+    name: str
+    linear_speed: HistogramConfig
+    linear_acceleration: HistogramConfig
+    angular_speed: HistogramConfig
+    angular_acceleration: HistogramConfig
+    distance_to_nearest_object: HistogramConfig
+    time_to_collision: HistogramConfig
+    distance_to_road_edge: HistogramConfig
+    collision_indication: BernoulliConfig
+    offroad_indication: BernoulliConfig
+    traffic_light_violation: BernoulliConfig
+    time_to_collision_vehicles_only: bool = True
+    """Score time to collision on evaluated vehicles only (code of 2025) or on all evaluated agents (code of 2024)."""
+    reports_traffic_lights: bool = True
+    """Whether the official result of that year has traffic light fields."""
+
+    @property
+    def histograms(self) -> tuple[HistogramConfig, ...]:
+        """Histogram configurations in the order of `HISTOGRAM_FEATURES`."""
+        return tuple(getattr(self, name) for name in HISTOGRAM_FEATURES)
+
+    @property
+    def bernoullis(self) -> tuple[BernoulliConfig, ...]:
+        """Bernoulli configurations in the order of `BERNOULLI_FEATURES`."""
+        return tuple(getattr(self, name) for name in BERNOULLI_FEATURES)
+
+    @property
+    def weights(self) -> tuple[float, ...]:
+        """Weight of each feature, in the order of `FEATURE_NAMES`."""
+        return tuple(getattr(self, name).weight for name in FEATURE_NAMES)
+
+    def sub_score_weights(self, sub_score: str) -> tuple[float, ...]:
+        """Weight of each feature inside one sub-score, in the order of `FEATURE_NAMES`; they sum to one."""
+        members = SUB_SCORES[sub_score]
+        total = sum(getattr(self, name).weight for name in members)
+        return tuple(getattr(self, name).weight / total if name in members else 0.0 for name in FEATURE_NAMES)
+
+
+METRIC_2025 = MetricConfig(
+    name="2025",
+    linear_speed=HistogramConfig(0.0, 25.0, 10, 0.05),
+    linear_acceleration=HistogramConfig(-12.0, 12.0, 11, 0.05),
+    angular_speed=HistogramConfig(-0.628, 0.628, 11, 0.05),
+    angular_acceleration=HistogramConfig(-3.14, 3.14, 11, 0.05),
+    distance_to_nearest_object=HistogramConfig(-5.0, 40.0, 10, 0.10),
+    time_to_collision=HistogramConfig(0.0, 5.0, 10, 0.10),
+    distance_to_road_edge=HistogramConfig(-20.0, 40.0, 10, 0.05),
+    collision_indication=BernoulliConfig(0.25),
+    offroad_indication=BernoulliConfig(0.25),
+    traffic_light_violation=BernoulliConfig(0.05),
+)
+"""The leaderboard of 2025."""
+
+
+def _metric_of_2024(name: str, *, original_code: bool) -> MetricConfig:
+    base = METRIC_2025
+    return MetricConfig(
+        name=name,
+        linear_speed=base.linear_speed,
+        linear_acceleration=base.linear_acceleration,
+        angular_speed=base.angular_speed,
+        angular_acceleration=base.angular_acceleration,
+        distance_to_nearest_object=base.distance_to_nearest_object,
+        time_to_collision=base.time_to_collision,
+        distance_to_road_edge=HistogramConfig(-20.0, 40.0, 10, 0.10),
+        collision_indication=base.collision_indication,
+        offroad_indication=base.offroad_indication,
+        traffic_light_violation=BernoulliConfig(0.0),
+        time_to_collision_vehicles_only=not original_code,
+        reports_traffic_lights=not original_code,
+    )
+
+
+METRIC_2024 = _metric_of_2024("2024", original_code=False)
+"""The configuration file of 2024 read by the code of 2025: time to collision over vehicles only."""
+
+METRIC_2024_ORIGINAL = _metric_of_2024("2024_original_code", original_code=True)
+"""The leaderboard of 2024: time to collision over all evaluated agents, no traffic lights."""
+
+METRIC_2023 = MetricConfig(
+    name="2023",
+    linear_speed=HistogramConfig(0.0, 35.0, 10, 0.09),
+    linear_acceleration=HistogramConfig(-15.0, 15.0, 10, 0.09),
+    angular_speed=HistogramConfig(-31.5, 31.5, 10, 0.09),
+    angular_acceleration=HistogramConfig(-31.5, 31.5, 10, 0.09),
+    distance_to_nearest_object=HistogramConfig(-5.0, 40.0, 10, 0.09),
+    time_to_collision=HistogramConfig(0.0, 5.0, 10, 0.09),
+    distance_to_road_edge=HistogramConfig(-20.0, 40.0, 10, 0.09),
+    collision_indication=BernoulliConfig(0.18),
+    offroad_indication=BernoulliConfig(0.18),
+    traffic_light_violation=BernoulliConfig(0.0),
+    time_to_collision_vehicles_only=False,
+    reports_traffic_lights=False,
+)
+"""The weights and ranges of 2023. They sum to 0.99 as published; values are not comparable with later years."""
+
+METRICS = {config.name: config for config in (METRIC_2025, METRIC_2024, METRIC_2024_ORIGINAL, METRIC_2023)}
+
+
+def metric_by_name(name: str) -> MetricConfig:
+    """Configuration called `name`.
+
+    Raises:
+        ConfigError: no such configuration; the message lists the known names.
+    """
+    if name not in METRICS:
+        raise ConfigError(f"Unknown metric {name!r}: known are {', '.join(METRICS)}.")
+    return METRICS[name]

@@ -1,0 +1,244 @@
+"""Distance to the nearest object and time to collision, as the official evaluator defines them.
+
+Both need a minimum over all other agents at every step of every rollout. A cheap bound on centre distances leaves the
+few pairs that can decide it; only these are measured exactly, so the result does not depend on the bound. Coordinates
+stay in the world frame in float32: box corners are rounded there by about 5e-4 m, and a local frame would flip a
+borderline collision now and then.
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+
+FAR_M = 1e10
+"""Distance reported where no other object is valid."""
+CORNER_ROUNDING = 0.7
+"""Share of a box's smaller half side that its corners are rounded by."""
+TIME_HORIZON_S = 5.0
+"""Time to collision where nobody is followed or approached."""
+MAX_HEADING_DIFFERENCE = math.radians(75.0)
+SMALL_HEADING_DIFFERENCE = math.radians(10.0)
+SMALL_OVERLAP_M = 0.5
+BOUND_SLACK_M = 0.05
+"""Far above the rounding of float32 world coordinates: bounds may be loose, never wrong."""
+
+
+class PlanarAgents(NamedTuple):
+    """Boxes of all simulated agents in the plane over time, and who of them is evaluated."""
+
+    x: Float[Tensor, "N A T"]
+    y: Float[Tensor, "N A T"]
+    heading: Float[Tensor, "N A T"]
+    length: Float[Tensor, "A"]
+    width: Float[Tensor, "A"]
+    evaluated: Int64[Tensor, "E"]
+    valid: Bool[Tensor, "N A T"] | None = None
+    """None: everybody is valid at every step."""
+
+
+class _Pairs(NamedTuple):
+    """Pairs of an evaluated and another agent at one step of one rollout, P of them."""
+
+    row: Int64[Tensor, "P"]
+    """Flat index of (rollout, evaluated agent, step)."""
+    ego: Int64[Tensor, "P"]
+    """Flat index of (rollout, agent, step) of the evaluated agent, and of the other below."""
+    other: Int64[Tensor, "P"]
+    ego_agent: Int64[Tensor, "P"]
+    other_agent: Int64[Tensor, "P"]
+
+
+def _exclude(far: Float[Tensor, "N E A T"], agents: PlanarAgents) -> Float[Tensor, "N E A T"]:
+    """Set what cannot be a pair to infinity, in place: an agent with itself, and invalid others."""
+    rank = torch.arange(len(agents.evaluated), device=far.device)
+    far[:, rank, agents.evaluated] = torch.inf
+    if agents.valid is not None:
+        far.masked_fill_(~agents.valid[:, None], torch.inf)
+    return far
+
+
+def _list_pairs(mask: Bool[Tensor, "N E A T"], evaluated: Int64[Tensor, "E"]) -> _Pairs:
+    num_evaluated, num_agents, num_steps = mask.shape[1:]
+    rollout, rank, other, step = mask.nonzero().unbind(-1)
+    ego = evaluated[rank]
+    return _Pairs(
+        row=(rollout * num_evaluated + rank) * num_steps + step,
+        ego=(rollout * num_agents + ego) * num_steps + step,
+        other=(rollout * num_agents + other) * num_steps + step,
+        ego_agent=ego,
+        other_agent=other,
+    )
+
+
+def _find_nearest_candidates(agents: PlanarAgents) -> _Pairs:
+    """Pairs that may hold the smallest distance of their row.
+
+    A rounded box contains the disc of half its smaller side and lies in the disc of half its diagonal, so with centre
+    distance c the distance of i and j lies between c - outer_i - outer_j and c - inner_i - inner_j.
+    """
+    inner = torch.minimum(agents.length, agents.width) / 2
+    outer = torch.hypot(agents.length, agents.width) / 2
+    dx = agents.x[:, None] - agents.x[:, agents.evaluated, None]  # [N, E, A, T]
+    dy = agents.y[:, None] - agents.y[:, agents.evaluated, None]
+    centre_distance = _exclude(dx.square_().add_(dy.square_()).sqrt_(), agents)
+    slack = (outer - inner)[agents.evaluated] + BOUND_SLACK_M
+    # With one agent alone the row is empty of pairs: everything is infinite and inf <= inf must not pass.
+    enough = (centre_distance - inner[:, None]).amin(2) + slack[:, None]  # [N, E, T]
+    enough.clamp_(max=torch.finfo(enough.dtype).max)
+    mask = (centre_distance - outer[:, None]) <= enough[:, :, None]
+    if agents.valid is not None:
+        mask &= agents.valid[:, agents.evaluated, None]
+    return _list_pairs(mask, agents.evaluated)
+
+
+def _compute_core_corners(
+    agents: PlanarAgents, state: Int64[Tensor, "P"], agent: Int64[Tensor, "P"]
+) -> tuple[Float[Tensor, "4 P"], Float[Tensor, "4 P"], Float[Tensor, "P"]]:
+    """World x and y of the corners of the cores (boxes less their rounding), counter-clockwise, and the rounding."""
+    length, width = agents.length[agent], agents.width[agent]
+    rounding = CORNER_ROUNDING * torch.minimum(length, width) / 2
+    half_length, half_width = (length - 2 * rounding) / 2, (width - 2 * rounding) / 2
+    heading = agents.heading.reshape(-1)[state]
+    cos, sin = heading.cos(), heading.sin()
+    along = torch.stack([half_length, -half_length, -half_length, half_length])  # [4, P]
+    across = torch.stack([half_width, half_width, -half_width, -half_width])
+    x = cos * along - sin * across + agents.x.reshape(-1)[state]
+    y = sin * along + cos * across + agents.y.reshape(-1)[state]
+    return x, y, rounding
+
+
+def _start_at_lowest(
+    x: Float[Tensor, "4 P"], y: Float[Tensor, "4 P"]
+) -> tuple[Float[Tensor, "4 P"], Float[Tensor, "4 P"]]:
+    first = y.argmin(0, keepdim=True)
+    order = (first + torch.arange(4, device=x.device)[:, None]) % 4
+    return x.gather(0, order), y.gather(0, order)
+
+
+def _add_rectangles(
+    a: tuple[Float[Tensor, "4 P"], Float[Tensor, "4 P"]], b: tuple[Float[Tensor, "4 P"], Float[Tensor, "4 P"]]
+) -> tuple[Float[Tensor, "8 P"], Float[Tensor, "8 P"]]:
+    """Vertices of the Minkowski sum of two rectangles, counter-clockwise.
+
+    Which rectangle's edge comes first is settled once, at the lowest corners, as in the official evaluator. Between
+    nearly parallel boxes, whose corners are rounded, the other edges may disagree, which moves a vertex by millimetres:
+    an exact sum would differ from the official distance by as much.
+    """
+    (ax, ay), (bx, by) = _start_at_lowest(*a), _start_at_lowest(*b)
+    a_edge_x, a_edge_y, b_edge_x, b_edge_y = ax[1] - ax[0], ay[1] - ay[0], bx[1] - bx[0], by[1] - by[0]
+    a_leads = a_edge_x * b_edge_y - a_edge_y * b_edge_x >= 0
+    # From vertex to vertex one of the two moves on by a corner, in turns.
+    turn = torch.arange(8, device=ax.device)
+    leading, trailing = (turn + 1) // 2 % 4, turn // 2
+    x = torch.where(a_leads, ax[leading] + bx[trailing], ax[trailing] + bx[leading])
+    y = torch.where(a_leads, ay[leading] + by[trailing], ay[trailing] + by[leading])
+    return x, y
+
+
+def _compute_origin_distance(x: Float[Tensor, "8 P"], y: Float[Tensor, "8 P"]) -> Float[Tensor, "P"]:
+    """Signed distance of the origin to a convex polygon given counter-clockwise, negative inside."""
+    edge_x, edge_y = x.roll(-1, 0) - x, y.roll(-1, 0) - y
+    squared_length = edge_x * edge_x + edge_y * edge_y
+    squared_length = torch.where(squared_length > 0, squared_length, 1.0)
+    along = (-(x * edge_x + y * edge_y) / squared_length).clamp_(0.0, 1.0)
+    off_x, off_y = x + along * edge_x, y + along * edge_y
+    distance = (off_x * off_x + off_y * off_y).sqrt_().amin(0)
+    outward = (y * edge_x - x * edge_y) / squared_length.sqrt()  # of the origin beyond each edge's line
+    gap = outward.amax(0)
+    return torch.where(gap <= 0, gap, distance)
+
+
+def _compute_box_distance(agents: PlanarAgents, pairs: _Pairs) -> Float[Tensor, "P"]:
+    """Signed distance between rounded boxes, negative for overlap: of the origin to the difference of their cores."""
+    *ego, ego_rounding = _compute_core_corners(agents, pairs.ego, pairs.ego_agent)
+    other_x, other_y, other_rounding = _compute_core_corners(agents, pairs.other, pairs.other_agent)
+    core_distance = _compute_origin_distance(*_add_rectangles(tuple(ego), (-other_x, -other_y)))
+    return core_distance - ego_rounding - other_rounding
+
+
+def compute_distance_to_nearest_object(agents: PlanarAgents) -> Float[Tensor, "N E T"]:
+    """Signed distance of each evaluated agent to the nearest other valid agent, m; negative for overlap.
+
+    Boxes have corners rounded by 0.35 of their smaller side; height plays no role. `FAR_M` where the agent itself or
+    everybody else is invalid.
+    """
+    num_rollouts, _, num_steps = agents.x.shape
+    pairs = _find_nearest_candidates(agents)
+    nearest = agents.x.new_full((num_rollouts * len(agents.evaluated) * num_steps,), FAR_M)
+    nearest.scatter_reduce_(0, pairs.row, _compute_box_distance(agents, pairs), "amin")
+    return nearest.view(num_rollouts, len(agents.evaluated), num_steps)
+
+
+def _find_follow_candidates(agents: PlanarAgents, speed: Float[Tensor, "N A T"]) -> _Pairs:
+    """Pairs whose other agent may be the one followed and be reached within the horizon.
+
+    Whoever is further ahead than the ego drives within the horizon gives 5 s whether chosen or not, and never hides a
+    nearer one: leaving it out changes nothing.
+    """
+    outer = torch.hypot(agents.length, agents.width) / 2
+    heading = agents.heading[:, agents.evaluated, None]
+    cos, sin = heading.cos(), heading.sin()
+    dx = agents.x[:, None] - agents.x[:, agents.evaluated, None]  # [N, E, A, T]
+    dy = agents.y[:, None] - agents.y[:, agents.evaluated, None]
+    ahead = dx * cos + dy * sin
+    aside = dy.mul_(cos).sub_(dx.mul_(sin)).abs_()
+    reach = TIME_HORIZON_S * speed[:, agents.evaluated] * 1.001 + (outer[agents.evaluated] + BOUND_SLACK_M)[:, None]
+    half_width = (agents.width[agents.evaluated] / 2 + BOUND_SLACK_M)[:, None]  # [E, 1]
+    # A speed of NaN (first and last step of a record) fails the comparison, as it does in the official rule.
+    mask = (ahead - outer[:, None] <= reach[:, :, None]) & (ahead > 0)
+    mask &= aside < half_width[:, :, None] + outer[:, None]
+    rank = torch.arange(len(agents.evaluated), device=mask.device)
+    mask[:, rank, agents.evaluated] = False
+    if agents.valid is not None:
+        mask &= agents.valid[:, None]
+    return _list_pairs(mask, agents.evaluated)
+
+
+def _compute_gaps(agents: PlanarAgents, pairs: _Pairs) -> tuple[Float[Tensor, "P"], Bool[Tensor, "P"]]:
+    """Free space between ego and other along the ego's heading, m, and whether the other is followed."""
+    x, y, heading = (values.reshape(-1) for values in (agents.x, agents.y, agents.heading))
+    ego_heading = heading[pairs.ego]
+    # Not wrapped: headings near 2 pi apart are "not following" in the official rule too.
+    turn = (heading[pairs.other] - ego_heading).abs()
+    cos, sin = ego_heading.cos(), ego_heading.sin()
+    dx, dy = x[pairs.other] - x[pairs.ego], y[pairs.other] - y[pairs.ego]
+    half_length, half_width = agents.length / 2, agents.width / 2
+    turn_cos, turn_sin = turn.cos().abs(), turn.sin().abs()
+    reach_along = half_length[pairs.other_agent] * turn_cos + half_width[pairs.other_agent] * turn_sin
+    reach_across = half_length[pairs.other_agent] * turn_sin + half_width[pairs.other_agent] * turn_cos
+    along = (dx * cos + dy * sin) - half_length[pairs.ego_agent] - reach_along
+    across = (dy * cos - dx * sin).abs() - half_width[pairs.ego_agent] - reach_across
+    is_followed = (along > 0) & (turn <= MAX_HEADING_DIFFERENCE) & (across < 0)
+    is_followed &= (across < -SMALL_OVERLAP_M) | (turn <= SMALL_HEADING_DIFFERENCE)
+    return along, is_followed
+
+
+def compute_time_to_collision(agents: PlanarAgents, speed: Float[Tensor, "N A T"]) -> Float[Tensor, "N E T"]:
+    """Seconds until each evaluated agent reaches the one it follows at their present speeds, at most 5.
+
+    Followed is the nearest of those ahead that overlap laterally and point roughly the same way (whether the evaluated
+    agent itself is valid is not asked). Full boxes, no rounding.
+
+    Args:
+        agents: Boxes.
+        speed: Speed in the plane, m/s; NaN counts as not approaching.
+    """
+    num_rollouts, num_agents, num_steps = agents.x.shape
+    shape = (num_rollouts, len(agents.evaluated), num_steps)
+    pairs = _find_follow_candidates(agents, speed)
+    gap, is_followed = _compute_gaps(agents, pairs)
+    gap = torch.where(is_followed, gap, torch.inf)
+    nearest = gap.new_full((math.prod(shape),), torch.inf)
+    nearest.scatter_reduce_(0, pairs.row, gap, "amin")
+    # Ties go to the first agent in track order.
+    leader = torch.where(is_followed & (gap == nearest[pairs.row]), pairs.other_agent, num_agents)
+    first = leader.new_full((math.prod(shape),), num_agents)
+    first.scatter_reduce_(0, pairs.row, leader, "amin")
+    first = first.view(shape)
+    leader_speed = speed.gather(1, first.clamp(max=num_agents - 1))
+    approach = speed[:, agents.evaluated] - leader_speed
+    seconds = (nearest.view(shape) / approach).clamp_(max=TIME_HORIZON_S)
+    return torch.where((first < num_agents) & (approach > 0), seconds, TIME_HORIZON_S)

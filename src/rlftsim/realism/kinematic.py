@@ -1,0 +1,77 @@
+"""Speeds and accelerations as the official evaluator takes them: central differences that ignore validity.
+
+Source: Waymo Open Sim Agents Challenge, evaluator of 2025. Everything is float32; the step is 0.1 s. A difference at
+step t needs t - 1 and t + 1 and is NaN where one of them is missing: speeds lose one step at each end, accelerations two.
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from rlftsim.scenario.types import STEP_S
+
+
+class KinematicFeatures(NamedTuple):
+    """Kinematics of trajectories, [..., T] each: m/s, m/s² (signed), rad/s, rad/s²."""
+
+    linear_speed: Float[Tensor, "... T"]
+    linear_acceleration: Float[Tensor, "... T"]
+    angular_speed: Float[Tensor, "... T"]
+    angular_acceleration: Float[Tensor, "... T"]
+
+
+def compute_central_difference(values: Float[Tensor, "... T"]) -> Float[Tensor, "... T"]:
+    """Half the difference between the next and the last step, per step; NaN at both ends."""
+    difference = torch.full_like(values, float("nan"))
+    difference[..., 1:-1] = (values[..., 2:] - values[..., :-2]) / 2
+    return difference
+
+
+def wrap_angle(angle: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
+    """Angle in [-pi, pi), by the floor-style remainder."""
+    return torch.remainder(angle + math.pi, 2 * math.pi) - math.pi
+
+
+def _compute_turn(angle: Float[Tensor, "... T"]) -> Float[Tensor, "... T"]:
+    # The two-step difference is wrapped, not the one-step one: at most pi/2 per step can be told apart.
+    return wrap_angle(2 * compute_central_difference(angle)) / 2
+
+
+def compute_kinematics(
+    position: tuple[Float[Tensor, "... T"], Float[Tensor, "... T"], Float[Tensor, "... T"]],
+    heading: Float[Tensor, "... T"],
+) -> KinematicFeatures:
+    """Linear and angular speed and acceleration of trajectories.
+
+    Args:
+        position: x, y and z of the box centre; the height counts.
+        heading: Radians; the second wrapped difference, not the difference of wrapped speeds, gives the acceleration.
+    """
+    dx, dy, dz = (compute_central_difference(axis) for axis in position)
+    linear_speed = (dx * dx + dy * dy + dz * dz).sqrt() / STEP_S
+    turn = _compute_turn(heading)
+    return KinematicFeatures(
+        linear_speed=linear_speed,
+        linear_acceleration=compute_central_difference(linear_speed) / STEP_S,
+        angular_speed=turn / STEP_S,
+        angular_acceleration=_compute_turn(turn) / STEP_S**2,
+    )
+
+
+def compute_ground_speed(x: Float[Tensor, "... T"], y: Float[Tensor, "... T"]) -> Float[Tensor, "... T"]:
+    """Speed in the plane, m/s, NaN at both ends: for time to collision, which leaves height out."""
+    dx, dy = compute_central_difference(x), compute_central_difference(y)
+    return (dx * dx + dy * dy).sqrt() / STEP_S
+
+
+def shrink_validity(valid: Bool[Tensor, "... T"]) -> Bool[Tensor, "... T"]:
+    """Where both neighbouring steps are valid (the step itself is not asked); False at both ends.
+
+    Applied once to the future's validity it says where speeds count, twice where accelerations count.
+    """
+    shrunk = torch.zeros_like(valid)
+    shrunk[..., 1:-1] = valid[..., 2:] & valid[..., :-2]
+    return shrunk

@@ -1,0 +1,179 @@
+"""From features to likelihoods: how probable the log is under the rollouts' histograms.
+
+Rollouts enter a score only through counts, so the counts of each rollout are kept apart: any set of rollouts (all, all
+but one, one alone) is a sum of them, and scoring every leave-one-out set costs one reduction. Features axis: H = 7
+histogram features in the order of `HISTOGRAM_FEATURES`, J = 3 Bernoulli features in that of `BERNOULLI_FEATURES`.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+
+from rlftsim.realism.config import HISTOGRAM_FEATURES, HistogramConfig, MetricConfig
+from rlftsim.realism.features import Features, ScenarioLog
+
+
+def compute_bin_edges(histogram: HistogramConfig) -> Float[np.ndarray, "K+1"]:
+    """Edges of equal-width bins as TensorFlow's float32 linspace rounds them: low + k * step, the last exactly high.
+
+    A float64 linspace rounded to float32 differs by up to 8e-7, enough to move a value to the next bin.
+    """
+    low, high = np.float32(histogram.low), np.float32(histogram.high)
+    edges = low + (high - low) / np.float32(histogram.num_bins) * np.arange(histogram.num_bins + 1, dtype=np.float32)
+    edges[-1] = high
+    return edges
+
+
+@dataclass(frozen=True, eq=False)
+class HistogramTable:
+    """The histogram features of a metric side by side, padded to the largest number of bins K."""
+
+    edges: Float[Tensor, "H K+1"]
+    """Infinite beyond a feature's own edges."""
+    low: Float[Tensor, "H"]
+    high: Float[Tensor, "H"]
+    last_bin: Int64[Tensor, "H"]
+    pseudocount: Float[Tensor, "H"]
+    num_bins: Float[Tensor, "H"]
+    bernoulli_pseudocount: Float[Tensor, "J"]
+
+
+@lru_cache(maxsize=32)
+def histogram_table(config: MetricConfig, device: torch.device) -> HistogramTable:
+    """The metric's bins on a device."""
+    histograms = config.histograms
+    edges = np.full((len(histograms), max(h.num_bins for h in histograms) + 1), np.inf, np.float32)
+    for row, histogram in enumerate(histograms):
+        edges[row, : histogram.num_bins + 1] = compute_bin_edges(histogram)
+    columns = [[h.low, h.high, h.pseudocount, h.num_bins] for h in histograms]
+    low, high, pseudocount, num_bins = torch.tensor(columns, device=device).unbind(1)
+    return HistogramTable(
+        edges=torch.from_numpy(edges).to(device),
+        low=low,
+        high=high,
+        last_bin=num_bins.long() - 1,
+        pseudocount=pseudocount,
+        num_bins=num_bins,
+        bernoulli_pseudocount=torch.tensor([b.pseudocount for b in config.bernoullis], device=device),
+    )
+
+
+def find_bins(values: Float[Tensor, "H m"], table: HistogramTable) -> Int64[Tensor, "H m"]:
+    """Bin of each value, after clipping into the range; closed on the left, the last bin on both sides.
+
+    NaN falls into the last bin, as in the official evaluator: the last steps of a rollout, where no difference exists,
+    are counted there.
+    """
+    clipped = values.clamp(table.low[:, None], table.high[:, None])
+    bins = torch.searchsorted(table.edges, clipped, right=True) - 1
+    last = table.last_bin[:, None]
+    return torch.where(clipped.isnan(), last, torch.minimum(bins, last).clamp_(min=0))
+
+
+def stack_histogram_features(features: Features) -> Float[Tensor, "H N E T"]:
+    """The histogram features of a set side by side."""
+    return torch.stack([getattr(features, name) for name in HISTOGRAM_FEATURES])
+
+
+def count_bins(values: Float[Tensor, "H N E T"], table: HistogramTable) -> Float[Tensor, "N H E K"]:
+    """Histogram of each rollout and agent over all T steps, valid or not."""
+    num_features, num_rollouts, num_agents, _ = values.shape
+    bins = find_bins(values.flatten(1), table).view(values.shape).permute(1, 0, 2, 3)
+    counts = values.new_zeros(num_rollouts, num_features, num_agents, table.edges.shape[1] - 1)
+    return counts.scatter_add_(-1, bins, counts.new_ones(1).expand(bins.shape))
+
+
+@dataclass(frozen=True, eq=False)
+class LogTarget:
+    """What the rollouts' histograms are asked about: the log's bins, counted, and its outcomes."""
+
+    steps_in_bin: Float[Tensor, "H E K"]
+    """Number of scored steps whose logged value lies in the bin."""
+    num_scored_steps: Float[Tensor, "H"]
+    outcome: Bool[Tensor, "J E"]
+    """Whether the agent ever collides, leaves the road, passes a red light in the log."""
+
+
+def compute_outcomes(features: Features, log: ScenarioLog) -> Bool[Tensor, "N J E"]:
+    """Whether an agent ever collides, leaves the road, passes a red light at a step where the log is valid.
+
+    A light violation counts for vehicles only.
+    """
+    log_valid = log.agents.future_valid
+    lights = features.traffic_light_violation & log.agents.is_vehicle[:, None]
+    return torch.stack([features.collision, features.offroad, lights], dim=1).logical_and_(log_valid).any(-1)
+
+
+def _stack_scored_steps(log: ScenarioLog, config: MetricConfig) -> Bool[Tensor, "H E T"]:
+    """At which steps of the log each histogram feature counts."""
+    features = log.features
+    valid, speed, acceleration = features.valid[0], features.speed_valid[0], features.acceleration_valid[0]
+    collision_time = valid & log.agents.is_vehicle[:, None] if config.time_to_collision_vehicles_only else valid
+    return torch.stack([speed, acceleration, speed, acceleration, valid, collision_time, valid])
+
+
+def build_log_target(log: ScenarioLog, config: MetricConfig) -> LogTarget:
+    """Bins and outcomes of the log under a configuration."""
+    table = histogram_table(config, log.agents.valid.device)
+    values = stack_histogram_features(log.features)[:, 0]
+    scored = _stack_scored_steps(log, config).to(values.dtype)
+    bins = find_bins(values.flatten(1), table).view(values.shape)
+    steps = values.new_zeros(*values.shape[:2], table.edges.shape[1] - 1).scatter_add_(-1, bins, scored)
+    return LogTarget(steps, scored.sum((1, 2)), compute_outcomes(log.features, log)[0])
+
+
+log_target = lru_cache(maxsize=128)(build_log_target)
+"""`build_log_target`, remembered (logs are compared by identity)."""
+
+
+@dataclass(frozen=True, eq=False)
+class RolloutCounts:
+    """What rollouts contribute to scores, each for itself; a set of rollouts is the sum over its members."""
+
+    bins: Float[Tensor, "N H E K"]
+    agreement: Float[Tensor, "N J E"]
+    """1 where the rollout's outcome is the log's."""
+    num_steps: int
+    """Values per rollout and agent, T."""
+
+
+def count_rollouts(features: Features, log: ScenarioLog, config: MetricConfig) -> RolloutCounts:
+    """Counts of each rollout, a rollout that stands for several counted once."""
+    values = stack_histogram_features(features)
+    table = histogram_table(config, values.device)
+    agreement = compute_outcomes(features, log) == log_target(log, config).outcome
+    return RolloutCounts(count_bins(values, table), agreement.to(values.dtype), values.shape[-1])
+
+
+def compute_log_probabilities(
+    counts: Float[Tensor, "S H E K"], num_values: Float[Tensor, "S"], table: HistogramTable
+) -> Float[Tensor, "S H E K"]:
+    """Log-probability of each bin for S sets of rollouts with additive smoothing, nats."""
+    pseudocount = table.pseudocount[:, None, None]
+    total = num_values[:, None] + table.pseudocount * table.num_bins  # [S, H]
+    return (counts + pseudocount).log_() - total.log()[..., None, None]
+
+
+def compute_likelihoods(
+    counts: RolloutCounts, num_rollouts: Float[Tensor, "S"], target: LogTarget, table: HistogramTable
+) -> Float[Tensor, "S F"]:
+    """Likelihood of the log under S sets of rollouts, one per feature: the exponential of the mean log-probability.
+
+    Histogram features average over all scored (agent, step) pairs together, Bernoulli ones over all agents. A feature
+    without a scored step is NaN, as in the official evaluator.
+
+    Args:
+        counts: Summed over each set: `bins` [S, H, E, K], `agreement` [S, J, E].
+        num_rollouts: Size of each set.
+        target: The log's side.
+        table: The metric's bins.
+    """
+    log_probability = compute_log_probabilities(counts.bins, num_rollouts * counts.num_steps, table)
+    histogram = (log_probability * target.steps_in_bin).sum((-1, -2)) / target.num_scored_steps  # [S, H]
+    pseudocount = table.bernoulli_pseudocount
+    agreement = (counts.agreement + pseudocount[:, None]) / (num_rollouts[:, None] + 2 * pseudocount)[..., None]
+    return torch.cat([histogram, agreement.log_().mean(-1)], dim=-1).exp_()

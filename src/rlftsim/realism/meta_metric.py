@@ -1,0 +1,239 @@
+"""The realism meta-metric of rollouts, of all but one of them, and of each alone.
+
+Source: Waymo Open Sim Agents Challenge. The leave-one-out and single-rollout values are what the rewards of RLFTSim
+(equation 2) are made of; they cost one reduction over per-rollout counts.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from functools import lru_cache
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from rlftsim.errors import DataError
+from rlftsim.realism.agents import SimulatedStates
+from rlftsim.realism.config import FEATURE_NAMES, METRIC_2025, SUB_SCORES, MetricConfig
+from rlftsim.realism.features import (
+    DEFAULT_COMPUTE,
+    ComputeConfig,
+    Features,
+    MissingMap,
+    ScenarioLog,
+    compute_features,
+    scenario_log,
+)
+from rlftsim.realism.likelihood import RolloutCounts, compute_likelihoods, count_rollouts, histogram_table, log_target
+from rlftsim.scenario.types import Scenario
+
+
+@dataclass(frozen=True, eq=False)
+class RealismResult:
+    """Scores of one scenario (no leading axis) or of several (leading axis B).
+
+    Likelihoods and meta-metrics: higher is better. N counts repeated rollouts too.
+    """
+
+    scenario_ids: tuple[str, ...]
+    config: MetricConfig
+    likelihoods: Float[Tensor, "*B F"]
+    """In the order of `FEATURE_NAMES`."""
+    meta_metric: Float[Tensor, "*B"]
+    kinematic: Float[Tensor, "*B"]
+    interactive: Float[Tensor, "*B"]
+    map_based: Float[Tensor, "*B"]
+    average_displacement_error: Float[Tensor, "*B"]
+    """Mean over rollouts and evaluated agents, m."""
+    min_average_displacement_error: Float[Tensor, "*B"]
+    """Of the best rollout: the mean over agents is taken before the minimum, m."""
+    collision_rate: Float[Tensor, "*B"]
+    """Share of (rollout, evaluated agent) pairs that ever collide in simulation while the log is valid."""
+    offroad_rate: Float[Tensor, "*B"]
+    traffic_light_violation_rate: Float[Tensor, "*B"]
+    """Of all agents; the likelihood looks at vehicles only."""
+    leave_one_out_meta_metric: Float[Tensor, "*B N"]
+    """Meta-metric of the other N - 1 rollouts; NaN for N = 1."""
+    single_meta_metric: Float[Tensor, "*B N"]
+    """Meta-metric of each rollout alone."""
+    rollout_displacement_error: Float[Tensor, "*B N"]
+    """Mean over evaluated agents, m."""
+    rollout_collision_rate: Float[Tensor, "*B N"]
+    rollout_offroad_rate: Float[Tensor, "*B N"]
+    rollout_traffic_light_violation_rate: Float[Tensor, "*B N"]
+
+    def likelihood(self, feature: str) -> Float[Tensor, "*B"]:
+        """Likelihood of one feature of `FEATURE_NAMES`."""
+        return self.likelihoods[..., FEATURE_NAMES.index(feature)]
+
+    def to_official_fields(self) -> list[dict[str, object]]:
+        """Plain numbers under the official messages' names, one entry per scenario; sub-scores under `buckets`."""
+        metrics = {name: values.reshape(-1).tolist() for name, values in self._official_metrics().items()}
+        buckets = {name: values.reshape(-1).tolist() for name, values in self._official_buckets().items()}
+        return [
+            {
+                "scenario_id": scenario_id,
+                **{name: column[row] for name, column in metrics.items()},
+                "buckets": {name: column[row] for name, column in buckets.items()},
+            }
+            for row, scenario_id in enumerate(self.scenario_ids)
+        ]
+
+    def _official_rates(self) -> dict[str, Tensor]:
+        rates = {
+            "simulated_collision_rate": self.collision_rate,
+            "simulated_offroad_rate": self.offroad_rate,
+            "simulated_traffic_light_violation_rate": self.traffic_light_violation_rate,
+        }
+        return rates if self.config.reports_traffic_lights else dict(list(rates.items())[:2])
+
+    def _official_metrics(self) -> dict[str, Tensor]:
+        reported = [
+            name for name in FEATURE_NAMES if self.config.reports_traffic_lights or name != "traffic_light_violation"
+        ]
+        return {
+            "metametric": self.meta_metric,
+            "average_displacement_error": self.average_displacement_error,
+            "min_average_displacement_error": self.min_average_displacement_error,
+            **{f"{name}_likelihood": self.likelihood(name) for name in reported},
+            **self._official_rates(),
+        }
+
+    def _official_buckets(self) -> dict[str, Tensor]:
+        return {
+            "realism_meta_metric": self.meta_metric,
+            "kinematic_metrics": self.kinematic,
+            "interactive_metrics": self.interactive,
+            "map_based_metrics": self.map_based,
+            "min_ade": self.min_average_displacement_error,
+            **self._official_rates(),
+        }
+
+
+@lru_cache(maxsize=32)
+def _score_weights(config: MetricConfig, device: torch.device) -> Float[Tensor, "4 F"]:
+    """Weights of the meta-metric and of the three sub-scores."""
+    rows = [config.weights, *(config.sub_score_weights(name) for name in SUB_SCORES)]
+    return torch.tensor(rows, dtype=torch.float32, device=device)
+
+
+def _weigh(likelihoods: Float[Tensor, "... F"], weights: Float[Tensor, "... F"]) -> Float[Tensor, "..."]:
+    # A feature of no weight stays out even where it is NaN (nobody's time to collision is scored).
+    return torch.where(weights > 0, likelihoods * weights, 0.0).sum(-1)
+
+
+def _form_sets(counts: RolloutCounts, repeat: int) -> tuple[RolloutCounts, Float[Tensor, "S"]]:
+    """Counts and sizes of S = 1 + N + N sets: all rollouts, all but each, each alone."""
+    num_rollouts = len(counts.bins) * repeat
+    # Counts are whole numbers below 2^24: sums and differences are exact in float32.
+    all_bins = counts.bins.sum(0, keepdim=True) * repeat
+    all_agreement = counts.agreement.sum(0, keepdim=True) * repeat
+    sets = RolloutCounts(
+        bins=torch.cat([all_bins, all_bins - counts.bins, counts.bins]),
+        agreement=torch.cat([all_agreement, all_agreement - counts.agreement, counts.agreement]),
+        num_steps=counts.num_steps,
+    )
+    size = counts.bins.new_ones(len(sets.bins))
+    size[:1] = num_rollouts
+    size[1 : len(counts.bins) + 1] = num_rollouts - 1
+    return sets, size
+
+
+def _any_rate(event: Bool[Tensor, "N E T"], log: ScenarioLog, repeat: int) -> Float[Tensor, "N"]:
+    """Share of evaluated agents of a rollout with an event at any step where the log is valid."""
+    occurred = (event & log.agents.future_valid).any(-1).to(torch.float32)
+    return occurred.mean(-1).repeat_interleave(repeat)
+
+
+def score_features(log: ScenarioLog, features: Features, config: MetricConfig = METRIC_2025) -> RealismResult:
+    """Scores of rollouts whose features are known (several metrics of the same rollouts share them)."""
+    distinct, repeat = len(features.linear_speed), features.repeat
+    sets, size = _form_sets(count_rollouts(features, log, config), repeat)
+    table = histogram_table(config, features.linear_speed.device)
+    likelihoods = compute_likelihoods(sets, size, log_target(log, config), table)  # [S, F]
+    weights = _score_weights(config, likelihoods.device)
+    rmm = _weigh(likelihoods, weights[0])
+    without_each, alone = rmm[1:].view(2, distinct).repeat_interleave(repeat, dim=1)
+    if distinct * repeat == 1:
+        without_each = torch.full_like(without_each, torch.nan)
+    scores = _weigh(likelihoods[:1], weights)
+    displacement = features.displacement_error.mean(-1).repeat_interleave(repeat)
+    collision = _any_rate(features.collision, log, repeat)
+    offroad = _any_rate(features.offroad, log, repeat)
+    light = _any_rate(features.traffic_light_violation, log, repeat)
+    return RealismResult(
+        scenario_ids=(log.scenario_id,),
+        config=config,
+        likelihoods=likelihoods[0],
+        meta_metric=scores[0],
+        kinematic=scores[1],
+        interactive=scores[2],
+        map_based=scores[3],
+        average_displacement_error=displacement.mean(),
+        min_average_displacement_error=displacement.min(),
+        collision_rate=collision.mean(),
+        offroad_rate=offroad.mean(),
+        traffic_light_violation_rate=light.mean(),
+        leave_one_out_meta_metric=without_each,
+        single_meta_metric=alone,
+        rollout_displacement_error=displacement,
+        rollout_collision_rate=collision,
+        rollout_offroad_rate=offroad,
+        rollout_traffic_light_violation_rate=light,
+    )
+
+
+def score(
+    scenario: Scenario | ScenarioLog,
+    states: SimulatedStates,
+    config: MetricConfig = METRIC_2025,
+    *,
+    missing_map: MissingMap = "error",
+    compute: ComputeConfig = DEFAULT_COMPUTE,
+) -> RealismResult:
+    """Scores of one scenario's rollouts, on the rollouts' device.
+
+    Args:
+        scenario: The recorded scenario, whose own part is computed once and remembered, or that part.
+        states: Its rollouts.
+        config: The metric's year.
+        missing_map: What to do without road edges: "error" or "neutral" (everybody counts as on the road).
+        compute: Memory bound.
+
+    Raises:
+        DataError: the scenario cannot be scored, or the rollouts' agents are not its simulated agents.
+    """
+    log = scenario
+    if isinstance(log, Scenario):
+        log = scenario_log(log, states.device, missing_map=missing_map, compute=compute)
+    return score_features(log, compute_features(log, states, compute=compute), config)
+
+
+def score_batch(
+    scenarios: Sequence[Scenario | ScenarioLog],
+    states: Sequence[SimulatedStates],
+    config: MetricConfig = METRIC_2025,
+    *,
+    missing_map: MissingMap = "error",
+    compute: ComputeConfig = DEFAULT_COMPUTE,
+) -> RealismResult:
+    """Scores of B scenarios with N rollouts each, stacked: [B], [B, F] and [B, N].
+
+    Raises:
+        DataError: as `score`; also if there is no scenario or the numbers of scenarios or rollouts differ.
+    """
+    if len(scenarios) != len(states) or not scenarios:
+        raise DataError(f"Scoring needs one set of rollouts per scenario, got {len(states)} for {len(scenarios)}.")
+    sizes = sorted({item.num_rollouts for item in states})
+    if len(sizes) > 1:
+        raise DataError(f"Scenarios scored together need equally many rollouts, got {sizes}: score them one by one.")
+    results = [
+        score(scenario, item, config, missing_map=missing_map, compute=compute)
+        for scenario, item in zip(scenarios, states)
+    ]
+    stacked = {
+        field.name: torch.stack([getattr(result, field.name) for result in results])
+        for field in fields(RealismResult)
+        if field.name not in ("scenario_ids", "config")
+    }
+    return RealismResult(scenario_ids=tuple(r.scenario_ids[0] for r in results), config=config, **stacked)

@@ -1,0 +1,126 @@
+"""The closed loop."""
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from rlftsim.errors import ConfigError
+from rlftsim.goals.types import Goals
+from rlftsim.rollout.noise import draw_noise
+from rlftsim.rollout.policy import DecisionDistribution, Policy, Sampling
+from rlftsim.rollout.types import AgentStates, Rollouts
+from rlftsim.scenario.batch import ScenarioBatch
+from rlftsim.scenario.types import FUTURE_STEPS
+
+Choose = Callable[[DecisionDistribution, Any, Sampling, Tensor], Tensor]
+Force = Callable[[Any, int], AgentStates | None]
+
+
+def sample_decision(
+    distribution: DecisionDistribution, state: Any, sampling: Sampling, noise: Float[Tensor, "B N A k"]
+) -> Tensor:
+    """The ordinary choice: a draw from the policy's distribution."""
+    return distribution.sample(sampling, noise)
+
+
+@torch.no_grad()
+def simulate(
+    policy: Policy,
+    batch: ScenarioBatch,
+    *,
+    num_rollouts: int | range,
+    seed: int,
+    context: Any = None,
+    goals: Goals | None = None,
+    sampling: Sampling = Sampling(),  # noqa: B008
+    choose: Choose = sample_decision,
+    force: Force | None = None,
+) -> Rollouts:
+    """Simulate N futures of every scenario, all in one batch.
+
+    Args:
+        policy: decides for every agent, the ego included.
+        batch: scenarios; only their history, map and lights are used.
+        num_rollouts: N, or a range of rollout ids: ids 8..15 of a seed are the same rollouts whether drawn alone or among 32.
+        seed: of the noise; see `rollout.noise`.
+        context: `policy.encode(batch)`, where it is at hand.
+        goals: what agents are asked to do; None = goal-free.
+        sampling: temperature and truncation.
+        choose: picks decisions from a distribution; CAT-K is another one.
+        force: called before every advance with the state and the step it starts at; may impose states on agents.
+
+    Raises:
+        ConfigError: no rollouts, or a decision length that does not divide the 80 steps.
+    """
+    rollout_ids = range(num_rollouts) if isinstance(num_rollouts, int) else num_rollouts
+    stride = policy.steps_per_decision
+    if len(rollout_ids) < 1 or FUTURE_STEPS % stride:
+        raise ConfigError(
+            f"cannot simulate {len(rollout_ids)} rollouts with {stride} steps per decision: need >= 1 and a divisor of 80."
+        )
+    num_decisions = FUTURE_STEPS // stride
+    context = policy.encode(batch) if context is None else context
+    initial = draw_noise(batch, rollout_ids, seed=seed, purpose="begin", per_agent=policy.initial_noise_size)
+    noise = draw_noise(batch, rollout_ids, seed=seed, purpose="decide", per_agent=num_decisions * policy.noise_size)
+    state = policy.begin(context, len(rollout_ids), goals, initial)
+    draws = state.draws
+
+    poses, decisions, log_probs, forces = [], [], [], []
+    for step, decision_noise in zip(
+        range(0, FUTURE_STEPS, stride), noise.unflatten(-1, (num_decisions, -1)).unbind(-2)
+    ):
+        distribution = policy.decide(context, state)
+        decision = choose(distribution, state, sampling, decision_noise)
+        forced = force(state, step) if force else None
+        state = policy.advance(context, state, decision, forced)
+        poses.append(state.poses)
+        decisions.append(decision)
+        log_probs.append(distribution.log_prob(decision, sampling))
+        forces.append(forced)
+    return _assemble(batch, poses, decisions, log_probs, forces, draws, goals)
+
+
+def _assemble(
+    batch: ScenarioBatch,
+    poses: list[Tensor],
+    decisions: list[Tensor],
+    log_probs: list[Tensor],
+    forces: list[AgentStates | None],
+    draws: Tensor | None,
+    goals: Goals | None,
+) -> Rollouts:
+    """What the loop collected, as one value."""
+    path = torch.cat(poses, dim=3)  # [B, N, A, T, 3]
+    forced = _join(forces, path)
+    mask = batch.agent_mask[:, None, :, None].expand(*path.shape[:3], len(decisions))
+    if forced is not None:
+        mask = mask & ~forced.valid.unflatten(-1, (len(decisions), -1)).all(-1)
+    return Rollouts(
+        position=path[..., :2],
+        heading=path[..., 2],
+        decision=torch.stack(decisions, dim=3),
+        decision_mask=mask,
+        log_prob=torch.where(mask, torch.stack(log_probs, dim=3), 0.0),
+        draws=draws,
+        goals=goals,
+        forced=forced,
+    )
+
+
+def _join(forces: list[AgentStates | None], path: Float[Tensor, "B N A T 3"]) -> AgentStates | None:
+    """Imposed states of all steps; None where nothing was imposed at all."""
+    if all(f is None for f in forces):
+        return None
+    pieces = []
+    for part, f in zip(path.chunk(len(forces), dim=3), forces):
+        if f is None:
+            f = AgentStates(part[..., :2], part[..., 2], torch.zeros_like(part[..., 0], dtype=torch.bool))
+        pieces.append(f)
+    return AgentStates(
+        torch.cat([p.position for p in pieces], 3),
+        torch.cat([p.heading for p in pieces], 3),
+        torch.cat([p.valid for p in pieces], 3),
+    )

@@ -1,0 +1,105 @@
+"""Scenarios side by side: padded tensors of the simulated agents, in the map frame."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+
+from rlftsim.errors import DataError
+from rlftsim.scenario.types import CURRENT_STEP, Scenario
+
+
+@dataclass(frozen=True, eq=False)
+class ScenarioBatch:
+    """B scenarios, their simulated agents (valid at the current step, track order) padded to A.
+
+    Frame: map, i.e. world minus `origin` (whole metres, exact in float32). Padding has `agent_mask` False and zeros elsewhere.
+    S is the largest number of recorded steps; a shorter record is invalid beyond its end.
+    """
+
+    scenarios: tuple[Scenario, ...]
+    origin: Float[Tensor, "B 2"]
+    """float64, metres, world frame."""
+    object_id: Int64[Tensor, "B A"]
+    object_type: Int64[Tensor, "B A"]
+    agent_mask: Bool[Tensor, "B A"]
+    """True = a simulated agent, False = padding."""
+    evaluated_mask: Bool[Tensor, "B A"]
+    position: Float[Tensor, "B A S 2"]
+    z: Float[Tensor, "B A S"]
+    heading: Float[Tensor, "B A S"]
+    velocity: Float[Tensor, "B A S 2"]
+    size: Float[Tensor, "B A 3"]
+    """Length, width, height at the current step."""
+    valid: Bool[Tensor, "B A S"]
+
+    @property
+    def num_scenarios(self) -> int:
+        """B."""
+        return len(self.scenarios)
+
+    @property
+    def device(self) -> torch.device:
+        """Where the tensors live."""
+        return self.position.device
+
+    def to(self, device: torch.device | str) -> "ScenarioBatch":
+        """The same batch on another device."""
+        moved = {f.name: v.to(device) for f in fields(self) if isinstance(v := getattr(self, f.name), Tensor)}
+        return replace(self, **moved)
+
+
+def collate(scenarios: Sequence[Scenario], *, max_agents: int | None = None) -> ScenarioBatch:
+    """Batch of scenarios in the map frame.
+
+    Args:
+        scenarios: at least one.
+        max_agents: pad to this many agents; None = as many as the fullest scenario has.
+
+    Raises:
+        DataError: no scenario, or a scenario with more agents than `max_agents`.
+    """
+    if not scenarios:
+        raise DataError("cannot batch 0 scenarios: hand over at least one.")
+    counts = [len(s.simulated_indices) for s in scenarios]
+    num_agents = max(counts) if max_agents is None else max_agents
+    if max(counts) > num_agents:
+        fullest = scenarios[counts.index(max(counts))]
+        raise DataError(f"{fullest.scenario_id}: {max(counts)} agents do not fit max_agents={num_agents}: raise it.")
+    num_steps = max(s.num_steps for s in scenarios)
+    rows = [_agent_rows(s, num_agents, num_steps) for s in scenarios]
+    stacked = {name: torch.from_numpy(np.stack([row[name] for row in rows])) for name in rows[0]}
+    return ScenarioBatch(scenarios=tuple(scenarios), **stacked)
+
+
+def _agent_rows(scenario: Scenario, num_agents: int, num_steps: int) -> dict[str, np.ndarray]:
+    """One scenario's agents as padded arrays, by field name of `ScenarioBatch`."""
+    tracks, chosen = scenario.tracks, scenario.simulated_indices
+    valid = _pad(tracks.valid[chosen], num_agents, num_steps)
+    centred = tracks.position[chosen].copy()
+    centred[..., :2] -= scenario.origin
+    centred[~tracks.valid[chosen]] = 0
+    return {
+        "origin": scenario.origin,
+        "object_id": _pad(tracks.object_id[chosen], num_agents),
+        "object_type": _pad(tracks.object_type[chosen].astype(np.int64), num_agents),
+        "agent_mask": _pad(np.ones(len(chosen), bool), num_agents),
+        "evaluated_mask": _pad(np.isin(chosen, scenario.evaluated_indices), num_agents),
+        "position": _pad(centred[..., :2], num_agents, num_steps),
+        "z": _pad(centred[..., 2], num_agents, num_steps),
+        "heading": _pad(tracks.heading[chosen], num_agents, num_steps) * valid,
+        "velocity": _pad(tracks.velocity[chosen], num_agents, num_steps) * valid[..., None],
+        "size": _pad(tracks.size[chosen, CURRENT_STEP], num_agents),
+        "valid": valid,
+    }
+
+
+def _pad(array: np.ndarray, rows: int, columns: int | None = None) -> np.ndarray:
+    """Zeros appended along the first axis, and along the second where `columns` is given."""
+    shape = (rows, *array.shape[1:]) if columns is None else (rows, columns, *array.shape[2:])
+    padded = np.zeros(shape, array.dtype)
+    padded[tuple(slice(0, n) for n in array.shape)] = array
+    return padded

@@ -1,0 +1,221 @@
+"""Map → map tokens: pieces of polyline of up to 5 m, each with a place, a direction and a kind.
+
+M map tokens. The rules are those of the public SMART code (polylines, their kinds, 5 m windows), in array form.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, Int8, Int64
+from torch import Tensor
+
+from rlftsim.geometry import rotate
+from rlftsim.scenario.batch import ScenarioBatch
+from rlftsim.scenario.types import CURRENT_STEP, LightState, MapFeatures, MapFeatureType, Scenario
+
+SPACING_M = 0.5
+WINDOW = 11
+"""Points of a window: 5 m."""
+MAX_GAP_M = 3.0
+NO_MAP_POSITION_M = 60_000.0
+"""Where the single dummy token of a scenario without map stands: out of everybody's reach."""
+
+NUM_TYPES, NUM_KINDS, NUM_LIGHTS = 10, 4, 5
+
+_TYPE_OF_FEATURE = {0: 1, 1: 0, 2: 1, 3: 3, 14: 4, 15: 4, 16: 5, 18: 9, 19: 9, 20: 9}
+_TYPE_OF_FEATURE |= {5: 8, 6: 6, 7: 7, 8: 8, 9: 6, 10: 6, 11: 7, 12: 8, 13: 8}
+STOP_SIGN_LANE_TYPE = 2
+_LIGHT_OF_STATE = {
+    LightState.UNKNOWN: 1,
+    LightState.ARROW_STOP: 2,
+    LightState.STOP: 2,
+    LightState.FLASHING_STOP: 2,
+    LightState.ARROW_GO: 3,
+    LightState.GO: 3,
+    LightState.ARROW_CAUTION: 4,
+    LightState.CAUTION: 4,
+    LightState.FLASHING_CAUTION: 4,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class MapPieces:
+    """The map tokens of one scenario before a vocabulary is applied. World frame, float32."""
+
+    points: Float32[np.ndarray, "M 3 2"]
+    """Begin, middle and end (0, 2.5, 5 m of a whole piece)."""
+    heading: Float32[np.ndarray, "M"]
+    """Direction at the begin."""
+    type: Int8[np.ndarray, "M"]
+    """0 freeway, 1 street, 2 lane with stop sign, 3 bicycle lane, 4 road edge, 5 median, 6 broken, 7 solid, 8 double line, 9 polygon."""
+    kind: Int8[np.ndarray, "M"]
+    """0 lane, 1 road edge, 2 road line, 3 polygon."""
+    light: Int8[np.ndarray, "M"]
+    """Traffic light of the lane at the current step: 0 none, 1 unknown, 2 stop, 3 go, 4 caution."""
+    windows: Float32[np.ndarray, "W 11 2"]
+    """The whole 5 m windows in their own frame (start at the origin, heading 0): what a vocabulary is clustered from."""
+
+
+@dataclass(frozen=True, eq=False)
+class MapTokens:
+    """Map tokens of a batch, map frame, padded to M."""
+
+    position: Float[Tensor, "B M 2"]
+    heading: Float[Tensor, "B M"]
+    token_id: Int64[Tensor, "B M"]
+    type: Int64[Tensor, "B M"]
+    kind: Int64[Tensor, "B M"]
+    light: Int64[Tensor, "B M"]
+    token_mask: Bool[Tensor, "B M"]
+
+
+def tokenize_map(batch: ScenarioBatch, prototypes: Float[Tensor, "V 11 2"]) -> MapTokens:
+    """Map tokens of a batch: each piece named by the nearest prototype (points 0, 5, 10; sum of squared distances)."""
+    pieces = [split_map(scenario) for scenario in batch.scenarios]
+    width = max(len(p.heading) for p in pieces)
+
+    def padded(arrays: list[np.ndarray], dtype: torch.dtype) -> Tensor:
+        out = torch.zeros((len(arrays), width, *arrays[0].shape[1:]), dtype=dtype)
+        for row, array in zip(out, arrays):
+            row[: len(array)] = torch.from_numpy(array).to(dtype)
+        return out.to(batch.device)
+
+    centred = [(p.points - s.origin).astype(np.float32) for p, s in zip(pieces, batch.scenarios)]
+    points = padded(centred, torch.float32)
+    heading = padded([p.heading for p in pieces], torch.float32)
+    local = rotate(points - points[:, :, :1], -heading[..., None])  # [B, M, 3, 2]
+    return MapTokens(
+        position=points[:, :, 0],
+        heading=heading,
+        token_id=_nearest_prototype(local, prototypes.to(batch.device)[:, [0, 5, 10]]),
+        type=padded([p.type for p in pieces], torch.int64),
+        kind=padded([p.kind for p in pieces], torch.int64),
+        light=padded([p.light for p in pieces], torch.int64),
+        token_mask=padded([np.ones(len(p.heading), bool) for p in pieces], torch.bool),
+    )
+
+
+def _nearest_prototype(local: Float[Tensor, "B M 3 2"], prototypes: Float[Tensor, "V 3 2"]) -> Int64[Tensor, "B M"]:
+    """Index of the prototype with the smallest sum of squared distances, lowest index on ties."""
+    flat, table = local.flatten(2), prototypes.flatten(1)
+    return torch.stack(
+        [torch.cdist(rows, table, compute_mode="donot_use_mm_for_euclid_dist").argmin(-1) for rows in flat]
+    )
+
+
+@lru_cache(maxsize=4096)
+def split_map(scenario: Scenario) -> MapPieces:
+    """Cut a scenario's map into pieces of up to 5 m. Cached by the scenario's identity.
+
+    A scenario without any usable polyline gets one dummy piece far away from everything.
+    """
+    order = _polyline_order(scenario.map_features)
+    stop_lanes = set(scenario.map_features.topology.stop_sign_lanes[:, 1].tolist())
+    lights = _lights_now(scenario)
+    groups: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    labels: list[tuple[int, int, int, int]] = []
+    for index, kind in order:
+        polyline = scenario.map_features.polyline(index)[:, :2]
+        if len(polyline) < 2:
+            continue
+        feature_type = int(scenario.map_features.feature_type[index])
+        lane_id = int(scenario.map_features.feature_id[index])
+        if kind == 3:
+            polyline = _polygon_sides(polyline)
+        type_ = _TYPE_OF_FEATURE[feature_type]
+        if kind == 0 and lane_id in stop_lanes and feature_type != MapFeatureType.LANE_BIKE:
+            type_ = STOP_SIGN_LANE_TYPE
+        points, heading, windows = _cut(polyline)
+        groups.append((points, heading, windows))
+        labels.append((len(heading), type_, kind, lights.get(lane_id, 0) if kind == 0 else 0))
+    if not sum(count for count, *_ in labels):
+        return _no_map()
+    counts = [count for count, *_ in labels]
+    type_column, kind_column, light_column = (
+        np.repeat(np.array([row[c] for row in labels], np.int8), counts) for c in (1, 2, 3)
+    )
+    points, heading, windows = (np.concatenate([g[i] for g in groups]) for i in range(3))
+    return MapPieces(points, heading, type_column, kind_column, light_column, windows)
+
+
+def _no_map() -> MapPieces:
+    zeros = np.zeros(1, np.int8)
+    points = np.full((1, 3, 2), NO_MAP_POSITION_M, np.float32)
+    return MapPieces(points, np.zeros(1, np.float32), zeros, zeros, zeros, np.zeros((0, WINDOW, 2), np.float32))
+
+
+def _polyline_order(features: MapFeatures) -> list[tuple[int, int]]:
+    """(feature index, kind): lanes, then road edges, road lines, polygons, each in file order."""
+    families = ((0, 1, 2, 3), (14, 15, 16), tuple(range(5, 14)), (18, 19, 20))
+    return [(int(i), kind) for kind, types in enumerate(families) for i in features.indices_of(types)]
+
+
+def _lights_now(scenario: Scenario) -> dict[int, int]:
+    """Light of each lane at the current step; the last one listed where a lane is listed twice."""
+    now = scenario.lights.step == CURRENT_STEP
+    states = (_LIGHT_OF_STATE.get(LightState(s), 1) for s in scenario.lights.state[now].tolist())
+    return dict(zip(scenario.lights.lane_id[now].tolist(), states))
+
+
+def _polygon_sides(polygon: np.ndarray) -> np.ndarray:
+    """A crosswalk-like polygon as its two longer sides, each there and back, a point every metre."""
+    a, b, c, d = polygon[[int(len(polygon) * share) for share in (0, 0.25, 0.5, 0.75)]]
+    sides = ((a, b), (c, d)) if np.hypot(*(b - a)) > np.hypot(*(d - a)) else ((a, d), (c, b))
+    lines = [_every_metre(start, end) for start, end in sides]
+    return np.concatenate([part for line in lines for part in (line, line[::-1])]).astype(np.float32)
+
+
+def _every_metre(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    length = float(np.hypot(*(end - start)))
+    if length == 0.0:
+        return np.stack([start, end])
+    along = np.arange(int(length) + 1)[:, None] / length
+    return np.concatenate([start + along * (end - start), end[None]])
+
+
+def _cut(polyline: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points [m, 3, 2] and headings [m] of the pieces of one polyline, and its whole windows [w, 11, 2] in their own frame.
+
+    The last point is dropped first and a polyline of at most 3 points gives nothing, as in the public SMART code.
+    """
+    points: list[np.ndarray] = [np.zeros((0, 3, 2))]
+    headings: list[np.ndarray] = [np.zeros(0)]
+    windows: list[np.ndarray] = [np.zeros((0, WINDOW, 2))]
+    polyline = polyline[:-1].astype(np.float64)
+    gaps = np.flatnonzero(np.hypot(*np.diff(polyline, axis=0).T) > MAX_GAP_M) + 1 if len(polyline) > 2 else None
+    for run in [] if gaps is None else np.split(polyline, gaps):
+        resampled = _resample(run)
+        if len(resampled) < 2:
+            continue
+        direction = np.diff(resampled, axis=0)
+        heading = np.arctan2(direction[:, 1], direction[:, 0])
+        heading = np.append(heading, heading[-1])
+        whole = max((len(resampled) - WINDOW) // (WINDOW - 1) + 1, 0)
+        starts = np.arange(whole) * (WINDOW - 1)
+        picks = starts[:, None] + np.array([0, 5, 10])
+        rest = np.arange(whole * (WINDOW - 1), len(resampled))
+        left = len(rest) - 1 if whole else len(rest)
+        if left >= 3:
+            picks = np.concatenate([picks, rest[np.linspace(0, len(rest) - 1, 3).astype(int)][None]])
+        points.append(resampled[picks])
+        headings.append(heading[picks[:, 0]])
+        windows.append(_local_windows(resampled, heading, starts))
+    return tuple(np.concatenate(part).astype(np.float32) for part in (points, headings, windows))  # type: ignore[return-value]
+
+
+def _resample(run: np.ndarray) -> np.ndarray:
+    """A point every half metre along a polyline, and its end point."""
+    lengths = np.hypot(*np.diff(run, axis=0).T)
+    along = np.concatenate([[0.0], np.cumsum(lengths)])
+    if len(run) < 2 or along[-1] == 0.0:
+        return run[:1]
+    at = np.append(np.arange(0.0, along[-1], SPACING_M), along[-1])
+    return np.stack([np.interp(at, along, run[:, c]) for c in (0, 1)], axis=-1)
+
+
+def _local_windows(points: np.ndarray, heading: np.ndarray, starts: np.ndarray) -> np.ndarray:
+    local = points[starts[:, None] + np.arange(WINDOW)] - points[starts][:, None]
+    cos, sin = np.cos(heading[starts])[:, None], np.sin(heading[starts])[:, None]
+    return np.stack([cos * local[..., 0] + sin * local[..., 1], cos * local[..., 1] - sin * local[..., 0]], axis=-1)

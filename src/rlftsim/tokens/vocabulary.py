@@ -1,0 +1,101 @@
+"""Templates of motion and of map pieces, and the file they live in.
+
+C = 3 classes (vehicle, pedestrian, cyclist), V motion tokens a class, six 10 Hz poses a token (step 0 is where it starts).
+Frame of a token: the agent at its start. A token's boxes have the size of the class, never of the agent.
+"""
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from jaxtyping import Bool, Float, Int64
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from rlftsim.errors import DataError
+from rlftsim.geometry import pose_of_corners
+from rlftsim.scenario.types import ObjectType
+
+STEPS_PER_TOKEN = 5
+CLASS_NAMES = ("vehicle", "pedestrian", "cyclist")
+CLASS_BOXES_M = ((4.8, 2.0), (1.0, 1.0), (2.0, 1.0))
+"""Length and width of the box a class is matched with."""
+
+_CLASS_OF_TYPE = torch.tensor([0, 0, 1, 2, 0])
+FORMAT = "rlftsim-vocabulary-1"
+
+
+def class_of_type(object_type: Int64[Tensor, "..."]) -> Int64[Tensor, "..."]:
+    """Class index of WOMD object types. Types that are none of the three (unset, other) move as vehicles: they must be
+    simulated, and a box that may drive is the least wrong."""
+    return _CLASS_OF_TYPE.to(object_type.device)[object_type.clamp(0, ObjectType.OTHER)]
+
+
+@dataclass(frozen=True, eq=False)
+class Vocabulary:
+    """Motion tokens of each class and prototypes of map pieces."""
+
+    corners: Float[Tensor, "C V 6 4 2"]
+    """Boxes at steps 0..5 in the frame of the start pose; rows past a class's own number of tokens are zero."""
+    token_mask: Bool[Tensor, "C V"]
+    """True = the token exists. Token 0 of every class stands exactly still."""
+    map_prototypes: Float[Tensor, "P 11 2"]
+    """Pieces of 5 m, a point every 0.5 m, start at the origin with heading 0."""
+    origin: str = ""
+    """The command, data and seed that made it."""
+
+    @property
+    def num_tokens(self) -> int:
+        """V."""
+        return self.corners.shape[1]
+
+    def end_corners(self) -> Float[Tensor, "C V 4 2"]:
+        """Box at the end of each token."""
+        return self.corners[:, :, STEPS_PER_TOKEN]
+
+    def poses(self) -> Float[Tensor, "C V 5 3"]:
+        """x, y, heading at steps 1..5 of each token."""
+        position, heading = pose_of_corners(self.corners[:, :, 1:])
+        return torch.cat([position, heading[..., None]], -1)
+
+    def to(self, device: torch.device | str) -> "Vocabulary":
+        """The same vocabulary on another device."""
+        return replace(
+            self,
+            corners=self.corners.to(device),
+            token_mask=self.token_mask.to(device),
+            map_prototypes=self.map_prototypes.to(device),
+        )
+
+    def save(self, path: Path) -> None:
+        """Write to `path` (safetensors), by way of a temporary name."""
+        tensors = {
+            "corners": self.corners.contiguous(),
+            "token_mask": self.token_mask.contiguous(),
+            "map_prototypes": self.map_prototypes.contiguous(),
+        }
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial = path.with_name(path.name + ".partial")
+        save_file(tensors, partial, metadata={"format": FORMAT, "origin": json.dumps(self.origin)})
+        partial.replace(path)
+
+    @classmethod
+    def load(cls, path: Path) -> "Vocabulary":
+        """Read what `save` wrote.
+
+        Raises:
+            DataError: no such file, damaged, or not a vocabulary.
+        """
+        try:
+            with safe_open(path, framework="pt") as file:
+                metadata = file.metadata() or {}
+                if metadata.get("format") != FORMAT:
+                    raise DataError(f"{path}: not a vocabulary of this version: build one with `rlftsim tokens`.")
+                names = ("corners", "token_mask", "map_prototypes")
+                return cls(*(file.get_tensor(n) for n in names), origin=json.loads(metadata["origin"]))
+        except FileNotFoundError:
+            raise DataError(f"{path}: no such vocabulary: build one with `rlftsim tokens`.") from None
+        except (SafetensorError, OSError) as error:
+            raise DataError(f"{path}: damaged vocabulary ({error}): build it again with `rlftsim tokens`.") from None
