@@ -11,6 +11,7 @@ from rlftsim.scenario.synthetic.bodies import (
     build_vehicle,
     drag_rear_axle,
     lane_change_offset,
+    smooth_over_time,
     smoother_step,
 )
 from rlftsim.scenario.types import ObjectType
@@ -51,6 +52,13 @@ def test_heading_in_a_curve_lags_behind_the_bumper():
 
 def test_smoother_step_rises_from_zero_to_one():
     np.testing.assert_allclose(smoother_step(np.array([-1.0, 0.0, 0.5, 1.0, 2.0])), [0.0, 0.0, 0.5, 1.0, 1.0])
+
+
+def test_smoothing_keeps_straight_motion_and_standstill():
+    line = np.stack([np.arange(60.0), np.full(60, 3.0)], axis=1)
+    smooth = smooth_over_time(line, 0.2)
+    np.testing.assert_allclose(smooth[10:-10], line[10:-10], atol=1e-9)
+    np.testing.assert_allclose(smooth[:, 1], 3.0)
 
 
 def test_lane_change_offset_removes_the_jump_between_lanes():

@@ -36,9 +36,7 @@ def test_corners_go_counter_clockwise_from_the_front_left():
     ids=["bumpers meet", "bumpers apart", "corner inside", "corner outside"],
 )
 def test_boxes_overlap(offset, heading, expected):
-    found = boxes_overlap(
-        np.zeros((1, 2)), np.zeros(1), CAR, np.array([offset], dtype=float), np.array([heading]), CAR
-    )
+    found = boxes_overlap(np.zeros((1, 2)), np.zeros(1), CAR, np.array([offset], dtype=float), np.array([heading]), CAR)
     assert bool(found[0]) is expected
 
 

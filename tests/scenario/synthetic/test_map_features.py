@@ -46,7 +46,7 @@ def test_a_ring_cut_open_continues_over_its_seam():
 
 def test_offset_to_the_left_of_a_line_along_x_is_above_it():
     line = np.array([[0.0, 0.0], [5.0, 0.0], [10.0, 0.0]])
-    np.testing.assert_allclose(offset_polyline(line, 2.0), line + [0.0, 2.0])
+    np.testing.assert_allclose(offset_polyline(line, 2.0), line + np.array([0.0, 2.0]))
 
 
 def test_offset_keeps_its_distance_at_a_corner():

@@ -25,9 +25,7 @@ def test_streets_join_their_nodes(kind, seed):
 
 
 def test_a_quiet_quarter_has_few_lights():
-    lights = [
-        sum(node.control == "traffic_light" for node in draw("quiet", seed).nodes) for seed in range(10)
-    ]
+    lights = [sum(node.control == "traffic_light" for node in draw("quiet", seed).nodes) for seed in range(10)]
     busy = [sum(node.control == "traffic_light" for node in draw("city", seed).nodes) for seed in range(10)]
     assert sum(lights) < 0.3 * sum(busy)
 

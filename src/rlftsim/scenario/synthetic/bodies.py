@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-from scipy.ndimage import gaussian_filter1d
 
 from rlftsim.scenario.types import STEP_S, ObjectType
 
@@ -105,8 +104,15 @@ def drag_rear_axle(
     return np.unwrap(heading)
 
 
-def _smooth(values: Float[np.ndarray, "n ..."], sigma_s: float) -> Float[np.ndarray, "n ..."]:
-    return gaussian_filter1d(values, sigma_s / STEP_S, axis=0, mode="nearest")
+def smooth_over_time(values: Float[np.ndarray, "n ..."], sigma_s: float) -> Float[np.ndarray, "n ..."]:
+    """Values convolved with a Gaussian along the steps; before the first and after the last step they are held."""
+    sigma = sigma_s / STEP_S
+    radius = int(np.ceil(4 * sigma))
+    kernel = np.exp(-0.5 * (np.arange(-radius, radius + 1) / sigma) ** 2)
+    columns = values.reshape(len(values), -1)
+    padded = np.pad(columns, ((radius, radius), (0, 0)), mode="edge")
+    smooth = [np.convolve(column, kernel / kernel.sum(), mode="valid") for column in padded.T]
+    return np.stack(smooth, axis=1).reshape(values.shape)
 
 
 def _central_differences(position: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
@@ -136,7 +142,7 @@ def build_vehicle(
     for step, distance in zip(path.change_steps, path.change_left_m, strict=True):
         left = left + lane_change_offset(driven, path.speed_mps, step, distance)
     normal = np.stack([-path.direction[:, 1], path.direction[:, 0]], axis=1)
-    bumper = _smooth(path.centre + left[:, None] * normal, BUMPER_SMOOTHING_S)
+    bumper = smooth_over_time(path.centre + left[:, None] * normal, BUMPER_SMOOTHING_S)
     heading = drag_rear_axle(bumper, size[0], path.direction[0])
     centre = bumper - size[0] / 2 * np.stack([np.cos(heading), np.sin(heading)], axis=1)
     return Body(
@@ -161,14 +167,14 @@ def build_pedestrian(
         heading_rad: heading used when the pedestrian never walks.
         size: length, width, height in metres.
     """
-    smooth = _smooth(position, WALK_SMOOTHING_S)
+    smooth = smooth_over_time(position, WALK_SMOOTHING_S)
     velocity = _central_differences(smooth)
     walking = np.flatnonzero(np.linalg.norm(velocity, axis=1) > WALK_HEADING_SPEED_MPS)
     heading = np.full(len(position), heading_rad)
     if len(walking):
         measured = np.unwrap(np.arctan2(velocity[walking, 1], velocity[walking, 0]))
         latest = np.clip(np.searchsorted(walking, np.arange(len(position)), side="right") - 1, 0, None)
-        heading = _smooth(measured[latest], WALK_SMOOTHING_S)
+        heading = smooth_over_time(measured[latest], WALK_SMOOTHING_S)
     return Body(ObjectType.PEDESTRIAN, first_step, smooth, heading, velocity, size)
 
 
@@ -184,7 +190,7 @@ class LabelNoise:
 
 def draw_label_noise(rng: np.random.Generator) -> LabelNoise:
     """Noise of one agent: median 10 mm along, 4 mm across, 1 mrad, with a long tail."""
-    along = float(rng.gamma(2.0, 0.0058))
+    along = float(rng.gamma(1.6, 0.0078))
     return LabelNoise(along, 0.4 * along, 0.1 * along, 3.0 * along)
 
 

@@ -58,7 +58,9 @@ class MapCropper:
         height = on_grid(self.ground.height_at(points), HEIGHT_GRID_PER_M)
         is_lane = np.array([feature.feature_type in LANE_TYPES for _, feature, _ in kept])
         speed = np.array([feature.speed_mps for _, feature, _ in kept]) * MPH_PER_MPS * is_lane
-        lengths = {feature_id: len(piece) for feature_id, feature, piece in kept if feature.feature_type in LANE_TYPES}
+        lanes = [row for row in kept if row[1].feature_type in LANE_TYPES]
+        lengths = {feature_id: len(piece) for feature_id, _, piece in lanes}
+        links = _links_not_cut(self.network_map.entry_exit, lanes)
         return MapFeatures(
             feature_id=np.array([feature_id for feature_id, _, _ in kept], np.int64),
             feature_type=np.array([feature.feature_type for _, feature, _ in kept], np.int8),
@@ -66,6 +68,7 @@ class MapCropper:
             offsets=np.append(0, np.cumsum([len(piece) for _, _, piece in kept])).astype(np.int64),
             topology=self._topology(
                 lengths,
+                links,
                 on_grid(np.rint(speed / 5.0) * 5.0, 1),
                 np.array([feature.interpolating for _, feature, _ in kept], bool),
                 {feature_id for feature_id, _, _ in kept},
@@ -73,10 +76,14 @@ class MapCropper:
         )
 
     def _topology(
-        self, lengths: dict[int, int], speed_mph: np.ndarray, interpolating: np.ndarray, present: set[int]
+        self,
+        lengths: dict[int, int],
+        links: list[tuple[int, int]],
+        speed_mph: np.ndarray,
+        interpolating: np.ndarray,
+        present: set[int],
     ) -> LaneTopology:
         whole = self.network_map
-        links = [(a, b) for a, b in whole.entry_exit if a in lengths and b in lengths]
         neighbors = [
             (lane, side, other, 0, lengths[lane] - 1, 0, lengths[other] - 1)
             for lane, side, other in whole.neighbors
@@ -91,6 +98,15 @@ class MapCropper:
             speed_limit_mph=speed_mph,
             interpolating=interpolating,
         )
+
+
+def _links_not_cut(
+    links: tuple[tuple[int, int], ...], lanes: list[tuple[int, Feature, np.ndarray]]
+) -> list[tuple[int, int]]:
+    """Links between lanes that still meet: the end of the first and the start of the second are both in the crop."""
+    starts = {lane_id for lane_id, feature, piece in lanes if np.array_equal(piece[0], feature.points[0])}
+    ends = {lane_id for lane_id, feature, piece in lanes if np.array_equal(piece[-1], feature.points[-1])}
+    return [(lane, after) for lane, after in links if lane in ends and after in starts]
 
 
 def _rows(rows: list[tuple[int, ...]], columns: int) -> np.ndarray:

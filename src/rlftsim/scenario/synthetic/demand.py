@@ -37,6 +37,8 @@ _SIZES = {
 }
 
 
+NUM_GAITS = 8
+"""Kinds of pedestrians by how fast they walk."""
 VEHICLES_PER_LANE_AND_S = {"city": (0.02, 0.04), "quiet": (0.04, 0.075), "freeway": (0.25, 0.4)}
 """Range of the vehicles that enter per second and lane; much more is gridlock within minutes."""
 
@@ -77,6 +79,11 @@ def _type_xml(rng: np.random.Generator, kind: RoadUserType) -> str:
         f'tau="{rng.uniform(0.8, 2.0):.2f}" minGap="{rng.uniform(1.2, 3.2):.2f}" '
         f'speedFactor="normc({mean:.3f},0.08,0.6,1.5)"/>'
     )
+
+
+def _walker_xml(rng: np.random.Generator, gait: int) -> str:
+    factor = rng.uniform(0.55, 1.45)
+    return f'<vType id="walker{gait}" vClass="pedestrian" speedFactor="normc({factor:.2f},0.08,0.4,1.7)"/>'
 
 
 def _poisson_times(rng: np.random.Generator, rate_per_s: float) -> np.ndarray:
@@ -131,10 +138,13 @@ def _walks(rng: np.random.Generator, plan: StreetPlan) -> list[tuple[float, str]
     walks = []
     for time in _poisson_times(rng, rng.uniform(0.04, 0.24)):
         start, goal = rng.choice(streets, 2, replace=False, p=attraction)
-        size = int(rng.choice([1, 2, 3], p=[0.75, 0.2, 0.05]))
+        size, gait = int(rng.choice([1, 2, 3], p=[0.75, 0.2, 0.05])), int(rng.integers(NUM_GAITS))
         for member in range(size):
             depart = time + 1.1 * member
-            row = f'<person id="p{len(walks)}" depart="{depart:.1f}" departPos="random"><personTrip from="{start}" to="{goal}" arrivalPos="random"/></person>'
+            row = (
+                f'<person id="p{len(walks)}" type="walker{gait}" depart="{depart:.1f}" departPos="random">'
+                f'<personTrip from="{start}" to="{goal}" arrivalPos="random"/></person>'
+            )
             walks.append((float(depart), row))
     return walks
 
@@ -148,6 +158,6 @@ def write_demand(plan: StreetPlan, rng: np.random.Generator, path: Path) -> dict
     types = draw_types(rng)
     departures = _vehicle_trips(rng, plan, types) + _walks(rng, plan)
     departures.sort(key=lambda row: row[0])
-    header = [_type_xml(rng, kind) for kind in types]
+    header = [_type_xml(rng, kind) for kind in types] + [_walker_xml(rng, gait) for gait in range(NUM_GAITS)]
     path.write_text("\n".join(["<routes>", *header, *(row for _, row in departures), "</routes>"]))
     return {kind.type_id: kind for kind in types}
