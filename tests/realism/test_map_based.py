@@ -12,6 +12,7 @@ from rlftsim.realism.map_based import (
     compute_distance_to_road_edge,
     compute_point_distance_to_road_edge,
 )
+from rlftsim.realism.rounding import compute_sqrt
 from rlftsim.realism.segment_search import CHUNK_SEGMENTS, find_nearest_segment
 
 CPU = torch.device("cpu")
@@ -93,7 +94,7 @@ def test_the_pruned_search_finds_what_a_full_search_finds(seed, num_polylines, m
     points, num_chunks = groups.flatten(0, 1), len(edges.segments.first_segment)
     rows = torch.arange(len(points)).repeat_interleave(num_chunks)
     chunks = torch.arange(num_chunks).repeat(len(points))
-    everything = _measure_road_edge(points[rows], edges.segments, chunks).view(len(points), -1)
+    everything = compute_sqrt(_measure_road_edge(points[rows], edges.segments, chunks)).view(len(points), -1)
     nearest = everything.argmin(-1)
     expected = edges.segments.first_segment[nearest // CHUNK_SEGMENTS] + nearest % CHUNK_SEGMENTS
     assert torch.equal(found.flatten(), expected)
