@@ -134,6 +134,15 @@ def test_states_of_another_shape_or_precision_are_refused(scenario):
         dataclasses.replace(states, repeat=0)
 
 
+def test_values_that_are_no_numbers_are_found_on_request(scenario):
+    states = draw_rollouts(scenario, 2, seed=1)
+    states.check_finite()
+    states.y[1, 3, 7] = float("nan")
+    with pytest.raises(DataError, match=f"object id {states.object_id[3]} in rollout 1 at future step 7"):
+        states.check_finite()
+    assert score(scenario, states).meta_metric.isfinite()
+
+
 def test_a_scenario_without_future_is_refused(scenario):
     tracks = scenario.tracks
     cut = dataclasses.replace(
