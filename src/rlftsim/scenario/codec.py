@@ -1,7 +1,7 @@
 """Lossless compression of the arrays of a scenario.
 
-Neighbours along the last axis (steps of a track, points of a polyline) are alike. So an array becomes integers, then differences or
-differences of differences along the last axis, then bytes sorted by significance, then zstd:
+Neighbours along the last axis (steps of a track, points of a polyline) are alike. So an array becomes integers, then
+differences or differences of differences along the last axis, then bytes sorted by significance, then zstd:
 
     float32 on a binary grid (all values are multiples of 2**-k)   the multiples
     other floats                                                   their bits

@@ -1,4 +1,6 @@
-"""A data set: a folder of Arrow shards, an index and a manifest. Everything is in it; what it was made from is never opened again.
+"""A data set: a folder of Arrow shards, an index and a manifest.
+
+Everything is in it; what it was made from is never opened again.
 
     manifest.json       schema version, shards with checksums and sources, counts, licence note; written last
     index.parquet       one row per scenario: where it is and what is in it
@@ -11,11 +13,14 @@ Files are written under temporary names and renamed, so a file under its own nam
 import json
 import os
 import shutil
-from collections import Counter, OrderedDict
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
+from functools import lru_cache
 from pathlib import Path
+from threading import Lock
 from types import TracebackType
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -30,6 +35,7 @@ from rlftsim.scenario.types import Scenario
 FORMAT = "rlftsim scenarios"
 MANIFEST, INDEX, INCOMPLETE, SHARDS = "manifest.json", "index.parquet", "INCOMPLETE", "shards"
 DEFAULT_LICENCE_NOTE = "The licence of the source data applies to this data set."
+_MAX_OPEN_SHARDS = 128  # each holds a file descriptor; systems allow 256 to 1024
 INDEX_SCHEMA = pa.schema([*INDEX_FIELDS, pa.field("shard", pa.string()), pa.field("row", pa.int32())])
 
 
@@ -72,8 +78,8 @@ class Manifest:
 class ScenarioDataset:
     """Scenarios of a data set's folder, by position or by id.
 
-    As long as a scenario is in the cache the same object comes back, so what is derived from it can be cached by identity. Can be
-    handed to other processes: each opens the files itself.
+    As long as a scenario is in the cache the same object comes back, so what is derived from it can be cached by
+    identity. Can be handed to other processes: each opens the files itself.
 
     Args:
         folder: the data set.
@@ -95,8 +101,9 @@ class ScenarioDataset:
         self._shard_names: list[str] = self.index["shard"].to_pylist()
         self._rows: list[int] = self.index["row"].to_pylist()
         self._position = {scenario_id: i for i, scenario_id in enumerate(self.scenario_ids)}
-        self._readers: dict[str, ShardReader] = {}
-        self._cache: OrderedDict[int, Scenario] = OrderedDict()
+        self._lock = Lock()
+        self._reader = lru_cache(_MAX_OPEN_SHARDS)(lambda name: ShardReader(self.folder / name))
+        self._decoded = lru_cache(cache_size)(self._decode)
 
     def __len__(self) -> int:
         return len(self.scenario_ids)
@@ -110,18 +117,8 @@ class ScenarioDataset:
         """
         if not -len(self) <= position < len(self):
             raise IndexError(f"position {position} in a data set of {len(self)} scenarios")
-        position = position % len(self)
-        if position in self._cache:
-            self._cache.move_to_end(position)
-            return self._cache[position]
-        name = self._shard_names[position]
-        if name not in self._readers:
-            self._readers[name] = ShardReader(self.folder / name)
-        scenario = self._readers[name].read(self._rows[position])
-        self._cache[position] = scenario
-        while len(self._cache) > self.cache_size:
-            self._cache.popitem(last=False)
-        return scenario
+        with self._lock:  # or two threads would get two objects for one scenario
+            return self._decoded(position % len(self))
 
     def __iter__(self) -> Iterator[Scenario]:
         return (self[position] for position in range(len(self)))
@@ -143,9 +140,14 @@ class ScenarioDataset:
             raise DataError(f"{self.folder}{of_split} has no scenario {scenario_id!r}")
         return self[self._position[scenario_id]]
 
+    def _decode(self, position: int) -> Scenario:
+        return self._reader(self._shard_names[position]).read(self._rows[position])
+
 
 class DatasetWriter:
-    """Writes a new data set; use it as a context manager. The folder appears, whole, when the block ends without an error.
+    """Writes a new data set; use it as a context manager.
+
+    The folder appears, whole, when the block ends without an error.
 
     Args:
         folder: must not exist or be empty.
@@ -168,7 +170,7 @@ class DatasetWriter:
         self.folder = Path(folder)
         if self.folder.exists() and (not self.folder.is_dir() or any(self.folder.iterdir())):
             raise DataError(f"{self.folder} is not an empty folder: choose another one or delete it")
-        self._temporary = self.folder.with_name(f".{self.folder.name}.{os.getpid()}.tmp")
+        self._temporary = self.folder.absolute().with_name(f".{self.folder.name}.{os.getpid()}.tmp")
         self._scenarios_per_shard = scenarios_per_shard
         self._licence_note = licence_note
         self._provenance = dict(provenance or {})
@@ -269,9 +271,12 @@ def write_index_and_manifest(
     licence_note: str = DEFAULT_LICENCE_NOTE,
     provenance: Mapping[str, object] | None = None,
 ) -> Manifest:
-    """Write the index of the given shards, then the manifest. Of scenarios with the same id the first stays in the index."""
+    """Write the index of the given shards, then the manifest.
+
+    Of scenarios with the same id only the first is in the index.
+    """
     entries = sorted(entries, key=lambda entry: entry.file)
-    table, duplicates = _build_index(folder, entries)
+    table, duplicates = build_index(folder, entries)
     with_temporary_name(folder / INDEX, lambda path: pq.write_table(table, path, compression="zstd"))
     manifest = Manifest(
         shards=tuple(entries),
@@ -295,6 +300,11 @@ def read_manifest(folder: str | os.PathLike[str]) -> Manifest:
     folder = Path(folder)
     if (folder / INCOMPLETE).exists():
         raise DataError(f"the conversion to {folder} was not finished: run the same convert command again, it goes on")
+    return parse_manifest(folder)
+
+
+def parse_manifest(folder: Path) -> Manifest:
+    """Manifest of a data set as `read_manifest` gives it, even where a conversion is unfinished."""
     try:
         values = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -315,7 +325,7 @@ def read_manifest(folder: str | os.PathLike[str]) -> Manifest:
         raise DataError(f"{folder / MANIFEST} is damaged ({error}): convert again") from error
 
 
-def shard_entry_from_json(values: Mapping[str, object]) -> ShardEntry:
+def shard_entry_from_json(values: Mapping[str, Any]) -> ShardEntry:
     """Inverse of `asdict` for a shard's entry."""
     skipped = tuple(SkippedRecord(**record) for record in values["skipped"])
     return ShardEntry(**{**values, "skipped": skipped})
@@ -336,7 +346,8 @@ def with_temporary_name(path: Path, write: Callable[[Path], object]) -> None:
     os.replace(temporary, path)
 
 
-def _build_index(folder: Path, entries: list[ShardEntry]) -> tuple[pa.Table, list[SkippedRecord]]:
+def build_index(folder: Path, entries: Iterable[ShardEntry]) -> tuple[pa.Table, list[SkippedRecord]]:
+    """Index of the given shards, read from them, and the scenarios left out because an earlier one has the same id."""
     tables, duplicates, first_place = [], [], {}
     for entry in entries:
         rows = ShardReader(folder / entry.file).index_rows()

@@ -66,8 +66,9 @@ def compute_index_row(scenario: Scenario, split: str) -> IndexRow:
 def classify_ego_manoeuvre(scenario: Scenario) -> Manoeuvre:
     """What the ego's logged track does from the current step to its last valid one.
 
-    Stationary: never faster than 2 m/s and it ends within 5 m. Else by the change of heading, turned continuously: below 30 degrees
-    straight (lane changes too), from 135 degrees a U-turn, in between left (counter-clockwise) or right.
+    Stationary: never faster than 2 m/s and it ends within 5 m. Else by the change of heading, turned continuously:
+    below 30 degrees straight (lane changes too), from 135 degrees a U-turn, in between left (counter-clockwise) or
+    right.
     """
     tracks, ego = scenario.tracks, scenario.ego_index
     steps = CURRENT_STEP + np.flatnonzero(tracks.valid[ego, CURRENT_STEP:])

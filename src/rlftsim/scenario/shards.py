@@ -1,7 +1,7 @@
 """Arrow shards: files of scenarios, one row each, every array an encoded column, memory-mapped for random access.
 
-A shard also holds its rows of the index, so the index can be rebuilt from the shards alone. Each row has a checksum over its encoded
-arrays that is checked whenever the row is read.
+A shard also holds its rows of the index, so the index can be rebuilt from the shards alone. Each row has a checksum
+over its encoded arrays that is checked whenever the row is read.
 """
 
 import hashlib
@@ -9,6 +9,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import asdict, fields
 from pathlib import Path
+from typing import Any
 
 import google_crc32c
 import numpy as np
@@ -22,8 +23,8 @@ from rlftsim.scenario.types import LaneTopology, LightStates, MapFeatures, Scena
 SCHEMA_VERSION = 1
 _ROWS_PER_BATCH = 16
 
-# Every array of a scenario and its dtype, in the order of the columns. `.x` and the like: one component of a vector per column,
-# because the components lie on different grids.
+# Every array of a scenario and its dtype, in the order of the columns. `.x` and the like: one component of a vector
+# per column, because the components lie on different grids.
 _ARRAY_DTYPES: Mapping[str, str] = {
     "timestamps_s": "float64",
     "tracks_to_predict": "int32",
@@ -169,7 +170,10 @@ class ShardReader:
             encoded = self._encoded(row)
             if _checksum(encoded) != self._table["checksum"][row].as_py():
                 raise ValueError("its checksum does not match")
-            arrays = {name: None if data is None else decode_array(data) for name, data in encoded.items()}
+            # None only where `types.py` allows it: the checksum has just been found right
+            arrays: dict[str, Any] = {
+                name: None if data is None else decode_array(data) for name, data in encoded.items()
+            }
             scenario_id = self._table["scenario_id"][row].as_py()
             return _from_arrays(scenario_id, self._table["ego_index"][row].as_py(), arrays)
         except (ValueError, OSError, pa.ArrowException) as error:

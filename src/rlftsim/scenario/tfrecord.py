@@ -2,8 +2,8 @@
 
     uint64 length | uint32 crc(length) | length bytes | uint32 crc(bytes)        little-endian, crc = masked crc32c
 
-A damaged checksum of the bytes costs one record. A damaged length costs the rest of the file, because only the length says where
-the next record starts.
+A damaged checksum of the bytes costs one record. A damaged length costs the rest of the file, because only the length
+says where the next record starts.
 """
 
 import logging
@@ -22,6 +22,8 @@ OnError = Literal["stop", "skip"]
 
 _HEADER = struct.Struct("<QI")
 _FOOTER = struct.Struct("<I")
+RECORD_OVERHEAD_BYTES = _HEADER.size + _FOOTER.size
+"""What a record takes in the file beside its own bytes."""
 _MASK_DELTA = 0xA282EAD8
 _GZIP_MAGIC = b"\x1f\x8b"
 
@@ -72,14 +74,16 @@ def read_records(
 
     Args:
         path: the file.
-        on_error: "stop" raises at the first damage; "skip" reports it and goes on with the next record, if that can be found.
+        on_error: "stop" raises at the first damage; "skip" reports it and goes on with the next record, if that can be
+            found.
         report: called with each skipped record, only under "skip".
 
     Yields:
         Number of the record in the file, from 0, and its bytes.
 
     Raises:
-        DataError: under "stop", damage: names file, record and cause. Always: the file does not exist or cannot be opened.
+        DataError: under "stop", damage: names file, record and cause. Always: the file does not exist or cannot be
+            opened.
     """
     path = Path(path)
     try:

@@ -1,7 +1,7 @@
 """Waymo Open Motion Dataset: TFRecord files of `Scenario` messages to `Scenario` objects, without TensorFlow.
 
-World coordinates become float32 here and nowhere else: the official evaluator rounds them so before it does anything. What a record
-stores where a state is not valid is kept as it is.
+World coordinates become float32 here and nowhere else: the official evaluator rounds them so before it does anything.
+What a record stores where a state is not valid is kept as it is.
 """
 
 import glob
@@ -84,26 +84,43 @@ def read_scenario_file(
 ) -> Iterator[tuple[int, Scenario]]:
     """Read one tfrecord file as `read_scenarios` does; yields the number of the record, from 0, with its scenario."""
     for record, data in read_records(path, on_error=on_error, report=report):
-        try:
-            scenario = scenario_from_bytes(data)
-        except DataError as error:
-            skipped = SkippedRecord(str(path), record, str(error))
-            if on_error == "stop":
-                raise DataError(str(skipped)) from error
-            report(skipped)
-            continue
-        yield record, scenario
+        scenario = scenario_or_report(path, record, data, on_error=on_error, report=report)
+        if scenario is not None:
+            yield record, scenario
+
+
+def scenario_or_report(
+    path: str | os.PathLike[str],
+    record: int,
+    data: bytes,
+    *,
+    on_error: OnError,
+    report: Callable[[SkippedRecord], None],
+) -> Scenario | None:
+    """Scenario of record number `record` of a file; None if it is bad, which is reported.
+
+    Raises:
+        DataError: under "stop", the record is bad: names file, record and cause.
+    """
+    try:
+        return scenario_from_bytes(data)
+    except DataError as error:
+        skipped = SkippedRecord(str(path), record, str(error))
+        if on_error == "stop":
+            raise DataError(str(skipped)) from error
+        report(skipped)
+        return None
 
 
 def scenario_from_bytes(record: bytes) -> Scenario:
     """Scenario of one serialized WOMD `Scenario` message with 91 steps, or 11 as in the test splits.
 
-    Map, lights, tracks to predict and objects of interest may be missing. Map features of a kind that WOMD did not have when this was
-    written are left out.
+    Map, lights, tracks to predict and objects of interest may be missing. Map features of a kind that WOMD did not
+    have when this was written are left out.
 
     Raises:
-        DataError: the bytes are no such message; there is no ego or it is not valid at step 10; a valid state or a map point is not
-            finite; the number of steps is another one; a track to predict does not exist.
+        DataError: the bytes are no such message; there is no ego or it is not valid at step 10; a valid state or a map
+            point is not finite; the number of steps is another one; a track to predict does not exist.
     """
     try:
         message = womd_pb2.Scenario.FromString(record)
@@ -114,6 +131,8 @@ def scenario_from_bytes(record: bytes) -> Scenario:
     if not message.scenario_id or not message.tracks:
         missing = "tracks" if message.scenario_id else "scenario_id"
         raise DataError(f"not a WOMD Scenario message, or an empty one: it has no {missing}")
+    if not isinstance(message.scenario_id, str):  # the parser hands out bytes where they are not UTF-8
+        raise DataError(f"not a WOMD Scenario message, or a damaged one: its scenario_id is {message.scenario_id!r}")
     tracks = _read_tracks(message)
     num_steps = tracks.valid.shape[1]
     ego_index = _read_ego_index(message, tracks)
@@ -139,7 +158,8 @@ def _read_tracks(message: womd_pb2.Scenario) -> Tracks:
             )
     if num_steps not in (HISTORY_STEPS, TOTAL_STEPS):
         raise DataError(
-            f"{num_steps} steps instead of {TOTAL_STEPS} (or {HISTORY_STEPS} in a test split): take WOMD's 9-second files, not the 20-second ones"
+            f"{num_steps} steps instead of {TOTAL_STEPS} (or {HISTORY_STEPS} in a test split): "
+            "take WOMD's 9-second files, not the 20-second ones"
         )
     states = np.array(
         [

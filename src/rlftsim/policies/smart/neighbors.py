@@ -11,6 +11,9 @@ from torch import Tensor
 
 from rlftsim.geometry import angle_between, heading_vector, wrap_angle
 
+PAIRS_PER_PIECE = 1 << 18
+"""Distances that are looked at together: they fit the processor's cache."""
+
 
 @dataclass(frozen=True, eq=False)
 class Neighbors:
@@ -23,22 +26,32 @@ class Neighbors:
 def nearest_within(
     targets: Float[Tensor, "... n 2"],
     sources: Float[Tensor, "... m 2"],
-    allowed: Bool[Tensor, "... n m"],
+    allowed: Bool[Tensor, "... n m"] | None,
     *,
     radius_m: float,
     limit: int | None,
 ) -> tuple[Int64[Tensor, "... n K"], Bool[Tensor, "... n K"]]:
-    """Sources nearer than a radius (strictly), nearest first where a limit binds.
+    """Sources nearer than a radius (strictly), nearest first where a limit binds; `allowed` None = all of them.
 
     K is the limit, or the largest number of neighbours that occurs; at least 1.
     """
-    difference = targets[..., :, None, :] - sources[..., None, :, :]
-    squared = difference.square().sum(-1).masked_fill(~allowed, torch.inf)
-    within = squared < radius_m**2
-    width = max(int(within.sum(-1).amax()) if within.numel() else 0, 1)
-    width = min(width, limit or width, squared.shape[-1])
-    nearest = squared.topk(width, dim=-1, largest=False, sorted=False)
-    return nearest.indices, nearest.values < radius_m**2
+    rows = max(PAIRS_PER_PIECE // max(sources.shape[-2], 1), 1)
+    pieces = targets.split(rows) if targets.dim() == 2 and allowed is None else (targets,)
+    squared = [_squared_distance(piece, sources, allowed) for piece in pieces]
+    if limit is None:
+        limit = max(int((s < radius_m**2).sum(-1).amax()) if s.numel() else 0 for s in squared)
+    width = min(max(limit, 1), sources.shape[-2])
+    nearest = [s.topk(width, dim=-1, largest=False, sorted=False) for s in squared]
+    return torch.cat([n.indices for n in nearest]), torch.cat([n.values for n in nearest]) < radius_m**2
+
+
+def _squared_distance(
+    targets: Float[Tensor, "... n 2"], sources: Float[Tensor, "... m 2"], allowed: Bool[Tensor, "... n m"] | None
+) -> Float[Tensor, "... n m"]:
+    """Squared distances, infinite where not allowed; each axis in place, since memory traffic is all the cost."""
+    squared = (targets[..., :, None, 0] - sources[..., None, :, 0]).square_()
+    squared += (targets[..., :, None, 1] - sources[..., None, :, 1]).square_()
+    return squared if allowed is None else squared.masked_fill_(~allowed, torch.inf)
 
 
 def relative_pose(

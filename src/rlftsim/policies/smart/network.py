@@ -5,6 +5,8 @@ B scenarios, N rollouts, A agents, K token steps of a block, M map tokens, D wid
 scenario), a single step of a rollout and all steps of a scoring pass go through the same code.
 """
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -12,11 +14,23 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 
 from rlftsim.geometry import angle_between, heading_vector
-from rlftsim.policies.layers import FourierEmbedding, MlpEmbedding, MlpLayer, RelationAttention, initialize, normalize
+from rlftsim.policies.layers import (
+    FourierEmbedding,
+    Grid,
+    MlpEmbedding,
+    MlpLayer,
+    RelationAttention,
+    TabulatedEmbedding,
+    initialize,
+    normalize,
+)
 from rlftsim.policies.smart.config import SmartConfig
 from rlftsim.policies.smart.neighbors import Neighbors, nearest_within, pad_lists, relative_pose
 from rlftsim.tokens.map_tokens import NUM_KINDS, NUM_LIGHTS, NUM_TYPES, MapTokens
 from rlftsim.tokens.vocabulary import CLASS_NAMES
+
+MAX_LOOK_BACK_M = 160.0
+"""Farthest that anybody gets while it is remembered (3 s at 50 m/s), for tables."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +47,19 @@ class Scene:
     """Embedding of an agent's class and size."""
     token_features: Float[Tensor, "C V D"]
     """Embedding of every motion token."""
+    relations: "Relations"
+
+
+RelationEmbedding = Callable[[Float[Tensor, "E n"]], Float[Tensor, "E D"]]
+
+
+@dataclass(frozen=True, eq=False)
+class Relations:
+    """How the decoder embeds relations: the networks themselves while they are trained, tables of them once they are frozen."""
+
+    time: RelationEmbedding
+    map: RelationEmbedding
+    agent: RelationEmbedding
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +121,8 @@ class MapEncoder(nn.Module):
         rows = tokens.token_mask.flatten().nonzero()[:, 0]
         neighbors = self._neighbors(tokens)
         position, heading = tokens.position.flatten(0, 1), tokens.heading.flatten()
-        relation = relation_features(self.relation, position, heading, position[rows], heading[rows], neighbors)
+        embedding = _tabulated(self.relation, self.config.map_radius_m)
+        relation = relation_features(embedding, position, heading, position[rows], heading[rows], neighbors)
         updated = x[rows]
         for layer in self.layers:
             source = x.index_copy(0, rows, normalize(updated))
@@ -116,7 +144,7 @@ class MapEncoder(nn.Module):
 
 
 def relation_features(
-    embedding: FourierEmbedding,
+    embedding: RelationEmbedding,
     position: Float[Tensor, "S 2"],
     heading: Float[Tensor, "S"],
     row_position: Float[Tensor, "R 2"],
@@ -150,6 +178,15 @@ class AgentDecoder(nn.Module):
         self.agent_layers = nn.ModuleList(RelationAttention(*sizes) for _ in layers)
         self.head = MlpLayer(dim, dim, num_tokens)
 
+    def relations(self) -> Relations:
+        """The relation embeddings, tabulated where nothing in them is trained."""
+        lag = Grid(-float(self.config.history_tokens), 1.0, self.config.history_tokens + 1)
+        return Relations(
+            time=_tabulated(self.time_relation, MAX_LOOK_BACK_M, lag),
+            map=_tabulated(self.map_relation, self.config.agent_map_radius_m),
+            agent=_tabulated(self.agent_relation, self.config.agent_radius_m),
+        )
+
     def embed_agents(self, class_id: Int64[Tensor, "B A"], size: Float[Tensor, "B A 3"]) -> Float[Tensor, "B A D"]:
         """Embedding of class and size (length, width, height)."""
         return self.class_embedding(class_id) + self.size(size)
@@ -176,9 +213,9 @@ class AgentDecoder(nn.Module):
         new_past = _extend(past, steps, torch.where(row_of >= 0, row_of + first_row, -1))
 
         x = self._embed_steps(scene, steps, rows)
-        time, time_relation = self._look_back(new_past, steps, rows, hidden)
+        time, time_relation = self._look_back(scene, new_past, steps, rows, hidden)
         around, map_relation = self._look_at_map(scene, steps, rows)
-        others, agent_relation = self._look_at_agents(steps, rows, row_of)
+        others, agent_relation = self._look_at_agents(scene, steps, rows, row_of)
         sources = []
         for index, layers in enumerate(zip(self.time_layers, self.map_layers, self.agent_layers)):
             time_layer, map_layer, agent_layer = layers
@@ -199,7 +236,12 @@ class AgentDecoder(nn.Module):
         return self.fusion(torch.cat([token, state], -1))
 
     def _look_back(
-        self, past: Past, steps: TokenSteps, rows: tuple[Tensor, ...], hidden: Bool[Tensor, "B N A K"] | None
+        self,
+        scene: Scene,
+        past: Past,
+        steps: TokenSteps,
+        rows: tuple[Tensor, ...],
+        hidden: Bool[Tensor, "B N A K"] | None,
     ) -> tuple[Neighbors, Float[Tensor, "R W D"]]:
         """Up to `history_tokens` earlier steps of the same agent."""
         scenario, rollout, agent, step = rows
@@ -214,7 +256,7 @@ class AgentDecoder(nn.Module):
         neighbors = Neighbors(row.clamp(min=0), mask)
         values = relative_pose(steps.position[rows], steps.heading[rows], past.position[place], past.heading[place])
         values = torch.cat([values, -lag[:, None].expand(len(step), -1, 1).to(values.dtype)], -1)
-        return neighbors, _embed_where(self.time_relation, values, mask)
+        return neighbors, _embed_where(scene.relations.time, values, mask)
 
     def _look_at_map(
         self, scene: Scene, steps: TokenSteps, rows: tuple[Tensor, ...]
@@ -226,16 +268,18 @@ class AgentDecoder(nn.Module):
         counts = torch.bincount(rows[0], minlength=len(scene.map_mask)).tolist()
         for b, part in enumerate(position.split(counts)):
             index, near = nearest_within(
-                part, scene.map_position[b], scene.map_mask[b].expand(len(part), -1),
+                part, scene.map_position[b][scene.map_mask[b]], None,
                 radius_m=self.config.agent_map_radius_m, limit=self.config.max_agent_map_neighbors,
             )  # fmt: skip
             lists.append(Neighbors(index + b * width, near))
         neighbors = pad_lists(lists)
         map_position, map_heading = scene.map_position.flatten(0, 1), scene.map_heading.flatten()
-        return neighbors, relation_features(self.map_relation, map_position, map_heading, position, heading, neighbors)
+        return neighbors, relation_features(
+            scene.relations.map, map_position, map_heading, position, heading, neighbors
+        )
 
     def _look_at_agents(
-        self, steps: TokenSteps, rows: tuple[Tensor, ...], row_of: Int64[Tensor, "B N A K"]
+        self, scene: Scene, steps: TokenSteps, rows: tuple[Tensor, ...], row_of: Int64[Tensor, "B N A K"]
     ) -> tuple[Neighbors, Float[Tensor, "R K D"]]:
         """Other agents of the same scenario, rollout and step within reach."""
         position = steps.position.transpose(2, 3)  # [B, N, K, A, 2]
@@ -250,12 +294,19 @@ class AgentDecoder(nn.Module):
         neighbors = Neighbors(row_of[scenario[:, None], rollout[:, None], index, step[:, None]].clamp(min=0), near)
         row_position, row_heading = steps.position[rows], steps.heading[rows]
         return neighbors, relation_features(
-            self.agent_relation, row_position, row_heading, row_position, row_heading, neighbors
+            scene.relations.agent, row_position, row_heading, row_position, row_heading, neighbors
         )
 
 
+def _tabulated(embedding: FourierEmbedding, reach_m: float, *more: Grid) -> RelationEmbedding:
+    """A table of an embedding of (distance, bearing, turn, ...) if it is frozen, else the embedding itself."""
+    angle = Grid(-math.pi, 2 * math.pi / 2048, 2049)
+    grids = (Grid(0.0, 0.01, round(reach_m * 100) + 1), angle, angle, *more)
+    return TabulatedEmbedding.build(embedding, grids) if embedding.is_frozen else embedding
+
+
 def _embed_where(
-    embedding: FourierEmbedding, values: Float[Tensor, "R K n"], mask: Bool[Tensor, "R K"]
+    embedding: RelationEmbedding, values: Float[Tensor, "R K n"], mask: Bool[Tensor, "R K"]
 ) -> Float[Tensor, "R K D"]:
     """Normalised embedding of relations, zero where there is none."""
     embedded = normalize(embedding(values[mask]))

@@ -1,0 +1,263 @@
+"""Is a data set whole and plausible, and what is in it?"""
+
+import os
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+
+from rlftsim.errors import DataError
+from rlftsim.scenario.dataset import INDEX, Manifest, ScenarioDataset, build_index, read_manifest
+from rlftsim.scenario.shards import ShardReader, hash_file
+from rlftsim.scenario.types import (
+    LANE_TYPES,
+    ROAD_EDGE_TYPES,
+    STEP_S,
+    ObjectType,
+    Scenario,
+)
+
+TELEPORT_SPEED_MPS = 60.0
+
+
+class Problem(StrEnum):
+    """Kinds of findings."""
+
+    MISSING_SHARD = "missing shard"
+    DAMAGED_SHARD = "damaged shard"
+    INDEX_MISMATCH = "index mismatch"
+    CONTRADICTORY_LIGHTS = "contradictory lights"
+    TELEPORT = "teleport"
+    MISSING_MAP = "missing map"
+    NO_EVALUATED_AGENTS = "no evaluated agents"
+
+    @property
+    def is_damage(self) -> bool:
+        """True: files are not what was written. False: they are, but the recorded content is doubtful."""
+        return self in (Problem.MISSING_SHARD, Problem.DAMAGED_SHARD, Problem.INDEX_MISMATCH)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something wrong with a data set."""
+
+    problem: Problem
+    where: str
+    """File inside the data set, or scenario id."""
+    detail: str
+
+    def __str__(self) -> str:
+        return f"{self.problem}: {self.where}: {self.detail}"
+
+
+@dataclass(frozen=True)
+class SpeedStats:
+    """Speeds of valid states of agents of one type, in metres per second."""
+
+    mean_mps: float
+    p95_mps: float
+    max_mps: float
+
+
+@dataclass(frozen=True)
+class DatasetStats:
+    """What is in a data set."""
+
+    num_scenarios: int
+    by_split: Mapping[str, int]
+    by_num_steps: Mapping[int, int]
+    by_ego_manoeuvre: Mapping[str, int]
+    agents_by_type: Mapping[str, int]
+    """Tracks that are valid at the current step, over all scenarios."""
+    mean_agents: float
+    mean_evaluated: float
+    mean_map_points: float
+    percent_with_lights: float
+    kilobytes_per_scenario: float
+    """Size of all shards over the scenarios in them, in units of 1000 bytes."""
+    speeds: Mapping[str, SpeedStats]
+    """By type of agent, from `num_speed_scenarios` scenarios."""
+    num_speed_scenarios: int
+
+
+def verify_dataset(folder: str | os.PathLike[str]) -> list[Finding]:
+    """Check every shard and every scenario of a data set.
+
+    Damage: shards missing or not as the manifest says, index and manifest that do not belong together. Doubtful
+    content: a lane with two states at a step, consecutive valid positions that imply more than 60 m/s, no lanes or no
+    road edges, nobody to evaluate beside the ego.
+
+    Returns:
+        What was found, empty if all is well; damage first.
+
+    Raises:
+        DataError: there is no finished data set in the folder.
+    """
+    folder = Path(folder)
+    manifest = read_manifest(folder)
+    damage, content, seen = [], [], set()
+    for entry in manifest.shards:
+        path = folder / entry.file
+        if not path.exists():
+            damage.append(Finding(Problem.MISSING_SHARD, entry.file, "the file is gone: convert again"))
+        elif hash_file(path) != entry.sha256:
+            damage.append(Finding(Problem.DAMAGED_SHARD, entry.file, "its checksum does not match: convert again"))
+        else:
+            content.extend(_check_shard(path, entry.file, seen))
+    if not damage:
+        damage.extend(_check_index(folder, manifest))
+    return damage + [f for f in content if f.problem.is_damage] + [f for f in content if not f.problem.is_damage]
+
+
+def dataset_stats(
+    folder: str | os.PathLike[str], *, split: str | None = None, max_speed_scenarios: int = 200
+) -> DatasetStats:
+    """Summary of a data set or one split of it.
+
+    Args:
+        folder: the data set.
+        split: only this split; None = all.
+        max_speed_scenarios: speeds are taken from at most so many scenarios, spread evenly over the index.
+
+    Raises:
+        DataError: no data set there, an unfinished or damaged one, or it has no such split.
+    """
+    dataset = ScenarioDataset(folder, split, cache_size=0)
+    index = dataset.index
+    num_scenarios = max(len(dataset), 1)
+    agents = {
+        kind: int(sum(index[f"num_{kind}"].to_pylist())) for kind in ("vehicles", "pedestrians", "cyclists", "others")
+    }
+    positions = np.unique(np.linspace(0, len(dataset) - 1, min(max_speed_scenarios, len(dataset))).astype(int))
+    total_bytes = sum((dataset.folder / entry.file).stat().st_size for entry in dataset.manifest.shards)
+    total_rows = max(sum(entry.num_rows for entry in dataset.manifest.shards), 1)
+    return DatasetStats(
+        num_scenarios=len(dataset),
+        by_split=_count(index["split"].to_pylist()),
+        by_num_steps=_count(index["num_steps"].to_pylist()),
+        by_ego_manoeuvre=_count(index["ego_manoeuvre"].to_pylist()),
+        agents_by_type=agents,
+        mean_agents=sum(agents.values()) / num_scenarios,
+        mean_evaluated=sum(index["num_evaluated"].to_pylist()) / num_scenarios,
+        mean_map_points=sum(index["num_map_points"].to_pylist()) / num_scenarios,
+        percent_with_lights=100.0 * sum(n > 0 for n in index["num_light_states"].to_pylist()) / num_scenarios,
+        kilobytes_per_scenario=total_bytes / total_rows / 1000.0,
+        speeds=_compute_speeds(dataset, positions),
+        num_speed_scenarios=len(positions),
+    )
+
+
+def check_scenario(scenario: Scenario) -> Iterator[Finding]:
+    """Doubtful content of one scenario."""
+    for problem, check in _CHECKS.items():
+        detail = check(scenario)
+        if detail is not None:
+            yield Finding(problem, scenario.scenario_id, detail)
+
+
+def _check_shard(path: Path, name: str, seen: set[str]) -> Iterator[Finding]:
+    """Findings in one shard; scenarios whose id was seen before are in no index and not looked at again."""
+    try:
+        reader = ShardReader(path)
+    except DataError as error:
+        yield Finding(Problem.DAMAGED_SHARD, name, str(error))
+        return
+    for row in range(len(reader)):
+        try:
+            scenario = reader.read(row)
+        except DataError as error:
+            yield Finding(Problem.DAMAGED_SHARD, name, str(error))
+        else:
+            if scenario.scenario_id not in seen:
+                yield from check_scenario(scenario)
+            seen.add(scenario.scenario_id)
+
+
+def _check_index(folder: Path, manifest: Manifest) -> Iterator[Finding]:
+    path = folder / INDEX
+    if not path.exists() or hash_file(path) != manifest.index_sha256:
+        yield Finding(Problem.INDEX_MISMATCH, INDEX, "it is not the one the manifest was written for: convert again")
+        return
+    expected, duplicates = build_index(folder, manifest.shards)
+    if not pq.read_table(path).equals(expected):
+        yield Finding(Problem.INDEX_MISMATCH, INDEX, "its rows are not those of the shards: convert again")
+    if expected.num_rows != manifest.num_scenarios or tuple(duplicates) != manifest.duplicates:
+        yield Finding(Problem.INDEX_MISMATCH, INDEX, "the manifest's counts are not those of the shards: convert again")
+
+
+def _describe_contradictory_lights(scenario: Scenario) -> str | None:
+    lights = scenario.lights
+    observed = np.unique(np.stack([lights.step, lights.lane_id, lights.state], axis=1), axis=0)
+    places, count = np.unique(observed[:, :2], axis=0, return_counts=True)
+    bad = np.flatnonzero(count > 1)
+    if not len(bad):
+        return None
+    step, lane = places[bad[0]]
+    return f"lane {lane} has {count[bad[0]]} different states at step {step}{_and_more(len(bad))}"
+
+
+def _describe_teleport(scenario: Scenario) -> str | None:
+    tracks = scenario.tracks
+    moved = np.diff(tracks.position[..., :2].astype(np.float64), axis=1)
+    speed = np.where(tracks.valid[:, 1:] & tracks.valid[:, :-1], np.hypot(moved[..., 0], moved[..., 1]), 0.0) / STEP_S
+    bad = np.argwhere(speed > TELEPORT_SPEED_MPS)
+    if not len(bad):
+        return None
+    track, step = bad[0]
+    distance_m = speed[track, step] * STEP_S
+    return (
+        f"track {tracks.object_id[track]} moves {distance_m:.1f} m from step {step} to {step + 1}{_and_more(len(bad))}"
+    )
+
+
+def _describe_missing_map(scenario: Scenario) -> str | None:
+    features = scenario.map_features
+    if not len(features.points):
+        return "no map features"
+    missing = [
+        name
+        for name, types in (("lanes", LANE_TYPES), ("road edges", ROAD_EDGE_TYPES))
+        if not len(features.indices_of(types))
+    ]
+    return f"no {' and no '.join(missing)}" if missing else None
+
+
+def _describe_nobody_to_evaluate(scenario: Scenario) -> str | None:
+    others = scenario.evaluated_indices[scenario.evaluated_indices != scenario.ego_index]
+    return None if len(others) else "no track to predict is valid at the current step, only the ego is evaluated"
+
+
+_CHECKS = {
+    Problem.CONTRADICTORY_LIGHTS: _describe_contradictory_lights,
+    Problem.TELEPORT: _describe_teleport,
+    Problem.MISSING_MAP: _describe_missing_map,
+    Problem.NO_EVALUATED_AGENTS: _describe_nobody_to_evaluate,
+}
+
+
+def _and_more(count: int) -> str:
+    return f" (and {count - 1} more)" if count > 1 else ""
+
+
+def _count(values: list) -> dict:
+    return dict(sorted(Counter(values).items()))
+
+
+def _compute_speeds(dataset: ScenarioDataset, positions: np.ndarray) -> dict[str, SpeedStats]:
+    by_type: dict[ObjectType, list[np.ndarray]] = {kind: [] for kind in ObjectType}
+    for position in positions:
+        scenario = dataset[int(position)]
+        tracks, agents = scenario.tracks, scenario.simulated_indices
+        speed = np.linalg.norm(tracks.velocity[agents].astype(np.float64), axis=-1)
+        for kind, values in by_type.items():
+            values.append(speed[tracks.valid[agents] & (tracks.object_type[agents] == kind)[:, None]])
+    merged = {kind.name.lower(): np.concatenate(values) for kind, values in by_type.items() if values}
+    return {
+        name: SpeedStats(float(speed.mean()), float(np.quantile(speed, 0.95)), float(speed.max()))
+        for name, speed in merged.items()
+        if len(speed)
+    }

@@ -1,0 +1,249 @@
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from rlftsim.errors import DataError
+from rlftsim.scenario.convert import convert, infer_split
+from rlftsim.scenario.dataset import ScenarioDataset
+from rlftsim.scenario.inspect import verify_dataset
+from rlftsim.scenario.womd import read_scenarios
+
+
+@pytest.fixture
+def source(tmp_path, make_message, make_tfrecord):
+    """Two shards of training, one of validation, two scenarios each."""
+    for split, number in (("training", 0), ("training", 1), ("validation", 0)):
+        messages = [make_message(f"{split}{number}{k}") for k in range(2)]
+        make_tfrecord(tmp_path / "womd" / split / f"{split}.tfrecord-{number:05d}-of-00002", *messages)
+    return tmp_path / "womd"
+
+
+def run(source, destination, **settings):
+    return convert(source, destination, **{"jobs": 1, "show_progress": False, **settings})
+
+
+def contents(folder):
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_every_scenario_arrives_with_its_split(source, tmp_path, differences):
+    report = run(source, tmp_path / "data")
+    assert (report.converted, report.skipped, report.duplicates) == (6, (), ())
+    assert (report.shards_written, report.shards_reused) == (3, 0)
+    assert report.counts == {"training": 4, "validation": 2}
+    originals = list(read_scenarios(source))
+    stored = list(ScenarioDataset(tmp_path / "data"))
+    assert [difference for a, b in zip(originals, stored, strict=True) for difference in differences(a, b)] == []
+    assert ScenarioDataset(tmp_path / "data", "validation").scenario_ids == ["validation00", "validation01"]
+    assert verify_dataset(tmp_path / "data") == []
+
+
+def test_the_source_is_not_needed_afterwards(source, tmp_path):
+    run(source, tmp_path / "data")
+    source.rename(tmp_path / "gone")
+    assert len(list(ScenarioDataset(tmp_path / "data"))) == 6
+
+
+def test_any_number_of_jobs_gives_the_same_bytes(source, tmp_path):
+    run(source, tmp_path / "one", jobs=1)
+    run(source, tmp_path / "two", jobs=2)
+    assert contents(tmp_path / "one") == contents(tmp_path / "two")
+
+
+def test_a_second_run_does_nothing_again(source, tmp_path):
+    run(source, tmp_path / "data")
+    before = contents(tmp_path / "data")
+    report = run(source, tmp_path / "data")
+    assert (report.converted, report.shards_written, report.shards_reused) == (6, 0, 3)
+    assert contents(tmp_path / "data") == before
+
+
+def test_a_changed_source_and_a_damaged_shard_are_converted_again(source, tmp_path, make_message, make_tfrecord):
+    run(source, tmp_path / "data")
+    make_tfrecord(source / "training" / "training.tfrecord-00001-of-00002", make_message("new"))
+    damaged = tmp_path / "data" / "shards" / "validation" / "validation.tfrecord-00000-of-00002.arrow"
+    damaged.write_bytes(damaged.read_bytes()[:-5])
+    report = run(source, tmp_path / "data")
+    assert (report.shards_written, report.shards_reused) == (2, 1)
+    assert ScenarioDataset(tmp_path / "data").scenario_ids == [
+        "training00",
+        "training01",
+        "new",
+        "validation00",
+        "validation01",
+    ]
+    assert verify_dataset(tmp_path / "data") == []
+
+
+def test_other_files_are_added_to_a_data_set(source, tmp_path):
+    run(source / "training", tmp_path / "data")
+    report = run(source / "validation", tmp_path / "data")
+    assert report.converted == 2
+    assert report.counts == {"training": 4, "validation": 2}
+
+
+def test_bad_records_are_skipped_and_reported(source, tmp_path, make_message, make_tfrecord):
+    path = source / "training" / "training.tfrecord-00001-of-00002"
+    bad = make_message("bad")
+    bad.tracks[0].states[20].center_x = float("nan")
+    make_tfrecord(path, make_message("good"), bad, make_message("cut"))
+    path.write_bytes(path.read_bytes()[:-30])
+    (source / "training" / "empty.tfrecord").touch()
+    report = run(source, tmp_path / "data")
+    assert report.converted == 5
+    assert [(s.file, s.record, s.cause.split(":")[0]) for s in report.skipped] == [
+        ("training/empty.tfrecord", 0, "the file is empty"),
+        (
+            "training/training.tfrecord-00001-of-00002",
+            1,
+            "track 100 has a NaN or infinite position at step 20, where it is marked valid",
+        ),
+        ("training/training.tfrecord-00001-of-00002", 2, "truncated"),
+    ]
+    assert run(source, tmp_path / "data").skipped == report.skipped  # the second run knows it from the first
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_stop_raises_at_a_bad_record_and_skip_goes_on_later(source, tmp_path, make_tfrecord, jobs):
+    make_tfrecord(source / "training" / "x.tfrecord", b"nonsense")
+    with pytest.raises(DataError, match=r"x\.tfrecord: record 0: not a WOMD Scenario message"):
+        run(source, tmp_path / "data", on_error="stop", jobs=jobs)
+    with pytest.raises(DataError, match="was not finished"):
+        ScenarioDataset(tmp_path / "data")
+    assert run(source, tmp_path / "data").converted == 6
+    with pytest.raises(DataError, match=r"x\.tfrecord: record 0"):
+        run(source, tmp_path / "data", on_error="stop")
+
+
+def test_of_duplicates_the_first_is_kept_and_the_others_are_reported(source, tmp_path, make_message, make_tfrecord):
+    make_tfrecord(source / "training" / "z.tfrecord", make_message("training01", num_tracks=1), make_message("new"))
+    report = run(source, tmp_path / "data")
+    assert report.converted == 7
+    assert [(d.file, d.record) for d in report.duplicates] == [("training/z.tfrecord", 0)]
+    assert "already in training/training.tfrecord-00000-of-00002 record 1" in report.duplicates[0].cause
+    assert len(ScenarioDataset(tmp_path / "data").by_id("training01").tracks.object_id) == 3
+    assert verify_dataset(tmp_path / "data") == []
+
+
+def test_a_foreign_destination_is_refused_and_left_alone(source, tmp_path):
+    (tmp_path / "home").mkdir()
+    (tmp_path / "home" / "diary.txt").write_text("mine")
+    with pytest.raises(DataError, match="not empty and not a data set"):
+        run(source, tmp_path / "home")
+    assert contents(tmp_path / "home") == {"diary.txt": b"mine"}
+
+
+def test_nothing_readable_leaves_nothing(tmp_path, make_tfrecord):
+    make_tfrecord(tmp_path / "x.tfrecord", b"nonsense")
+    with pytest.raises(
+        DataError, match=r"not one scenario could be converted; first of 1 causes: x\.tfrecord: record 0"
+    ):
+        run(tmp_path / "x.tfrecord", tmp_path / "data")
+    assert not (tmp_path / "data").exists()
+
+
+def test_two_conversions_to_one_folder_do_not_mix(source, tmp_path):
+    fcntl = pytest.importorskip("fcntl")
+    (tmp_path / "data").mkdir()
+    with open(tmp_path / "data" / "INCOMPLETE", "w") as other:
+        fcntl.flock(other, fcntl.LOCK_EX)
+        with pytest.raises(DataError, match="another process is converting"):
+            run(source, tmp_path / "data")
+
+
+@pytest.mark.parametrize(
+    ("path", "split"),
+    [
+        ("/data/x/training.tfrecord-00000-of-01000", "training"),
+        ("/data/x/uncompressed_scenario_validation_interactive_validation_interactive.tfrecord-0-of-9", "validation"),
+        ("/data/testing/a.tfrecord", "testing"),
+        ("/testing/x/a.tfrecord", "unknown"),
+    ],
+)
+def test_the_split_is_told_by_the_name_of_file_or_folder(path, split):
+    assert infer_split(Path(path)) == split
+
+
+def test_a_given_split_wins(source, tmp_path):
+    assert run(source, tmp_path / "data", split="mine").counts == {"mine": 6}
+
+
+CONVERT = """
+import sys
+from rlftsim.scenario.convert import convert
+if __name__ == "__main__":
+    report = convert(sys.argv[1], sys.argv[2], jobs=int(sys.argv[3]), show_progress=False)
+    print(report.converted, report.shards_written, report.shards_reused)
+"""
+
+
+@pytest.fixture
+def many(tmp_path, make_message, make_tfrecord):
+    """Twelve shards of eight scenarios: long enough to be interrupted in the middle."""
+    for number in range(12):
+        messages = [make_message(f"{number}-{k}", num_tracks=40) for k in range(8)]
+        make_tfrecord(tmp_path / "many" / f"training.tfrecord-{number:05d}-of-00012", *messages)
+    return tmp_path / "many"
+
+
+def start(script, source, destination, jobs):
+    return subprocess.Popen(
+        [sys.executable, str(script), str(source), str(destination), str(jobs)],
+        start_new_session=True,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def wait_for_shards(process, destination, count):
+    deadline = time.monotonic() + 60
+    while len(list(destination.rglob("*.arrow.json"))) < count:
+        assert process.poll() is None, "ended before it could be interrupted"
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
+@pytest.mark.parametrize(("jobs", "kind"), [(1, signal.SIGKILL), (2, signal.SIGKILL), (2, signal.SIGINT)])
+def test_an_interrupted_conversion_goes_on_and_gives_the_same_bytes(many, tmp_path, jobs, kind):
+    script = tmp_path / "convert_script.py"
+    script.write_text(CONVERT)
+    destination = tmp_path / "data"
+    process = start(script, many, destination, jobs)
+    wait_for_shards(process, destination, 3)
+    if kind == signal.SIGINT:
+        os.killpg(process.pid, kind)  # as a terminal does
+    else:
+        process.kill()
+    process.communicate(timeout=60)
+    assert process.returncode != 0
+    with pytest.raises(DataError, match="was not finished"):
+        ScenarioDataset(destination)
+    wait_for_orphans(destination)
+
+    report = run(many, destination)
+    assert report.converted == 96
+    assert report.shards_reused >= 3
+    assert report.shards_written + report.shards_reused == 12
+    run(many, tmp_path / "uninterrupted")
+    assert contents(destination) == contents(tmp_path / "uninterrupted")
+    assert verify_dataset(destination) == []
+
+
+def wait_for_orphans(destination):
+    """Workers of a killed process end by themselves; from then on nothing in the folder changes."""
+    before = None
+    while before != (before := sorted(destination.rglob("*"))):
+        time.sleep(0.5)
+
+
+@pytest.mark.official
+def test_no_official_scenario_is_lost(shared, tmp_path):
+    report = run(shared / "data" / "womd", tmp_path / "data")
+    assert (report.converted, report.skipped, report.duplicates) == (7, (), ())
+    damage = [finding for finding in verify_dataset(tmp_path / "data") if finding.problem.is_damage]
+    assert damage == []

@@ -1,0 +1,180 @@
+import json
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rlftsim.errors import DataError
+from rlftsim.scenario.dataset import DatasetWriter, ScenarioDataset, write_dataset
+from rlftsim.scenario.types import LaneTopology
+from rlftsim.scenario.womd import read_scenarios, scenario_from_bytes
+
+
+@pytest.fixture
+def scenarios(make_message):
+    return [scenario_from_bytes(make_message(f"id{k}", num_tracks=1 + k).SerializeToString()) for k in range(5)]
+
+
+@pytest.fixture
+def folder(tmp_path, scenarios):
+    split = {"id4": "validation"}
+    write_dataset(scenarios, tmp_path / "data", split=lambda s: split.get(s.scenario_id, "training"))
+    return tmp_path / "data"
+
+
+def test_scenarios_come_back_bit_by_bit(folder, scenarios, differences):
+    back = list(ScenarioDataset(folder))
+    assert [difference for a, b in zip(scenarios, back, strict=True) for difference in differences(a, b)] == []
+
+
+def test_odd_values_and_missing_tables_come_back(tmp_path, scenarios, differences):
+    one = scenarios[2]
+    position, valid = one.tracks.position.copy(), one.tracks.valid.copy()
+    valid[0, 5:8] = False
+    position[0, 5:8, 0] = np.nan, -0.0, -np.inf
+    one = replace(
+        one,
+        tracks=replace(one.tracks, position=position, valid=valid),
+        map_features=replace(one.map_features, topology=LaneTopology()),
+    )
+    write_dataset([one], tmp_path / "data")
+    assert differences(one, ScenarioDataset(tmp_path / "data")[0]) == []
+
+
+def test_scenarios_are_found_by_position_and_id(folder):
+    dataset = ScenarioDataset(folder)
+    assert len(dataset) == 5
+    assert dataset.scenario_ids == ["id0", "id1", "id2", "id3", "id4"]
+    assert dataset[-1] is dataset[4] is dataset.by_id("id4")
+    assert "id3" in dataset
+    assert "id9" not in dataset
+    with pytest.raises(DataError, match="no scenario 'id9'"):
+        dataset.by_id("id9")
+    with pytest.raises(IndexError):
+        dataset[5]
+
+
+def test_a_split_shows_only_its_scenarios(folder):
+    dataset = ScenarioDataset(folder, "validation")
+    assert dataset.scenario_ids == [dataset[0].scenario_id] == ["id4"]
+    assert dataset.index["split"].to_pylist() == ["validation"]
+    with pytest.raises(DataError, match="no split 'testing', only training, validation"):
+        ScenarioDataset(folder, "testing")
+
+
+def test_the_same_object_comes_back_while_it_is_cached(folder):
+    dataset = ScenarioDataset(folder, cache_size=2)
+    first, second = dataset[0], dataset[1]
+    assert dataset[0] is first
+    dataset[2]  # pushes out the least recently used one: 1
+    assert dataset[0] is first
+    assert dataset[1] is not second
+
+
+def test_many_scenarios_are_spread_over_shards(tmp_path, scenarios):
+    with DatasetWriter(tmp_path / "data", scenarios_per_shard=2) as writer:
+        for scenario in scenarios:
+            writer.add(scenario)
+    dataset = ScenarioDataset(tmp_path / "data")
+    assert [entry.num_rows for entry in dataset.manifest.shards] == [2, 2, 1]
+    assert [scenario.scenario_id for scenario in dataset] == dataset.scenario_ids == ["id0", "id1", "id2", "id3", "id4"]
+
+
+def test_the_manifest_says_where_the_data_comes_from(tmp_path, scenarios):
+    write_dataset(scenarios, tmp_path / "data", licence_note="CC0", provenance={"seed": 3})
+    manifest = json.loads((tmp_path / "data" / "manifest.json").read_text())
+    assert manifest["licence_note"] == "CC0"
+    assert manifest["provenance"] == {"seed": 3}
+    assert manifest["counts"] == {"unknown": 5}
+
+
+def test_the_same_scenarios_give_the_same_bytes(tmp_path, scenarios):
+    for name in ("a", "b"):
+        write_dataset(scenarios, tmp_path / name)
+    for path in (tmp_path / "a").rglob("*.*"):
+        assert path.read_bytes() == (tmp_path / "b" / path.relative_to(tmp_path / "a")).read_bytes()
+
+
+def test_another_process_can_open_the_data_set_again(folder):
+    again = pickle.loads(pickle.dumps(ScenarioDataset(folder, "training")))
+    assert again.scenario_ids == ["id0", "id1", "id2", "id3"]
+
+
+def test_an_error_while_writing_leaves_nothing(tmp_path, scenarios):
+    with pytest.raises(DataError, match="id0 is in the data set already"):
+        write_dataset([*scenarios, scenarios[0]], tmp_path / "data")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_with_something_in_it_is_not_overwritten(folder, scenarios):
+    with pytest.raises(DataError, match="not an empty folder"):
+        write_dataset(scenarios, folder)
+
+
+def test_a_wrong_dtype_is_refused_before_it_is_written(tmp_path, scenarios):
+    tracks = replace(scenarios[0].tracks, heading=scenarios[0].tracks.heading.astype(np.float64))
+    with pytest.raises(DataError, match=r"id0: tracks\.heading is float64, it must be float32"):
+        write_dataset([replace(scenarios[0], tracks=tracks)], tmp_path / "data")
+
+
+def shard_of(folder):
+    (path,) = (folder / "shards").glob("*.arrow")
+    return path
+
+
+def test_a_flipped_byte_in_a_shard_is_found_when_its_row_is_read(folder):
+    path = shard_of(folder)
+    data = bytearray(path.read_bytes())
+    for offset in range(len(data) // 2, len(data) // 2 + 64, 8):
+        data[offset] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(DataError, match=r"shard .*00000\.arrow.* damaged .*: delete the file and run"):
+        list(ScenarioDataset(folder))
+
+
+def test_a_truncated_shard_is_refused(folder):
+    path = shard_of(folder)
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(DataError, match=r"00000\.arrow is damaged"):
+        ScenarioDataset(folder)[0]
+
+
+def test_a_missing_shard_is_named(folder):
+    shard_of(folder).unlink()
+    with pytest.raises(DataError, match=r"00000\.arrow is missing"):
+        ScenarioDataset(folder)[0]
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "cause"),
+    [
+        ("manifest.json", b"{", "cannot be read"),
+        ("manifest.json", b"[]", "not the manifest"),
+        ("manifest.json", b'{"format": "rlftsim scenarios", "schema_version": 99}', "schema version 99"),
+        ("manifest.json", b'{"format": "rlftsim scenarios", "schema_version": 1}', "is damaged"),
+        ("index.parquet", b"nonsense", "cannot be read"),
+        ("INCOMPLETE", b"", "was not finished"),
+    ],
+)
+def test_damage_around_the_shards_is_refused_in_words(folder, file, content, cause):
+    (folder / file).write_bytes(content)
+    with pytest.raises(DataError, match=cause):
+        ScenarioDataset(folder)
+
+
+def test_a_folder_without_a_data_set_is_refused(tmp_path):
+    with pytest.raises(DataError, match="have to be converted first"):
+        ScenarioDataset(tmp_path)
+    with pytest.raises(DataError, match="no such folder"):
+        ScenarioDataset(tmp_path / "none")
+
+
+@pytest.mark.official
+def test_every_official_scenario_comes_back_bit_by_bit_and_small(shared, tmp_path, differences):
+    scenarios = list(read_scenarios(shared / "data/womd"))
+    write_dataset(scenarios, tmp_path / "data")
+    dataset = ScenarioDataset(tmp_path / "data")
+    assert [difference for a, b in zip(scenarios, dataset, strict=True) for difference in differences(a, b)] == []
+    size = sum(path.stat().st_size for path in (tmp_path / "data").rglob("*.*") if path.is_file())
+    assert size / len(scenarios) < 120_000

@@ -1,0 +1,114 @@
+import json
+
+import pytest
+
+from rlftsim.errors import DataError
+from rlftsim.scenario.dataset import write_dataset
+from rlftsim.scenario.inspect import Problem, dataset_stats, verify_dataset
+from rlftsim.scenario.womd import scenario_from_bytes
+
+
+@pytest.fixture
+def make_dataset(tmp_path):
+    def make(*messages):
+        folder = tmp_path / "data"
+        write_dataset(
+            [scenario_from_bytes(message.SerializeToString()) for message in messages], folder, split="training"
+        )
+        return folder
+
+    return make
+
+
+def found(folder):
+    return [(finding.problem, finding.where) for finding in verify_dataset(folder)]
+
+
+def test_nothing_is_found_in_a_sound_data_set(make_dataset, make_message):
+    assert verify_dataset(make_dataset(make_message("a"), make_message("b", num_steps=11))) == []
+
+
+def test_contradictory_lights_are_found_but_repeated_ones_are_not(make_dataset, make_message):
+    contradicting, repeating = make_message("a"), make_message("b")
+    contradicting.dynamic_map_states[3].lane_states.add(lane=7, state=4)
+    repeating.dynamic_map_states[3].lane_states.add(lane=7, state=6)
+    folder = make_dataset(contradicting, repeating)
+    assert found(folder) == [(Problem.CONTRADICTORY_LIGHTS, "a")]
+    assert "lane 7 has 2 different states at step 3" in verify_dataset(folder)[0].detail
+
+
+def test_a_jump_between_valid_states_is_a_teleport(make_dataset, make_message):
+    jumping, hidden = make_message("a"), make_message("b")
+    for state in jumping.tracks[0].states[40:]:
+        state.center_x += 6.0  # 6.1 m in 0.1 s
+    for state in hidden.tracks[0].states[40:]:
+        state.center_x += 6.0
+    hidden.tracks[0].states[40].valid = False
+    folder = make_dataset(jumping, hidden)
+    assert found(folder) == [(Problem.TELEPORT, "a")]
+    assert verify_dataset(folder)[0].detail == "track 100 moves 6.1 m from step 39 to 40"
+
+
+def test_missing_map_and_nobody_to_evaluate_are_found(make_dataset, make_message):
+    no_map, no_edges, nobody = make_message("a"), make_message("b"), make_message("c")
+    no_map.ClearField("map_features")
+    del no_edges.map_features[1]
+    nobody.tracks[0].states[10].valid = False
+    folder = make_dataset(no_map, no_edges, nobody)
+    assert found(folder) == [
+        (Problem.MISSING_MAP, "a"),
+        (Problem.MISSING_MAP, "b"),
+        (Problem.NO_EVALUATED_AGENTS, "c"),
+    ]
+    assert [finding.detail for finding in verify_dataset(folder)][:2] == ["no map features", "no road edges"]
+
+
+def test_a_flipped_byte_and_a_missing_shard_are_found(make_dataset, make_message):
+    folder = make_dataset(make_message("a"))
+    shard = folder / "shards" / "00000.arrow"
+    data = bytearray(shard.read_bytes())
+    data[len(data) // 2] ^= 1
+    shard.write_bytes(data)
+    assert found(folder) == [(Problem.DAMAGED_SHARD, "shards/00000.arrow")]
+    shard.unlink()
+    assert found(folder) == [(Problem.MISSING_SHARD, "shards/00000.arrow")]
+
+
+def test_an_index_of_another_data_set_is_found(make_dataset, make_message, tmp_path):
+    folder = make_dataset(make_message("a"))
+    other = scenario_from_bytes(make_message("b").SerializeToString())
+    write_dataset([other], tmp_path / "other")
+    (folder / "index.parquet").write_bytes((tmp_path / "other" / "index.parquet").read_bytes())
+    assert found(folder) == [(Problem.INDEX_MISMATCH, "index.parquet")]
+
+
+def test_wrong_counts_in_the_manifest_are_found(make_dataset, make_message):
+    folder = make_dataset(make_message("a"))
+    manifest = json.loads((folder / "manifest.json").read_text())
+    (folder / "manifest.json").write_text(json.dumps({**manifest, "num_scenarios": 2}))
+    assert found(folder) == [(Problem.INDEX_MISMATCH, "index.parquet")]
+
+
+def test_an_unfinished_data_set_cannot_be_verified(tmp_path):
+    with pytest.raises(DataError, match="is no data set"):
+        verify_dataset(tmp_path)
+
+
+def test_stats_count_and_measure(make_dataset, make_message):
+    stats = dataset_stats(make_dataset(make_message("a"), make_message("b", lights=False, num_steps=11)))
+    assert stats.num_scenarios == 2
+    assert stats.by_split == {"training": 2}
+    assert stats.by_num_steps == {11: 1, 91: 1}
+    assert stats.agents_by_type == {"vehicles": 2, "pedestrians": 2, "cyclists": 2, "others": 0}
+    assert (stats.mean_agents, stats.mean_evaluated, stats.percent_with_lights) == (3.0, 2.0, 50.0)
+    # track k is of type 1 + k and drives 1 + k m/s
+    assert {name: speed.max_mps for name, speed in stats.speeds.items()} == {
+        "vehicle": 1.0,
+        "pedestrian": 2.0,
+        "cyclist": 3.0,
+    }
+
+
+def test_stats_of_an_empty_data_set_are_zeros(make_dataset):
+    stats = dataset_stats(make_dataset())
+    assert (stats.num_scenarios, stats.mean_agents, stats.speeds) == (0, 0.0, {})
