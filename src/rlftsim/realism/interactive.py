@@ -155,9 +155,9 @@ def _compute_origin_distance(x: Float[Tensor, "8 P"], y: Float[Tensor, "8 P"]) -
 
 def _compute_box_distance(agents: PlanarAgents, pairs: _Pairs) -> Float[Tensor, "P"]:
     """Signed distance between rounded boxes, negative for overlap: of the origin to the difference of their cores."""
-    *ego, ego_rounding = _compute_core_corners(agents, pairs.ego, pairs.ego_agent)
+    ego_x, ego_y, ego_rounding = _compute_core_corners(agents, pairs.ego, pairs.ego_agent)
     other_x, other_y, other_rounding = _compute_core_corners(agents, pairs.other, pairs.other_agent)
-    core_distance = _compute_origin_distance(*_add_rectangles(tuple(ego), (-other_x, -other_y)))
+    core_distance = _compute_origin_distance(*_add_rectangles((ego_x, ego_y), (-other_x, -other_y)))
     return core_distance - ego_rounding - other_rounding
 
 

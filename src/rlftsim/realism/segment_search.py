@@ -99,11 +99,13 @@ def _squared_box_distance(
     axis_scale: tuple[float, ...],
 ) -> Float[Tensor, "..."]:
     """Squared distance between boxes, each given by its lowest and highest corners; 0 where they touch."""
-    total = None
+    squares = []
     for axis, scale in enumerate(axis_scale):
         gap = torch.maximum(boxes[0][axis] - points[1][axis], points[0][axis] - boxes[1][axis]).clamp_(min=0.0)
-        gap = gap if scale == 1.0 else gap.mul_(scale)
-        total = gap.square_() if total is None else total.add_(gap.square_())
+        squares.append((gap if scale == 1.0 else gap.mul_(scale)).square_())
+    total = squares[0]
+    for square in squares[1:]:
+        total.add_(square)
     return total
 
 
