@@ -20,7 +20,7 @@ from rlftsim.scenario.types import CURRENT_STEP, Scenario
 from rlftsim.training.checkpoint import Progress, newest_checkpoint, read_checkpoint, write_checkpoint
 from rlftsim.training.data import scenarios_of_update
 from rlftsim.training.parallel import DeviceConfig, add_up, add_up_gradients, own_share, start_fabric
-from rlftsim.training.progress import progress_bar
+from rlftsim.progress import progress_bar
 from rlftsim.training.run_folder import RunFolder
 
 
