@@ -98,7 +98,7 @@ class PairedComparison:
         if self.is_better or self.is_worse:
             word, side = ("higher", "above") if self.is_better else ("lower", "below")
             return (
-                f"{self.second} scores {word} than {self.first} in {self.metric}: "
+                f"{_sentence(self.second)} scores {word} than {self.first} in {self.metric}: "
                 f"the whole 95 % interval of the mean difference lies {side} zero."
             )
         return (
@@ -205,6 +205,11 @@ def format_number(value: float, digits: int) -> str:
     return f"{value:.{digits}f}".replace("-", "−")
 
 
+def _sentence(text: str) -> str:
+    """With a capital first letter."""
+    return text[:1].upper() + text[1:]
+
+
 def _shown_columns(rows: Sequence[ResultRow]) -> list[Column]:
     return [column for column in COLUMNS if any(getattr(row, column.field) is not None for row in rows)]
 
@@ -293,7 +298,7 @@ def _comparison_html(comparison: PairedComparison | None) -> str:
     p_text = "p < 0.0001" if comparison.p_value < 1e-4 else f"p = {comparison.p_value:.2g}"
     sign = "+" if comparison.mean_difference > 0 else ""
     return (
-        f"<h2>{escape(comparison.second)} against {escape(comparison.first)}, scenario by scenario</h2>"
+        f"<h2>{escape(_sentence(comparison.second))} against {escape(comparison.first)}, scenario by scenario</h2>"
         f'<div class="card comparison"><div><p class="verdict">{escape(comparison.verdict_text)}</p>'
         f"<p>Mean difference in {escape(comparison.metric)} {sign}{format_number(comparison.mean_difference, 4)}, "
         f"95 % interval {_interval_text(comparison.interval, 4)}, {p_text} ({escape(comparison.test)}), "

@@ -12,7 +12,7 @@ from rlftsim.errors import DataError
 from rlftsim.viewer.page import embed_json
 
 WIDTH, HEIGHT = 460, 270
-LEFT, RIGHT, TOP, BOTTOM = 58, 14, 12, 44
+LEFT, RIGHT, TOP, BOTTOM = 72, 14, 12, 44
 """Room around the plotted area, in the SVG's own units."""
 MAX_DRAWN_POINTS = 600
 MIN_POINTS_TO_SMOOTH = 12
@@ -86,9 +86,11 @@ def chart_html(chart: Chart) -> str:
 
 
 def smooth(values: Float[np.ndarray, "n"], window: int) -> Float[np.ndarray, "n"]:
-    """Centred running mean; near the ends the window is cut off, so a constant stays a constant."""
-    kernel = np.ones(window)
-    return np.convolve(values, kernel, "same") / np.convolve(np.ones(len(values)), kernel, "same")
+    """Centred running mean. Near the ends the window shrinks on both sides, so a straight line stays a straight line."""
+    index = np.arange(len(values))
+    half = np.minimum(window // 2, np.minimum(index, index[::-1]))
+    sums = np.concatenate([[0.0], np.cumsum(values)])
+    return (sums[index + half + 1] - sums[index - half]) / (2 * half + 1)
 
 
 def colour_of(index: int) -> str:

@@ -168,7 +168,8 @@ def _legend_html(animation: Animation) -> str:
             ("".join(f'<circle cx="{x}" cy="8" r="3.5" fill="var(--{c})"/>' for x, c in dots), "traffic light")
         )
     if any(line.kind == "stop_sign" for line in animation.scene.lines):
-        octagon = '<path d="M16 6.3v3.4L13.7 12h-3.4L8 9.7V6.3L10.3 4h3.4z" fill="var(--stop)"/>'
+        octagon = '<path d="M18 5.5v5L14.5 14h-5L6 10.5v-5L9.5 2h5z" fill="var(--stop)"/>'
+        octagon += '<path d="M8.5 7h7v2h-7z" fill="var(--surface)"/>'
         entries.append((octagon, "stop sign"))
     if any(t.collides is not None for t in trajectories):
         entries.append((f"{_box_svg('collision', 7)}{_ring_svg('collision')}", "collides"))
@@ -188,6 +189,6 @@ def _box_svg(colour: str, half: float = 10) -> str:
 def _ring_svg(colour: str, dashes: str = "") -> str:
     """The frame around a marked vehicle."""
     return (
-        f'<rect x="1" y="1" width="22" height="14" rx="3" fill="none" stroke="var(--{colour})" stroke-width="2"'
+        f'<rect x="1" y="1" width="22" height="14" rx="3" fill="var(--{colour})" fill-opacity=".3" stroke="var(--{colour})" stroke-width="2"'
         f' stroke-dasharray="{dashes}"/>'
     )

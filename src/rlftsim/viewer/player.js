@@ -106,9 +106,10 @@
       ctx.beginPath();
       for (let i = 0; i < 8; i++) {
         const a = Math.PI / 8 + (i * Math.PI) / 4;
-        ctx.lineTo(x + 4 * px * Math.cos(a), y + 4 * px * Math.sin(a));
+        ctx.lineTo(x + 6 * px * Math.cos(a), y + 6 * px * Math.sin(a));
       }
       ctx.closePath(); ctx.fillStyle = colours.stop; ctx.fill();
+      ctx.fillStyle = colours.surface; ctx.fillRect(x - 3.5 * px, y - 0.9 * px, 7 * px, 1.8 * px);
     }
   }
 
@@ -149,8 +150,16 @@
     const half = Math.max(length / 200, (type === CYCLIST ? 2 : 1) * small * px), halfWidth = Math.max(width / 200, small * px);
     ctx.save();
     ctx.translate(state.x, state.y); ctx.rotate(state.heading);
+    const ring = (gap, colour, dash) => {
+      traceShape(ctx, type, half + gap * px, halfWidth + gap * px);
+      ctx.fillStyle = ctx.strokeStyle = colour; ctx.lineWidth = 2 * px;
+      ctx.globalAlpha = 0.3; ctx.fill(); ctx.globalAlpha = 1;
+      ctx.setLineDash(dash); ctx.stroke(); ctx.setLineDash([]);
+    };
+    if (state.offroad) ring(state.collides ? 8 : 4, colours.offroad, [3 * px, 2 * px]);
+    if (state.collides) ring(4, colours.collision, []);
     traceShape(ctx, type, half, halfWidth);
-    ctx.fillStyle = state.collides ? colours.collision : colours[`agent-${ROLE_NAMES[role]}`];
+    ctx.fillStyle = colours[`agent-${ROLE_NAMES[role]}`];
     ctx.fill();
     ctx.strokeStyle = hovered ? colours.ink : colours["agent-outline"]; ctx.lineWidth = (hovered ? 2 : 0.8) * px; ctx.stroke();
     // the heading mark: a wedge that points ahead, outside the disc of a pedestrian
@@ -159,12 +168,6 @@
     ctx.beginPath(); ctx.moveTo(tip, 0); ctx.lineTo(root, spread); ctx.lineTo(root, -spread); ctx.closePath();
     if (type !== PEDESTRIAN) ctx.fillStyle = colours["heading-mark"];
     ctx.fill();
-    const ring = (gap, colour, dash) => {
-      traceShape(ctx, type, half + gap * px, halfWidth + gap * px);
-      ctx.strokeStyle = colour; ctx.lineWidth = 2 * px; ctx.setLineDash(dash); ctx.stroke(); ctx.setLineDash([]);
-    };
-    if (state.collides) ring(4, colours.collision, []);
-    if (state.offroad) ring(state.collides ? 8 : 4, colours.offroad, [3 * px, 2 * px]);
     ctx.restore();
   }
 
@@ -376,10 +379,10 @@
     draw() {
       this.colours ??= readColours(this.root);
       for (const panel of this.panels) { panel.draw(this.colours); panel.describe(this.hovered); }
-      const seconds = (this.time - this.scene.now) * STEP_S, past = this.time < this.scene.now;
+      const seconds = (this.time - this.scene.now) * STEP_S, distance = Math.round(10 * seconds);
       this.slider.value = this.time;
       this.find("clock").textContent = `${seconds < -0.04 ? "−" : "+"}${Math.abs(seconds).toFixed(1)} s`;
-      this.find("phase").textContent = past ? "history" : "future";
+      this.find("phase").textContent = distance < 0 ? "history" : distance ? "future" : "now";
       this.root.dataset.step = Math.floor(this.time);
     }
   }
