@@ -158,13 +158,12 @@ def compute_log_probabilities(
     return (counts + pseudocount).log_() - total.log()[..., None, None]
 
 
-def compute_likelihoods(
+def compute_agent_log_likelihoods(
     counts: RolloutCounts, num_rollouts: Float[Tensor, "S"], target: LogTarget, table: HistogramTable
-) -> Float[Tensor, "S F"]:
-    """Likelihood of the log under S sets of rollouts, one per feature: the exponential of the mean log-probability.
+) -> Float[Tensor, "S F E"]:
+    """What each agent adds to the log-likelihood of the log under S sets of rollouts, nats.
 
-    Histogram features average over all scored (agent, step) pairs together, Bernoulli ones over all agents. A feature
-    without a scored step is NaN, as in the official evaluator.
+    The log-probabilities of an agent's scored steps, summed; for a Bernoulli feature that of its one outcome.
 
     Args:
         counts: Summed over each set: `bins` [S, H, E, K], `agreement` [S, J, E].
@@ -173,7 +172,25 @@ def compute_likelihoods(
         table: The metric's bins.
     """
     log_probability = compute_log_probabilities(counts.bins, num_rollouts * counts.num_steps, table)
-    histogram = (log_probability * target.steps_in_bin).sum((-1, -2)) / target.num_scored_steps  # [S, H]
+    histogram = (log_probability * target.steps_in_bin).sum(-1)  # [S, H, E]
     pseudocount = table.bernoulli_pseudocount
     agreement = (counts.agreement + pseudocount[:, None]) / (num_rollouts[:, None] + 2 * pseudocount)[..., None]
-    return torch.cat([histogram, agreement.log_().mean(-1)], dim=-1).exp_()
+    return torch.cat([histogram, agreement.log_()], dim=1)
+
+
+def count_terms(target: LogTarget) -> Float[Tensor, "F"]:
+    """Number of log-probabilities a feature's mean is taken over: scored (agent, step) pairs, or agents."""
+    num_bernoulli, num_agents = target.outcome.shape
+    return torch.cat([target.num_scored_steps, target.num_scored_steps.new_full((num_bernoulli,), num_agents)])
+
+
+def compute_likelihoods(
+    counts: RolloutCounts, num_rollouts: Float[Tensor, "S"], target: LogTarget, table: HistogramTable
+) -> Float[Tensor, "S F"]:
+    """Likelihood of the log under S sets of rollouts, one per feature: the exponential of the mean log-probability.
+
+    Histogram features average over all scored (agent, step) pairs together, Bernoulli ones over all agents. A feature
+    without a scored step is NaN, as in the official evaluator. Arguments as in `compute_agent_log_likelihoods`.
+    """
+    by_agent = compute_agent_log_likelihoods(counts, num_rollouts, target, table)
+    return (by_agent.sum(-1) / count_terms(target)).exp_()
