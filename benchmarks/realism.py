@@ -67,9 +67,7 @@ def change_agents(scenario, states, num_agents: int):
     chosen = np.array([order[a % len(order)] for a in range(num_agents)])
     shift = np.array([a // len(order) for a in range(num_agents)]) * 3.0
     rows = scenario.simulated_indices[chosen]
-    tracks = replace(
-        scenario.tracks, **{name: values[rows].copy() for name, values in vars(scenario.tracks).items()}
-    )
+    tracks = replace(scenario.tracks, **{name: values[rows].copy() for name, values in vars(scenario.tracks).items()})
     tracks.position[..., 0] += shift[:, None].astype(np.float32)
     tracks.object_id[:] = np.arange(num_agents)
     predicted = np.arange(1, min(num_agents, 8), dtype=np.int32)
@@ -137,7 +135,10 @@ def measure_leave_one_out(shared: Path, prefix: str, recipe: str) -> dict[str, f
         bins, agreement = counts.bins.sum(0, keepdim=True), counts.agreement.sum(0, keepdim=True)
         sizes = torch.tensor([float(NUM_ROLLOUTS)])
         if with_sets:
-            bins, agreement = torch.cat([bins, bins - counts.bins]), torch.cat([agreement, agreement - counts.agreement])
+            bins, agreement = (
+                torch.cat([bins, bins - counts.bins]),
+                torch.cat([agreement, agreement - counts.agreement]),
+            )
             sizes = torch.cat([sizes, torch.full((NUM_ROLLOUTS,), NUM_ROLLOUTS - 1.0)])
         return compute_likelihoods(RolloutCounts(bins, agreement, counts.num_steps), sizes, target, table)
 
@@ -173,11 +174,8 @@ def run_official(python: Path, shared: Path, recipe: str) -> dict[str, dict[str,
         rollouts = shared / "golden" / "rmm" / "rollouts" / f"{prefix}_{recipe}.npz"
         with tempfile.TemporaryDirectory() as folder:
             out = Path(folder) / "result.json"
-            subprocess.run(
-                [python, script, "--scenarios", shared / "data" / "womd", "--rollouts", rollouts, "--configs", "2025"]
-                + ["--threads", "1", "--out", out],
-                check=True,
-            )
+            arguments = ["--scenarios", shared / "data" / "womd", "--rollouts", rollouts, "--configs", "2025"]
+            subprocess.run([python, script, *arguments, "--threads", "1", "--out", out], check=True)
             result = json.loads(out.read_text())
         case = result["cases"][0]
         found[prefix] = {
@@ -220,10 +218,14 @@ def print_comparison(options: argparse.Namespace) -> None:
 
 
 def print_scaling(options: argparse.Namespace) -> None:
-    header = "agents | evaluated | map points | rollouts | prepare ms | score ms | ms per rollout | added MiB | peak MiB |"
+    header = (
+        "agents | evaluated | map points | rollouts | prepare ms | score ms | ms per rollout | added MiB | peak MiB |"
+    )
     settings = {
         "rollouts (637f)": [("637f", n, None) for n in ROLLOUTS_SCALED],
-        "agents (ee51 with fewer agents, or with copies 3 m beside)": [("ee51", NUM_ROLLOUTS, a) for a in AGENTS_SCALED],
+        "agents (ee51 with fewer agents, or with copies 3 m beside)": [
+            ("ee51", NUM_ROLLOUTS, a) for a in AGENTS_SCALED
+        ],
     }
     for title, cases in settings.items():
         print(f"\n## More {title}\n\n| {header}\n|{'--:|' * 9}", flush=True)

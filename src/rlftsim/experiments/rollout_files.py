@@ -168,7 +168,9 @@ def _entries_of_submission(path: Path) -> Iterator[RolloutEntry]:
         if not messages:
             raise DataError("it holds no rollouts")
         for message in messages:
-            names = [f for f in iterate_fields(file, message.start, message.stop) if (f.number, f.wire_type) == (1, BYTES)]
+            names = [
+                f for f in iterate_fields(file, message.start, message.stop) if (f.number, f.wire_type) == (1, BYTES)
+            ]
             if len(names) != 1:
                 raise DataError(f"the rollouts at byte {message.start} name no scenario")
             file.seek(names[0].start)

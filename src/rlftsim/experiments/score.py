@@ -89,7 +89,7 @@ def score_rollouts(
     rollouts: Path,
     scenarios: Path,
     out: Path | None = None,
-    config: ScoreConfig = ScoreConfig(),  # noqa: B008
+    config: ScoreConfig = ScoreConfig(),
     *,
     name: str | None = None,
     show_progress: bool = True,
@@ -113,7 +113,7 @@ def score_rollouts(
     """
     with tempfile.TemporaryDirectory() as nowhere:
         entries, source = find_rollouts(rollouts)[: config.limit], open_scenarios(scenarios)
-        _check_entries(entries, source, config, scenarios)
+        check_entries(entries, source, config, scenarios)
         known = next((entry for entry in entries if entry.scenario_id in source), None)
         if known is None:
             raise DataError(f"{rollouts}: none of its {len(entries)} scenarios is in {scenarios}: nothing to score.")
@@ -175,7 +175,7 @@ class _Job:
     place: ResumableEvaluation
 
 
-def _check_entries(entries: Sequence[RolloutEntry], source: ScenarioSource, config: ScoreConfig, where: Path) -> None:
+def check_entries(entries: Sequence[RolloutEntry], source: ScenarioSource, config: ScoreConfig, where: Path) -> None:
     """Refuse, or mention, rollouts without scenario and scenarios with several sets of rollouts."""
     unknown = [entry for entry in entries if entry.scenario_id not in source]
     if unknown and config.missing_scenario == "error":

@@ -108,7 +108,7 @@ def compute_outcomes(features: Features, log: ScenarioLog) -> Bool[Tensor, "N J 
     return torch.stack([features.collision, features.offroad, lights], dim=1).logical_and_(log_valid).any(-1)
 
 
-def _stack_scored_steps(log: ScenarioLog, config: MetricConfig) -> Bool[Tensor, "H E T"]:
+def stack_scored_steps(log: ScenarioLog, config: MetricConfig) -> Bool[Tensor, "H E T"]:
     """At which steps of the log each histogram feature counts."""
     features = log.features
     valid, speed, acceleration = features.valid[0], features.speed_valid[0], features.acceleration_valid[0]
@@ -120,7 +120,7 @@ def build_log_target(log: ScenarioLog, config: MetricConfig) -> LogTarget:
     """Bins and outcomes of the log under a configuration."""
     table = histogram_table(config, log.agents.valid.device)
     values = stack_histogram_features(log.features)[:, 0]
-    scored = _stack_scored_steps(log, config).to(values.dtype)
+    scored = stack_scored_steps(log, config).to(values.dtype)
     bins = find_bins(values.flatten(1), table).view(values.shape)
     steps = values.new_zeros(*values.shape[:2], table.edges.shape[1] - 1).scatter_add_(-1, bins, scored)
     return LogTarget(steps, scored.sum((1, 2)), compute_outcomes(log.features, log)[0])
