@@ -17,6 +17,8 @@ LEFT, RIGHT, TOP, BOTTOM = 72, 14, 12, 44
 MAX_DRAWN_POINTS = 600
 MIN_POINTS_TO_SMOOTH = 12
 NUM_SERIES_COLOURS = 4
+DRAWN_MAGNITUDE = 1e30
+"""Values further from zero are left out as if not finite; on a logarithmic axis also those closer to it than one over this."""
 
 
 @dataclass(frozen=True)
@@ -112,16 +114,14 @@ def format_tick(value: float, step: float) -> str:
     largest = max(abs(value), step)
     if largest >= 1e5 or step < 1e-5:
         return f"{value:.3g}".replace("-", "−")
-    digits = max(0, -math.floor(math.log10(step) + 1e-9))
-    if digits and abs(round(step, digits) - step) > 1e-9 * step:
-        digits += 1
+    digits = next((d for d in range(8) if abs(round(step, d) - step) < 1e-6 * step), 8)
     return f"{value:,.{digits}f}".replace("-", "−").replace(",", "\u202f")
 
 
 def _drawable(curve: Curve, log_y: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Finite (and, on a logarithmic axis, positive) points, averaged over neighbours where there are very many."""
+    """Points that can be drawn, averaged over neighbours where there are very many."""
     x, y = np.asarray(curve.x, float), np.asarray(curve.y, float)
-    kept = np.isfinite(x) & np.isfinite(y) & ((y > 0) if log_y else True)
+    kept = np.isfinite(x) & (np.abs(y) < DRAWN_MAGNITUDE) & ((y > 1 / DRAWN_MAGNITUDE) if log_y else True)
     x, y = x[kept], y[kept]
     if len(x) <= MAX_DRAWN_POINTS:
         return x, y
@@ -156,9 +156,7 @@ def _axes(drawn: list[tuple[str, np.ndarray, np.ndarray]], chart: Chart) -> Axes
 def _frame_svg(axes: Axes, chart: Chart) -> str:
     """Grid, tick labels, axis labels, reference line."""
     bottom, right = HEIGHT - BOTTOM, WIDTH - RIGHT
-    parts = [
-        f'<clipPath id="plot"><rect x="{LEFT}" y="{TOP}" width="{right - LEFT}" height="{bottom - TOP}"/></clipPath>'
-    ]
+    parts = []
     for value, label in _vertical_ticks(axes):
         y = float(axes.vertical(np.array(value)))
         parts.append(f'<path class="grid" d="M{LEFT} {y:.1f}H{right}"/>')
@@ -196,9 +194,10 @@ def _vertical_ticks(axes: Axes) -> list[tuple[float, str]]:
         ticks = nice_ticks(axes.y_low, axes.y_high, 5)
         step = ticks[1] - ticks[0] if len(ticks) > 1 else 1
         return [(v, format_tick(v, step)) for v in ticks]
-    multiples = (1,) if axes.y_high - axes.y_low > 2 else (1, 2, 5)
     decades = range(math.floor(axes.y_low), math.ceil(axes.y_high) + 1)
-    marks = [m * 10.0**d for d in decades for m in multiples if axes.y_low <= math.log10(m * 10.0**d) <= axes.y_high]
+    multiples = (1,) if len(decades) > 3 else (1, 2, 5)
+    exponents = [(m, d) for d in decades[:: max(1, len(decades) // 5)] for m in multiples]
+    marks = [m * 10.0**d for m, d in exponents if axes.y_low <= math.log10(m) + d <= axes.y_high]
     return [(v, f"{v:.3g}".replace("-", "−")) for v in marks]
 
 
@@ -207,16 +206,19 @@ def _curve_svg(axes: Axes, x: np.ndarray, y: np.ndarray, colour: str) -> str:
     if not len(x):
         return ""
     window = _window(len(x))
-    style = f'stroke="{colour}" clip-path="url(#plot)"'
-    raw = _path(axes.horizontal(x), axes.vertical(y))
+    across, down = axes.horizontal(x), axes.vertical(y)
+    raw = _path(across, down)
     if window == 1:
-        dots = "".join(
-            f'<circle cx="{a:.1f}" cy="{b:.1f}" r="3" fill="{colour}"/>'
-            for a, b in zip(axes.horizontal(x), axes.vertical(y))
-        )
-        return f'<path class="smooth" d="{raw}" {style}/>{dots}'
-    smoothed = _path(axes.horizontal(x), axes.vertical(smooth(y, window)))
-    return f'<path class="raw" d="{raw}" {style}/><path class="smooth" d="{smoothed}" {style}/>'
+        dots = "".join(f'<circle cx="{a:.1f}" cy="{b:.1f}" r="3" fill="{colour}"/>' for a, b in zip(across, down))
+        return f'<path class="smooth" d="{raw}" stroke="{colour}"/>{dots}'
+    smoothed = _path(across, axes.vertical(smooth(y, window)))
+    # a nested svg cuts off what lies outside its box: the wildest raw points
+    box = f"{LEFT} {TOP} {WIDTH - LEFT - RIGHT} {HEIGHT - TOP - BOTTOM}"
+    place = 'x="{}" y="{}" width="{}" height="{}"'.format(*box.split())
+    return (
+        f'<svg {place} viewBox="{box}"><path class="raw" d="{raw}" stroke="{colour}"/></svg>'
+        f'<path class="smooth" d="{smoothed}" stroke="{colour}"/>'
+    )
 
 
 def _path(x: np.ndarray, y: np.ndarray) -> str:
