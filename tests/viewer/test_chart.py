@@ -13,7 +13,7 @@ def test_smoothing_keeps_a_straight_line():
 
 
 def test_smoothing_averages_over_the_window():
-    # 0 0 3 0 0 with a window of 3: the spike spreads over its neighbours, the ends have no neighbours to share
+    # 0 0 3 0 0 with a window of 3: inside a running mean, at the ends a line through two zeros
     np.testing.assert_allclose(smooth(np.array([0.0, 0, 3, 0, 0]), 3), [0, 1, 1, 1, 0])
 
 

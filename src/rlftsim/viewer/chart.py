@@ -88,11 +88,19 @@ def chart_html(chart: Chart) -> str:
 
 
 def smooth(values: Float[np.ndarray, "n"], window: int) -> Float[np.ndarray, "n"]:
-    """Centred running mean. Near the ends the window shrinks on both sides, so a straight line stays a straight line."""
-    index = np.arange(len(values))
-    half = np.minimum(window // 2, np.minimum(index, index[::-1]))
-    sums = np.concatenate([[0.0], np.cumsum(values)])
-    return (sums[index + half + 1] - sums[index - half]) / (2 * half + 1)
+    """At each point the straight line fitted to its neighbours: inside a running mean, at the ends without their bias or jumps.
+
+    Args:
+        values: at equal distances.
+        window: how many points are fitted, an odd number; fewer at the ends.
+    """
+    half, smoothed = window // 2, np.array(values, float)
+    for i in range(len(smoothed)):
+        near = np.arange(max(0, i - half), min(len(smoothed), i + half + 1))
+        offset = near - near.mean()
+        slope = offset @ values[near] / max(float(offset @ offset), 1.0)
+        smoothed[i] = values[near].mean() + slope * (i - near.mean())
+    return smoothed
 
 
 def colour_of(index: int) -> str:
