@@ -61,7 +61,9 @@ class Convert:
         """Convert and say what became of every record."""
         report = convert(self.source, self.destination, split=self.split, on_error=self.on_error, jobs=self.jobs)
         by_split = ", ".join(f"{count} {split}" for split, count in report.counts.items())
-        print(f"{report.destination}: {report.converted} scenarios converted, {len(report.skipped)} lost; in all {by_split}.")
+        print(
+            f"{report.destination}: {report.converted} scenarios converted, {len(report.skipped)} lost; in all {by_split}."
+        )
         for record in [*report.skipped, *report.duplicates][:MAX_LISTED]:
             print(f"  left out: {record.file}, record {record.record}: {record.cause}")
         hidden = len(report.skipped) + len(report.duplicates) - MAX_LISTED
@@ -123,7 +125,7 @@ def _stats_table(name: str, stats: DatasetStats) -> Table:
     return table
 
 
-def _counts(counts) -> str:  # noqa: ANN001
+def _counts(counts) -> str:
     return ", ".join(f"{count} {name}" for name, count in counts.items())
 
 

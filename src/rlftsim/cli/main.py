@@ -38,7 +38,9 @@ INTERRUPTED = 130
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command line; returns the exit status."""
-    command = tyro.cli(Command, args=arguments, prog="rlftsim", description=DESCRIPTION, config=(tyro.conf.OmitSubcommandPrefixes,))
+    command = tyro.cli(
+        Command, args=arguments, prog="rlftsim", description=DESCRIPTION, config=(tyro.conf.OmitSubcommandPrefixes,)
+    )
     try:
         return command.run()
     except RlftsimError as error:
