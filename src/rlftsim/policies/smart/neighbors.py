@@ -11,7 +11,6 @@ from torch import Tensor
 
 from rlftsim.geometry import angle_between, heading_vector, wrap_angle
 
-
 PAIRS_PER_PIECE = 1 << 18
 """Distances that are looked at together: they fit the processor's cache."""
 

@@ -29,7 +29,6 @@ from rlftsim.policies.smart.neighbors import Neighbors, nearest_within, pad_list
 from rlftsim.tokens.map_tokens import NUM_KINDS, NUM_LIGHTS, NUM_TYPES, MapTokens
 from rlftsim.tokens.vocabulary import CLASS_NAMES
 
-
 MAX_LOOK_BACK_M = 160.0
 """Farthest that anybody gets while it is remembered (3 s at 50 m/s), for tables."""
 

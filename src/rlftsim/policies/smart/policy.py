@@ -59,9 +59,9 @@ class SmartState:
 class TeacherForced:
     """Predictions along recorded tracks and what they should have said."""
 
-    distribution: TokenDistribution
+    logits: Float[Tensor, "R V"]
     target: Int64[Tensor, "R"]
-    """Token that came next, for the elements of the distribution."""
+    """Token that came next."""
     target_mask: Bool[Tensor, "R"]
     """True = the next state was recorded and the agent is trained on."""
 
@@ -186,10 +186,13 @@ class SmartPolicy(nn.Module):
         decides = steps.valid.clone()
         decides[..., : HISTORY_TOKENS - 1] = False
         counts = (tokens.valid[..., 1:] & trained[..., None])[:, None][decides]
-        distribution = TokenDistribution(
-            self._logits(rows[decides[steps.valid]], scenarios.object_type, decides), decides
-        )
-        return TeacherForced(distribution, tokens.token_id[:, None, :, 1:][decides], counts)
+        logits = self._logits(rows[decides[steps.valid]], scenarios.object_type, decides)
+        return TeacherForced(logits, tokens.token_id[:, None, :, 1:][decides], counts)
+
+    def fine_tuned_parts(self) -> tuple[nn.Module, ...]:
+        """What closed-loop fine-tuning trains: the decoder's attention and the head, as the public CAT-K code does."""
+        decoder = self.network.decoder
+        return decoder.time_layers, decoder.map_layers, decoder.agent_layers, decoder.head
 
     # ---- files ----------------------------------------------------------------------------------------------------
 

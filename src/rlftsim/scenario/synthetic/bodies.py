@@ -1,0 +1,210 @@
+"""From a simulator's bumper on a lane to bodies that move like vehicles, and from striping pedestrians to smooth walkers.
+
+Arrays run over the steps (0.1 s) during which a road user exists; positions in plan coordinates, metres.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from rlftsim.scenario.types import STEP_S, ObjectType
+
+REAR_AXLE_FROM_BUMPER = 0.78
+"""Share of the length between front bumper and rear axle."""
+MIN_LANE_CHANGE_M = 18.0
+LANE_CHANGE_S = 3.0
+BUMPER_SMOOTHING_S = 0.15
+WALK_SMOOTHING_S = 0.4
+WALK_HEADING_SPEED_MPS = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """One road user over the steps it exists, without label noise."""
+
+    object_type: ObjectType
+    first_step: int
+    position: Float[np.ndarray, "n 2"]
+    heading: Float[np.ndarray, "n"]
+    velocity: Float[np.ndarray, "n 2"]
+    size: tuple[float, float, float]
+    is_parked: bool = False
+    is_evaluable: bool = True
+    """False = never among the tracks to predict (a lot's cars, long vehicles)."""
+
+    @property
+    def num_steps(self) -> int:
+        """Length of life in steps."""
+        return len(self.heading)
+
+
+@dataclass(frozen=True, eq=False)
+class LanePath:
+    """A vehicle's front bumper as SUMO reports it: per step a point on a lane's centre line, its direction, and the lane changes."""
+
+    first_step: int
+    centre: Float[np.ndarray, "n 2"]
+    direction: Float[np.ndarray, "n 2"]
+    """Unit tangent of the lane."""
+    speed_mps: Float[np.ndarray, "n"]
+    change_steps: tuple[int, ...] = ()
+    """First step on the new lane."""
+    change_left_m: tuple[float, ...] = ()
+    """How far the new lane lies to the left of the old one (negative: to the right)."""
+
+
+def smoother_step(u: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    """Rises from 0 at u = 0 to 1 at u = 1 with two vanishing derivatives at both ends; constant outside."""
+    u = np.clip(u, 0.0, 1.0)
+    return u**3 * (u * (6 * u - 15) + 10)
+
+
+def lane_change_offset(
+    driven_m: Float[np.ndarray, "n"], speed_mps: Float[np.ndarray, "n"], step: int, left_m: float
+) -> Float[np.ndarray, "n"]:
+    """Lateral offset that turns a jump between two lane centres into a smooth step along the driven distance.
+
+    A function of distance, not of time: a car that stops in the middle of a lane change stands where it is.
+
+    Args:
+        driven_m: distance driven since the first step.
+        speed_mps: speed per step.
+        step: first step on the new lane.
+        left_m: signed distance of the new lane from the old one, positive to the left.
+
+    Returns:
+        Metres to the left to add to the centre of the current lane; adding it to the jump leaves no discontinuity.
+    """
+    length = max(MIN_LANE_CHANGE_M, LANE_CHANGE_S * float(speed_mps[step]))
+    share = smoother_step((driven_m - driven_m[step]) / length + 0.5)
+    on_new_lane = np.arange(len(driven_m)) >= step
+    return left_m * (share - on_new_lane)
+
+
+def drag_rear_axle(
+    bumper: Float[np.ndarray, "n 2"], length_m: float, direction: Float[np.ndarray, "2"]
+) -> Float[np.ndarray, "n"]:
+    """Heading of a body whose rear axle is dragged behind its front bumper (a tractrix), unwrapped.
+
+    Args:
+        bumper: path of the middle of the front bumper.
+        length_m: length of the body.
+        direction: unit vector the body points along at the first step.
+    """
+    reach = REAR_AXLE_FROM_BUMPER * length_m
+    rear_x, rear_y = bumper[0] - reach * direction
+    heading = np.empty(len(bumper))
+    for step, (x, y) in enumerate(bumper.tolist()):
+        dx, dy = x - rear_x, y - rear_y
+        distance = math.hypot(dx, dy)
+        rear_x, rear_y = x - dx / distance * reach, y - dy / distance * reach
+        heading[step] = math.atan2(dy, dx)
+    return np.unwrap(heading)
+
+
+def smooth_over_time(values: Float[np.ndarray, "n ..."], sigma_s: float) -> Float[np.ndarray, "n ..."]:
+    """Values convolved with a Gaussian along the steps; before the first and after the last step they are held."""
+    sigma = sigma_s / STEP_S
+    radius = int(np.ceil(4 * sigma))
+    kernel = np.exp(-0.5 * (np.arange(-radius, radius + 1) / sigma) ** 2)
+    columns = values.reshape(len(values), -1)
+    padded = np.pad(columns, ((radius, radius), (0, 0)), mode="edge")
+    smooth = [np.convolve(column, kernel / kernel.sum(), mode="valid") for column in padded.T]
+    return np.stack(smooth, axis=1).reshape(values.shape)
+
+
+def _central_differences(position: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+    if len(position) < 2:
+        return np.zeros_like(position)
+    return np.gradient(position, STEP_S, axis=0)
+
+
+def build_vehicle(
+    path: LanePath,
+    object_type: ObjectType,
+    size: tuple[float, float, float],
+    habit: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    is_evaluable: bool = True,
+) -> Body:
+    """Body of a vehicle that follows a bumper path.
+
+    Args:
+        path: bumper on lane centres.
+        object_type: vehicle or cyclist.
+        size: length, width, height in metres.
+        habit: how the driver keeps the lane: constant offset to the left and amplitude of a slow weave in metres, its phase.
+        is_evaluable: whether it may be a track to predict.
+    """
+    driven = np.concatenate([[0.0], np.cumsum(path.speed_mps[1:] * STEP_S)])
+    left = habit[0] + habit[1] * np.sin(driven / 14.0 + habit[2])
+    for step, distance in zip(path.change_steps, path.change_left_m, strict=True):
+        left = left + lane_change_offset(driven, path.speed_mps, step, distance)
+    normal = np.stack([-path.direction[:, 1], path.direction[:, 0]], axis=1)
+    bumper = smooth_over_time(path.centre + left[:, None] * normal, BUMPER_SMOOTHING_S)
+    heading = drag_rear_axle(bumper, size[0], path.direction[0])
+    centre = bumper - size[0] / 2 * np.stack([np.cos(heading), np.sin(heading)], axis=1)
+    return Body(
+        object_type,
+        path.first_step,
+        centre,
+        heading,
+        _central_differences(centre),
+        size,
+        is_evaluable=is_evaluable,
+    )
+
+
+def build_pedestrian(
+    first_step: int, position: Float[np.ndarray, "n 2"], heading_rad: float, size: tuple[float, float, float]
+) -> Body:
+    """Body of a pedestrian; while it stands it keeps the heading it had.
+
+    Args:
+        first_step: step of the first position.
+        position: as SUMO reports it.
+        heading_rad: heading used when the pedestrian never walks.
+        size: length, width, height in metres.
+    """
+    smooth = smooth_over_time(position, WALK_SMOOTHING_S)
+    velocity = _central_differences(smooth)
+    walking = np.flatnonzero(np.linalg.norm(velocity, axis=1) > WALK_HEADING_SPEED_MPS)
+    heading = np.full(len(position), heading_rad)
+    if len(walking):
+        measured = np.unwrap(np.arctan2(velocity[walking, 1], velocity[walking, 0]))
+        latest = np.clip(np.searchsorted(walking, np.arange(len(position)), side="right") - 1, 0, None)
+        heading = smooth_over_time(measured[latest], WALK_SMOOTHING_S)
+    return Body(ObjectType.PEDESTRIAN, first_step, smooth, heading, velocity, size)
+
+
+@dataclass(frozen=True)
+class LabelNoise:
+    """Jitter of labels: white noise of one agent."""
+
+    along_m: float
+    across_m: float
+    heading_rad: float
+    velocity_mps: float
+
+
+def draw_label_noise(rng: np.random.Generator) -> LabelNoise:
+    """Noise of one agent: median 10 mm along, 4 mm across, 1 mrad, with a long tail."""
+    along = float(rng.gamma(1.6, 0.0078))
+    return LabelNoise(along, 0.4 * along, 0.1 * along, 3.0 * along)
+
+
+def add_label_noise(
+    rng: np.random.Generator, noise: LabelNoise, position: np.ndarray, heading: np.ndarray, velocity: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Position [n, 2], heading [n] and velocity [n, 2] with noise that fades below 0.5 m/s: what stands is frozen."""
+    moving = np.clip(np.linalg.norm(velocity, axis=1) / 0.5, 0.0, 1.0)
+    moving[moving < 0.1] = 0.0
+    forward = np.stack([np.cos(heading), np.sin(heading)], axis=1)
+    left = np.stack([-forward[:, 1], forward[:, 0]], axis=1)
+    shape = len(heading)
+    shift = (rng.normal(0, noise.along_m, shape) * moving)[:, None] * forward
+    shift += (rng.normal(0, noise.across_m, shape) * moving)[:, None] * left
+    turned = heading + rng.normal(0, noise.heading_rad, shape) * moving
+    pushed = velocity + rng.normal(0, noise.velocity_mps, (shape, 2)) * moving[:, None]
+    return position + shift, turned, pushed

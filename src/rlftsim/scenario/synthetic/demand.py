@@ -1,0 +1,163 @@
+"""Who travels: vehicle types with their drivers, trips of vehicles and bicycles, walks of pedestrians."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from rlftsim.scenario.synthetic.street_plan import StreetPlan
+from rlftsim.scenario.synthetic.sumo import SIMULATED_S
+from rlftsim.scenario.types import ObjectType
+
+
+@dataclass(frozen=True)
+class RoadUserType:
+    """A kind of vehicle together with its driver."""
+
+    type_id: str
+    vehicle_class: str
+    object_type: ObjectType
+    length_m: float
+    width_m: float
+    height_m: float
+
+
+_SHARES = {"car": 0.62, "suv": 0.24, "van": 0.05, "truck": 0.04, "bus": 0.02, "motorcycle": 0.03}
+_CLASSES = {"car": "passenger", "suv": "passenger", "van": "delivery", "truck": "truck", "bus": "bus"}
+_SIZES = {
+    # length, width, height: mean, spread, low, high in metres, mirrors included
+    "car": ((4.55, 0.22, 4.0, 5.1), (2.04, 0.06, 1.9, 2.2), (1.56, 0.08, 1.4, 1.8)),
+    "suv": ((4.85, 0.30, 4.3, 5.7), (2.18, 0.09, 2.0, 2.4), (1.85, 0.12, 1.6, 2.2)),
+    "van": ((5.70, 0.40, 5.0, 6.8), (2.36, 0.10, 2.2, 2.6), (2.50, 0.20, 2.1, 2.9)),
+    "truck": ((8.00, 1.40, 6.0, 11.0), (2.70, 0.12, 2.5, 2.9), (3.20, 0.30, 2.6, 3.9)),
+    "bus": ((11.9, 0.40, 11.0, 12.6), (2.90, 0.08, 2.7, 3.0), (3.20, 0.10, 3.0, 3.5)),
+    "motorcycle": ((2.15, 0.10, 1.9, 2.4), (0.90, 0.06, 0.8, 1.0), (1.55, 0.08, 1.4, 1.8)),
+    "bicycle": ((1.85, 0.11, 1.6, 2.1), (0.84, 0.05, 0.74, 0.95), (1.80, 0.10, 1.5, 2.0)),
+    "pedestrian": ((0.92, 0.10, 0.7, 1.2), (0.86, 0.08, 0.7, 1.1), (1.72, 0.13, 1.3, 2.0)),
+}
+
+
+NUM_GAITS = 8
+"""Kinds of pedestrians by how fast they walk."""
+VEHICLES_PER_LANE_AND_S = {"city": (0.02, 0.04), "quiet": (0.04, 0.075), "freeway": (0.25, 0.4)}
+"""Range of the vehicles that enter per second and lane; much more is gridlock within minutes."""
+
+
+def draw_size(rng: np.random.Generator, kind: str) -> tuple[float, float, float]:
+    """Length, width and height in metres of one road user of a kind such as "car" or "pedestrian"."""
+    length, width, height = (
+        float(np.clip(rng.normal(mean, spread), low, high)) for mean, spread, low, high in _SIZES[kind]
+    )
+    return length, width, height
+
+
+def draw_types(rng: np.random.Generator, count: int = 36) -> list[RoadUserType]:
+    """Types of one network: the last four are bicycles, the rest motor vehicles by their shares."""
+    kinds = list(rng.choice(list(_SHARES), count - 4, p=list(_SHARES.values()))) + ["bicycle"] * 4
+    kinds[0] = "car"
+    types = []
+    for index, kind in enumerate(kinds):
+        length, width, height = draw_size(rng, kind)
+        vehicle_class = _CLASSES.get(kind, str(kind))
+        object_type = ObjectType.CYCLIST if kind == "bicycle" else ObjectType.VEHICLE
+        types.append(RoadUserType(f"{kind}{index}", vehicle_class, object_type, length, width, height))
+    return types
+
+
+def _type_xml(rng: np.random.Generator, kind: RoadUserType) -> str:
+    common = (
+        f'<vType id="{kind.type_id}" vClass="{kind.vehicle_class}" length="{kind.length_m:.2f}" width="{kind.width_m:.2f}" '
+        f'lcStrategic="{rng.uniform(0.6, 1.5):.2f}" lcSpeedGain="{rng.uniform(0.4, 1.8):.2f}" '
+        f'lcKeepRight="{rng.uniform(0.0, 0.4):.2f}" lcMaxSpeedLatStanding="0" lcMaxSpeedLatFactor="0.25" '
+        f'jmTimegapMinor="{rng.uniform(0.6, 1.4):.2f}" impatience="{rng.uniform(0.0, 0.3):.2f}" '
+    )
+    if kind.object_type == ObjectType.CYCLIST:
+        return common + f'accel="1.0" decel="2.5" minGap="0.8" maxSpeed="{rng.uniform(3.8, 6.5):.2f}"/>'
+    mean = np.clip(rng.normal(1.0, 0.06), 0.88, 1.12)
+    return common + (
+        f'carFollowModel="EIDM" accel="{rng.uniform(1.5, 2.8):.2f}" decel="{rng.uniform(1.8, 3.2):.2f}" '
+        f'tau="{rng.uniform(0.8, 2.0):.2f}" minGap="{rng.uniform(1.2, 3.2):.2f}" '
+        f'speedFactor="normc({mean:.3f},0.08,0.6,1.5)"/>'
+    )
+
+
+def _walker_xml(rng: np.random.Generator, gait: int) -> str:
+    factor = rng.uniform(0.55, 1.45)
+    return f'<vType id="walker{gait}" vClass="pedestrian" speedFactor="normc({factor:.2f},0.08,0.4,1.7)"/>'
+
+
+def _poisson_times(rng: np.random.Generator, rate_per_s: float) -> np.ndarray:
+    count = rng.poisson(rate_per_s * SIMULATED_S)
+    return np.sort(rng.uniform(0, SIMULATED_S, count))
+
+
+def _reachable_nodes(plan: StreetPlan, start: str) -> set[str]:
+    reached, frontier = set(), [start]
+    while frontier:
+        here = frontier.pop()
+        if here not in reached:
+            reached.add(here)
+            frontier += [street.to_node for street in plan.streets if street.from_node == here]
+    return reached
+
+
+def _vehicle_trips(rng: np.random.Generator, plan: StreetPlan, types: list[RoadUserType]) -> list[tuple[float, str]]:
+    """Trips from fringe to fringe, more of them on wide and important streets."""
+    fringe = {node.node_id for node in plan.fringe_nodes}
+    weight = {"arterial": 1.6, "collector": 1.0, "residential": 0.6, "freeway": 1.0, "ramp": 0.5}
+    sources = [street for street in plan.streets if street.from_node in fringe]
+    sinks = [street for street in plan.streets if street.to_node in fringe]
+    per_lane = rng.uniform(*VEHICLES_PER_LANE_AND_S[plan.kind])
+    bicycles = 0.0 if plan.kind == "freeway" else rng.uniform(0.01, 0.06)
+    motor = [kind.type_id for kind in types if kind.object_type == ObjectType.VEHICLE]
+    cycles = [kind.type_id for kind in types if kind.object_type == ObjectType.CYCLIST]
+    trips = []
+    for source in sources:
+        lanes = sum(lane.kind == "travel" for lane in source.lanes)
+        reachable = _reachable_nodes(plan, source.from_node)
+        goals = [sink for sink in sinks if sink.to_node != source.from_node and sink.to_node in reachable]
+        shares = np.array([weight[goal.street_class] * len(goal.lanes) for goal in goals])
+        for time in _poisson_times(rng, per_lane * lanes * weight[source.street_class]):
+            goal = goals[int(rng.choice(len(goals), p=shares / shares.sum()))]
+            kind = rng.choice(cycles) if rng.random() < bicycles else rng.choice(motor)
+            row = (
+                f'<trip id="v{len(trips)}" type="{kind}" depart="{time:.1f}" from="{source.street_id}" '
+                f'to="{goal.street_id}" departLane="best" departSpeed="max"/>'
+            )
+            trips.append((float(time), row))
+    return trips
+
+
+def _walks(rng: np.random.Generator, plan: StreetPlan) -> list[tuple[float, str]]:
+    """Short walks between streets; a few busy streets attract most of them."""
+    if plan.kind == "freeway":
+        return []
+    streets = [street.street_id for street in plan.streets]
+    attraction = rng.gamma(0.5, 1.0, len(streets)) + 0.05
+    attraction /= attraction.sum()
+    walks = []
+    for time in _poisson_times(rng, rng.uniform(0.04, 0.24)):
+        start, goal = rng.choice(streets, 2, replace=False, p=attraction)
+        size, gait = int(rng.choice([1, 2, 3], p=[0.75, 0.2, 0.05])), int(rng.integers(NUM_GAITS))
+        for member in range(size):
+            depart = time + 1.1 * member
+            row = (
+                f'<person id="p{len(walks)}" type="walker{gait}" depart="{depart:.1f}" departPos="random">'
+                f'<personTrip from="{start}" to="{goal}" arrivalPos="random"/></person>'
+            )
+            walks.append((float(depart), row))
+    return walks
+
+
+def write_demand(plan: StreetPlan, rng: np.random.Generator, path: Path) -> dict[str, RoadUserType]:
+    """Write types, trips and walks, ordered by departure.
+
+    Returns:
+        Type of each `type_id`.
+    """
+    types = draw_types(rng)
+    departures = _vehicle_trips(rng, plan, types) + _walks(rng, plan)
+    departures.sort(key=lambda row: row[0])
+    header = [_type_xml(rng, kind) for kind in types] + [_walker_xml(rng, gait) for gait in range(NUM_GAITS)]
+    path.write_text("\n".join(["<routes>", *header, *(row for _, row in departures), "</routes>"]))
+    return {kind.type_id: kind for kind in types}

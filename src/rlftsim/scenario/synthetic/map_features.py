@@ -1,0 +1,342 @@
+"""Map of a whole network in WOMD's terms: lanes, road lines, road edges, stop signs, crosswalks and how lanes hang together."""
+
+from collections import defaultdict
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from rlftsim.errors import ConfigError
+from rlftsim.scenario.synthetic.network import Connector, Lane, Network
+from rlftsim.scenario.synthetic.street_plan import Street, offset_polyline
+from rlftsim.scenario.synthetic.sumo import INSTALL_HINT
+from rlftsim.scenario.types import MapFeatureType
+
+POINT_SPACING_M = 0.5
+FREEWAY_LIMIT_MPS = 24.0
+SOLID_BEFORE_JUNCTION_M = 25.0
+KERB_RADIUS_M = 4.5
+OPEN_END_M = 22.0
+MOUTH_M = 4.0
+MEDIAN_AREA_PER_PERIMETER_M = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class Feature:
+    """One map feature in plan coordinates."""
+
+    feature_id: int
+    feature_type: MapFeatureType
+    points: Float[np.ndarray, "n 2"]
+    speed_mps: float = 0.0
+    interpolating: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class NetworkMap:
+    """All features of a network; ids are unique in it."""
+
+    features: tuple[Feature, ...]
+    lane_ids: dict[str, int]
+    """Feature id of each compiled lane, of connectors by their first part."""
+    entry_exit: tuple[tuple[int, int], ...]
+    """Lane and the lane after it."""
+    neighbors: tuple[tuple[int, int, int], ...]
+    """Lane, side (0 left, 1 right), neighbour."""
+    stop_sign_lanes: tuple[tuple[int, int], ...]
+    light_lanes: tuple[tuple[str, int, int, str], ...]
+    """Junction, link index, feature id of the connector, direction letter."""
+    drivable: Any = field(repr=False, default=None)
+    """Drivable area as a shapely geometry."""
+
+
+def resample(points: Float[np.ndarray, "n 2"], spacing_m: float = POINT_SPACING_M) -> Float[np.ndarray, "m 2"]:
+    """Points every `spacing_m` along a polyline, first and last kept."""
+    along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
+    count = max(2, int(np.ceil(along[-1] / spacing_m)) + 1)
+    at = np.linspace(0.0, along[-1], count)
+    return np.stack([np.interp(at, along, points[:, k]) for k in range(2)], axis=1)
+
+
+def _shapely() -> tuple[Any, Any]:
+    try:
+        import shapely
+        from shapely import ops
+    except ImportError as error:
+        raise ConfigError(INSTALL_HINT) from error
+    return shapely, ops
+
+
+# --- drivable area -------------------------------------------------------------------------------------------------------------
+
+
+def _strip(shape: Float[np.ndarray, "n 2"], left_m: float, right_m: float) -> Any:
+    """Polygon between two offsets of a polyline (metres to the left, metres to the right)."""
+    shapely, _ = _shapely()
+    points = resample(shape, 2.0)
+    ring = np.concatenate([offset_polyline(points, left_m), offset_polyline(points, -right_m)[::-1]])
+    return shapely.Polygon(ring).buffer(0)
+
+
+def _street_strips(network: Network) -> dict[str, Any]:
+    """Paved strip of each street as compiled: all lanes but sidewalks."""
+    strips = {}
+    for street in network.plan.streets:
+        if network.plan.kind == "freeway":  # as planned, so that no gap is left where segments meet
+            strips[street.street_id] = _strip(street.points, 0.3, street.roadway_width_m)
+            continue
+        paved = [k for k, lane in enumerate(street.lanes) if lane.kind != "sidewalk"]
+        leftmost = network.lane((street.street_id, paved[-1]))
+        left = leftmost.width_m / 2 + (0.3 if street.reverse_id is None else 0.05)
+        right = street.roadway_width_m - leftmost.width_m / 2
+        strips[street.street_id] = _strip(leftmost.shape, left, right)
+    return strips
+
+
+def _mouth(network: Network, street: Street, node_id: str) -> Any:
+    """Roadway of a street continued straight into a junction, without its parking strip, so that kerbs meet there."""
+    leftmost = network.lane((street.street_id, len(street.lanes) - 1))
+    end = leftmost.shape[-2:] if street.to_node == node_id else leftmost.shape[:2]
+    along = (end[1] - end[0]) / max(float(np.linalg.norm(end[1] - end[0])), 1e-6)
+    line = np.stack(
+        [end[1], end[1] + MOUTH_M * along] if street.to_node == node_id else [end[0] - MOUTH_M * along, end[0]]
+    )
+    width = sum(lane.width_m for lane in street.lanes if lane.kind not in ("sidewalk", "parking"))
+    return _strip(line, leftmost.width_m / 2, width - leftmost.width_m / 2)
+
+
+def _junction_area(network: Network, node_id: str, strips: dict[str, Any]) -> Any:
+    """Connectors and crosswalks, kerbs rounded, cut to the surroundings of the junction."""
+    shapely, _ = _shapely()
+    shape = shapely.Polygon(network.junction_shapes[node_id]).buffer(0)
+    near = shape.buffer(14.0)
+    parts = [
+        shapely.LineString(connector.shape).buffer(connector.width_m / 2 + 0.2, cap_style="flat")
+        for connector in network.connectors
+        if connector.junction == node_id and len(connector.shape) > 1
+    ]
+    parts += [
+        shapely.LineString(line).buffer(width / 2, cap_style="flat")
+        for junction, line, width in network.crosswalks
+        if junction == node_id
+    ]
+    parts += [
+        strips[street.street_id].intersection(near)
+        for street in network.plan.streets
+        if node_id in (street.from_node, street.to_node)
+    ]
+    parts += [
+        _mouth(network, street, node_id).intersection(shape)
+        for street in network.plan.streets
+        if node_id in (street.from_node, street.to_node)
+    ]
+    area = shapely.union_all(parts)
+    rounded = area.buffer(KERB_RADIUS_M).buffer(-KERB_RADIUS_M)
+    return shapely.union_all([area, rounded.intersection(shape.buffer(5.0))])
+
+
+def compute_drivable_area(network: Network) -> Any:
+    """Union of the streets' strips and the junctions, as a shapely geometry in plan coordinates."""
+    shapely, _ = _shapely()
+    strips = _street_strips(network)
+    fringe = {node.node_id for node in network.plan.fringe_nodes}
+    parts = list(strips.values()) + [shapely.Polygon(taper) for taper in network.plan.tapers]
+    if network.plan.kind != "freeway":
+        parts += [
+            _junction_area(network, node.node_id, strips)
+            for node in network.plan.nodes
+            if node.node_id not in fringe and node.node_id in network.junction_shapes
+        ]
+    area = shapely.union_all(parts).buffer(0.3).buffer(-0.3)
+    return area if network.plan.kind != "freeway" else area.buffer(2.0).buffer(-4.0).buffer(2.0)
+
+
+def oriented_rings(area: Any) -> list[tuple[Float[np.ndarray, "n 2"], bool]]:
+    """Rings of a polygon with the area on their left: outer ones counter-clockwise, holes clockwise.
+
+    Returns:
+        Closed rings (first point repeated at the end) and whether each is a median, a thin hole.
+    """
+    shapely, _ = _shapely()
+    rings = []
+    for polygon in getattr(area, "geoms", [area]):
+        oriented = shapely.geometry.polygon.orient(polygon, 1.0)
+        rings.append((np.asarray(oriented.exterior.coords), False))
+        for hole in oriented.interiors:
+            size = shapely.Polygon(hole).area
+            if size > 2.0:
+                rings.append((np.asarray(hole.coords), size / hole.length < MEDIAN_AREA_PER_PERIMETER_M))
+    return rings
+
+
+def split_ring(ring: Float[np.ndarray, "n 2"], keep: np.ndarray) -> list[Float[np.ndarray, "m 2"]]:
+    """Runs of consecutive kept points of a closed ring, order kept; a run may pass the seam. The whole ring stays closed."""
+    if keep.all():
+        return [ring]
+    if not keep.any():
+        return []
+    points, kept = ring[:-1], keep[:-1]
+    start = int(np.flatnonzero(~kept)[0])
+    points, kept = np.roll(points, -start, axis=0), np.roll(kept, -start)
+    bounds = np.flatnonzero(np.diff(np.concatenate([[0], kept.astype(np.int8), [0]])))
+    return [points[a:b] for a, b in zip(bounds[::2], bounds[1::2], strict=True) if b - a >= 2]
+
+
+def _edge_features(network: Network, area: Any) -> list[tuple[MapFeatureType, np.ndarray]]:
+    ends = np.stack([node.position for node in network.plan.fringe_nodes])
+    rows = []
+    for ring, is_median in oriented_rings(area):
+        points = resample(ring)
+        far = (np.linalg.norm(points[:, None] - ends[None], axis=-1) > OPEN_END_M).all(axis=1)
+        kind = MapFeatureType.EDGE_MEDIAN if is_median else MapFeatureType.EDGE_BOUNDARY
+        rows += [(kind, run) for run in split_ring(points, far)]
+    return rows
+
+
+# --- lanes and lines -----------------------------------------------------------------------------------------------------------
+
+
+def _lane_type(lane: Lane) -> MapFeatureType:
+    if lane.kind == "bicycle":
+        return MapFeatureType.LANE_BIKE
+    return MapFeatureType.LANE_FREEWAY if lane.speed_mps > FREEWAY_LIMIT_MPS else MapFeatureType.LANE_SURFACE_STREET
+
+
+def _split_before_end(points: np.ndarray, tail_m: float) -> tuple[np.ndarray, np.ndarray]:
+    fine = resample(points)
+    cut = max(0, len(fine) - 1 - int(tail_m / POINT_SPACING_M))
+    return fine[: cut + 1], fine[cut:]
+
+
+def _left_border(network: Network, lane: Lane) -> Float[np.ndarray, "n 2"]:
+    """Line along the left of a lane. On a freeway as planned, so that lines do not break where segments meet."""
+    street = lane.street
+    assert street is not None
+    if network.plan.kind == "freeway":
+        return offset_polyline(street.points, -sum(other.width_m for other in street.lanes[lane.index + 1 :]))
+    return offset_polyline(resample(lane.shape, 2.0), lane.width_m / 2)
+
+
+def _between_lanes(
+    line: Float[np.ndarray, "n 2"], beside_bicycles: bool, solid_tail: bool
+) -> list[tuple[MapFeatureType, np.ndarray]]:
+    """Line between two lanes of one direction, solid where nobody should change any more."""
+    if beside_bicycles:
+        return [(MapFeatureType.LINE_SOLID_SINGLE_WHITE, resample(line))]
+    if not solid_tail:
+        return [(MapFeatureType.LINE_BROKEN_SINGLE_WHITE, resample(line))]
+    body, tail = _split_before_end(line, SOLID_BEFORE_JUNCTION_M)
+    rows = [(MapFeatureType.LINE_SOLID_SINGLE_WHITE, tail)]
+    return [(MapFeatureType.LINE_BROKEN_SINGLE_WHITE, body), *rows] if len(body) > 1 else rows
+
+
+def _separator(street: Street, line: Float[np.ndarray, "n 2"]) -> list[tuple[MapFeatureType, np.ndarray]]:
+    """Line to the left of a direction: between the directions, or along a median."""
+    if street.reverse_id is None:
+        return [] if street.street_class == "ramp" else [(MapFeatureType.LINE_SOLID_SINGLE_YELLOW, resample(line))]
+    if street.street_id > street.reverse_id:
+        return []
+    is_minor = street.street_class == "residential"
+    kind = MapFeatureType.LINE_BROKEN_SINGLE_YELLOW if is_minor else MapFeatureType.LINE_SOLID_DOUBLE_YELLOW
+    return [(kind, resample(line))]
+
+
+def _line_features(network: Network) -> list[tuple[MapFeatureType, np.ndarray]]:
+    fringe = {node.node_id for node in network.plan.fringe_nodes}
+    rows = []
+    for street in network.plan.streets:
+        lanes = [network.lane((street.street_id, k)) for k in range(len(street.lanes))]
+        driven = [lane for lane in lanes if lane.kind in ("travel", "bicycle")]
+        solid_tail = network.plan.kind != "freeway" and street.to_node not in fringe
+        for lane, left in pairwise(driven):
+            rows += _between_lanes(_left_border(network, lane), "bicycle" in (lane.kind, left.kind), solid_tail)
+        rows += _separator(street, _left_border(network, driven[-1]))
+        if street.street_class == "freeway":
+            rows.append((MapFeatureType.LINE_SOLID_SINGLE_WHITE, resample(_left_border(network, lanes[0]))))
+    return rows
+
+
+def _stop_points(network: Network) -> list[tuple[str, np.ndarray, list[Connector]]]:
+    """Approaches with a stop sign: street, place right of the stop line, connectors it controls."""
+    approaches: dict[str, list[Connector]] = defaultdict(list)
+    for connector in network.connectors:
+        if connector.state in ("s", "w"):
+            approaches[connector.from_lane[0]].append(connector)
+    rows = []
+    for street_id, connectors in approaches.items():
+        outermost = network.lane((street_id, min(c.from_lane[1] for c in connectors)))
+        street = outermost.street
+        assert street is not None
+        right = sum(x.width_m for x in street.lanes[: outermost.index] if x.kind != "sidewalk")
+        border = offset_polyline(outermost.shape, -(outermost.width_m / 2 + right + 0.6))
+        rows.append((street_id, border[-1], connectors))
+    return rows
+
+
+def _crosswalk_polygon(line: Float[np.ndarray, "n 2"], width_m: float) -> Float[np.ndarray, "m 2"]:
+    return np.concatenate([offset_polyline(line, width_m / 2), offset_polyline(line, -width_m / 2)[::-1]])
+
+
+def build_network_map(network: Network) -> NetworkMap:
+    """All map features of a network, lanes first. Connectors at the network's ends (turn-arounds) are left out."""
+    fringe = {node.node_id for node in network.plan.fringe_nodes}
+    features: list[Feature] = []
+    lane_ids: dict[str, int] = {}
+
+    def add(kind: MapFeatureType, points: np.ndarray, speed: float = 0.0, interpolating: bool = False) -> int:
+        features.append(Feature(len(features) + 1, kind, points, speed, interpolating))
+        return len(features)
+
+    for lane in network.lanes.values():
+        if lane.street is not None and lane.kind in ("travel", "bicycle"):
+            lane_ids[lane.lane_id] = add(_lane_type(lane), resample(lane.shape), lane.speed_mps)
+    connectors = [c for c in network.connectors if c.junction not in fringe and len(c.shape) > 1]
+    for connector in connectors:
+        kind = MapFeatureType.LANE_BIKE if connector.is_bicycle else _lane_type(network.lane(connector.from_lane))
+        lane_ids[connector.parts[0]] = add(kind, resample(connector.shape), connector.speed_mps, True)
+    for kind, points in _line_features(network):
+        add(kind, points)
+    area = compute_drivable_area(network)
+    for kind, points in _edge_features(network, area):
+        add(kind, points)
+    for _, line, width in network.crosswalks:
+        add(MapFeatureType.CROSSWALK, _crosswalk_polygon(line, width))
+    signs = []
+    for _, place, controlled in _stop_points(network):
+        sign = add(MapFeatureType.STOP_SIGN, place[None])
+        lanes = sorted({f"{c.from_lane[0]}_{c.from_lane[1]}" for c in controlled})
+        signs += [(sign, lane_ids[lane_id]) for lane_id in lanes]
+    return NetworkMap(
+        features=tuple(features),
+        lane_ids=lane_ids,
+        entry_exit=_lane_links(connectors, lane_ids),
+        neighbors=_lane_neighbors(network, lane_ids),
+        stop_sign_lanes=tuple(signs),
+        light_lanes=tuple(
+            (c.light, c.link_index, lane_ids[c.parts[0]], c.direction) for c in connectors if c.light is not None
+        ),
+        drivable=area,
+    )
+
+
+def _lane_links(connectors: list[Connector], lane_ids: dict[str, int]) -> tuple[tuple[int, int], ...]:
+    links = []
+    for connector in connectors:
+        middle = lane_ids[connector.parts[0]]
+        links.append((lane_ids[f"{connector.from_lane[0]}_{connector.from_lane[1]}"], middle))
+        links.append((middle, lane_ids[f"{connector.to_lane[0]}_{connector.to_lane[1]}"]))
+    return tuple(links)
+
+
+def _lane_neighbors(network: Network, lane_ids: dict[str, int]) -> tuple[tuple[int, int, int], ...]:
+    rows = []
+    for lane in network.lanes.values():
+        if lane.lane_id not in lane_ids or lane.street is None:
+            continue
+        for side, step in ((0, 1), (1, -1)):
+            other = f"{lane.street.street_id}_{lane.index + step}"
+            if other in lane_ids:
+                rows.append((lane_ids[lane.lane_id], side, lane_ids[other]))
+    return tuple(rows)

@@ -1,0 +1,154 @@
+"""The compiled network, read back: lanes, connectors through junctions, crosswalks, signal programs' places."""
+
+import xml.etree.ElementTree as ElementTree
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from rlftsim.scenario.synthetic.street_plan import Street, StreetPlan
+
+LaneKey = tuple[str, int]
+"""Street id and lane index."""
+
+
+@dataclass(frozen=True, eq=False)
+class Lane:
+    """A lane as compiled: on a street (`street` set) or inside a junction."""
+
+    lane_id: str
+    shape: Float[np.ndarray, "n 2"]
+    length_m: float
+    """What SUMO drives; may differ from the length of the shape."""
+    width_m: float
+    speed_mps: float
+    kind: str
+    """Kind of the planned lane, or "internal", "crossing", "walkingarea"."""
+    street: Street | None = None
+    index: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Connector:
+    """One way through a junction: the internal lanes from stop line to exit, joined."""
+
+    from_lane: LaneKey
+    to_lane: LaneKey
+    parts: tuple[str, ...]
+    shape: Float[np.ndarray, "n 2"]
+    width_m: float
+    speed_mps: float
+    is_bicycle: bool
+    junction: str
+    direction: str
+    """SUMO's letter: s straight, l left, r right, t turn around, L and R partly."""
+    state: str
+    """SUMO's letter of the right of way; s and w mean a stop sign."""
+    light: str | None
+    link_index: int
+
+
+@dataclass(frozen=True, eq=False)
+class Network:
+    """What the compiler made of a plan."""
+
+    plan: StreetPlan
+    lanes: dict[str, Lane]
+    connectors: tuple[Connector, ...]
+    junction_shapes: dict[str, Float[np.ndarray, "n 2"]]
+    crosswalks: tuple[tuple[str, Float[np.ndarray, "n 2"], float], ...]
+    """Junction, centre line, width in metres."""
+    lights: tuple[str, ...]
+
+    def lane(self, key: LaneKey) -> Lane:
+        """Lane of a street by index."""
+        return self.lanes[f"{key[0]}_{key[1]}"]
+
+
+def _points(text: str) -> Float[np.ndarray, "n 2"]:
+    return np.array([[float(value) for value in pair.split(",")[:2]] for pair in text.split()])
+
+
+def _read_lanes(root: ElementTree.Element, plan: StreetPlan) -> dict[str, Lane]:
+    streets = {street.street_id: street for street in plan.streets}
+    lanes = {}
+    for edge in root.iter("edge"):
+        street = streets.get(edge.get("id", ""))
+        for row in edge.iter("lane"):
+            index = int(row.get("index", 0))
+            kind = street.lanes[index].kind if street else edge.get("function", "internal")
+            lanes[row.get("id", "")] = Lane(
+                lane_id=row.get("id", ""),
+                shape=_points(row.get("shape", "")),
+                length_m=float(row.get("length", 0)),
+                width_m=float(row.get("width", 3.2)),
+                speed_mps=float(row.get("speed", 0)),
+                kind=kind,
+                street=street,
+                index=index,
+            )
+    return lanes
+
+
+def join_shapes(shapes: list[Float[np.ndarray, "n 2"]]) -> Float[np.ndarray, "n 2"]:
+    """Polylines put end to end, doubled points removed."""
+    points = np.concatenate(shapes)
+    keep = np.append(True, np.linalg.norm(np.diff(points, axis=0), axis=1) > 1e-3)
+    return points[keep]
+
+
+def _read_connectors(root: ElementTree.Element, lanes: dict[str, Lane]) -> list[Connector]:
+    rows = list(root.iter("connection"))
+    onward = {f"{row.get('from')}_{row.get('fromLane')}": row for row in rows if row.get("from", "").startswith(":")}
+    connectors = []
+    for row in rows:
+        origin = lanes.get(f"{row.get('from')}_{row.get('fromLane')}")
+        if origin is None or origin.street is None or origin.kind not in ("travel", "bicycle") or not row.get("via"):
+            continue
+        parts = [row.get("via", "")]
+        while onward[parts[-1]].get("via"):
+            parts.append(onward[parts[-1]].get("via", ""))
+        goal = lanes[f"{row.get('to')}_{row.get('toLane')}"]
+        shape = join_shapes([lanes[part].shape for part in parts])
+        connectors.append(
+            Connector(
+                from_lane=(origin.street.street_id, origin.index),
+                to_lane=(row.get("to", ""), int(row.get("toLane", 0))),
+                parts=tuple(parts),
+                shape=shape,
+                width_m=min(origin.width_m, goal.width_m),
+                speed_mps=lanes[parts[0]].speed_mps,
+                is_bicycle="bicycle" in (origin.kind, goal.kind),
+                junction=origin.street.to_node,
+                direction=row.get("dir", "s"),
+                state=row.get("state", "M"),
+                light=row.get("tl"),
+                link_index=int(row.get("linkIndex", 0)),
+            )
+        )
+    return connectors
+
+
+def read_network(path: Path, plan: StreetPlan) -> Network:
+    """Parse the compiled network file of `plan`."""
+    root = ElementTree.parse(path).getroot()
+    lanes = _read_lanes(root, plan)
+    shapes = {
+        row.get("id", ""): _points(row.get("shape", ""))
+        for row in root.iter("junction")
+        if row.get("type") != "internal" and len(row.get("shape", "").split()) >= 3
+    }
+    crosswalks = tuple(
+        (lane.lane_id[1:].rsplit("_", 2)[0], lane.shape, lane.width_m)
+        for lane in lanes.values()
+        if lane.kind == "crossing"
+    )
+    return Network(
+        plan=plan,
+        lanes=lanes,
+        connectors=tuple(_read_connectors(root, lanes)),
+        junction_shapes=shapes,
+        crosswalks=crosswalks,
+        lights=tuple(row.get("id", "") for row in root.iter("tlLogic")),
+    )

@@ -1,0 +1,8 @@
+"""The data set that ships with the package: 200 synthetic scenarios, made by `generate` with the arguments in its manifest."""
+
+from pathlib import Path
+
+
+def pack_path() -> Path:
+    """Folder of the embedded data set, with the splits "training" and "validation"; open it with `ScenarioDataset`."""
+    return Path(__file__).parent / "pack"

@@ -1,0 +1,132 @@
+"""Parked cars: along the kerb in parking strips, and in rows in the interior of blocks."""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from rlftsim.scenario.synthetic.bodies import Body
+from rlftsim.scenario.synthetic.demand import draw_size
+from rlftsim.scenario.synthetic.map_features import resample
+from rlftsim.scenario.synthetic.network import Network
+from rlftsim.scenario.synthetic.street_plan import Street, offset_polyline
+from rlftsim.scenario.types import ObjectType
+
+CLEAR_AT_JUNCTION_M = 12.0
+_KINDS, _SHARES = ("car", "suv", "van"), (0.66, 0.29, 0.05)
+
+
+def _parked(position: np.ndarray, heading: float, size: tuple[float, float, float], num_steps: int) -> Body:
+    return Body(
+        ObjectType.VEHICLE,
+        0,
+        np.repeat(position[None], num_steps, axis=0),
+        np.full(num_steps, heading),
+        np.zeros((num_steps, 2)),
+        size,
+        is_parked=True,
+        is_evaluable=False,
+    )
+
+
+def _draw_car(rng: np.random.Generator) -> tuple[float, float, float]:
+    return draw_size(rng, str(rng.choice(_KINDS, p=_SHARES)))
+
+
+def park_along(
+    rng: np.random.Generator, line: Float[np.ndarray, "n 2"], occupancy: float, num_steps: int
+) -> list[Body]:
+    """Cars one behind another along the centre line of a parking strip, `occupancy` of the places taken."""
+    points = resample(line)
+    spacing = float(np.linalg.norm(points[1] - points[0]))
+    cars, at = [], CLEAR_AT_JUNCTION_M
+    while True:
+        size = _draw_car(rng)
+        place = at + size[0] / 2
+        at += size[0] + rng.uniform(0.6, 1.6)
+        if at > (len(points) - 1) * spacing - CLEAR_AT_JUNCTION_M:
+            return cars
+        if rng.random() >= occupancy:
+            continue
+        index = min(int(place / spacing), len(points) - 2)
+        tangent = points[index + 1] - points[index]
+        heading = float(np.arctan2(tangent[1], tangent[0])) + rng.normal(0, 0.02)
+        lateral = np.clip(rng.normal(0, 0.08), -0.15, 0.15)
+        normal = np.array([-tangent[1], tangent[0]]) / np.linalg.norm(tangent)
+        cars.append(_parked(points[index] + lateral * normal, heading, size, num_steps))
+
+
+def park_in_strips(rng: np.random.Generator, network: Network, num_steps: int) -> list[Body]:
+    """Cars in all parking strips of a network; every street has its own occupancy."""
+    cars = []
+    for lane in network.lanes.values():
+        if lane.kind == "parking":
+            cars += park_along(rng, lane.shape, float(rng.uniform(0.25, 0.9)), num_steps)
+    return cars
+
+
+def _row_of_places(
+    rng: np.random.Generator, street: Street, setback_m: float, square: bool
+) -> list[tuple[Float[np.ndarray, "2"], float]]:
+    """Places of one row beside a street: position and heading."""
+    border = offset_polyline(resample(street.points, 4.0), -(street.roadway_width_m + setback_m))
+    points = resample(border)
+    pitch = rng.uniform(2.7, 3.0) if square else rng.uniform(6.0, 6.8)
+    count = int(rng.integers(5, 16)) if square else int(rng.integers(3, 8))
+    first = rng.uniform(8, max(9.0, len(points) * 0.5 - count * pitch))
+    places = []
+    for k in range(count):
+        index = int((first + k * pitch) / 0.5)
+        if index >= len(points) - 2:
+            break
+        tangent = points[index + 1] - points[index]
+        heading = float(np.arctan2(tangent[1], tangent[0]))
+        if square:
+            heading += np.pi / 2 if rng.random() < 0.7 else -np.pi / 2
+        places.append((points[index], heading))
+    return places
+
+
+def park_in_lots(
+    rng: np.random.Generator, network: Network, drivable: Any, num_steps: int, lots_per_street: float
+) -> list[Body]:
+    """Rows of parked cars 8-25 m beside the streets, away from every roadway and from one another."""
+    import shapely
+
+    shapely.prepare(near_road := drivable.buffer(5.5))
+    cars: list[Body] = []
+    taken: list[np.ndarray] = []
+    for street in network.plan.streets:
+        for _ in range(int(rng.poisson(lots_per_street))):
+            occupancy, square = rng.uniform(0.3, 0.95), bool(rng.random() < 0.75)
+            setback = rng.uniform(8.5, 20.0)
+            rows = [setback, setback + (rng.uniform(5.6, 6.2) if square else rng.uniform(8, 10))]
+            for row in rows[: int(rng.integers(1, 3))]:
+                for place, heading in _row_of_places(rng, street, row, square):
+                    size = _draw_car(rng)
+                    clear = 2.6 if square else 6.0
+                    if rng.random() >= occupancy or shapely.intersects_xy(near_road, *place):
+                        continue
+                    if taken and np.min(np.linalg.norm(np.array(taken) - place, axis=1)) < clear:
+                        continue
+                    taken.append(place)
+                    wobble = place + rng.normal(0, 0.1, 2)
+                    cars.append(_parked(wobble, heading + rng.normal(0, 0.03), size, num_steps))
+    return drop_overlapping(cars)
+
+
+def drop_overlapping(cars: list[Body]) -> list[Body]:
+    """Cars in order, without those whose box meets an earlier one's."""
+    from rlftsim.scenario.synthetic.gates import boxes_overlap
+
+    kept: list[Body] = []
+    for car in cars:
+        near = [other for other in kept if np.linalg.norm(other.position[0] - car.position[0]) < 8.0]
+        if not any(
+            boxes_overlap(
+                car.position[:1], car.heading[:1], car.size, other.position[:1], other.heading[:1], other.size
+            )[0]
+            for other in near
+        ):
+            kept.append(car)
+    return kept

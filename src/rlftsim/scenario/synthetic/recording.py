@@ -1,0 +1,133 @@
+"""SUMO's output files read back: bodies of all road users, states of all lights."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow.csv
+from jaxtyping import Float
+
+from rlftsim.scenario.synthetic.bodies import Body, LanePath, build_pedestrian, build_vehicle
+from rlftsim.scenario.synthetic.demand import RoadUserType, draw_size
+from rlftsim.scenario.synthetic.network import Lane, Network
+from rlftsim.scenario.synthetic.sumo import DISCARDED_S
+from rlftsim.scenario.types import STEP_S
+
+MIN_STEPS = 12
+LONGEST_EVALUATED_M = 7.0
+
+
+class _LaneRuler:
+    """Points and directions at SUMO's positions along lanes, with the lengths measured once."""
+
+    def __init__(self, lanes: dict[str, Lane]) -> None:
+        self._lanes = lanes
+        self._along: dict[str, Float[np.ndarray, n]] = {}
+
+    def points_at(self, lane_id: str, positions_m: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 2"]:
+        """Points at SUMO's positions, which count the lane's nominal length, not that of its shape."""
+        lane = self._lanes[lane_id]
+        if lane_id not in self._along:
+            steps = np.linalg.norm(np.diff(lane.shape, axis=0), axis=1)
+            self._along[lane_id] = np.append(0.0, np.cumsum(steps))
+        along = self._along[lane_id]
+        at = positions_m * (along[-1] / max(lane.length_m, 1e-3))
+        return np.stack([np.interp(at, along, lane.shape[:, k]) for k in range(2)], axis=1)
+
+    def directions_at(self, lane_id: str, positions_m: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 2"]:
+        """Unit tangents over one metre around the positions."""
+        length = self._lanes[lane_id].length_m
+        reach = min(0.5, 0.4 * length)
+        middle = np.clip(positions_m, reach, max(length - reach, reach))
+        delta = self.points_at(lane_id, middle + reach) - self.points_at(lane_id, middle - reach)
+        return delta / np.maximum(np.linalg.norm(delta, axis=1, keepdims=True), 1e-9)
+
+
+def _read_table(path: Path, wanted: tuple[str, ...]) -> dict[str, np.ndarray] | None:
+    if not path.exists():
+        return None
+    table = pyarrow.csv.read_csv(path, parse_options=pyarrow.csv.ParseOptions(delimiter=";"))
+    if not set(wanted) <= set(table.column_names) or table.num_rows == 0:
+        return None
+    return {name: table.column(name).to_numpy(zero_copy_only=False) for name in wanted}
+
+
+def _runs_by_id(ids: np.ndarray, step: np.ndarray) -> list[np.ndarray]:
+    """Row indices of every road user in time order; a user with a gap in time counts as two."""
+    order = np.lexsort((step, ids.astype(str)))
+    new = (ids[order][1:] != ids[order][:-1]) | (np.diff(step[order]) != 1)
+    return [run for run in np.split(order, np.flatnonzero(new) + 1) if len(run) >= MIN_STEPS]
+
+
+def _lane_path(ruler: _LaneRuler, lanes: dict[str, Lane], rows: dict[str, np.ndarray], first_step: int) -> LanePath:
+    lane_ids, positions = rows["vehicle_lane"], rows["vehicle_pos"]
+    centre = np.empty((len(lane_ids), 2))
+    direction = np.empty_like(centre)
+    starts = np.append(0, np.flatnonzero(lane_ids[1:] != lane_ids[:-1]) + 1)
+    changes, distances = [], []
+    for start, stop in zip(starts, np.append(starts[1:], len(lane_ids)), strict=True):
+        lane_id = lane_ids[start]
+        centre[start:stop] = ruler.points_at(lane_id, positions[start:stop])
+        direction[start:stop] = ruler.directions_at(lane_id, positions[start:stop])
+        before = lanes[lane_ids[start - 1]] if start else None
+        now = lanes[lane_id]
+        if before is not None and before.street is not None and before.street is now.street:
+            jump = centre[start] - ruler.points_at(before.lane_id, positions[start : start + 1])[0]
+            changes.append(int(start))
+            distances.append(float(jump @ np.array([-direction[start, 1], direction[start, 0]])))
+    return LanePath(first_step, centre, direction, rows["vehicle_speed"], tuple(changes), tuple(distances))
+
+
+def read_vehicles(path: Path, network: Network, types: dict[str, RoadUserType], rng: np.random.Generator) -> list[Body]:
+    """Bodies of all motor vehicles and bicycles in the vehicles' trajectory file."""
+    names = ("timestep_time", "vehicle_id", "vehicle_type", "vehicle_speed", "vehicle_pos", "vehicle_lane")
+    table = _read_table(path, names)
+    if table is None:
+        return []
+    known = np.array([lane in network.lanes for lane in table["vehicle_lane"]])
+    table = {name: column[known] for name, column in table.items()}
+    step = np.rint((table["timestep_time"] - DISCARDED_S) / STEP_S).astype(int)
+    ruler = _LaneRuler(network.lanes)
+    bodies = []
+    for run in _runs_by_id(table["vehicle_id"], step):
+        kind = types[table["vehicle_type"][run[0]]]
+        lane_path = _lane_path(ruler, network.lanes, {name: table[name][run] for name in names}, int(step[run[0]]))
+        height = kind.height_m + float(np.clip(rng.normal(0, 0.04), -0.1, 0.1))
+        habit = (float(rng.normal(0, 0.14)), float(rng.uniform(0.0, 0.12)), float(rng.uniform(0, 2 * np.pi)))
+        size = (kind.length_m, kind.width_m, height)
+        bodies.append(build_vehicle(lane_path, kind.object_type, size, habit, kind.length_m <= LONGEST_EVALUATED_M))
+    return bodies
+
+
+def read_pedestrians(path: Path, rng: np.random.Generator) -> list[Body]:
+    """Bodies of all pedestrians in the persons' trajectory file."""
+    names = ("timestep_time", "person_id", "person_x", "person_y", "person_angle")
+    table = _read_table(path, names)
+    if table is None:
+        return []
+    step = np.rint((table["timestep_time"] - DISCARDED_S) / STEP_S).astype(int)
+    bodies = []
+    for run in _runs_by_id(table["person_id"], step):
+        position = np.stack([table["person_x"][run], table["person_y"][run]], axis=1).astype(float)
+        heading = np.pi / 2 - np.radians(float(table["person_angle"][run[0]]))
+        bodies.append(build_pedestrian(int(step[run[0]]), position, heading, draw_size(rng, "pedestrian")))
+    return bodies
+
+
+@dataclass(frozen=True, eq=False)
+class SignalStates:
+    """SUMO's letters of all links of one junction, one string per recorded step."""
+
+    junction: str
+    states: tuple[str, ...]
+
+    def has_protected_phase(self, link_index: int) -> bool:
+        """Whether the link is ever both allowed to go with and without right of way."""
+        return {"G", "g"} <= {state[link_index] for state in self.states}
+
+
+def read_signals(path: Path, junction: str) -> SignalStates:
+    """Signal states of a junction from the first recorded step on."""
+    found = re.findall(r'time="([\d.]+)"[^>]*state="([^"]*)"', path.read_text())
+    return SignalStates(junction, tuple(state for time, state in found if float(time) >= DISCARDED_S - 1e-6))

@@ -1,0 +1,313 @@
+"""From minutes of traffic to scenarios of 9.1 seconds: who watches, who is seen, who is evaluated."""
+
+import hashlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from rlftsim.scenario.synthetic.bodies import Body, add_label_noise, draw_label_noise
+from rlftsim.scenario.synthetic.crop import HEIGHT_GRID_PER_M, MapCropper, on_grid
+from rlftsim.scenario.synthetic.gates import (
+    MAX_OFF_ROAD_M,
+    MAX_OVERLAP_S,
+    MIN_MOVING_AGENTS,
+    compute_off_road_m,
+    compute_overlap_s,
+    moves_plausibly,
+)
+from rlftsim.scenario.synthetic.recording import SignalStates
+from rlftsim.scenario.types import (
+    CURRENT_STEP,
+    STEP_S,
+    TOTAL_STEPS,
+    LightState,
+    LightStates,
+    MapFeatures,
+    ObjectType,
+    Scenario,
+    Tracks,
+)
+
+FIRST_START = 20
+"""Smoothing over time bends the very first steps of a recording."""
+WINDOW_EVERY_STEPS = 100
+EGO_TO_END_M = 95.0
+EGO_TO_EGO_M = 70.0
+MAP_BEYOND_RANGE_M = 20.0
+PREDICT_WITHIN_M = 70.0
+MAX_PREDICTED_PEDESTRIANS = 2
+POSITION_GRID_PER_M = 512
+HEADING_GRID_PER_RAD = 4096
+VELOCITY_GRID_PER_MPS = 256
+SIZE_GRID_PER_M = 128
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """A simulated network: everything windows are cut from."""
+
+    name: str
+    bodies: tuple[Body, ...]
+    cropper: MapCropper
+    signals: dict[str, SignalStates]
+    ends: Float[np.ndarray, "n 2"]
+    """Where the network ends."""
+    num_steps: int
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """Bodies seen in a window; arrays over its 91 steps, zero where a body does not exist."""
+
+    bodies: list[Body]
+    position: Float[np.ndarray, "o 91 2"]
+    heading: Float[np.ndarray, "o 91"]
+    velocity: Float[np.ndarray, "o 91 2"]
+    valid: Bool[np.ndarray, "o 91"]
+
+    @property
+    def travelled_m(self) -> Float[np.ndarray, "o"]:
+        """Distance driven while valid."""
+        both = self.valid[:, 1:] & self.valid[:, :-1]
+        return (np.linalg.norm(np.diff(self.position, axis=1), axis=-1) * both).sum(axis=1)
+
+
+def _slice_body(body: Body, start: int) -> tuple[int, int, int] | None:
+    """First and last+1 step of the window in which the body exists, and the body's own index of the first."""
+    first = max(0, body.first_step - start)
+    last = min(TOTAL_STEPS, body.first_step + body.num_steps - start)
+    return (first, last, start + first - body.first_step) if last > first else None
+
+
+def _see(distance_m: Float[np.ndarray, "n"], range_m: float, rng: np.random.Generator) -> Bool[np.ndarray, "n"]:
+    """Steps at which a body is seen: those within range, less now and then a spell behind something, the more likely the farther."""
+    seen = distance_m < range_m
+    if rng.random() < 0.5 * np.clip(distance_m.mean() / range_m, 0.0, 1.0):
+        begin = int(rng.integers(-20, TOTAL_STEPS))
+        seen[max(0, begin) : max(0, begin + int(rng.integers(5, 50)))] = False
+    return seen
+
+
+def _look(bodies: list[Body], start: int, ego: Body, range_m: float, rng: np.random.Generator) -> _View:
+    """All bodies the ego sees at any step of the window; the ego comes last."""
+    ego_slice = slice(start - ego.first_step, start - ego.first_step + TOTAL_STEPS)
+    ego_path = ego.position[ego_slice]
+    kept, arrays = [], []
+    for body in [*(other for other in bodies if other is not ego), ego]:
+        span = _slice_body(body, start)
+        if span is None:
+            continue
+        first, last, index = span
+        own = slice(index, index + last - first)
+        distance = np.linalg.norm(body.position[own] - ego_path[first:last], axis=1)
+        if distance.min() > range_m:
+            continue
+        near = _see(distance, range_m, rng) if body is not ego else np.ones(TOTAL_STEPS, bool)
+        if not near.any():
+            continue
+        position, heading = np.zeros((TOTAL_STEPS, 2)), np.zeros(TOTAL_STEPS)
+        velocity, valid = np.zeros((TOTAL_STEPS, 2)), np.zeros(TOTAL_STEPS, bool)
+        position[first:last], heading[first:last] = body.position[own], body.heading[own]
+        velocity[first:last], valid[first:last] = body.velocity[own], near
+        kept.append(body)
+        arrays.append((position, heading, velocity, valid))
+    return _View(kept, *(np.stack(column) for column in zip(*arrays, strict=True)))
+
+
+def _passes_gates(view: _View, rng: np.random.Generator) -> bool:
+    moving = view.travelled_m > 1.0
+    if moving.sum() < MIN_MOVING_AGENTS:
+        return False
+    if not moving[-1] and rng.random() >= 0.15:
+        return False
+    for index in np.flatnonzero(moving):
+        seen = np.flatnonzero(view.valid[index])
+        span = slice(seen[0], seen[-1] + 1)  # also where it is hidden for a while
+        is_vehicle = view.bodies[index].object_type != ObjectType.PEDESTRIAN
+        if not moves_plausibly(view.position[index, span], view.heading[index, span], is_vehicle):
+            return False
+    vehicles = [k for k, body in enumerate(view.bodies) if body.object_type == ObjectType.VEHICLE]
+    sizes = [view.bodies[k].size for k in vehicles]
+    overlap = compute_overlap_s(view.position[vehicles], view.heading[vehicles], sizes, view.valid[vehicles])
+    return overlap <= MAX_OVERLAP_S
+
+
+def _is_on_road(view: _View, index: int, drivable: Any) -> bool:
+    body, valid = view.bodies[index], view.valid[index]
+    if body.object_type != ObjectType.VEHICLE:
+        return True
+    distance = compute_off_road_m(drivable, view.position[index, valid], view.heading[index, valid], body.size)
+    return distance <= MAX_OFF_ROAD_M
+
+
+def choose_tracks_to_predict(view: _View, rng: np.random.Generator, drivable: Any) -> list[int]:
+    """2 to 8 tracks, the far-travelling ones first, pedestrians and cyclists favoured; in half the sets one that stands."""
+    future = slice(CURRENT_STEP + 1, None)
+    ego_now = view.position[-1, CURRENT_STEP]
+    candidates = [
+        k
+        for k, body in enumerate(view.bodies[:-1])
+        if body.is_evaluable
+        and view.valid[k, CURRENT_STEP]
+        and view.valid[k, future].mean() >= 0.7
+        and np.linalg.norm(view.position[k, CURRENT_STEP] - ego_now) < PREDICT_WITHIN_M
+        and not (body.object_type == ObjectType.VEHICLE and rng.random() < 0.1)
+    ]
+    travelled = np.minimum(view.travelled_m, 40.0)
+    rank = {
+        k: travelled[k] * (1.0 if view.bodies[k].object_type == ObjectType.VEHICLE else 2.0) + rng.normal(0, 8.0)
+        for k in candidates
+    }
+    wanted = int(rng.choice([2, 3, 4, 5, 6, 7, 8], p=[0.14, 0.18, 0.2, 0.16, 0.13, 0.1, 0.09]))
+    moving = sorted((k for k in candidates if travelled[k] > 1.0), key=lambda k: -rank[k])
+    standing = [k for k in candidates if travelled[k] <= 1.0]
+    order = ([standing[0]] if standing and rng.random() < 0.5 else []) + moving + standing
+    chosen: list[int] = []
+    pedestrians = 0
+    for k in dict.fromkeys(order):
+        is_pedestrian = view.bodies[k].object_type == ObjectType.PEDESTRIAN
+        if len(chosen) == wanted or (is_pedestrian and pedestrians == MAX_PREDICTED_PEDESTRIANS):
+            continue
+        if _is_on_road(view, k, drivable):
+            chosen.append(k)
+            pedestrians += is_pedestrian
+    return sorted(chosen)
+
+
+def _observe_lights(
+    world: World, features: MapFeatures, start: int, ego_path: Float[np.ndarray, "n 2"], range_m: float
+) -> LightStates:
+    """State of every light whose lane begins within the range, per step."""
+    first_point = {
+        int(features.feature_id[k]): features.points[features.offsets[k]] for k in range(len(features.feature_id))
+    }
+    seen = []
+    for junction, link, lane_id, direction in world.cropper.network_map.light_lanes:
+        stop = world.cropper.network_map.features[lane_id - 1].points[0]
+        kept = first_point.get(lane_id)
+        if kept is None or np.linalg.norm(kept[:2] - stop) > 0.01:
+            continue
+        if np.linalg.norm(ego_path - stop, axis=1).min() < range_m:
+            arrow = direction in "lL" and world.signals[junction].has_protected_phase(link)
+            seen.append((junction, link, lane_id, kept, arrow))
+    rows = [
+        (step, lane_id, _light_state(world.signals[junction].states[start + step][link], arrow), stop)
+        for step in range(TOTAL_STEPS)
+        for junction, link, lane_id, stop, arrow in seen
+    ]
+    return LightStates(
+        step=np.array([row[0] for row in rows], np.int32),
+        lane_id=np.array([row[1] for row in rows], np.int64),
+        state=np.array([row[2] for row in rows], np.int8),
+        stop_point=np.array([row[3] for row in rows], np.float32).reshape(-1, 3),
+    )
+
+
+def _light_state(letter: str, arrow: bool) -> LightState:
+    """WOMD's state for a letter of SUMO; a protected turn shows arrows."""
+    if letter == "G":
+        return LightState.ARROW_GO if arrow else LightState.GO
+    if letter == "g":
+        return LightState.GO
+    if letter in "yY":
+        return LightState.ARROW_CAUTION if arrow else LightState.CAUTION
+    return LightState.ARROW_STOP if arrow else LightState.STOP
+
+
+def _label(view: _View, world: World, rng: np.random.Generator) -> Tracks:
+    """Noisy, rounded tracks with heights; zero where not valid."""
+    position, heading, velocity = view.position.copy(), view.heading.copy(), view.velocity.copy()
+    for k, body in enumerate(view.bodies):
+        if not body.is_parked:
+            noise = draw_label_noise(rng)
+            position[k], heading[k], velocity[k] = add_label_noise(rng, noise, position[k], heading[k], velocity[k])
+    size = np.array([body.size for body in view.bodies])
+    z = world.cropper.ground.height_at(position) + size[:, None, 2] / 2
+    heading = np.arctan2(np.sin(heading), np.cos(heading))
+    valid = view.valid
+    return Tracks(
+        object_id=np.cumsum(rng.integers(1, 9, len(view.bodies))).astype(np.int64),
+        object_type=np.array([body.object_type for body in view.bodies], np.int8),
+        position=np.concatenate(
+            [
+                on_grid(position * valid[..., None], POSITION_GRID_PER_M),
+                on_grid(z * valid, HEIGHT_GRID_PER_M)[..., None],
+            ],
+            axis=-1,
+        ),
+        heading=on_grid(heading * valid, HEADING_GRID_PER_RAD),
+        velocity=on_grid(velocity * valid[..., None], VELOCITY_GRID_PER_MPS),
+        size=on_grid(size[:, None] * valid[..., None], SIZE_GRID_PER_M),
+        valid=valid,
+    )
+
+
+def _candidate_egos(world: World, start: int) -> list[tuple[Body, bool]]:
+    """Cars that exist throughout the window and keep away from the network's ends, and whether each moves."""
+    egos = []
+    for body in world.bodies:
+        index = start - body.first_step
+        if body.object_type != ObjectType.VEHICLE or not body.is_evaluable or body.is_parked:
+            continue
+        if index < 0 or index + TOTAL_STEPS > body.num_steps:
+            continue
+        path = body.position[index : index + TOTAL_STEPS]
+        if np.linalg.norm(path[::10, None] - world.ends[None], axis=-1).min() > EGO_TO_END_M:
+            egos.append((body, bool(np.linalg.norm(path[-1] - path[0]) > 1.0)))
+    return egos
+
+
+def _choose_egos(world: World, start: int, rng: np.random.Generator) -> list[Body]:
+    candidates = _candidate_egos(world, start)
+    if not candidates:
+        return []
+    weights = np.array([6.0 if moving else 1.0 for _, moving in candidates])
+    order = rng.choice(len(candidates), len(candidates), replace=False, p=weights / weights.sum())
+    first = candidates[order[0]][0]
+    chosen = [first]
+    now = start + CURRENT_STEP
+    for index in order[1:]:
+        other = candidates[index][0]
+        gap = other.position[now - other.first_step] - first.position[now - first.first_step]
+        if np.linalg.norm(gap) > EGO_TO_EGO_M:
+            return [*chosen, other]
+    return chosen
+
+
+def cut_scenario(world: World, start: int, ego: Body, rng: np.random.Generator) -> Scenario | None:
+    """Scenario that begins at step `start` of the recording as `ego` sees it, or None if it fails a gate."""
+    range_m = float(rng.uniform(65.0, 95.0))
+    view = _look(list(world.bodies), start, ego, range_m, rng)
+    drivable = world.cropper.network_map.drivable
+    if not _passes_gates(view, rng) or not _is_on_road(view, len(view.bodies) - 1, drivable):
+        return None
+    predicted = choose_tracks_to_predict(view, rng, drivable)
+    if len(predicted) < 2:
+        return None
+    ego_path = view.position[-1]
+    features = world.cropper.crop(ego_path[::6], range_m + MAP_BEYOND_RANGE_M)
+    name = f"{world.name}/{start}/{world.bodies.index(ego)}"
+    return Scenario(
+        scenario_id=hashlib.sha256(name.encode()).hexdigest()[:16],
+        timestamps_s=np.round(np.arange(TOTAL_STEPS) * STEP_S, 1),
+        tracks=_label(view, world, rng),
+        map_features=features,
+        lights=_observe_lights(world, features, start, ego_path, range_m),
+        ego_index=len(view.bodies) - 1,
+        tracks_to_predict=np.array(predicted, np.int32),
+        difficulty=np.ones(len(predicted), np.int8),
+        objects_of_interest=np.zeros(0, np.int64),
+    )
+
+
+def cut_scenarios(world: World, rng: np.random.Generator) -> Iterator[Scenario]:
+    """Scenarios of a world in random order, no two of them overlapping in time and place; those that fail a gate are left out."""
+    starts = rng.permutation(np.arange(FIRST_START, world.num_steps - TOTAL_STEPS, WINDOW_EVERY_STEPS))
+    for start in starts.tolist():
+        for ego in _choose_egos(world, start, rng):
+            scenario = cut_scenario(world, start, ego, rng)
+            if scenario is not None:
+                yield scenario

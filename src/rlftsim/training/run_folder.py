@@ -1,0 +1,141 @@
+"""The folder of a run: resolved configuration, environment, metrics, checkpoints.
+
+config.json        what was asked for, every default filled in
+environment.json   versions, machine, command, commit
+metrics.jsonl      a line an update; also as TensorBoard events in tensorboard/
+checkpoints/       see `training.checkpoint`
+model/             the result, once the run is done (`save_pretrained`)
+"""
+
+import dataclasses
+import json
+import os
+import platform
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from torch.utils.tensorboard import SummaryWriter
+
+from rlftsim import __version__
+from rlftsim.errors import CheckpointError
+
+PACKAGES = ("torch", "numpy", "pyarrow", "lightning-fabric", "safetensors")
+
+
+def to_plain(config: Any) -> Any:
+    """A configuration dataclass as values that JSON can hold."""
+    if dataclasses.is_dataclass(config) and not isinstance(config, type):
+        return {f.name: to_plain(getattr(config, f.name)) for f in dataclasses.fields(config)}
+    if isinstance(config, Mapping):
+        return {str(k): to_plain(v) for k, v in config.items()}
+    if isinstance(config, list | tuple):
+        return [to_plain(v) for v in config]
+    return config if isinstance(config, str | int | float | bool | None) else str(config)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.name}.partial")
+    partial.write_text(text)
+    partial.replace(path)
+
+
+def describe_environment() -> dict[str, Any]:
+    """Versions, machine, command line and the commit of a checkout."""
+    return {
+        "command": " ".join(sys.argv),
+        "python": platform.python_version(),
+        "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
+        "packages": {"rlftsim": __version__, **{name: version(name) for name in PACKAGES}},
+        "commit": _commit(),
+    }
+
+
+def _commit() -> str | None:
+    """Commit of the checkout this package runs from; None where it is installed."""
+    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=12"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, timeout=5, check=True).stdout.strip() or None
+    except (OSError, subprocess.SubprocessError):
+        return None
+
+
+class RunFolder:
+    """Opens a run's folder for the first time or to go on. Only the process of rank 0 writes.
+
+    Raises:
+        CheckpointError: the folder belongs to a run with another configuration.
+    """
+
+    def __init__(self, path: Path, config: Any, *, writes: bool = True):
+        self.path = path
+        self.checkpoints = path / "checkpoints"
+        self.model = path / "model"
+        self._writes = writes
+        self._metrics = path / "metrics.jsonl"
+        self._board: SummaryWriter | None = None
+        plain = to_plain(config)
+        self._refuse_other(plain)
+        if writes:
+            write_text(path / "config.json", json.dumps(plain, indent=1) + "\n")
+            write_text(path / "environment.json", json.dumps(describe_environment(), indent=1) + "\n")
+
+    def _refuse_other(self, config: Any) -> None:
+        path = self.path / "config.json"
+        if not path.exists():
+            return
+        try:
+            old = json.loads(path.read_text())
+        except ValueError:
+            return
+        differing = sorted(k for k in old.keys() | config.keys() if old.get(k) != config.get(k))
+        if differing:
+            raise CheckpointError(
+                f"{self.path} belongs to a run with other settings ({', '.join(differing)}): "
+                "name another --out, or remove the folder to start anew."
+            )
+
+    def continue_from(self, update: int) -> None:
+        """Drop the metrics of updates that will be done again."""
+        if not self._writes:
+            return
+        if self._metrics.exists():
+            lines = self._metrics.read_text().splitlines()
+            kept = [line for line in lines if _update_of(line) <= update]
+            write_text(self._metrics, "".join(f"{line}\n" for line in kept))
+        self._board = SummaryWriter(str(self.path / "tensorboard"), purge_step=update + 1)
+
+    def log(self, update: int, values: Mapping[str, float]) -> None:
+        """Add a line of metrics."""
+        if not self._writes:
+            return
+        with self._metrics.open("a") as file:
+            file.write(json.dumps({"update": update, "time": round(time.time(), 3), **values}) + "\n")
+        if self._board is not None:
+            for name, value in values.items():
+                self._board.add_scalar(name, value, update)
+
+    def close(self) -> None:
+        """Flush what is pending."""
+        if self._board is not None:
+            self._board.close()
+
+
+def read_metrics(path: Path) -> list[dict[str, float]]:
+    """The metrics of a run's folder, a dictionary an update; empty where there are none."""
+    metrics = path / "metrics.jsonl"
+    return [json.loads(line) for line in metrics.read_text().splitlines()] if metrics.exists() else []
+
+
+def _update_of(line: str) -> float:
+    """Update of a line of metrics; infinite for a line that a kill cut short."""
+    try:
+        return json.loads(line)["update"]
+    except (ValueError, KeyError):
+        return float("inf")
