@@ -13,16 +13,23 @@ def test_smoothing_keeps_a_straight_line():
 
 
 def test_smoothing_averages_over_the_window():
-    # 0 0 3 0 0 with a window of 3: inside a running mean, at the ends a line through two zeros
-    np.testing.assert_allclose(smooth(np.array([0.0, 0, 3, 0, 0]), 3), [0, 1, 1, 1, 0])
+    # 0 0 3 0 0 with a window of 3: inside the mean of three; at the ends the line through 0 0 3 (slope 1.5, mean 1 in the
+    # middle) is read off one place further out
+    np.testing.assert_allclose(smooth(np.array([0.0, 0, 3, 0, 0]), 3), [-0.5, 1, 1, 1, -0.5])
+
+
+def test_smoothed_line_of_a_logarithmic_chart_stays_positive():
+    falling = 10.0 ** -np.arange(40)
+    html = chart_html(Chart("t", "x", "y", [Curve("a", range(40), np.maximum(falling, 1e-25))], log_y=True))
+    assert "nan" not in html
 
 
 @pytest.mark.parametrize(
     ("low", "high", "expected"),
     [
-        (0, 1, [0, 0.2, 0.4, 0.6, 0.8, 1]),
+        (0.0, 1.0, [0, 0.2, 0.4, 0.6, 0.8, 1]),
         (0.689, 0.713, [0.69, 0.695, 0.7, 0.705, 0.71]),
-        (-3, 12, [-2.5, 0, 2.5, 5, 7.5, 10]),
+        (-3.0, 12.0, [-2.5, 0, 2.5, 5, 7.5, 10]),
     ],
 )
 def test_ticks_are_round_numbers_inside_the_limits(low, high, expected):
@@ -32,7 +39,7 @@ def test_ticks_are_round_numbers_inside_the_limits(low, high, expected):
 def test_tick_labels_have_the_digits_they_need():
     assert [format_tick(v, 0.005) for v in (0.69, 0.695)] == ["0.690", "0.695"]
     assert format_tick(-2.5, 2.5) == "−2.5"
-    assert format_tick(20000, 5000) == "20\u202f000"
+    assert format_tick(20000.0, 5000.0) == "20\u202f000"
     assert format_tick(0.0025, 0.0025) == "0.0025"
 
 

@@ -26,8 +26,8 @@ class Curve:
     """Values over updates (or steps, or epochs). Points that are not finite leave a gap."""
 
     name: str
-    x: Sequence[float]
-    y: Sequence[float]
+    x: Sequence[float] | Sequence[int] | np.ndarray
+    y: Sequence[float] | Sequence[int] | np.ndarray
 
     def __post_init__(self) -> None:
         if len(self.x) != len(self.y):
@@ -59,14 +59,17 @@ class Axes:
     y_high: float
     log_y: bool
 
-    def horizontal(self, x: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    def horizontal(self, x: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
         """SVG coordinate of x."""
-        return LEFT + (np.asarray(x, float) - self.x_low) / (self.x_high - self.x_low) * (WIDTH - LEFT - RIGHT)
+        return np.asarray(
+            LEFT + (np.asarray(x, float) - self.x_low) / (self.x_high - self.x_low) * (WIDTH - LEFT - RIGHT)
+        )
 
-    def vertical(self, y: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    def vertical(self, y: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
         """SVG coordinate of y."""
         height = np.log10(y) if self.log_y else np.asarray(y, float)
-        return HEIGHT - BOTTOM - (height - self.y_low) / (self.y_high - self.y_low) * (HEIGHT - TOP - BOTTOM)
+        share = (height - self.y_low) / (self.y_high - self.y_low)
+        return np.asarray(HEIGHT - BOTTOM - share * (HEIGHT - TOP - BOTTOM))
 
 
 def chart_html(chart: Chart) -> str:
@@ -92,11 +95,13 @@ def smooth(values: Float[np.ndarray, "n"], window: int) -> Float[np.ndarray, "n"
 
     Args:
         values: at equal distances.
-        window: how many points are fitted, an odd number; fewer at the ends.
+        window: how many points are fitted; near the ends they lie mostly on one side.
     """
-    half, smoothed = window // 2, np.array(values, float)
+    smoothed = np.array(values, float)
+    window = min(window, len(smoothed))
     for i in range(len(smoothed)):
-        near = np.arange(max(0, i - half), min(len(smoothed), i + half + 1))
+        start = min(max(i - window // 2, 0), len(smoothed) - window)
+        near = np.arange(start, start + window)
         offset = near - near.mean()
         slope = offset @ values[near] / max(float(offset @ offset), 1.0)
         smoothed[i] = values[near].mean() + slope * (i - near.mean())
@@ -137,6 +142,12 @@ def _drawable(curve: Curve, log_y: bool) -> tuple[np.ndarray, np.ndarray]:
     return np.array([x[g].mean() for g in groups]), np.array([y[g].mean() for g in groups])
 
 
+def _smoothed(y: np.ndarray, log_y: bool) -> np.ndarray:
+    """Smoothed on the scale on which it is drawn, so that it stays positive on a logarithmic one."""
+    window = _window(len(y))
+    return 10 ** smooth(np.log10(y), window) if log_y else smooth(y, window)
+
+
 def _window(num_points: int) -> int:
     """Odd number of points to average over; 1 = too few to smooth."""
     return 1 if num_points < MIN_POINTS_TO_SMOOTH else 2 * (num_points // 24) + 3
@@ -148,7 +159,7 @@ def _axes(drawn: list[tuple[str, np.ndarray, np.ndarray]], chart: Chart) -> Axes
     heights = []
     for _, _, y in drawn:
         if len(y):
-            heights += [np.quantile(y, 0.02), np.quantile(y, 0.98), *smooth(y, _window(len(y)))]
+            heights += [np.quantile(y, 0.02), np.quantile(y, 0.98), *_smoothed(y, chart.log_y)]
     if chart.reference:
         heights.append(chart.reference[1])
     y = np.array([h for h in heights if h > 0]) if chart.log_y else np.array(heights)
@@ -172,7 +183,7 @@ def _frame_svg(axes: Axes, chart: Chart) -> str:
     ticks = nice_ticks(axes.x_low, axes.x_high, 5)
     for value in ticks:
         x = float(axes.horizontal(np.array(value)))
-        label = format_tick(value, ticks[1] - ticks[0] if len(ticks) > 1 else 1)
+        label = format_tick(value, ticks[1] - ticks[0] if len(ticks) > 1 else 1.0)
         parts.append(f'<path class="tick" d="M{x:.1f} {bottom}v5"/>')
         parts.append(f'<text x="{x:.1f}" y="{bottom + 18}" text-anchor="middle">{label}</text>')
     parts.append(f'<path class="axis" d="M{LEFT} {bottom}H{right}"/>')
@@ -200,10 +211,10 @@ def _vertical_ticks(axes: Axes) -> list[tuple[float, str]]:
     """Values to mark on the vertical axis, with their labels."""
     if not axes.log_y:
         ticks = nice_ticks(axes.y_low, axes.y_high, 5)
-        step = ticks[1] - ticks[0] if len(ticks) > 1 else 1
+        step = ticks[1] - ticks[0] if len(ticks) > 1 else 1.0
         return [(v, format_tick(v, step)) for v in ticks]
     decades = range(math.floor(axes.y_low), math.ceil(axes.y_high) + 1)
-    multiples = (1,) if len(decades) > 3 else (1, 2, 5)
+    multiples = (1,) if axes.y_high - axes.y_low > 2 else (1, 2, 5)
     exponents = [(m, d) for d in decades[:: max(1, len(decades) // 5)] for m in multiples]
     marks = [m * 10.0**d for m, d in exponents if axes.y_low <= math.log10(m) + d <= axes.y_high]
     return [(v, f"{v:.3g}".replace("-", "−")) for v in marks]
@@ -219,7 +230,7 @@ def _curve_svg(axes: Axes, x: np.ndarray, y: np.ndarray, colour: str) -> str:
     if window == 1:
         dots = "".join(f'<circle cx="{a:.1f}" cy="{b:.1f}" r="3" fill="{colour}"/>' for a, b in zip(across, down))
         return f'<path class="smooth" d="{raw}" stroke="{colour}"/>{dots}'
-    smoothed = _path(across, axes.vertical(smooth(y, window)))
+    smoothed = _path(across, axes.vertical(_smoothed(y, axes.log_y)))
     # a nested svg cuts off what lies outside its box: the wildest raw points
     box = f"{LEFT} {TOP} {WIDTH - LEFT - RIGHT} {HEIGHT - TOP - BOTTOM}"
     place = 'x="{}" y="{}" width="{}" height="{}"'.format(*box.split())
