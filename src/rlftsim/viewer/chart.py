@@ -82,6 +82,7 @@ def chart_html(chart: Chart) -> str:
     axes = _axes(drawn, chart)
     parts = [_frame_svg(axes, chart)]
     parts += [_curve_svg(axes, x, y, colour_of(index)) for index, (_, x, y) in enumerate(drawn)]
+    parts.append(_reference_svg(axes, chart))
     hover = embed_json([_hover_points(axes, name, x, y, index) for index, (name, x, y) in enumerate(drawn)])
     return (
         f'<figure class="chart">{title}{_legend_html(chart)}'
@@ -143,9 +144,10 @@ def _drawable(curve: Curve, log_y: bool) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _smoothed(y: np.ndarray, log_y: bool) -> np.ndarray:
-    """Smoothed on the scale on which it is drawn, so that it stays positive on a logarithmic one."""
-    window = _window(len(y))
-    return 10 ** smooth(np.log10(y), window) if log_y else smooth(y, window)
+    """Smoothed on the scale on which it is drawn, and never beyond the raw values: a rate does not fall below zero."""
+    height = np.log10(y) if log_y else y
+    smoothed = np.clip(smooth(height, _window(len(y))), height.min(), height.max())
+    return 10**smoothed if log_y else smoothed
 
 
 def _window(num_points: int) -> int:
@@ -173,7 +175,7 @@ def _axes(drawn: list[tuple[str, np.ndarray, np.ndarray]], chart: Chart) -> Axes
 
 
 def _frame_svg(axes: Axes, chart: Chart) -> str:
-    """Grid, tick labels, axis labels, reference line."""
+    """Grid, tick labels, axis labels."""
     bottom, right = HEIGHT - BOTTOM, WIDTH - RIGHT
     parts = []
     for value, label in _vertical_ticks(axes):
@@ -193,7 +195,7 @@ def _frame_svg(axes: Axes, chart: Chart) -> str:
     )
     turn = f"translate(13 {(TOP + bottom) / 2}) rotate(-90)"
     parts.append(f'<text class="label" transform="{turn}" text-anchor="middle">{escape(chart.y_label)}</text>')
-    return "".join(parts) + _reference_svg(axes, chart)
+    return "".join(parts)
 
 
 def _reference_svg(axes: Axes, chart: Chart) -> str:
@@ -203,7 +205,7 @@ def _reference_svg(axes: Axes, chart: Chart) -> str:
     y = float(axes.vertical(np.array(height)))
     return (
         f'<path class="reference" d="M{LEFT} {y:.1f}H{WIDTH - RIGHT}"/>'
-        f'<text x="{WIDTH - RIGHT - 4}" y="{y - 5:.1f}" text-anchor="end">{escape(name)}</text>'
+        f'<text class="halo" x="{WIDTH - RIGHT - 4}" y="{y - 5:.1f}" text-anchor="end">{escape(name)}</text>'
     )
 
 
