@@ -38,7 +38,7 @@ from rlftsim.scenario.types import STEP_S, Scenario
 
 GENERATOR_VERSION = 1
 LICENCE_NOTE = "CC0-1.0: synthetic scenarios, no rights reserved."
-KINDS = ("city", "quiet", "city", "freeway", "city", "city", "city", "city")
+KINDS = ("city", "quiet", "city", "freeway", "city", "city", "quiet", "city")
 """Kinds of the networks in turn; a freeway gives half as many scenarios as the others."""
 LOTS_PER_STREET = {"city": 0.35, "quiet": 0.22, "freeway": 0.0}
 MAX_ATTEMPTS = 6
