@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Bool, Float, Int, Int64
 from torch import Tensor
 
 from rlftsim.errors import DataError
@@ -23,7 +23,7 @@ class SimulatedStates:
     Every agent exists at all T = 80 steps. Agents may come in any order, named by `object_id`.
     """
 
-    object_id: Int64[np.ndarray, "A"]
+    object_id: Int[np.ndarray, "A"]
     """Kept on the host: matching agents must not wait for a device."""
     x: Float[Tensor, "N A T"]
     y: Float[Tensor, "N A T"]
@@ -54,6 +54,22 @@ class SimulatedStates:
     def num_rollouts(self) -> int:
         """Number of rollouts stood for, N x repeat."""
         return self.x.shape[0] * self.repeat
+
+    def check_finite(self) -> None:
+        """Refuse rollouts with values that are not finite; waits for the device, so it is left to the caller.
+
+        The metric itself goes by the official rules, under which NaN lies in a histogram's last bin.
+
+        Raises:
+            DataError: names the first such rollout, object id and step.
+        """
+        finite = torch.stack([self.x, self.y, self.z, self.heading]).isfinite().all(0)
+        if not finite.all():
+            rollout, agent, step = (~finite).nonzero()[0].tolist()
+            raise DataError(
+                f"Simulated state of object id {self.object_id[agent]} in rollout {rollout} at future step {step} is "
+                "not finite: positions in metres and headings in radians must be numbers."
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +152,7 @@ def _shorten(ids: Sequence[int]) -> str:
     return f"{listed}, ... ({len(ids)} in all)" if len(ids) > 8 else listed
 
 
-def match_agents(expected: Int64[np.ndarray, "A"], given: Int64[np.ndarray, "A"], where: str) -> Int64[np.ndarray, "A"]:
+def match_agents(expected: Int64[np.ndarray, "A"], given: Int64[np.ndarray, "G"], where: str) -> Int64[np.ndarray, "A"]:
     """Index into `given` of each expected object id.
 
     Raises:

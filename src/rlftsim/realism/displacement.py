@@ -4,6 +4,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from rlftsim.realism.rounding import compute_sqrt
+
 
 def compute_displacement_error(
     rollout: Float[Tensor, "N E T 3"], log: Float[Tensor, "E T 3"], valid: Bool[Tensor, "E S"]
@@ -21,7 +23,7 @@ def compute_displacement_error(
     difference = rollout - log
     # Written out: the float32 sum of three squares in this order, without a reduction over a tiny axis.
     dx, dy, dz = difference.unbind(-1)
-    distance = (dx * dx + dy * dy + dz * dz).sqrt()  # [N, E, T]
+    distance = compute_sqrt(dx * dx + dy * dy + dz * dz)  # [N, E, T]
     future_valid = valid[:, -distance.shape[-1] :]
     # where, not a product: an invalid logged state may be anything.
     return torch.where(future_valid, distance, 0.0).sum(-1) / valid.sum(-1)

@@ -13,6 +13,8 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
+from rlftsim.realism.rounding import compute_sqrt
+
 FAR_M = 1e10
 """Distance reported where no other object is valid."""
 CORNER_ROUNDING = 0.7
@@ -145,17 +147,17 @@ def _compute_origin_distance(x: Float[Tensor, "8 P"], y: Float[Tensor, "8 P"]) -
     squared_length = torch.where(squared_length > 0, squared_length, 1.0)
     along = (-(x * edge_x + y * edge_y) / squared_length).clamp_(0.0, 1.0)
     off_x, off_y = x + along * edge_x, y + along * edge_y
-    distance = (off_x * off_x + off_y * off_y).sqrt_().amin(0)
-    outward = (y * edge_x - x * edge_y) / squared_length.sqrt()  # of the origin beyond each edge's line
-    gap = outward.amax(0)
-    return torch.where(gap <= 0, gap, distance)
+    distance = compute_sqrt((off_x * off_x + off_y * off_y).amin(0))
+    outward = y * edge_x - x * edge_y  # positive where the origin is beyond an edge's line
+    # Inside, too, the distance is to edges, not to their lines: between parallel boxes an edge may be a millimetre of noise.
+    return torch.where((outward <= 0).all(0), -distance, distance)
 
 
 def _compute_box_distance(agents: PlanarAgents, pairs: _Pairs) -> Float[Tensor, "P"]:
     """Signed distance between rounded boxes, negative for overlap: of the origin to the difference of their cores."""
-    *ego, ego_rounding = _compute_core_corners(agents, pairs.ego, pairs.ego_agent)
+    ego_x, ego_y, ego_rounding = _compute_core_corners(agents, pairs.ego, pairs.ego_agent)
     other_x, other_y, other_rounding = _compute_core_corners(agents, pairs.other, pairs.other_agent)
-    core_distance = _compute_origin_distance(*_add_rectangles(tuple(ego), (-other_x, -other_y)))
+    core_distance = _compute_origin_distance(*_add_rectangles((ego_x, ego_y), (-other_x, -other_y)))
     return core_distance - ego_rounding - other_rounding
 
 

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from rlftsim.realism.rounding import compute_sqrt
 from rlftsim.scenario.types import STEP_S
 
 
@@ -51,7 +52,7 @@ def compute_kinematics(
         heading: Radians; the second wrapped difference, not the difference of wrapped speeds, gives the acceleration.
     """
     dx, dy, dz = (compute_central_difference(axis) for axis in position)
-    linear_speed = (dx * dx + dy * dy + dz * dz).sqrt() / STEP_S
+    linear_speed = compute_sqrt(dx * dx + dy * dy + dz * dz) / STEP_S
     turn = _compute_turn(heading)
     return KinematicFeatures(
         linear_speed=linear_speed,
@@ -64,7 +65,7 @@ def compute_kinematics(
 def compute_ground_speed(x: Float[Tensor, "... T"], y: Float[Tensor, "... T"]) -> Float[Tensor, "... T"]:
     """Speed in the plane, m/s, NaN at both ends: for time to collision, which leaves height out."""
     dx, dy = compute_central_difference(x), compute_central_difference(y)
-    return (dx * dx + dy * dy).sqrt() / STEP_S
+    return compute_sqrt(dx * dx + dy * dy) / STEP_S
 
 
 def shrink_validity(valid: Bool[Tensor, "... T"]) -> Bool[Tensor, "... T"]:

@@ -17,7 +17,7 @@ from rlftsim.realism.config import HISTOGRAM_FEATURES, HistogramConfig, MetricCo
 from rlftsim.realism.features import Features, ScenarioLog
 
 
-def compute_bin_edges(histogram: HistogramConfig) -> Float[np.ndarray, "K+1"]:
+def compute_bin_edges(histogram: HistogramConfig) -> Float[np.ndarray, "K1"]:
     """Edges of equal-width bins as TensorFlow's float32 linspace rounds them: low + k * step, the last exactly high.
 
     A float64 linspace rounded to float32 differs by up to 8e-7, enough to move a value to the next bin.
@@ -32,7 +32,7 @@ def compute_bin_edges(histogram: HistogramConfig) -> Float[np.ndarray, "K+1"]:
 class HistogramTable:
     """The histogram features of a metric side by side, padded to the largest number of bins K."""
 
-    edges: Float[Tensor, "H K+1"]
+    edges: Float[Tensor, "H K1"]
     """Infinite beyond a feature's own edges."""
     low: Float[Tensor, "H"]
     high: Float[Tensor, "H"]

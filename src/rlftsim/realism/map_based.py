@@ -12,6 +12,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from rlftsim.realism.agents import Trajectories
+from rlftsim.realism.rounding import compute_sqrt
 from rlftsim.realism.segment_search import ChunkedSegments, chunk_segments, find_nearest_segment
 from rlftsim.scenario.types import ROAD_EDGE_TYPES, MapFeatures
 
@@ -107,14 +108,14 @@ def build_road_edges(features: MapFeatures, device: torch.device) -> RoadEdges |
 def _measure_road_edge(
     points: Float[Tensor, "P 3"], segments: ChunkedSegments, chunk: Int64[Tensor, "P"]
 ) -> Float[Tensor, "P U"]:
-    """Distance in space with heights stretched, to the point of the segment nearest in the plane."""
+    """Squared distance in space with heights stretched, to the point of the segment nearest in the plane."""
     dx, dy, dz = (axis[chunk] for axis in segments.delta)
     to_x, to_y, to_z = (points[:, axis, None] - segments.start[axis][chunk] for axis in range(3))
     along = to_x * dx + to_y * dy
     along.div_(segments.squared_length[chunk]).clamp_(0.0, 1.0)
     off_x, off_y, off_z = to_x.sub_(along * dx), to_y.sub_(along * dy), to_z.sub_(along * dz)
     off_z.mul_(HEIGHT_STRETCH)
-    return off_x.square_().add_(off_y.square_()).add_(off_z.square_()).sqrt_()
+    return off_x.square_().add_(off_y.square_()).add_(off_z.square_())
 
 
 def _cross(ax: Tensor, ay: Tensor, bx: Tensor, by: Tensor) -> Tensor:
@@ -137,7 +138,7 @@ def _compute_signed_distance(
     along = (to_x * dx + to_y * dy) / torch.where(squared_length > 0, squared_length, 1.0)
     clipped = along.clamp(0.0, 1.0)
     off_x, off_y = to_x - clipped * dx, to_y - clipped * dy
-    distance = (off_x * off_x + off_y * off_y).sqrt()
+    distance = compute_sqrt(off_x * off_x + off_y * off_y)
     is_before = along < 0
     neighbor = torch.where(is_before, edges.previous[segment], torch.where(along > 1, edges.next[segment], segment))
     side, other_side = _cross(to_x, to_y, dx, dy).sign(), _compute_side(x, y, edges, neighbor)

@@ -139,7 +139,7 @@ def _form_sets(counts: RolloutCounts, repeat: int) -> tuple[RolloutCounts, Float
     return sets, size
 
 
-def _any_rate(event: Bool[Tensor, "N E T"], log: ScenarioLog, repeat: int) -> Float[Tensor, "N"]:
+def _any_rate(event: Bool[Tensor, "N E T"], log: ScenarioLog, repeat: int) -> Float[Tensor, "N_repeat"]:
     """Share of evaluated agents of a rollout with an event at any step where the log is valid."""
     occurred = (event & log.agents.future_valid).any(-1).to(torch.float32)
     return occurred.mean(-1).repeat_interleave(repeat)

@@ -15,6 +15,8 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
+from rlftsim.realism.rounding import compute_largest_square, compute_sqrt
+
 CHUNK_SEGMENTS = 16
 LISTED_CHUNKS = 12
 _FAR = 1e15
@@ -45,7 +47,7 @@ class ChunkedSegments:
 
 
 DistanceRule = Callable[[Float[Tensor, "P D"], ChunkedSegments, Int64[Tensor, "P"]], Float[Tensor, "P U"]]
-"""Distance of each point to the segments of one chunk."""
+"""Squared distance of each point to the segments of one chunk."""
 
 
 def chunk_segments(
@@ -97,11 +99,13 @@ def _squared_box_distance(
     axis_scale: tuple[float, ...],
 ) -> Float[Tensor, "..."]:
     """Squared distance between boxes, each given by its lowest and highest corners; 0 where they touch."""
-    total = None
+    squares = []
     for axis, scale in enumerate(axis_scale):
         gap = torch.maximum(boxes[0][axis] - points[1][axis], points[0][axis] - boxes[1][axis]).clamp_(min=0.0)
-        gap = gap if scale == 1.0 else gap.mul_(scale)
-        total = gap.square_() if total is None else total.add_(gap.square_())
+        squares.append((gap if scale == 1.0 else gap.mul_(scale)).square_())
+    total = squares[0]
+    for square in squares[1:]:
+        total.add_(square)
     return total
 
 
@@ -127,7 +131,10 @@ def _measure(
     keys = []
     size = max(1, max_pairs // CHUNK_SEGMENTS)
     for row, chunk in zip(pairs[0].split(size), pairs[1].split(size)):
-        distance, slot = rule(points[row], segments, chunk).min(-1)
+        squared = rule(points[row], segments, chunk)
+        distance = compute_sqrt(squared.amin(-1))
+        # Equal are distances, not their squares: rounding the root makes more of them equal.
+        slot = (squared <= compute_largest_square(distance)[:, None]).to(torch.uint8).argmax(-1)
         keys.append(_to_key(distance, chunk * CHUNK_SEGMENTS + slot))
     return keys[0] if len(keys) == 1 else torch.cat(keys)
 
@@ -190,7 +197,7 @@ def find_nearest_segment(
     Args:
         groups: Points in groups of neighbours (any grouping is right, a tight one is fast).
         segments: Where to search.
-        rule: Distance of points to the segments of a chunk, never below the distance to the chunk's box.
+        rule: Squared distance of points to the segments of a chunk, never below that to the chunk's box.
         max_pairs: Upper bound of point-segment or group-box pairs held at once; sets memory, not results.
     """
     num_chunks = segments.low.shape[1]

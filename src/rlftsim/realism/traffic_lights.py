@@ -42,7 +42,7 @@ class Signals:
 def _measure_lane(
     points: Float[Tensor, "P 2"], segments: ChunkedSegments, chunk: Int64[Tensor, "P"]
 ) -> Float[Tensor, "P U"]:
-    """The official rule, which is not a distance: it steps from the segment's start away from the projection.
+    """Square of what the official rule compares, which is not a distance: it steps from the segment's start away from the projection.
 
     It amounts to the nearest segment start, with starts ahead of or abreast of the point preferred. It is never below
     the distance to the segment's start.
@@ -51,7 +51,7 @@ def _measure_lane(
     to_x, to_y = (points[:, axis, None] - segments.start[axis][chunk] for axis in range(2))
     along = ((to_x * dx + to_y * dy) / segments.squared_length[chunk]).clamp_(0.0, 1.0)
     off_x, off_y = to_x + along * dx, to_y + along * dy
-    return (off_x * off_x + off_y * off_y).sqrt_()
+    return off_x * off_x + off_y * off_y
 
 
 def _cut_lane_segments(

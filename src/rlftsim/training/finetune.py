@@ -17,6 +17,7 @@ from lightning_fabric import Fabric
 from torch import Tensor, nn
 
 from rlftsim.errors import CheckpointError, ConfigError
+from rlftsim.progress import progress_bar
 from rlftsim.realism import RealismResult, metric_by_name, score_batch
 from rlftsim.realism.from_rollouts import states_of_rollouts
 from rlftsim.rollout.noise import derive_seed
@@ -29,7 +30,6 @@ from rlftsim.training.checkpoint import Progress, newest_checkpoint, read_checkp
 from rlftsim.training.data import scenarios_of_update
 from rlftsim.training.parallel import DeviceConfig, add_up, add_up_gradients, own_share, start_fabric
 from rlftsim.training.policy_gradient import Reduction, masked_sum, policy_gradient_loss, rollout_log_prob
-from rlftsim.training.progress import progress_bar
 from rlftsim.training.reference import KlConfig, adapt_beta, move_reference
 from rlftsim.training.rewards import Reward, reward_by_name
 from rlftsim.training.run_folder import RunFolder

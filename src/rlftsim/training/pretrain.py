@@ -14,13 +14,13 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from rlftsim.errors import ConfigError
+from rlftsim.progress import progress_bar
 from rlftsim.rollout.noise import derive_seed
 from rlftsim.scenario.batch import ScenarioBatch, collate
 from rlftsim.scenario.types import CURRENT_STEP, Scenario
 from rlftsim.training.checkpoint import Progress, newest_checkpoint, read_checkpoint, write_checkpoint
 from rlftsim.training.data import scenarios_of_update
 from rlftsim.training.parallel import DeviceConfig, add_up, add_up_gradients, own_share, start_fabric
-from rlftsim.training.progress import progress_bar
 from rlftsim.training.run_folder import RunFolder
 
 

@@ -21,9 +21,10 @@ from typing import Any
 
 from torch.utils.tensorboard import SummaryWriter
 
+from rlftsim import __version__
 from rlftsim.errors import CheckpointError
 
-PACKAGES = ("rlftsim", "torch", "numpy", "pyarrow", "lightning-fabric", "safetensors")
+PACKAGES = ("torch", "numpy", "pyarrow", "lightning-fabric", "safetensors")
 
 
 def to_plain(config: Any) -> Any:
@@ -51,7 +52,7 @@ def describe_environment() -> dict[str, Any]:
         "command": " ".join(sys.argv),
         "python": platform.python_version(),
         "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
-        "packages": {name: version(name) for name in PACKAGES},
+        "packages": {"rlftsim": __version__, **{name: version(name) for name in PACKAGES}},
         "commit": _commit(),
     }
 
@@ -120,16 +121,16 @@ class RunFolder:
             for name, value in values.items():
                 self._board.add_scalar(name, value, update)
 
-    def read_metrics(self) -> list[dict[str, float]]:
-        """All lines of metrics so far."""
-        if not self._metrics.exists():
-            return []
-        return [json.loads(line) for line in self._metrics.read_text().splitlines()]
-
     def close(self) -> None:
         """Flush what is pending."""
         if self._board is not None:
             self._board.close()
+
+
+def read_metrics(path: Path) -> list[dict[str, float]]:
+    """The metrics of a run's folder, a dictionary an update; empty where there are none."""
+    metrics = path / "metrics.jsonl"
+    return [json.loads(line) for line in metrics.read_text().splitlines()] if metrics.exists() else []
 
 
 def _update_of(line: str) -> float:

@@ -66,7 +66,7 @@ def smart_nano() -> SmartConfig:
 def smart_demo() -> SmartConfig:
     """Small enough to train on two CPU cores in minutes."""
     return SmartConfig(
-        dim=64, num_heads=4, head_dim=16, num_map_layers=1, num_decoder_layers=2, num_frequencies=16,
+        dim=48, num_heads=4, head_dim=12, num_map_layers=1, num_decoder_layers=2, num_frequencies=8,
         agent_map_radius_m=30.0, agent_radius_m=30.0, history_tokens=4,
-        max_map_neighbors=16, max_agent_map_neighbors=24, max_agent_neighbors=12,
+        max_map_neighbors=8, max_agent_map_neighbors=16, max_agent_neighbors=8,
     )  # fmt: skip

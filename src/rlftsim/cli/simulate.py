@@ -1,0 +1,58 @@
+"""The verb that rolls scenarios out: simulate."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from tyro.conf import Positional
+
+from rlftsim.cli.data import open_split
+from rlftsim.errors import ConfigError
+from rlftsim.progress import progress_bar
+from rlftsim.recipes.models import load_policy
+from rlftsim.rollout.files import write_rollouts
+from rlftsim.rollout.policy import Sampling
+from rlftsim.rollout.simulate import simulate
+from rlftsim.scenario.batch import collate
+
+
+@dataclass(frozen=True)
+class Simulate:
+    """Simulate futures of scenarios: every agent, the ego included, moves by the model for 8 seconds.
+
+    Writes one npz a scenario: scenario_id, object_ids [A], x y z heading [N, A, 80], world frame. Files that are there are kept,
+    so an interrupted run goes on where it was.
+    """
+
+    model: Positional[str]
+    """Model folder, or "constant_velocity"."""
+    data: str
+    """Folder of a data set, or "synthetic"."""
+    out: Path
+    """Folder for the rollouts."""
+    split: str = "validation"
+    scenario: list[str] | None = None
+    """Only these scenario ids."""
+    num_rollouts: int = 32
+    seed: int = 0
+    temperature: float = 1.0
+    """Below 1 likely motions become likelier; 0 always takes the most likely one."""
+    top_k: int | None = None
+    """Sample among this many of the most likely motions only."""
+
+    def run(self) -> int:
+        """Simulate scenario by scenario."""
+        policy, sampling = load_policy(self.model), Sampling(self.temperature, self.top_k)
+        scenarios = open_split(self.data, self.split)
+        ids = self.scenario or scenarios.scenario_ids
+        unknown = [i for i in ids if i not in scenarios]
+        if unknown:
+            raise ConfigError(f"no scenario {', '.join(unknown)} in split {self.split!r} of {self.data}.")
+        left = [i for i in ids if not (self.out / f"{i}.npz").exists()]
+        with progress_bar("simulate", len(ids), len(ids) - len(left)) as advance:
+            for scenario_id in left:
+                batch = collate([scenarios.by_id(scenario_id)])
+                rollouts = simulate(policy, batch, num_rollouts=self.num_rollouts, seed=self.seed, sampling=sampling)
+                write_rollouts(self.out, batch, rollouts)
+                advance()
+        print(f"{self.out}: {self.num_rollouts} rollouts of {len(ids)} scenarios.")
+        return 0

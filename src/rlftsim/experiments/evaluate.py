@@ -1,0 +1,296 @@
+"""Scores of a policy on a data set: simulate every scenario, score all its rollouts together, keep every scenario's numbers.
+
+Work is done in groups of scenarios. A finished group is a part file under `<name>.parts/`; a run that was interrupted goes on
+with the groups that are missing, and when all are there they become `<name>.parquet`.
+"""
+
+import copy
+import hashlib
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+import pyarrow as pa
+import torch
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from torch import nn
+
+from rlftsim.errors import ConfigError, DataError
+from rlftsim.experiments.evaluation import (
+    SCHEMA,
+    EvaluateConfig,
+    Evaluation,
+    Provenance,
+    Skipped,
+    join_evaluations,
+    row_of_result,
+)
+from rlftsim.experiments.fingerprint import fingerprint_policy
+from rlftsim.experiments.workers import run_in_processes
+from rlftsim.realism import SimulatedStates, build_scenario_log, metric_by_name, score
+from rlftsim.realism.from_rollouts import logged_states, states_of_rollouts
+from rlftsim.rollout.policy import Policy
+from rlftsim.rollout.simulate import simulate
+from rlftsim.scenario.batch import collate
+from rlftsim.scenario.dataset import MANIFEST, ScenarioDataset
+from rlftsim.scenario.types import TOTAL_STEPS, Scenario
+
+__all__ = ["EvaluateConfig", "Evaluation", "Provenance", "Skipped", "evaluate", "simulate_states"]
+
+SCENARIOS_PER_GROUP = 4
+"""What is lost at most, for each process, when a run is interrupted."""
+_CACHED_SCENARIOS = 2  # each is looked at once
+
+Oracle = Literal["oracle"]
+
+
+def evaluate(
+    policy: Policy | Oracle,
+    dataset_folder: Path,
+    out: Path,
+    config: EvaluateConfig = EvaluateConfig(),  # noqa: B008
+    *,
+    name: str,
+    show_progress: bool = True,
+) -> Evaluation:
+    """Score a policy on the scenarios of a data set; the result is also written to `out/<name>.parquet`.
+
+    Interrupted in any way, the same call goes on where it was. Once finished, it reads the file.
+
+    Args:
+        policy: any policy, or "oracle" for the record itself.
+        dataset_folder: an `rlftsim convert` data set.
+        out: folder of the result, made if missing.
+        config: rollouts, metric, sampling, scenarios, processes.
+        name: of the row and the file. Unfinished work and results of another policy, data set or setting under this name
+            are replaced, with a word on stderr.
+        show_progress: whether to draw a bar with the time left on stderr, if that is a terminal.
+
+    Raises:
+        DataError: no such data set or split, or scenarios whose future is withheld (a test split).
+        ConfigError: an impossible name, or several processes for a policy that lives on a GPU.
+    """
+    dataset_folder, out = Path(dataset_folder), Path(out)
+    if not name or Path(name).name != name:
+        raise ConfigError(f"an evaluation's name becomes a file name, {name!r} cannot.")
+    positions = _choose_scenarios(ScenarioDataset(dataset_folder, config.split), config)
+    job = _Job(_frozen_copy(policy), dataset_folder, _describe(policy, dataset_folder, config), name, out)
+    if config.jobs > 1 and job.device.type != "cpu":
+        raise ConfigError(f"evaluate.jobs={config.jobs} works on CPUs only, the policy is on {job.device}: set jobs=1.")
+    groups = [positions[i : i + SCENARIOS_PER_GROUP] for i in range(0, len(positions), SCENARIOS_PER_GROUP)]
+    finished = _read_finished(job, groups)
+    if finished is None:
+        _fill_parts(job, groups, show_progress)
+        parts = [_read_part(job, group) for group in groups]
+        finished = join_evaluations(name, job.provenance, [part for part in parts if part is not None])
+        finished.write(job.result_path)
+    shutil.rmtree(job.parts_folder, ignore_errors=True)
+    return finished
+
+
+def simulate_states(
+    policy: Policy, scenario: Scenario, config: EvaluateConfig, device: torch.device
+) -> SimulatedStates:
+    """All rollouts of one scenario, simulated a few at a time; a deterministic policy is simulated once.
+
+    Raises:
+        ConfigError: the policy cannot do what `config` asks, e.g. top-k without categories.
+    """
+    batch = collate([scenario]).to(device)
+    with torch.no_grad():
+        context = policy.encode(batch)
+    is_random = policy.initial_noise_size or (policy.noise_size and config.temperature > 0)
+    ids = range(config.num_rollouts if is_random else 1)
+    passes = []
+    for first in range(0, len(ids), config.rollouts_per_pass):
+        some = ids[first : first + config.rollouts_per_pass]
+        rollouts = simulate(
+            policy, batch, num_rollouts=some, seed=config.seed, context=context, sampling=config.sampling
+        )
+        passes.append(states_of_rollouts(batch, rollouts)[0])
+    joined = _join_passes(passes)
+    return joined if is_random else replace(joined, repeat=config.num_rollouts)
+
+
+def _join_passes(passes: Sequence[SimulatedStates]) -> SimulatedStates:
+    fields = (torch.cat([getattr(p, axis) for p in passes]) for axis in ("x", "y", "z", "heading"))
+    return SimulatedStates(passes[0].object_id, *fields)
+
+
+@dataclass(frozen=True, eq=False)
+class _Job:
+    """One evaluation under way; is handed to other processes."""
+
+    policy: Policy | Oracle
+    dataset_folder: Path
+    provenance: Provenance
+    name: str
+    out: Path
+
+    @property
+    def config(self) -> EvaluateConfig:
+        return self.provenance.config
+
+    @property
+    def result_path(self) -> Path:
+        return self.out / f"{self.name}.parquet"
+
+    @property
+    def parts_folder(self) -> Path:
+        return self.out / f"{self.name}.parts"
+
+    def part_path(self, group: range) -> Path:
+        return self.parts_folder / f"{group.start:06d}-{group.stop:06d}.parquet"
+
+    @property
+    def device(self) -> torch.device:
+        weights = self.policy.parameters() if isinstance(self.policy, nn.Module) else ()
+        return next((w.device for w in weights), torch.device("cpu"))
+
+
+def _frozen_copy(policy: Policy | Oracle) -> Policy | Oracle:
+    """A copy without dropout whose weights nobody trains, so that parts of it may be looked up in tables."""
+    return copy.deepcopy(policy).eval().requires_grad_(False) if isinstance(policy, nn.Module) else policy
+
+
+def _describe(policy: Policy | Oracle, dataset_folder: Path, config: EvaluateConfig) -> Provenance:
+    is_oracle = isinstance(policy, str)
+    return Provenance(
+        config=config,
+        policy="oracle" if is_oracle else type(policy).__name__,
+        policy_fingerprint="oracle" if is_oracle else fingerprint_policy(policy),
+        dataset=str(dataset_folder.resolve()),
+        manifest_sha256=hashlib.sha256((dataset_folder / MANIFEST).read_bytes()).hexdigest(),
+    )
+
+
+def _choose_scenarios(dataset: ScenarioDataset, config: EvaluateConfig) -> range:
+    """Positions to evaluate.
+
+    Raises:
+        DataError: none, or one without its future.
+    """
+    chosen = range(min(len(dataset), config.limit or len(dataset)))
+    where = f"{dataset.folder}" + (f" (split {dataset.split})" if dataset.split else "")
+    if not chosen:
+        raise DataError(f"{where} has no scenarios: nothing to evaluate.")
+    steps = dataset.index["num_steps"].to_pylist()
+    short = [i for i in chosen if steps[i] < TOTAL_STEPS]
+    if short:
+        raise DataError(
+            f"{where}: {len(short)} of {len(chosen)} scenarios withhold their future, the first is "
+            f"{dataset.scenario_ids[short[0]]} with {steps[short[0]]} steps: a test split can be simulated but not "
+            "evaluated, use training or validation data."
+        )
+    return chosen
+
+
+def _read_finished(job: _Job, groups: list[range]) -> Evaluation | None:
+    """The result of an earlier call with the same arguments, if there is one."""
+    if not job.result_path.exists():
+        return None
+    try:
+        found = Evaluation.read(job.result_path)
+    except DataError as error:
+        _say(f"{error} Doing so.")
+        return None
+    other = found.provenance.differences(job.provenance)
+    if other:
+        _say(f"{job.result_path} is of another {', '.join(other)}: it will be replaced.")
+        return None
+    ids = _open(job).scenario_ids[: groups[-1].stop]
+    return found if {*found.scenario_ids, *(s.scenario_id for s in found.skipped)} == set(ids) else None
+
+
+def _read_part(job: _Job, group: range) -> Evaluation | None:
+    """What an earlier call left of a group; None if there is nothing usable."""
+    path = job.part_path(group)
+    if not path.exists():
+        return None
+    try:
+        part = Evaluation.read(path)
+    except DataError as error:
+        _say(f"{error} Doing so.")
+        return None
+    other = part.provenance.differences(job.provenance)
+    if other:
+        _say(f"{path} is of another {', '.join(other)}: discarded.")
+    return None if other else part
+
+
+def _fill_parts(job: _Job, groups: list[range], show_progress: bool) -> None:
+    """Work on the groups whose part is missing."""
+    missing = [group for group in groups if _read_part(job, group) is None]
+    total = sum(len(group) for group in groups)
+    with _progress_bar(job.name, total, total - sum(len(group) for group in missing), show_progress) as advance:
+        task = partial(_evaluate_group, job)
+        if min(job.config.jobs, len(missing)) > 1:
+            run_in_processes(task, missing, jobs=min(job.config.jobs, len(missing)), advance=advance)
+        else:
+            for group in missing:
+                task(group, advance, lambda: False)
+
+
+def _evaluate_group(job: _Job, group: range, advance: Callable[[int], None], is_stopped: Callable[[], bool]) -> None:
+    """Score a few scenarios and write their part."""
+    dataset = _open(job)
+    rows, skipped = [], []
+    for position in group:
+        if is_stopped():
+            return
+        outcome = _evaluate_scenario(job, dataset[position])
+        if isinstance(outcome, Skipped):
+            skipped.append(outcome)
+        else:
+            rows.append(outcome)
+        advance(1)
+    table = pa.Table.from_pylist(rows, schema=SCHEMA)
+    Evaluation(job.name, job.provenance, table, tuple(skipped)).write(job.part_path(group))
+
+
+def _evaluate_scenario(job: _Job, scenario: Scenario) -> dict[str, object] | Skipped:
+    """Row of one scenario, or why there is none."""
+    try:
+        log = build_scenario_log(scenario, job.device)
+    except DataError as error:
+        return Skipped(scenario.scenario_id, str(error))
+    config = job.config
+    if isinstance(job.policy, str):
+        states = logged_states(scenario, num_rollouts=config.num_rollouts, device=job.device)
+    else:
+        states = simulate_states(job.policy, scenario, config, job.device)
+    return row_of_result(
+        score(log, states, metric_by_name(config.metric)),
+        num_agents=len(scenario.simulated_indices),
+        num_evaluated=len(scenario.evaluated_indices),
+    )
+
+
+def _open(job: _Job) -> ScenarioDataset:
+    return ScenarioDataset(job.dataset_folder, job.config.split, cache_size=_CACHED_SCENARIOS)
+
+
+@contextmanager
+def _progress_bar(name: str, total: int, done: int, show: bool) -> Iterator[Callable[[int], None]]:
+    columns = (
+        TextColumn(f"evaluating {name}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("scenarios"),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+    )
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, disable=not (show and console.is_terminal)) as progress:
+        bar = progress.add_task(name, total=total, completed=done)
+        yield lambda count: progress.advance(bar, count)
+
+
+def _say(message: str) -> None:
+    Console(stderr=True, highlight=False, soft_wrap=True).print(message, markup=False)

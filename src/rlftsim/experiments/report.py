@@ -1,0 +1,380 @@
+"""The page a run ends with: table, paired comparison, learning curves, animations and the facts needed to repeat it."""
+
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from html import escape
+
+import numpy as np
+from rich.table import Table
+
+from rlftsim.viewer.chart import Chart, chart_html, format_tick, nice_ticks
+from rlftsim.viewer.page import Animation, animation_html, page_html, read_asset, write_text
+
+NORMAL_QUANTILE_95 = 1.959964
+"""Half-width of a 95 % interval in standard errors."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A mean over scenarios with its uncertainty."""
+
+    mean: float
+    standard_error: float | None = None
+    interval: tuple[float, float] | None = None
+    """95 %; None = mean ± 1.96 standard errors."""
+
+    @classmethod
+    def of(cls, values: Sequence[float] | np.ndarray) -> "Estimate":
+        """Mean and standard error of one value per scenario; values that are not finite are left out."""
+        finite = np.asarray(values, float)
+        finite = finite[np.isfinite(finite)]
+        if not len(finite):
+            return cls(math.nan)
+        error = float(finite.std(ddof=1) / math.sqrt(len(finite))) if len(finite) > 1 else None
+        return cls(float(finite.mean()), error)
+
+    @property
+    def limits(self) -> tuple[float, float] | None:
+        """The 95 % interval; None where the uncertainty is unknown."""
+        if self.interval is not None or self.standard_error is None:
+            return self.interval
+        half_width = NORMAL_QUANTILE_95 * self.standard_error
+        return self.mean - half_width, self.mean + half_width
+
+
+@dataclass(frozen=True)
+class ResultRow:
+    """One policy's results on the held-out scenarios. None = not measured."""
+
+    name: str
+    realism_meta_metric: Estimate | None = None
+    kinematic: Estimate | None = None
+    interactive: Estimate | None = None
+    map_based: Estimate | None = None
+    min_average_displacement_error_m: Estimate | None = None
+    collision_rate: Estimate | None = None
+    """Share in [0, 1]."""
+    offroad_rate: Estimate | None = None
+    """Share in [0, 1]."""
+    note: str = ""
+    emphasised: bool = False
+
+
+@dataclass(frozen=True)
+class PairedComparison:
+    """Two policies on the same scenarios: mean of the differences `second - first`."""
+
+    first: str
+    second: str
+    mean_difference: float
+    interval: tuple[float, float]
+    """95 %."""
+    p_value: float
+    num_scenarios: int
+    metric: str = "RMM"
+    test: str = "paired t-test"
+    differences: Sequence[float] = ()
+    """One per scenario; drawn where given."""
+    verdict: str = ""
+    """A sentence; empty = written from the interval."""
+
+    @property
+    def is_better(self) -> bool:
+        """Whether the whole interval lies above zero."""
+        return self.interval[0] > 0
+
+    @property
+    def is_worse(self) -> bool:
+        """Whether the whole interval lies below zero."""
+        return self.interval[1] < 0
+
+    @property
+    def verdict_text(self) -> str:
+        """`verdict`, or what the interval allows to say."""
+        if self.verdict:
+            return self.verdict
+        if self.is_better or self.is_worse:
+            word, side = ("higher", "above") if self.is_better else ("lower", "below")
+            return (
+                f"{_sentence(self.second)} scores {word} than {self.first} in {self.metric}: "
+                f"the whole 95 % interval of the mean difference lies {side} zero."
+            )
+        return (
+            f"No difference in {self.metric} between {self.second} and {self.first} can be claimed: "
+            "the 95 % interval of the mean difference contains zero."
+        )
+
+
+@dataclass(frozen=True)
+class ChartGroup:
+    """Charts side by side under one heading."""
+
+    title: str
+    charts: Sequence[Chart]
+    caption: str = ""
+
+
+@dataclass(frozen=True)
+class Report:
+    """Everything on the page. Only the title is needed; what is empty is left out."""
+
+    title: str
+    summary: Sequence[str] = ()
+    """Paragraphs."""
+    rows: Sequence[ResultRow] = ()
+    table_note: str = ""
+    """For instance how many scenarios and rollouts the means are over."""
+    comparison: PairedComparison | None = None
+    chart_groups: Sequence[ChartGroup] = ()
+    animations: Sequence[Animation] = ()
+    animations_note: str = ""
+    facts: Mapping[str, str] = field(default_factory=dict)
+    """Configuration, versions, durations, command, commit, ..."""
+    footnotes: Sequence[str] = ()
+
+
+@dataclass(frozen=True)
+class Column:
+    """How one field of `ResultRow` is shown."""
+
+    field: str
+    heading: str
+    meaning: str
+    higher_is_better: bool
+    digits: int
+    factor: float = 1.0
+
+    def estimate(self, row: ResultRow) -> Estimate | None:
+        """The row's value; None where it was not measured or has no finite mean."""
+        value: Estimate | None = getattr(row, self.field)
+        return value if value is not None and math.isfinite(value.mean) else None
+
+    def text(self, number: float) -> str:
+        """A number in the column's unit and digits."""
+        return format_number(self.factor * number, self.digits)
+
+
+COLUMNS = (
+    Column("realism_meta_metric", "RMM", "realism meta-metric", True, 4),
+    Column("kinematic", "kinematic", "kinematic sub-score", True, 4),
+    Column("interactive", "interactive", "interactive sub-score", True, 4),
+    Column("map_based", "map-based", "map-based sub-score", True, 4),
+    Column("min_average_displacement_error_m", "minADE [m]", "displacement from the log of the best rollout", False, 2),
+    Column("collision_rate", "collision [%]", "evaluated agents that collide", False, 2, 100.0),
+    Column("offroad_rate", "off-road [%]", "evaluated agents that leave the road", False, 2, 100.0),
+)
+
+
+def write_report(path: str | os.PathLike[str], report: Report) -> None:
+    """Write the report as one self-contained HTML page. Nothing half-written is left at `path`."""
+    write_text(path, report_html(report))
+
+
+def report_html(report: Report) -> str:
+    """The whole page."""
+    sections = [
+        _heading_html(report),
+        _tiles_html(report),
+        _table_html(report),
+        _comparison_html(report.comparison),
+        _animations_html(report),
+        *(_chart_group_html(group) for group in report.chart_groups),
+        _facts_html(report.facts),
+        _footnotes_html(report.footnotes),
+    ]
+    return page_html(report.title, "\n".join(s for s in sections if s), extra_js=read_asset("chart.js"))
+
+
+def result_table(report: Report) -> Table:
+    """The result table for a terminal."""
+    table = Table(title=report.title, caption=report.table_note or None, title_justify="left", caption_justify="left")
+    table.add_column("policy", no_wrap=True)
+    shown = _shown_columns(report.rows)
+    for column in shown:
+        table.add_column(f"{column.heading} {_arrow(column)}".replace("[", r"\["), justify="right", no_wrap=True)
+    for row in report.rows:
+        cells = [_plain_cell(column, column.estimate(row)) for column in shown]
+        table.add_row(row.name.replace("[", r"\["), *cells, style="bold" if row.emphasised else None)
+    return table
+
+
+def format_number(value: float, digits: int) -> str:
+    """Fixed digits, with a real minus sign."""
+    return f"{value:.{digits}f}".replace("-", "−")
+
+
+def _sentence(text: str) -> str:
+    """With a capital first letter."""
+    return text[:1].upper() + text[1:]
+
+
+def _shown_columns(rows: Sequence[ResultRow]) -> list[Column]:
+    return [column for column in COLUMNS if any(getattr(row, column.field) is not None for row in rows)]
+
+
+def _arrow(column: Column) -> str:
+    return "↑" if column.higher_is_better else "↓"
+
+
+def _plain_cell(column: Column, estimate: Estimate | None) -> str:
+    if estimate is None:
+        return "–"
+    error = f" ± {column.text(estimate.standard_error)}" if estimate.standard_error is not None else ""
+    return f"{column.text(estimate.mean)}{error}"
+
+
+def _heading_html(report: Report) -> str:
+    paragraphs = "".join(f'<p class="lead">{escape(text)}</p>' for text in report.summary)
+    return f"<header><h1>{escape(report.title)}</h1>{paragraphs}</header>"
+
+
+def _tiles_html(report: Report) -> str:
+    """The two compared means and their difference, large."""
+    comparison = report.comparison
+    if comparison is None:
+        return ""
+    tiles = []
+    by_name = {row.name: row.realism_meta_metric for row in report.rows}
+    for name in (comparison.first, comparison.second):
+        estimate = by_name.get(name)
+        if estimate is not None and comparison.metric == "RMM" and math.isfinite(estimate.mean):
+            tiles.append(_tile_html(f"RMM, {name}", format_number(estimate.mean, 4), estimate.limits))
+    sign = "+" if comparison.mean_difference > 0 else ""
+    tone = "good" if comparison.is_better else "bad" if comparison.is_worse else ""
+    difference = sign + format_number(comparison.mean_difference, 4)
+    tiles.append(_tile_html("mean paired difference", difference, comparison.interval, tone))
+    return f'<div class="tiles">{"".join(tiles)}</div>'
+
+
+def _tile_html(what: str, value: str, interval: tuple[float, float] | None, tone: str = "") -> str:
+    limits = f'<div class="interval">95 % interval {_interval_text(interval, 4)}</div>' if interval else ""
+    return f'<div class="card tile {tone}"><div class="what">{escape(what)}</div><div class="value">{value}</div>{limits}</div>'
+
+
+def _interval_text(interval: tuple[float, float], digits: int, factor: float = 1.0) -> str:
+    low, high = (format_number(factor * v, digits) for v in interval)
+    return f"{low} to {high}"
+
+
+def _table_html(report: Report) -> str:
+    if not report.rows:
+        return ""
+    shown = _shown_columns(report.rows)
+    headings = "".join(
+        f'<th scope="col"><abbr title="{escape(c.meaning)}; {"higher" if c.higher_is_better else "lower"} is better">'
+        f"{escape(c.heading)} {_arrow(c)}</abbr></th>"
+        for c in shown
+    )
+    body = "".join(_table_row_html(row, shown) for row in report.rows)
+    note = f"{escape(report.table_note)} " if report.table_note else ""
+    return (
+        '<h2>Results</h2><div class="card scroll"><table class="results"><thead><tr><th scope="col">policy</th>'
+        f'{headings}</tr></thead><tbody>{body}</tbody></table></div><p class="note" style="margin-top:10px">{note}'
+        "Mean ± standard error over scenarios; point at a number for its 95 % interval. ↑ higher is better, ↓ lower is better.</p>"
+    )
+
+
+def _table_row_html(row: ResultRow, columns: Sequence[Column]) -> str:
+    note = f'<span class="note">{escape(row.note)}</span>' if row.note else ""
+    style = ' class="emphasised"' if row.emphasised else ""
+    cells = "".join(_cell_html(column, column.estimate(row)) for column in columns)
+    return f'<tr{style}><th scope="row">{escape(row.name)}{note}</th>{cells}</tr>'
+
+
+def _cell_html(column: Column, estimate: Estimate | None) -> str:
+    if estimate is None:
+        return "<td>–</td>"
+    error, limits = estimate.standard_error, estimate.limits
+    error_html = f' <span class="error">± {column.text(error)}</span>' if error is not None else ""
+    title = f' title="95 % interval {_interval_text(limits, column.digits, column.factor)}"' if limits else ""
+    return f"<td{title}>{column.text(estimate.mean)}{error_html}</td>"
+
+
+def _comparison_html(comparison: PairedComparison | None) -> str:
+    if comparison is None:
+        return ""
+    p_text = "p < 0.0001" if comparison.p_value < 1e-4 else f"p = {comparison.p_value:.2g}"
+    sign = "+" if comparison.mean_difference > 0 else ""
+    return (
+        f"<h2>{escape(_sentence(comparison.second))} against {escape(comparison.first)}, scenario by scenario</h2>"
+        f'<div class="card comparison"><div><p class="verdict">{escape(comparison.verdict_text)}</p>'
+        f"<p>Mean difference in {escape(comparison.metric)} {sign}{format_number(comparison.mean_difference, 4)}, "
+        f"95 % interval {_interval_text(comparison.interval, 4)}, {p_text} ({escape(comparison.test)}), "
+        f"{comparison.num_scenarios} scenarios.</p></div>{_difference_svg(comparison)}</div>"
+    )
+
+
+def _difference_svg(comparison: PairedComparison) -> str:
+    """A dot per scenario, the mean with its interval below, zero dashed."""
+    width, margin, base = 520, 24, 108
+    dots = np.sort(np.asarray(comparison.differences, float))
+    dots = dots[np.isfinite(dots)]
+    shown = np.concatenate([dots, comparison.interval, [0.0, comparison.mean_difference]])
+    low, high = float(shown.min()), float(shown.max())
+    if low == high:
+        low, high = low - 1, high + 1
+
+    def across(value: float) -> float:
+        return margin + (value - low) / (high - low) * (width - 2 * margin)
+
+    tone = "var(--good)" if comparison.is_better else "var(--bad)" if comparison.is_worse else "var(--accent)"
+    parts = []
+    ticks = nice_ticks(low, high, 6)
+    for tick in ticks:
+        label = format_tick(tick, ticks[1] - ticks[0] if len(ticks) > 1 else 1)
+        parts.append(f'<path class="tick" d="M{across(tick):.1f} {base}v5"/>')
+        parts.append(f'<text x="{across(tick):.1f}" y="{base + 18}" text-anchor="middle">{label}</text>')
+    parts.append(f'<path class="axis" d="M{margin} {base}H{width - margin}"/>')
+    parts.append(f'<path class="zero" d="M{across(0):.1f} 4V{base}"/>')
+    for value, height in zip(dots, _stacked(np.array([across(v) for v in dots]), diameter=7)):
+        colour = "var(--good)" if value > 0 else "var(--bad)" if value < 0 else "var(--muted)"
+        y = 70 - min(height * 7, 62)
+        parts.append(f'<circle cx="{across(value):.1f}" cy="{y}" r="3.2" fill="{colour}" opacity=".65"/>')
+    start, stop = (across(v) for v in comparison.interval)
+    parts.append(f'<path d="M{start:.1f} 91H{stop:.1f}" stroke="{tone}" stroke-width="4" stroke-linecap="round"/>')
+    parts.append(f'<circle cx="{across(comparison.mean_difference):.1f}" cy="91" r="6.5" fill="{tone}"/>')
+    dots_label = "a dot per scenario, " if len(dots) else ""
+    caption = f"{dots_label}mean and 95 % interval; {escape(comparison.second)} minus {escape(comparison.first)}"
+    parts.append(f'<text x="{width / 2}" y="{base + 38}" text-anchor="middle">{caption}</text>')
+    return f'<svg viewBox="0 0 {width} 152" role="img" aria-label="{caption}">{"".join(parts)}</svg>'
+
+
+def _stacked(across: np.ndarray, diameter: float) -> list[int]:
+    """For sorted positions, the lowest row in which each dot touches no earlier one."""
+    last: list[float] = []
+    rows = []
+    for x in across:
+        row = next((i for i, end in enumerate(last) if x - end >= diameter), len(last))
+        last[row : row + 1] = [float(x)]
+        rows.append(row)
+    return rows
+
+
+def _animations_html(report: Report) -> str:
+    if not report.animations:
+        return ""
+    note = f'<p class="muted">{escape(report.animations_note)}</p>' if report.animations_note else ""
+    return f"<h2>Scenarios in motion</h2>{note}" + "\n".join(animation_html(a) for a in report.animations)
+
+
+def _chart_group_html(group: ChartGroup) -> str:
+    if not group.charts:
+        return ""
+    caption = f'<p class="muted">{escape(group.caption)}</p>' if group.caption else ""
+    charts = "".join(chart_html(chart) for chart in group.charts)
+    return f'<h2>{escape(group.title)}</h2>{caption}<div class="charts">{charts}</div>'
+
+
+def _facts_html(facts: Mapping[str, str]) -> str:
+    if not facts:
+        return ""
+    items = "".join(f"<dt>{escape(name)}</dt><dd>{escape(str(value))}</dd>" for name, value in facts.items())
+    return f'<h2>How this was made</h2><dl class="card facts">{items}</dl>'
+
+
+def _footnotes_html(footnotes: Sequence[str]) -> str:
+    if not footnotes:
+        return ""
+    return f'<h2>Notes</h2><ol class="footnotes">{"".join(f"<li>{escape(text)}</li>" for text in footnotes)}</ol>'

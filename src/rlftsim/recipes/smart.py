@@ -1,0 +1,70 @@
+"""SMART's sizes with the numbers they are trained by. A variant calls one of these and changes fields."""
+
+from dataclasses import dataclass, field, replace
+
+from rlftsim.policies.smart.config import SmartConfig, smart_demo, smart_mini, smart_nano, smart_tiny
+from rlftsim.tokens.clustering import TokensConfig
+from rlftsim.training.finetune import FinetuneConfig
+from rlftsim.training.pretrain import PretrainConfig
+from rlftsim.training.reference import KlConfig
+
+
+@dataclass(frozen=True)
+class SmartRecipe:
+    """Everything from the vocabulary to the fine-tuned policy."""
+
+    tokens: TokensConfig = field(default_factory=TokensConfig)
+    model: SmartConfig = field(default_factory=SmartConfig)
+    pretrain: PretrainConfig = field(default_factory=PretrainConfig)
+    finetune: FinetuneConfig = field(default_factory=FinetuneConfig)
+
+
+def smart_tiny_rlftsim() -> SmartRecipe:
+    """The paper: SMART-tiny (7 M), pre-trained on WOMD for 32 epochs, fine-tuned for one."""
+    return SmartRecipe(model=smart_tiny())
+
+
+def smart_mini_rlftsim() -> SmartRecipe:
+    """SMART-mini (3 M)."""
+    return SmartRecipe(model=smart_mini())
+
+
+def smart_nano_rlftsim() -> SmartRecipe:
+    """SMART-nano (1 M): fits one small GPU."""
+    return SmartRecipe(model=smart_nano(), pretrain=PretrainConfig(batch_size=16))
+
+
+def smart_demo_rlftsim() -> SmartRecipe:
+    """Minutes on two CPU cores, for a few hundred scenarios: a small model, a short pre-training, large fine-tuning steps."""
+    return SmartRecipe(
+        tokens=TokensConfig(num_tokens=1024, num_map_prototypes=256),
+        model=smart_demo(),
+        pretrain=PretrainConfig(
+            epochs=10, batch_size=8, learning_rate=2e-3, warmup_updates=10, gradient_clip=1.0, label_smoothing=0.0,
+            max_trained_agents=None, checkpoint_every=50,
+        ),
+        finetune=FinetuneConfig(
+            epochs=5, batch_size=8, num_rollouts=4, learning_rate=3e-4, warmup_updates=5, checkpoint_every=20,
+            kl=KlConfig(target=0.05, initial_beta=0.01),
+        ),
+    )  # fmt: skip
+
+
+def smart_demo_quick() -> SmartRecipe:
+    """The demo's stages at the smallest size that still exercises all of them."""
+    recipe = smart_demo_rlftsim()
+    return replace(
+        recipe,
+        tokens=replace(recipe.tokens, num_tokens=256, num_map_prototypes=64),
+        pretrain=replace(recipe.pretrain, epochs=1),
+        finetune=replace(recipe.finetune, epochs=0.25, batch_size=4),
+    )
+
+
+RECIPES = {
+    "smart-tiny": smart_tiny_rlftsim,
+    "smart-mini": smart_mini_rlftsim,
+    "smart-nano": smart_nano_rlftsim,
+    "smart-demo": smart_demo_rlftsim,
+}
+"""By the names the command line takes."""

@@ -1,0 +1,578 @@
+"""Does a policy keep the contract of `rollout.policy`? For our policies and for yours.
+
+    report = check_policy(my_policy, scenarios)
+    print(report)
+
+Hand over scenes with several kinds of agents, a map and, if you have them, lights: a rule can only be seen broken where it applies.
+"""
+
+import copy
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from rlftsim.errors import RlftsimError
+from rlftsim.geometry import rotate, wrap_angle
+from rlftsim.goals.types import Goals
+from rlftsim.rollout.edge_scenes import edge_scenes, move_scenario
+from rlftsim.rollout.policy import DecisionDistribution, Policy, Sampling
+from rlftsim.rollout.simulate import simulate
+from rlftsim.rollout.types import AgentStates, Rollouts
+from rlftsim.scenario.batch import ScenarioBatch, collate
+from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, STEP_S, Scenario
+
+NUM_ROLLOUTS = 3
+SCORE_TOLERANCE = 1e-4
+"""Nats, between what was sampled and what is scored."""
+PADDING_TOLERANCE = 1e-5
+POSE_TOLERANCE_M = 1e-3
+MONTE_CARLO_DRAWS = 4096
+MONTE_CARLO_ERRORS = 5.0
+"""Standard errors that a Monte Carlo mean may be off."""
+TURN_RAD, SHIFT_M = 0.7, (137.0, -52.0)
+
+Outcome = Literal["passed", "failed", "not applicable"]
+
+
+@dataclass(frozen=True)
+class CheckResult:
+    """One rule of the contract."""
+
+    rule: str
+    outcome: Outcome
+    detail: str
+    """What was measured, or why the rule does not apply."""
+
+    def __str__(self) -> str:
+        return f"{self.outcome:>14}  {self.rule}: {self.detail}"
+
+
+@dataclass(frozen=True)
+class CheckReport:
+    """All rules of the contract."""
+
+    policy: str
+    results: tuple[CheckResult, ...]
+
+    @property
+    def failures(self) -> tuple[CheckResult, ...]:
+        """What is broken."""
+        return tuple(r for r in self.results if r.outcome == "failed")
+
+    @property
+    def is_passed(self) -> bool:
+        """Whether nothing is broken."""
+        return not self.failures
+
+    def __str__(self) -> str:
+        count = sum(r.outcome == "passed" for r in self.results)
+        summary = f"{self.policy}: {count} rules kept, {len(self.failures)} broken."
+        return "\n".join([summary, *(str(r) for r in self.results)])
+
+
+class _NotApplicable(Exception):
+    """The rule says nothing about this policy."""
+
+
+class _Broken(Exception):
+    """The rule is broken; says by how much."""
+
+
+def check_policy(policy: Policy, scenarios: Sequence[Scenario], *, reference: Policy | None = None) -> CheckReport:
+    """Try every rule of the policy contract that applies.
+
+    Nothing is changed in the policy: a module is copied and put into evaluation mode. Takes seconds for a small policy.
+
+    Args:
+        policy: the policy.
+        scenarios: at least one, on which everything is tried; best of different sizes and with all kinds of agents.
+        reference: another policy of the same kind for KL divergences; None = a copy with perturbed weights.
+
+    Returns:
+        One result per rule. A rule whose check raised an error counts as broken, the error is its detail.
+    """
+    subject = _Subject(_evaluation_copy(policy), tuple(scenarios), reference)
+    return CheckReport(type(policy).__name__, tuple(_run(check, subject) for check in CHECKS))
+
+
+def _run(check: "Check", subject: "_Subject") -> CheckResult:
+    rule = str(check.__doc__).splitlines()[0].rstrip(".")
+    try:
+        return CheckResult(rule, "passed", check(subject))
+    except _NotApplicable as reason:
+        return CheckResult(rule, "not applicable", str(reason))
+    except _Broken as measured:
+        return CheckResult(rule, "failed", str(measured))
+    except Exception as error:
+        return CheckResult(rule, "failed", f"raised {type(error).__name__}: {error}")
+
+
+def _evaluation_copy(policy: Policy) -> Policy:
+    return copy.deepcopy(policy).eval() if isinstance(policy, nn.Module) else policy
+
+
+@dataclass(frozen=True, eq=False)
+class _Subject:
+    """A policy and the scenes it is tried on."""
+
+    policy: Policy
+    scenarios: tuple[Scenario, ...]
+    given_reference: Policy | None
+
+    @cached_property
+    def batch(self) -> ScenarioBatch:
+        return self.collate(self.scenarios)
+
+    @cached_property
+    def rollouts(self) -> Rollouts:
+        return self.simulate(self.batch)
+
+    @cached_property
+    def steered(self) -> Rollouts:
+        """Rollouts in which some agents are led for a while."""
+        return self.simulate(self.batch, force=_lead_some(self.batch, self.policy.steps_per_decision))
+
+    @property
+    def module(self) -> nn.Module:
+        if not isinstance(self.policy, nn.Module) or not any(True for _ in self.policy.parameters()):
+            raise _NotApplicable("the policy has no weights")
+        return self.policy
+
+    @property
+    def is_random(self) -> bool:
+        return self.policy.noise_size > 0
+
+    @property
+    def device(self) -> torch.device:
+        weights = self.policy.parameters() if isinstance(self.policy, nn.Module) else ()
+        return next((w.device for w in weights), torch.device("cpu"))
+
+    @cached_property
+    def reference(self) -> Policy:
+        """Another policy of the same kind."""
+        if self.given_reference is not None:
+            return _evaluation_copy(self.given_reference)
+        other = copy.deepcopy(self.module)
+        generator = torch.Generator().manual_seed(1)
+        with torch.no_grad():
+            for weight in other.parameters():
+                noise = torch.randn(weight.shape, generator=generator).to(weight)
+                weight.add_(0.1 * noise * weight.abs().mean())
+        assert isinstance(other, Policy)
+        return other
+
+    def collate(self, scenarios: Sequence[Scenario], max_agents: int | None = None) -> ScenarioBatch:
+        return collate(scenarios, max_agents=max_agents).to(self.device)
+
+    def simulate(self, batch: ScenarioBatch, num_rollouts: int | range = NUM_ROLLOUTS, **options) -> Rollouts:
+        return simulate(self.policy, batch, num_rollouts=num_rollouts, seed=0, **options)
+
+    def score(self, batch: ScenarioBatch, rollouts: Rollouts, policy: Policy | None = None) -> DecisionDistribution:
+        policy = self.policy if policy is None else policy
+        with torch.no_grad():
+            return policy.score(policy.encode(batch), rollouts)
+
+    def log_prob(self, batch: ScenarioBatch, rollouts: Rollouts, policy: Policy | None = None) -> Tensor:
+        """Scored log-probabilities [B, N, A, L], 0 where the policy did not decide."""
+        scored = self.score(batch, rollouts, policy).log_prob(rollouts.decision)
+        return torch.where(rollouts.decision_mask, scored, 0.0)
+
+
+Check = Callable[[_Subject], str]
+
+
+def _within(measured: float, allowed: float, what: str) -> str:
+    """Text of a measurement, or `_Broken` with it."""
+    text = f"{what} {measured:.2g}, allowed {allowed:g}"
+    if not measured <= allowed:
+        raise _Broken(text)
+    return text
+
+
+def _gap(a: Tensor, b: Tensor) -> float:
+    """Largest absolute difference; infinite where shapes differ or a value is not finite."""
+    if a.shape != b.shape or not (a.isfinite().all() and b.isfinite().all()):
+        return math.inf
+    return float((a.double() - b.double()).abs().max()) if a.numel() else 0.0
+
+
+def _lead_some(batch: ScenarioBatch, stride: int) -> Callable[[object, int], AgentStates]:
+    """A `force`: the first agent is led throughout, every third from the second on for two seconds; straight on."""
+    now = CURRENT_STEP
+    position, velocity, heading = batch.position[:, :, now], batch.velocity[:, :, now], batch.heading[:, :, now]
+    index = torch.arange(batch.agent_mask.shape[1], device=batch.device)
+
+    def force(state: object, step: int) -> AgentStates:
+        time = torch.arange(step + 1, step + stride + 1, device=batch.device) * STEP_S
+        path = position[:, :, None] + velocity[:, :, None] * time[:, None]
+        led = batch.agent_mask & ((index == 0) | ((index % 3 == 1) & (step < 20)))
+        shape = (-1, NUM_ROLLOUTS, -1, stride)
+        return AgentStates(
+            path[:, None].expand(*shape, 2),
+            heading[:, None, :, None].expand(shape),
+            led[:, None, :, None].expand(shape),
+        )
+
+    return force
+
+
+# ---- 1, 2: scores ------------------------------------------------------------------------------------------------------
+
+
+def scores_equal_what_was_sampled(subject: _Subject) -> str:
+    """Scored log-probabilities equal the sampled ones."""
+    scored = subject.log_prob(subject.batch, subject.rollouts)
+    return _within(_gap(scored, subject.rollouts.log_prob), SCORE_TOLERANCE, "largest gap")
+
+
+def scores_hold_with_forced_agents(subject: _Subject) -> str:
+    """Scored log-probabilities equal the sampled ones where agents are forced for a while."""
+    rollouts = subject.steered
+    led = rollouts.forced.valid if rollouts.forced is not None else torch.zeros(0)
+    off = (rollouts.position - rollouts.forced.position)[led] if rollouts.forced is not None else led
+    _within(float(off.abs().max()), 0.0, "distance of forced agents from where they were put (m)")
+    return _within(_gap(subject.log_prob(subject.batch, rollouts), rollouts.log_prob), SCORE_TOLERANCE, "largest gap")
+
+
+def scores_hold_with_goals(subject: _Subject) -> str:
+    """Scored log-probabilities equal the sampled ones where agents have goals."""
+    batch = subject.batch
+    index = torch.arange(batch.agent_mask.shape[1], device=batch.device)
+    shift = torch.tensor([20.0, 5.0], device=batch.device)
+    goals = Goals(
+        (batch.position[:, :, CURRENT_STEP] + shift)[:, None].expand(-1, NUM_ROLLOUTS, -1, -1),
+        (batch.agent_mask & (index % 2 == 0))[:, None].expand(-1, NUM_ROLLOUTS, -1),
+    )
+    rollouts = subject.simulate(batch, goals=goals)
+    return _within(_gap(subject.log_prob(batch, rollouts), rollouts.log_prob), SCORE_TOLERANCE, "largest gap")
+
+
+def slices_of_scores_are_scores_of_slices(subject: _Subject) -> str:
+    """The score of some of the rollouts is that part of the score of all."""
+    gaps = []
+    for rollouts in (subject.rollouts, subject.steered):
+        whole = subject.log_prob(subject.batch, rollouts)
+        for part in (slice(0, 1), slice(1, NUM_ROLLOUTS)):
+            gaps.append(_gap(subject.log_prob(subject.batch, rollouts.select(part)), whole[:, part]))
+    return _within(max(gaps), SCORE_TOLERANCE, "largest gap")
+
+
+# ---- 3: the distribution -----------------------------------------------------------------------------------------------
+
+
+def divergence_from_itself_is_zero(subject: _Subject) -> str:
+    """The KL divergence of a policy from itself is 0."""
+    scored = subject.score(subject.batch, subject.rollouts)
+    return _within(float(scored.kl(scored).abs().max()), 1e-6, "largest KL")
+
+
+def divergence_is_never_negative(subject: _Subject) -> str:
+    """The KL divergence from another policy is not negative, and somewhere positive."""
+    reference = subject.reference
+    scored = subject.score(subject.batch, subject.rollouts)
+    kl = scored.kl(subject.score(subject.batch, subject.rollouts, reference))
+    if subject.is_random and not float(kl.max()) > 0:
+        raise _Broken("the KL from another policy is 0 everywhere")
+    return _within(-float(kl.min()), 1e-6, "most negative KL: minus")
+
+
+def padding_decides_nothing(subject: _Subject) -> str:
+    """Padding has log-probability, KL and entropy of exactly 0."""
+    width = subject.batch.agent_mask.shape[1] + 2
+    batch = subject.collate(subject.scenarios, max_agents=width)
+    rollouts = subject.simulate(batch)
+    scored = subject.score(batch, rollouts)
+    padding = ~batch.agent_mask[:, None, :, None].expand(rollouts.log_prob.shape)
+    values = (scored.log_prob(rollouts.decision), scored.kl(scored), scored.entropy())
+    return _within(max(float(v[padding].abs().max()) for v in values), 0.0, "largest value")
+
+
+def entropy_agrees_with_monte_carlo(subject: _Subject) -> str:
+    """The entropy is the mean of minus the log-probability of draws."""
+    drawn = _draw_many(subject)
+    return _agree(-drawn.log_prob, drawn.distribution.entropy()[0], drawn.mask)
+
+
+def divergence_agrees_with_monte_carlo(subject: _Subject) -> str:
+    """The KL divergence from another policy is the mean log-ratio of draws."""
+    drawn = _draw_many(subject)
+    other = _first_distribution(subject, subject.reference)
+    ratio = torch.stack([own - other.log_prob(d)[0] for own, d in zip(drawn.log_prob, drawn.decisions)])
+    return _agree(ratio, drawn.distribution.kl(other)[0], drawn.mask)
+
+
+def probabilities_add_up_to_one(subject: _Subject) -> str:
+    """Probabilities add up to 1 (as importance weights of draws at temperature 1.5)."""
+    warm = Sampling(temperature=1.5)
+    drawn = _draw_many(subject, warm)
+    weight = torch.stack(
+        [(drawn.distribution.log_prob(d)[0] - p).exp() for d, p in zip(drawn.decisions, drawn.log_prob)]
+    )
+    return _agree(weight, torch.ones_like(weight[0]), drawn.mask)
+
+
+@dataclass(frozen=True, eq=False)
+class _Drawn:
+    """Many draws of the first decision of the smallest scenario."""
+
+    distribution: DecisionDistribution
+    """[1, N, A]."""
+    decisions: list[Tensor]
+    log_prob: Tensor
+    """[K, N, A], under the distribution drawn from."""
+    mask: Tensor
+    """[A], True = a simulated agent."""
+
+
+def _smallest(subject: _Subject) -> ScenarioBatch:
+    return subject.collate([min(subject.scenarios, key=lambda s: len(s.simulated_indices))])
+
+
+def _first_distribution(subject: _Subject, policy: Policy, num_rollouts: int = 64) -> DecisionDistribution:
+    """What the policy says first in the smallest scenario, for N equal rollouts [1, N, A]."""
+    batch = _smallest(subject)
+    shape = (1, num_rollouts, batch.agent_mask.shape[1], policy.initial_noise_size)
+    noise = torch.full(shape, 0.5, device=batch.device)
+    with torch.no_grad():
+        context = policy.encode(batch)
+        return policy.decide(context, policy.begin(context, num_rollouts, None, noise))
+
+
+def _draw_many(subject: _Subject, sampling: Sampling = Sampling()) -> _Drawn:  # noqa: B008
+    if not subject.is_random:
+        raise _NotApplicable("decisions are deterministic (noise_size is 0)")
+    distribution = _first_distribution(subject, subject.policy)
+    mask = _smallest(subject).agent_mask[0]
+    generator = torch.Generator().manual_seed(0)
+    rounds = MONTE_CARLO_DRAWS // 64
+    decisions = []
+    for _ in range(rounds):
+        noise = torch.rand(1, 64, len(mask), subject.policy.noise_size, generator=generator).to(mask.device)
+        decisions.append(distribution.sample(sampling, noise))
+    log_prob = torch.stack([distribution.log_prob(d, sampling)[0] for d in decisions])
+    return _Drawn(distribution, decisions, log_prob, mask)
+
+
+def _agree(draws: Tensor, expected: Tensor, mask: Tensor) -> str:
+    """Compare Monte Carlo means of draws [K, N, A] with values [N, A]."""
+    flat = draws.double().flatten(0, 1)[:, mask]  # [K N, agents]
+    error = flat.std(0) / math.sqrt(len(flat)) + 1e-6
+    gap = (flat.mean(0) - expected.double().mean(0)[mask]).abs() / error
+    return _within(float(gap.max()), MONTE_CARLO_ERRORS, f"standard errors off, over {len(flat)} draws:")
+
+
+# ---- 4, 5: sampling and kinematics -------------------------------------------------------------------------------------
+
+
+def temperature_zero_repeats_itself(subject: _Subject) -> str:
+    """At temperature 0 every rollout is the same, twice, up to what is drawn once per rollout."""
+    first, second = (subject.simulate(subject.batch, sampling=Sampling(temperature=0.0)) for _ in range(2))
+    if not subject.policy.initial_noise_size:
+        _within(
+            _gap(first.position, first.position[:, :1].expand_as(first.position)),
+            POSE_TOLERANCE_M,
+            "rollouts apart (m)",
+        )
+    return _within(_gap(first.position, second.position), 0.0, "runs apart (m)")
+
+
+def same_seed_gives_the_same_rollouts(subject: _Subject) -> str:
+    """The same seed gives the same rollouts, whole or in slices."""
+    again = subject.simulate(subject.batch)
+    _within(_gap(again.position, subject.rollouts.position), 0.0, "runs apart (m)")
+    last = subject.simulate(subject.batch, range(1, NUM_ROLLOUTS))
+    return _within(_gap(last.position, subject.rollouts.position[:, 1:]), POSE_TOLERANCE_M, "slices apart (m)")
+
+
+def top_k_truncates_or_is_refused(subject: _Subject) -> str:
+    """Top-k keeps the most likely decisions, or is refused where there are no categories."""
+    if subject.rollouts.decision.is_floating_point():
+        try:
+            subject.simulate(subject.batch, sampling=Sampling(top_k=3))
+        except RlftsimError as error:
+            return f"refused: {error}"
+        raise _Broken("decisions are no categories, and yet top_k=3 is accepted")
+    greedy = subject.simulate(subject.batch, sampling=Sampling(temperature=0.0))
+    first = subject.simulate(subject.batch, sampling=Sampling(top_k=1))
+    _within(_gap(first.position, greedy.position), POSE_TOLERANCE_M, "top-1 apart from the mode (m)")
+    few = subject.simulate(subject.batch, sampling=Sampling(top_k=3))
+    scored = torch.where(
+        few.decision_mask, subject.score(subject.batch, few).log_prob(few.decision, Sampling(top_k=3)), 0.0
+    )
+    return _within(_gap(scored, few.log_prob), SCORE_TOLERANCE, "largest gap of truncated log-probabilities")
+
+
+def decisions_replay_to_the_same_poses(subject: _Subject) -> str:
+    """Replaying decisions through `advance` gives the same poses, bit for bit."""
+    return _within(
+        max(_replay_gap(subject, r) for r in (subject.rollouts, subject.steered)), 0.0, "largest gap (m, rad)"
+    )
+
+
+def _replay_gap(subject: _Subject, rollouts: Rollouts) -> float:
+    policy, stride = subject.policy, subject.policy.steps_per_decision
+    if policy.initial_noise_size:
+        raise _NotApplicable("the policy draws once per rollout; only it can repeat these draws")
+    noise = rollouts.log_prob.new_zeros(*rollouts.log_prob.shape[:3], 0)
+    poses = []
+    with torch.no_grad():
+        context = policy.encode(subject.batch)
+        state = policy.begin(context, rollouts.num_rollouts, rollouts.goals, noise)
+        for index in range(FUTURE_STEPS // stride):
+            forced = rollouts.forced and rollouts.forced.steps(index * stride, (index + 1) * stride)
+            state = policy.advance(context, state, rollouts.decision[:, :, :, index], forced)
+            poses.append(state.poses)
+    path = torch.cat(poses, 3)
+    return max(_gap(path[..., :2], rollouts.position), _gap(path[..., 2], rollouts.heading))
+
+
+# ---- 6: gradients ------------------------------------------------------------------------------------------------------
+
+
+def gradients_reach_what_is_trained(subject: _Subject) -> str:
+    """Gradients of the score reach every weight that is trained and no other, and are finite."""
+    module = copy.deepcopy(subject.module)
+    trained = [p for p in module.parameters() if p.requires_grad]
+    if not trained:
+        raise _NotApplicable("no weight is trained")
+    _back_propagate(module, subject, scale=1.0)
+    named = dict(module.named_parameters())
+    missed = [name for name, p in named.items() if p.requires_grad and p.grad is None]
+    strays = [name for name, p in named.items() if not p.requires_grad and p.grad is not None]
+    broken = [name for name, p in named.items() if p.grad is not None and not p.grad.isfinite().all()]
+    if missed or strays or broken:
+        raise _Broken(f"not reached: {missed}; reached though not trained: {strays}; not finite: {broken}")
+    flat = [name for name, p in named.items() if p.grad is not None and not p.grad.any()]
+    return f"{len(trained)} weights reached" + (f", zero on these scenarios: {', '.join(flat)}" if flat else "")
+
+
+def zero_reward_moves_nothing(subject: _Subject) -> str:
+    """With a reward of 0 the policy gradient is exactly 0."""
+    module = copy.deepcopy(subject.module)
+    if not any(p.requires_grad for p in module.parameters()):
+        raise _NotApplicable("no weight is trained")
+    _back_propagate(module, subject, scale=0.0)
+    largest = max(_gap(p.grad, torch.zeros_like(p.grad)) for p in module.parameters() if p.grad is not None)
+    return _within(largest, 0.0, "largest gradient")
+
+
+def _back_propagate(module: nn.Module, subject: _Subject, *, scale: float) -> None:
+    """Gradients of a policy-gradient loss whose rewards are `scale` times 1, 2, ..."""
+    assert isinstance(module, Policy)
+    module.zero_grad(set_to_none=True)
+    rollouts = subject.rollouts
+    scored = module.score(module.encode(subject.batch), rollouts).log_prob(rollouts.decision)
+    reward = scale * torch.arange(1.0, NUM_ROLLOUTS + 1, device=scored.device)[None, :, None, None]
+    (-reward * torch.where(rollouts.decision_mask, scored, 0.0)).sum().backward()
+
+
+def frozen_weights_say_the_same(subject: _Subject) -> str:
+    """Freezing the weights changes no score."""
+    frozen = copy.deepcopy(subject.module).requires_grad_(False)
+    assert isinstance(frozen, Policy)
+    free = copy.deepcopy(subject.module).requires_grad_(True)
+    assert isinstance(free, Policy)
+    scores = [subject.log_prob(subject.batch, subject.rollouts, policy) for policy in (frozen, free)]
+    return _within(_gap(*scores), SCORE_TOLERANCE, "largest gap")
+
+
+# ---- 7, 8, 9: scenes ---------------------------------------------------------------------------------------------------
+
+
+def turned_and_shifted_scenes_score_alike(subject: _Subject) -> str:
+    """Scenarios and rollouts turned and shifted together have the same scores."""
+    gaps = {}
+    for what, turn in (("shifted", 0.0), ("turned by 90 degrees", math.pi / 2), ("turned by 0.7 rad", TURN_RAD)):
+        moved = [move_scenario(s, turn, SHIFT_M) for s in subject.scenarios]
+        batch = subject.collate(moved)
+        offset = torch.from_numpy(_offsets(subject.scenarios, moved)).to(subject.device)
+        # forced agents are scored where their decisions are, so they are moved too
+        for rollouts in (subject.rollouts, subject.steered):
+            scored = subject.log_prob(batch, _move_rollouts(rollouts, turn, offset))
+            gaps[what] = max(gaps.get(what, 0.0), _gap(scored, subject.log_prob(subject.batch, rollouts)))
+    worst = max(gaps, key=lambda name: gaps[name])
+    return _within(gaps[worst], SCORE_TOLERANCE, f"largest gap ({worst})")
+
+
+def company_in_a_batch_changes_nothing(subject: _Subject) -> str:
+    """A scenario alone has the same scores as in a batch with a larger one, and the same rollouts."""
+    batch, gaps, apart = subject.batch, [], []
+    if len(subject.scenarios) < 2:
+        raise _NotApplicable("a single scenario was handed over")
+    whole = subject.log_prob(batch, subject.rollouts)
+    for b, scenario in enumerate(subject.scenarios):
+        count = batch.agent_mask.shape[1] if subject.rollouts.draws is not None else len(scenario.simulated_indices)
+        alone = subject.collate([scenario], max_agents=count)
+        own = _of_scenario(subject.rollouts, b, count)
+        gaps.append(_gap(subject.log_prob(alone, own), whole[b : b + 1, :, :count]))
+        apart.append(_gap(subject.simulate(alone).position, own.position))
+    _within(max(apart), POSE_TOLERANCE_M, "rollouts apart (m)")
+    return _within(max(gaps), PADDING_TOLERANCE, "largest gap")
+
+
+def edge_scenes_run(subject: _Subject) -> str:
+    """One agent, no map, no lights, 128 agents, agents first seen now or never: all are simulated and scored."""
+    gaps = {}
+    for name, scenario in edge_scenes(subject.scenarios[0]).items():
+        batch = subject.collate([scenario])
+        rollouts = subject.simulate(batch)
+        if not (rollouts.position.isfinite().all() and rollouts.heading.isfinite().all()):
+            raise _Broken(f"{name}: poses are not finite")
+        gaps[name] = _gap(subject.log_prob(batch, rollouts), rollouts.log_prob)
+    worst = max(gaps, key=lambda name: gaps[name])
+    return _within(gaps[worst], SCORE_TOLERANCE, f"{len(gaps)} scenes, largest gap ({worst})")
+
+
+def _offsets(before: Sequence[Scenario], after: Sequence[Scenario]) -> np.ndarray:
+    """Where the origin of each scenario's map frame went, in the moved map frame [B, 2]."""
+    return np.stack([a.origin + np.array(SHIFT_M) - b.origin for a, b in zip(before, after)]).astype(np.float32)
+
+
+def _move_rollouts(rollouts: Rollouts, turn: float, offset: Tensor) -> Rollouts:
+    def moved(position: Tensor) -> Tensor:
+        angle = torch.full(position.shape[:-1], turn, device=position.device)
+        return rotate(position, angle) + offset[:, None, None, None]
+
+    forced = rollouts.forced
+    if forced is not None:
+        forced = AgentStates(moved(forced.position), wrap_angle(forced.heading + turn), forced.valid)
+    return replace(
+        rollouts, position=moved(rollouts.position), heading=wrap_angle(rollouts.heading + turn), forced=forced
+    )
+
+
+def _of_scenario(rollouts: Rollouts, b: int, num_agents: int) -> Rollouts:
+    """Rollouts of one scenario of a batch, without its padding."""
+    names = ("position", "heading", "decision", "decision_mask", "log_prob")
+    own = {name: getattr(rollouts, name)[b : b + 1, :, :num_agents] for name in names}
+    return replace(rollouts, **own, draws=None if rollouts.draws is None else rollouts.draws[b : b + 1])
+
+
+CHECKS: tuple[Check, ...] = (
+    scores_equal_what_was_sampled,
+    scores_hold_with_forced_agents,
+    scores_hold_with_goals,
+    slices_of_scores_are_scores_of_slices,
+    divergence_from_itself_is_zero,
+    divergence_is_never_negative,
+    padding_decides_nothing,
+    entropy_agrees_with_monte_carlo,
+    divergence_agrees_with_monte_carlo,
+    probabilities_add_up_to_one,
+    temperature_zero_repeats_itself,
+    same_seed_gives_the_same_rollouts,
+    top_k_truncates_or_is_refused,
+    decisions_replay_to_the_same_poses,
+    gradients_reach_what_is_trained,
+    zero_reward_moves_nothing,
+    frozen_weights_say_the_same,
+    turned_and_shifted_scenes_score_alike,
+    company_in_a_batch_changes_nothing,
+    edge_scenes_run,
+)

@@ -1,0 +1,97 @@
+"""Variants of a scenario that policies must cope with: moved elsewhere, emptied, crowded, seen late."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from rlftsim.scenario.types import CURRENT_STEP, LaneTopology, LightStates, MapFeatures, Scenario, Tracks
+
+_NO_LIGHTS = LightStates(
+    np.zeros(0, np.int32), np.zeros(0, np.int64), np.zeros(0, np.int8), np.zeros((0, 3), np.float32)
+)
+_NO_MAP = MapFeatures(
+    np.zeros(0, np.int64), np.zeros(0, np.int8), np.zeros((0, 3), np.float32), np.zeros(1, np.int64), LaneTopology()
+)
+
+
+def move_scenario(scenario: Scenario, turn_rad: float, shift_m: tuple[float, float]) -> Scenario:
+    """The same scenario turned counter-clockwise about its `origin`, then shifted.
+
+    Args:
+        scenario: any.
+        turn_rad: angle.
+        shift_m: x and y, world frame; whole metres keep float32 coordinates as exact as they were.
+    """
+    centre = np.append(scenario.origin, 0.0)
+    cos, sin = np.cos(turn_rad), np.sin(turn_rad)
+    matrix = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    shift = np.append(np.asarray(shift_m, np.float64), 0.0)
+
+    def moved(points: np.ndarray) -> np.ndarray:
+        return ((points.astype(np.float64) - centre) @ matrix.T + centre + shift).astype(np.float32)
+
+    tracks, features, lights = scenario.tracks, scenario.map_features, scenario.lights
+    heading = np.remainder(tracks.heading.astype(np.float64) + turn_rad + np.pi, 2 * np.pi) - np.pi
+    velocity = (tracks.velocity.astype(np.float64) @ matrix[:2, :2].T).astype(np.float32)
+    return replace(
+        scenario,
+        tracks=replace(tracks, position=moved(tracks.position), heading=heading.astype(np.float32), velocity=velocity),
+        map_features=replace(features, points=moved(features.points)),
+        lights=replace(lights, stop_point=moved(lights.stop_point)),
+    )
+
+
+def edge_scenes(scenario: Scenario) -> dict[str, Scenario]:
+    """A scenario's awkward variants, by name. All keep the ego."""
+    ego_alone = _with_tracks(scenario, np.array([scenario.ego_index]))
+    return {
+        "one agent": ego_alone,
+        "one agent, no map, no lights": replace(ego_alone, map_features=_NO_MAP, lights=_NO_LIGHTS),
+        "no map": replace(scenario, map_features=_NO_MAP, lights=_NO_LIGHTS),
+        "no lights": replace(scenario, lights=_NO_LIGHTS),
+        "128 agents": _crowded(scenario, 128),
+        "agents first seen at the current step": _seen_from(scenario, CURRENT_STEP),
+        "agents first seen at step 7": _seen_from(scenario, 7),
+        "an agent that is never valid": _with_absent_agent(scenario),
+    }
+
+
+def _with_tracks(scenario: Scenario, chosen: np.ndarray) -> Scenario:
+    """Some of the tracks, in the given order; only the ego is evaluated."""
+    fields = {name: getattr(scenario.tracks, name)[chosen] for name in Tracks.__dataclass_fields__}
+    return replace(
+        scenario,
+        tracks=Tracks(**fields),
+        ego_index=int(np.flatnonzero(chosen == scenario.ego_index)[0]),
+        tracks_to_predict=scenario.tracks_to_predict[:0],
+        difficulty=scenario.difficulty[:0],
+        objects_of_interest=scenario.objects_of_interest[:0],
+    )
+
+
+def _crowded(scenario: Scenario, num_agents: int) -> Scenario:
+    """The agents over and over again, 3.1 m apart, until there are so many."""
+    own = scenario.simulated_indices
+    chosen = np.append(scenario.ego_index, np.resize(own, num_agents - 1))
+    many = _with_tracks(scenario, chosen)
+    rows = np.arange(len(chosen), dtype=np.float32)
+    shift = np.stack([rows % 11 * 3.1, rows // 11 * 3.3, 0 * rows], -1)[:, None]
+    ids = np.arange(len(chosen), dtype=np.int64) + 1
+    return replace(many, tracks=replace(many.tracks, object_id=ids, position=many.tracks.position + shift))
+
+
+def _seen_from(scenario: Scenario, step: int) -> Scenario:
+    """Nobody but the ego is seen before a step."""
+    valid = scenario.tracks.valid.copy()
+    others = np.arange(len(valid)) != scenario.ego_index
+    valid[others, :step] = False
+    return replace(scenario, tracks=replace(scenario.tracks, valid=valid))
+
+
+def _with_absent_agent(scenario: Scenario) -> Scenario:
+    """One more track, which has not a single valid step."""
+    rows = np.append(np.arange(len(scenario.tracks.valid)), scenario.ego_index)
+    tracks = _with_tracks(scenario, rows).tracks
+    valid, ids = tracks.valid.copy(), tracks.object_id.copy()
+    valid[-1], ids[-1] = False, ids.max() + 1
+    return replace(scenario, tracks=replace(tracks, valid=valid, object_id=ids))

@@ -1,0 +1,246 @@
+"""Line charts as inline SVG: axes, labels, a smoothed line over the raw one. Drawn here, so a page needs no plotting library."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+
+import numpy as np
+from jaxtyping import Float
+
+from rlftsim.errors import DataError
+from rlftsim.viewer.page import embed_json
+
+WIDTH, HEIGHT = 460, 270
+LEFT, RIGHT, TOP, BOTTOM = 72, 14, 12, 44
+"""Room around the plotted area, in the SVG's own units."""
+MAX_DRAWN_POINTS = 600
+MIN_POINTS_TO_SMOOTH = 12
+NUM_SERIES_COLOURS = 4
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Values over updates (or steps, or epochs). Points that are not finite leave a gap."""
+
+    name: str
+    x: Sequence[float]
+    y: Sequence[float]
+
+    def __post_init__(self) -> None:
+        if len(self.x) != len(self.y):
+            raise DataError(f"curve {self.name}: {len(self.x)} x values but {len(self.y)} y values.")
+
+
+@dataclass(frozen=True)
+class Chart:
+    """Curves that share both axes."""
+
+    title: str
+    x_label: str
+    y_label: str
+    curves: Sequence[Curve]
+    log_y: bool = False
+    """Powers of ten; values that are not positive are left out."""
+    reference: tuple[str, float] | None = None
+    """Name and height of a dashed horizontal line, such as the KL target."""
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Axes:
+    """Where a value is drawn. Vertical limits are logarithms where `log_y`."""
+
+    x_low: float
+    x_high: float
+    y_low: float
+    y_high: float
+    log_y: bool
+
+    def horizontal(self, x: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+        """SVG coordinate of x."""
+        return LEFT + (np.asarray(x, float) - self.x_low) / (self.x_high - self.x_low) * (WIDTH - LEFT - RIGHT)
+
+    def vertical(self, y: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+        """SVG coordinate of y."""
+        height = np.log10(y) if self.log_y else np.asarray(y, float)
+        return HEIGHT - BOTTOM - (height - self.y_low) / (self.y_high - self.y_low) * (HEIGHT - TOP - BOTTOM)
+
+
+def chart_html(chart: Chart) -> str:
+    """A `<figure>` with title, legend (where there is more than one curve), SVG and note."""
+    drawn = [(curve.name, *_drawable(curve, chart.log_y)) for curve in chart.curves]
+    title = f'<figcaption class="chart-title">{escape(chart.title)}</figcaption>'
+    note = f'<p class="note">{escape(chart.note)}</p>' if chart.note else ""
+    if not any(len(x) for _, x, _ in drawn):
+        return f'<figure class="chart">{title}<p class="note">Nothing was recorded.</p>{note}</figure>'
+    axes = _axes(drawn, chart)
+    parts = [_frame_svg(axes, chart)]
+    parts += [_curve_svg(axes, x, y, colour_of(index)) for index, (_, x, y) in enumerate(drawn)]
+    hover = embed_json([_hover_points(axes, name, x, y, index) for index, (name, x, y) in enumerate(drawn)])
+    return (
+        f'<figure class="chart">{title}{_legend_html(chart)}'
+        f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(chart.title)}">{"".join(parts)}</svg>'
+        f'<script type="application/json">{hover}</script>{note}</figure>'
+    )
+
+
+def smooth(values: Float[np.ndarray, "n"], window: int) -> Float[np.ndarray, "n"]:
+    """Centred running mean. Near the ends the window shrinks on both sides, so a straight line stays a straight line."""
+    index = np.arange(len(values))
+    half = np.minimum(window // 2, np.minimum(index, index[::-1]))
+    sums = np.concatenate([[0.0], np.cumsum(values)])
+    return (sums[index + half + 1] - sums[index - half]) / (2 * half + 1)
+
+
+def colour_of(index: int) -> str:
+    """CSS colour of the curve with this number."""
+    return f"var(--series-{index % NUM_SERIES_COLOURS + 1})"
+
+
+def nice_ticks(low: float, high: float, count: int) -> list[float]:
+    """About `count` round numbers in [low, high]."""
+    raw = (high - low) / max(count, 1)
+    magnitude = 10.0 ** math.floor(math.log10(raw))
+    step = min((m * magnitude for m in (1, 2, 2.5, 5, 10)), key=lambda s: abs(s - raw))
+    first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
+    return [i * step for i in range(first, last + 1)]
+
+
+def format_tick(value: float, step: float) -> str:
+    """As many digits as the distance between ticks needs; powers of ten where there would be too many."""
+    largest = max(abs(value), step)
+    if largest >= 1e5 or step < 1e-5:
+        return f"{value:.3g}".replace("-", "−")
+    digits = max(0, -math.floor(math.log10(step) + 1e-9))
+    if digits and abs(round(step, digits) - step) > 1e-9 * step:
+        digits += 1
+    return f"{value:,.{digits}f}".replace("-", "−").replace(",", "\u202f")
+
+
+def _drawable(curve: Curve, log_y: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Finite (and, on a logarithmic axis, positive) points, averaged over neighbours where there are very many."""
+    x, y = np.asarray(curve.x, float), np.asarray(curve.y, float)
+    kept = np.isfinite(x) & np.isfinite(y) & ((y > 0) if log_y else True)
+    x, y = x[kept], y[kept]
+    if len(x) <= MAX_DRAWN_POINTS:
+        return x, y
+    groups = np.array_split(np.arange(len(x)), MAX_DRAWN_POINTS)
+    return np.array([x[g].mean() for g in groups]), np.array([y[g].mean() for g in groups])
+
+
+def _window(num_points: int) -> int:
+    """Odd number of points to average over; 1 = too few to smooth."""
+    return 1 if num_points < MIN_POINTS_TO_SMOOTH else 2 * (num_points // 24) + 3
+
+
+def _axes(drawn: list[tuple[str, np.ndarray, np.ndarray]], chart: Chart) -> Axes:
+    """Limits around the smoothed lines and all but the wildest raw points."""
+    x = np.concatenate([x for _, x, _ in drawn])
+    heights = []
+    for _, _, y in drawn:
+        if len(y):
+            heights += [np.quantile(y, 0.02), np.quantile(y, 0.98), *smooth(y, _window(len(y)))]
+    if chart.reference:
+        heights.append(chart.reference[1])
+    y = np.array([h for h in heights if h > 0]) if chart.log_y else np.array(heights)
+    y = np.log10(y) if chart.log_y else y
+    margin = 0.06 * (y.max() - y.min()) or max(0.05 * abs(float(y[0])), 1e-3)
+    wide = float(x.max()) if x.max() > x.min() else float(x.min()) + 1
+    low = float(y.min() - margin)
+    if not chart.log_y and low < 0 <= y.min():
+        low = 0.0
+    return Axes(float(x.min()), wide, low, float(y.max() + margin), chart.log_y)
+
+
+def _frame_svg(axes: Axes, chart: Chart) -> str:
+    """Grid, tick labels, axis labels, reference line."""
+    bottom, right = HEIGHT - BOTTOM, WIDTH - RIGHT
+    parts = [
+        f'<clipPath id="plot"><rect x="{LEFT}" y="{TOP}" width="{right - LEFT}" height="{bottom - TOP}"/></clipPath>'
+    ]
+    for value, label in _vertical_ticks(axes):
+        y = float(axes.vertical(np.array(value)))
+        parts.append(f'<path class="grid" d="M{LEFT} {y:.1f}H{right}"/>')
+        parts.append(f'<text x="{LEFT - 8}" y="{y + 4:.1f}" text-anchor="end">{label}</text>')
+    ticks = nice_ticks(axes.x_low, axes.x_high, 5)
+    for value in ticks:
+        x = float(axes.horizontal(np.array(value)))
+        label = format_tick(value, ticks[1] - ticks[0] if len(ticks) > 1 else 1)
+        parts.append(f'<path class="tick" d="M{x:.1f} {bottom}v5"/>')
+        parts.append(f'<text x="{x:.1f}" y="{bottom + 18}" text-anchor="middle">{label}</text>')
+    parts.append(f'<path class="axis" d="M{LEFT} {bottom}H{right}"/>')
+    middle = (LEFT + right) / 2
+    parts.append(
+        f'<text class="label" x="{middle}" y="{HEIGHT - 6}" text-anchor="middle">{escape(chart.x_label)}</text>'
+    )
+    turn = f"translate(13 {(TOP + bottom) / 2}) rotate(-90)"
+    parts.append(f'<text class="label" transform="{turn}" text-anchor="middle">{escape(chart.y_label)}</text>')
+    return "".join(parts) + _reference_svg(axes, chart)
+
+
+def _reference_svg(axes: Axes, chart: Chart) -> str:
+    if not chart.reference or (axes.log_y and chart.reference[1] <= 0):
+        return ""
+    name, height = chart.reference
+    y = float(axes.vertical(np.array(height)))
+    return (
+        f'<path class="reference" d="M{LEFT} {y:.1f}H{WIDTH - RIGHT}"/>'
+        f'<text x="{WIDTH - RIGHT - 4}" y="{y - 5:.1f}" text-anchor="end">{escape(name)}</text>'
+    )
+
+
+def _vertical_ticks(axes: Axes) -> list[tuple[float, str]]:
+    """Values to mark on the vertical axis, with their labels."""
+    if not axes.log_y:
+        ticks = nice_ticks(axes.y_low, axes.y_high, 5)
+        step = ticks[1] - ticks[0] if len(ticks) > 1 else 1
+        return [(v, format_tick(v, step)) for v in ticks]
+    multiples = (1,) if axes.y_high - axes.y_low > 2 else (1, 2, 5)
+    decades = range(math.floor(axes.y_low), math.ceil(axes.y_high) + 1)
+    marks = [m * 10.0**d for d in decades for m in multiples if axes.y_low <= math.log10(m * 10.0**d) <= axes.y_high]
+    return [(v, f"{v:.3g}".replace("-", "−")) for v in marks]
+
+
+def _curve_svg(axes: Axes, x: np.ndarray, y: np.ndarray, colour: str) -> str:
+    """The raw line, pale, and the smoothed one; dots where there are too few points to smooth."""
+    if not len(x):
+        return ""
+    window = _window(len(x))
+    style = f'stroke="{colour}" clip-path="url(#plot)"'
+    raw = _path(axes.horizontal(x), axes.vertical(y))
+    if window == 1:
+        dots = "".join(
+            f'<circle cx="{a:.1f}" cy="{b:.1f}" r="3" fill="{colour}"/>'
+            for a, b in zip(axes.horizontal(x), axes.vertical(y))
+        )
+        return f'<path class="smooth" d="{raw}" {style}/>{dots}'
+    smoothed = _path(axes.horizontal(x), axes.vertical(smooth(y, window)))
+    return f'<path class="raw" d="{raw}" {style}/><path class="smooth" d="{smoothed}" {style}/>'
+
+
+def _path(x: np.ndarray, y: np.ndarray) -> str:
+    return "M" + "L".join(f"{a:.1f} {b:.1f}" for a, b in zip(x, y))
+
+
+def _hover_points(axes: Axes, name: str, x: np.ndarray, y: np.ndarray, index: int) -> dict[str, object]:
+    """What `chart.js` shows under the pointer: positions in the SVG and the values as text."""
+    return {
+        "name": name,
+        "colour": colour_of(index),
+        "x": [round(float(v), 1) for v in axes.horizontal(x)],
+        "y": [round(float(v), 1) for v in axes.vertical(y)],
+        "at": [f"{v:g}" for v in np.round(x, 2)],
+        "value": [f"{v:.4g}" for v in y],
+    }
+
+
+def _legend_html(chart: Chart) -> str:
+    if len(chart.curves) < 2:
+        return ""
+    items = "".join(
+        f'<li><svg viewBox="0 0 24 16" aria-hidden="true"><path d="M2 8H22" stroke="{colour_of(i)}" stroke-width="3"/></svg>'
+        f"{escape(curve.name)}</li>"
+        for i, curve in enumerate(chart.curves)
+    )
+    return f'<ul class="legend chart-legend">{items}</ul>'

@@ -1,0 +1,194 @@
+"""Scenarios that play in a browser: pieces of HTML that need no network, and a page made of them."""
+
+import json
+import os
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from html import escape
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from rlftsim.errors import DataError
+from rlftsim.viewer.scene import SceneView, Trajectories
+
+SPEEDS = (0.25, 0.5, 1, 2, 4)
+"""How many times real time a scene can play."""
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """One picture of a scene: who moved the agents, and how."""
+
+    title: str
+    trajectories: Trajectories
+
+
+@dataclass(frozen=True, eq=False)
+class Animation:
+    """A scene with its panels side by side; they share time, view and the number of the rollout."""
+
+    title: str
+    scene: SceneView
+    panels: Sequence[Panel]
+    caption: str = ""
+
+    def __post_init__(self) -> None:
+        if not self.panels:
+            raise DataError(f"{self.title}: an animation needs at least one panel.")
+        for panel in self.panels:
+            shown, expected = panel.trajectories.position.shape[1], len(self.scene.agents)
+            if shown != expected:
+                raise DataError(
+                    f"{self.title}, {panel.title}: {shown} agents, but scene {self.scene.scenario_id} has {expected}: "
+                    "build both from the same scenario."
+                )
+
+    def to_payload(self) -> dict[str, Any]:
+        """Lists, numbers and text only, as `player.js` reads them."""
+        return {
+            "scene": self.scene.to_payload(),
+            "panels": [
+                {
+                    **panel.trajectories.to_payload(),
+                    "marks": [panel.trajectories.collides is not None, panel.trajectories.offroad is not None],
+                }
+                for panel in self.panels
+            ],
+        }
+
+
+def animation_html(animation: Animation) -> str:
+    """A `<figure>` that plays the animation on a page made by `page_html`."""
+    panels = "".join(_panel_html(panel) for panel in animation.panels)
+    caption = f'<p class="player-caption">{escape(animation.caption)}</p>' if animation.caption else ""
+    return (
+        f'<figure class="player" tabindex="0" aria-label="{escape(animation.title)}">'
+        f'<figcaption><div class="player-title">{escape(animation.title)}</div>{caption}</figcaption>'
+        f'<div class="panels">{panels}</div>'
+        f"{_controls_html()}{_legend_html(animation)}"
+        '<p class="hint"><kbd>space</kbd> play or pause · <kbd>←</kbd> <kbd>→</kbd> one step · drag to move, wheel to zoom '
+        "(after a click into the picture) · point at an agent to follow it in all panels</p>"
+        f'<script type="application/json">{embed_json(animation.to_payload())}</script></figure>'
+    )
+
+
+def page_html(title: str, body: str, *, extra_css: str = "", extra_js: str = "") -> str:
+    """A whole self-contained page.
+
+    Args:
+        title: plain text.
+        body: HTML, whose texts are already escaped.
+        extra_css: style rules after those of the player.
+        extra_js: script after that of the player.
+    """
+    return (
+        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{escape(title)}</title><style>\n{read_asset('page.css')}{extra_css}</style></head>\n"
+        f"<body><main>\n{body}\n</main>\n<script>\n{read_asset('player.js')}{extra_js}</script></body></html>\n"
+    )
+
+
+def write_page(path: str | os.PathLike[str], title: str, animations: Sequence[Animation], *, caption: str = "") -> None:
+    """A page of animations and nothing else. Nothing half-written is left at `path`."""
+    intro = f'<p class="lead">{escape(caption)}</p>' if caption else ""
+    figures = "\n".join(animation_html(animation) for animation in animations)
+    write_text(path, page_html(title, f"<h1>{escape(title)}</h1>{intro}\n{figures}"))
+
+
+def write_text(path: str | os.PathLike[str], text: str) -> None:
+    """Write under a temporary name beside `path`, then rename."""
+    target = Path(path)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=".part")
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8") as file:
+            file.write(text)
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, target)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def embed_json(payload: Any) -> str:
+    """Compact JSON that cannot end the `<script>` it stands in."""
+    return json.dumps(payload, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+
+
+@cache
+def read_asset(name: str) -> str:
+    """A text file of this package."""
+    return (resources.files("rlftsim.viewer") / name).read_text(encoding="utf-8")
+
+
+def _panel_html(panel: Panel) -> str:
+    title = escape(panel.title)
+    return (
+        f'<div class="panel"><div class="panel-head"><span class="panel-title">{title}</span>'
+        f'<span class="panel-status"></span></div><canvas role="img" aria-label="{title}"></canvas>'
+        '<div class="panel-tip" hidden></div></div>'
+    )
+
+
+def _controls_html() -> str:
+    """Buttons found by `data-part`; `several` = only where there is more than one rollout."""
+    speeds = "".join(f'<option value="{s}"{" selected" if s == 1 else ""}>{s}×</option>' for s in SPEEDS)
+    return (
+        '<div class="controls"><button class="play" data-part="play" aria-label="Play"></button>'
+        '<div class="timeline"><input type="range" data-part="time" min="0" max="90" step="any" value="10" aria-label="Time">'
+        '<span class="clock"><b data-part="clock">+0.0 s</b> <span data-part="phase"></span></span></div>'
+        f'<label>speed <select data-part="speed">{speeds}</select></label>'
+        '<label class="several">rollout <select data-part="rollout"></select></label>'
+        '<label class="several"><input type="checkbox" data-part="all" checked> paths of all rollouts</label>'
+        '<span class="zoom"><button data-part="zoom-out" aria-label="Zoom out">−</button>'
+        '<button data-part="zoom-in" aria-label="Zoom in">+</button><button data-part="reset">reset view</button></span></div>'
+    )
+
+
+def _legend_html(animation: Animation) -> str:
+    """Only what can be seen: marks that no panel has are left out."""
+    trajectories = [panel.trajectories for panel in animation.panels]
+    entries = [
+        (_box_svg("agent-ego"), "ego"),
+        (_box_svg("agent-evaluated"), "evaluated"),
+        (_box_svg("agent-other"), "other"),
+        ('<ellipse cx="12" cy="8" rx="8" ry="3" fill="var(--agent-other)"/>', "cyclist"),
+        (
+            '<circle cx="10" cy="8" r="4.5" fill="var(--agent-other)"/><path d="M14 5l6 3-6 3z" fill="var(--agent-other)"/>',
+            "pedestrian",
+        ),
+    ]
+    if animation.scene.lights:
+        dots = zip((5, 12, 19), ("stop", "caution", "go"))
+        entries.append(
+            ("".join(f'<circle cx="{x}" cy="8" r="3.5" fill="var(--{c})"/>' for x, c in dots), "traffic light")
+        )
+    if any(line.kind == "stop_sign" for line in animation.scene.lines):
+        octagon = '<path d="M18 5.5v5L14.5 14h-5L6 10.5v-5L9.5 2h5z" fill="var(--stop)"/>'
+        octagon += '<path d="M8.5 7h7v2h-7z" fill="var(--surface)"/>'
+        entries.append((octagon, "stop sign"))
+    if any(t.collides is not None for t in trajectories):
+        entries.append((f"{_box_svg('collision', 7)}{_ring_svg('collision')}", "collides"))
+    if any(t.offroad is not None for t in trajectories):
+        entries.append((f"{_box_svg('agent-other', 7)}{_ring_svg('offroad', '3 2')}", "off road"))
+    items = "".join(f'<li><svg viewBox="0 0 24 16" aria-hidden="true">{svg}</svg>{name}</li>' for svg, name in entries)
+    return f'<ul class="legend">{items}</ul>'
+
+
+def _box_svg(colour: str, half: float = 10) -> str:
+    """A vehicle from above, heading right."""
+    shape = f'<rect x="{12 - half}" y="{8 - half * 0.42}" width="{2 * half}" height="{half * 0.84}" rx="1.5" fill="var(--{colour})"/>'
+    tip, root = 12 + half * 0.85, 12 + half * 0.3
+    return f'{shape}<path d="M{tip} 8L{root} {8 - half * 0.28}V{8 + half * 0.28}z" fill="var(--heading-mark)"/>'
+
+
+def _ring_svg(colour: str, dashes: str = "") -> str:
+    """The frame around a marked vehicle."""
+    return (
+        f'<rect x="1" y="1" width="22" height="14" rx="3" fill="var(--{colour})" fill-opacity=".3" stroke="var(--{colour})" stroke-width="2"'
+        f' stroke-dasharray="{dashes}"/>'
+    )

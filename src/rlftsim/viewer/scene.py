@@ -1,0 +1,371 @@
+"""What a picture of a scenario needs, and nothing else: map, lights, boxes and trajectories in the map frame.
+
+Agents are the simulated ones (`Scenario.simulated_indices`), in the order of a batch's axis A. Small on purpose: `to_payload` rounds to
+centimetres and hundredths of a radian and stores second differences, so that smooth motion becomes mostly zeros.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from rlftsim.errors import DataError
+from rlftsim.rollout.types import Rollouts
+from rlftsim.scenario.types import (
+    CURRENT_STEP,
+    HISTORY_STEPS,
+    LightStates,
+    MapFeatures,
+    MapFeatureType,
+    Scenario,
+)
+from rlftsim.viewer.overlap import compute_overlap
+
+SIMPLIFY_TOLERANCE_M = 0.1
+"""How far a drawn map line may be from the recorded one."""
+MIN_FOCUS_RADIUS_M, MAX_FOCUS_RADIUS_M = 30.0, 80.0
+UNSEEN_LIGHT = "-"
+
+MAP_KINDS = {
+    MapFeatureType.LANE_UNDEFINED: "lane",
+    MapFeatureType.LANE_FREEWAY: "lane",
+    MapFeatureType.LANE_SURFACE_STREET: "lane",
+    MapFeatureType.LANE_BIKE: "bike_lane",
+    MapFeatureType.LINE_UNKNOWN: "white",
+    MapFeatureType.LINE_BROKEN_SINGLE_WHITE: "white_broken",
+    MapFeatureType.LINE_SOLID_SINGLE_WHITE: "white",
+    MapFeatureType.LINE_SOLID_DOUBLE_WHITE: "white",
+    MapFeatureType.LINE_BROKEN_SINGLE_YELLOW: "yellow_broken",
+    MapFeatureType.LINE_BROKEN_DOUBLE_YELLOW: "yellow_broken",
+    MapFeatureType.LINE_SOLID_SINGLE_YELLOW: "yellow",
+    MapFeatureType.LINE_SOLID_DOUBLE_YELLOW: "yellow",
+    MapFeatureType.LINE_PASSING_DOUBLE_YELLOW: "yellow_broken",
+    MapFeatureType.EDGE_UNKNOWN: "edge",
+    MapFeatureType.EDGE_BOUNDARY: "edge",
+    MapFeatureType.EDGE_MEDIAN: "edge",
+    MapFeatureType.STOP_SIGN: "stop_sign",
+    MapFeatureType.CROSSWALK: "crosswalk",
+    MapFeatureType.SPEED_BUMP: "speed_bump",
+    MapFeatureType.DRIVEWAY: "driveway",
+}
+"""How each kind of map feature is drawn."""
+
+
+@dataclass(frozen=True, eq=False)
+class MapLine:
+    """One piece of map: a polyline, a polygon (crosswalk, speed bump, driveway) or a point (stop sign)."""
+
+    kind: str
+    """A value of `MAP_KINDS`."""
+    points: Float[np.ndarray, "n 2"]
+    """Map frame, metres."""
+
+
+@dataclass(frozen=True, eq=False)
+class Light:
+    """One traffic light at its stop point."""
+
+    stop_point: Float[np.ndarray, "2"]
+    """Map frame, metres."""
+    states: str
+    """One character a step: WOMD's number of the state, or `UNSEEN_LIGHT`."""
+
+
+@dataclass(frozen=True, eq=False)
+class AgentBoxes:
+    """Who is in the picture; sizes at the current step, metres."""
+
+    object_id: Int[np.ndarray, "A"]
+    object_type: Int[np.ndarray, "A"]
+    length: Float[np.ndarray, "A"]
+    width: Float[np.ndarray, "A"]
+    is_ego: Bool[np.ndarray, "A"]
+    evaluated_mask: Bool[np.ndarray, "A"]
+    """True = the metric measures this agent; the ego is one of them."""
+
+    def __len__(self) -> int:
+        return len(self.object_id)
+
+
+@dataclass(frozen=True, eq=False)
+class SceneView:
+    """What stands still in a scenario, in the map frame."""
+
+    scenario_id: str
+    lines: tuple[MapLine, ...]
+    lights: tuple[Light, ...]
+    agents: AgentBoxes
+    focus: tuple[float, float, float]
+    """Where to look first: x and y of the centre and half of the shown width, metres."""
+
+    def to_payload(self) -> dict[str, Any]:
+        """Lists, numbers and text only, as `player.js` reads them: centimetres, the points of a line as differences."""
+        kinds: dict[str, list[list[int]]] = {}
+        for line in self.lines:
+            kinds.setdefault(line.kind, []).append(_encode_points(line.points))
+        agents = self.agents
+        roles = np.where(agents.is_ego, 2, agents.evaluated_mask.astype(int))
+        columns = (agents.object_id, agents.object_type, _centi(agents.length), _centi(agents.width), roles)
+        return {
+            "id": self.scenario_id,
+            "now": CURRENT_STEP,
+            "focus": [round(v, 1) for v in self.focus],
+            "map": kinds,
+            "lights": [[*_centi(light.stop_point).tolist(), light.states] for light in self.lights],
+            "agents": [list(row) for row in zip(*(c.tolist() for c in columns))],
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectories:
+    """N ways the agents moved over S steps from step 0 on, map frame. The log is one of them, with N = 1."""
+
+    position: Float[np.ndarray, "N A S 2"]
+    heading: Float[np.ndarray, "N A S"]
+    valid: Bool[np.ndarray, "N A S"]
+    collides: Bool[np.ndarray, "N A S"] | None = None
+    """Where an agent overlaps another one; None = unknown, nothing is marked."""
+    offroad: Bool[np.ndarray, "N A S"] | None = None
+    """Where a corner of an agent is off the road; None = unknown, nothing is marked."""
+
+    @property
+    def num_rollouts(self) -> int:
+        """N."""
+        return self.position.shape[0]
+
+    @property
+    def num_steps(self) -> int:
+        """S."""
+        return self.position.shape[2]
+
+    def first(self, num_rollouts: int) -> "Trajectories":
+        """The first rollouts only."""
+        kept = {name: None if values is None else values[:num_rollouts] for name, values in vars(self).items()}
+        return replace(self, **kept)
+
+    def with_overlaps(self, agents: AgentBoxes) -> "Trajectories":
+        """The same with `collides` = the boxes overlap, and did not at the current step (a recorded stroller and its pusher do).
+
+        Boxes have sharp corners here, so these are not exactly the metric's collisions.
+        """
+        collides = compute_overlap(
+            self.position, self.heading, agents.length, agents.width, self.valid, ignore_from=CURRENT_STEP
+        )
+        return replace(self, collides=collides)
+
+    def with_evaluated_flags(
+        self,
+        scenario: Scenario,
+        *,
+        collision: Bool[Tensor | np.ndarray, "N E T"] | None = None,
+        offroad: Bool[Tensor | np.ndarray, "N E T"] | None = None,
+    ) -> "Trajectories":
+        """The same with the metric's own marks, which exist for evaluated agents and future steps.
+
+        Args:
+            scenario: the one shown.
+            collision: rows in the order of `scenario.evaluated_indices`.
+            offroad: the same.
+        """
+        marks = {"collides": collision, "offroad": offroad}
+        spread = {name: self._spread(scenario, values) for name, values in marks.items() if values is not None}
+        return replace(self, **spread)
+
+    def _spread(self, scenario: Scenario, values: Tensor | np.ndarray) -> Bool[np.ndarray, "N A S"]:
+        """Values of evaluated agents at future steps, put where they belong."""
+        full = np.zeros(self.valid.shape, bool)
+        rows = np.searchsorted(scenario.simulated_indices, scenario.evaluated_indices)
+        full[:, rows, HISTORY_STEPS:] = np.asarray(values, bool)[
+            : self.num_rollouts, :, : self.num_steps - HISTORY_STEPS
+        ]
+        return full
+
+    def to_payload(self) -> dict[str, Any]:
+        """Lists and numbers only, as `player.js` reads them."""
+        return {"steps": self.num_steps, "rollouts": [self._encode_rollout(n) for n in range(self.num_rollouts)]}
+
+    def _encode_rollout(self, n: int) -> list[list[list[int]]]:
+        """Per agent x, y (centimetres), heading (centiradians) as second differences; intervals of valid, colliding, off-road steps."""
+        position, heading = _hold(self.position[n], self.valid[n]), _hold(self.heading[n], self.valid[n])
+        channels = _centi(np.stack([position[..., 0], position[..., 1], np.unwrap(heading, axis=-1)], axis=1))
+        flags = [self.valid[n]] + [
+            np.zeros_like(self.valid[n]) if f is None else f[n] & self.valid[n] for f in (self.collides, self.offroad)
+        ]
+        return [
+            [*(_second_differences(c) for c in channels[agent]), *(_intervals(f[agent]) for f in flags)]
+            for agent in range(len(channels))
+        ]
+
+
+def build_scene(scenario: Scenario) -> SceneView:
+    """The still part of a picture: map (simplified to 10 cm), lights, agents."""
+    return SceneView(
+        scenario_id=scenario.scenario_id,
+        lines=_map_lines(scenario.map_features, scenario.origin),
+        lights=_lights(scenario.lights, scenario.origin, scenario.num_steps),
+        agents=_agent_boxes(scenario),
+        focus=_focus(scenario),
+    )
+
+
+def logged_trajectories(scenario: Scenario) -> Trajectories:
+    """What was recorded of the simulated agents: 91 steps, 11 where the future is withheld."""
+    tracks, chosen = scenario.tracks, scenario.simulated_indices
+    position = (tracks.position[chosen][..., :2] - scenario.origin).astype(np.float32)
+    heading = tracks.heading[chosen]
+    finite = np.isfinite(position).all(-1) & np.isfinite(heading)
+    return Trajectories(position[None], heading[None], (tracks.valid[chosen] & finite)[None])
+
+
+def rollout_trajectories(
+    scenario: Scenario, rollouts: Rollouts, *, row: int, max_rollouts: int | None = None
+) -> Trajectories:
+    """Simulated futures of one scenario of a batch, after its logged history.
+
+    Args:
+        scenario: the one in row `row` of the batch.
+        rollouts: of the whole batch.
+        row: index b of the scenario in the batch.
+        max_rollouts: keep the first so many; None = all.
+
+    Raises:
+        DataError: the rollouts have fewer agents than the scenario, so they belong to another one.
+    """
+    num_agents = len(scenario.simulated_indices)
+    if rollouts.position.shape[2] < num_agents:
+        raise DataError(
+            f"{scenario.scenario_id}: {num_agents} agents, but the rollouts have {rollouts.position.shape[2]}: "
+            "hand over the scenario of the same row."
+        )
+    future_position, future_heading = (
+        values[row, :max_rollouts, :num_agents].detach().to("cpu", torch.float32).numpy()
+        for values in (rollouts.position, rollouts.heading)
+    )
+    log = logged_trajectories(scenario)
+
+    def after_history(past: np.ndarray, future: np.ndarray) -> np.ndarray:
+        repeated = np.repeat(past[:, :, :HISTORY_STEPS], len(future), axis=0)
+        return np.concatenate([repeated, future], axis=2)
+
+    return Trajectories(
+        position=after_history(log.position, future_position),
+        heading=after_history(log.heading, future_heading),
+        valid=after_history(log.valid, np.isfinite(future_position).all(-1) & np.isfinite(future_heading)),
+    )
+
+
+def simplify(points: Float[np.ndarray, "n 2"], tolerance_m: float = SIMPLIFY_TOLERANCE_M) -> Float[np.ndarray, "m 2"]:
+    """A polyline with fewer points, nowhere further than `tolerance_m` from the given one (Douglas-Peucker)."""
+    if len(points) < 3:
+        return points
+    keep = np.zeros(len(points), bool)
+    keep[[0, -1]] = True
+    spans = [(0, len(points) - 1)]
+    while spans:
+        start, stop = spans.pop()
+        if stop - start < 2:
+            continue
+        distance = _distance_to_segment(points[start + 1 : stop], points[start], points[stop])
+        farthest = int(distance.argmax())
+        if distance[farthest] > tolerance_m:
+            middle = start + 1 + farthest
+            keep[middle] = True
+            spans += [(start, middle), (middle, stop)]
+    return points[keep]
+
+
+def _distance_to_segment(points: np.ndarray, start: np.ndarray, stop: np.ndarray) -> Float[np.ndarray, "n"]:
+    """Distance of points to a segment, metres; it may have no length."""
+    along = stop - start
+    share = np.clip((points - start) @ along / max(float(along @ along), 1e-12), 0, 1)
+    return np.linalg.norm(points - start - share[:, None] * along, axis=-1)
+
+
+def _map_lines(features: MapFeatures, origin: np.ndarray) -> tuple[MapLine, ...]:
+    """Every feature with finite points, in file order."""
+    lines = []
+    for index in range(len(features)):
+        points = features.polyline(index)[:, :2].astype(np.float64) - origin
+        points = points[np.isfinite(points).all(-1)]
+        if len(points):
+            lines.append(MapLine(MAP_KINDS[MapFeatureType(int(features.feature_type[index]))], simplify(points)))
+    return tuple(lines)
+
+
+def _lights(lights: LightStates, origin: np.ndarray, num_steps: int) -> tuple[Light, ...]:
+    """One light per controlled lane; where a lane is listed twice in a step, the later entry counts."""
+    found = []
+    for lane_id in np.unique(lights.lane_id):
+        rows = np.flatnonzero(lights.lane_id == lane_id)
+        states = [UNSEEN_LIGHT] * num_steps
+        for step, state in zip(lights.step[rows], lights.state[rows]):
+            states[int(step)] = str(int(state))
+        stop_point = lights.stop_point[rows[0], :2].astype(np.float64) - origin
+        if np.isfinite(stop_point).all():
+            found.append(Light(stop_point, "".join(states)))
+    return tuple(found)
+
+
+def _agent_boxes(scenario: Scenario) -> AgentBoxes:
+    tracks, chosen = scenario.tracks, scenario.simulated_indices
+    return AgentBoxes(
+        object_id=tracks.object_id[chosen],
+        object_type=tracks.object_type[chosen].astype(np.int64),
+        length=tracks.size[chosen, CURRENT_STEP, 0],
+        width=tracks.size[chosen, CURRENT_STEP, 1],
+        is_ego=chosen == scenario.ego_index,
+        evaluated_mask=np.isin(chosen, scenario.evaluated_indices),
+    )
+
+
+def _focus(scenario: Scenario) -> tuple[float, float, float]:
+    """A square around everything the evaluated agents did, neither tiny nor so large that boxes become dots."""
+    chosen = scenario.evaluated_indices
+    visited = (scenario.tracks.position[chosen][scenario.tracks.valid[chosen]][:, :2] - scenario.origin).astype(float)
+    if not len(visited):
+        return 0.0, 0.0, MIN_FOCUS_RADIUS_M
+    low, high = visited.min(0), visited.max(0)
+    radius = float(np.clip((high - low).max() / 2 + 8, MIN_FOCUS_RADIUS_M, MAX_FOCUS_RADIUS_M))
+    ego = scenario.tracks.position[scenario.ego_index, CURRENT_STEP, :2] - scenario.origin
+    # where not everything fits, the ego at the current step stays in the picture
+    centre = np.clip((low + high) / 2, ego - 0.8 * radius, ego + 0.8 * radius)
+    return float(centre[0]), float(centre[1]), radius
+
+
+def _centi(values: np.ndarray) -> Int[np.ndarray, "..."]:
+    """Hundredths, as whole numbers."""
+    return np.rint(np.asarray(values, np.float64) * 100).astype(np.int64)
+
+
+def _encode_points(points: Float[np.ndarray, "n 2"]) -> list[int]:
+    """x0, y0, then differences from point to point, centimetres."""
+    centimetres = _centi(points)
+    return np.diff(centimetres, axis=0, prepend=np.zeros((1, 2), np.int64)).ravel().tolist()
+
+
+def _second_differences(values: Int[np.ndarray, "S"]) -> list[int]:
+    """Value, first difference, then second differences; zeros at the end are left out."""
+    first = np.diff(values, prepend=0)
+    second = first.copy()
+    second[2:] = np.diff(first[1:])
+    return np.trim_zeros(second, "b").tolist()
+
+
+def _intervals(flags: Bool[np.ndarray, "S"]) -> list[int]:
+    """Start, stop, start, stop, ...: half-open runs of True."""
+    padded = np.concatenate([[False], flags, [False]])
+    return np.flatnonzero(padded[1:] != padded[:-1]).tolist()
+
+
+def _hold(values: np.ndarray, valid: Bool[np.ndarray, "A S"]) -> np.ndarray:
+    """Values with gaps filled by the last valid one (before the first: by the first), which costs nothing when encoded."""
+    steps = np.arange(valid.shape[1])
+    last = np.maximum.accumulate(np.where(valid, steps, -1), axis=1)
+    first = np.where(valid.any(1), valid.argmax(1), 0)
+    source = np.where(last < 0, first[:, None], last)
+    held = np.take_along_axis(values, source if values.ndim == 2 else source[..., None], axis=1)
+    known = valid.any(1).reshape(-1, *[1] * (values.ndim - 1))
+    return np.where(known, held, 0)

@@ -1,0 +1,183 @@
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from realism_drawing import draw_map, draw_red_light, draw_rollouts, draw_traffic, select_rollouts
+
+from rlftsim.errors import DataError
+from rlftsim.realism import (
+    METRIC_2024_ORIGINAL,
+    ComputeConfig,
+    SimulatedStates,
+    compute_features,
+    scenario_log,
+    score,
+    score_batch,
+    score_features,
+)
+
+
+@pytest.fixture(scope="module")
+def scenario():
+    return draw_traffic(0, lights=draw_red_light())
+
+
+def test_the_scenario_part_is_built_once(scenario):
+    assert scenario_log(scenario) is scenario_log(scenario, "cpu")
+
+
+def test_rollouts_that_repeat_the_log_score_high_but_not_one(scenario):
+    oracle = draw_rollouts(scenario, 1, seed=0, spread=0.0)
+    result = score(scenario, dataclasses.replace(oracle, repeat=32))
+    assert 0.6 < result.meta_metric < 0.999
+    assert result.min_average_displacement_error == pytest.approx(0.0)
+    assert result.leave_one_out_meta_metric.shape == (32,)
+
+
+def test_leave_one_out_and_single_values_equal_scores_from_scratch(scenario):
+    states = draw_rollouts(scenario, 5, seed=1)
+    result = score(scenario, states)
+    for rollout in range(5):
+        others = [other for other in range(5) if other != rollout]
+        without = score(scenario, select_rollouts(states, others)).meta_metric
+        alone = score(scenario, select_rollouts(states, [rollout])).meta_metric
+        assert result.leave_one_out_meta_metric[rollout].item() == pytest.approx(without.item(), abs=1e-6)
+        assert result.single_meta_metric[rollout].item() == pytest.approx(alone.item(), abs=1e-6)
+
+
+def test_leaving_out_the_only_rollout_is_not_a_number(scenario):
+    result = score(scenario, draw_rollouts(scenario, 1, seed=1))
+    assert result.leave_one_out_meta_metric.isnan().all()
+    assert result.single_meta_metric[0] == result.meta_metric
+
+
+def test_sub_scores_add_up_to_the_meta_metric(scenario):
+    result = score(scenario, draw_rollouts(scenario, 4, seed=1))
+    combined = 0.2 * result.kinematic + 0.45 * result.interactive + 0.35 * result.map_based
+    assert combined.item() == pytest.approx(result.meta_metric.item(), abs=1e-6)
+
+
+def test_per_rollout_errors_and_rates_average_to_the_reported_ones(scenario):
+    result = score(scenario, draw_rollouts(scenario, 4, seed=1, spread=4.0))
+    assert result.rollout_displacement_error.mean() == result.average_displacement_error
+    assert result.rollout_displacement_error.min() == result.min_average_displacement_error
+    assert result.rollout_collision_rate.mean() == result.collision_rate
+    assert result.rollout_offroad_rate.mean() == result.offroad_rate
+    assert result.offroad_rate > 0
+
+
+def test_a_batch_is_its_scenarios_stacked():
+    scenarios = [draw_traffic(seed, num_agents=4 + seed) for seed in range(3)]
+    states = [draw_rollouts(scenario, 4, seed=7) for scenario in scenarios]
+    batch = score_batch(scenarios, states)
+    assert batch.meta_metric.shape == (3,)
+    assert batch.leave_one_out_meta_metric.shape == (3, 4)
+    assert batch.likelihoods.shape == (3, 10)
+    assert batch.likelihood("linear_speed").shape == (3,)
+    for row, (scenario, item) in enumerate(zip(scenarios, states)):
+        single = score(scenario, item)
+        assert torch.equal(batch.leave_one_out_meta_metric[row], single.leave_one_out_meta_metric)
+        assert batch.to_official_fields()[row] == single.to_official_fields()[0]
+
+
+def test_batches_must_match(scenario):
+    states = draw_rollouts(scenario, 4, seed=1)
+    with pytest.raises(DataError, match="got 1 for 2"):
+        score_batch([scenario, scenario], [states])
+    with pytest.raises(DataError, match="got 0 for 0"):
+        score_batch([], [])
+    with pytest.raises(DataError, match=r"\[3, 4\]"):
+        score_batch([scenario, scenario], [states, select_rollouts(states, [0, 1, 2])])
+
+
+def test_features_serve_several_metrics(scenario):
+    states = draw_rollouts(scenario, 4, seed=1)
+    log = scenario_log(scenario)
+    result = score_features(log, compute_features(log, states), METRIC_2024_ORIGINAL)
+    fields = result.to_official_fields()[0]
+    assert fields["metametric"] == score(scenario, states, METRIC_2024_ORIGINAL).meta_metric.item()
+    assert not any("traffic_light" in name for name in [*fields, *fields["buckets"]])
+
+
+def test_memory_bounds_change_no_value(scenario):
+    states = draw_rollouts(scenario, 4, seed=1)
+    small = score(scenario, states, compute=ComputeConfig(max_pairs=1))
+    large = score(scenario, states, compute=ComputeConfig(max_pairs=1 << 22))
+    assert small.to_official_fields() == large.to_official_fields()
+
+
+def test_missing_unknown_and_repeated_agents_are_named(scenario):
+    states = draw_rollouts(scenario, 2, seed=1)
+    simulated = [int(object_id) for object_id in states.object_id]
+
+    def give(ids, index):
+        return SimulatedStates(
+            np.array(ids), *(v[:, index].contiguous() for v in (states.x, states.y, states.z, states.heading))
+        )
+
+    with pytest.raises(DataError, match=f"drawn_0 .*missing {simulated[0]}"):
+        score(scenario, give(simulated[1:], [1, 2, 3, 4]))
+    with pytest.raises(DataError, match="not simulated in this scenario 5000"):
+        score(scenario, give([*simulated, 5000], [0, 1, 2, 3, 4, 4]))
+    with pytest.raises(DataError, match="listed twice"):
+        score(scenario, give([*simulated, simulated[0]], [0, 1, 2, 3, 4, 0]))
+
+
+def test_states_of_another_shape_or_precision_are_refused(scenario):
+    states = draw_rollouts(scenario, 2, seed=1)
+    with pytest.raises(DataError, match=r"float32 of shape \[N, A = 5, T = 80\], got torch.float64"):
+        dataclasses.replace(states, x=states.x.double())
+    with pytest.raises(DataError, match=r"\[2, 5, 79\]"):
+        dataclasses.replace(states, z=states.z[..., 1:])
+    with pytest.raises(DataError, match="At least one rollout"):
+        dataclasses.replace(states, repeat=0)
+
+
+def test_values_that_are_no_numbers_are_found_on_request(scenario):
+    states = draw_rollouts(scenario, 2, seed=1)
+    states.check_finite()
+    states.y[1, 3, 7] = float("nan")
+    with pytest.raises(DataError, match=f"object id {states.object_id[3]} in rollout 1 at future step 7"):
+        states.check_finite()
+    assert score(scenario, states).meta_metric.isfinite()
+
+
+def test_a_scenario_without_future_is_refused(scenario):
+    tracks = scenario.tracks
+    cut = dataclasses.replace(
+        tracks,
+        **{name: getattr(tracks, name)[:, :11] for name in ("position", "heading", "velocity", "size", "valid")},
+    )
+    with pytest.raises(DataError, match="drawn_0 records 11 steps"):
+        score(dataclasses.replace(scenario, tracks=cut), draw_rollouts(scenario, 2, seed=1))
+
+
+def test_a_scenario_without_road_edges_is_refused_or_counts_as_on_the_road():
+    scenario = draw_traffic(0, map_features=draw_map([]))
+    states = draw_rollouts(scenario, 4, seed=1)
+    with pytest.raises(DataError, match="drawn_0 has no road edge"):
+        score(scenario, states)
+    result = score(scenario, states, missing_map="neutral")
+    assert result.likelihood("distance_to_road_edge") > 0.99
+    assert result.likelihood("offroad_indication") > 0.99
+    assert result.offroad_rate == 0
+
+
+@pytest.mark.parametrize(("num_agents", "num_rollouts"), [(2, 1), (2, 33), (60, 2)])
+def test_lonely_and_crowded_scenes_and_any_number_of_rollouts_score(num_agents, num_rollouts):
+    scenario = draw_traffic(1, num_agents=num_agents, num_evaluated=1)
+    result = score(scenario, draw_rollouts(scenario, num_rollouts, seed=1))
+    assert result.likelihoods.isfinite().all()
+    assert len(scenario.simulated_indices) == num_agents - 1
+
+
+def test_an_evaluated_agent_seen_at_the_current_step_only_gives_what_the_rules_say():
+    scenario = draw_traffic(1, num_agents=3, num_evaluated=1)
+    scenario.tracks.valid[0] = False
+    scenario.tracks.valid[0, 10] = True
+    result = score(scenario, draw_rollouts(scenario, 2, seed=1))
+    # No step of the log is scored: likelihoods of histograms are 0/0; outcomes are all "no" on both sides.
+    assert result.likelihoods[:7].isnan().all()
+    assert result.likelihoods[7:].tolist() == pytest.approx([2.001 / 2.002] * 3)
+    assert result.average_displacement_error == 0
