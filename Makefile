@@ -1,8 +1,40 @@
-# The commands a newcomer types. OMP_WAIT_POLICY=PASSIVE: on shared cores spinning threads made two threads twenty times slower than one.
+# The commands a newcomer types.
+# OMP_WAIT_POLICY=PASSIVE: on shared cores waiting threads that spin made two threads twenty times slower than one.
 export OMP_WAIT_POLICY = PASSIVE
 PYTHON ?= python3
 VENV ?= .venv
-RUN = $(VENV)/bin
+BIN = $(VENV)/bin
+PIP = $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+OUT ?= runs/demo
+PYTEST_FLAGS ?=
 
-.PHONY: demo demo-quick test lint
+.PHONY: demo demo-quick test lint clean
 .DEFAULT_GOAL := demo
+
+## the whole pipeline on the synthetic scenarios, to runs/demo/report.html
+demo: $(BIN)/.installed
+	$(BIN)/rlftsim demo --out $(OUT)
+
+## the same stages at their smallest
+demo-quick: $(BIN)/.installed
+	$(BIN)/rlftsim demo --quick --out $(OUT)-quick
+
+## lint, types and tests
+test: $(BIN)/.installed-test lint
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile --jaxtyping-packages=rlftsim,beartype.beartype $(PYTEST_FLAGS)
+
+lint: $(BIN)/.installed-test
+	$(BIN)/ruff check src tests benchmarks
+	$(BIN)/ruff format --check src tests benchmarks
+
+$(BIN)/.installed: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(PIP) -e .
+	touch $@
+
+$(BIN)/.installed-test: $(BIN)/.installed
+	$(PIP) -e ".[test]"
+	touch $@
+
+clean:
+	rm -rf $(VENV) runs

@@ -18,6 +18,8 @@ from rlftsim.scenario.synthetic.generate import generate
 
 SYNTHETIC = "synthetic"
 MAX_LISTED = 20
+CACHED_SCENARIOS = 1024
+"""About a megabyte each; with them stay their tokens."""
 
 
 def data_folder(name: str) -> Path:
@@ -32,7 +34,7 @@ def open_split(name: str, split: str) -> ScenarioDataset:
         DataError: there are none; says which splits there are.
     """
     folder = data_folder(name)
-    scenarios = ScenarioDataset(folder, split)
+    scenarios = ScenarioDataset(folder, split, cache_size=CACHED_SCENARIOS)
     if not len(scenarios):
         known = sorted(set(ScenarioDataset(folder).index["split"].to_pylist()))
         raise DataError(f"{name} has no scenarios in split {split!r}: it has {', '.join(known) or 'none at all'}.")
@@ -61,7 +63,9 @@ class Convert:
         """Convert and say what became of every record."""
         report = convert(self.source, self.destination, split=self.split, on_error=self.on_error, jobs=self.jobs)
         by_split = ", ".join(f"{count} {split}" for split, count in report.counts.items())
-        print(f"{report.destination}: {report.converted} scenarios converted, {len(report.skipped)} lost; in all {by_split}.")
+        print(
+            f"{report.destination}: {report.converted} scenarios converted, {len(report.skipped)} lost; in all {by_split}."
+        )
         for record in [*report.skipped, *report.duplicates][:MAX_LISTED]:
             print(f"  left out: {record.file}, record {record.record}: {record.cause}")
         hidden = len(report.skipped) + len(report.duplicates) - MAX_LISTED
@@ -123,7 +127,7 @@ def _stats_table(name: str, stats: DatasetStats) -> Table:
     return table
 
 
-def _counts(counts) -> str:  # noqa: ANN001
+def _counts(counts) -> str:
     return ", ".join(f"{count} {name}" for name, count in counts.items())
 
 

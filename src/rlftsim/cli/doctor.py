@@ -48,7 +48,7 @@ class Doctor:
 
 
 def _python() -> Diagnosis:
-    good = (3, 11) <= sys.version_info[:2]
+    good = sys.version_info[:2] >= (3, 11)
     found = platform.python_version() + ("" if good else ": needs 3.11 or newer")
     return Diagnosis("Python", GOOD if good else BAD, found)
 
@@ -100,7 +100,9 @@ def _sumo() -> Diagnosis:
 def _disk() -> Diagnosis:
     free = {str(folder): shutil.disk_usage(folder).free / 1e9 for folder in (Path.cwd(), Path(tempfile.gettempdir()))}
     state = GOOD if min(free.values()) >= MIN_FREE_GB else WARNING
-    return Diagnosis("disk", state, ", ".join(f"{gigabytes:.1f} GB free in {folder}" for folder, gigabytes in free.items()))
+    return Diagnosis(
+        "disk", state, ", ".join(f"{gigabytes:.1f} GB free in {folder}" for folder, gigabytes in free.items())
+    )
 
 
 def _pack() -> Diagnosis:

@@ -48,13 +48,23 @@ class Tokens:
         )
         vocabulary.save(self.out)
         Console().print(_coverage_table(reports, reconstruction_error(scenarios, vocabulary)))
-        print(f"{self.out}: {vocabulary.num_tokens} motion tokens a class, {len(vocabulary.map_prototypes)} map pieces.")
+        print(
+            f"{self.out}: {vocabulary.num_tokens} motion tokens a class, {len(vocabulary.map_prototypes)} map pieces."
+        )
         return 0
 
 
 def _coverage_table(reports: tuple[CoverageReport, ...], errors: tuple[tuple[str, int, float, float], ...]) -> Table:
     table = Table(title="How well the tokens stand for the data", title_justify="left")
-    for heading in ("class", "motions", "tokens", "disk [cm]", "error mean · 95 % [cm]", "rolling error mean · 95 % [cm]", "fastest [m/s]"):
+    for heading in (
+        "class",
+        "motions",
+        "tokens",
+        "disk [cm]",
+        "error mean · 95 % [cm]",
+        "rolling error mean · 95 % [cm]",
+        "fastest [m/s]",
+    ):
         table.add_column(heading, justify="left" if heading == "class" else "right")
     for report, (_, _, mean, p95) in zip(reports, errors):
         table.add_row(
@@ -116,6 +126,8 @@ class Finetune:
         """Load the model and fine-tune it."""
         recipe = configure(RECIPES[self.recipe](), self.set)
         scenarios = open_split(self.data, self.split)
-        card = model_card(f"fine-tuned ({recipe.finetune.reward}) from {self.model}", data_folder(self.data), len(scenarios))
+        card = model_card(
+            f"fine-tuned ({recipe.finetune.reward}) from {self.model}", data_folder(self.data), len(scenarios)
+        )
         print(f"model: {finetune(load_policy(self.model), scenarios, self.out, recipe.finetune, card=card)}")
         return 0

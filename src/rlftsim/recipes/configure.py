@@ -59,7 +59,9 @@ def _parse(text: str, kind: Any, whole: str) -> Any:
         return tuple(float(v) if float in allowed else v for v in value)
     types = tuple(a for a in allowed if isinstance(a, type))
     is_bool_for_number = isinstance(value, bool) and bool not in allowed
-    if value in [a for a in allowed if not isinstance(a, type)] or (types and isinstance(value, types) and not is_bool_for_number):
+    if value in [a for a in allowed if not isinstance(a, type)] or (
+        types and isinstance(value, types) and not is_bool_for_number
+    ):
         return value
     wanted = ", ".join(a.__name__ if isinstance(a, type) else repr(a) for a in allowed)
     raise ConfigError(f"{whole}={text}: expected {wanted}.")

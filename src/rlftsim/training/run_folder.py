@@ -121,16 +121,16 @@ class RunFolder:
             for name, value in values.items():
                 self._board.add_scalar(name, value, update)
 
-    def read_metrics(self) -> list[dict[str, float]]:
-        """All lines of metrics so far."""
-        if not self._metrics.exists():
-            return []
-        return [json.loads(line) for line in self._metrics.read_text().splitlines()]
-
     def close(self) -> None:
         """Flush what is pending."""
         if self._board is not None:
             self._board.close()
+
+
+def read_metrics(path: Path) -> list[dict[str, float]]:
+    """The metrics of a run's folder, a dictionary an update; empty where there are none."""
+    metrics = path / "metrics.jsonl"
+    return [json.loads(line) for line in metrics.read_text().splitlines()] if metrics.exists() else []
 
 
 def _update_of(line: str) -> float:
