@@ -1,7 +1,7 @@
 """How long and how much memory does the realism metric take, beside the official evaluator and as scenes grow?
 
     python benchmarks/realism.py ../shared
-    python benchmarks/realism.py ../shared --official /some/venv/bin/python [--keep official.json]
+    python benchmarks/realism.py ../shared --official /some/venv/bin/python [--keep official.json] [--model runs/pretrain/model]
 
 Prints Markdown tables. Every measurement is a process of its own with one thread, because the peak of resident memory never
 goes down. Times are CPU time: what a process used, whatever else the machine was doing. `--official` runs the evaluator
@@ -160,6 +160,34 @@ def measure_scenarios(shared: Path, recipe: str, prefixes: tuple[str, ...]) -> d
     return {"cpu_s": time.process_time() - start, "added_mib": peak_mib() - before}
 
 
+def measure_update(
+    shared: Path, model: str, size: str, prefixes: tuple[str, ...], num_updates: int
+) -> dict[str, float]:
+    """Seconds of the parts of a fine-tuning update (median), on the vocabulary of a model folder."""
+    import torch
+
+    from rlftsim.policies.smart.config import smart_tiny
+    from rlftsim.policies.smart.policy import SmartPolicy
+    from rlftsim.recipes.models import load_policy
+    from rlftsim.scenario.batch import collate
+    from rlftsim.scenario.womd import read_scenarios
+    from rlftsim.training.finetune import FinetuneConfig, prepare, update_policy
+    from rlftsim.training.parallel import DeviceConfig, start_fabric
+
+    torch.set_num_threads(1)
+    scenarios = [s for s in read_scenarios(shared / "data" / "womd") if s.scenario_id.startswith(prefixes)]
+    policy = load_policy(model)
+    if size == "smart-tiny":
+        policy = SmartPolicy(smart_tiny(), policy.vocabulary)  # weights as they are born: time does not depend on them
+    config = FinetuneConfig(batch_size=len(scenarios), device=DeviceConfig("cpu", threads=1))
+    fabric = start_fabric(config.device)
+    learner, batch = prepare(policy, config, fabric.device), collate(scenarios)
+    logged = [update_policy(learner, batch, config, fabric) for _ in range(num_updates)]
+    names = [name for name in logged[0] if name.startswith("seconds_")]
+    first = {f"first_{name}": logged[0][name] for name in names}
+    return first | {name: sorted(values[name] for values in logged)[num_updates // 2] for name in names}
+
+
 def alone(function, *arguments) -> Any:
     """The value of a call in a fresh process."""
     with multiprocessing.get_context("spawn").Pool(1) as pool:
@@ -256,17 +284,39 @@ def print_leave_one_out(options: argparse.Namespace) -> None:
         )
 
 
+def print_update_share(options: argparse.Namespace) -> None:
+    print("\n## The reward's share of a fine-tuning update: 4 rollouts, wall time of one thread\n")
+    print(
+        "| model | scenarios | rollouts s | reward s | gradients s | share | share in the first update, scenario part included |"
+    )
+    print("|---|--:|--:|--:|--:|--:|--:|")
+    for size, prefixes in (("smart-demo", COMPARED), ("smart-tiny", ("bada", "637f"))):
+        row = alone(measure_update, options.shared, options.model, size, prefixes, 3)
+        parts = ("rollout", "reward", "backward", "step")
+        share, first = (
+            row[f"{at}seconds_reward"] / sum(row[f"{at}seconds_{p}"] for p in parts) for at in ("", "first_")
+        )
+        print(
+            f"| {size} | {len(prefixes)} | {row['seconds_rollout']:.2f} | {row['seconds_reward']:.2f} | "
+            f"{row['seconds_backward']:.2f} | {share:.1%} | {first:.1%} |",
+            flush=True,
+        )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("shared", type=Path, help="folder with data/womd, golden/rmm and tools/official_rmm")
     parser.add_argument("--official", type=Path, help="Python of an environment with the official evaluator")
     parser.add_argument("--keep", type=Path, help="JSON file with the official evaluator's part, written once")
+    parser.add_argument("--model", help="a fine-tunable model's folder: also measure the reward's share of an update")
     parser.add_argument("--recipe", default="messy")
     options = parser.parse_args()
     os.environ["OMP_NUM_THREADS"] = "1"
     if options.official or options.keep:
         print_comparison(options)
     print_leave_one_out(options)
+    if options.model:
+        print_update_share(options)
     print_scaling(options)
 
 
