@@ -290,8 +290,8 @@ def print_update_share(options: argparse.Namespace) -> None:
         "| model | scenarios | rollouts s | reward s | gradients s | share | share in the first update, scenario part included |"
     )
     print("|---|--:|--:|--:|--:|--:|--:|")
-    for size, prefixes in (("smart-demo", COMPARED), ("smart-tiny", ("bada", "637f"))):
-        row = alone(measure_update, options.shared, options.model, size, prefixes, 3)
+    for size, prefixes, num_updates in (("the given one", COMPARED, 3), ("smart-tiny", ("bada",), 2)):
+        row = alone(measure_update, options.shared, options.model, size, prefixes, num_updates)
         parts = ("rollout", "reward", "backward", "step")
         share, first = (
             row[f"{at}seconds_reward"] / sum(row[f"{at}seconds_{p}"] for p in parts) for at in ("", "first_")

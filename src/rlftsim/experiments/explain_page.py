@@ -26,7 +26,7 @@ _UNITS = {
 }
 _BAR_WIDTH, _BAR_HEIGHT, _LEFT, _BOTTOM, _TOP = 380, 190, 40, 46, 8
 _CSS = """
-.results thead th.narrow { white-space: normal; min-width: 92px; }
+.results thead th.narrow { white-space: normal; min-width: 64px; padding-left: 8px; padding-right: 8px; }
 .cost { background: color-mix(in srgb, var(--bad) calc(var(--heat) * 70%), transparent); }
 .gain { background: color-mix(in srgb, var(--good) calc(var(--heat) * 70%), transparent); }
 .strip { display: grid; grid-template-columns: minmax(200px, 290px) minmax(0, 1fr) 70px; gap: 4px 14px; align-items: center; font-size: 14px; padding: 14px 18px; font-variant-numeric: tabular-nums; }
@@ -152,8 +152,8 @@ def _cost_chart(explanation: Explanation) -> Chart:
     steps = np.nan_to_num(explanation.cost[: len(HISTOGRAM_FEATURES), :, :WHOLE_FUTURE]).sum(1)  # [H, T]
     seconds = (np.arange(steps.shape[1]) + 1) * STEP_S
     chosen = np.argsort(-steps.sum(1), kind="stable")[:4]
-    curves = [Curve(_words(HISTOGRAM_FEATURES[i]), seconds.tolist(), steps[i].tolist()) for i in chosen]
-    return Chart("Cost of a step, all evaluated agents", "seconds after now", "cost of 0.1 s", curves)
+    curves = [Curve(_words(HISTOGRAM_FEATURES[i]), seconds.tolist(), (1000 * steps[i]).tolist()) for i in chosen]
+    return Chart("Cost of a step, all evaluated agents", "seconds after now", "thousandths for 0.1 s", curves)
 
 
 def _event_chart(explanation: Explanation) -> Chart:
@@ -183,9 +183,7 @@ def _histogram_html(histogram: FeatureHistogram) -> str:
             )
     for k in range(0, len(histogram.edges), 2 if len(histogram.edges) > 8 else 1):
         x = _LEFT + k * width
-        ticks.append(
-            f'<text x="{x:.1f}" y="{bottom + 15}" text-anchor="middle">{_tick(histogram.edges[k])}</text>'
-        )
+        ticks.append(f'<text x="{x:.1f}" y="{bottom + 15}" text-anchor="middle">{_tick(histogram.edges[k])}</text>')
     title = _words(histogram.feature)
     axis = (
         f'<path class="axis" d="M{_LEFT} {bottom}H{_BAR_WIDTH}"/>'

@@ -110,7 +110,9 @@ def explain(scenario: Scenario, states: SimulatedStates, config: MetricConfig = 
         cost=cost.unflatten(-1, (len(log.agents.evaluated), -1)).numpy(),
         event_share=_event_share(log, features),
         histograms=_histograms(log, features, config),
-        rollouts=_trajectories(scenario, states),
+        rollouts=_trajectories(scenario, states).with_evaluated_flags(
+            scenario, collision=features.collision, offroad=features.offroad
+        ),
     )
 
 
