@@ -17,7 +17,6 @@ from typing import Literal
 import pyarrow as pa
 import torch
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from torch import nn
 
 from rlftsim.errors import ConfigError, DataError
@@ -31,7 +30,7 @@ from rlftsim.experiments.evaluation import (
     row_of_result,
 )
 from rlftsim.experiments.fingerprint import fingerprint_policy
-from rlftsim.experiments.workers import run_in_processes
+from rlftsim.progress import progress_bar
 from rlftsim.realism import SimulatedStates, build_scenario_log, metric_by_name, score
 from rlftsim.realism.from_rollouts import logged_states, states_of_rollouts
 from rlftsim.rollout.policy import Policy
@@ -39,6 +38,7 @@ from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import MANIFEST, ScenarioDataset
 from rlftsim.scenario.types import TOTAL_STEPS, Scenario
+from rlftsim.workers import run_tasks
 
 __all__ = ["EvaluateConfig", "Evaluation", "Provenance", "Skipped", "evaluate", "simulate_states"]
 
@@ -227,13 +227,20 @@ def _fill_parts(job: _Job, groups: list[range], show_progress: bool) -> None:
     """Work on the groups whose part is missing."""
     missing = [group for group in groups if _read_part(job, group) is None]
     total = sum(len(group) for group in groups)
-    with _progress_bar(job.name, total, total - sum(len(group) for group in missing), show_progress) as advance:
-        task = partial(_evaluate_group, job)
-        if min(job.config.jobs, len(missing)) > 1:
-            run_in_processes(task, missing, jobs=min(job.config.jobs, len(missing)), advance=advance)
-        else:
-            for group in missing:
-                task(group, advance, lambda: False)
+    done = total - sum(len(group) for group in missing)
+    with progress_bar(f"evaluating {job.name}", total, done, show=show_progress) as advance, _one_thread():
+        run_tasks(partial(_evaluate_group, job), missing, jobs=job.config.jobs, advance=advance)
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """As many as in a worker process: the number of processes must not change a result."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def _evaluate_group(job: _Job, group: range, advance: Callable[[int], None], is_stopped: Callable[[], bool]) -> None:
@@ -273,23 +280,6 @@ def _evaluate_scenario(job: _Job, scenario: Scenario) -> dict[str, object] | Ski
 
 def _open(job: _Job) -> ScenarioDataset:
     return ScenarioDataset(job.dataset_folder, job.config.split, cache_size=_CACHED_SCENARIOS)
-
-
-@contextmanager
-def _progress_bar(name: str, total: int, done: int, show: bool) -> Iterator[Callable[[int], None]]:
-    columns = (
-        TextColumn(f"evaluating {name}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("scenarios"),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-    )
-    console = Console(stderr=True)
-    with Progress(*columns, console=console, disable=not (show and console.is_terminal)) as progress:
-        bar = progress.add_task(name, total=total, completed=done)
-        yield lambda count: progress.advance(bar, count)
 
 
 def _say(message: str) -> None:
