@@ -17,7 +17,10 @@ from rlftsim.experiments.evaluation import SCORE_COLUMNS, Evaluation
 from rlftsim.experiments.scenario_source import open_scenarios
 from rlftsim.experiments.score import ScoreConfig, format_scores, score_rollouts, to_json
 from rlftsim.rollout.baselines import ConstantVelocity
+from rlftsim.rollout.files import write_rollouts
+from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario import womd_pb2
+from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import write_dataset
 from rlftsim.scenario.tfrecord import write_records
 
@@ -237,3 +240,15 @@ def test_official_files_give_the_official_numbers(shared):
         assert row.pop("scenario_id").startswith("637f")
         assert row == pytest.approx(official["metrics"], abs=1e-5)
         assert buckets == pytest.approx(official["buckets"], abs=1e-5)
+
+
+def test_what_simulate_writes_scores_as_the_evaluated_policy(data, tmp_path):
+    policy = ConstantVelocity()
+    for scenario in SCENARIOS:
+        batch = collate([scenario])
+        write_rollouts(tmp_path / "rollouts", batch, simulate(policy, batch, num_rollouts=2, seed=0))
+    scored = score_rollouts(tmp_path / "rollouts", data, None, CONFIG)
+    evaluated = evaluate(policy, data, tmp_path, EvaluateConfig(num_rollouts=2), name="cv")
+    place = [evaluated.scenario_ids.index(scenario_id) for scenario_id in scored.scenario_ids]
+    for column in SCORE_COLUMNS:
+        np.testing.assert_allclose(scored.values(column), evaluated.values(column)[place], atol=1e-6)

@@ -6,12 +6,14 @@ from pathlib import Path
 
 from rlftsim.experiments.explain_page import explanation_html
 from rlftsim.experiments.explanation import explain
-from rlftsim.experiments.parts import count_progress, run_groups
+from rlftsim.experiments.parts import one_thread
 from rlftsim.experiments.rollout_files import RolloutEntry, find_rollouts, read_states
 from rlftsim.experiments.scenario_source import ScenarioSource, open_scenarios
 from rlftsim.experiments.score import ScoreConfig, check_entries, has_road_edge
+from rlftsim.progress import progress_bar
 from rlftsim.realism import metric_by_name
 from rlftsim.viewer.page import write_text
+from rlftsim.workers import run_tasks
 
 
 def explain_rollouts(
@@ -33,8 +35,8 @@ def explain_rollouts(
     check_entries(entries, source, config, scenarios)
     pages = {out / f"{name}.html": entry for name, entry in _page_names(entries).items()}
     missing = [item for item in pages.items() if not item[0].exists()]
-    with count_progress("explain", len(pages), len(pages) - len(missing), show=show_progress) as advance:
-        run_groups(partial(_write_page, source, config), missing, jobs=config.num_jobs, advance=advance)
+    with progress_bar("explain", len(pages), len(pages) - len(missing), show=show_progress) as advance, one_thread():
+        run_tasks(partial(_write_page, source, config), missing, jobs=config.num_jobs, advance=advance)
     return [page for page in pages if page.exists()]
 
 

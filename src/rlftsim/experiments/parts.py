@@ -5,18 +5,19 @@ Groups are ranges of positions. A finished group is a file under `<name>.parts/`
 """
 
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import pyarrow as pa
+import torch
 from rich.console import Console
 
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.experiments.evaluation import SCHEMA, Evaluation, Provenance, Skipped, join_evaluations
-from rlftsim.experiments.workers import Task, run_in_processes
 from rlftsim.progress import progress_bar
+from rlftsim.workers import Task, run_tasks
 
 SCENARIOS_PER_GROUP = 4
 """What is lost at most, for each process, when a run is interrupted."""
@@ -105,32 +106,19 @@ class ResumableEvaluation:
         missing = [group for group in groups if self._read_part(group) is None]
         total = sum(len(group) for group in groups)
         done = total - sum(len(group) for group in missing)
-        with count_progress(title, total, done, show=show_progress) as advance:
-            run_groups(task, missing, jobs=jobs, advance=advance)
-
-
-def run_groups(task: Task, items: Sequence[object], *, jobs: int, advance: Callable[[int], None]) -> None:
-    """Call `task` for every item, in several processes where there are several jobs and items."""
-    if min(jobs, len(items)) > 1:
-        run_in_processes(task, items, jobs=min(jobs, len(items)), advance=advance)
-        return
-    for item in items:
-        task(item, advance, lambda: False)
+        with progress_bar(title, total, done, show=show_progress) as advance, one_thread():
+            run_tasks(task, missing, jobs=jobs, advance=advance)
 
 
 @contextmanager
-def count_progress(title: str, total: int, done: int, *, show: bool) -> Iterator[Callable[[int], None]]:
-    """The progress bar for work that reports how many units it finished."""
-    if not show:
-        yield lambda count: None
-        return
-    with progress_bar(title, total, done) as advance:
-
-        def advance_by(count: int) -> None:
-            for _ in range(count):
-                advance()
-
-        yield advance_by
+def one_thread() -> Iterator[None]:
+    """As many as in a worker process: the number of processes must not change a result."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def say(message: str) -> None:

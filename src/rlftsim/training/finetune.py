@@ -141,7 +141,7 @@ def finetune(
             _stop_if_diverged(learner, run, config)
             if fabric.is_global_zero and _is_checkpoint_due(learner, config, total):
                 write_checkpoint(run.checkpoints, _progress(learner), _modules(learner), learner.optimizer)
-            advance(f"RMM {values['rmm']:.3f}, KL {values['kl']:.4f}, beta {learner.beta:.3f}")
+            advance(note=f"RMM {values['rmm']:.3f}, KL {values['kl']:.4f}, beta {learner.beta:.3f}")
     run.close()
     if fabric.is_global_zero:
         policy.save_pretrained(run.model, card=card)  # type: ignore[operator]

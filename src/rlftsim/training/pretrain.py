@@ -120,7 +120,7 @@ def pretrain(
             run.log(update + 1, {**values, "seconds": time.perf_counter() - start})
             if fabric.is_global_zero and ((update + 1) % config.checkpoint_every == 0 or update + 1 == total):
                 write_checkpoint(run.checkpoints, Progress(update + 1), {"policy": model}, optimizer)
-            advance(f"loss {values['loss']:.3f}, right {values['accuracy']:.0%}")
+            advance(note=f"loss {values['loss']:.3f}, right {values['accuracy']:.0%}")
     run.close()
     if fabric.is_global_zero:
         model.eval().save_pretrained(run.model, card=card)
