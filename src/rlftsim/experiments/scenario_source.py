@@ -21,8 +21,10 @@ _CACHED_SCENARIOS = 2
 class ScenarioSource(Protocol):
     """Scenarios by id; can be handed to other processes."""
 
-    fingerprint: str
-    """Hash of what is in it."""
+    @property
+    def fingerprint(self) -> str:
+        """Hash of what is in it."""
+        ...
 
     def __contains__(self, scenario_id: object) -> bool: ...
 
