@@ -4,7 +4,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Literal, Protocol
+from typing import Literal, Protocol, runtime_checkable
 
 from rich.console import Console
 from rich.progress import (
@@ -31,6 +31,7 @@ def print_wide(*tables: object) -> None:
         console.print(table)
 
 
+@runtime_checkable
 class Advance(Protocol):
     """Told whenever work is done."""
 

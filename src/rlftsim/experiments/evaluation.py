@@ -8,7 +8,7 @@ import math
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Self
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -200,7 +200,7 @@ class Evaluation:
         with_temporary_name(path, lambda temporary: pq.write_table(table, temporary, compression="zstd"))
 
     @classmethod
-    def read(cls, path: Path) -> Self:
+    def read(cls, path: Path) -> "Evaluation":
         """Read what `write` wrote.
 
         Raises:
