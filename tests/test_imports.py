@@ -90,7 +90,9 @@ def test_a_policy_that_knows_the_metric_would_be_seen(tmp_path, monkeypatch):
     monkeypatch.setattr(f"{__name__}.PACKAGE", tmp_path)
     bad = tmp_path / "policies" / "bad.py"
     bad.parent.mkdir()
-    bad.write_text("from rlftsim.realism import score\nfrom rlftsim.scenario.types import Scenario\nimport rlftsim.cli\n")
+    bad.write_text(
+        "from rlftsim.realism import score\nfrom rlftsim.scenario.types import Scenario\nimport rlftsim.cli\n"
+    )
     assert offences(bad) == ["cli", "realism"]
     teacher = tmp_path / "training" / "teacher.py"
     teacher.parent.mkdir()
