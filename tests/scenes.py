@@ -141,6 +141,27 @@ def junction_map() -> MapFeatures:
     )
 
 
+def bend_map(radius_m: float = 90.0) -> MapFeatures:
+    """A road that winds to the left about (0, radius): no piece lies straight ahead of another, no two are equally far."""
+    angles = np.linspace(-0.71, 1.63, 263)
+
+    def arc(offset_m: float, backwards: bool = False) -> list[tuple[float, float]]:
+        radii = radius_m - offset_m + 1.5 * np.sin(9 * angles)
+        points = np.stack([radii * np.sin(angles), radius_m - radii * np.cos(angles)], -1).tolist()
+        return points[::-1] if backwards else points
+
+    kind = MapFeatureType
+    return polylines(
+        [
+            (kind.LANE_SURFACE_STREET, arc(0.1)),
+            (kind.LANE_SURFACE_STREET, arc(3.7, backwards=True)),
+            (kind.EDGE_BOUNDARY, arc(-2.2)),
+            (kind.EDGE_BOUNDARY, arc(5.8, backwards=True)),
+            (kind.LINE_SOLID_SINGLE_YELLOW, arc(1.9)),
+        ]
+    )
+
+
 def light(lane_id: int, x_m: float, y_m: float, *, red_until: int = 50) -> LightStates:
     """A light on one lane, its stop point relative to the ego: red, and green from a step on."""
     steps = np.arange(TOTAL_STEPS, dtype=np.int32)
@@ -190,6 +211,22 @@ def junction_with_light(scenario_id: str = "junction") -> Scenario:
     return build_scenario(scenario_id, (*TRAFFIC, *turning), junction_map(), light(1, 38.0, 0.2), num_predicted=7)
 
 
+def bend(scenario_id: str = "bend", num_agents: int = 6) -> Scenario:
+    """A bending road with a light, on which nobody goes straight: no bearing is exactly 0 or 180 degrees.
+
+    One agent has gaps, one is first seen at step 7.
+    """
+    movers = (
+        Mover(speed_mps=9.3, turn_rate_radps=0.103),
+        Mover(x_m=17.1, y_m=2.2, heading_rad=0.19, speed_mps=8.1, turn_rate_radps=0.09, missing=(3, 4, 25, 26, 89, 90)),
+        Mover(x_m=30.9, y_m=9.7, heading_rad=-2.78, speed_mps=10.7, turn_rate_radps=-0.11),
+        Mover(ObjectType.PEDESTRIAN, x_m=12.1, y_m=-6.7, heading_rad=0.4, speed_mps=1.3, turn_rate_radps=0.05),
+        Mover(ObjectType.CYCLIST, x_m=-14.9, y_m=-2.3, heading_rad=-0.2, speed_mps=4.7, turn_rate_radps=-0.03),
+        Mover(x_m=-9.2, y_m=4.6, heading_rad=1.2, speed_mps=2.1, turn_rate_radps=0.3, missing=tuple(range(7))),
+    )
+    return build_scenario(scenario_id, movers[:num_agents], bend_map(), light(1, 24.0, 3.2), num_predicted=5)
+
+
 def lone_agent(scenario_id: str = "lone") -> Scenario:
     """The ego and nobody else."""
     return build_scenario(scenario_id, TRAFFIC[:1])
@@ -208,7 +245,8 @@ def crowd(scenario_id: str = "crowd", num_agents: int = 128) -> Scenario:
         Mover(kinds[k % 3], *rng.uniform((-50, -30, -3, 0, -0.1), (80, 30, 3, 9, 0.1)).tolist())
         for k in range(num_agents - 1)
     ]
-    return build_scenario(scenario_id, (TRAFFIC[0], *others), num_predicted=7)
+    ego = Mover(speed_mps=9.3, turn_rate_radps=0.04)
+    return build_scenario(scenario_id, (ego, *others), num_predicted=7)
 
 
 def with_gaps(scenario_id: str = "gaps") -> Scenario:

@@ -13,10 +13,13 @@ from rlftsim.experiments import evaluate as module
 from rlftsim.experiments.evaluate import EvaluateConfig, Evaluation, evaluate
 from rlftsim.experiments.evaluation import SCORE_COLUMNS
 from rlftsim.experiments.fingerprint import fingerprint_policy
+from rlftsim.policies.smart.config import SmartConfig
+from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.realism import score
 from rlftsim.realism.from_rollouts import logged_states
 from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
+from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
 
 CONFIG = EvaluateConfig(num_rollouts=4, rollouts_per_pass=2)
 
@@ -108,6 +111,20 @@ def test_neither_passes_nor_processes_change_a_number(data, tmp_path):
     assert same(results[0], results[1])
     assert same(results[0], results[2])
     assert not multiprocessing.active_children()
+
+
+def test_a_model_with_weights_is_evaluated_in_processes_and_left_as_it_was(data, tmp_path):
+    scenarios = [scenes.straight_road(), scenes.crowd(num_agents=20)]
+    vocabulary, _ = build_vocabulary(scenarios, TokensConfig(num_tokens=16, num_map_prototypes=8))
+    policy = SmartPolicy(
+        SmartConfig(dim=16, num_heads=2, head_dim=8, num_map_layers=1, num_decoder_layers=1, num_frequencies=4),
+        vocabulary,
+    ).train()
+    config = replace(CONFIG, num_rollouts=2)
+    alone = evaluate(policy, data, tmp_path, config, name="alone")
+    assert same(alone, evaluate(policy, data, tmp_path, replace(config, jobs=2), name="together"))
+    assert policy.training
+    assert all(weight.requires_grad for weight in policy.parameters())
 
 
 def test_an_evaluation_comes_back_from_its_file(data, tmp_path):

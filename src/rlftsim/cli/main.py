@@ -1,56 +1,99 @@
-"""Reads the command line, runs the verb, and turns a user's mistakes into one line."""
+"""Reads the command line, runs the verb, and turns a user's mistakes into one line.
 
+Only the verb that is asked for is imported: nobody waits for torch to read a help text.
+"""
+
+import difflib
+import importlib
 import sys
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Any
 
-import tyro
-
-from rlftsim.cli.data import Convert, Data, Synthesize
-from rlftsim.cli.demo import Demo
-from rlftsim.cli.doctor import Doctor
-from rlftsim.cli.results import Compare, Evaluate
-from rlftsim.cli.simulate import Simulate
-from rlftsim.cli.train import Finetune, Pretrain, Tokens
+from rlftsim import __version__
 from rlftsim.errors import RlftsimError
 
-Command = (
-    Annotated[Demo, tyro.conf.subcommand("demo")]
-    | Annotated[Convert, tyro.conf.subcommand("convert")]
-    | Annotated[Data, tyro.conf.subcommand("data")]
-    | Annotated[Synthesize, tyro.conf.subcommand("synthesize")]
-    | Annotated[Tokens, tyro.conf.subcommand("tokens")]
-    | Annotated[Pretrain, tyro.conf.subcommand("pretrain")]
-    | Annotated[Finetune, tyro.conf.subcommand("finetune")]
-    | Annotated[Simulate, tyro.conf.subcommand("simulate")]
-    | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
-    | Annotated[Compare, tyro.conf.subcommand("compare")]
-    | Annotated[Doctor, tyro.conf.subcommand("doctor")]
-)
+VERBS = {
+    "demo": ("rlftsim.cli.demo", "Demo"),
+    "doctor": ("rlftsim.cli.doctor", "Doctor"),
+    "convert": ("rlftsim.cli.data", "Convert"),
+    "data": ("rlftsim.cli.data", "Data"),
+    "synthesize": ("rlftsim.cli.data", "Synthesize"),
+    "tokens": ("rlftsim.cli.train", "Tokens"),
+    "pretrain": ("rlftsim.cli.train", "Pretrain"),
+    "finetune": ("rlftsim.cli.train", "Finetune"),
+    "simulate": ("rlftsim.cli.simulate", "Simulate"),
+    "evaluate": ("rlftsim.cli.results", "Evaluate"),
+    "compare": ("rlftsim.cli.results", "Compare"),
+}
+"""Module and class of each verb, in the order a newcomer meets them."""
 
-DESCRIPTION = """Traffic agents that behave like real road users: read WOMD, pre-train a next-token traffic model, fine-tune it \
-closed-loop against the official realism meta-metric, measure it.
+OVERVIEW = f"""rlftsim {__version__}: traffic agents that behave like real road users.
 
-Start with `rlftsim demo`: the whole pipeline on the synthetic scenarios that ship with the package."""
+usage: rlftsim VERB ...      rlftsim VERB --help explains a verb
+
+  demo         see the whole pipeline work on synthetic scenarios, in minutes, on a CPU
+  doctor       look at this machine and say what to do about what is wrong
+
+  convert      WOMD tfrecords to a portable data set
+  data         check a data set, or say what is in it
+  synthesize   make synthetic scenarios with SUMO
+
+  tokens       build a vocabulary of motion and map tokens
+  pretrain     train a model to predict the next motion token
+  finetune     fine-tune a model closed-loop with a realism reward
+  simulate     roll scenarios out with a model
+
+  evaluate     measure a model with the official realism meta-metric
+  compare      compare two evaluations scenario by scenario
+"""
 
 INTERRUPTED = 130
+USER_MISTAKE = 2
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command line; returns the exit status."""
-    command = tyro.cli(
-        Command, args=arguments, prog="rlftsim", description=DESCRIPTION, config=(tyro.conf.OmitSubcommandPrefixes,)
-    )
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    if not words or words[0] in ("-h", "--help", "help"):
+        print(OVERVIEW, end="")
+        return 0 if words else USER_MISTAKE
+    if words[0] in ("-V", "--version"):
+        print(f"rlftsim {__version__}")
+        return 0
+    if words[0] not in VERBS:
+        near = difflib.get_close_matches(words[0], VERBS, 1)
+        hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(VERBS)}."
+        print(f"rlftsim: no verb {words[0]!r}: {hint}", file=sys.stderr)
+        return USER_MISTAKE
+    return _run(words)
+
+
+def parse(words: Sequence[str]) -> Any:
+    """The verb of a command line with its settings; has a method `run`.
+
+    Raises:
+        SystemExit: the words make no sense, or ask for help; what was wrong has been printed.
+    """
+    import tyro
+
+    module, name = VERBS[words[0]]
+    verb = getattr(importlib.import_module(module), name)
+    config = (tyro.conf.OmitSubcommandPrefixes,)
+    return tyro.cli(verb, args=list(words[1:]), prog=f"rlftsim {words[0]}", config=config)
+
+
+def _run(words: list[str]) -> int:
     try:
-        return command.run()
+        return parse(words).run()
     except RlftsimError as error:
         print(f"rlftsim: {error}", file=sys.stderr)
-        return 2
+        return USER_MISTAKE
     except KeyboardInterrupt:
         print("\nrlftsim: stopped. The same command goes on where it was.", file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:
         return 0
     except OSError as error:
-        print(f"rlftsim: {error.strerror or error}: {error.filename or 'no file named'}", file=sys.stderr)
+        where = f": {error.filename}" if error.filename else ""
+        print(f"rlftsim: {error.strerror or error}{where}", file=sys.stderr)
         return 1

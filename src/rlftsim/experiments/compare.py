@@ -107,7 +107,7 @@ class Comparison:
         """How many scenarios are compared, and how many are not."""
         alone = [(self.num_only_a, self.name_a), (self.num_only_b, self.name_b)]
         left_out = "".join(f", {count} only in {name} left out" for count, name in alone if count)
-        return f"{self.num_paired} scenarios in both{left_out}"
+        return f"{self.num_paired} scenario{'s' if self.num_paired != 1 else ''} in both{left_out}"
 
 
 def compare(a: Evaluation, b: Evaluation, *, alpha: float = 0.05) -> Comparison:
@@ -154,7 +154,8 @@ def compare_paired(column: str, a: np.ndarray, b: np.ndarray, *, alpha: float = 
     a, b = a[known], b[known]
     count = len(a)
     if count == 0:
-        return PairedDifference(column, 0, *[math.nan] * 4, (math.nan, math.nan), math.nan, alpha)
+        nan = math.nan
+        return PairedDifference(column, 0, nan, nan, nan, nan, (nan, nan), nan, alpha)
     gain = b - a
     mean, error, p_value, half = float(gain.mean()), math.nan, math.nan, math.nan
     if count > 1:

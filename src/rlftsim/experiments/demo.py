@@ -30,17 +30,16 @@ from rlftsim.rollout.policy import Policy
 from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import ScenarioDataset
-from rlftsim.scenario.types import CURRENT_STEP, Scenario
+from rlftsim.scenario.types import Scenario
 from rlftsim.tokens.clustering import build_vocabulary
 from rlftsim.tokens.vocabulary import Vocabulary
 from rlftsim.training.finetune import finetune
 from rlftsim.training.pretrain import pretrain
 from rlftsim.training.run_folder import describe_environment, read_metrics
 from rlftsim.viewer.chart import Chart, Curve
-from rlftsim.viewer.overlap import compute_overlap
 from rlftsim.viewer.page import Animation, Panel
 from rlftsim.viewer.picture import to_png
-from rlftsim.viewer.scene import Trajectories, build_scene, logged_trajectories, rollout_trajectories
+from rlftsim.viewer.scene import build_scene, logged_trajectories, rollout_trajectories
 
 BASE, TUNED, FLOOR, CEILING = "base", "fine-tuned", "constant velocity", "oracle"
 
@@ -266,26 +265,13 @@ def _animations(
 
 
 def _animation(scenario: Scenario, contestants: dict[str, SmartPolicy], gain: float, config: DemoConfig) -> Animation:
-    panels = [Panel("logged", _with_overlaps(scenario, logged_trajectories(scenario)))]
+    scene = build_scene(scenario)
+    panels = [Panel("logged", logged_trajectories(scenario).with_overlaps(scene.agents))]
     batch = collate([scenario])
     for name, policy in contestants.items():
         rollouts = simulate(policy.eval(), batch, num_rollouts=config.rollouts_shown, seed=config.evaluate.seed)
-        panels.append(Panel(name, _with_overlaps(scenario, rollout_trajectories(scenario, rollouts, row=0))))
+        panels.append(Panel(name, rollout_trajectories(scenario, rollouts, row=0).with_overlaps(scene.agents)))
     title = f"Scenario {scenario.scenario_id}"
     return Animation(
         title, build_scene(scenario), panels, caption=f"RMM of the fine-tuned model minus the base model: {gain:+.3f}"
     )
-
-
-def _with_overlaps(scenario: Scenario, trajectories: Trajectories) -> Trajectories:
-    """The same trajectories with overlapping boxes marked; agents that overlap in the record from the start are not."""
-    size = scenario.tracks.size[scenario.simulated_indices, CURRENT_STEP]
-    overlap = compute_overlap(
-        trajectories.position,
-        trajectories.heading,
-        size[:, 0],
-        size[:, 1],
-        trajectories.valid,
-        ignore_from=CURRENT_STEP,
-    )
-    return Trajectories(trajectories.position, trajectories.heading, trajectories.valid, collides=overlap)

@@ -118,8 +118,8 @@ def simulate_states(
 
 
 def _join_passes(passes: Sequence[SimulatedStates]) -> SimulatedStates:
-    fields = (torch.cat([getattr(p, axis) for p in passes]) for axis in ("x", "y", "z", "heading"))
-    return SimulatedStates(passes[0].object_id, *fields)
+    x, y, z, heading = (torch.cat([getattr(p, axis) for p in passes]) for axis in ("x", "y", "z", "heading"))
+    return SimulatedStates(passes[0].object_id, x, y, z, heading)
 
 
 @dataclass(frozen=True, eq=False)

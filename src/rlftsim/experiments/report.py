@@ -26,7 +26,7 @@ class Estimate:
     """95 %; None = mean ± 1.96 standard errors."""
 
     @classmethod
-    def of(cls, values: Sequence[float] | np.ndarray) -> "Estimate":
+    def of(cls, values: Sequence[float] | Sequence[int] | np.ndarray) -> "Estimate":
         """Mean and standard error of one value per scenario; values that are not finite are left out."""
         finite = np.asarray(values, float)
         finite = finite[np.isfinite(finite)]
@@ -75,7 +75,7 @@ class PairedComparison:
     num_scenarios: int
     metric: str = "RMM"
     test: str = "paired t-test"
-    differences: Sequence[float] = ()
+    differences: Sequence[float] | np.ndarray = ()
     """One per scenario; drawn where given."""
     verdict: str = ""
     """A sentence; empty = written from the interval."""
@@ -323,12 +323,12 @@ def _difference_svg(comparison: PairedComparison) -> str:
     parts = []
     ticks = nice_ticks(low, high, 6)
     for tick in ticks:
-        label = format_tick(tick, ticks[1] - ticks[0] if len(ticks) > 1 else 1)
+        label = format_tick(tick, ticks[1] - ticks[0] if len(ticks) > 1 else 1.0)
         parts.append(f'<path class="tick" d="M{across(tick):.1f} {base}v5"/>')
         parts.append(f'<text x="{across(tick):.1f}" y="{base + 18}" text-anchor="middle">{label}</text>')
     parts.append(f'<path class="axis" d="M{margin} {base}H{width - margin}"/>')
-    parts.append(f'<path class="zero" d="M{across(0):.1f} 4V{base}"/>')
-    for value, height in zip(dots, _stacked(np.array([across(v) for v in dots]), diameter=7)):
+    parts.append(f'<path class="zero" d="M{across(0.0):.1f} 4V{base}"/>')
+    for value, height in zip(dots, _stacked(np.array([across(v) for v in dots]), diameter=7.0)):
         colour = "var(--good)" if value > 0 else "var(--bad)" if value < 0 else "var(--muted)"
         y = 70 - min(height * 7, 62)
         parts.append(f'<circle cx="{across(value):.1f}" cy="{y}" r="3.2" fill="{colour}" opacity=".65"/>')

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from rlftsim.errors import RlftsimError
 from rlftsim.geometry import rotate, wrap_angle
 from rlftsim.goals.types import Goals
-from rlftsim.rollout.edge_scenes import edge_scenes, move_scenario
+from rlftsim.rollout.edge_scenes import EXACT_TURN_RAD, edge_scenes, move_scenario, place_on_grid
 from rlftsim.rollout.policy import DecisionDistribution, Policy, Sampling
 from rlftsim.rollout.simulate import simulate
 from rlftsim.rollout.types import AgentStates, Rollouts
@@ -35,7 +35,8 @@ POSE_TOLERANCE_M = 1e-3
 MONTE_CARLO_DRAWS = 4096
 MONTE_CARLO_ERRORS = 5.0
 """Standard errors that a Monte Carlo mean may be off."""
-TURN_RAD, SHIFT_M = 0.7, (137.0, -52.0)
+LEAD_TURN_RATE_RADPS = 0.2
+SHIFT_M = (137.0, -52.0)
 
 Outcome = Literal["passed", "failed", "not applicable"]
 
@@ -203,19 +204,21 @@ def _gap(a: Tensor, b: Tensor) -> float:
 
 
 def _lead_some(batch: ScenarioBatch, stride: int) -> Callable[[object, int], AgentStates]:
-    """A `force`: the first agent is led throughout, every third from the second on for two seconds; straight on."""
+    """A `force`: the first agent is led throughout, every third from the second on for two seconds; along arcs."""
     now = CURRENT_STEP
     position, velocity, heading = batch.position[:, :, now], batch.velocity[:, :, now], batch.heading[:, :, now]
     index = torch.arange(batch.agent_mask.shape[1], device=batch.device)
 
     def force(state: object, step: int) -> AgentStates:
         time = torch.arange(step + 1, step + stride + 1, device=batch.device) * STEP_S
-        path = position[:, :, None] + velocity[:, :, None] * time[:, None]
+        turn = LEAD_TURN_RATE_RADPS * time
+        way = rotate(velocity[:, :, None] * time[:, None], (turn / 2).expand(*heading.shape, stride))
+        path, towards = position[:, :, None] + way, wrap_angle(heading[:, :, None] + turn)
         led = batch.agent_mask & ((index == 0) | ((index % 3 == 1) & (step < 20)))
         shape = (-1, NUM_ROLLOUTS, -1, stride)
         return AgentStates(
             path[:, None].expand(*shape, 2),
-            heading[:, None, :, None].expand(shape),
+            towards[:, None].expand(shape),
             led[:, None, :, None].expand(shape),
         )
 
@@ -488,14 +491,15 @@ def frozen_weights_say_the_same(subject: _Subject) -> str:
 def turned_and_shifted_scenes_score_alike(subject: _Subject) -> str:
     """Scenarios and rollouts turned and shifted together have the same scores."""
     gaps = {}
-    for what, turn in (("shifted", 0.0), ("turned by 90 degrees", math.pi / 2), ("turned by 0.7 rad", TURN_RAD)):
-        moved = [move_scenario(s, turn, SHIFT_M) for s in subject.scenarios]
+    still = replace(subject, scenarios=tuple(place_on_grid(s) for s in subject.scenarios))
+    turns = (("shifted", 0.0), ("turned by 90 degrees", math.pi / 2), ("turned by 53.13 degrees", EXACT_TURN_RAD))
+    for what, turn in turns:
+        moved = [move_scenario(s, turn, SHIFT_M) for s in still.scenarios]
         batch = subject.collate(moved)
-        offset = torch.from_numpy(_offsets(subject.scenarios, moved)).to(subject.device)
-        # forced agents are scored where their decisions are, so they are moved too
-        for rollouts in (subject.rollouts, subject.steered):
+        offset = torch.from_numpy(_offsets(still.scenarios, moved)).to(subject.device)
+        for rollouts in (still.rollouts, still.steered):
             scored = subject.log_prob(batch, _move_rollouts(rollouts, turn, offset))
-            gaps[what] = max(gaps.get(what, 0.0), _gap(scored, subject.log_prob(subject.batch, rollouts)))
+            gaps[what] = max(gaps.get(what, 0.0), _gap(scored, subject.log_prob(still.batch, rollouts)))
     worst = max(gaps, key=lambda name: gaps[name])
     return _within(gaps[worst], SCORE_TOLERANCE, f"largest gap ({worst})")
 

@@ -6,6 +6,9 @@ import numpy as np
 
 from rlftsim.scenario.types import CURRENT_STEP, LaneTopology, LightStates, MapFeatures, Scenario, Tracks
 
+EXACT_TURN_RAD = float(np.arctan2(4.0, 3.0))
+"""Sine 4/5, cosine 3/5."""
+_GRID_M = 5 / 4096
 _NO_LIGHTS = LightStates(
     np.zeros(0, np.int32), np.zeros(0, np.int64), np.zeros(0, np.int8), np.zeros((0, 3), np.float32)
 )
@@ -38,6 +41,25 @@ def move_scenario(scenario: Scenario, turn_rad: float, shift_m: tuple[float, flo
         tracks=replace(tracks, position=moved(tracks.position), heading=heading.astype(np.float32), velocity=velocity),
         map_features=replace(features, points=moved(features.points)),
         lights=replace(lights, stop_point=moved(lights.stop_point)),
+    )
+
+
+def place_on_grid(scenario: Scenario) -> Scenario:
+    """The same scenario at the world's origin, coordinates rounded to 5/4096 m (1.2 mm).
+
+    Such coordinates stay exact in float32 when they are turned by 90 degrees or by `EXACT_TURN_RAD` and shifted by some
+    hundreds of whole metres, so that what a policy makes of them differs by the policy's own rounding alone.
+    """
+    central = move_scenario(scenario, 0.0, (-float(scenario.origin[0]), -float(scenario.origin[1])))
+
+    def rounded(points: np.ndarray) -> np.ndarray:
+        return (np.round(points / _GRID_M) * _GRID_M).astype(np.float32)
+
+    return replace(
+        central,
+        tracks=replace(central.tracks, position=rounded(central.tracks.position)),
+        map_features=replace(central.map_features, points=rounded(central.map_features.points)),
+        lights=replace(central.lights, stop_point=rounded(central.lights.stop_point)),
     )
 
 

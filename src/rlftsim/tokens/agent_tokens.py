@@ -5,7 +5,6 @@ K is 18 for a whole scenario, 2 where only the history is recorded. The rules ar
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import torch
 from jaxtyping import Bool, Float, Int64
@@ -13,6 +12,7 @@ from torch import Tensor
 
 from rlftsim.geometry import box_corners, pose_of_corners, rotate, wrap_angle
 from rlftsim.scenario.batch import ScenarioBatch, collate
+from rlftsim.scenario.derived import derived
 from rlftsim.scenario.types import CURRENT_STEP, STEP_S, Scenario
 from rlftsim.tokens.vocabulary import CLASS_BOXES_M, STEPS_PER_TOKEN, Vocabulary, class_of_type
 
@@ -196,8 +196,8 @@ def tokenize_agents(batch: ScenarioBatch, vocabulary: Vocabulary) -> AgentTokens
     return AgentTokens(**{name: padded(name) for name in AgentTokens.__dataclass_fields__})
 
 
-@lru_cache(maxsize=4096)
+@derived
 def _tokenize_scenario(scenario: Scenario, vocabulary: Vocabulary) -> AgentTokens:
-    """Tokens of one scenario on the CPU; cached by the identity of both."""
+    """Tokens of one scenario on the CPU; remembered with the scenario."""
     batch = collate([scenario])
     return tokenize_tracks(clean_tracks(batch), batch.object_type, vocabulary.to("cpu"))

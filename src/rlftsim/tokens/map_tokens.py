@@ -4,7 +4,6 @@ M map tokens. The rules are those of the public SMART code (polylines, their kin
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 import torch
@@ -13,6 +12,7 @@ from torch import Tensor
 
 from rlftsim.geometry import rotate
 from rlftsim.scenario.batch import ScenarioBatch
+from rlftsim.scenario.derived import derived
 from rlftsim.scenario.types import CURRENT_STEP, LightState, MapFeatures, MapFeatureType, Scenario
 
 SPACING_M = 0.5
@@ -105,9 +105,9 @@ def _nearest_prototype(local: Float[Tensor, "B M 3 2"], prototypes: Float[Tensor
     )
 
 
-@lru_cache(maxsize=4096)
+@derived
 def split_map(scenario: Scenario) -> MapPieces:
-    """Cut a scenario's map into pieces of up to 5 m. Cached by the scenario's identity.
+    """Cut a scenario's map into pieces of up to 5 m. Remembered with the scenario.
 
     A scenario without any usable polyline gets one dummy piece far away from everything.
     """

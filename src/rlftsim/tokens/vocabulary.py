@@ -46,6 +46,10 @@ class Vocabulary:
     origin: str = ""
     """The command, data and seed that made it."""
 
+    def __deepcopy__(self, memo: object) -> "Vocabulary":
+        """Itself: it never changes, and what was derived with it stays known to a copy of a policy."""
+        return self
+
     @property
     def num_tokens(self) -> int:
         """V."""

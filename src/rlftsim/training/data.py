@@ -1,8 +1,29 @@
 """Which scenarios an update sees: a function of the seed and the update alone, so that resuming needs nothing else."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
+from rlftsim.errors import DataError
 from rlftsim.rollout.noise import derive_seed
+from rlftsim.scenario.batch import ScenarioBatch, collate
+from rlftsim.scenario.types import Scenario
+
+
+def batch_with_futures(scenarios: Sequence[Scenario], indices: Sequence[int]) -> ScenarioBatch:
+    """Batch of some scenarios.
+
+    Raises:
+        DataError: one of them withholds its future, so nothing can be learned from it.
+    """
+    chosen = [scenarios[i] for i in indices]
+    for scenario in chosen:
+        if not scenario.has_future:
+            raise DataError(
+                f"scenario {scenario.scenario_id} records {scenario.num_steps} steps, its future is withheld: "
+                "train on the training split."
+            )
+    return collate(chosen)
 
 
 def scenarios_of_update(update: int, batch_size: int, num_scenarios: int, seed: int) -> list[int]:

@@ -24,10 +24,10 @@ from rlftsim.rollout.noise import derive_seed
 from rlftsim.rollout.policy import Policy
 from rlftsim.rollout.simulate import simulate
 from rlftsim.rollout.types import Rollouts
-from rlftsim.scenario.batch import ScenarioBatch, collate
+from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import Scenario
 from rlftsim.training.checkpoint import Progress, newest_checkpoint, read_checkpoint, write_checkpoint
-from rlftsim.training.data import scenarios_of_update
+from rlftsim.training.data import batch_with_futures, scenarios_of_update
 from rlftsim.training.parallel import DeviceConfig, add_up, add_up_gradients, own_share, start_fabric
 from rlftsim.training.policy_gradient import Reduction, masked_sum, policy_gradient_loss, rollout_log_prob
 from rlftsim.training.reference import KlConfig, adapt_beta, move_reference
@@ -135,7 +135,7 @@ def finetune(
             chosen = own_share(
                 scenarios_of_update(learner.update, config.batch_size, len(scenarios), config.seed), fabric
             )
-            batch = collate([scenarios[i] for i in chosen]).to(fabric.device)
+            batch = batch_with_futures(scenarios, chosen).to(fabric.device)
             values = update_policy(learner, batch, config, fabric)
             run.log(learner.update, values)
             _stop_if_diverged(learner, run, config)

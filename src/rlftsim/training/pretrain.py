@@ -16,10 +16,10 @@ from torch.nn import functional
 from rlftsim.errors import ConfigError
 from rlftsim.progress import progress_bar
 from rlftsim.rollout.noise import derive_seed
-from rlftsim.scenario.batch import ScenarioBatch, collate
+from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import CURRENT_STEP, Scenario
 from rlftsim.training.checkpoint import Progress, newest_checkpoint, read_checkpoint, write_checkpoint
-from rlftsim.training.data import scenarios_of_update
+from rlftsim.training.data import batch_with_futures, scenarios_of_update
 from rlftsim.training.parallel import DeviceConfig, add_up, add_up_gradients, own_share, start_fabric
 from rlftsim.training.run_folder import RunFolder
 
@@ -156,7 +156,7 @@ def _update(
     sums = torch.zeros(4, device=fabric.device)  # loss, right, right among the best five, predictions
     chosen = own_share(scenarios_of_update(update, config.batch_size, len(scenarios), config.seed), fabric)
     for micro in _pieces(chosen, config.micro_batch_size):
-        batch = collate([scenarios[i] for i in micro]).to(fabric.device)
+        batch = batch_with_futures(scenarios, micro).to(fabric.device)
         trained = trained_agents(batch, config, derive_seed(config.seed, "agents", update))
         with fabric.autocast():
             prediction = model.teacher_forced(batch, trained)

@@ -17,6 +17,8 @@ LEFT, RIGHT, TOP, BOTTOM = 72, 14, 12, 44
 MAX_DRAWN_POINTS = 600
 MIN_POINTS_TO_SMOOTH = 12
 NUM_SERIES_COLOURS = 4
+DRAWN_MAGNITUDE = 1e30
+"""Values further from zero are left out as if not finite; on a logarithmic axis also those closer to it than one over this."""
 
 
 @dataclass(frozen=True)
@@ -24,8 +26,8 @@ class Curve:
     """Values over updates (or steps, or epochs). Points that are not finite leave a gap."""
 
     name: str
-    x: Sequence[float]
-    y: Sequence[float]
+    x: Sequence[float] | Sequence[int] | np.ndarray
+    y: Sequence[float] | Sequence[int] | np.ndarray
 
     def __post_init__(self) -> None:
         if len(self.x) != len(self.y):
@@ -57,14 +59,17 @@ class Axes:
     y_high: float
     log_y: bool
 
-    def horizontal(self, x: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    def horizontal(self, x: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
         """SVG coordinate of x."""
-        return LEFT + (np.asarray(x, float) - self.x_low) / (self.x_high - self.x_low) * (WIDTH - LEFT - RIGHT)
+        return np.asarray(
+            LEFT + (np.asarray(x, float) - self.x_low) / (self.x_high - self.x_low) * (WIDTH - LEFT - RIGHT)
+        )
 
-    def vertical(self, y: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    def vertical(self, y: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
         """SVG coordinate of y."""
         height = np.log10(y) if self.log_y else np.asarray(y, float)
-        return HEIGHT - BOTTOM - (height - self.y_low) / (self.y_high - self.y_low) * (HEIGHT - TOP - BOTTOM)
+        share = (height - self.y_low) / (self.y_high - self.y_low)
+        return np.asarray(HEIGHT - BOTTOM - share * (HEIGHT - TOP - BOTTOM))
 
 
 def chart_html(chart: Chart) -> str:
@@ -77,6 +82,7 @@ def chart_html(chart: Chart) -> str:
     axes = _axes(drawn, chart)
     parts = [_frame_svg(axes, chart)]
     parts += [_curve_svg(axes, x, y, colour_of(index)) for index, (_, x, y) in enumerate(drawn)]
+    parts.append(_reference_svg(axes, chart))
     hover = embed_json([_hover_points(axes, name, x, y, index) for index, (name, x, y) in enumerate(drawn)])
     return (
         f'<figure class="chart">{title}{_legend_html(chart)}'
@@ -86,11 +92,21 @@ def chart_html(chart: Chart) -> str:
 
 
 def smooth(values: Float[np.ndarray, "n"], window: int) -> Float[np.ndarray, "n"]:
-    """Centred running mean. Near the ends the window shrinks on both sides, so a straight line stays a straight line."""
-    index = np.arange(len(values))
-    half = np.minimum(window // 2, np.minimum(index, index[::-1]))
-    sums = np.concatenate([[0.0], np.cumsum(values)])
-    return (sums[index + half + 1] - sums[index - half]) / (2 * half + 1)
+    """At each point the straight line fitted to its neighbours: inside a running mean, at the ends without their bias or jumps.
+
+    Args:
+        values: at equal distances.
+        window: how many points are fitted; near the ends they lie mostly on one side.
+    """
+    smoothed = np.array(values, float)
+    window = min(window, len(smoothed))
+    for i in range(len(smoothed)):
+        start = min(max(i - window // 2, 0), len(smoothed) - window)
+        near = np.arange(start, start + window)
+        offset = near - near.mean()
+        slope = offset @ values[near] / max(float(offset @ offset), 1.0)
+        smoothed[i] = values[near].mean() + slope * (i - near.mean())
+    return smoothed
 
 
 def colour_of(index: int) -> str:
@@ -112,21 +128,26 @@ def format_tick(value: float, step: float) -> str:
     largest = max(abs(value), step)
     if largest >= 1e5 or step < 1e-5:
         return f"{value:.3g}".replace("-", "−")
-    digits = max(0, -math.floor(math.log10(step) + 1e-9))
-    if digits and abs(round(step, digits) - step) > 1e-9 * step:
-        digits += 1
+    digits = next((d for d in range(8) if abs(round(step, d) - step) < 1e-6 * step), 8)
     return f"{value:,.{digits}f}".replace("-", "−").replace(",", "\u202f")
 
 
 def _drawable(curve: Curve, log_y: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Finite (and, on a logarithmic axis, positive) points, averaged over neighbours where there are very many."""
+    """Points that can be drawn, averaged over neighbours where there are very many."""
     x, y = np.asarray(curve.x, float), np.asarray(curve.y, float)
-    kept = np.isfinite(x) & np.isfinite(y) & ((y > 0) if log_y else True)
+    kept = np.isfinite(x) & (np.abs(y) < DRAWN_MAGNITUDE) & ((y > 1 / DRAWN_MAGNITUDE) if log_y else True)
     x, y = x[kept], y[kept]
     if len(x) <= MAX_DRAWN_POINTS:
         return x, y
     groups = np.array_split(np.arange(len(x)), MAX_DRAWN_POINTS)
     return np.array([x[g].mean() for g in groups]), np.array([y[g].mean() for g in groups])
+
+
+def _smoothed(y: np.ndarray, log_y: bool) -> np.ndarray:
+    """Smoothed on the scale on which it is drawn, and never beyond the raw values: a rate does not fall below zero."""
+    height = np.log10(y) if log_y else y
+    smoothed = np.clip(smooth(height, _window(len(y))), height.min(), height.max())
+    return 10**smoothed if log_y else smoothed
 
 
 def _window(num_points: int) -> int:
@@ -140,7 +161,7 @@ def _axes(drawn: list[tuple[str, np.ndarray, np.ndarray]], chart: Chart) -> Axes
     heights = []
     for _, _, y in drawn:
         if len(y):
-            heights += [np.quantile(y, 0.02), np.quantile(y, 0.98), *smooth(y, _window(len(y)))]
+            heights += [np.quantile(y, 0.02), np.quantile(y, 0.98), *_smoothed(y, chart.log_y)]
     if chart.reference:
         heights.append(chart.reference[1])
     y = np.array([h for h in heights if h > 0]) if chart.log_y else np.array(heights)
@@ -154,11 +175,9 @@ def _axes(drawn: list[tuple[str, np.ndarray, np.ndarray]], chart: Chart) -> Axes
 
 
 def _frame_svg(axes: Axes, chart: Chart) -> str:
-    """Grid, tick labels, axis labels, reference line."""
+    """Grid, tick labels, axis labels."""
     bottom, right = HEIGHT - BOTTOM, WIDTH - RIGHT
-    parts = [
-        f'<clipPath id="plot"><rect x="{LEFT}" y="{TOP}" width="{right - LEFT}" height="{bottom - TOP}"/></clipPath>'
-    ]
+    parts = []
     for value, label in _vertical_ticks(axes):
         y = float(axes.vertical(np.array(value)))
         parts.append(f'<path class="grid" d="M{LEFT} {y:.1f}H{right}"/>')
@@ -166,7 +185,7 @@ def _frame_svg(axes: Axes, chart: Chart) -> str:
     ticks = nice_ticks(axes.x_low, axes.x_high, 5)
     for value in ticks:
         x = float(axes.horizontal(np.array(value)))
-        label = format_tick(value, ticks[1] - ticks[0] if len(ticks) > 1 else 1)
+        label = format_tick(value, ticks[1] - ticks[0] if len(ticks) > 1 else 1.0)
         parts.append(f'<path class="tick" d="M{x:.1f} {bottom}v5"/>')
         parts.append(f'<text x="{x:.1f}" y="{bottom + 18}" text-anchor="middle">{label}</text>')
     parts.append(f'<path class="axis" d="M{LEFT} {bottom}H{right}"/>')
@@ -176,7 +195,7 @@ def _frame_svg(axes: Axes, chart: Chart) -> str:
     )
     turn = f"translate(13 {(TOP + bottom) / 2}) rotate(-90)"
     parts.append(f'<text class="label" transform="{turn}" text-anchor="middle">{escape(chart.y_label)}</text>')
-    return "".join(parts) + _reference_svg(axes, chart)
+    return "".join(parts)
 
 
 def _reference_svg(axes: Axes, chart: Chart) -> str:
@@ -186,7 +205,7 @@ def _reference_svg(axes: Axes, chart: Chart) -> str:
     y = float(axes.vertical(np.array(height)))
     return (
         f'<path class="reference" d="M{LEFT} {y:.1f}H{WIDTH - RIGHT}"/>'
-        f'<text x="{WIDTH - RIGHT - 4}" y="{y - 5:.1f}" text-anchor="end">{escape(name)}</text>'
+        f'<text class="halo" x="{WIDTH - RIGHT - 4}" y="{y - 5:.1f}" text-anchor="end">{escape(name)}</text>'
     )
 
 
@@ -194,11 +213,12 @@ def _vertical_ticks(axes: Axes) -> list[tuple[float, str]]:
     """Values to mark on the vertical axis, with their labels."""
     if not axes.log_y:
         ticks = nice_ticks(axes.y_low, axes.y_high, 5)
-        step = ticks[1] - ticks[0] if len(ticks) > 1 else 1
+        step = ticks[1] - ticks[0] if len(ticks) > 1 else 1.0
         return [(v, format_tick(v, step)) for v in ticks]
-    multiples = (1,) if axes.y_high - axes.y_low > 2 else (1, 2, 5)
     decades = range(math.floor(axes.y_low), math.ceil(axes.y_high) + 1)
-    marks = [m * 10.0**d for d in decades for m in multiples if axes.y_low <= math.log10(m * 10.0**d) <= axes.y_high]
+    multiples = (1,) if axes.y_high - axes.y_low > 2 else (1, 2, 5)
+    exponents = [(m, d) for d in decades[:: max(1, len(decades) // 5)] for m in multiples]
+    marks = [m * 10.0**d for m, d in exponents if axes.y_low <= math.log10(m) + d <= axes.y_high]
     return [(v, f"{v:.3g}".replace("-", "−")) for v in marks]
 
 
@@ -207,16 +227,19 @@ def _curve_svg(axes: Axes, x: np.ndarray, y: np.ndarray, colour: str) -> str:
     if not len(x):
         return ""
     window = _window(len(x))
-    style = f'stroke="{colour}" clip-path="url(#plot)"'
-    raw = _path(axes.horizontal(x), axes.vertical(y))
+    across, down = axes.horizontal(x), axes.vertical(y)
+    raw = _path(across, down)
     if window == 1:
-        dots = "".join(
-            f'<circle cx="{a:.1f}" cy="{b:.1f}" r="3" fill="{colour}"/>'
-            for a, b in zip(axes.horizontal(x), axes.vertical(y))
-        )
-        return f'<path class="smooth" d="{raw}" {style}/>{dots}'
-    smoothed = _path(axes.horizontal(x), axes.vertical(smooth(y, window)))
-    return f'<path class="raw" d="{raw}" {style}/><path class="smooth" d="{smoothed}" {style}/>'
+        dots = "".join(f'<circle cx="{a:.1f}" cy="{b:.1f}" r="3" fill="{colour}"/>' for a, b in zip(across, down))
+        return f'<path class="smooth" d="{raw}" stroke="{colour}"/>{dots}'
+    smoothed = _path(across, axes.vertical(_smoothed(y, axes.log_y)))
+    # a nested svg cuts off what lies outside its box: the wildest raw points
+    box = f"{LEFT} {TOP} {WIDTH - LEFT - RIGHT} {HEIGHT - TOP - BOTTOM}"
+    place = 'x="{}" y="{}" width="{}" height="{}"'.format(*box.split())
+    return (
+        f'<svg {place} viewBox="{box}"><path class="raw" d="{raw}" stroke="{colour}"/></svg>'
+        f'<path class="smooth" d="{smoothed}" stroke="{colour}"/>'
+    )
 
 
 def _path(x: np.ndarray, y: np.ndarray) -> str:

@@ -70,7 +70,7 @@ def _boxes_overlap(
         [cos * other_half[:, 0] + sin * other_half[:, 1], sin * other_half[:, 0] + cos * other_half[:, 1]], -1
     )
     reach_other = np.stack([cos * half[0] + sin * half[1], sin * half[0] + cos * half[1]], -1)
-    return (own < half + reach_own).all(-1) & (other < other_half + reach_other).all(-1)
+    return np.all((own < half + reach_own) & (other < other_half + reach_other), axis=-1)
 
 
 def _along_axes(vector: Float[np.ndarray, "k 2"], heading: Float[np.ndarray, "k"]) -> Float[np.ndarray, "k 2"]:

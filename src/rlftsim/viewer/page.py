@@ -172,14 +172,14 @@ def _legend_html(animation: Animation) -> str:
         octagon += '<path d="M8.5 7h7v2h-7z" fill="var(--surface)"/>'
         entries.append((octagon, "stop sign"))
     if any(t.collides is not None for t in trajectories):
-        entries.append((f"{_box_svg('collision', 7)}{_ring_svg('collision')}", "collides"))
+        entries.append((f"{_ring_svg('collision')}{_box_svg('agent-other', 7.0)}", "collides"))
     if any(t.offroad is not None for t in trajectories):
-        entries.append((f"{_box_svg('agent-other', 7)}{_ring_svg('offroad', '3 2')}", "off road"))
+        entries.append((f"{_ring_svg('offroad', '3 2')}{_box_svg('agent-other', 7.0)}", "off road"))
     items = "".join(f'<li><svg viewBox="0 0 24 16" aria-hidden="true">{svg}</svg>{name}</li>' for svg, name in entries)
     return f'<ul class="legend">{items}</ul>'
 
 
-def _box_svg(colour: str, half: float = 10) -> str:
+def _box_svg(colour: str, half: float = 10.0) -> str:
     """A vehicle from above, heading right."""
     shape = f'<rect x="{12 - half}" y="{8 - half * 0.42}" width="{2 * half}" height="{half * 0.84}" rx="1.5" fill="var(--{colour})"/>'
     tip, root = 12 + half * 0.85, 12 + half * 0.3

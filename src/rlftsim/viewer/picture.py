@@ -90,12 +90,16 @@ def _draw_map(axis: Axes, scene: SceneView, *, points_per_m: float) -> None:
     by_kind: dict[str, list[np.ndarray]] = {}
     for line in scene.lines:
         by_kind.setdefault(line.kind, []).append(line.points)
-    axis.add_collection(PolyCollection(by_kind.get("driveway", []), facecolor=COLOURS["road"]), autolim=False)
+    axis.add_collection(PolyCollection(by_kind.get("driveway", []), facecolor=COLOURS["road"], zorder=1), autolim=False)
     for kind, width in LANE_WIDTH_M.items():
-        lanes = LineCollection(by_kind.get(kind, []), colors=COLOURS["road"], lw=width * points_per_m, capstyle="round")
+        lanes = LineCollection(
+            by_kind.get(kind, []), colors=COLOURS["road"], lw=width * points_per_m, capstyle="round", zorder=1
+        )
         axis.add_collection(lanes, autolim=False)
     for kind in ("crosswalk", "speed_bump"):
-        areas = PolyCollection(by_kind.get(kind, []), facecolor=COLOURS["crosswalk"], edgecolor=COLOURS["edge"], lw=0.4)
+        areas = PolyCollection(
+            by_kind.get(kind, []), facecolor=COLOURS["crosswalk"], edgecolor=COLOURS["edge"], lw=0.4, zorder=1
+        )
         axis.add_collection(areas, autolim=False)
     for kind, dashes in (
         ("white", "-"),

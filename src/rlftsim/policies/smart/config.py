@@ -32,8 +32,15 @@ class SmartConfig:
     dropout: float = 0.1
     history_drop: float = 0.1
     """Share of (agent, step) pairs that are hidden from the attention over time, in pre-training only."""
-    first_motion_is_position: bool = False
-    """The public code takes an agent's position as the motion vector of its first token. True repeats that, for parity."""
+    public_code_quirks: bool = False
+    """Repeat what the public code does where this package differs on purpose: an agent's first motion vector is its position, and
+    the sign of what lies exactly behind is left to rounding. Models trained there need it."""
+
+    @property
+    def seam_rad(self) -> float:
+        """Angles this near to -pi count as +pi: what lies exactly behind is common (straight lanes, opposite directions) and must
+        not be one or the other by the last bit."""
+        return 0.0 if self.public_code_quirks else 1e-3
 
     def __post_init__(self) -> None:
         for name in ("dim", "num_heads", "head_dim", "num_map_layers", "num_decoder_layers", "history_tokens"):
@@ -67,6 +74,6 @@ def smart_demo() -> SmartConfig:
     """Small enough to train on two CPU cores in minutes."""
     return SmartConfig(
         dim=48, num_heads=4, head_dim=12, num_map_layers=1, num_decoder_layers=2, num_frequencies=8,
-        agent_map_radius_m=30.0, agent_radius_m=30.0, history_tokens=4,
+        map_radius_m=11.0, agent_map_radius_m=30.0, agent_radius_m=30.0, history_tokens=4,
         max_map_neighbors=8, max_agent_map_neighbors=16, max_agent_neighbors=8,
     )  # fmt: skip

@@ -3,7 +3,9 @@
 R rows that look, K neighbours a row. A list is padded with index 0 where its mask is False.
 """
 
+import math
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int64
@@ -21,6 +23,18 @@ class Neighbors:
 
     index: Int64[Tensor, "R K"]
     mask: Bool[Tensor, "R K"]
+
+
+@dataclass(frozen=True, eq=False)
+class Poses:
+    """Where something is and which way it points."""
+
+    position: Float[Tensor, "*shape 2"]
+    heading: Float[Tensor, "*shape"]
+
+    def __getitem__(self, index: Any) -> "Poses":
+        """Some of them."""
+        return Poses(self.position[index], self.heading[index])
 
 
 def nearest_within(
@@ -54,16 +68,16 @@ def _squared_distance(
     return squared if allowed is None else squared.masked_fill_(~allowed, torch.inf)
 
 
-def relative_pose(
-    position: Float[Tensor, "R 2"],
-    heading: Float[Tensor, "R"],
-    other_position: Float[Tensor, "R K 2"],
-    other_heading: Float[Tensor, "R K"],
-) -> Float[Tensor, "R K 3"]:
-    """Distance, bearing in the row's frame, and difference of heading, from rows to their neighbours."""
-    offset = other_position - position[:, None]
-    bearing = angle_between(heading_vector(heading)[:, None].expand_as(offset), offset)
-    return torch.stack([offset.norm(dim=-1), bearing, wrap_angle(other_heading - heading[:, None])], -1)
+def relative_pose(row: Poses, other: Poses, *, seam_rad: float) -> Float[Tensor, "R K 3"]:
+    """Distance, bearing in the row's frame, and difference of heading, from rows [R] to their neighbours [R, K].
+
+    Angles lie in [seam_rad - pi, seam_rad + pi).
+    """
+    offset = other.position - row.position[:, None]
+    bearing = angle_between(heading_vector(row.heading)[:, None].expand_as(offset), offset)
+    angles = torch.stack([bearing, wrap_angle(other.heading - row.heading[:, None])], -1)
+    angles = torch.where(angles < seam_rad - math.pi, angles + 2 * math.pi, angles)
+    return torch.cat([offset.norm(dim=-1, keepdim=True), angles], -1)
 
 
 def pad_lists(lists: list[Neighbors]) -> Neighbors:

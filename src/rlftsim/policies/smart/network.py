@@ -25,7 +25,7 @@ from rlftsim.policies.layers import (
     normalize,
 )
 from rlftsim.policies.smart.config import SmartConfig
-from rlftsim.policies.smart.neighbors import Neighbors, nearest_within, pad_lists, relative_pose
+from rlftsim.policies.smart.neighbors import Neighbors, Poses, nearest_within, pad_lists, relative_pose
 from rlftsim.tokens.map_tokens import NUM_KINDS, NUM_LIGHTS, NUM_TYPES, MapTokens
 from rlftsim.tokens.vocabulary import CLASS_NAMES
 
@@ -120,9 +120,9 @@ class MapEncoder(nn.Module):
         x = x.flatten(0, 1)
         rows = tokens.token_mask.flatten().nonzero()[:, 0]
         neighbors = self._neighbors(tokens)
-        position, heading = tokens.position.flatten(0, 1), tokens.heading.flatten()
+        poses = Poses(tokens.position.flatten(0, 1), tokens.heading.flatten())
         embedding = _tabulated(self.relation, self.config.map_radius_m)
-        relation = relation_features(embedding, position, heading, position[rows], heading[rows], neighbors)
+        relation = relation_features(embedding, poses[rows], poses, neighbors, seam_rad=self.config.seam_rad)
         updated = x[rows]
         for layer in self.layers:
             source = x.index_copy(0, rows, normalize(updated))
@@ -144,15 +144,10 @@ class MapEncoder(nn.Module):
 
 
 def relation_features(
-    embedding: RelationEmbedding,
-    position: Float[Tensor, "S 2"],
-    heading: Float[Tensor, "S"],
-    row_position: Float[Tensor, "R 2"],
-    row_heading: Float[Tensor, "R"],
-    neighbors: Neighbors,
+    embedding: RelationEmbedding, rows: Poses, sources: Poses, neighbors: Neighbors, *, seam_rad: float
 ) -> Float[Tensor, "R K D"]:
-    """Normalised embedding of the relation of each row to each neighbour; zero where there is none."""
-    values = relative_pose(row_position, row_heading, position[neighbors.index], heading[neighbors.index])
+    """Normalised embedding of the relation of each row [R] to each of its neighbours among the sources [S]; zero where there is none."""
+    values = relative_pose(rows, sources[neighbors.index], seam_rad=seam_rad)
     return _embed_where(embedding, values, neighbors.mask)
 
 
@@ -254,7 +249,11 @@ class AgentDecoder(nn.Module):
         if hidden is not None:
             mask = mask & ~hidden[place] & ~hidden[rows][:, None]
         neighbors = Neighbors(row.clamp(min=0), mask)
-        values = relative_pose(steps.position[rows], steps.heading[rows], past.position[place], past.heading[place])
+        values = relative_pose(
+            Poses(steps.position, steps.heading)[rows],
+            Poses(past.position, past.heading)[place],
+            seam_rad=self.config.seam_rad,
+        )
         values = torch.cat([values, -lag[:, None].expand(len(step), -1, 1).to(values.dtype)], -1)
         return neighbors, _embed_where(scene.relations.time, values, mask)
 
@@ -264,7 +263,7 @@ class AgentDecoder(nn.Module):
         """Map tokens of the own scenario within reach."""
         lists = []
         width = scene.map_mask.shape[1]
-        position, heading = steps.position[rows], steps.heading[rows]
+        position = steps.position[rows]
         counts = torch.bincount(rows[0], minlength=len(scene.map_mask)).tolist()
         for b, part in enumerate(position.split(counts)):
             index, near = nearest_within(
@@ -273,9 +272,13 @@ class AgentDecoder(nn.Module):
             )  # fmt: skip
             lists.append(Neighbors(index + b * width, near))
         neighbors = pad_lists(lists)
-        map_position, map_heading = scene.map_position.flatten(0, 1), scene.map_heading.flatten()
+        sources = Poses(scene.map_position.flatten(0, 1), scene.map_heading.flatten())
         return neighbors, relation_features(
-            scene.relations.map, map_position, map_heading, position, heading, neighbors
+            scene.relations.map,
+            Poses(steps.position, steps.heading)[rows],
+            sources,
+            neighbors,
+            seam_rad=self.config.seam_rad,
         )
 
     def _look_at_agents(
@@ -292,9 +295,9 @@ class AgentDecoder(nn.Module):
         scenario, rollout, agent, step = rows
         index, near = index[scenario, rollout, step, agent], near[scenario, rollout, step, agent]
         neighbors = Neighbors(row_of[scenario[:, None], rollout[:, None], index, step[:, None]].clamp(min=0), near)
-        row_position, row_heading = steps.position[rows], steps.heading[rows]
+        poses = Poses(steps.position, steps.heading)[rows]
         return neighbors, relation_features(
-            scene.relations.agent, row_position, row_heading, row_position, row_heading, neighbors
+            scene.relations.agent, poses, poses, neighbors, seam_rad=self.config.seam_rad
         )
 
 

@@ -250,7 +250,7 @@ class SmartPolicy(nn.Module):
         position = tokens.position
         before = torch.cat([torch.zeros_like(position[:, :, :1]), position[:, :, :-1]], 2)
         motion = position - before
-        if not self.config.first_motion_is_position:
+        if not self.config.public_code_quirks:
             known = torch.cat([torch.zeros_like(tokens.valid[..., :1]), tokens.valid[..., :-1]], -1)
             motion = torch.where(known[..., None], motion, 0.0)
         else:

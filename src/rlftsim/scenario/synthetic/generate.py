@@ -25,20 +25,21 @@ from rlftsim.scenario.dataset import (
 )
 from rlftsim.scenario.shards import ShardReader, ShardWriter
 from rlftsim.scenario.synthetic import sumo
+from rlftsim.scenario.synthetic.city_plan import draw_city_plan
 from rlftsim.scenario.synthetic.crop import MapCropper
 from rlftsim.scenario.synthetic.demand import write_demand
+from rlftsim.scenario.synthetic.freeway_plan import draw_freeway_plan
 from rlftsim.scenario.synthetic.ground import draw_ground
 from rlftsim.scenario.synthetic.map_features import build_network_map
 from rlftsim.scenario.synthetic.network import Network, read_network
 from rlftsim.scenario.synthetic.parking import park_in_lots, park_in_strips
 from rlftsim.scenario.synthetic.recording import SignalStates, read_pedestrians, read_signals, read_vehicles
-from rlftsim.scenario.synthetic.street_plan import draw_city_plan, draw_freeway_plan
 from rlftsim.scenario.synthetic.windows import World, cut_scenarios
 from rlftsim.scenario.types import STEP_S, Scenario
 
 GENERATOR_VERSION = 1
 LICENCE_NOTE = "CC0-1.0: synthetic scenarios, no rights reserved."
-KINDS = ("city", "quiet", "city", "freeway", "city", "city", "city", "city")
+KINDS = ("city", "quiet", "city", "freeway", "city", "city", "quiet", "city")
 """Kinds of the networks in turn; a freeway gives half as many scenarios as the others."""
 LOTS_PER_STREET = {"city": 0.35, "quiet": 0.22, "freeway": 0.0}
 MAX_ATTEMPTS = 6

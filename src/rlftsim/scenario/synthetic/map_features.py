@@ -150,7 +150,10 @@ def compute_drivable_area(network: Network) -> Any:
             if node.node_id not in fringe and node.node_id in network.junction_shapes
         ]
     area = shapely.union_all(parts).buffer(0.3).buffer(-0.3)
-    return area if network.plan.kind != "freeway" else area.buffer(2.0).buffer(-4.0).buffer(2.0)
+    if network.plan.kind != "freeway":
+        return area
+    # One carriageway at a time: smoothing both at once would close a narrow median here and there.
+    return shapely.union_all([part.buffer(2.0).buffer(-4.0).buffer(2.0) for part in getattr(area, "geoms", [area])])
 
 
 def oriented_rings(area: Any) -> list[tuple[Float[np.ndarray, "n 2"], bool]]:

@@ -15,6 +15,9 @@ from rlftsim.scenario.synthetic.sumo import DISCARDED_S
 from rlftsim.scenario.types import STEP_S
 
 MIN_STEPS = 12
+LONGEST_STRIDE_M = 1.6
+SMALLEST_JUMP_M = 0.3
+"""Lanes that follow one another may not quite meet (bicycles keep right in a car's lane); this far apart it is a lane change."""
 LONGEST_EVALUATED_M = 7.0
 
 
@@ -72,10 +75,16 @@ def _lane_path(ruler: _LaneRuler, lanes: dict[str, Lane], rows: dict[str, np.nda
         direction[start:stop] = ruler.directions_at(lane_id, positions[start:stop])
         before = lanes[lane_ids[start - 1]] if start else None
         now = lanes[lane_id]
-        if before is not None and before.street is not None and before.street is now.street:
+        if before is None:
+            continue
+        if before.street is not None and before.street is now.street:
             jump = centre[start] - ruler.points_at(before.lane_id, positions[start : start + 1])[0]
+        else:
+            jump = centre[start] - centre[start - 1]
+        left_m = float(jump @ np.array([-direction[start, 1], direction[start, 0]]))
+        if abs(left_m) > SMALLEST_JUMP_M:
             changes.append(int(start))
-            distances.append(float(jump @ np.array([-direction[start, 1], direction[start, 0]])))
+            distances.append(left_m)
     return LanePath(first_step, centre, direction, rows["vehicle_speed"], tuple(changes), tuple(distances))
 
 
@@ -110,6 +119,8 @@ def read_pedestrians(path: Path, rng: np.random.Generator) -> list[Body]:
     bodies = []
     for run in _runs_by_id(table["person_id"], step):
         position = np.stack([table["person_x"][run], table["person_y"][run]], axis=1).astype(float)
+        if np.linalg.norm(np.diff(position, axis=0), axis=1).max() > LONGEST_STRIDE_M:
+            continue  # SUMO moves a few of them at once to the other side of a junction; smoothing hides jumps of a metre
         heading = np.pi / 2 - np.radians(float(table["person_angle"][run[0]]))
         bodies.append(build_pedestrian(int(step[run[0]]), position, heading, draw_size(rng, "pedestrian")))
     return bodies

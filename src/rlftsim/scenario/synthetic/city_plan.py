@@ -1,0 +1,235 @@
+"""City plans: irregular, sheared and bent grids of streets of three classes."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from rlftsim.scenario.synthetic.street_plan import (
+    MAX_RADIUS_M,
+    PRIORITY,
+    Control,
+    Node,
+    PlannedLane,
+    Street,
+    StreetClass,
+    StreetPlan,
+    offset_polyline,
+)
+
+
+@dataclass(frozen=True)
+class _LineProfile:
+    """What all streets of one line of the grid have in common."""
+
+    street_class: StreetClass
+    travel_lanes: int
+    lane_width_m: float
+    speed_mps: float
+    median_m: float
+    bicycle: bool
+    priority: int
+
+
+def _draw_profile(rng: np.random.Generator, street_class: StreetClass, is_column: bool, quiet: bool) -> _LineProfile:
+    """Profile of a line of a class; streets of a quiet quarter have at most two lanes per direction."""
+    lanes, low, high = {
+        "arterial": (2 if quiet else int(rng.integers(2, 4)), 15.0, 19.5),
+        "collector": (1 if quiet else int(rng.integers(1, 3)), 11.0, 15.6),
+        "residential": (1, 9.5, 12.0),
+    }[street_class]
+    bicycle_share = {"arterial": 0.25, "collector": 0.33, "residential": 0.0}[street_class]
+    return _LineProfile(
+        street_class=street_class,
+        travel_lanes=lanes,
+        lane_width_m=float(rng.uniform(3.0, 3.8)),
+        speed_mps=float(rng.uniform(low, high)),
+        median_m=3.0 if street_class == "arterial" and rng.random() < 0.45 else 0.0,
+        bicycle=bool(rng.random() < bicycle_share),
+        priority=PRIORITY[street_class] + int(is_column),
+    )
+
+
+def _draw_classes(rng: np.random.Generator, columns: int, rows: int, quiet: bool) -> list[StreetClass]:
+    """Class of every line, columns first. Two arterials cross somewhere in a city; a quiet quarter has at most one."""
+    names: list[StreetClass] = ["arterial", "collector", "residential"]
+    shares = [0.0, 0.42, 0.58] if quiet else [0.3, 0.37, 0.33]
+    classes = [names[int(k)] for k in rng.choice(3, columns + rows, p=shares)]
+    if quiet and rng.random() < 0.6:
+        classes[int(rng.integers(columns + rows))] = "arterial"
+    if not quiet:
+        classes[int(rng.integers(columns))] = "arterial"
+        classes[columns + int(rng.integers(rows))] = "arterial"
+    return classes
+
+
+def _draw_grid(rng: np.random.Generator, columns: int, rows: int) -> Float[np.ndarray, "c r 2"]:
+    """Node positions: irregular, sheared, rotated."""
+    widest = 200.0 if max(columns, rows) == 3 else 150.0
+    x = np.concatenate([[0.0], np.cumsum(rng.uniform(90, widest, columns - 1))])
+    y = np.concatenate([[0.0], np.cumsum(rng.uniform(90, widest, rows - 1))])
+    grid = np.stack(np.meshgrid(x - x.mean(), y - y.mean(), indexing="ij"), axis=-1)
+    grid += np.clip(rng.normal(0, 8.0, grid.shape), -14, 14)
+    grid[..., 0] += rng.uniform(-0.25, 0.25) * grid[..., 1]
+    angle = rng.uniform(0, 2 * np.pi)
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    return grid @ turn.T
+
+
+def _curve(rng: np.random.Generator, start: np.ndarray, end: np.ndarray) -> Float[np.ndarray, "n 2"]:
+    """Straight or bulging line; the squared sine keeps both ends straight, where a junction is cut out."""
+    length = float(np.linalg.norm(end - start))
+    s = np.linspace(0, 1, max(31, int(length / 4)))
+    points = start + s[:, None] * (end - start)
+    if rng.random() >= 0.6:
+        return points
+    direction = (end - start) / length
+    bulge = np.clip(rng.normal(0, 0.035 * length), -0.08 * length, 0.08 * length) * np.sin(np.pi * s) ** 2
+    return points + bulge[:, None] * np.array([-direction[1], direction[0]])
+
+
+def _draw_lanes(rng: np.random.Generator, profile: _LineProfile, gutter_m: float) -> tuple[PlannedLane, ...]:
+    parking_share = {"arterial": 0.06, "collector": 0.4, "residential": 0.75}[profile.street_class]
+    lanes = [PlannedLane("sidewalk", float(rng.uniform(1.6, 2.6))), PlannedLane("gutter", gutter_m)]
+    if rng.random() < parking_share:
+        lanes.append(PlannedLane("parking", 2.3))
+    if profile.bicycle:
+        lanes.append(PlannedLane("bicycle", 1.6))
+    lanes += [PlannedLane("travel", profile.lane_width_m)] * profile.travel_lanes
+    return tuple(lanes)
+
+
+def _both_directions(rng: np.random.Generator, profile: _LineProfile, start: Node, end: Node) -> tuple[Street, Street]:
+    """The two directions of one street, each with its own strip of parking."""
+    middle = _curve(rng, start.position, end.position)
+    gutter = float(rng.uniform(0.3, 2.0))
+    ids = (f"{start.node_id}to{end.node_id}", f"{end.node_id}to{start.node_id}")
+    forward = Street(
+        street_id=ids[0],
+        from_node=start.node_id,
+        to_node=end.node_id,
+        points=offset_polyline(middle, -profile.median_m / 2),
+        street_class=profile.street_class,
+        lanes=_draw_lanes(rng, profile, gutter),
+        speed_mps=profile.speed_mps,
+        priority=profile.priority,
+        reverse_id=None if profile.median_m else ids[1],
+    )
+    backward = replace(
+        forward,
+        street_id=ids[1],
+        from_node=end.node_id,
+        to_node=start.node_id,
+        points=offset_polyline(middle[::-1], -profile.median_m / 2),
+        lanes=_draw_lanes(rng, profile, gutter),
+        reverse_id=None if profile.median_m else ids[0],
+    )
+    return forward, backward
+
+
+def _is_connected(nodes: set[str], links: list[tuple[str, str]]) -> bool:
+    reached, frontier = set(), [next(iter(nodes))]
+    while frontier:
+        here = frontier.pop()
+        if here in reached:
+            continue
+        reached.add(here)
+        frontier += [b if a == here else a for a, b in links if here in (a, b)]
+    return reached >= nodes
+
+
+def _draw_links(
+    rng: np.random.Generator, columns: int, rows: int, classes: list[StreetClass]
+) -> list[tuple[tuple[int, int], tuple[int, int], int]]:
+    """Streets of the grid as (node, node, line); some minor ones dropped as long as all nodes stay connected."""
+    links = [((i, j), (i, j + 1), i) for i in range(columns) for j in range(rows - 1)]
+    links += [((i, j), (i + 1, j), columns + j) for i in range(columns - 1) for j in range(rows)]
+    share = rng.uniform(0.18, 0.25)
+    nodes = {f"{i}.{j}" for i in range(columns) for j in range(rows)}
+    for link in [links[int(k)] for k in rng.permutation(len(links))]:
+        if classes[link[2]] == "arterial" or rng.random() >= share:
+            continue
+        rest = [other for other in links if other is not link]
+        if _is_connected(nodes, [(f"{a[0]}.{a[1]}", f"{b[0]}.{b[1]}") for a, b, _ in rest]):
+            links = rest
+    return links
+
+
+def _draw_control(
+    rng: np.random.Generator, crossing: tuple[StreetClass, StreetClass], degree: int, lights: float
+) -> Control:
+    """Who gives way at a node of the grid; `lights` scales how eager the quarter is to build lights."""
+    if degree <= 2:
+        return "priority"
+    kinds = frozenset(crossing)
+    draw = rng.random()
+    if kinds == {"arterial"}:
+        return "traffic_light" if draw < lights else "allway_stop"
+    if kinds == {"arterial", "collector"}:
+        return "traffic_light" if draw < 0.55 * lights else "priority_stop"
+    if kinds == {"collector"}:
+        return "traffic_light" if draw < 0.3 * lights else "allway_stop" if draw < 0.7 else "priority_stop"
+    if kinds == {"residential"}:
+        return "allway_stop" if draw < 0.35 else "priority_stop" if draw < 0.65 else "right_before_left"
+    return "allway_stop" if kinds == {"collector", "residential"} and draw < 0.35 else "priority_stop"
+
+
+def _stub_ends(
+    rng: np.random.Generator, grid: Float[np.ndarray, "c r 2"], classes: list[StreetClass]
+) -> list[tuple[tuple[int, int], np.ndarray, int]]:
+    """Where traffic enters: (node, outer end, line) for the two ends of every line."""
+    columns, rows = grid.shape[:2]
+    ends = [((i, j), (i, inner), i) for i in range(columns) for j, inner in ((0, 1), (rows - 1, rows - 2))]
+    ends += [
+        ((i, j), (inner, j), columns + j) for j in range(rows) for i, inner in ((0, 1), (columns - 1, columns - 2))
+    ]
+    stubs = []
+    for outer, inner, line in ends:
+        if classes[line] != "arterial" and rng.random() < 0.25:
+            continue
+        direction = grid[outer] - grid[inner]
+        direction /= np.linalg.norm(direction)
+        stubs.append((outer, grid[outer] + direction * rng.uniform(130, 170), line))
+    return stubs
+
+
+def draw_city_plan(rng: np.random.Generator, quiet: bool = False) -> StreetPlan:
+    """Irregular grid of arterials, collectors and residential streets with stubs where traffic enters.
+
+    Args:
+        rng: decides everything.
+        quiet: a quarter of minor streets, at most one arterial, hardly any lights.
+
+    Returns:
+        A connected plan; every node but the fringe has a control fitting the classes that meet there.
+    """
+    columns, rows = int(rng.integers(3, 5)), int(rng.integers(3, 5))
+    classes = _draw_classes(rng, columns, rows, quiet)
+    profiles = [_draw_profile(rng, kind, line < columns, quiet) for line, kind in enumerate(classes)]
+    grid = _draw_grid(rng, columns, rows)
+    links = _draw_links(rng, columns, rows, classes)
+    stubs = _stub_ends(rng, grid, classes)
+    reach = max(float(np.linalg.norm(end)) for _, end, _ in stubs)
+    shrink = min(1.0, MAX_RADIUS_M / reach)
+    degree = np.zeros((columns, rows), int)
+    for a, b, _ in links:
+        degree[a] += 1
+        degree[b] += 1
+    for a, _, _ in stubs:
+        degree[a] += 1
+    inner = {
+        (i, j): Node(
+            f"n{i}{j}",
+            grid[i, j] * shrink,
+            _draw_control(rng, (classes[i], classes[columns + j]), int(degree[i, j]), 0.2 if quiet else 1.0),
+        )
+        for i in range(columns)
+        for j in range(rows)
+    }
+    fringe = [Node(f"f{k}", end * shrink, "dead_end", is_fringe=True) for k, (_, end, _) in enumerate(stubs)]
+    streets: list[Street] = []
+    for a, b, line in links:
+        streets += _both_directions(rng, profiles[line], inner[a], inner[b])
+    for node, (a, _, line) in zip(fringe, stubs, strict=True):
+        streets += _both_directions(rng, profiles[line], node, inner[a])
+    return StreetPlan("quiet" if quiet else "city", (*inner.values(), *fringe), tuple(streets))
