@@ -1,4 +1,4 @@
-"""A bar with an ETA on a terminal, a line now and then elsewhere."""
+"""What a person sees of long work: a bar with an ETA on a terminal, a line now and then elsewhere; and tables at its end."""
 
 import sys
 import time
@@ -10,6 +10,17 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 SECONDS_BETWEEN_LINES = 30.0
+FILE_WIDTH = 200
+"""Columns of a table that is not printed on a terminal."""
+
+
+def print_wide(*tables: object) -> None:
+    """Print tables; in a file or a pipe they are as wide as they need to be."""
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=FILE_WIDTH)
+    for table in tables:
+        console.print(table)
 
 
 class Advance(Protocol):

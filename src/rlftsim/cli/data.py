@@ -5,11 +5,11 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
-from rich.console import Console
 from rich.table import Table
 from tyro.conf import Positional
 
 from rlftsim.errors import DataError
+from rlftsim.progress import print_wide
 from rlftsim.scenario.convert import convert
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.inspect import DatasetStats, dataset_stats, verify_dataset
@@ -102,7 +102,7 @@ class Stats:
 
     def run(self) -> int:
         """Print the numbers."""
-        Console().print(_stats_table(self.data, dataset_stats(data_folder(self.data), split=self.split)))
+        print_wide(_stats_table(self.data, dataset_stats(data_folder(self.data), split=self.split)))
         return 0
 
 

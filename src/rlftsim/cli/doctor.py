@@ -12,9 +12,9 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import torch
-from rich.console import Console
 from rich.table import Table
 
+from rlftsim.progress import print_wide
 from rlftsim.scenario.inspect import verify_dataset
 from rlftsim.scenario.synthetic import pack_path
 
@@ -43,7 +43,7 @@ class Doctor:
         colour = {GOOD: "green", WARNING: "yellow", BAD: "red"}
         for d in diagnoses:
             table.add_row(d.what, f"[{colour[d.state]}]{d.state}[/]", d.found)
-        Console().print(table)
+        print_wide(table)
         return int(any(d.state == BAD for d in diagnoses))
 
 

@@ -5,13 +5,13 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.console import Console
 from tyro.conf import Positional
 
 from rlftsim.cli.data import data_folder
 from rlftsim.experiments.compare import compare, format_comparison, format_table
 from rlftsim.experiments.evaluate import EvaluateConfig, evaluate
 from rlftsim.experiments.evaluation import Evaluation
+from rlftsim.progress import print_wide
 from rlftsim.recipes.models import load_policy_or_oracle
 
 
@@ -38,10 +38,9 @@ class Evaluate:
         name = self.name or (path.parent.name if path.name == "model" else path.name)
         policy = load_policy_or_oracle(self.model)
         result = evaluate(policy, data_folder(self.data), self.out, self.config, name=name)
-        console = Console()
-        console.print(format_table(result))
+        print_wide(format_table(result))
         for skipped in result.skipped:
-            console.print(f"  skipped {skipped.scenario_id}: {skipped.reason}")
+            print(f"  skipped {skipped.scenario_id}: {skipped.reason}")
         print(f"{self.out / name}.parquet")
         return 0
 
@@ -60,7 +59,5 @@ class Compare:
     def run(self) -> int:
         """Print both tables."""
         a, b = Evaluation.read(self.first), Evaluation.read(self.second)
-        console = Console()
-        console.print(format_table(a, b))
-        console.print(format_comparison(compare(a, b, alpha=self.alpha)))
+        print_wide(format_table(a, b), format_comparison(compare(a, b, alpha=self.alpha)))
         return 0

@@ -12,6 +12,7 @@ from tyro.conf import Positional
 
 from rlftsim.cli.data import data_folder, open_split
 from rlftsim.policies.smart.policy import SmartPolicy
+from rlftsim.progress import print_wide
 from rlftsim.recipes.card import model_card
 from rlftsim.recipes.configure import Override, configure
 from rlftsim.recipes.models import load_policy
@@ -47,7 +48,7 @@ class Tokens:
             scenarios, recipe.tokens, origin=origin, progress=lambda what: say.print(f"clustering {what}")
         )
         vocabulary.save(self.out)
-        Console().print(_coverage_table(reports, reconstruction_error(scenarios, vocabulary)))
+        print_wide(_coverage_table(reports, reconstruction_error(scenarios, vocabulary)))
         print(
             f"{self.out}: {vocabulary.num_tokens} motion tokens a class, {len(vocabulary.map_prototypes)} map pieces."
         )

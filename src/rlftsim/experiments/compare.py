@@ -195,7 +195,7 @@ def format_comparison(comparison: Comparison, *, columns: Sequence[str] = TABLE_
     table = Table(title=f"{comparison.name_b} against {comparison.name_a}: {comparison.pairing}", title_justify="left")
     table.add_column("", no_wrap=True)
     for name in (comparison.name_a, comparison.name_b, "difference"):
-        table.add_column(name, justify="right", no_wrap=True)
+        table.add_column(name, justify="right")
     table.add_column("verdict")
     for column in columns:
         row = comparison[column]

@@ -23,6 +23,7 @@ from rlftsim.experiments.report import (
     write_report,
 )
 from rlftsim.policies.smart.policy import SmartPolicy
+from rlftsim.progress import print_wide
 from rlftsim.recipes.card import model_card
 from rlftsim.recipes.smart import SmartRecipe
 from rlftsim.rollout.baselines import ConstantVelocity
@@ -41,6 +42,8 @@ from rlftsim.viewer.page import Animation, Panel
 from rlftsim.viewer.picture import to_png
 from rlftsim.viewer.scene import build_scene, logged_trajectories, rollout_trajectories
 
+CLAIM = "closed-loop fine-tuning makes a traffic model more realistic"
+NO_CLAIM = "closed-loop fine-tuning of a traffic model"
 BASE, TUNED, FLOOR, CEILING = "base", "fine-tuned", "constant velocity", "oracle"
 
 
@@ -111,7 +114,7 @@ def run_demo(config: DemoConfig, out: Path) -> DemoResult:
         report = build_report(evaluations, comparison, animations, config, out, stages.seconds)
         write_report(out / "report.html", report)
         to_png(out / "picture.png", animations[0])
-    Console().print(result_table(report))
+    print_wide(result_table(report))
     print(f"fine-tuned against base, {comparison.pairing}: {comparison['meta_metric'].verdict}")
     return DemoResult(out / "report.html", comparison, evaluations)
 
@@ -157,9 +160,8 @@ def build_report(
     """The page: table, paired comparison, learning curves, animations, facts."""
     base, tuned = evaluations[:2]
     difference = comparison["meta_metric"]
-    total = sum(seconds.values())
     return Report(
-        title="RLFTSim demo: closed-loop fine-tuning makes a traffic model more realistic",
+        title=f"RLFTSim demo: {CLAIM if difference.is_difference and difference.difference > 0 else NO_CLAIM}",
         summary=(
             "A small next-token traffic model was pre-trained on synthetic scenarios and then fine-tuned closed-loop: it drives "
             "every agent itself, and the realism meta-metric of its own rollouts, left one out at a time (MLOO), is the reward.",
@@ -173,7 +175,7 @@ def build_report(
         chart_groups=_charts(out, config),
         animations=animations,
         animations_note="Every agent moves by the model, the ego included; the first 1.1 s are recorded.",
-        facts=_facts(config, seconds, total),
+        facts=_facts(config, seconds),
         footnotes=(
             "The scenarios are synthetic (SUMO traffic on invented streets): these numbers show that the pipeline works and say "
             "nothing about the Waymo Open Motion Dataset.",
@@ -221,7 +223,7 @@ def _charts(out: Path, config: DemoConfig) -> list[ChartGroup]:
             "Fine-tuning",
             [
                 chart(after, "Realism of the training rollouts", "RMM", rmm="RMM"),
-                chart(after, "Reward", "standard deviation over a scenario's rollouts", reward_std="MLOO"),
+                chart(after, "Reward", "std over a scenario's rollouts", reward_std="MLOO"),
                 chart(after, "Distance from the base model", "nats per decision", kl="KL"),
                 chart(after, "Strength of the KL penalty", "beta", beta="beta"),
                 chart(after, "Off-road and collision", "share of evaluated agents", offroad_rate="off-road", collision_rate="collision"),
@@ -232,7 +234,7 @@ def _charts(out: Path, config: DemoConfig) -> list[ChartGroup]:
     ]  # fmt: skip
 
 
-def _facts(config: DemoConfig, seconds: dict[str, float], total: float) -> dict[str, str]:
+def _facts(config: DemoConfig, seconds: dict[str, float]) -> dict[str, str]:
     environment, recipe = describe_environment(), config.recipe
     return {
         "command": environment["command"],
@@ -242,7 +244,7 @@ def _facts(config: DemoConfig, seconds: dict[str, float], total: float) -> dict[
         "pre-training": f"{recipe.pretrain.epochs:g} epochs, batch {recipe.pretrain.batch_size}, learning rate {recipe.pretrain.learning_rate:g}",
         "fine-tuning": f"{recipe.finetune.epochs:g} epochs, {recipe.finetune.batch_size} scenarios x {recipe.finetune.num_rollouts} rollouts an update, "
         f"learning rate {recipe.finetune.learning_rate:g}, KL target {recipe.finetune.kl.target:g}",
-        "time": f"{total / 60:.1f} min ("
+        "time": f"{sum(seconds.values()) / 60:.1f} min ("
         + ", ".join(f"{name.split(':')[0]} {s:.0f} s" for name, s in seconds.items())
         + ")",
     }

@@ -193,7 +193,7 @@ def result_table(report: Report) -> Table:
     table.add_column("policy", no_wrap=True)
     shown = _shown_columns(report.rows)
     for column in shown:
-        table.add_column(f"{column.heading} {_arrow(column)}".replace("[", r"\["), justify="right", no_wrap=True)
+        table.add_column(f"{column.heading} {_arrow(column)}".replace("[", r"\["), justify="right")
     for row in report.rows:
         cells = [_plain_cell(column, column.estimate(row)) for column in shown]
         table.add_row(row.name.replace("[", r"\["), *cells, style="bold" if row.emphasised else None)
