@@ -59,7 +59,7 @@ def test_the_papers_recipe_has_the_papers_numbers():
         ("finetune.betas=(0.8, 0.95)", (0.8, 0.95)),
         ("finetune.device.accelerator=cpu", "cpu"),
         ("tokens.mirror=false", False),
-        ("model.first_motion_is_position=True", True),
+        ("model.public_code_quirks=True", True),
     ],
 )
 def test_a_good_override_changes_one_field(override, value):

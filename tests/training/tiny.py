@@ -37,8 +37,8 @@ def pack_scenarios(count=NUM_SCENARIOS):
     """Small scenarios of the embedded pack that have vehicles, pedestrians and cyclists."""
     data = ScenarioDataset(pack_path(), "training")
     columns = (data.index[name].to_pylist() for name in ("num_vehicles", "num_pedestrians", "num_cyclists"))
-    mixed = [i for i, (v, p, c) in enumerate(zip(*columns)) if p and c and v + p + c < 20]
-    return [data[i] for i in mixed[:count]]
+    mixed = sorted((sum(counts), i) for i, counts in enumerate(zip(*columns)) if all(counts))
+    return [data[i] for _, i in mixed[:count]]
 
 
 def small_vocabulary(scenarios):
