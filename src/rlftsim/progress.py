@@ -4,7 +4,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -23,6 +23,7 @@ def print_wide(*tables: object) -> None:
         console.print(table)
 
 
+@runtime_checkable
 class Advance(Protocol):
     """Told after every unit of work."""
 

@@ -24,6 +24,7 @@ from rlftsim.training.parallel import DeviceConfig, add_up, add_up_gradients, ow
 from rlftsim.training.run_folder import RunFolder
 
 
+@runtime_checkable
 class Prediction(Protocol):
     """What a model says along recorded tracks, and what it should have said."""
 
