@@ -56,7 +56,7 @@ class DecisionDistribution(Protocol):
         ...
 
     def kl(self, other: Any) -> Float[Tensor, "..."]:
-        """KL(self || other) between the full distributions of two policies of one kind, closed form."""
+        """KL(self || other) to a distribution of the same kind, between the full ones, closed form."""
         ...
 
     def entropy(self) -> Float[Tensor, "..."]:
@@ -64,6 +64,7 @@ class DecisionDistribution(Protocol):
         ...
 
 
+@runtime_checkable
 class PolicyState(Protocol):
     """A policy's own state of B x N running simulations."""
 

@@ -378,7 +378,7 @@ def _read_index(folder: Path, manifest: Manifest, split: str | None) -> pa.Table
         return index
     if split not in manifest.counts:
         raise DataError(f"{folder} has no split {split!r}, only {', '.join(manifest.counts) or 'none'}")
-    return index.filter(pc.equal(index["split"], split))
+    return index.filter(pc.field("split") == split)
 
 
 def _reopen(folder: Path, split: str | None, cache_size: int) -> ScenarioDataset:

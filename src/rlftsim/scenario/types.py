@@ -10,6 +10,7 @@ Shapes: O objects, S steps at 10 Hz (91; 11 in a test split), F map features, P 
 from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import cached_property
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int8, Int32, Int64
@@ -192,3 +193,16 @@ class Scenario:
     def origin(self) -> Float[np.ndarray, "2"]:
         """Ego position at the current step rounded to whole metres, float64: the centre of the scenario's *map* frame."""
         return np.round(self.tracks.position[self.ego_index, CURRENT_STEP, :2].astype(np.float64))
+
+
+@runtime_checkable
+class Scenarios(Protocol):
+    """Scenarios that are looked up by position: a list of them, or a data set."""
+
+    def __len__(self) -> int:
+        """How many there are."""
+        ...
+
+    def __getitem__(self, position: int, /) -> Scenario:
+        """One of them."""
+        ...

@@ -93,7 +93,8 @@ class Past:
     def repeat(self, num_rollouts: int) -> "Past":
         """The past of a single rollout, shared by N of them."""
         shapes = ((v, (-1, num_rollouts, *v.shape[2:])) for v in (self.position, self.heading, self.row))
-        return Past(*(v.expand(shape) for v, shape in shapes), self.sources)
+        position, heading, row = (v.expand(shape) for v, shape in shapes)
+        return Past(position, heading, row, self.sources)
 
 
 class MapEncoder(nn.Module):
