@@ -5,7 +5,7 @@ Columns: likelihoods and meta-metrics, higher is better; `*_error` in metres and
 
 import json
 import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -248,4 +248,4 @@ def row_of_result(result: RealismResult, *, num_agents: int, num_evaluated: int)
 
 
 def _provenance_of(values: dict[str, Any]) -> Provenance:
-    return replace(Provenance(**values), config=EvaluateConfig(**values["config"]))
+    return Provenance(**{**values, "config": EvaluateConfig(**values["config"])})
