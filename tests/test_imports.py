@@ -10,7 +10,8 @@ import rlftsim
 PACKAGE = Path(rlftsim.__file__).parent
 
 FLOORS = (
-    ("geometry", "errors", "progress"),
+    ("errors",),
+    ("geometry", "progress", "workers"),
     ("scenario",),
     ("tokens", "goals"),
     ("rollout",),

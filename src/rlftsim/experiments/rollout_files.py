@@ -150,6 +150,11 @@ def _states_of_npz(entry: RolloutEntry) -> SimulatedStates:
                 f"{axis} must be floats [N, A, {FUTURE_STEPS}] with A = {len(ids)} as in object_ids, "
                 f"got {values.dtype} {list(values.shape)}."
             )
+    numbers = [len(values) for values in arrays.values()]
+    if len(set(numbers)) > 1:
+        raise DataError(
+            f"x, y, z and heading hold {', '.join(map(str, numbers))} rollouts: there must be equally many."
+        )
     with np.errstate(over="ignore"):  # what becomes infinite is refused by name
         fields = [torch.from_numpy(np.ascontiguousarray(arrays[axis], np.float32)) for axis in AXES]
     return SimulatedStates(ids.astype(np.int64), *fields)
