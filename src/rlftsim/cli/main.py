@@ -22,6 +22,7 @@ VERBS = {
     "pretrain": ("rlftsim.cli.train", "Pretrain"),
     "finetune": ("rlftsim.cli.train", "Finetune"),
     "simulate": ("rlftsim.cli.simulate", "Simulate"),
+    "score": ("rlftsim.cli.results", "Score"),
     "evaluate": ("rlftsim.cli.results", "Evaluate"),
     "compare": ("rlftsim.cli.results", "Compare"),
 }
@@ -43,6 +44,7 @@ usage: rlftsim VERB ...      rlftsim VERB --help explains a verb
   finetune     fine-tune a model closed-loop with a realism reward
   simulate     roll scenarios out with a model
 
+  score        score anybody's rollouts with the official realism meta-metric
   evaluate     measure a model with the official realism meta-metric
   compare      compare two evaluations scenario by scenario
 """
