@@ -222,7 +222,7 @@ def _heat_cell(value: float, among: Float[np.ndarray, "..."]) -> str:
     return f'<td class="{"cost" if value > 0 else "gain"}" style="--heat:{heat:.2f}">{text}</td>'
 
 
-def _tick(edge: float) -> str:
+def _tick(edge: float | np.floating) -> str:
     return f"{edge:.3g}".replace("-", "−")
 
 
