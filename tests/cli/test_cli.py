@@ -178,7 +178,7 @@ def test_pretraining_and_fine_tuning_by_command(vocabulary, tmp_path, capsys):
         capsys, "finetune", "smart-demo", "--model", base, *common, "--out", tuned, "--set", *once, "finetune.seed=1"
     )
     assert status == 2
-    assert "other settings (seed)" in err
+    assert "other settings or inputs (seed)" in err
     # a damaged checkpoint says what to do
     newest = next((tuned / "checkpoints").iterdir())
     (newest / "policy.safetensors").write_bytes(b"garbage")

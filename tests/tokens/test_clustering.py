@@ -101,7 +101,6 @@ def test_a_vocabulary_of_any_size_can_be_built(num_tokens, num_map_prototypes, m
     assert np.isfinite(vocabulary.corners.numpy()).all()
 
 
-@pytest.mark.xfail(strict=True, reason="a class without any motion ends in a numpy error about reshaping")
 def test_data_without_cyclists_gives_cyclists_a_single_token():
     movers = tuple(m for m in scenes.TRAFFIC if m.kind != ObjectType.CYCLIST)
     vocabulary, reports = build_vocabulary([scenes.build_scenario("no cyclists", movers)], SMALL)

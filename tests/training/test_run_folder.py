@@ -26,7 +26,7 @@ def test_the_same_settings_may_come_back(tmp_path):
 
 def test_other_settings_are_refused_by_name(tmp_path):
     RunFolder(tmp_path, FinetuneConfig())
-    with pytest.raises(CheckpointError, match=r"other settings \(kl, seed\): name another --out"):
+    with pytest.raises(CheckpointError, match=r"other settings or inputs \(kl, seed\): name another --out"):
         RunFolder(tmp_path, FinetuneConfig(kl=KlConfig(target=0.02), seed=1))
     with pytest.raises(CheckpointError, match="other settings"):
         RunFolder(tmp_path, tiny.PRETRAIN)

@@ -8,7 +8,11 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Goals:
-    """A point for some of the agents. Frame: map (centred). `goal_mask` is True where an agent has a goal; elsewhere `position` means nothing."""
+    """A point for some of the agents of each rollout. Frame: map (centred). `goal_mask` is True where an agent has a goal; elsewhere `position` means nothing."""
 
-    position: Float[Tensor, "*batch A 2"]
-    goal_mask: Bool[Tensor, "*batch A"]
+    position: Float[Tensor, "B N A 2"]
+    goal_mask: Bool[Tensor, "B N A"]
+
+    def rollouts(self, selected: slice) -> "Goals":
+        """The goals of some of the rollouts."""
+        return Goals(self.position[:, selected], self.goal_mask[:, selected])

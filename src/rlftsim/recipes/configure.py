@@ -1,9 +1,9 @@
 """`field=value` on the command line changes a recipe."""
 
-import ast
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, TypeVar, get_args, get_type_hints
+from types import NoneType
+from typing import Any, Literal, NoReturn, TypeVar, get_args, get_origin, get_type_hints
 
 from rlftsim.errors import ConfigError
 
@@ -47,21 +47,50 @@ def _changed(config: Config, path: list[str], text: str, whole: str) -> Config:
 
 
 def _parse(text: str, kind: Any, whole: str) -> Any:
-    """A value of the annotated kind: bool, int, float, str, None, a choice, or a tuple of them."""
-    allowed = [a for a in (get_args(kind) or (kind,)) if a is not Ellipsis]
+    """A value of the annotated kind."""
     try:
-        value = ast.literal_eval(text)
-    except (ValueError, SyntaxError):
-        value = {"none": None, "true": True, "false": False}.get(text.lower(), text)
-    if float in allowed and isinstance(value, int) and not isinstance(value, bool):
-        value = float(value)
-    if isinstance(value, tuple) and isinstance(kind, type(tuple[int])):
-        return tuple(float(v) if float in allowed else v for v in value)
-    types = tuple(a for a in allowed if isinstance(a, type))
-    is_bool_for_number = isinstance(value, bool) and bool not in allowed
-    if value in [a for a in allowed if not isinstance(a, type)] or (
-        types and isinstance(value, types) and not is_bool_for_number
-    ):
-        return value
-    wanted = ", ".join(a.__name__ if isinstance(a, type) else repr(a) for a in allowed)
-    raise ConfigError(f"{whole}={text}: expected {wanted}.")
+        return _as(text.strip(), kind)
+    except ValueError:
+        raise ConfigError(f"{whole}={text}: expected {_words(kind)}.") from None
+
+
+def _as(text: str, kind: Any) -> Any:
+    """A text as bool, int, float, str, None, one of a choice, a tuple, or the first of several kinds that fits; else ValueError."""
+    inner = get_args(kind)
+    if get_origin(kind) is Literal:
+        return {str(choice): choice for choice in inner}[text] if text in map(str, inner) else _refuse(text)
+    if get_origin(kind) is tuple:
+        parts = [part.strip() for part in text.strip("()[] ").split(",") if part.strip()]
+        kinds = [inner[0]] * len(parts) if inner[-1] is Ellipsis else list(inner)
+        return tuple(_as(part, k) for part, k in zip(parts, kinds)) if len(parts) == len(kinds) else _refuse(text)
+    if inner:
+        return _first_that_fits(text, sorted(inner, key=lambda k: k is not NoneType))
+    if kind in (NoneType, bool):
+        known = {"none": None} if kind is NoneType else {"true": True, "false": False}
+        return known[text.lower()] if text.lower() in known else _refuse(text)
+    return kind(text)
+
+
+def _first_that_fits(text: str, kinds: Sequence[Any]) -> Any:
+    for kind in kinds:
+        try:
+            return _as(text, kind)
+        except ValueError:
+            continue
+    return _refuse(text)
+
+
+def _refuse(text: str) -> NoReturn:
+    raise ValueError(text)
+
+
+def _words(kind: Any) -> str:
+    """A kind as a person would say it."""
+    inner = get_args(kind)
+    if get_origin(kind) is Literal:
+        return "one of " + ", ".join(map(str, inner))
+    if get_origin(kind) is tuple:
+        return "(" + ", ".join("..." if k is Ellipsis else _words(k) for k in inner) + ")"
+    if inner:
+        return " or ".join(_words(k) for k in inner)
+    return "none" if kind is NoneType else kind.__name__

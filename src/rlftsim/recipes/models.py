@@ -24,10 +24,14 @@ def load_policy(name: str) -> Policy:
     if (folder / "model" / "config.json").exists():
         folder = folder / "model"
     if not folder.is_dir():
-        raise ConfigError(f"{name!r} is neither a model folder nor one of {', '.join([*NAMED, 'oracle'])}.")
+        raise ConfigError(f"{name!r} is neither a model folder nor one of {', '.join(NAMED)}.")
     return SmartPolicy.from_pretrained(folder).eval()
 
 
 def load_policy_or_oracle(name: str) -> Policy | Literal["oracle"]:
     """As `load_policy`; "oracle" stands for the record itself."""
-    return "oracle" if name == "oracle" else load_policy(name)
+    if name == "oracle":
+        return "oracle"
+    if name not in NAMED and not Path(name).is_dir():
+        raise ConfigError(f"{name!r} is neither a model folder nor one of {', '.join([*NAMED, 'oracle'])}.")
+    return load_policy(name)

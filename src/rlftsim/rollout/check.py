@@ -164,7 +164,7 @@ class _Subject:
         with torch.no_grad():
             for weight in other.parameters():
                 noise = torch.randn(weight.shape, generator=generator).to(weight)
-                weight.add_(0.1 * noise * weight.abs().mean())
+                weight.add_(0.1 * noise * (weight.abs().mean() + 0.01))
         assert isinstance(other, Policy)
         return other
 

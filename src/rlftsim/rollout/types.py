@@ -62,6 +62,7 @@ class Rollouts:
             decision=self.decision[:, selected],
             decision_mask=self.decision_mask[:, selected],
             log_prob=self.log_prob[:, selected],
+            goals=None if self.goals is None else self.goals.rollouts(selected),
             draws=None if self.draws is None else self.draws[:, selected],
             forced=None if self.forced is None else self.forced.rollouts(selected),
         )

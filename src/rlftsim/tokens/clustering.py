@@ -145,7 +145,7 @@ def _mirrored(motions: Float32[np.ndarray, "n 6 3"], mirror: bool) -> Float32[np
 
 def _thin(motions: Float32[np.ndarray, "n 6 3"], config: TokensConfig) -> Float32[np.ndarray, "m 6 3"]:
     """Drop motions that repeat another one to the centimetre, then keep at most `max_segments`, evenly spread."""
-    _, first = np.unique(np.round(motions[:, [2, 5]].reshape(len(motions), -1) / 0.01), axis=0, return_index=True)
+    _, first = np.unique(np.round(motions[:, [2, 5]].reshape(len(motions), 6) / 0.01), axis=0, return_index=True)
     distinct = motions[np.sort(first)]
     if len(distinct) <= config.max_segments:
         return distinct

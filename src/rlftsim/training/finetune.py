@@ -15,7 +15,7 @@ from jaxtyping import Float
 from lightning_fabric import Fabric
 from torch import Tensor, nn
 
-from rlftsim.errors import CheckpointError, ConfigError
+from rlftsim.errors import ConfigError
 from rlftsim.progress import progress_bar
 from rlftsim.realism import RealismResult, metric_by_name, score_batch
 from rlftsim.realism.from_rollouts import states_of_rollouts
@@ -31,7 +31,8 @@ from rlftsim.training.parallel import DeviceConfig, add_up, add_up_gradients, ow
 from rlftsim.training.policy_gradient import Reduction, masked_sum, policy_gradient_loss, rollout_log_prob
 from rlftsim.training.reference import KlConfig, adapt_beta, move_reference
 from rlftsim.training.rewards import Reward, reward_by_name
-from rlftsim.training.run_folder import RunFolder
+from rlftsim.training.rewards.base import finite_or_zero
+from rlftsim.training.run_folder import RunFolder, describe_inputs
 
 
 @dataclass(frozen=True)
@@ -123,7 +124,7 @@ def finetune(policy: Policy, scenarios: Scenarios, out: Path, config: FinetuneCo
     if not len(scenarios):
         raise ConfigError("no scenario to train on: is the data set empty, or the split misspelt?")
     fabric = start_fabric(config.device)
-    run = RunFolder(out, config, writes=fabric.is_global_zero)
+    run = RunFolder(out, config, describe_inputs(policy, scenarios), writes=fabric.is_global_zero)
     learner = prepare(policy, config, fabric.device)
     _resume(learner, run)
     total = config.num_updates(len(scenarios))
@@ -186,8 +187,8 @@ def update_policy(learner: Learner, batch: ScenarioBatch, config: FinetuneConfig
     }
     if not learner.skipped_in_a_row:
         learner.beta = adapt_beta(learner.beta, kl, config.kl)
-        if config.kl.reference_every and learner.update % config.kl.reference_every == 0:
-            move_reference(learner.reference, learner.policy, config.kl.reference_share)
+    if config.kl.reference_every and learner.update % config.kl.reference_every == 0:
+        move_reference(learner.reference, learner.policy, config.kl.reference_share)
     clock.lap("step")
     return {**values, "learning_rate": learner.optimizer.param_groups[0]["lr"], **clock.seconds}
 
@@ -200,7 +201,7 @@ def compute_reward(
     states = states_of_rollouts(batch, rollouts)
     scores = score_batch(batch.scenarios, states, metric_by_name(config.metric), missing_map="neutral")
     values = reward(scores, rollouts, batch)
-    return scores, torch.where(values.isfinite().all(-1, keepdim=True), values, 0.0)
+    return scores, finite_or_zero(values)
 
 
 @dataclass
@@ -210,7 +211,7 @@ class _Sums:
     kl: float
     entropy: float
     gap: float
-    """Largest difference between a log-probability as sampled and as scored."""
+    """Largest difference between a log-probability as sampled and as scored, in this process."""
     count: float
 
 
@@ -229,8 +230,8 @@ def _accumulate_gradients(
     )
     num_scenarios, num_decisions = add_up(totals, fabric).tolist()
     sums = torch.zeros(3, device=fabric.device, dtype=torch.float64)
-    gap = 0.0
-    with torch.no_grad():
+    gaps: list[Tensor] = []
+    with fabric.autocast(), torch.no_grad():
         reference_context = learner.reference.encode(batch)
     for start in range(0, config.num_rollouts, config.rollouts_per_pass):
         part = slice(start, start + config.rollouts_per_pass)
@@ -246,10 +247,10 @@ def _accumulate_gradients(
         loss = loss + (learner.beta * kl - config.entropy_bonus * entropy) / max(num_decisions, 1.0)
         fabric.backward(loss)
         sums += torch.stack([kl.detach(), entropy.detach(), loss.detach()])
-        gap = max(gap, float(torch.where(mask, log_prob.detach() - rows.log_prob, 0.0).abs().max()))
+        gaps.append(torch.where(mask, log_prob.detach() - rows.log_prob, 0.0).abs().max())
     add_up_gradients(learner.parameters, fabric)
     kl, entropy, _ = add_up(sums, fabric).tolist()
-    return _Sums(kl, entropy, gap, num_decisions)
+    return _Sums(kl, entropy, float(torch.stack(gaps).max()), num_decisions)
 
 
 def _step(learner: Learner, sums: _Sums, config: FinetuneConfig) -> float:
@@ -269,11 +270,10 @@ def _step(learner: Learner, sums: _Sums, config: FinetuneConfig) -> float:
 
 def _stop_if_diverged(learner: Learner, run: RunFolder, config: FinetuneConfig) -> None:
     if learner.skipped_in_a_row >= config.max_skipped_in_a_row:
-        newest = newest_checkpoint(run.checkpoints)
-        raise CheckpointError(
-            f"{run.path}: {learner.skipped_in_a_row} updates in a row were skipped (KL above max_kl={config.max_kl} or not finite). "
-            f"The last good checkpoint is {newest or 'none'}: lower learning_rate or raise kl.initial_beta."
+        cause = (
+            f"{learner.skipped_in_a_row} updates in a row were skipped, KL above max_kl={config.max_kl} or not finite"
         )
+        raise run.diverged(cause, "lower learning_rate or raise kl.initial_beta")
 
 
 def _describe(

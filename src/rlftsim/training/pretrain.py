@@ -21,7 +21,10 @@ from rlftsim.scenario.types import CURRENT_STEP, Scenarios
 from rlftsim.training.checkpoint import Progress, newest_checkpoint, read_checkpoint, write_checkpoint
 from rlftsim.training.data import batch_with_futures, scenarios_of_update
 from rlftsim.training.parallel import DeviceConfig, add_up, add_up_gradients, own_share, start_fabric
-from rlftsim.training.run_folder import RunFolder
+from rlftsim.training.run_folder import RunFolder, describe_inputs
+
+IMPOSSIBLE = -1e8
+"""A token that cannot be chosen has a smaller logit than this."""
 
 
 @runtime_checkable
@@ -79,6 +82,8 @@ class PretrainConfig:
     """Agents farther from the ego at the current step are context only."""
     max_trained_agents: int | None = 32
     """Of a scenario; the evaluated ones first, the rest at random. None = all."""
+    max_skipped_in_a_row: int = 5
+    """An update whose gradient is not finite is skipped; after so many in a row the run stops."""
     checkpoint_every: int = 200
     """Updates."""
     seed: int = 0
@@ -108,26 +113,29 @@ def pretrain(model: NextTokenModel, scenarios: Scenarios, out: Path, config: Pre
 
     Raises:
         ConfigError: the model cannot be pre-trained, or there is no scenario.
-        CheckpointError: `out` holds another run.
+        CheckpointError: `out` holds another run, or the run diverged.
     """
     if not isinstance(model, nn.Module) or not isinstance(model, NextTokenModel):
         raise ConfigError(f"{type(model).__name__} cannot be pre-trained: it needs teacher_forced and save_pretrained.")
     if not len(scenarios):
         raise ConfigError("no scenario to train on: is the data set empty, or the split misspelt?")
     fabric = start_fabric(config.device)
-    run = RunFolder(out, config, writes=fabric.is_global_zero)
+    run = RunFolder(out, config, describe_inputs(model, scenarios), writes=fabric.is_global_zero)
     model.to(fabric.device).train()
     optimizer = torch.optim.AdamW(model.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay)
     newest = newest_checkpoint(run.checkpoints)
     done = read_checkpoint(newest, {"policy": model}, optimizer).update if newest else 0
     run.continue_from(done)
-    total = config.num_updates(len(scenarios))
+    total, skipped = config.num_updates(len(scenarios)), 0
     with progress_bar("pre-train", total, done) as advance:
         for update in range(done, total):
             start = time.perf_counter()
             _set_learning_rate(optimizer, learning_rate(update, total, config))
             values = _update(model, optimizer, scenarios, update, config, fabric)
             run.log(update + 1, {**values, "seconds": time.perf_counter() - start})
+            skipped = 0 if math.isfinite(values["gradient_norm"]) else skipped + 1
+            if skipped >= config.max_skipped_in_a_row:
+                raise run.diverged(f"the gradients of {skipped} updates in a row are not finite", "lower learning_rate")
             if fabric.is_global_zero and ((update + 1) % config.checkpoint_every == 0 or update + 1 == total):
                 write_checkpoint(run.checkpoints, Progress(update + 1), {"policy": model}, optimizer)
             advance(note=f"loss {values['loss']:.3f}, right {values['accuracy']:.0%}")
@@ -167,7 +175,7 @@ def _update(
     chosen = own_share(scenarios_of_update(update, config.batch_size, len(scenarios), config.seed), fabric)
     for micro in _pieces(chosen, config.micro_batch_size):
         batch = batch_with_futures(scenarios, micro).to(fabric.device)
-        trained = trained_agents(batch, config, derive_seed(config.seed, "agents", update))
+        trained = trained_agents(batch, config, update)
         with fabric.autocast():
             prediction = model.teacher_forced(batch, trained)
         loss, counts = _loss(prediction, config.label_smoothing)
@@ -179,7 +187,8 @@ def _update(
     for parameter in parameters:
         parameter.grad.div_(sums[3].clamp(min=1))  # type: ignore[union-attr]
     norm = torch.nn.utils.clip_grad_norm_(parameters, config.gradient_clip)
-    optimizer.step()
+    if math.isfinite(float(norm)):
+        optimizer.step()
     loss, right, among_five, count = sums.tolist()
     count = max(count, 1.0)
     return {
@@ -198,17 +207,25 @@ def _pieces(items: list[int], size: int) -> Iterator[list[int]]:
 
 
 def _loss(prediction: Prediction, label_smoothing: float) -> tuple[Float[Tensor, ""], Float[Tensor, "3"]]:
-    """Summed cross-entropy, and how many predictions were right, right among the best five, and made at all."""
+    """Summed cross-entropy (smoothed over the tokens that exist), and how many predictions were right, right among the best
+    five, and made at all."""
     logits, target = prediction.logits[prediction.target_mask], prediction.target[prediction.target_mask]
-    loss = functional.cross_entropy(logits, target, reduction="sum", label_smoothing=label_smoothing)
+    log_probs = functional.log_softmax(logits, -1)
+    exists = logits > IMPOSSIBLE
+    elsewhere = torch.where(exists, log_probs, 0.0).sum(-1) / exists.sum(-1)
+    of_target = log_probs.gather(-1, target[:, None])[:, 0]
+    loss = -((1 - label_smoothing) * of_target + label_smoothing * elsewhere).sum()
     best = logits.detach().topk(min(5, logits.shape[-1]), dim=-1).indices == target[:, None]
     return loss, torch.stack(
         [best[:, 0].sum(), best.any(-1).sum(), torch.tensor(len(target), device=target.device)]
     ).float()
 
 
-def trained_agents(batch: ScenarioBatch, config: PretrainConfig, seed: int) -> Bool[Tensor, "B A"]:
-    """Agents whose predictions count: the evaluated and interesting ones, then those near the ego with a future, up to a limit."""
+def trained_agents(batch: ScenarioBatch, config: PretrainConfig, update: int) -> Bool[Tensor, "B A"]:
+    """Agents whose predictions count: the evaluated and interesting ones, then those near the ego with a future, up to a limit.
+
+    Who is drawn depends on the seed, the update and the scenario, not on how a batch is put together.
+    """
     now, future = CURRENT_STEP, slice(CURRENT_STEP + 1, None)
     ego = torch.tensor([s.tracks.object_id[s.ego_index] for s in batch.scenarios], device=batch.device)
     interest = torch.zeros_like(batch.agent_mask)
@@ -220,7 +237,12 @@ def trained_agents(batch: ScenarioBatch, config: PretrainConfig, seed: int) -> B
     others = near & (batch.valid[:, :, future].sum(-1) >= 5) & batch.agent_mask & ~first
     if config.max_trained_agents is None:
         return first | others
-    generator = torch.Generator().manual_seed(seed % 2**63)
-    luck = torch.rand(others.shape, generator=generator).to(batch.device)
+    luck = torch.zeros(others.shape)
+    for row, scenario in zip(luck, batch.scenarios):
+        seed = derive_seed(config.seed, "agents", update, scenario.scenario_id)
+        generator = torch.Generator().manual_seed(seed % 2**63)
+        count = len(scenario.simulated_indices)
+        row[:count] = torch.rand(count, generator=generator)
+    luck = luck.to(batch.device)
     order = torch.where(others, luck, 2.0).argsort(-1).argsort(-1)
     return first | (others & (order < config.max_trained_agents - first.sum(-1, keepdim=True)))

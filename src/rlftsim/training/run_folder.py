@@ -8,7 +8,9 @@ model/             the result, once the run is done (`save_pretrained`)
 """
 
 import dataclasses
+import hashlib
 import json
+import math
 import os
 import platform
 import subprocess
@@ -19,12 +21,31 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from torch import nn
 from torch.utils.tensorboard import SummaryWriter
 
 from rlftsim import __version__
 from rlftsim.errors import CheckpointError
+from rlftsim.scenario.types import Scenarios
+from rlftsim.training.checkpoint import newest_checkpoint
 
 PACKAGES = ("torch", "numpy", "pyarrow", "lightning-fabric", "safetensors")
+
+
+MAY_CHANGE = {"device", "checkpoint_every"}
+"""Settings that a run may be continued with other values of."""
+
+
+def describe_inputs(module: nn.Module, scenarios: Scenarios) -> dict[str, str]:
+    """What a run starts from, as short hashes: the weights before training, and which scenarios in which order."""
+    weights, ids = hashlib.blake2b(digest_size=8), hashlib.blake2b(digest_size=8)
+    for name, value in module.state_dict().items():
+        weights.update(name.encode())
+        weights.update(value.detach().cpu().contiguous().numpy().tobytes())
+    known = getattr(scenarios, "scenario_ids", None)
+    for scenario_id in known if known is not None else (scenarios[i].scenario_id for i in range(len(scenarios))):
+        ids.update(scenario_id.encode())
+    return {"initial_weights": weights.hexdigest(), "scenarios": ids.hexdigest()}
 
 
 def to_plain(config: Any) -> Any:
@@ -73,14 +94,14 @@ class RunFolder:
         CheckpointError: the folder belongs to a run with another configuration.
     """
 
-    def __init__(self, path: Path, config: Any, *, writes: bool = True):
+    def __init__(self, path: Path, config: Any, inputs: Mapping[str, str] | None = None, *, writes: bool = True):
         self.path = path
         self.checkpoints = path / "checkpoints"
         self.model = path / "model"
         self._writes = writes
         self._metrics = path / "metrics.jsonl"
         self._board: SummaryWriter | None = None
-        plain = to_plain(config)
+        plain = {**to_plain(config), **(inputs or {})}
         self._refuse_other(plain)
         if writes:
             write_text(path / "config.json", json.dumps(plain, indent=1) + "\n")
@@ -94,12 +115,17 @@ class RunFolder:
             old = json.loads(path.read_text())
         except ValueError:
             return
-        differing = sorted(k for k in old.keys() | config.keys() if old.get(k) != config.get(k))
+        differing = sorted(k for k in (old.keys() | config.keys()) - MAY_CHANGE if old.get(k) != config.get(k))
         if differing:
             raise CheckpointError(
-                f"{self.path} belongs to a run with other settings ({', '.join(differing)}): "
+                f"{self.path} belongs to a run with other settings or inputs ({', '.join(differing)}): "
                 "name another --out, or remove the folder to start anew."
             )
+
+    def diverged(self, cause: str, remedy: str) -> CheckpointError:
+        """The error of a run that makes no sense any more; names its last good checkpoint."""
+        newest = newest_checkpoint(self.checkpoints)
+        return CheckpointError(f"{self.path}: {cause}. The last good checkpoint is {newest or 'none'}: {remedy}.")
 
     def continue_from(self, update: int) -> None:
         """Drop the metrics of updates that will be done again."""
@@ -130,7 +156,8 @@ class RunFolder:
 def read_metrics(path: Path) -> list[dict[str, Any]]:
     """The metrics of a run's folder, a dictionary an update; empty where there are none."""
     metrics = path / "metrics.jsonl"
-    return [json.loads(line) for line in metrics.read_text().splitlines()] if metrics.exists() else []
+    lines = metrics.read_text().splitlines() if metrics.exists() else []
+    return [json.loads(line) for line in lines if math.isfinite(_update_of(line))]
 
 
 def _update_of(line: str) -> float:
