@@ -44,6 +44,8 @@ class AgentTokens:
     logged_position: Float[Tensor, "B A K 2"]
     logged_heading: Float[Tensor, "B A K"]
     logged_valid: Bool[Tensor, "B A K"]
+    next_token_id: Int64[Tensor, "B A K"]
+    """Token that should come next: `token_id` of the next step. The last column means nothing, nor does what `valid` there denies."""
 
 
 def clean_tracks(batch: ScenarioBatch, *, public_order_of_operations: bool = False) -> CleanTracks:
@@ -164,13 +166,38 @@ def tokenize_tracks(
         columns.append((token_id, position * valid[..., None], heading * valid, valid))
     token_id, led_positions, led_headings, valid = (torch.stack([c[i] for c in columns], 2) for i in range(4))
     logged = slice(STEPS_PER_TOKEN, None, STEPS_PER_TOKEN)
+    logged_position, logged_heading = tracks.position[..., logged, :], tracks.heading[..., logged]
+    next_token_id = token_id.roll(-1, -1)
+    if public_order_of_operations:
+        following = (logged_position.roll(-1, -2), logged_heading.roll(-1, -1))
+        next_token_id = tokens_towards(
+            following, (led_positions, led_headings), class_id[..., None].expand_as(valid), valid, vocabulary
+        )
     return AgentTokens(
         token_id, led_positions, led_headings, valid,
-        tracks.position[..., logged, :], tracks.heading[..., logged], tracks.valid[..., logged],
+        logged_position, logged_heading, tracks.valid[..., logged], next_token_id,
     )  # fmt: skip
 
 
 Pose = tuple[Float[Tensor, "*batch 2"], Float[Tensor, "*batch"]]
+
+
+def tokens_towards(
+    goal: Pose,
+    pose: Pose,
+    class_id: Int64[Tensor, "*batch"],
+    valid: Bool[Tensor, "*batch"],
+    vocabulary: Vocabulary,
+) -> Int64[Tensor, "*batch"]:
+    """Token that leads nearest from a pose to a goal pose: smallest sum of corner distances in the frame of the pose, 0 where not `valid`."""
+    return nearest_tokens(local_boxes(goal, pose, class_id), class_id, valid, vocabulary)
+
+
+def local_boxes(goal: Pose, pose: Pose, class_id: Int64[Tensor, "*batch"]) -> Float[Tensor, "*batch 4 2"]:
+    """Box of a class at a goal pose, in the frame of another pose."""
+    length, width = torch.tensor(CLASS_BOXES_M, device=class_id.device)[class_id].unbind(-1)
+    position = rotate(goal[0] - pose[0], -pose[1])
+    return box_corners(position, wrap_angle(goal[1] - pose[1]), length, width)
 
 
 def _match_in_local_frame(

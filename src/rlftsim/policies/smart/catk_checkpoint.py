@@ -1,7 +1,7 @@
 """Checkpoints of the public CAT-K code: strict import, and export back.
 
-    policy = import_catk(Path("clsft.ckpt"), [Path("agent_vocab.npz"), Path("map_vocab.npz")]).policy
-    policy.save_pretrained(Path("models/clsft"))
+policy = import_catk(Path("clsft.ckpt"), [Path("agent_vocab.npz"), Path("map_vocab.npz")]).policy
+policy.save_pretrained(Path("models/clsft"))
 """
 
 from collections.abc import Sequence
@@ -16,7 +16,12 @@ from torch import Tensor
 
 from rlftsim.errors import CheckpointError, ConfigError
 from rlftsim.policies.smart.catk_keys import PREFIX, aliases, catk_name
-from rlftsim.policies.smart.catk_vocabulary import PUBLISHED_AGENT_FILE, PUBLISHED_NUM_TOKENS, is_published, read_catk_vocabulary
+from rlftsim.policies.smart.catk_vocabulary import (
+    PUBLISHED_AGENT_FILE,
+    PUBLISHED_NUM_TOKENS,
+    is_published,
+    read_catk_vocabulary,
+)
 from rlftsim.policies.smart.config import SmartConfig, smart_mini, smart_nano, smart_tiny
 from rlftsim.policies.smart.lightning_file import read_lightning
 from rlftsim.policies.smart.network import SmartNetwork

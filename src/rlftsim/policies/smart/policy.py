@@ -188,7 +188,7 @@ class SmartPolicy(nn.Module):
         decides[..., : HISTORY_TOKENS - 1] = False
         counts = (tokens.valid[..., 1:] & trained[..., None])[:, None][decides]
         logits = self._logits(rows[decides[steps.valid]], scenarios.object_type, decides)
-        return TeacherForced(logits, tokens.token_id[:, None, :, 1:][decides], counts)
+        return TeacherForced(logits, tokens.next_token_id[:, None, :, :-1][decides], counts)
 
     def fine_tuned_parts(self) -> tuple[nn.Module, ...]:
         """What closed-loop fine-tuning trains: the decoder's attention and the head, as the public CAT-K code does."""
