@@ -7,7 +7,7 @@ where the rollout has led.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Int64
@@ -18,24 +18,28 @@ from rlftsim.rollout.policy import DecisionDistribution, Policy, Sampling
 from rlftsim.rollout.simulate import Choose, simulate
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
+from rlftsim.tokens import public_order
 from rlftsim.tokens.agent_tokens import (
     HISTORY_TOKENS,
     AgentTokens,
+    Pose,
     local_boxes,
-    nearest_tokens,
     tokenize_agents,
+    tokens_towards,
 )
-from rlftsim.tokens.vocabulary import Vocabulary, class_of_type
+from rlftsim.tokens.vocabulary import CLASS_BOXES_M, Vocabulary, class_of_type
 
 DEFAULT_NUM_CANDIDATES = 32
 
 
+@runtime_checkable
 class TokenPolicy(Policy, Protocol):
     """A policy whose decisions are tokens of a vocabulary."""
 
     vocabulary: Vocabulary
 
 
+@runtime_checkable
 class TokenLogits(Protocol):
     """What CAT-K needs of a distribution over tokens: logits of the R elements where the mask is True, in the mask's order."""
 
@@ -62,6 +66,7 @@ def roll_out_closest(
     num_rollouts: int = 1,
     seed: int = 0,
     context: Any = None,
+    public_order_of_operations: bool = False,
 ) -> PursuingRollouts:
     """Simulate with CAT-K.
 
@@ -74,15 +79,18 @@ def roll_out_closest(
         num_rollouts: N.
         seed: of what else is random in the policy.
         context: `policy.encode(batch)`, where it is at hand.
+        public_order_of_operations: round where the public code rounds, see `tokens.public_order`.
 
     Raises:
         ConfigError: no candidates.
     """
     if num_candidates < 1:
         raise ConfigError(f"num_candidates must be at least 1, got {num_candidates}.")
-    tokens = tokenize_agents(batch, policy.vocabulary)
+    tokens = tokenize_agents(batch, policy.vocabulary, public_order_of_operations=public_order_of_operations)
     targets: list[tuple[Tensor, Tensor]] = []
-    choose = closest_among_top_k(batch, tokens, policy.vocabulary, num_candidates, targets)
+    choose = closest_among_top_k(
+        batch, tokens, policy.vocabulary, num_candidates, targets, distances_where_placed=public_order_of_operations
+    )
     rollouts = simulate(policy, batch, num_rollouts=num_rollouts, seed=seed, context=context, choose=choose)
     target, mask = (torch.stack(part, -1) for part in zip(*targets))
     return PursuingRollouts(rollouts, target, mask)
@@ -94,6 +102,8 @@ def closest_among_top_k(
     vocabulary: Vocabulary,
     num_candidates: int,
     targets: list[tuple[Tensor, Tensor]],
+    *,
+    distances_where_placed: bool = False,
 ) -> Choose:
     """A `choose` for one call of `simulate`.
 
@@ -103,40 +113,53 @@ def closest_among_top_k(
         vocabulary: the policy's.
         num_candidates: K.
         targets: receives, decision by decision, the nearest token of all [B, N, A] and whether the next state was recorded.
+        distances_where_placed: place the candidates before distances are taken, as the public code does.
     """
-    class_id = class_of_type(batch.object_type)[:, None]
     steps: Iterator[int] = iter(range(HISTORY_TOKENS, tokens.logged_valid.shape[-1]))
+    distances = _distances_where_placed if distances_where_placed else _distances_in_local_frame
 
     def choose(
         distribution: DecisionDistribution, state: Any, sampling: Sampling, noise: Tensor
     ) -> Int64[Tensor, "B N A"]:
         step = next(steps)
-        goal = (tokens.logged_position[:, None, :, step], tokens.logged_heading[:, None, :, step])
-        classes = class_id.expand_as(state.heading)
+        pose = (state.position, state.heading)
+        goal = (
+            tokens.logged_position[:, None, :, step].expand_as(state.position),
+            tokens.logged_heading[:, None, :, step].expand_as(state.heading),
+        )
+        class_id = class_of_type(batch.object_type)[:, None].expand_as(state.heading)
         recorded = tokens.logged_valid[:, None, :, step].expand_as(state.heading)
-        boxes = local_boxes(goal, (state.position, state.heading), classes)
-        targets.append((nearest_tokens(boxes, classes, recorded, vocabulary), recorded))
-        return _closest(distribution, boxes, classes, recorded, vocabulary, num_candidates)  # type: ignore[arg-type]
+        targets.append((tokens_towards(goal, pose, class_id, recorded, vocabulary), recorded))
+        best, mask = _most_likely(distribution, num_candidates)  # type: ignore[arg-type]
+        ends = vocabulary.end_corners()[class_id[mask][:, None], best]
+        goal, pose = ((position[mask], heading[mask]) for position, heading in (goal, pose))
+        nearest = distances(ends, goal, pose, class_id[mask]).argmin(-1, keepdim=True)
+        chosen = torch.where(recorded[mask], best.gather(-1, nearest)[:, 0], best[:, 0])
+        return torch.zeros_like(class_id).masked_scatter(mask, chosen)
 
     return choose
 
 
-def _closest(
-    distribution: TokenLogits,
-    boxes: Float[Tensor, "B N A 4 2"],
-    class_id: Int64[Tensor, "B N A"],
-    recorded: Bool[Tensor, "B N A"],
-    vocabulary: Vocabulary,
-    num_candidates: int,
-) -> Int64[Tensor, "B N A"]:
-    """Among the most likely tokens the one with the smallest mean corner distance; the most likely one where nothing is recorded."""
-    mask = distribution.mask
-    best = distribution.logits.topk(min(num_candidates, distribution.logits.shape[-1]), dim=-1).indices  # [R, K]
-    ends = vocabulary.end_corners()[class_id[mask][:, None], best]
-    distance = (ends - boxes[mask][:, None]).norm(dim=-1).mean(-1)
-    nearest = best.gather(-1, distance.argmin(-1, keepdim=True))[:, 0]
-    chosen = torch.where(recorded[mask], nearest, best[:, 0])
-    return torch.zeros_like(class_id).masked_scatter(mask, chosen)
+def _most_likely(distribution: TokenLogits, num_candidates: int) -> tuple[Int64[Tensor, "R K"], Bool[Tensor, "B N A"]]:
+    """Token ids of the agents that decide, the most likely one first; who decides."""
+    count = min(num_candidates, distribution.logits.shape[-1])
+    return distribution.logits.topk(count, dim=-1).indices, distribution.mask
+
+
+def _distances_in_local_frame(
+    ends: Float[Tensor, "R K 4 2"], goal: Pose, pose: Pose, class_id: Int64[Tensor, "R"]
+) -> Float[Tensor, "R K"]:
+    """Mean corner distances from tokens' end boxes to the box at a goal pose."""
+    return (ends - local_boxes(goal, pose, class_id)[:, None]).norm(dim=-1).mean(-1)
+
+
+def _distances_where_placed(
+    ends: Float[Tensor, "R K 4 2"], goal: Pose, pose: Pose, class_id: Int64[Tensor, "R"]
+) -> Float[Tensor, "R K"]:
+    """As `_distances_in_local_frame`, in the public code's order of operations."""
+    length, width = torch.tensor(CLASS_BOXES_M, device=class_id.device)[class_id].unbind(-1)
+    aim = public_order.boxes_around(*goal, length, width)
+    return (public_order.place_boxes(ends, *pose) - aim[:, None]).norm(dim=-1).mean(-1)
 
 
 def catk_loss(
