@@ -9,9 +9,13 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from realism_drawing import draw_red_light, draw_rollouts, draw_traffic, select_rollouts
+from torch.nn import functional
 
 from rlftsim.realism import SimulatedStates, build_scenario_log, compute_features, score
 from rlftsim.realism.config import HISTOGRAM_FEATURES
+from rlftsim.realism.from_rollouts import states_of_rollouts
+from rlftsim.rollout.types import Rollouts
+from rlftsim.scenario.batch import collate
 from rlftsim.scenario.types import MapFeatures
 
 SEEDS = st.integers(0, 10_000)
@@ -50,7 +54,10 @@ def test_the_order_of_tracks_in_the_record_does_not_matter(seed):
         scenario.tracks, **{name: values[order] for name, values in vars(scenario.tracks).items()}
     )
     shuffled = dataclasses.replace(
-        scenario, tracks=tracks, ego_index=int(rank[0]), tracks_to_predict=rank[scenario.tracks_to_predict]
+        scenario,
+        tracks=tracks,
+        ego_index=int(rank[0]),
+        tracks_to_predict=rank[scenario.tracks_to_predict].astype(np.int32),
     )
     assert score(shuffled, states).to_official_fields() == score(scenario, states).to_official_fields()
 
@@ -164,3 +171,46 @@ def test_a_rotation_changes_features_by_rounding_only(seed, angle):
     assert (before.linear_acceleration - after.linear_acceleration).abs().nan_to_num().max() < 1e-2
     # Time to collision jumps where an agent is just or just not followed: nearly all steps agree.
     assert ((before.time_to_collision - after.time_to_collision).abs() > 1e-2).float().mean() < 0.01
+
+
+@SLOW
+@given(SEEDS, st.floats(-1.5, 1.5))
+def test_a_rotation_moves_the_score_by_a_few_flipped_bins_at_most(seed, angle):
+    # 3 agents x 80 steps: a flipped bin changes a likelihood by about 1/240 of itself.
+    scenario = draw_traffic(seed)
+    states = draw_rollouts(scenario, 3, seed=seed)
+    moved, moved_states = move(scenario, states, angle, [0.0, 0.0])
+    assert score(moved, moved_states).meta_metric.item() == pytest.approx(
+        score(scenario, states).meta_metric.item(), abs=0.01
+    )
+
+
+@SLOW
+@given(SEEDS, st.integers(2, 6))
+def test_leaving_one_out_equals_scoring_the_others(seed, num_rollouts):
+    scenario = draw_traffic(seed, lights=draw_red_light())
+    states = draw_rollouts(scenario, num_rollouts, seed=seed)
+    without_each = score(scenario, states).leave_one_out_meta_metric
+    for rollout in range(num_rollouts):
+        others = [other for other in range(num_rollouts) if other != rollout]
+        expected = score(scenario, select_rollouts(states, others)).meta_metric
+        assert without_each[rollout].item() == pytest.approx(expected.item(), abs=1e-6)
+
+
+@SLOW
+@given(SEEDS, st.integers(0, 9))
+def test_padding_of_a_batch_changes_nothing(seed, padding):
+    scenario, states = draw(seed)
+    count = len(states.object_id)
+    batch = collate([scenario], max_agents=count + padding)
+    position = torch.stack([states.x, states.y], -1)[None] - batch.origin[:, None, None, None].float()
+    padded = Rollouts(
+        position=functional.pad(position, (0, 0, 0, 0, 0, padding), value=float("nan")),
+        heading=functional.pad(states.heading[None], (0, 0, 0, padding), value=float("nan")),
+        decision=torch.zeros(1, 4, count + padding, 1),
+        decision_mask=torch.ones(1, 4, count + padding, 1, dtype=torch.bool),
+        log_prob=torch.zeros(1, 4, count + padding, 1),
+    )
+    (unpadded,) = states_of_rollouts(batch, padded)
+    same_height = dataclasses.replace(states, z=unpadded.z)  # a policy keeps the current step's height
+    assert score(scenario, unpadded).to_official_fields() == score(scenario, same_height).to_official_fields()

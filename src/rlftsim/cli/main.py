@@ -23,6 +23,7 @@ VERBS = {
     "finetune": ("rlftsim.cli.train", "Finetune"),
     "model": ("rlftsim.cli.model", "Model"),
     "simulate": ("rlftsim.cli.simulate", "Simulate"),
+    "score": ("rlftsim.cli.results", "Score"),
     "evaluate": ("rlftsim.cli.results", "Evaluate"),
     "compare": ("rlftsim.cli.results", "Compare"),
 }
@@ -45,6 +46,7 @@ usage: rlftsim VERB ...      rlftsim VERB --help explains a verb
   model        take a checkpoint from the public CAT-K code, or hand one back
   simulate     roll scenarios out with a model
 
+  score        score anybody's rollouts with the official realism meta-metric
   evaluate     measure a model with the official realism meta-metric
   compare      compare two evaluations scenario by scenario
 """

@@ -1,5 +1,7 @@
-"""Verbs that measure: evaluate, compare."""
+"""Verbs that measure: score, evaluate, compare."""
 
+import json
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -11,6 +13,8 @@ from rlftsim.cli.data import data_folder
 from rlftsim.experiments.compare import compare, format_comparison, format_table
 from rlftsim.experiments.evaluate import EvaluateConfig, evaluate
 from rlftsim.experiments.evaluation import Evaluation
+from rlftsim.experiments.explain import explain_rollouts
+from rlftsim.experiments.score import ScoreConfig, format_scores, score_rollouts, to_json
 from rlftsim.progress import print_wide
 from rlftsim.recipes.models import load_policy_or_oracle
 
@@ -42,6 +46,44 @@ class Evaluate:
         for skipped in result.skipped:
             print(f"  skipped {skipped.scenario_id}: {skipped.reason}")
         print(f"{self.out / name}.parquet")
+        return 0
+
+
+@dataclass(frozen=True)
+class Score:
+    """Score anybody's rollouts with the official realism meta-metric.
+
+    Reads npz files (scenario_id, object_ids [A], x y z heading [N, A, 80]) and official submission files; see
+    docs/rollout_formats.md. With OUT an interrupted run goes on where it was.
+    """
+
+    rollouts: Positional[Path]
+    """A file of rollouts, or a folder of them."""
+    scenarios: str
+    """What was simulated: a converted data set, tfrecords (file, folder, quoted glob), or "synthetic"."""
+    out: Path | None = None
+    """Folder for the per-scenario results (Parquet)."""
+    name: str | None = None
+    """Of the row and the file; left out, the name of the rollouts."""
+    json: bool = False
+    """Print JSON under the official messages' names instead of a table."""
+    explain: Path | None = None
+    """Folder for a page a scenario: which feature, agent and steps cost how much."""
+    config: Annotated[ScoreConfig, tyro.conf.arg(name="")] = field(default_factory=ScoreConfig)
+
+    def run(self) -> int:
+        """Score, print, explain."""
+        scenarios = data_folder(self.scenarios)
+        result = score_rollouts(self.rollouts, scenarios, self.out, self.config, name=self.name)
+        if self.json:
+            print(json.dumps(to_json(result), allow_nan=False))
+        else:
+            print_wide(format_scores(result))
+            for skipped in result.skipped:
+                print(f"  skipped {skipped.scenario_id}: {skipped.reason}")
+        if self.explain is not None:
+            pages = explain_rollouts(self.rollouts, scenarios, self.explain, self.config)
+            print(f"{self.explain}: {len(pages)} pages", file=sys.stderr)
         return 0
 
 

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -212,7 +213,7 @@ def _paired_differences(base: Evaluation, tuned: Evaluation) -> list[float]:
 def _charts(out: Path, config: DemoConfig) -> list[ChartGroup]:
     before, after = read_metrics(out / "pretrain"), read_metrics(out / "finetune")
 
-    def chart(lines: list[dict[str, float]], title: str, label: str, **named: str) -> Chart:
+    def chart(lines: list[dict[str, Any]], title: str, label: str, **named: str) -> Chart:
         updates = [line["update"] for line in lines]
         curves = [Curve(name, updates, [line[key] for line in lines]) for key, name in named.items()]
         reference = ("target", config.recipe.finetune.kl.target) if "kl" in named else None

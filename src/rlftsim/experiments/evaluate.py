@@ -1,37 +1,23 @@
 """Scores of a policy on a data set: simulate every scenario, score all its rollouts together, keep every scenario's numbers.
 
-Work is done in groups of scenarios. A finished group is a part file under `<name>.parts/`; a run that was interrupted goes on
-with the groups that are missing, and when all are there they become `<name>.parquet`.
+A run that was interrupted goes on with what is missing, see `experiments.parts`.
 """
 
 import copy
 import hashlib
-import shutil
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Literal
 
-import pyarrow as pa
 import torch
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from torch import nn
 
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.experiments.evaluation import (
-    SCHEMA,
-    EvaluateConfig,
-    Evaluation,
-    Provenance,
-    Skipped,
-    join_evaluations,
-    row_of_result,
-)
+from rlftsim.experiments.evaluation import EvaluateConfig, Evaluation, Provenance, Skipped, row_of_result
 from rlftsim.experiments.fingerprint import fingerprint_policy
-from rlftsim.experiments.workers import run_in_processes
+from rlftsim.experiments.parts import ResumableEvaluation
 from rlftsim.realism import SimulatedStates, build_scenario_log, metric_by_name, score
 from rlftsim.realism.from_rollouts import logged_states, states_of_rollouts
 from rlftsim.rollout.policy import Policy
@@ -42,8 +28,6 @@ from rlftsim.scenario.types import TOTAL_STEPS, Scenario
 
 __all__ = ["EvaluateConfig", "Evaluation", "Provenance", "Skipped", "evaluate", "simulate_states"]
 
-SCENARIOS_PER_GROUP = 4
-"""What is lost at most, for each process, when a run is interrupted."""
 _CACHED_SCENARIOS = 2  # each is looked at once
 
 Oracle = Literal["oracle"]
@@ -69,28 +53,21 @@ def evaluate(
         config: rollouts, metric, sampling, scenarios, processes.
         name: of the row and the file. Unfinished work and results of another policy, data set or setting under this name
             are replaced, with a word on stderr.
-        show_progress: whether to draw a bar with the time left on stderr, if that is a terminal.
+        show_progress: whether to show progress and the time left on stderr.
 
     Raises:
         DataError: no such data set or split, or scenarios whose future is withheld (a test split).
         ConfigError: an impossible name, or several processes for a policy that lives on a GPU.
     """
     dataset_folder, out = Path(dataset_folder), Path(out)
-    if not name or Path(name).name != name:
-        raise ConfigError(f"an evaluation's name becomes a file name, {name!r} cannot.")
     positions = _choose_scenarios(ScenarioDataset(dataset_folder, config.split), config)
     job = _Job(_frozen_copy(policy), dataset_folder, _describe(policy, dataset_folder, config), name, out)
     if config.jobs > 1 and job.device.type != "cpu":
         raise ConfigError(f"evaluate.jobs={config.jobs} works on CPUs only, the policy is on {job.device}: set jobs=1.")
-    groups = [positions[i : i + SCENARIOS_PER_GROUP] for i in range(0, len(positions), SCENARIOS_PER_GROUP)]
-    finished = _read_finished(job, groups)
-    if finished is None:
-        _fill_parts(job, groups, show_progress)
-        parts = [_read_part(job, group) for group in groups]
-        finished = join_evaluations(name, job.provenance, [part for part in parts if part is not None])
-        finished.write(job.result_path)
-    shutil.rmtree(job.parts_folder, ignore_errors=True)
-    return finished
+    ids = _open(job).scenario_ids[: len(positions)]
+    return job.parts.run(
+        partial(_evaluate_group, job), ids, jobs=config.jobs, title=f"evaluate {name}", show_progress=show_progress
+    )
 
 
 def simulate_states(
@@ -137,15 +114,8 @@ class _Job:
         return self.provenance.config
 
     @property
-    def result_path(self) -> Path:
-        return self.out / f"{self.name}.parquet"
-
-    @property
-    def parts_folder(self) -> Path:
-        return self.out / f"{self.name}.parts"
-
-    def part_path(self, group: range) -> Path:
-        return self.parts_folder / f"{group.start:06d}-{group.stop:06d}.parquet"
+    def parts(self) -> ResumableEvaluation:
+        return ResumableEvaluation(self.name, self.provenance, self.out)
 
     @property
     def device(self) -> torch.device:
@@ -190,67 +160,16 @@ def _choose_scenarios(dataset: ScenarioDataset, config: EvaluateConfig) -> range
     return chosen
 
 
-def _read_finished(job: _Job, groups: list[range]) -> Evaluation | None:
-    """The result of an earlier call with the same arguments, if there is one."""
-    if not job.result_path.exists():
-        return None
-    try:
-        found = Evaluation.read(job.result_path)
-    except DataError as error:
-        _say(f"{error} Doing so.")
-        return None
-    other = found.provenance.differences(job.provenance)
-    if other:
-        _say(f"{job.result_path} is of another {', '.join(other)}: it will be replaced.")
-        return None
-    ids = _open(job).scenario_ids[: groups[-1].stop]
-    return found if {*found.scenario_ids, *(s.scenario_id for s in found.skipped)} == set(ids) else None
-
-
-def _read_part(job: _Job, group: range) -> Evaluation | None:
-    """What an earlier call left of a group; None if there is nothing usable."""
-    path = job.part_path(group)
-    if not path.exists():
-        return None
-    try:
-        part = Evaluation.read(path)
-    except DataError as error:
-        _say(f"{error} Doing so.")
-        return None
-    other = part.provenance.differences(job.provenance)
-    if other:
-        _say(f"{path} is of another {', '.join(other)}: discarded.")
-    return None if other else part
-
-
-def _fill_parts(job: _Job, groups: list[range], show_progress: bool) -> None:
-    """Work on the groups whose part is missing."""
-    missing = [group for group in groups if _read_part(job, group) is None]
-    total = sum(len(group) for group in groups)
-    with _progress_bar(job.name, total, total - sum(len(group) for group in missing), show_progress) as advance:
-        task = partial(_evaluate_group, job)
-        if min(job.config.jobs, len(missing)) > 1:
-            run_in_processes(task, missing, jobs=min(job.config.jobs, len(missing)), advance=advance)
-        else:
-            for group in missing:
-                task(group, advance, lambda: False)
-
-
 def _evaluate_group(job: _Job, group: range, advance: Callable[[int], None], is_stopped: Callable[[], bool]) -> None:
     """Score a few scenarios and write their part."""
     dataset = _open(job)
-    rows, skipped = [], []
+    outcomes = []
     for position in group:
         if is_stopped():
             return
-        outcome = _evaluate_scenario(job, dataset[position])
-        if isinstance(outcome, Skipped):
-            skipped.append(outcome)
-        else:
-            rows.append(outcome)
+        outcomes.append(_evaluate_scenario(job, dataset[position]))
         advance(1)
-    table = pa.Table.from_pylist(rows, schema=SCHEMA)
-    Evaluation(job.name, job.provenance, table, tuple(skipped)).write(job.part_path(group))
+    job.parts.write_part(group, outcomes)
 
 
 def _evaluate_scenario(job: _Job, scenario: Scenario) -> dict[str, object] | Skipped:
@@ -273,24 +192,3 @@ def _evaluate_scenario(job: _Job, scenario: Scenario) -> dict[str, object] | Ski
 
 def _open(job: _Job) -> ScenarioDataset:
     return ScenarioDataset(job.dataset_folder, job.config.split, cache_size=_CACHED_SCENARIOS)
-
-
-@contextmanager
-def _progress_bar(name: str, total: int, done: int, show: bool) -> Iterator[Callable[[int], None]]:
-    columns = (
-        TextColumn(f"evaluating {name}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("scenarios"),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-    )
-    console = Console(stderr=True)
-    with Progress(*columns, console=console, disable=not (show and console.is_terminal)) as progress:
-        bar = progress.add_task(name, total=total, completed=done)
-        yield lambda count: progress.advance(bar, count)
-
-
-def _say(message: str) -> None:
-    Console(stderr=True, highlight=False, soft_wrap=True).print(message, markup=False)

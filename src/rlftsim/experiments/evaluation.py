@@ -5,10 +5,10 @@ Columns: likelihoods and meta-metrics, higher is better; `*_error` in metres and
 
 import json
 import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Self
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -200,7 +200,7 @@ class Evaluation:
         with_temporary_name(path, lambda temporary: pq.write_table(table, temporary, compression="zstd"))
 
     @classmethod
-    def read(cls, path: Path) -> Self:
+    def read(cls, path: Path) -> "Evaluation":
         """Read what `write` wrote.
 
         Raises:
@@ -248,4 +248,4 @@ def row_of_result(result: RealismResult, *, num_agents: int, num_evaluated: int)
 
 
 def _provenance_of(values: dict[str, Any]) -> Provenance:
-    return replace(Provenance(**values), config=EvaluateConfig(**values["config"]))
+    return Provenance(**{**values, "config": EvaluateConfig(**values["config"])})

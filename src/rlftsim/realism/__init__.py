@@ -15,6 +15,7 @@ from rlftsim.realism.config import (
     MetricConfig,
     metric_by_name,
 )
+from rlftsim.realism.credit import Credit, compute_credit
 from rlftsim.realism.features import (
     ComputeConfig,
     Features,
@@ -33,12 +34,14 @@ __all__ = [
     "METRIC_2024_ORIGINAL",
     "METRIC_2025",
     "ComputeConfig",
+    "Credit",
     "Features",
     "MetricConfig",
     "RealismResult",
     "ScenarioLog",
     "SimulatedStates",
     "build_scenario_log",
+    "compute_credit",
     "compute_features",
     "metric_by_name",
     "scenario_log",

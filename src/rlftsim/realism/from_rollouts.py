@@ -36,4 +36,5 @@ def logged_states(scenario: Scenario, *, num_rollouts: int, device: torch.device
     position = torch.from_numpy(scenario.tracks.position[chosen, future]).to(device)[None]
     heading = torch.from_numpy(scenario.tracks.heading[chosen, future]).to(device)[None]
     ids = scenario.tracks.object_id[chosen]
-    return SimulatedStates(ids, *position.unbind(-1), heading, repeat=num_rollouts)
+    x, y, z = position.unbind(-1)
+    return SimulatedStates(ids, x, y, z, heading, repeat=num_rollouts)

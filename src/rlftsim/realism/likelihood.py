@@ -108,7 +108,7 @@ def compute_outcomes(features: Features, log: ScenarioLog) -> Bool[Tensor, "N J 
     return torch.stack([features.collision, features.offroad, lights], dim=1).logical_and_(log_valid).any(-1)
 
 
-def _stack_scored_steps(log: ScenarioLog, config: MetricConfig) -> Bool[Tensor, "H E T"]:
+def stack_scored_steps(log: ScenarioLog, config: MetricConfig) -> Bool[Tensor, "H E T"]:
     """At which steps of the log each histogram feature counts."""
     features = log.features
     valid, speed, acceleration = features.valid[0], features.speed_valid[0], features.acceleration_valid[0]
@@ -120,7 +120,7 @@ def build_log_target(log: ScenarioLog, config: MetricConfig) -> LogTarget:
     """Bins and outcomes of the log under a configuration."""
     table = histogram_table(config, log.agents.valid.device)
     values = stack_histogram_features(log.features)[:, 0]
-    scored = _stack_scored_steps(log, config).to(values.dtype)
+    scored = stack_scored_steps(log, config).to(values.dtype)
     bins = find_bins(values.flatten(1), table).view(values.shape)
     steps = values.new_zeros(*values.shape[:2], table.edges.shape[1] - 1).scatter_add_(-1, bins, scored)
     return LogTarget(steps, scored.sum((1, 2)), compute_outcomes(log.features, log)[0])
@@ -158,13 +158,12 @@ def compute_log_probabilities(
     return (counts + pseudocount).log_() - total.log()[..., None, None]
 
 
-def compute_likelihoods(
+def compute_agent_log_likelihoods(
     counts: RolloutCounts, num_rollouts: Float[Tensor, "S"], target: LogTarget, table: HistogramTable
-) -> Float[Tensor, "S F"]:
-    """Likelihood of the log under S sets of rollouts, one per feature: the exponential of the mean log-probability.
+) -> Float[Tensor, "S F E"]:
+    """What each agent adds to the log-likelihood of the log under S sets of rollouts, nats.
 
-    Histogram features average over all scored (agent, step) pairs together, Bernoulli ones over all agents. A feature
-    without a scored step is NaN, as in the official evaluator.
+    The log-probabilities of an agent's scored steps, summed; for a Bernoulli feature that of its one outcome.
 
     Args:
         counts: Summed over each set: `bins` [S, H, E, K], `agreement` [S, J, E].
@@ -173,7 +172,25 @@ def compute_likelihoods(
         table: The metric's bins.
     """
     log_probability = compute_log_probabilities(counts.bins, num_rollouts * counts.num_steps, table)
-    histogram = (log_probability * target.steps_in_bin).sum((-1, -2)) / target.num_scored_steps  # [S, H]
+    histogram = (log_probability * target.steps_in_bin).sum(-1)  # [S, H, E]
     pseudocount = table.bernoulli_pseudocount
     agreement = (counts.agreement + pseudocount[:, None]) / (num_rollouts[:, None] + 2 * pseudocount)[..., None]
-    return torch.cat([histogram, agreement.log_().mean(-1)], dim=-1).exp_()
+    return torch.cat([histogram, agreement.log_()], dim=1)
+
+
+def count_terms(target: LogTarget) -> Float[Tensor, "F"]:
+    """Number of log-probabilities a feature's mean is taken over: scored (agent, step) pairs, or agents."""
+    num_bernoulli, num_agents = target.outcome.shape
+    return torch.cat([target.num_scored_steps, target.num_scored_steps.new_full((num_bernoulli,), num_agents)])
+
+
+def compute_likelihoods(
+    counts: RolloutCounts, num_rollouts: Float[Tensor, "S"], target: LogTarget, table: HistogramTable
+) -> Float[Tensor, "S F"]:
+    """Likelihood of the log under S sets of rollouts, one per feature: the exponential of the mean log-probability.
+
+    Histogram features average over all scored (agent, step) pairs together, Bernoulli ones over all agents. A feature
+    without a scored step is NaN, as in the official evaluator. Arguments as in `compute_agent_log_likelihoods`.
+    """
+    by_agent = compute_agent_log_likelihoods(counts, num_rollouts, target, table)
+    return (by_agent.sum(-1) / count_terms(target)).exp_()

@@ -122,8 +122,8 @@ def _weigh(likelihoods: Float[Tensor, "... F"], weights: Float[Tensor, "... F"])
     return torch.where(weights > 0, likelihoods * weights, 0.0).sum(-1)
 
 
-def _form_sets(counts: RolloutCounts, repeat: int) -> tuple[RolloutCounts, Float[Tensor, "S"]]:
-    """Counts and sizes of S = 1 + N + N sets: all rollouts, all but each, each alone."""
+def form_sets(counts: RolloutCounts, repeat: int) -> tuple[RolloutCounts, Float[Tensor, "S"]]:
+    """Counts and sizes of S = 1 + N + N sets: all rollouts, all but each, each alone. N are the distinct ones."""
     num_rollouts = len(counts.bins) * repeat
     # Counts are whole numbers below 2^24: sums and differences are exact in float32.
     all_bins = counts.bins.sum(0, keepdim=True) * repeat
@@ -148,7 +148,7 @@ def _any_rate(event: Bool[Tensor, "N E T"], log: ScenarioLog, repeat: int) -> Fl
 def score_features(log: ScenarioLog, features: Features, config: MetricConfig = METRIC_2025) -> RealismResult:
     """Scores of rollouts whose features are known (several metrics of the same rollouts share them)."""
     distinct, repeat = len(features.linear_speed), features.repeat
-    sets, size = _form_sets(count_rollouts(features, log, config), repeat)
+    sets, size = form_sets(count_rollouts(features, log, config), repeat)
     table = histogram_table(config, features.linear_speed.device)
     likelihoods = compute_likelihoods(sets, size, log_target(log, config), table)  # [S, F]
     weights = _score_weights(config, likelihoods.device)

@@ -40,11 +40,11 @@ def smart_demo_rlftsim() -> SmartRecipe:
         tokens=TokensConfig(num_tokens=1024, num_map_prototypes=256),
         model=smart_demo(),
         pretrain=PretrainConfig(
-            epochs=10, batch_size=8, learning_rate=2e-3, warmup_updates=10, gradient_clip=1.0, label_smoothing=0.0,
+            epochs=10.0, batch_size=8, learning_rate=2e-3, warmup_updates=10, gradient_clip=1.0, label_smoothing=0.0,
             max_trained_agents=None, checkpoint_every=50,
         ),
         finetune=FinetuneConfig(
-            epochs=5, batch_size=8, num_rollouts=4, learning_rate=3e-4, warmup_updates=5, checkpoint_every=20,
+            epochs=5.0, batch_size=8, num_rollouts=4, learning_rate=3e-4, warmup_updates=5, checkpoint_every=20,
             kl=KlConfig(target=0.05, initial_beta=0.01),
         ),
     )  # fmt: skip
@@ -56,7 +56,7 @@ def smart_demo_quick() -> SmartRecipe:
     return replace(
         recipe,
         tokens=replace(recipe.tokens, num_tokens=256, num_map_prototypes=64),
-        pretrain=replace(recipe.pretrain, epochs=1),
+        pretrain=replace(recipe.pretrain, epochs=1.0),
         finetune=replace(recipe.finetune, epochs=0.25, batch_size=4),
     )
 

@@ -9,7 +9,7 @@ Differences from a classical policy API, each for a reason:
 """
 
 from dataclasses import dataclass
-from typing import Any, Protocol, Self, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
@@ -43,6 +43,7 @@ class Sampling:
         return self.temperature == 1.0 and self.top_k is None
 
 
+@runtime_checkable
 class DecisionDistribution(Protocol):
     """One independent distribution per leading element: [B, N, A] while simulating, [B, N, A, L] when scored. float32, nats."""
 
@@ -54,8 +55,8 @@ class DecisionDistribution(Protocol):
         """Log-probability under the distribution that `sampling` draws from, event axes summed."""
         ...
 
-    def kl(self, other: Self) -> Float[Tensor, "..."]:
-        """KL(self || other) between the full distributions, closed form."""
+    def kl(self, other: Any) -> Float[Tensor, "..."]:
+        """KL(self || other) to a distribution of the same kind, between the full ones, closed form."""
         ...
 
     def entropy(self) -> Float[Tensor, "..."]:
@@ -63,6 +64,7 @@ class DecisionDistribution(Protocol):
         ...
 
 
+@runtime_checkable
 class PolicyState(Protocol):
     """A policy's own state of B x N running simulations."""
 

@@ -25,7 +25,7 @@ _MAX_GRID_EXPONENT = 16
 _MAX_ORDER = 2
 
 
-def encode_array(array: np.ndarray) -> bytes:
+def encode_array(array: np.ndarray | np.generic) -> bytes:
     """Compressed form of `array` [..., n], whose neighbours along the last axis are alike.
 
     Raises:
@@ -80,7 +80,7 @@ def _to_words(array: np.ndarray) -> tuple[np.ndarray, int, int]:
 
 def _from_words(words: np.ndarray, dtype: np.dtype, method: int, exponent: int) -> np.ndarray:
     if method == _GRID:
-        return np.ldexp(words.astype(np.float32), -exponent)
+        return np.asarray(np.ldexp(words.astype(np.float32), -exponent))
     if method == _NARROW:
         return words.astype(dtype)
     return words.view(dtype)
@@ -139,4 +139,4 @@ def _zigzag(words: np.ndarray) -> np.ndarray:
 
 def _undo_zigzag(words: np.ndarray) -> np.ndarray:
     unsigned = words.view(f"u{words.itemsize}")
-    return (unsigned >> np.uint8(1)).view(words.dtype) ^ -(words & 1)
+    return np.asarray((unsigned >> np.uint8(1)).view(words.dtype) ^ -(words & 1))  # of no axes, it would be a scalar

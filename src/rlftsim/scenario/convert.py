@@ -6,25 +6,16 @@ interrupted or how.
 """
 
 import json
-import multiprocessing
 import os
 import re
 import shutil
-import signal
-import threading
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
-from multiprocessing.queues import SimpleQueue
-from multiprocessing.synchronize import Event
 from pathlib import Path
 
-from rich.console import Console
-from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-
 from rlftsim.errors import DataError
+from rlftsim.progress import progress_bar
 from rlftsim.scenario.dataset import (
     INCOMPLETE,
     MANIFEST,
@@ -40,6 +31,7 @@ from rlftsim.scenario.dataset import (
 from rlftsim.scenario.shards import SCHEMA_VERSION, ShardWriter, hash_file
 from rlftsim.scenario.tfrecord import RECORD_OVERHEAD_BYTES, OnError, SkippedRecord, read_records
 from rlftsim.scenario.womd import find_tfrecords, scenario_or_report
+from rlftsim.workers import run_tasks
 
 WOMD_LICENCE_NOTE = (
     "Waymo Open Dataset material: Waymo Dataset License Agreement for Non-Commercial Use (waymo.com/open/terms). "
@@ -289,83 +281,10 @@ def _write_shard(
 
 
 def _run(tasks: list[_Task], jobs: int, show_progress: bool) -> list[_Outcome]:
-    """Convert all files; returns their outcomes in the order of `tasks`."""
-    jobs = min(jobs, len(tasks))
-    with _progress_bar(sum(task.source.stat().st_size for task in tasks), show_progress) as advance:
-        if jobs == 1:
-            return [_convert_file(task, advance, lambda: False) for task in tasks]
-        return _run_in_processes(tasks, jobs, advance)
-
-
-def _run_in_processes(tasks: list[_Task], jobs: int, advance: Callable[[int], None]) -> list[_Outcome]:
-    context = multiprocessing.get_context("spawn")
-    line = _Line(context.Event(), context.SimpleQueue())
-    with ProcessPoolExecutor(jobs, context, _start_worker, (line,)) as pool:
-        futures = [pool.submit(_work, task) for task in tasks]
-        try:
-            _wait(futures, line, advance)
-            return [future.result() for future in futures]
-        except BrokenProcessPool as error:
-            raise DataError("a worker process died (out of memory?): run the same command again, it goes on") from error
-        finally:  # after an error or Ctrl-C the files in progress are given up, the finished ones stay
-            line.stop.set()
-            pool.shutdown(wait=True, cancel_futures=True)
-
-
-def _wait(futures: list[Future[_Outcome]], line: "_Line", advance: Callable[[int], None]) -> None:
-    """Show progress until all are done or one failed, whose error is raised."""
-    pending = set(futures)
-    while pending:
-        done, pending = wait(pending, timeout=0.2, return_when=FIRST_COMPLETED)
-        while not line.progress.empty():
-            advance(line.progress.get())
-        for future in done:
-            future.result()
-
-
-@dataclass(frozen=True)
-class _Line:
-    """What connects a worker process to the one that started it."""
-
-    stop: Event
-    progress: "SimpleQueue[int]"
-
-
-_line: _Line  # of this process, if it is a worker
-
-
-def _start_worker(line: _Line) -> None:
-    global _line
-    _line = line
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group: the parent tells what to do
-    threading.Thread(target=_exit_with_parent, daemon=True).start()
-
-
-def _exit_with_parent() -> None:
-    """End this process when its parent is killed, so that no orphan writes beside the run that follows."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
-
-
-def _work(task: _Task) -> _Outcome:
-    return _convert_file(task, _line.progress.put, _line.stop.is_set)
-
-
-@contextmanager
-def _progress_bar(total_bytes: int, show: bool) -> Iterator[Callable[[int], None]]:
-    columns = (
-        TextColumn("converting"),
-        BarColumn(),
-        DownloadColumn(),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=Console(stderr=True), disable=not show) as progress:
-        bar = progress.add_task("converting", total=total_bytes)
-        yield lambda num_bytes: progress.advance(bar, num_bytes)
+    """Convert all files; returns their outcomes in the order of `tasks`. Stopped, files in progress are given up, finished ones stay."""
+    total = sum(task.source.stat().st_size for task in tasks)
+    with progress_bar("converting", total, unit="bytes", show=show_progress) as advance:
+        return run_tasks(_convert_file, tasks, jobs=jobs, advance=advance)
 
 
 def _usable_cores() -> int:

@@ -14,7 +14,7 @@ import json
 import os
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -75,7 +75,7 @@ class Manifest:
     rlftsim_version: str = rlftsim.__version__
 
 
-class ScenarioDataset:
+class ScenarioDataset(Sequence[Scenario]):
     """Scenarios of a data set's folder, by position or by id.
 
     As long as a scenario is in the cache the same object comes back, so what is derived from it can be cached by
@@ -108,7 +108,7 @@ class ScenarioDataset:
     def __len__(self) -> int:
         return len(self.scenario_ids)
 
-    def __getitem__(self, position: int) -> Scenario:
+    def __getitem__(self, position: int) -> Scenario:  # type: ignore[override]  # no slices: they would decode
         """Scenario at a position of the index; negative positions count from the end.
 
         Raises:
@@ -378,7 +378,7 @@ def _read_index(folder: Path, manifest: Manifest, split: str | None) -> pa.Table
         return index
     if split not in manifest.counts:
         raise DataError(f"{folder} has no split {split!r}, only {', '.join(manifest.counts) or 'none'}")
-    return index.filter(pc.equal(index["split"], split))
+    return index.filter(pc.field("split") == split)
 
 
 def _reopen(folder: Path, split: str | None, cache_size: int) -> ScenarioDataset:

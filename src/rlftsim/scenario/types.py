@@ -10,6 +10,7 @@ Shapes: O objects, S steps at 10 Hz (91; 11 in a test split), F map features, P 
 from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import cached_property
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int8, Int32, Int64
@@ -98,15 +99,15 @@ def _no_rows(columns: int) -> Int64[np.ndarray, "0 columns"]:
 class LaneTopology:
     """How lanes hang together; every row starts with a lane's feature id, rows are in file order. Empty where a source lacks it."""
 
-    entry_lanes: Int64[np.ndarray, "n 2"] = field(default_factory=lambda: _no_rows(2))
+    entry_lanes: Int64[np.ndarray, "n_entry 2"] = field(default_factory=lambda: _no_rows(2))
     """lane, lane before it."""
-    exit_lanes: Int64[np.ndarray, "n 2"] = field(default_factory=lambda: _no_rows(2))
+    exit_lanes: Int64[np.ndarray, "n_exit 2"] = field(default_factory=lambda: _no_rows(2))
     """lane, lane after it."""
-    neighbors: Int64[np.ndarray, "n 7"] = field(default_factory=lambda: _no_rows(7))
+    neighbors: Int64[np.ndarray, "n_neighbor 7"] = field(default_factory=lambda: _no_rows(7))
     """lane, side (0 left, 1 right), neighbour's feature id, own start and end index, neighbour's start and end index."""
-    boundaries: Int64[np.ndarray, "n 6"] = field(default_factory=lambda: _no_rows(6))
+    boundaries: Int64[np.ndarray, "n_boundary 6"] = field(default_factory=lambda: _no_rows(6))
     """lane, side (0 left, 1 right), boundary's feature id, own start and end index, road line type as in WOMD."""
-    stop_sign_lanes: Int64[np.ndarray, "n 2"] = field(default_factory=lambda: _no_rows(2))
+    stop_sign_lanes: Int64[np.ndarray, "n_stop 2"] = field(default_factory=lambda: _no_rows(2))
     """stop sign's feature id, lane it controls."""
     speed_limit_mph: Float32[np.ndarray, "F"] | None = None
     """One per map feature, 0 where unknown or no lane."""
@@ -127,7 +128,7 @@ class MapFeatures:
     def __len__(self) -> int:
         return len(self.feature_id)
 
-    def polyline(self, index: int) -> Float32[np.ndarray, "n 3"]:
+    def polyline(self, index: int | np.integer) -> Float32[np.ndarray, "n 3"]:
         """Points of feature `index`, world frame."""
         return self.points[self.offsets[index] : self.offsets[index + 1]]
 
@@ -192,3 +193,16 @@ class Scenario:
     def origin(self) -> Float[np.ndarray, "2"]:
         """Ego position at the current step rounded to whole metres, float64: the centre of the scenario's *map* frame."""
         return np.round(self.tracks.position[self.ego_index, CURRENT_STEP, :2].astype(np.float64))
+
+
+@runtime_checkable
+class Scenarios(Protocol):
+    """Scenarios that are looked up by position: a list of them, or a data set."""
+
+    def __len__(self) -> int:
+        """How many there are."""
+        ...
+
+    def __getitem__(self, position: int, /) -> Scenario:
+        """One of them."""
+        ...

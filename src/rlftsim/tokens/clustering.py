@@ -136,14 +136,14 @@ def _motions_of(scenario: Scenario) -> tuple[Float32[np.ndarray, "n 6 3"], Int64
     return motions[plausible], class_id[plausible]
 
 
-def _mirrored(motions: Float32[np.ndarray, "n 6 3"], mirror: bool) -> Float32[np.ndarray, "n 6 3"]:
+def _mirrored(motions: Float32[np.ndarray, "n 6 3"], mirror: bool) -> Float32[np.ndarray, "m 6 3"]:
     """The motions and, if asked for, their mirror images."""
     if not mirror:
         return motions
     return np.stack([motions, motions * np.array([1, -1, -1], np.float32)], 1).reshape(-1, *motions.shape[1:])
 
 
-def _thin(motions: Float32[np.ndarray, "n 6 3"], config: TokensConfig) -> Float32[np.ndarray, "n 6 3"]:
+def _thin(motions: Float32[np.ndarray, "n 6 3"], config: TokensConfig) -> Float32[np.ndarray, "m 6 3"]:
     """Drop motions that repeat another one to the centimetre, then keep at most `max_segments`, evenly spread."""
     _, first = np.unique(np.round(motions[:, [2, 5]].reshape(len(motions), -1) / 0.01), axis=0, return_index=True)
     distinct = motions[np.sort(first)]

@@ -7,10 +7,10 @@ import numpy as np
 from rlftsim.errors import DataError
 from rlftsim.rollout.noise import derive_seed
 from rlftsim.scenario.batch import ScenarioBatch, collate
-from rlftsim.scenario.types import Scenario
+from rlftsim.scenario.types import Scenarios
 
 
-def batch_with_futures(scenarios: Sequence[Scenario], indices: Sequence[int]) -> ScenarioBatch:
+def batch_with_futures(scenarios: Scenarios, indices: Sequence[int]) -> ScenarioBatch:
     """Batch of some scenarios.
 
     Raises:

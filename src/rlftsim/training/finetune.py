@@ -6,7 +6,6 @@
 import copy
 import math
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -25,7 +24,7 @@ from rlftsim.rollout.policy import Policy
 from rlftsim.rollout.simulate import simulate
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
-from rlftsim.scenario.types import Scenario
+from rlftsim.scenario.types import Scenarios
 from rlftsim.training.checkpoint import Progress, newest_checkpoint, read_checkpoint, write_checkpoint
 from rlftsim.training.data import batch_with_futures, scenarios_of_update
 from rlftsim.training.parallel import DeviceConfig, add_up, add_up_gradients, own_share, start_fabric
@@ -102,9 +101,7 @@ class Learner:
         return [p for p in self.policy.parameters() if p.requires_grad]
 
 
-def finetune(
-    policy: Policy, scenarios: Sequence[Scenario], out: Path, config: FinetuneConfig, *, card: str = ""
-) -> Path:
+def finetune(policy: Policy, scenarios: Scenarios, out: Path, config: FinetuneConfig, *, card: str = "") -> Path:
     """Fine-tune a policy in place; go on where a run in `out` was stopped.
 
     Args:
@@ -141,7 +138,7 @@ def finetune(
             _stop_if_diverged(learner, run, config)
             if fabric.is_global_zero and _is_checkpoint_due(learner, config, total):
                 write_checkpoint(run.checkpoints, _progress(learner), _modules(learner), learner.optimizer)
-            advance(f"RMM {values['rmm']:.3f}, KL {values['kl']:.4f}, beta {learner.beta:.3f}")
+            advance(note=f"RMM {values['rmm']:.3f}, KL {values['kl']:.4f}, beta {learner.beta:.3f}")
     run.close()
     if fabric.is_global_zero:
         policy.save_pretrained(run.model, card=card)  # type: ignore[operator]

@@ -6,7 +6,7 @@ counts. So the estimator is that of one process with the same global batch, howe
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, cast
 
 import torch
 from lightning_fabric import Fabric
@@ -67,7 +67,9 @@ def own_share(items: list[int], fabric: Fabric) -> list[int]:
 
 def add_up(values: Tensor, fabric: Fabric) -> Tensor:
     """Sum over processes."""
-    return fabric.all_reduce(values, reduce_op="sum") if fabric.world_size > 1 else values
+    if fabric.world_size == 1:
+        return values
+    return cast(Tensor, fabric.all_reduce(values, reduce_op="sum"))
 
 
 def add_up_gradients(parameters: Iterable[nn.Parameter], fabric: Fabric) -> None:

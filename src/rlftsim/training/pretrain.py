@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -17,19 +17,31 @@ from rlftsim.errors import ConfigError
 from rlftsim.progress import progress_bar
 from rlftsim.rollout.noise import derive_seed
 from rlftsim.scenario.batch import ScenarioBatch
-from rlftsim.scenario.types import CURRENT_STEP, Scenario
+from rlftsim.scenario.types import CURRENT_STEP, Scenarios
 from rlftsim.training.checkpoint import Progress, newest_checkpoint, read_checkpoint, write_checkpoint
 from rlftsim.training.data import batch_with_futures, scenarios_of_update
 from rlftsim.training.parallel import DeviceConfig, add_up, add_up_gradients, own_share, start_fabric
 from rlftsim.training.run_folder import RunFolder
 
 
+@runtime_checkable
 class Prediction(Protocol):
     """What a model says along recorded tracks, and what it should have said."""
 
-    logits: Float[Tensor, "R V"]
-    target: Int64[Tensor, "R"]
-    target_mask: Bool[Tensor, "R"]
+    @property
+    def logits(self) -> Float[Tensor, "R V"]:
+        """Of R predictions, over the vocabulary."""
+        ...
+
+    @property
+    def target(self) -> Int64[Tensor, "R"]:
+        """Token that came next."""
+        ...
+
+    @property
+    def target_mask(self) -> Bool[Tensor, "R"]:
+        """True = the prediction counts."""
+        ...
 
 
 @runtime_checkable
@@ -81,9 +93,7 @@ class PretrainConfig:
         return max(math.ceil(self.epochs * num_scenarios / self.batch_size), 1)
 
 
-def pretrain(
-    model: NextTokenModel, scenarios: Sequence[Scenario], out: Path, config: PretrainConfig, *, card: str = ""
-) -> Path:
+def pretrain(model: NextTokenModel, scenarios: Scenarios, out: Path, config: PretrainConfig, *, card: str = "") -> Path:
     """Pre-train a model in place; go on where a run in `out` was stopped.
 
     Args:
@@ -120,7 +130,7 @@ def pretrain(
             run.log(update + 1, {**values, "seconds": time.perf_counter() - start})
             if fabric.is_global_zero and ((update + 1) % config.checkpoint_every == 0 or update + 1 == total):
                 write_checkpoint(run.checkpoints, Progress(update + 1), {"policy": model}, optimizer)
-            advance(f"loss {values['loss']:.3f}, right {values['accuracy']:.0%}")
+            advance(note=f"loss {values['loss']:.3f}, right {values['accuracy']:.0%}")
     run.close()
     if fabric.is_global_zero:
         model.eval().save_pretrained(run.model, card=card)
@@ -144,7 +154,7 @@ def _set_learning_rate(optimizer: torch.optim.Optimizer, value: float) -> None:
 def _update(
     model: NextTokenModel,
     optimizer: torch.optim.Optimizer,
-    scenarios: Sequence[Scenario],
+    scenarios: Scenarios,
     update: int,
     config: PretrainConfig,
     fabric: Fabric,

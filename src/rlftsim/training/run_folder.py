@@ -127,7 +127,7 @@ class RunFolder:
             self._board.close()
 
 
-def read_metrics(path: Path) -> list[dict[str, float]]:
+def read_metrics(path: Path) -> list[dict[str, Any]]:
     """The metrics of a run's folder, a dictionary an update; empty where there are none."""
     metrics = path / "metrics.jsonl"
     return [json.loads(line) for line in metrics.read_text().splitlines()] if metrics.exists() else []
@@ -136,6 +136,6 @@ def read_metrics(path: Path) -> list[dict[str, float]]:
 def _update_of(line: str) -> float:
     """Update of a line of metrics; infinite for a line that a kill cut short."""
     try:
-        return json.loads(line)["update"]
+        return float(json.loads(line)["update"])
     except (ValueError, KeyError):
         return float("inf")

@@ -93,7 +93,8 @@ class Past:
     def repeat(self, num_rollouts: int) -> "Past":
         """The past of a single rollout, shared by N of them."""
         shapes = ((v, (-1, num_rollouts, *v.shape[2:])) for v in (self.position, self.heading, self.row))
-        return Past(*(v.expand(shape) for v, shape in shapes), self.sources)
+        position, heading, row = (v.expand(shape) for v, shape in shapes)
+        return Past(position, heading, row, self.sources)
 
 
 class MapEncoder(nn.Module):
@@ -259,7 +260,7 @@ class AgentDecoder(nn.Module):
 
     def _look_at_map(
         self, scene: Scene, steps: TokenSteps, rows: tuple[Tensor, ...]
-    ) -> tuple[Neighbors, Float[Tensor, "R K D"]]:
+    ) -> tuple[Neighbors, Float[Tensor, "R W D"]]:
         """Map tokens of the own scenario within reach."""
         lists = []
         width = scene.map_mask.shape[1]
@@ -283,7 +284,7 @@ class AgentDecoder(nn.Module):
 
     def _look_at_agents(
         self, scene: Scene, steps: TokenSteps, rows: tuple[Tensor, ...], row_of: Int64[Tensor, "B N A K"]
-    ) -> tuple[Neighbors, Float[Tensor, "R K D"]]:
+    ) -> tuple[Neighbors, Float[Tensor, "R W D"]]:
         """Other agents of the same scenario, rollout and step within reach."""
         position = steps.position.transpose(2, 3)  # [B, N, K, A, 2]
         valid = steps.valid.transpose(2, 3)

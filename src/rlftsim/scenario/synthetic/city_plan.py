@@ -54,7 +54,7 @@ def _draw_classes(rng: np.random.Generator, columns: int, rows: int, quiet: bool
     """Class of every line, columns first. Two arterials cross somewhere in a city; a quiet quarter has at most one."""
     names: list[StreetClass] = ["arterial", "collector", "residential"]
     shares = [0.0, 0.42, 0.58] if quiet else [0.3, 0.37, 0.33]
-    classes = [names[int(k)] for k in rng.choice(3, columns + rows, p=shares)]
+    classes: list[StreetClass] = [names[int(k)] for k in rng.choice(3, columns + rows, p=shares)]
     if quiet and rng.random() < 0.6:
         classes[int(rng.integers(columns + rows))] = "arterial"
     if not quiet:

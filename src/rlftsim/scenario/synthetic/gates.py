@@ -38,7 +38,7 @@ def moves_plausibly(
 
 
 def box_corners(
-    position: Float[np.ndarray, "n 2"], heading: Float[np.ndarray, "n"], size: Size
+    position: Float[np.ndarray, "n 2"], heading: Float[np.ndarray, "n"], size: Size | np.ndarray
 ) -> Float[np.ndarray, "n 4 2"]:
     """Corners of the boxes of one body, counter-clockwise from the front left."""
     forward = np.stack([np.cos(heading), np.sin(heading)], axis=1) * size[0] / 2

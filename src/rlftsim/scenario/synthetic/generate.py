@@ -1,18 +1,17 @@
 """Make a data set of synthetic scenarios: one street network after another, each in its own process."""
 
 import json
-import multiprocessing
 import tempfile
-from collections.abc import Iterator, Mapping
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
+from functools import partial
 from itertools import islice
 from pathlib import Path
 
 import numpy as np
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from rlftsim.errors import ConfigError, DataError, RlftsimError
+from rlftsim.progress import progress_bar
 from rlftsim.scenario.dataset import (
     INCOMPLETE,
     MANIFEST,
@@ -36,6 +35,7 @@ from rlftsim.scenario.synthetic.parking import park_in_lots, park_in_strips
 from rlftsim.scenario.synthetic.recording import SignalStates, read_pedestrians, read_signals, read_vehicles
 from rlftsim.scenario.synthetic.windows import World, cut_scenarios
 from rlftsim.scenario.types import STEP_S, Scenario
+from rlftsim.workers import Advance, run_tasks
 
 GENERATOR_VERSION = 1
 LICENCE_NOTE = "CC0-1.0: synthetic scenarios, no rights reserved."
@@ -274,22 +274,11 @@ def _make_shards(tasks: list[NetworkTask], folder: Path, jobs: int, show_progres
     """Write the shards that are not there yet."""
     done = [task for task in tasks if (folder / SHARDS / task.shard_name).exists()]
     todo = [task for task in tasks if task not in done]
-    columns = (
-        TextColumn("synthetic scenarios"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, disable=not show_progress) as progress:
-        bar = progress.add_task("scenarios", total=sum(task.num_scenarios for task in tasks))
-        progress.advance(bar, sum(task.num_scenarios for task in done))
-        if jobs == 1:
-            for task in todo:
-                progress.advance(bar, _write_shard(task, folder))
-            return
-        context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(jobs, mp_context=context) as pool:
-            futures = [pool.submit(_write_shard, task, folder) for task in todo]
-            for future in as_completed(futures):
-                progress.advance(bar, future.result())
+    total, so_far = (sum(task.num_scenarios for task in some) for some in (tasks, done))
+    with progress_bar("synthetic scenarios", total, so_far, show=show_progress) as advance:
+        run_tasks(partial(_make_shard, folder=folder), todo, jobs=jobs, advance=advance)
+
+
+def _make_shard(task: NetworkTask, advance: Advance, is_stopped: Callable[[], bool], *, folder: Path) -> None:
+    if not is_stopped():
+        advance(_write_shard(task, folder))

@@ -26,7 +26,7 @@ class _LaneRuler:
 
     def __init__(self, lanes: dict[str, Lane]) -> None:
         self._lanes = lanes
-        self._along: dict[str, Float[np.ndarray, n]] = {}
+        self._along: dict[str, np.ndarray] = {}
 
     def points_at(self, lane_id: str, positions_m: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 2"]:
         """Points at SUMO's positions, which count the lane's nominal length, not that of its shape."""
@@ -70,10 +70,10 @@ def _lane_path(ruler: _LaneRuler, lanes: dict[str, Lane], rows: dict[str, np.nda
     starts = np.append(0, np.flatnonzero(lane_ids[1:] != lane_ids[:-1]) + 1)
     changes, distances = [], []
     for start, stop in zip(starts, np.append(starts[1:], len(lane_ids)), strict=True):
-        lane_id = lane_ids[start]
+        lane_id = str(lane_ids[start])
         centre[start:stop] = ruler.points_at(lane_id, positions[start:stop])
         direction[start:stop] = ruler.directions_at(lane_id, positions[start:stop])
-        before = lanes[lane_ids[start - 1]] if start else None
+        before = lanes[str(lane_ids[start - 1])] if start else None
         now = lanes[lane_id]
         if before is None:
             continue
@@ -100,7 +100,7 @@ def read_vehicles(path: Path, network: Network, types: dict[str, RoadUserType], 
     ruler = _LaneRuler(network.lanes)
     bodies = []
     for run in _runs_by_id(table["vehicle_id"], step):
-        kind = types[table["vehicle_type"][run[0]]]
+        kind = types[str(table["vehicle_type"][run[0]])]
         lane_path = _lane_path(ruler, network.lanes, {name: table[name][run] for name in names}, int(step[run[0]]))
         height = kind.height_m + float(np.clip(rng.normal(0, 0.04), -0.1, 0.1))
         habit = (float(rng.normal(0, 0.14)), float(rng.uniform(0.0, 0.12)), float(rng.uniform(0, 2 * np.pi)))

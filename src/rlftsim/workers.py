@@ -13,34 +13,38 @@ from multiprocessing.queues import SimpleQueue
 from multiprocessing.synchronize import Event
 from typing import Any
 
-import torch
-
 from rlftsim.errors import ConfigError, DataError
 
-Task = Callable[[Any, Callable[[int], None], Callable[[], bool]], None]
+Advance = Callable[[int], None]
+Task = Callable[[Any, Advance, Callable[[], bool]], Any]
 """Called with an item, a function that reports progress, and one that says whether to give up."""
 
 
-def run_in_processes(task: Task, items: Sequence[Any], *, jobs: int, advance: Callable[[int], None]) -> None:
-    """Call `task` for every item in `jobs` processes of one torch thread each.
+def run_tasks(task: Task, items: Sequence[Any], *, jobs: int, advance: Advance) -> list[Any]:
+    """Call `task` for every item, in this process or in several with one thread each; results in the order of the items.
 
-    The first error, and Ctrl-C, stop all the others. A task that is told to give up returns without a result.
+    The first error, and Ctrl-C, stop all the others. A task that is told to give up may return or raise as it likes.
 
     Args:
-        task: can be pickled.
+        task: can be pickled, if there is more than one job.
         items: what to work on.
-        jobs: processes.
+        jobs: processes; 1 = this one.
         advance: told the progress that tasks report.
 
     Raises:
         ConfigError: the task cannot be handed to another process.
         DataError: a process died.
     """
+    jobs = min(jobs, len(items))
+    if jobs <= 1:
+        return [task(item, advance, lambda: False) for item in items]
     context = multiprocessing.get_context("spawn")
     line = _Line(context.Event(), context.SimpleQueue())
     with ProcessPoolExecutor(jobs, context, _start_worker, (_pickled(task), line)) as pool:
+        futures = [pool.submit(_work, item) for item in items]
         try:
-            _wait([pool.submit(_work, item) for item in items], line, advance)
+            _wait(futures, line, advance)
+            return [future.result() for future in futures]
         except BrokenProcessPool as error:
             raise DataError(
                 "a worker process died (out of memory?): run the same command again, it goes on."
@@ -67,14 +71,14 @@ def _pickled(task: Task) -> bytes:
     try:
         return pickle.dumps(task)
     except (pickle.PicklingError, AttributeError, TypeError) as error:
-        raise ConfigError(f"this policy cannot be handed to other processes ({error}): set jobs=1.") from error
+        raise ConfigError(f"this work cannot be handed to other processes ({error}): set jobs=1.") from error
 
 
 def _start_worker(task: bytes, line: _Line) -> None:
     global _task, _line
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group: the parent tells what to do
     threading.Thread(target=_exit_with_parent, daemon=True).start()
-    torch.set_num_threads(1)
+    os.environ["OMP_NUM_THREADS"] = "1"  # read when torch is imported, which unpickling the task may do
     _task, _line = pickle.loads(task), line
 
 
@@ -86,11 +90,11 @@ def _exit_with_parent() -> None:
         os._exit(1)
 
 
-def _work(item: Any) -> None:
-    _task(item, _line.progress.put, _line.stop.is_set)
+def _work(item: Any) -> Any:
+    return _task(item, _line.progress.put, _line.stop.is_set)
 
 
-def _wait(futures: Sequence[Future[None]], line: _Line, advance: Callable[[int], None]) -> None:
+def _wait(futures: Sequence[Future[Any]], line: _Line, advance: Advance) -> None:
     """Show progress until all are done or one failed, whose error is raised."""
     pending = set(futures)
     while pending:

@@ -1,0 +1,213 @@
+"""What a person meets at the prompt: help for every verb, and one line for every mistake."""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import typing
+
+import pytest
+
+from rlftsim import __version__
+from rlftsim.cli.data import open_split
+from rlftsim.cli.main import VERBS, main
+from rlftsim.cli.train import RecipeName
+from rlftsim.recipes.smart import RECIPES
+from rlftsim.scenario.synthetic import pack_path
+
+
+def run(capsys, *arguments) -> tuple[int, str, str]:
+    """Exit status, standard output and standard error of a command line."""
+    try:
+        status = main([str(a) for a in arguments])
+    except SystemExit as stop:  # what the command line itself does not understand
+        status = int(stop.code or 0)
+    captured = capsys.readouterr()
+    return status, captured.out, captured.err
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_verb_explains_itself(verb, capsys):
+    status, out, _ = run(capsys, verb, "--help")
+    assert status == 0
+    assert f"rlftsim {verb}" in out
+    assert len(out.splitlines()) > 5
+
+
+@pytest.mark.parametrize(("line", "expected"), [(["--help"], 0), (["-h"], 0), (["help"], 0), ([], 2)])
+def test_the_overview_names_every_verb(line, expected, capsys):
+    status, out, _ = run(capsys, *line)
+    assert status == expected
+    assert all(re.search(rf"^  {verb} ", out, re.MULTILINE) for verb in VERBS)
+
+
+def test_the_version_is_told(capsys):
+    assert run(capsys, "--version") == (0, f"rlftsim {__version__}\n", "")
+
+
+def test_a_misspelt_verb_is_guessed(capsys):
+    status, _, err = run(capsys, "finetun")
+    assert (status, err) == (2, "rlftsim: no verb 'finetun': did you mean finetune?\n")
+
+
+def test_help_does_not_wait_for_torch():
+    code = "import sys; from rlftsim.cli import main; main(['--help']); sys.exit('torch' in sys.modules)"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    assert subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True).returncode == 0
+
+
+def test_the_recipes_one_can_name_are_the_ones_there_are():
+    assert typing.get_args(RecipeName) == tuple(RECIPES)
+
+
+@pytest.fixture
+def vocabulary(tmp_path, capsys):
+    """A small vocabulary file made by the command."""
+    path = tmp_path / "vocabulary.safetensors"
+    small = ["tokens.num-tokens=32", "tokens.num-map-prototypes=8"]
+    arguments = ["tokens", "--data", "synthetic", "--split", "validation", "--out", path, "--recipe", "smart-demo"]
+    status, out, _ = run(capsys, *arguments, "--set", *small)
+    assert status == 0
+    assert "32 motion tokens a class" in out
+    return path
+
+
+@pytest.fixture
+def evaluation(tmp_path, capsys):
+    """A small evaluation made by the command."""
+    arguments = ["evaluate", "oracle", "--data", "synthetic", "--out", tmp_path / "e", "--num-rollouts", "2"]
+    status, out, err = run(capsys, *arguments, "--limit", "1")
+    assert status == 0, err
+    assert "oracle.parquet" in out
+    return tmp_path / "e" / "oracle.parquet"
+
+
+WRONG = {
+    "a data set that is not there": ("data stats {tmp}/nothing", "nothing is no data set.*no such folder"),
+    "a folder that is no data set": ("data verify {tmp}", "is no data set, it has no manifest.json"),
+    "a damaged manifest": ("data stats {tmp}/broken", "manifest.json cannot be read"),
+    "an unfinished conversion": ("data stats {tmp}/unfinished", "was not finished: run the same convert command again"),
+    "an unknown split": ("simulate constant_velocity --data synthetic --out {tmp}/o --split tests", "no split 'tests', only training, validation"),
+    "an unknown split to train on": ("tokens --data synthetic --out {tmp}/v --split tests", "no split 'tests', only training, validation"),
+    "an unknown split to evaluate": ("evaluate oracle --data synthetic --out {tmp}/o --split tests", "no split 'tests', only training, validation"),
+    "an unknown scenario": ("simulate constant_velocity --data synthetic --out {tmp}/o --scenario nobody", "no scenario nobody in split 'validation'"),
+    "an unknown model": ("evaluate {tmp}/no-model --data synthetic --out {tmp}/o", "no-model' is neither a model folder nor one of constant_velocity, oracle"),
+    "a folder that is no model": ("simulate {tmp} --data synthetic --out {tmp}/o", "not a model folder, config.json is missing"),
+    "a model to fine-tune that is not there": ("finetune smart-demo --model {tmp}/no-model --data synthetic --out {tmp}/o", "is neither a model folder"),
+    "a baseline to fine-tune": ("finetune smart-demo --model constant_velocity --data synthetic --out {tmp}/o", "ConstantVelocity has no weights"),
+    "a vocabulary that is not there": ("pretrain smart-demo --data synthetic --out {tmp}/o --vocabulary {tmp}/v", "no such vocabulary: build one with"),
+    "a vocabulary that is none": ("pretrain smart-demo --data synthetic --out {tmp}/o --vocabulary {tmp}/garbage", "damaged vocabulary"),
+    "a field that does not exist": ("tokens --data synthetic --out {tmp}/v --set tokens.size=5", "no field 'size' here, known are num_tokens"),
+    "a value of the wrong kind": ("tokens --data synthetic --out {tmp}/v --set tokens.num_tokens=few", "expected int"),
+    "a value out of range": ("tokens --data synthetic --out {tmp}/v --set tokens.num_tokens=1", "needs num_tokens >= 2"),
+    "no value": ("tokens --data synthetic --out {tmp}/v --set tokens.num_tokens", "is not field=value"),
+    "an unknown metric": ("evaluate oracle --data synthetic --out {tmp}/o --metric 1999", "Unknown metric '1999': known are 2025"),
+    "no rollouts": ("evaluate oracle --data synthetic --out {tmp}/o --num-rollouts 0", "num_rollouts must be at least 1"),
+    "a temperature below zero": ("simulate constant_velocity --data synthetic --out {tmp}/o --temperature -1", "temperature must be >= 0"),
+    "top-k of a policy without categories": ("simulate constant_velocity --data synthetic --out {tmp}/o --top-k 3", "top_k=3 needs a policy with categories"),
+    "a tfrecord that is not there": ("convert {tmp}/x.tfrecord {tmp}/o", "no such file or folder"),
+    "a folder without tfrecords": ("convert {tmp} {tmp}/o", "no tfrecord file in this folder"),
+    "a destination that is taken": ("convert {tmp}/garbage {tmp}", "is not empty and not a data set"),
+    "an evaluation that is none": ("compare {tmp}/garbage {tmp}/garbage", "garbage"),
+    "an evaluation that is not there": ("compare {tmp}/a.parquet {tmp}/b.parquet", "a.parquet"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("mistake", WRONG)
+def test_a_mistake_ends_in_one_line_and_status_2(mistake, tmp_path, capsys):
+    (tmp_path / "garbage").write_bytes(b"garbage" * 9)
+    shutil.copytree(pack_path(), tmp_path / "unfinished", ignore=shutil.ignore_patterns("*.arrow"))
+    (tmp_path / "unfinished" / "INCOMPLETE").touch()
+    (tmp_path / "broken").mkdir()
+    (tmp_path / "broken" / "manifest.json").write_text("{")
+    line, words = WRONG[mistake]
+    status, _, err = run(capsys, *line.format(tmp=tmp_path).split())
+    said = [part for part in err.splitlines() if part.startswith("rlftsim: ")]
+    assert status == 2
+    assert len(said) == 1, err
+    assert "Traceback" not in err
+    assert re.search(words, said[0]), said[0]
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "fly",
+        "pretrain smart-huge --data synthetic --out o --vocabulary v",
+        "evaluate oracle --data synthetic",
+        "evaluate oracle --data synthetic --out o --num-rollouts many",
+        "data",
+        "convert a b --on-error wait",
+    ],
+)
+def test_a_line_that_cannot_be_read_is_explained(line, capsys):
+    status, out, err = run(capsys, *line.split())
+    assert status == 2
+    assert "Traceback" not in err + out
+    assert err.strip()
+
+
+def test_stats_and_verify_of_the_embedded_scenarios(capsys):
+    status, out, _ = run(capsys, "data", "stats", "synthetic")
+    assert status == 0
+    assert "160 training" in out
+    assert "40 validation" in out
+
+
+def test_pretraining_and_fine_tuning_by_command(vocabulary, tmp_path, capsys):
+    small = ["model.dim=16", "model.num-heads=2", "model.head-dim=8", "model.num-decoder-layers=1"]
+    once = ["pretrain.epochs=0.05", "pretrain.batch-size=1", "pretrain.device.accelerator=cpu", "pretrain.device.threads=1"]  # fmt: skip
+    common = ["--data", "synthetic", "--split", "validation"]
+    base, tuned = tmp_path / "base", tmp_path / "tuned"
+    status, out, _ = run(
+        capsys, "pretrain", "smart-demo", *common, "--out", base, "--vocabulary", vocabulary, "--set", *small, *once
+    )
+    assert status == 0
+    assert f"model: {base / 'model'}" in out
+    card = (base / "model" / "README.md").read_text()
+    assert "CC0" in card
+    assert "40 scenarios" in card
+    once = ["finetune.epochs=0.025", "finetune.batch-size=1", "finetune.num-rollouts=2", "finetune.device.threads=1"]
+    status, out, _ = run(capsys, "finetune", "smart-demo", "--model", base, *common, "--out", tuned, "--set", *once)
+    assert status == 0
+    assert json.loads((tuned / "config.json").read_text())["num_rollouts"] == 2
+    # the same folder with other settings is another run
+    status, _, err = run(
+        capsys, "finetune", "smart-demo", "--model", base, *common, "--out", tuned, "--set", *once, "finetune.seed=1"
+    )
+    assert status == 2
+    assert "other settings (seed)" in err
+    # a damaged checkpoint says what to do
+    newest = next((tuned / "checkpoints").iterdir())
+    (newest / "policy.safetensors").write_bytes(b"garbage")
+    status, _, err = run(capsys, "finetune", "smart-demo", "--model", base, *common, "--out", tuned, "--set", *once)
+    assert status == 2
+    assert f"{newest.name}: cannot go on from it" in err
+
+
+def test_simulating_again_keeps_what_is_there(tmp_path, capsys):
+    arguments = ["simulate", "constant_velocity", "--data", "synthetic", "--out", tmp_path, "--num-rollouts", "2"]
+    name = open_split("synthetic", "validation").scenario_ids[0]
+    for _ in range(2):
+        status, out, _ = run(capsys, *arguments, "--scenario", name)
+        assert status == 0
+        assert "2 rollouts of 1 scenarios" in out
+    [file] = tmp_path.iterdir()
+    stamp = file.stat().st_mtime_ns
+    run(capsys, *arguments, "--scenario", name)
+    assert file.stat().st_mtime_ns == stamp
+
+
+def test_comparing_an_evaluation_with_itself(evaluation, capsys):
+    status, out, _ = run(capsys, "compare", evaluation, evaluation)
+    assert status == 0
+    assert "oracle" in out
+
+
+def test_doctor_looks_at_everything(capsys):
+    status, out, _ = run(capsys, "doctor")
+    assert status in (0, 1)
+    for what in ("Python", "torch", "threads", "GPU", "SUMO", "disk", "synthetic scenarios"):
+        assert what in out

@@ -1,0 +1,68 @@
+"""The pages under docs/ that hold Python are run as they stand: all blocks of a page, in order, in one namespace."""
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+DOCS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
+BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
+LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
+
+
+def blocks(text: str) -> list[tuple[int, str]]:
+    """Python blocks of a page, each with the line it starts on."""
+    return [(text[: m.start(1)].count("\n"), m.group(1)) for m in BLOCK.finditer(text)]
+
+
+def with_code() -> list[Path]:
+    return [page for page in DOCS if blocks(page.read_text())]
+
+
+def run_page(page: Path) -> dict[str, object]:
+    """Run a page's blocks; errors point to lines of the page."""
+    namespace: dict[str, object] = {"__name__": page.stem}
+    for line, code in blocks(page.read_text()):
+        exec(compile("\n" * line + code, str(page), "exec"), namespace)  # the repository's own documentation
+    return namespace
+
+
+@pytest.mark.parametrize("page", with_code(), ids=lambda p: p.name)
+def test_the_page_runs(page, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    run_page(page)
+
+
+def test_the_pages_with_code_are_found():
+    assert {"walk.md", "extending.md"} <= {page.name for page in with_code()}
+
+
+def test_the_walk_checks_every_station():
+    code = blocks((ROOT / "docs" / "walk.md").read_text())
+    assert len(code) > 10
+    silent = [c for _, c in code if not any(isinstance(n, ast.Assert) for n in ast.walk(ast.parse(c)))]
+    assert [c for c in silent if "assert_close" not in c] == []
+
+
+def test_a_page_that_lies_would_be_seen(tmp_path):
+    page = tmp_path / "lie.md"
+    page.write_text("One.\n\n```python\nx = 1\n```\n\nTwo.\n\n```python\nassert x == 2\n```\n")
+    with pytest.raises(AssertionError) as caught:
+        run_page(page)
+    assert caught.traceback[-1].lineno == 9  # counted from 0: the tenth line of the page
+
+
+@pytest.mark.parametrize("page", DOCS, ids=lambda p: p.name)
+def test_links_between_pages_lead_somewhere(page):
+    local = [target for target in LINK.findall(page.read_text()) if "://" not in target]
+    for target in local:
+        path, _, anchor = target.partition("#")
+        goal = page.parent / path if path else page
+        if goal.suffix in (".png", ".html"):
+            continue  # pictures are made by the demo
+        assert goal.exists(), f"{page.name} links to {target}"
+        if anchor:
+            headings = re.findall(r"^#+ (.+)$", goal.read_text(), re.MULTILINE)
+            assert anchor in {re.sub(r"[^\w -]", "", h).strip().lower().replace(" ", "-") for h in headings}, target

@@ -1,0 +1,131 @@
+"""What README and docs tell a person to type exists, and the tree they show is the tree there is."""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from rlftsim.cli.main import VERBS, parse
+from rlftsim.errors import RlftsimError
+from rlftsim.recipes.configure import configure
+from rlftsim.recipes.smart import RECIPES
+
+ROOT = Path(__file__).parents[1]
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
+FENCE = re.compile(r"^```\w*\n(.*?)^```", re.DOTALL | re.MULTILINE)
+README = (ROOT / "README.md").read_text()
+
+
+def shell_lines(text: str) -> list[str]:
+    """Lines of fenced blocks."""
+    return [line.strip() for block in FENCE.findall(text) for line in block.splitlines()]
+
+
+COMMANDS = [
+    (page.name, line) for page in PAGES for line in shell_lines(page.read_text()) if line.startswith("rlftsim ")
+]
+INLINE = [
+    (page.name, code) for page in PAGES for code in re.findall(r"`(rlftsim [^`\n]+)`", page.read_text())
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("page", "line"), COMMANDS, ids=[f"{p}: {line[8:60]}" for p, line in COMMANDS])
+def test_every_command_can_be_read(page, line):
+    words = shlex.split(line)[1:]
+    verb = parse(words)
+    overrides = getattr(verb, "set", [])
+    if overrides:
+        configure(RECIPES[verb.recipe](), overrides)
+
+
+def test_there_are_commands_and_a_wrong_one_would_be_seen():
+    shown = {shlex.split(line)[1] for page, line in COMMANDS if page == "README.md"}
+    assert {"convert", "tokens", "pretrain", "finetune", "evaluate", "compare", "simulate"} <= shown
+    with pytest.raises(SystemExit):
+        parse(shlex.split("evaluate runs/base --date data/womd --out runs/evaluations"))
+    with pytest.raises(RlftsimError):
+        configure(RECIPES["smart-tiny"](), ["finetune.learnin-rate=1e-5"])
+
+
+@pytest.mark.parametrize(("page", "code"), INLINE, ids=[f"{p}: {c[8:40]}" for p, c in INLINE])
+def test_commands_named_in_passing_name_verbs_and_options_that_exist(page, code, capsys):
+    words = shlex.split(code)[1:]
+    assert words[0] in (*VERBS, "VERB")
+    options = [w for w in words if w.startswith("--") and w != "--help"]
+    if options:
+        with pytest.raises(SystemExit):
+            parse([words[0], "--help"])
+        text = capsys.readouterr().out
+        assert all(option in text for option in options)
+
+
+@pytest.mark.parametrize(
+    "override", sorted(set(re.findall(r"--set ([\w.-]+=[\w.-]+)", "".join(p.read_text() for p in PAGES))))
+)
+def test_every_override_in_the_documents_is_a_field(override):
+    if "on-the-road" in override:
+        return  # the reward that docs/extending.md registers
+    configure(RECIPES["smart-tiny"](), [override])
+
+
+def test_make_knows_the_targets_that_are_shown():
+    makefile = (ROOT / "Makefile").read_text()
+    shown = {w.split()[1] for page in PAGES for w in shell_lines(page.read_text()) if w.startswith("make ")}
+    shown |= set(re.findall(r"`make ([\w-]+)", README))
+    assert {"demo", "test"} <= shown
+    assert all(re.search(rf"^{target}:", makefile, re.MULTILINE) for target in shown)
+
+
+def tree() -> dict[str, str]:
+    """Path → reason of the file tree in README."""
+    block = next(b for b in FENCE.findall(README) if b.startswith("src/rlftsim/"))
+    entries, parent = {}, ""
+    for line in block.splitlines():
+        name, _, reason = line.strip().partition(" ")
+        if not line.startswith(" "):
+            parent = name if name == "src/rlftsim/" else ""
+        entries[name if name == parent else parent + name] = reason.strip()
+    return entries
+
+
+def test_the_tree_shows_what_is_there_with_a_reason():
+    entries = tree()
+    assert all((ROOT / path).exists() for path in entries), [p for p in entries if not (ROOT / p).exists()]
+    assert all(reason for path, reason in entries.items() if path != "src/rlftsim/")
+    package = ROOT / "src" / "rlftsim"
+    rooms = {p.name for p in package.iterdir() if not p.name.startswith(("_", "."))}
+    assert {Path(path).name for path in entries if path.startswith("src/rlftsim/") and path != "src/rlftsim/"} == rooms
+
+
+def test_the_tree_climbs_from_the_ground():
+    from test_imports import FLOOR_OF
+
+    floors = [
+        FLOOR_OF[Path(path).stem] for path in tree() if path.startswith("src/rlftsim/") and path != "src/rlftsim/"
+    ]
+    assert floors == sorted(floors)
+
+
+def test_the_block_of_measurements_is_marked():
+    assert README.count("<!-- measured:begin -->") == README.count("<!-- measured:end -->") == 1
+
+
+def test_the_licence_is_apache_2():
+    text = (ROOT / "LICENSE").read_text()
+    assert "Apache License" in text
+    assert "Version 2.0, January 2004" in text
+    assert "END OF TERMS AND CONDITIONS" in text
+    assert 'license = "Apache-2.0"' in (ROOT / "pyproject.toml").read_text()
+
+
+@pytest.mark.parametrize(
+    "path", re.findall(r"`((?:tests|docs|benchmarks)/[\w/]+\.\w+)", "".join(p.read_text() for p in PAGES))
+)
+def test_files_named_in_the_documents_exist(path):
+    assert (ROOT / path).exists()
+
+
+@pytest.mark.parametrize("name", sorted(set(re.findall(r"`((?:cli|experiments|goals|policies|realism|recipes|rollout|scenario|tokens|training|viewer)/[\w/]+\.\w+)(?::[^`]*)?`", "".join(p.read_text() for p in PAGES)))))  # fmt: skip
+def test_modules_named_in_the_documents_exist(name):
+    assert (ROOT / "src" / "rlftsim" / name).exists()

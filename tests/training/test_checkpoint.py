@@ -1,0 +1,98 @@
+import copy
+import shutil
+
+import pytest
+import torch
+from torch import nn
+
+from rlftsim.errors import CheckpointError
+from rlftsim.training.checkpoint import Progress, newest_checkpoint, read_checkpoint, write_checkpoint
+
+
+def small_run(seed=0, steps=3):
+    """A module and an optimiser that has moments."""
+    torch.manual_seed(seed)
+    module = nn.Sequential(nn.Linear(3, 4), nn.LayerNorm(4), nn.Linear(4, 2))
+    optimizer = torch.optim.AdamW(module.parameters(), lr=1e-2)
+    for _ in range(steps):
+        step(module, optimizer)
+    return module, optimizer
+
+
+def step(module, optimizer):
+    optimizer.zero_grad()
+    module(torch.arange(6.0).view(2, 3)).square().sum().backward()
+    optimizer.step()
+
+
+def test_a_checkpoint_gives_back_weights_and_moments_bit_for_bit(tmp_path):
+    module, optimizer = small_run()
+    path = write_checkpoint(tmp_path, Progress(7, {"beta": 0.1 + 0.2}), {"policy": module}, optimizer)
+    other, other_optimizer = small_run(seed=1, steps=0)
+    assert read_checkpoint(path, {"policy": other}, other_optimizer) == Progress(7, {"beta": 0.1 + 0.2})
+    for name, value in module.state_dict().items():
+        assert torch.equal(other.state_dict()[name], value)
+    old, new = optimizer.state_dict()["state"], other_optimizer.state_dict()["state"]
+    assert old.keys() == new.keys()
+    assert all(torch.equal(old[i][name], new[i][name]) for i in old for name in old[i])
+    step(module, optimizer)
+    step(other, other_optimizer)
+    assert all(torch.equal(a, b) for a, b in zip(module.parameters(), other.parameters()))
+
+
+def test_the_learning_rate_in_force_is_the_optimisers_own(tmp_path):
+    module, optimizer = small_run()
+    path = write_checkpoint(tmp_path, Progress(1), {"policy": module}, optimizer)
+    other, other_optimizer = small_run(seed=1)
+    other_optimizer.param_groups[0]["lr"] = 0.5
+    read_checkpoint(path, {"policy": other}, other_optimizer)
+    assert other_optimizer.param_groups[0]["lr"] == 0.5
+
+
+def test_only_the_newest_two_are_kept(tmp_path):
+    module, optimizer = small_run()
+    for update in (2, 4, 6, 10):
+        write_checkpoint(tmp_path, Progress(update), {"policy": module}, optimizer)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["update-00000006", "update-00000010"]
+    newest = newest_checkpoint(tmp_path)
+    assert newest is not None
+    assert newest.name == "update-00000010"
+
+
+def test_a_half_written_checkpoint_is_not_taken_for_whole(tmp_path):
+    module, optimizer = small_run()
+    good = write_checkpoint(tmp_path, Progress(2), {"policy": module}, optimizer)
+    shutil.copytree(good, tmp_path / ".partial-update-00000004")
+    assert newest_checkpoint(tmp_path) == good
+    assert newest_checkpoint(tmp_path / "nothing") is None
+
+
+def test_writing_goes_on_over_what_a_killed_run_left(tmp_path):
+    module, optimizer = small_run()
+    leftover = tmp_path / ".partial-update-00000004"
+    leftover.mkdir(parents=True)
+    (leftover / "policy.safetensors").write_bytes(b"half")
+    path = write_checkpoint(tmp_path, Progress(4), {"policy": module}, optimizer)
+    assert not leftover.exists()
+    assert read_checkpoint(path, {"policy": copy.deepcopy(module)}, optimizer).update == 4
+
+
+@pytest.mark.parametrize("name", ["policy.safetensors", "optimizer.safetensors", "progress.json"])
+@pytest.mark.parametrize("damage", ["cut", "gone", "garbage"])
+def test_a_damaged_checkpoint_is_refused_in_words(tmp_path, name, damage):
+    module, optimizer = small_run()
+    path = write_checkpoint(tmp_path, Progress(2), {"policy": module}, optimizer)
+    content = (path / name).read_bytes()
+    if damage == "gone":
+        (path / name).unlink()
+    else:
+        (path / name).write_bytes(content[: len(content) // 2] if damage == "cut" else b"\xff" * 40)
+    with pytest.raises(CheckpointError, match=r"update-00000002: cannot go on from it .*delete this folder"):
+        read_checkpoint(path, {"policy": module}, optimizer)
+
+
+def test_a_checkpoint_of_another_model_is_refused(tmp_path):
+    module, optimizer = small_run()
+    path = write_checkpoint(tmp_path, Progress(2), {"policy": module}, optimizer)
+    with pytest.raises(CheckpointError, match="cannot go on from it"):
+        read_checkpoint(path, {"policy": nn.Linear(3, 4)}, optimizer)

@@ -1,0 +1,292 @@
+"""One update of closed-loop fine-tuning, taken apart."""
+
+import copy
+import json
+import math
+from dataclasses import replace
+
+import pytest
+import tiny
+import torch
+
+import scenes
+from rlftsim.errors import CheckpointError, ConfigError
+from rlftsim.rollout.baselines import ConstantVelocity
+from rlftsim.rollout.simulate import simulate
+from rlftsim.scenario.batch import collate
+from rlftsim.training import finetune as module
+from rlftsim.training.finetune import FinetuneConfig, compute_reward, finetune, prepare, update_policy
+from rlftsim.training.parallel import start_fabric
+from rlftsim.training.policy_gradient import masked_sum
+from rlftsim.training.reference import KlConfig
+from rlftsim.training.rewards import register_reward
+from rlftsim.training.rewards.base import _REWARDS
+from rlftsim.training.run_folder import read_metrics
+
+CONFIG = replace(tiny.FINETUNE, num_rollouts=4, gradient_clip=1e9)
+
+
+@pytest.fixture(scope="module")
+def fabric():
+    return start_fabric(tiny.CPU)
+
+
+@pytest.fixture
+def batch(drawn_scenarios):
+    return collate(drawn_scenarios[:2])
+
+
+@pytest.fixture
+def learner(vocabulary, fabric):
+    return prepare(tiny.tiny_policy(vocabulary), CONFIG, fabric.device)
+
+
+@pytest.fixture
+def reward_of():
+    """Register a reward for the length of a test; gives its name."""
+    names = []
+
+    def register(reward):
+        names.append(f"test-{len(names)}")
+        register_reward(names[-1])(reward)
+        return names[-1]
+
+    yield register
+    for name in names:
+        del _REWARDS[name]
+
+
+def nothing(scores, rollouts, batch):
+    return torch.zeros_like(scores.single_meta_metric)
+
+
+def move_weights(policy, size=0.05):
+    """A policy beside the one it was."""
+    generator = torch.Generator().manual_seed(11)
+    with torch.no_grad():
+        for weight in policy.parameters():
+            weight.add_(size * torch.randn(weight.shape, generator=generator))
+
+
+def snapshot(module):
+    return {name: value.clone() for name, value in module.state_dict().items()}
+
+
+def moved(module, before):
+    return [name for name, value in module.state_dict().items() if not torch.equal(value, before[name])]
+
+
+def test_an_update_moves_the_decoder_and_nothing_else(learner, batch, fabric):
+    before, held = snapshot(learner.policy), snapshot(learner.reference)
+    update_policy(learner, batch, CONFIG, fabric)
+    changed = moved(learner.policy, before)
+    assert changed
+    parts = ("time_layers", "map_layers", "agent_layers", "head")
+    assert all(name.startswith(tuple(f"network.decoder.{part}" for part in parts)) for name in changed)
+    assert moved(learner.reference, held) == []
+
+
+def test_training_everything_reaches_the_map_encoder(vocabulary, batch, fabric):
+    config = replace(CONFIG, trained="all")
+    learner = prepare(tiny.tiny_policy(vocabulary), config, fabric.device)
+    before = snapshot(learner.policy)
+    update_policy(learner, batch, config, fabric)
+    assert any("map_encoder" in name for name in moved(learner.policy, before))
+
+
+def test_scored_log_probs_equal_the_sampled_ones_and_the_gap_is_logged(learner, batch, fabric):
+    values = update_policy(learner, batch, CONFIG, fabric)
+    assert 0 <= values["score_gap"] < 1e-4
+
+
+def test_the_first_update_has_no_kl_and_the_next_one_has(learner, batch, fabric):
+    assert update_policy(learner, batch, CONFIG, fabric)["kl"] == pytest.approx(0.0, abs=1e-6)
+    assert update_policy(learner, batch, CONFIG, fabric)["kl"] > 1e-6
+
+
+def test_gradients_do_not_depend_on_how_many_rollouts_are_scored_at_once(vocabulary, batch, fabric):
+    found = []
+    for rollouts_per_pass in (4, 2, 1, 3):
+        config = replace(CONFIG, rollouts_per_pass=rollouts_per_pass)
+        learner = prepare(tiny.tiny_policy(vocabulary), config, fabric.device)
+        move_weights(learner.reference)
+        values = update_policy(learner, batch, config, fabric)
+        found.append((tiny.gradients_of(learner.policy), values))
+    whole, logged = found[0]
+    assert max(float(g.abs().max()) for g in whole.values()) > 1e-3
+    for gradients, values in found[1:]:
+        for name, gradient in whole.items():
+            torch.testing.assert_close(gradients[name], gradient, atol=1e-6, rtol=1e-5, msg=name)
+        for name in ("kl", "entropy", "gradient_norm"):
+            assert values[name] == pytest.approx(logged[name], rel=1e-5), name
+
+
+def gradients_with(learner, batch, fabric, config, beta):
+    twin = copy.deepcopy(learner)
+    twin.optimizer = torch.optim.AdamW(twin.parameters, lr=0.0)
+    twin.beta = beta
+    update_policy(twin, batch, config, fabric)
+    return tiny.gradients_of(twin.policy)
+
+
+def test_with_a_reward_of_zero_the_gradient_is_beta_times_that_of_the_kl(learner, batch, fabric, reward_of):
+    config = replace(CONFIG, reward=reward_of(nothing))
+    move_weights(learner.reference)
+    found = gradients_with(learner, batch, fabric, config, beta=0.3)
+    rollouts = simulate(
+        learner.policy, batch, num_rollouts=4, seed=module.derive_seed(config.seed, "rollouts", learner.update)
+    )
+    learner.policy.zero_grad()
+    scored = learner.policy.score(learner.policy.encode(batch), rollouts)
+    with torch.no_grad():
+        held = learner.reference.score(learner.reference.encode(batch), rollouts)
+    kl = masked_sum(scored.kl(held), rollouts.decision_mask) / rollouts.decision_mask.sum()
+    kl.backward()
+    for name, gradient in tiny.gradients_of(learner.policy).items():
+        torch.testing.assert_close(found[name], 0.3 * gradient, atol=1e-6, rtol=1e-4, msg=name)
+
+
+def test_with_a_reward_of_zero_and_no_distance_from_the_reference_nothing_pulls(learner, batch, fabric, reward_of):
+    config = replace(CONFIG, reward=reward_of(nothing))
+    values = update_policy(learner, batch, config, fabric)
+    assert values["gradient_norm"] < 1e-6
+
+
+def test_the_sum_over_decisions_pulls_harder_than_their_mean(learner, batch, fabric):
+    mean = gradients_with(learner, batch, fabric, CONFIG, beta=0.0)
+    total = gradients_with(learner, batch, fabric, replace(CONFIG, log_prob_reduction="sum"), beta=0.0)
+    norms = [math.sqrt(sum(float(g.square().sum()) for g in gs.values())) for gs in (mean, total)]
+    assert norms[1] > 16 * norms[0]  # 16 decisions of at least one agent are added up instead of averaged
+
+
+def test_a_reward_that_is_no_number_counts_as_none(batch, learner, reward_of):
+    def broken(scores, rollouts, batch):
+        values = scores.single_meta_metric.clone()
+        values[0, 1] = torch.nan
+        return values
+
+    rollouts = simulate(learner.policy, batch, num_rollouts=4, seed=0)
+    _, reward = compute_reward(batch, rollouts, replace(CONFIG, reward=reward_of(broken)))
+    assert reward[0].tolist() == [0.0] * 4
+    assert reward[1].abs().min() > 0
+
+
+def test_a_scenario_without_map_has_a_reward(learner):
+    batch = collate([scenes.without_map()])
+    rollouts = simulate(learner.policy, batch, num_rollouts=4, seed=0)
+    _, reward = compute_reward(batch, rollouts, CONFIG)
+    assert reward.isfinite().all()
+    assert reward.abs().max() > 0
+    assert float(reward.sum()) == pytest.approx(0.0, abs=1e-6)
+
+
+def poison_from(monkeypatch, update):
+    """Rewards are NaN from the n-th update on."""
+    original, calls = module.compute_reward, []
+
+    def poisoned(*args):
+        calls.append(1)
+        scores, reward = original(*args)
+        return scores, reward * torch.nan if len(calls) >= update else reward
+
+    monkeypatch.setattr(module, "compute_reward", poisoned)
+
+
+def test_an_update_that_is_not_finite_is_skipped(learner, batch, fabric, monkeypatch):
+    update_policy(learner, batch, CONFIG, fabric)
+    before, beta = snapshot(learner.policy), learner.beta
+    moments = copy.deepcopy(learner.optimizer.state_dict()["state"])
+    poison_from(monkeypatch, 1)
+    values = update_policy(learner, batch, CONFIG, fabric)
+    assert values["skipped"] == 1.0
+    assert moved(learner.policy, before) == []
+    assert learner.beta == beta
+    for index, state in learner.optimizer.state_dict()["state"].items():
+        assert all(torch.equal(value, moments[index][name]) for name, value in state.items())
+    monkeypatch.undo()
+    assert update_policy(learner, batch, CONFIG, fabric)["skipped"] == 0.0
+    assert moved(learner.policy, before)
+
+
+def test_an_update_whose_kl_exploded_is_skipped(learner, batch, fabric):
+    move_weights(learner.reference, 0.5)
+    before = snapshot(learner.policy)
+    values = update_policy(learner, batch, replace(CONFIG, max_kl=1e-3), fabric)
+    assert values["kl"] > 1e-3
+    assert values["skipped"] == 1.0
+    assert moved(learner.policy, before) == []
+
+
+def test_a_run_that_diverges_stops_and_names_its_last_good_checkpoint(
+    vocabulary, drawn_scenarios, tmp_path, monkeypatch
+):
+    poison_from(monkeypatch, 4)  # three good updates, a checkpoint after the second
+    config = replace(tiny.FINETUNE, epochs=5.0, max_skipped_in_a_row=3)
+    with pytest.raises(CheckpointError, match=r"3 updates in a row .*update-00000002.*learning_rate"):
+        finetune(tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path, config)
+    assert [line["skipped"] for line in read_metrics(tmp_path)] == [0, 0, 0, 1, 2, 3]
+    assert not (tmp_path / "model").exists()
+    monkeypatch.undo()  # and it goes on from there once the cause is gone
+    finetune(tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path, config)
+    assert (tmp_path / "model" / "config.json").exists()
+
+
+def test_the_reference_moves_every_so_many_updates(learner, batch, fabric):
+    config = replace(CONFIG, kl=KlConfig(reference_every=2, reference_share=0.25))
+    first = snapshot(learner.reference)
+    update_policy(learner, batch, config, fabric)
+    assert moved(learner.reference, first) == []
+    update_policy(learner, batch, config, fabric)
+    name = moved(learner.reference, first)[0]
+    expected = 0.25 * learner.policy.state_dict()[name] + 0.75 * first[name]
+    torch.testing.assert_close(learner.reference.state_dict()[name], expected)
+
+
+def test_beta_adapts_to_the_kl_of_the_update(learner, batch, fabric):
+    values = update_policy(learner, batch, CONFIG, fabric)  # KL 0, far below the target: beta falls by 0.2 / horizon
+    assert values["beta"] == 0.1
+    assert learner.beta == pytest.approx(0.1 * (1 - 0.2 / 5))
+
+
+def test_the_learning_rate_warms_up(learner, batch, fabric):
+    config = replace(CONFIG, warmup_updates=4, learning_rate=4e-4)
+    rates = [update_policy(learner, batch, config, fabric)["learning_rate"] for _ in range(5)]
+    assert rates == pytest.approx([1e-4, 2e-4, 3e-4, 4e-4, 4e-4])
+
+
+def test_a_run_leaves_what_docs_training_promises(vocabulary, drawn_scenarios, tmp_path):
+    config = replace(tiny.FINETUNE, epochs=0.5)
+    model = finetune(tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path, config, card="a card\n")
+    assert model == tmp_path / "model"
+    assert {p.name for p in model.iterdir()} == {
+        "config.json", "model.safetensors", "vocabulary.safetensors", "README.md",
+    }  # fmt: skip
+    assert (model / "README.md").read_text() == "a card\n"
+    assert json.loads((tmp_path / "config.json").read_text())["num_rollouts"] == 2
+    assert json.loads((tmp_path / "environment.json").read_text())["packages"]["torch"] == torch.__version__
+    assert list((tmp_path / "tensorboard").glob("events*"))
+    assert [p.name for p in (tmp_path / "checkpoints").iterdir()] == ["update-00000002"]
+
+
+def test_a_policy_without_weights_is_refused(drawn_scenarios, tmp_path):
+    with pytest.raises(ConfigError, match="ConstantVelocity has no weights"):
+        finetune(ConstantVelocity(), drawn_scenarios, tmp_path, tiny.FINETUNE)
+
+
+def test_no_scenario_is_refused(vocabulary, tmp_path):
+    with pytest.raises(ConfigError, match="no scenario to train on"):
+        finetune(tiny.tiny_policy(vocabulary), [], tmp_path, tiny.FINETUNE)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"num_rollouts": 1}, "at least 2 rollouts"),
+        ({"batch_size": 0}, "must be positive"),
+        ({"reward": "joy"}, "unknown reward 'joy': known are .*mloo"),
+        ({"metric": "1999"}, "known are 2025"),
+    ],
+)
+def test_impossible_settings_are_refused_at_once(changes, words):
+    with pytest.raises(ConfigError, match=words):
+        FinetuneConfig(**changes)

@@ -1,0 +1,152 @@
+"""A run that was stopped, politely or not, ends with the weights of one that never was."""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import tiny
+import torch
+from safetensors.torch import load_file
+
+import rlftsim
+from rlftsim.training import finetune as finetune_module
+from rlftsim.training import pretrain as pretrain_module
+from rlftsim.training.finetune import finetune
+from rlftsim.training.pretrain import pretrain
+from rlftsim.training.run_folder import read_metrics
+
+MODULES = {"pretrain": pretrain_module, "finetune": finetune_module}
+WORK = {"pretrain": "_update", "finetune": "update_policy"}
+
+
+def weights(out: Path) -> dict[str, torch.Tensor]:
+    return load_file(out / "model" / "model.safetensors")
+
+
+def assert_same_weights(first: Path, second: Path):
+    a, b = weights(first), weights(second)
+    assert a.keys() == b.keys()
+    differing = [name for name in a if not torch.equal(a[name], b[name])]
+    assert differing == []
+
+
+def train(stage, vocabulary, scenarios, out, **changes):
+    policy = tiny.tiny_policy(vocabulary)
+    if stage == "pretrain":
+        return pretrain(policy, scenarios, out, replace(tiny.PRETRAIN, **changes))
+    return finetune(policy, scenarios, out, replace(tiny.FINETUNE, **changes))
+
+
+def stop_at(monkeypatch, stage, update):
+    """Let a run be interrupted in the middle of its n-th update."""
+    module, name = MODULES[stage], WORK[stage]
+    original, calls = getattr(module, name), []
+
+    def interrupted(*args, **options):
+        calls.append(1)
+        result = original(*args, **options)  # the weights have moved, nothing is written yet
+        if len(calls) == update:
+            raise KeyboardInterrupt
+        return result
+
+    monkeypatch.setattr(module, name, interrupted)
+
+
+@pytest.mark.parametrize("stage", ["pretrain", "finetune"])
+@pytest.mark.parametrize("update", [1, 4])
+def test_a_run_interrupted_inside_an_update_ends_as_if_it_never_was(
+    stage, update, vocabulary, drawn_scenarios, tmp_path, monkeypatch
+):
+    changes = {"epochs": 1.25, "batch_size": 1}  # five updates, checkpoints after 2, 4 and 5
+    train(stage, vocabulary, drawn_scenarios, tmp_path / "whole", **changes)
+    with monkeypatch.context() as patch:
+        stop_at(patch, stage, update)
+        with pytest.raises(KeyboardInterrupt):
+            train(stage, vocabulary, drawn_scenarios, tmp_path / "stopped", **changes)
+    assert not (tmp_path / "stopped" / "model").exists()
+    train(stage, vocabulary, drawn_scenarios, tmp_path / "stopped", **changes)
+    assert_same_weights(tmp_path / "whole", tmp_path / "stopped")
+    lines = read_metrics(tmp_path / "stopped")
+    assert [line["update"] for line in lines] == [1, 2, 3, 4, 5]
+    timeless = {k for k in lines[0] if k != "time" and not k.startswith("seconds")}
+    for mine, other in zip(lines, read_metrics(tmp_path / "whole")):
+        assert {k: mine[k] for k in timeless} == {k: other[k] for k in timeless}
+
+
+@pytest.mark.parametrize("stage", ["pretrain", "finetune"])
+def test_a_finished_run_does_nothing_more(stage, vocabulary, drawn_scenarios, tmp_path, monkeypatch):
+    changes = {"epochs": 0.5, "batch_size": 1}
+    train(stage, vocabulary, drawn_scenarios, tmp_path, **changes)
+    before = weights(tmp_path)
+
+    def no_more(*_, **__):
+        raise AssertionError("an update too many")
+
+    monkeypatch.setattr(MODULES[stage], WORK[stage], no_more)
+    train(stage, vocabulary, drawn_scenarios, tmp_path, **changes)
+    assert all(torch.equal(before[name], value) for name, value in weights(tmp_path).items())
+
+
+def start(stage, out) -> subprocess.Popen:
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(rlftsim.__file__).parents[1]), *sys.path])}
+    command = [sys.executable, tiny.__file__, stage, str(out)]
+    return subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
+
+
+def lines_logged(out: Path) -> int:
+    """Whole lines of metrics: a kill may cut the last one short."""
+    path = out / "metrics.jsonl"
+    return path.read_text().count("\n") if path.exists() else 0
+
+
+def kill_at_random(stage, out) -> str:
+    """SIGKILL a run at a random moment between its first and its last update; says when that was."""
+    seed = random.SystemRandom().randrange(2**32)
+    chance = random.Random(seed)
+    after, pause = chance.randint(1, 6), chance.uniform(0, 0.5)
+    process = start(stage, out)
+    deadline = time.monotonic() + 120
+    while lines_logged(out) < after and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.02)
+    time.sleep(pause)
+    process.send_signal(signal.SIGKILL)
+    errors = process.communicate()[1]
+    return f"killed {pause:.3f} s after update {after} with status {process.returncode}: {errors[-500:]}"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stage", ["pretrain", "finetune"])
+def test_a_run_killed_at_a_random_moment_ends_as_if_it_never_was(stage, tmp_path):
+    tiny.run(stage, tmp_path / "whole")
+    what = kill_at_random(stage, tmp_path / "killed")
+    print(what)
+    assert lines_logged(tmp_path / "killed"), what
+    tiny.run(stage, tmp_path / "killed")
+    assert_same_weights(tmp_path / "whole", tmp_path / "killed")
+    assert [line["update"] for line in read_metrics(tmp_path / "killed")] == list(range(1, 9))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stage", ["pretrain", "finetune"])
+def test_two_processes_find_the_gradient_of_one(stage, tmp_path):
+    for processes in (1, 2):
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+        command = [sys.executable, tiny.__file__, stage, str(tmp_path / str(processes)), "--updates", "1"]
+        command += ["--batch-size", "4", "--processes", str(processes)]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
+        assert done.returncode == 0, done.stderr[-2000:]
+    one, two = (load_file(tmp_path / n / "gradients.safetensors") for n in ("1", "2"))
+    assert one.keys() == two.keys()
+    assert max(float(g.abs().max()) for g in one.values()) > 1e-3
+    for name, gradient in one.items():
+        torch.testing.assert_close(two[name], gradient, atol=1e-6, rtol=1e-5, msg=name)
+    a, b = (read_metrics(tmp_path / n)[0] for n in ("1", "2"))
+    watched = ["loss", "accuracy", "predictions"] if stage == "pretrain" else ["kl", "entropy", "gradient_norm", "rmm"]
+    for name in watched:
+        assert b[name] == pytest.approx(a[name], rel=1e-5, abs=1e-6), name

@@ -1,0 +1,108 @@
+"""Rewards: hand-made numbers, and what every leave-one-out reward has in common."""
+
+import pytest
+import tiny
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+import scenes
+from rlftsim.errors import ConfigError
+from rlftsim.realism import METRIC_2025, score_batch
+from rlftsim.realism.from_rollouts import states_of_rollouts
+from rlftsim.rollout.simulate import simulate
+from rlftsim.scenario.batch import collate
+from rlftsim.training.rewards import leave_one_out, register_reward, reward_by_name
+from rlftsim.training.rewards.base import _REWARDS
+from rlftsim.training.rewards.mloo import compute_mloo
+
+values = st.integers(2, 8).flatmap(
+    lambda n: st.lists(st.lists(st.floats(0, 1, width=32), min_size=n, max_size=n), min_size=1, max_size=3)
+)
+
+
+def test_mloo_of_hand_made_numbers():
+    # without the first the other two reach 0.6, and so on; their mean is 0.7
+    without_each = torch.tensor([[0.6, 0.7, 0.8]])
+    torch.testing.assert_close(compute_mloo(without_each), torch.tensor([[0.1, 0.0, -0.1]]))
+
+
+def test_the_rollout_that_the_group_misses_most_is_rewarded_most():
+    assert compute_mloo(torch.tensor([[0.50, 0.71, 0.70, 0.69]])).argmax() == 0
+
+
+def test_leave_one_out_of_hand_made_numbers():
+    # 1 - mean(2, 6), 2 - mean(1, 6), 6 - mean(1, 2)
+    torch.testing.assert_close(leave_one_out(torch.tensor([[1.0, 2.0, 6.0]])), torch.tensor([[-3.0, -1.5, 4.5]]))
+
+
+@given(values)
+def test_leave_one_out_rewards_sum_to_zero(rows):
+    x = torch.tensor(rows)
+    for reward in (compute_mloo(x), leave_one_out(x)):
+        assert reward.shape == x.shape
+        torch.testing.assert_close(reward.sum(-1), torch.zeros(len(x)), atol=1e-5, rtol=0)
+
+
+@given(values, st.floats(-1, 1))
+def test_what_all_rollouts_share_is_no_reward(rows, shift):
+    x = torch.tensor(rows)
+    torch.testing.assert_close(leave_one_out(x + shift), leave_one_out(x), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("reward", [compute_mloo, leave_one_out])
+def test_a_single_rollout_cannot_be_left_out(reward):
+    with pytest.raises(ConfigError, match=r"at least 2 rollouts per scenario, got 1: set finetune\.num_rollouts"):
+        reward(torch.zeros(3, 1))
+
+
+@pytest.fixture(scope="module")
+def simulated(vocabulary):
+    batch = collate([scenes.straight_road(), scenes.junction_with_light()])
+    rollouts = simulate(tiny.tiny_policy(vocabulary), batch, num_rollouts=4, seed=1)
+    scores = score_batch(batch.scenarios, states_of_rollouts(batch, rollouts), METRIC_2025)
+    return scores, rollouts, batch
+
+
+@pytest.mark.parametrize("name", sorted(_REWARDS))
+def test_every_reward_is_one_finite_number_per_rollout_that_sums_to_zero(name, simulated):
+    reward = reward_by_name(name)(*simulated)
+    assert reward.shape == (2, 4)
+    assert reward.isfinite().all()
+    assert (reward.abs().amax(-1) > 0).all()
+    torch.testing.assert_close(reward.sum(-1), torch.zeros(2), atol=1e-5, rtol=0)
+
+
+def test_mloo_is_made_of_the_metric_without_each_rollout(simulated):
+    """The metric of the other three, computed from scratch, gives the reward."""
+    _, rollouts, batch = simulated
+    rows = []
+    for left_out in range(4):
+        others = [i for i in range(4) if i != left_out]
+        kept = rollouts.position[:, others], rollouts.heading[:, others]
+        some = type(rollouts)(
+            *kept, *(getattr(rollouts, n)[:, others] for n in ("decision", "decision_mask", "log_prob"))
+        )
+        rows.append(score_batch(batch.scenarios, states_of_rollouts(batch, some), METRIC_2025).meta_metric)
+    without_each = torch.stack(rows, -1)
+    expected = without_each.mean(-1, keepdim=True) - without_each
+    torch.testing.assert_close(reward_by_name("mloo")(*simulated), expected, atol=1e-6, rtol=0)
+
+
+def test_a_reward_from_outside_is_found_by_name(simulated):
+    @register_reward("test-quiet")
+    def quiet(scores, rollouts, batch):
+        return leave_one_out(-scores.rollout_collision_rate)
+
+    try:
+        assert reward_by_name("test-quiet") is quiet
+        assert reward_by_name("test-quiet")(*simulated).shape == (2, 4)
+        with pytest.raises(ConfigError, match="'test-quiet' is registered already"):
+            register_reward("test-quiet")(quiet)
+    finally:
+        del _REWARDS["test-quiet"]
+
+
+def test_an_unknown_reward_is_refused_with_the_known_ones():
+    with pytest.raises(ConfigError, match=r"unknown reward 'joy': known are .*mloo, .*rloo"):
+        reward_by_name("joy")

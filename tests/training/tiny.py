@@ -1,0 +1,97 @@
+"""A model so small that a whole training run takes seconds, for tests; also a command, so that a run can be killed or spread.
+
+python tests/training/tiny.py pretrain|finetune OUT [--processes 2] [--updates 8]
+"""
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from safetensors.torch import save_file
+
+from rlftsim.policies.smart.config import SmartConfig
+from rlftsim.policies.smart.policy import SmartPolicy
+from rlftsim.scenario.dataset import ScenarioDataset
+from rlftsim.scenario.synthetic import pack_path
+from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
+from rlftsim.training.finetune import FinetuneConfig, finetune
+from rlftsim.training.parallel import DeviceConfig
+from rlftsim.training.pretrain import PretrainConfig, pretrain
+
+NUM_SCENARIOS = 5
+CPU = DeviceConfig(accelerator="cpu", threads=1)
+MODEL = SmartConfig(
+    dim=16, num_heads=2, head_dim=8, num_map_layers=1, num_decoder_layers=1, num_frequencies=4, history_tokens=3,
+    max_map_neighbors=4, max_agent_map_neighbors=6, max_agent_neighbors=6,
+)  # fmt: skip
+WITHOUT_CHANCE = replace(MODEL, dropout=0.0, history_drop=0.0)
+PRETRAIN = PretrainConfig(epochs=1.6, batch_size=1, learning_rate=1e-3, label_smoothing=0.0, checkpoint_every=2, device=CPU)  # fmt: skip
+FINETUNE = FinetuneConfig(
+    epochs=1.6, batch_size=1, num_rollouts=2, learning_rate=1e-3, warmup_updates=2, checkpoint_every=2, device=CPU
+)
+"""Eight updates on five scenarios, with a checkpoint after every second."""
+
+
+def pack_scenarios(count=NUM_SCENARIOS):
+    """Small scenarios of the embedded pack that have vehicles, pedestrians and cyclists."""
+    data = ScenarioDataset(pack_path(), "training")
+    columns = (data.index[name].to_pylist() for name in ("num_vehicles", "num_pedestrians", "num_cyclists"))
+    mixed = sorted((sum(counts), i) for i, counts in enumerate(zip(*columns)) if all(counts))
+    return [data[i] for _, i in mixed[:count]]
+
+
+def small_vocabulary(scenarios):
+    """48 motion tokens a class."""
+    return build_vocabulary(scenarios, TokensConfig(num_tokens=48, num_map_prototypes=16))[0]
+
+
+def tiny_policy(vocabulary, config=MODEL, seed=3):
+    """Fresh weights, the same for the same seed; the head a little bolder than fresh ones are."""
+    torch.manual_seed(seed)
+    policy = SmartPolicy(config, vocabulary)
+    with torch.no_grad():
+        for name, weight in policy.named_parameters():
+            if name.startswith("network.decoder.head") and weight.dim() == 2:
+                weight.mul_(3.0)
+    return policy
+
+
+def gradients_of(policy):
+    """What the last update left in the parameters."""
+    return {name: p.grad.clone() for name, p in policy.named_parameters() if p.grad is not None}
+
+
+def run(stage, out, *, updates=8, processes=1, batch_size=1):
+    """Train on the pack's scenarios; also writes the gradients of the last update."""
+    scenarios = pack_scenarios()
+    policy = tiny_policy(small_vocabulary(scenarios), WITHOUT_CHANCE if batch_size > 1 else MODEL)
+    changes = {
+        "device": replace(CPU, devices=processes), "batch_size": batch_size,
+        "epochs": updates * batch_size / NUM_SCENARIOS, "gradient_clip": 1e9 if batch_size > 1 else 1.0,
+    }  # fmt: skip
+    if stage == "pretrain":
+        pretrain(policy, scenarios, out, replace(PRETRAIN, max_trained_agents=None, **changes))
+    else:
+        finetune(policy, scenarios, out, replace(FINETUNE, **changes))
+    if not torch.distributed.is_initialized() or torch.distributed.get_rank() == 0:
+        save_file(gradients_of(policy), out / "gradients.safetensors")
+    return policy
+
+
+def main():
+    parser = argparse.ArgumentParser()
+    parser.add_argument("stage", choices=("pretrain", "finetune"))
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--updates", type=int, default=8)
+    parser.add_argument("--processes", type=int, default=1)
+    parser.add_argument("--batch-size", type=int, default=1)
+    options = parser.parse_args()
+    run(
+        options.stage, options.out,
+        updates=options.updates, processes=options.processes, batch_size=options.batch_size,
+    )  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
