@@ -67,8 +67,7 @@ def test_targets_are_those_of_the_public_code(frame, policy, batch_a, golden):
     assert rolling == golden.scalars(f"nano_{frame}")["train"]["bc_target_vs_gtidx_mismatch"]
 
 
-@frames
-@pytest.mark.parametrize("label_smoothing", [0.1, 0.0])
+@pytest.mark.parametrize(("frame", "label_smoothing"), [("centred", 0.1), ("absolute", 0.1), ("centred", 0.0)])
 def test_pre_training_loss_and_gradients(frame, label_smoothing, policy, batch_a, golden):
     expected = golden.scalars(f"nano_{frame}")["train"]
     loss, count = bc_loss(policy, batch_a(frame), golden.arrays(f"nano/{frame}_train"), label_smoothing)
@@ -88,12 +87,15 @@ def test_pre_training_loss_and_gradients(frame, label_smoothing, policy, batch_a
     [
         pytest.param(
             "centred",
-            marks=pytest.mark.xfail(
-                strict=True,
-                reason="losses of steps 4 and 6 differ by 1.06e-3 and 1.12e-3 (2e-4 of their value): in AdamW's first step the sign of "
-                "gradients that are all but zero counts, and rounding decides it; weights changed by half a float32 step "
-                "give curves that differ by 8e-5 or by 1.3e-3",
-            ),
+            marks=[
+                pytest.mark.slow,
+                pytest.mark.xfail(
+                    strict=True,
+                    reason="losses of steps 4 and 6 differ by 1.06e-3 and 1.12e-3 (2e-4 of their value): in AdamW's first step the sign of "
+                    "gradients that are all but zero counts, and rounding decides it; weights changed by half a float32 step "
+                    "give curves that differ by 8e-5 or by 1.3e-3",
+                ),
+            ],
         ),
         "absolute",
     ],

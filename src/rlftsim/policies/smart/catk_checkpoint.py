@@ -89,8 +89,8 @@ def import_catk(checkpoint: Path, vocabulary: Sequence[Path]) -> CatkImport:
 
 
 def export_catk(policy: SmartPolicy) -> dict[str, Tensor]:
-    """A model's weights under the public code's names, on the CPU; importing them again gives the same bits."""
-    named = {catk_name(k): v.detach().cpu().contiguous() for k, v in policy.network.state_dict().items()}
+    """Copies of a model's weights under the public code's names, on the CPU; importing them again gives the same bits."""
+    named = {catk_name(k): v.detach().cpu().clone() for k, v in policy.network.state_dict().items()}
     return named | {second: named[first].clone() for second, first in aliases(named).items()}
 
 
