@@ -42,9 +42,8 @@ def check_gradients(policy, total, by_parameter):
     ours = gradient_norms(policy)
     theirs = {own_name(name.removeprefix(PREFIX)): norm for name, norm in by_parameter.items()}
     assert ours.keys() == theirs.keys()
-    # norms that are nothing but rounding (a bias in front of a softmax) are compared with the total
-    allowed = {name: GRADIENT_TOLERANCE * norm + 1e-6 * total for name, norm in theirs.items()}
-    wrong = {name: (ours[name], norm) for name, norm in theirs.items() if abs(ours[name] - norm) > allowed[name]}
+    off = {name: abs(ours[name] / norm - 1) for name, norm in theirs.items()}
+    wrong = {name: value for name, value in off.items() if value > GRADIENT_TOLERANCE}
     assert wrong == {}
     assert sum(n * n for n in ours.values()) ** 0.5 == pytest.approx(total, rel=GRADIENT_TOLERANCE)
 
@@ -82,38 +81,46 @@ def test_pre_training_loss_and_gradients(frame, label_smoothing, policy, batch_a
         check_gradients(policy, total, expected["bc_grad"])
 
 
-@pytest.mark.parametrize(
-    "frame",
-    [
-        pytest.param(
-            "centred",
-            marks=[
-                pytest.mark.slow,
-                pytest.mark.xfail(
-                    strict=True,
-                    reason="losses of steps 4 and 6 differ by 1.06e-3 and 1.12e-3 (2e-4 of their value): in AdamW's first step the sign of "
-                    "gradients that are all but zero counts, and rounding decides it; weights changed by half a float32 step "
-                    "give curves that differ by 8e-5 or by 1.3e-3",
-                ),
-            ],
-        ),
-        "absolute",
-    ],
-)
-def test_six_optimiser_steps(frame, policy, batch_a, golden):
-    expected = golden.scalars(f"nano_{frame}")["train"]
-    arrays = golden.arrays(f"nano/{frame}_train")
+def optimiser_curve(policy, batch, arrays, num_steps):
+    """Losses and gradient norms of some steps on one batch."""
     optimizer = torch.optim.AdamW(policy.parameters(), lr=LEARNING_RATE, weight_decay=WEIGHT_DECAY)
     losses, norms = [], []
-    for _ in expected["bc_curve"]:
+    for _ in range(num_steps):
         optimizer.zero_grad()
-        loss, _ = bc_loss(policy, batch_a(frame), arrays, 0.1)
+        loss, _ = bc_loss(policy, batch, arrays, 0.1)
         loss.backward()
         norms.append(torch.nn.utils.clip_grad_norm_(policy.parameters(), GRADIENT_CLIP).item())
         optimizer.step()
         losses.append(loss.item())
+    return losses, norms
+
+
+def check_six_steps(policy, frame, batch_a, golden):
+    expected, arrays = golden.scalars(f"nano_{frame}")["train"], golden.arrays(f"nano/{frame}_train")
+    losses, norms = optimiser_curve(policy, batch_a(frame), arrays, len(expected["bc_curve"]))
     np.testing.assert_allclose(losses, expected["bc_curve"], atol=CURVE_TOLERANCE, rtol=0)
     np.testing.assert_allclose(norms, expected["bc_curve_gradnorm"], rtol=CURVE_TOLERANCE)
+
+
+def test_six_optimiser_steps_in_absolute_coordinates(policy, batch_a, golden):
+    check_six_steps(policy, "absolute", batch_a, golden)
+
+
+@pytest.mark.slow
+@pytest.mark.xfail(
+    strict=True,
+    reason="losses of steps 4 and 6 differ by 1.06e-3 and 1.12e-3 (2e-4 of their value): the input of one ReLU is 1.3e-7 here and "
+    "below zero in the public code (typical size 0.7), so a part of the first gradient is missing there",
+)
+def test_six_optimiser_steps(policy, batch_a, golden):
+    check_six_steps(policy, "centred", batch_a, golden)
+
+
+@pytest.mark.slow
+def test_six_optimiser_steps_with_that_one_relu_on_the_other_side(policy, batch_a, golden):
+    with torch.no_grad():
+        policy.network.decoder.time_layers[2].feed_forward[1].bias[166] -= 2e-7
+    check_six_steps(policy, "centred", batch_a, golden)
 
 
 def test_closest_among_top_k_in_our_own_order_of_operations(policy, batch_a, golden):
