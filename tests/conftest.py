@@ -2,6 +2,11 @@ import os
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+
+# slow machines are no failure; the same examples every time
+settings.register_profile("rlftsim", deadline=None, derandomize=True)
+settings.load_profile("rlftsim")
 
 
 @pytest.fixture(scope="session")

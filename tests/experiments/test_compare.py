@@ -97,7 +97,7 @@ def test_evaluations_of_different_kinds_are_refused():
     with pytest.raises(DataError, match="no scenario in common"):
         compare(a, evaluation("b", [0.1, 0.2], ["x", "y"]))
     with pytest.raises(ConfigError, match="alpha"):
-        compare(a, a, alpha=5)
+        compare(a, a, alpha=5.0)
 
 
 def test_an_interval_holds_the_truth_as_often_as_it_says():

@@ -46,6 +46,12 @@ class _Wobbling:
     def log_prob(self, decision, sampling):
         return torch.zeros_like(decision[..., 0])
 
+    def kl(self, other):
+        return torch.zeros_like(self.decision[..., 0])
+
+    def entropy(self):
+        return torch.zeros_like(self.decision[..., 0])
+
 
 @pytest.fixture(scope="session")
 def data(tmp_path_factory):

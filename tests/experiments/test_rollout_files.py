@@ -96,7 +96,7 @@ CHANGES = {
     "a step is missing": ({"x": np.zeros((2, 6, 79), np.float32)}, r"x must be floats \[N, A, 80\] with A = 6.*79"),
     "an agent is missing": ({"y": np.zeros((2, 5, 80), np.float32)}, r"y must be floats"),
     "an axis is missing": ({"heading": np.zeros((6, 80), np.float32)}, r"heading must be floats"),
-    "another number of rollouts": ({"z": np.zeros((3, 6, 80), np.float32)}, r"Simulated z"),
+    "another number of rollouts": ({"z": np.zeros((3, 6, 80), np.float32)}, r"equally many"),
     "no rollouts": ({axis: np.zeros((0, 6, 80), np.float32) for axis in AXES}, "x must be floats"),
     "whole numbers": ({"x": np.zeros((2, 6, 80), np.int64)}, "got int64"),
     "ids in two dimensions": ({"object_ids": np.zeros((6, 1), np.int32)}, "object_ids must be whole numbers"),

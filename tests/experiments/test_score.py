@@ -3,6 +3,7 @@ import json
 import multiprocessing
 from dataclasses import replace
 
+import jaxtyping
 import numpy as np
 import pytest
 from rich.console import Console
@@ -208,7 +209,7 @@ def test_agents_that_are_not_the_scenarios_are_named_with_the_file(data, tmp_pat
 
 def test_impossible_settings_are_refused():
     for wrong in ({"jobs": 0}, {"limit": 0}, {"metric": "1999"}):
-        with pytest.raises(ConfigError):
+        with pytest.raises((ConfigError, jaxtyping.TypeCheckError)):  # the latter under run-time type checks
             ScoreConfig(**wrong)
 
 

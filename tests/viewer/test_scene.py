@@ -75,7 +75,12 @@ def test_rollout_is_the_history_followed_by_the_simulation(scenario):
 def test_rollouts_of_another_scenario_are_refused(scenario):
     rollouts = simulate(ConstantVelocity(), collate([scenario]), num_rollouts=1, seed=0)
     with pytest.raises(DataError, match="3 agents, but the rollouts have 2"):
-        rollout_trajectories(scenario, replace(rollouts, position=rollouts.position[:, :, :2]), row=0)
+        rollout_trajectories(scenario, _first_agents(rollouts, 2), row=0)
+
+
+def _first_agents(rollouts, count):
+    fields = ("position", "heading", "decision", "decision_mask", "log_prob")
+    return replace(rollouts, **{name: getattr(rollouts, name)[:, :, :count] for name in fields})
 
 
 def test_payload_restores_positions_to_half_a_centimetre(scenario):

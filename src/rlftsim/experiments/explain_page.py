@@ -183,7 +183,9 @@ def _histogram_html(histogram: FeatureHistogram) -> str:
             )
     for k in range(0, len(histogram.edges), 2 if len(histogram.edges) > 8 else 1):
         x = _LEFT + k * width
-        ticks.append(f'<text x="{x:.1f}" y="{bottom + 15}" text-anchor="middle">{_tick(histogram.edges[k])}</text>')
+        ticks.append(
+            f'<text x="{x:.1f}" y="{bottom + 15}" text-anchor="middle">{_tick(float(histogram.edges[k]))}</text>'
+        )
     title = _words(histogram.feature)
     axis = (
         f'<path class="axis" d="M{_LEFT} {bottom}H{_BAR_WIDTH}"/>'
@@ -220,7 +222,7 @@ def _heat_cell(value: float, among: Float[np.ndarray, "..."]) -> str:
     return f'<td class="{"cost" if value > 0 else "gain"}" style="--heat:{heat:.2f}">{text}</td>'
 
 
-def _tick(edge: float) -> str:
+def _tick(edge: float | np.floating) -> str:
     return f"{edge:.3g}".replace("-", "−")
 
 

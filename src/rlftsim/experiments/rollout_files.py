@@ -150,9 +150,14 @@ def _states_of_npz(entry: RolloutEntry) -> SimulatedStates:
                 f"{axis} must be floats [N, A, {FUTURE_STEPS}] with A = {len(ids)} as in object_ids, "
                 f"got {values.dtype} {list(values.shape)}."
             )
+    numbers = [len(values) for values in arrays.values()]
+    if len(set(numbers)) > 1:
+        raise DataError(
+            f"x, y, z and heading hold {', '.join(map(str, numbers))} rollouts: there must be equally many."
+        )
     with np.errstate(over="ignore"):  # what becomes infinite is refused by name
-        fields = [torch.from_numpy(np.ascontiguousarray(arrays[axis], np.float32)) for axis in AXES]
-    return SimulatedStates(ids.astype(np.int64), *fields)
+        x, y, z, heading = (torch.from_numpy(np.ascontiguousarray(arrays[axis], np.float32)) for axis in AXES)
+    return SimulatedStates(ids.astype(np.int64), x, y, z, heading)
 
 
 def _entries_of_submission(path: Path) -> Iterator[RolloutEntry]:
@@ -196,8 +201,8 @@ def _states_of_submission(entry: RolloutEntry) -> SimulatedStates:
             raise DataError(f"rollout {rollout} has other agents than rollout 0: object id {other[0]} is in one only.")
     values = np.array([[scene[object_id] for object_id in ids] for scene in scenes], np.float32)
     values = values.reshape(len(scenes), len(ids), len(AXES), FUTURE_STEPS)
-    fields = [torch.from_numpy(np.ascontiguousarray(values[:, :, axis])) for axis in range(len(AXES))]
-    return SimulatedStates(np.array(ids, np.int64), *fields)
+    x, y, z, heading = (torch.from_numpy(np.ascontiguousarray(values[:, :, axis])) for axis in range(len(AXES)))
+    return SimulatedStates(np.array(ids, np.int64), x, y, z, heading)
 
 
 def _trajectories_by_id(scene: submission_pb2.JointScene, rollout: int) -> dict[int, np.ndarray]:

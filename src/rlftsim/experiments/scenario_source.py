@@ -4,7 +4,7 @@ import hashlib
 import io
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from rlftsim.errors import DataError
 from rlftsim.experiments.wire_format import BYTES, iterate_fields
@@ -18,6 +18,7 @@ _HEADER_BYTES = 12
 _CACHED_SCENARIOS = 2
 
 
+@runtime_checkable
 class ScenarioSource(Protocol):
     """Scenarios by id; can be handed to other processes."""
 

@@ -6,7 +6,8 @@ A submission file holds the rollouts of hundreds of scenarios: finding out which
 """
 
 from collections.abc import Iterator
-from typing import BinaryIO, NamedTuple
+from io import BufferedIOBase
+from typing import NamedTuple
 
 from rlftsim.errors import DataError
 
@@ -24,7 +25,7 @@ class WireField(NamedTuple):
     stop: int
 
 
-def iterate_fields(file: BinaryIO, start: int, stop: int) -> Iterator[WireField]:
+def iterate_fields(file: BufferedIOBase, start: int, stop: int) -> Iterator[WireField]:
     """Fields of the message in bytes [start, stop) of a file, in order.
 
     Raises:
@@ -52,7 +53,7 @@ def iterate_fields(file: BinaryIO, start: int, stop: int) -> Iterator[WireField]
         position = end
 
 
-def _read_varint(file: BinaryIO, stop: int) -> int:
+def _read_varint(file: BufferedIOBase, stop: int) -> int:
     begin = file.tell()
     value = 0
     for shift in range(_MAX_VARINT_BYTES):

@@ -14,7 +14,7 @@ import json
 import os
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -75,7 +75,7 @@ class Manifest:
     rlftsim_version: str = rlftsim.__version__
 
 
-class ScenarioDataset(Sequence[Scenario]):
+class ScenarioDataset:
     """Scenarios of a data set's folder, by position or by id.
 
     As long as a scenario is in the cache the same object comes back, so what is derived from it can be cached by
@@ -108,7 +108,7 @@ class ScenarioDataset(Sequence[Scenario]):
     def __len__(self) -> int:
         return len(self.scenario_ids)
 
-    def __getitem__(self, position: int) -> Scenario:  # type: ignore[override]  # no slices: they would decode
+    def __getitem__(self, position: int) -> Scenario:
         """Scenario at a position of the index; negative positions count from the end.
 
         Raises:
