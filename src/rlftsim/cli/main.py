@@ -21,6 +21,7 @@ VERBS = {
     "tokens": ("rlftsim.cli.train", "Tokens"),
     "pretrain": ("rlftsim.cli.train", "Pretrain"),
     "finetune": ("rlftsim.cli.train", "Finetune"),
+    "model": ("rlftsim.cli.model", "Model"),
     "simulate": ("rlftsim.cli.simulate", "Simulate"),
     "score": ("rlftsim.cli.results", "Score"),
     "evaluate": ("rlftsim.cli.results", "Evaluate"),
@@ -42,6 +43,7 @@ usage: rlftsim VERB ...      rlftsim VERB --help explains a verb
   tokens       build a vocabulary of motion and map tokens
   pretrain     train a model to predict the next motion token
   finetune     fine-tune a model closed-loop with a realism reward
+  model        take a checkpoint from the public CAT-K code, or hand one back
   simulate     roll scenarios out with a model
 
   score        score anybody's rollouts with the official realism meta-metric

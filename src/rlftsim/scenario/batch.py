@@ -1,7 +1,8 @@
-"""Scenarios side by side: padded tensors of the simulated agents, in the map frame."""
+"""Scenarios side by side: padded tensors of the simulated agents, in the map frame unless asked otherwise."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Literal
 
 import numpy as np
 import torch
@@ -11,18 +12,20 @@ from torch import Tensor
 from rlftsim.errors import DataError
 from rlftsim.scenario.types import CURRENT_STEP, Scenario
 
+Frame = Literal["map", "world"]
+
 
 @dataclass(frozen=True, eq=False)
 class ScenarioBatch:
     """B scenarios, their simulated agents (valid at the current step, track order) padded to A.
 
-    Frame: map, i.e. world minus `origin` (whole metres, exact in float32). Padding has `agent_mask` False and zeros elsewhere.
+    Frame: map, i.e. world minus the scenario's own origin (whole metres, exact in float32). Padding has `agent_mask` False and zeros elsewhere.
     S is the largest number of recorded steps; a shorter record is invalid beyond its end.
     """
 
     scenarios: tuple[Scenario, ...]
     origin: Float[Tensor, "B 2"]
-    """float64, metres, world frame."""
+    """float64, metres, world frame: where (0, 0) of the batch's frame is. Zeros in the world frame."""
     object_id: Int64[Tensor, "B A"]
     object_type: Int64[Tensor, "B A"]
     agent_mask: Bool[Tensor, "B A"]
@@ -35,6 +38,7 @@ class ScenarioBatch:
     size: Float[Tensor, "B A 3"]
     """Length, width, height at the current step."""
     valid: Bool[Tensor, "B A S"]
+    frame: Frame = "map"
 
     @property
     def num_scenarios(self) -> int:
@@ -52,12 +56,14 @@ class ScenarioBatch:
         return replace(self, **moved)
 
 
-def collate(scenarios: Sequence[Scenario], *, max_agents: int | None = None) -> ScenarioBatch:
-    """Batch of scenarios in the map frame.
+def collate(scenarios: Sequence[Scenario], *, max_agents: int | None = None, frame: Frame = "map") -> ScenarioBatch:
+    """Batch of scenarios.
 
     Args:
         scenarios: at least one.
         max_agents: pad to this many agents; None = as many as the fullest scenario has.
+        frame: "map" = centred on each scenario. "world" = as recorded, kilometres from the origin, where float32 rounds to half a
+            millimetre: for comparison with code that works there.
 
     Raises:
         DataError: no scenario, or a scenario with more agents than `max_agents`.
@@ -70,20 +76,27 @@ def collate(scenarios: Sequence[Scenario], *, max_agents: int | None = None) -> 
         fullest = scenarios[counts.index(max(counts))]
         raise DataError(f"{fullest.scenario_id}: {max(counts)} agents do not fit max_agents={num_agents}: raise it.")
     num_steps = max(s.num_steps for s in scenarios)
-    rows = [_agent_rows(s, num_agents, num_steps) for s in scenarios]
+    rows = [_agent_rows(s, num_agents, num_steps, origin_of(s, frame)) for s in scenarios]
     stacked = {name: torch.from_numpy(np.stack([row[name] for row in rows])) for name in rows[0]}
-    return ScenarioBatch(scenarios=tuple(scenarios), **stacked)
+    return ScenarioBatch(scenarios=tuple(scenarios), **stacked, frame=frame)
 
 
-def _agent_rows(scenario: Scenario, num_agents: int, num_steps: int) -> dict[str, np.ndarray]:
+def origin_of(scenario: Scenario, frame: Frame) -> Float[np.ndarray, "2"]:
+    """World coordinates of a frame's (0, 0), float64."""
+    return scenario.origin if frame == "map" else np.zeros(2)
+
+
+def _agent_rows(
+    scenario: Scenario, num_agents: int, num_steps: int, origin: Float[np.ndarray, "2"]
+) -> dict[str, np.ndarray]:
     """One scenario's agents as padded arrays, by field name of `ScenarioBatch`."""
     tracks, chosen = scenario.tracks, scenario.simulated_indices
     valid = _pad(tracks.valid[chosen], num_agents, num_steps)
     centred = tracks.position[chosen].copy()
-    centred[..., :2] -= scenario.origin
+    centred[..., :2] -= origin
     centred[~tracks.valid[chosen]] = 0
     return {
-        "origin": scenario.origin,
+        "origin": origin,
         "object_id": _pad(tracks.object_id[chosen], num_agents),
         "object_type": _pad(tracks.object_type[chosen].astype(np.int64), num_agents),
         "agent_mask": _pad(np.ones(len(chosen), bool), num_agents),

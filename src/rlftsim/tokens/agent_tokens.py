@@ -11,9 +11,10 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from rlftsim.geometry import box_corners, pose_of_corners, rotate, wrap_angle
-from rlftsim.scenario.batch import ScenarioBatch, collate
+from rlftsim.scenario.batch import Frame, ScenarioBatch, collate
 from rlftsim.scenario.derived import derived
 from rlftsim.scenario.types import CURRENT_STEP, STEP_S, Scenario
+from rlftsim.tokens import public_order
 from rlftsim.tokens.vocabulary import CLASS_BOXES_M, STEPS_PER_TOKEN, Vocabulary, class_of_type
 
 HISTORY_TOKENS = 2
@@ -23,7 +24,7 @@ _ROWS_PER_CHUNK = 512
 
 @dataclass(frozen=True, eq=False)
 class CleanTracks:
-    """Recorded tracks with gaps filled, headings cleaned and begun early enough for the first token. Map frame."""
+    """Recorded tracks with gaps filled, headings cleaned and begun early enough for the first token. In the batch's frame."""
 
     position: Float[Tensor, "*batch A S 2"]
     heading: Float[Tensor, "*batch A S"]
@@ -33,7 +34,7 @@ class CleanTracks:
 
 @dataclass(frozen=True, eq=False)
 class AgentTokens:
-    """The rolling tokenisation of recorded tracks. Map frame; zeros where `valid` is False."""
+    """The rolling tokenisation of recorded tracks. In the batch's frame; zeros where `valid` is False."""
 
     token_id: Int64[Tensor, "B A K"]
     position: Float[Tensor, "B A K 2"]
@@ -43,13 +44,22 @@ class AgentTokens:
     logged_position: Float[Tensor, "B A K 2"]
     logged_heading: Float[Tensor, "B A K"]
     logged_valid: Bool[Tensor, "B A K"]
+    next_token_id: Int64[Tensor, "B A K"]
+    """Token that should come next: `token_id` of the next step. The last column means nothing, nor does what `valid` there denies."""
 
 
-def clean_tracks(batch: ScenarioBatch) -> CleanTracks:
-    """Tracks as SMART sees them: gaps interpolated, jumps of heading removed, up to five made-up steps before the first."""
+def clean_tracks(batch: ScenarioBatch, *, public_order_of_operations: bool = False) -> CleanTracks:
+    """Tracks as SMART sees them: gaps interpolated, jumps of heading removed, up to five made-up steps before the first.
+
+    Args:
+        batch: recorded tracks.
+        public_order_of_operations: round where the public code rounds, see `tokens.public_order`.
+    """
     position, heading, velocity, valid = _fill_gaps(batch.position, batch.heading, batch.velocity, batch.valid)
+    if public_order_of_operations:
+        position, velocity, valid = public_order.fill_gaps_in_world(batch)
     heading = _hold_jumping_headings(heading, valid)
-    return _begin_earlier(CleanTracks(position, heading, velocity, valid))
+    return _begin_earlier(CleanTracks(position, heading, velocity, valid), stepwise=public_order_of_operations)
 
 
 def _fill_gaps(
@@ -95,8 +105,11 @@ def _hold_jumping_headings(heading: Float[Tensor, "B A S"], valid: Bool[Tensor, 
     return torch.stack(columns, -1)
 
 
-def _begin_earlier(tracks: CleanTracks) -> CleanTracks:
-    """Extend each track backwards, at constant velocity, to the last multiple of five steps (and to step 5 at the least)."""
+def _begin_earlier(tracks: CleanTracks, *, stepwise: bool) -> CleanTracks:
+    """Extend each track backwards, at constant velocity, to the last multiple of five steps (and to step 5 at the least).
+
+    `stepwise`: subtract a step after the other instead of their product, for the sake of rounding.
+    """
     num_steps = tracks.valid.shape[-1]
     steps = torch.arange(num_steps, device=tracks.valid.device)
     first = torch.where(tracks.valid, steps, num_steps).amin(-1)  # [B, A]
@@ -105,7 +118,10 @@ def _begin_earlier(tracks: CleanTracks) -> CleanTracks:
     made_up = (lead > 0) & (lead <= extra[..., None]) & (first < num_steps)[..., None]
     at = first.clamp(max=num_steps - 1)[..., None].expand_as(made_up)
     velocity = _take_steps(tracks.velocity, at)
-    back = _take_steps(tracks.position, at) - lead[..., None] * STEP_S * velocity
+    start = _take_steps(tracks.position, at)
+    back = start - lead[..., None] * STEP_S * velocity
+    if stepwise:
+        back = public_order.step_back(start[..., 0, :], velocity[..., 0, :], lead)
     return CleanTracks(
         position=torch.where(made_up[..., None], back, tracks.position),
         heading=torch.where(made_up, tracks.heading.gather(-1, at), tracks.heading),
@@ -120,9 +136,22 @@ def class_boxes(object_type: Int64[Tensor, "..."]) -> tuple[Float[Tensor, "..."]
     return table[..., 0], table[..., 1]
 
 
-def tokenize_tracks(tracks: CleanTracks, object_type: Int64[Tensor, "B A"], vocabulary: Vocabulary) -> AgentTokens:
-    """Rolling matching: at each token step the token that leads nearest to the record from where the last one led."""
-    length, width = class_boxes(object_type)
+def tokenize_tracks(
+    tracks: CleanTracks,
+    object_type: Int64[Tensor, "B A"],
+    vocabulary: Vocabulary,
+    *,
+    public_order_of_operations: bool = False,
+) -> AgentTokens:
+    """Rolling matching: at each token step the token that leads nearest to the record from where the last one led.
+
+    Args:
+        tracks: what `clean_tracks` returned.
+        object_type: WOMD's object types.
+        vocabulary: the tokens.
+        public_order_of_operations: round where the public code rounds, see `tokens.public_order`.
+    """
+    match = _match_placed if public_order_of_operations else _match_in_local_frame
     class_id = class_of_type(object_type)
     position, heading = tracks.position[..., 0, :], tracks.heading[..., 0]
     columns: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
@@ -130,19 +159,67 @@ def tokenize_tracks(tracks: CleanTracks, object_type: Int64[Tensor, "B A"], voca
     for end in ends:
         valid = tracks.valid[..., end - STEPS_PER_TOKEN] & tracks.valid[..., end]
         logged_position, logged_heading = tracks.position[..., end, :], tracks.heading[..., end]
-        target = box_corners(logged_position, logged_heading, length, width)
-        local = rotate(target - position[..., None, :], -heading[..., None])
-        token_id = nearest_tokens(local, class_id, valid, vocabulary)
-        led_position, led_heading = place_pose(vocabulary, class_id, token_id, position, heading)
+        logged_pose, pose = (logged_position, logged_heading), (position, heading)
+        token_id, led_position, led_heading = match(logged_pose, pose, class_id, valid, vocabulary)
         position = torch.where(valid[..., None], led_position, logged_position)
         heading = torch.where(valid, led_heading, logged_heading)
         columns.append((token_id, position * valid[..., None], heading * valid, valid))
     token_id, led_positions, led_headings, valid = (torch.stack([c[i] for c in columns], 2) for i in range(4))
     logged = slice(STEPS_PER_TOKEN, None, STEPS_PER_TOKEN)
+    logged_position, logged_heading = tracks.position[..., logged, :], tracks.heading[..., logged]
+    next_token_id = token_id.roll(-1, -1)
+    if public_order_of_operations:
+        following = (logged_position.roll(-1, -2), logged_heading.roll(-1, -1))
+        next_token_id = tokens_towards(
+            following, (led_positions, led_headings), class_id[..., None].expand_as(valid), valid, vocabulary
+        )
     return AgentTokens(
         token_id, led_positions, led_headings, valid,
-        tracks.position[..., logged, :], tracks.heading[..., logged], tracks.valid[..., logged],
+        logged_position, logged_heading, tracks.valid[..., logged], next_token_id,
     )  # fmt: skip
+
+
+Pose = tuple[Float[Tensor, "*batch 2"], Float[Tensor, "*batch"]]
+
+
+def tokens_towards(
+    goal: Pose,
+    pose: Pose,
+    class_id: Int64[Tensor, "*batch"],
+    valid: Bool[Tensor, "*batch"],
+    vocabulary: Vocabulary,
+) -> Int64[Tensor, "*batch"]:
+    """Token that leads nearest from a pose to a goal pose: smallest sum of corner distances in the frame of the pose, 0 where not `valid`."""
+    return nearest_tokens(local_boxes(goal, pose, class_id), class_id, valid, vocabulary)
+
+
+def local_boxes(goal: Pose, pose: Pose, class_id: Int64[Tensor, "*batch"]) -> Float[Tensor, "*batch 4 2"]:
+    """Box of a class at a goal pose, in the frame of another pose."""
+    length, width = torch.tensor(CLASS_BOXES_M, device=class_id.device)[class_id].unbind(-1)
+    position = rotate(goal[0] - pose[0], -pose[1])
+    return box_corners(position, wrap_angle(goal[1] - pose[1]), length, width)
+
+
+def _match_in_local_frame(
+    logged: Pose, pose: Pose, class_id: Int64[Tensor, "B A"], valid: Bool[Tensor, "B A"], vocabulary: Vocabulary
+) -> tuple[Int64[Tensor, "B A"], Float[Tensor, "B A 2"], Float[Tensor, "B A"]]:
+    """Token that leads nearest from a pose to the logged one, and where it leads."""
+    length, width = torch.tensor(CLASS_BOXES_M, device=valid.device)[class_id].unbind(-1)
+    target = box_corners(*logged, length, width)
+    local = rotate(target - pose[0][..., None, :], -pose[1][..., None])
+    token_id = nearest_tokens(local, class_id, valid, vocabulary)
+    return token_id, *place_pose(vocabulary, class_id, token_id, *pose)
+
+
+def _match_placed(
+    logged: Pose, pose: Pose, class_id: Int64[Tensor, "B A"], valid: Bool[Tensor, "B A"], vocabulary: Vocabulary
+) -> tuple[Int64[Tensor, "B A"], Float[Tensor, "B A 2"], Float[Tensor, "B A"]]:
+    """As `_match_in_local_frame`, in the public code's order of operations."""
+    length, width = torch.tensor(CLASS_BOXES_M, device=valid.device)[class_id].unbind(-1)
+    target = public_order.boxes_around(*logged, length, width)
+    token_id = public_order.nearest_placed_tokens(target, *pose, class_id, valid, vocabulary)
+    corners = vocabulary.end_corners()[class_id, token_id]
+    return token_id, *pose_of_corners(public_order.place_boxes(corners[..., None, :, :], *pose)[..., 0, :, :])
 
 
 def nearest_tokens(
@@ -180,9 +257,17 @@ def place_pose(
     return position + rotate(local_position, heading), wrap_angle(heading + local_heading)
 
 
-def tokenize_agents(batch: ScenarioBatch, vocabulary: Vocabulary) -> AgentTokens:
-    """Tokens of a batch's recorded tracks; each scenario's are computed once and remembered while it is in memory."""
-    rows = [_tokenize_scenario(scenario, vocabulary) for scenario in batch.scenarios]
+def tokenize_agents(
+    batch: ScenarioBatch, vocabulary: Vocabulary, *, public_order_of_operations: bool = False
+) -> AgentTokens:
+    """Tokens of a batch's recorded tracks; each scenario's are computed once and remembered while it is in memory.
+
+    Args:
+        batch: its scenarios and its frame count.
+        vocabulary: the tokens.
+        public_order_of_operations: round where the public code rounds, see `tokens.public_order`.
+    """
+    rows = [_tokenize_scenario(s, vocabulary, batch.frame, public_order_of_operations) for s in batch.scenarios]
     num_agents = batch.agent_mask.shape[1]
     num_tokens = max(row.valid.shape[-1] for row in rows)
 
@@ -197,7 +282,8 @@ def tokenize_agents(batch: ScenarioBatch, vocabulary: Vocabulary) -> AgentTokens
 
 
 @derived
-def _tokenize_scenario(scenario: Scenario, vocabulary: Vocabulary) -> AgentTokens:
+def _tokenize_scenario(scenario: Scenario, vocabulary: Vocabulary, frame: Frame, public: bool) -> AgentTokens:
     """Tokens of one scenario on the CPU; remembered with the scenario."""
-    batch = collate([scenario])
-    return tokenize_tracks(clean_tracks(batch), batch.object_type, vocabulary.to("cpu"))
+    batch = collate([scenario], frame=frame)
+    tracks = clean_tracks(batch, public_order_of_operations=public)
+    return tokenize_tracks(tracks, batch.object_type, vocabulary.to("cpu"), public_order_of_operations=public)

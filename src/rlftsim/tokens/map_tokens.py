@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Float32, Int8, Int64
 from torch import Tensor
 
 from rlftsim.geometry import rotate
-from rlftsim.scenario.batch import ScenarioBatch
+from rlftsim.scenario.batch import ScenarioBatch, origin_of
 from rlftsim.scenario.derived import derived
 from rlftsim.scenario.types import CURRENT_STEP, LightState, MapFeatures, MapFeatureType, Scenario
 
@@ -60,7 +60,7 @@ class MapPieces:
 
 @dataclass(frozen=True, eq=False)
 class MapTokens:
-    """Map tokens of a batch, map frame, padded to M."""
+    """Map tokens of a batch, in its frame, padded to M."""
 
     position: Float[Tensor, "B M 2"]
     heading: Float[Tensor, "B M"]
@@ -82,7 +82,8 @@ def tokenize_map(batch: ScenarioBatch, prototypes: Float[Tensor, "V 11 2"]) -> M
             row[: len(array)] = torch.from_numpy(array).to(dtype)
         return out.to(batch.device)
 
-    centred = [(p.points - s.origin).astype(np.float32) for p, s in zip(pieces, batch.scenarios)]
+    origins = [origin_of(s, batch.frame) for s in batch.scenarios]
+    centred = [(p.points - origin).astype(np.float32) for p, origin in zip(pieces, origins)]
     points = padded(centred, torch.float32)
     heading = padded([p.heading for p in pieces], torch.float32)
     local = rotate(points - points[:, :, :1], -heading[..., None])  # [B, M, 3, 2]
@@ -117,7 +118,7 @@ def split_map(scenario: Scenario) -> MapPieces:
     groups: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     labels: list[tuple[int, int, int, int]] = []
     for index, kind in order:
-        polyline = scenario.map_features.polyline(index)[:, :2]
+        polyline = scenario.map_features.polyline(index)
         if len(polyline) < 2:
             continue
         feature_type = int(scenario.map_features.feature_type[index])
@@ -127,7 +128,7 @@ def split_map(scenario: Scenario) -> MapPieces:
         type_ = _TYPE_OF_FEATURE[feature_type]
         if kind == 0 and lane_id in stop_lanes and feature_type != MapFeatureType.LANE_BIKE:
             type_ = STOP_SIGN_LANE_TYPE
-        points, heading, windows = _cut(polyline)
+        points, heading, windows = _cut(polyline[:, :2])
         groups.append((points, heading, windows))
         labels.append((len(heading), type_, kind, lights.get(lane_id, 0) if kind == 0 else 0))
     if not sum(count for count, *_ in labels):
@@ -161,18 +162,19 @@ def _lights_now(scenario: Scenario) -> dict[int, int]:
 
 def _polygon_sides(polygon: np.ndarray) -> np.ndarray:
     """A crosswalk-like polygon as its two longer sides, each there and back, a point every metre."""
-    a, b, c, d = polygon[[int(len(polygon) * share) for share in (0, 0.25, 0.5, 0.75)]]
-    sides = ((a, b), (c, d)) if np.hypot(*(b - a)) > np.hypot(*(d - a)) else ((a, d), (c, b))
+    corners = polygon[[int(len(polygon) * share) for share in (0, 0.25, 0.5, 0.75)]]
+    a, b, c, d = corners.astype(np.float64)
+    sides = ((a, b), (c, d)) if np.hypot(*(b - a)[:2]) > np.hypot(*(c - b)[:2]) else ((a, d), (c, b))
     lines = [_every_metre(start, end) for start, end in sides]
     return np.concatenate([part for line in lines for part in (line, line[::-1])]).astype(np.float32)
 
 
 def _every_metre(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    length = float(np.hypot(*(end - start)))
+    length = np.linalg.norm(end - start)
     if length == 0.0:
         return np.stack([start, end])
-    along = np.arange(int(length) + 1)[:, None] / length
-    return np.concatenate([start + along * (end - start), end[None]])
+    metres = np.arange(int(length) + 1)[:, None]
+    return np.concatenate([start + (end - start) / length * metres, end[None]])
 
 
 def _cut(polyline: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -206,9 +208,9 @@ def _cut(polyline: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _resample(run: np.ndarray) -> np.ndarray:
-    """A point every half metre along a polyline, and its end point."""
-    lengths = np.hypot(*np.diff(run, axis=0).T)
-    along = np.concatenate([[0.0], np.cumsum(lengths)])
+    """A point every half metre along a polyline, and its end point. Lengths of segments are float32, as in the public code."""
+    lengths = np.linalg.norm(np.diff(run, axis=0).astype(np.float32), axis=-1)
+    along = np.concatenate([[0.0], np.cumsum(lengths, dtype=np.float64)])
     if len(run) < 2 or along[-1] == 0.0:
         return run[:1]
     at = np.append(np.arange(0.0, along[-1], SPACING_M), along[-1])

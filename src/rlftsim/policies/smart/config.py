@@ -33,8 +33,9 @@ class SmartConfig:
     history_drop: float = 0.1
     """Share of (agent, step) pairs that are hidden from the attention over time, in pre-training only."""
     public_code_quirks: bool = False
-    """Repeat what the public code does where this package differs on purpose: an agent's first motion vector is its position, and
-    the sign of what lies exactly behind is left to rounding. Models trained there need it."""
+    """Repeat what the public code does where this package differs on purpose: an agent's first motion vector is its position,
+    the sign of what lies exactly behind is left to rounding, and tokens are matched and placed in the order of operations of
+    `tokens.public_order`. Models trained there need it."""
 
     @property
     def seam_rad(self) -> float:

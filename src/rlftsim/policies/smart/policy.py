@@ -11,7 +11,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from rlftsim.errors import CheckpointError
-from rlftsim.geometry import box_corners, rotate, wrap_angle
+from rlftsim.geometry import box_corners, pose_of_corners, rotate, wrap_angle
 from rlftsim.goals.types import Goals
 from rlftsim.policies.layers import normalize
 from rlftsim.policies.smart.config import SmartConfig
@@ -19,6 +19,7 @@ from rlftsim.policies.smart.distribution import TokenDistribution
 from rlftsim.policies.smart.network import Past, Scene, SmartNetwork, TokenSteps
 from rlftsim.rollout.types import AgentStates, Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
+from rlftsim.tokens import public_order
 from rlftsim.tokens.agent_tokens import HISTORY_TOKENS, AgentTokens, class_boxes, nearest_tokens, tokenize_agents
 from rlftsim.tokens.map_tokens import tokenize_map
 from rlftsim.tokens.vocabulary import STEPS_PER_TOKEN, Vocabulary, class_of_type
@@ -92,7 +93,7 @@ class SmartPolicy(nn.Module):
 
     def encode(self, scenarios: ScenarioBatch) -> SmartContext:
         """Map features, history tokens and what the decoder made of them."""
-        tokens = tokenize_agents(scenarios, self.vocabulary)
+        tokens = self._tokenize(scenarios)
         scene = self._scene(scenarios)
         history = self._recorded_steps(tokens, slice(0, HISTORY_TOKENS))
         rows, past = self.network.decoder(scene, history, None)
@@ -177,7 +178,7 @@ class SmartPolicy(nn.Module):
             scenarios: with their future.
             trained: True = the agent's predictions count; the others are context.
         """
-        tokens = tokenize_agents(scenarios, self.vocabulary)
+        tokens = self._tokenize(scenarios)
         steps = self._recorded_steps(tokens, slice(0, -1))
         hidden = None
         if self.training and self.config.history_drop:
@@ -187,7 +188,7 @@ class SmartPolicy(nn.Module):
         decides[..., : HISTORY_TOKENS - 1] = False
         counts = (tokens.valid[..., 1:] & trained[..., None])[:, None][decides]
         logits = self._logits(rows[decides[steps.valid]], scenarios.object_type, decides)
-        return TeacherForced(logits, tokens.token_id[:, None, :, 1:][decides], counts)
+        return TeacherForced(logits, tokens.next_token_id[:, None, :, :-1][decides], counts)
 
     def fine_tuned_parts(self) -> tuple[nn.Module, ...]:
         """What closed-loop fine-tuning trains: the decoder's attention and the head, as the public CAT-K code does."""
@@ -245,6 +246,10 @@ class SmartPolicy(nn.Module):
             relations=decoder.relations(),
         )
 
+    def _tokenize(self, scenarios: ScenarioBatch) -> AgentTokens:
+        public = self.config.public_code_quirks
+        return tokenize_agents(scenarios, self.vocabulary, public_order_of_operations=public)
+
     def _recorded_steps(self, tokens: AgentTokens, steps: slice) -> TokenSteps:
         """A block of recorded token steps, as a single rollout."""
         position = tokens.position
@@ -289,6 +294,11 @@ class SmartPolicy(nn.Module):
     ) -> Float[Tensor, "B N A 5 3"]:
         """The five poses of the chosen tokens, placed at the current state. Padding stands still."""
         class_id = class_of_type(context.object_type)[:, None].expand(decision.shape)
+        if self.config.public_code_quirks:
+            corners = self.vocabulary.corners[class_id, decision, 1:]
+            placed = public_order.place_boxes(corners, state.position, state.heading)
+            position, heading = pose_of_corners(placed)
+            return torch.cat([position, heading[..., None]], -1)
         local = self.vocabulary.poses()[class_id, decision]  # [B, N, A, 5, 3]
         position = state.position[..., None, :] + rotate(local[..., :2], state.heading[..., None])
         heading = wrap_angle(state.heading[..., None] + local[..., 2])

@@ -1,0 +1,100 @@
+"""The verb that takes models from elsewhere and hands them back: model."""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from tyro.conf import Positional
+
+from rlftsim import __version__
+from rlftsim.errors import ConfigError
+from rlftsim.policies.smart.catk_checkpoint import CatkImport, import_catk, write_catk
+from rlftsim.policies.smart.catk_vocabulary import write_catk_vocabulary
+from rlftsim.policies.smart.policy import SmartPolicy
+
+Format = Literal["catk"]
+
+
+@dataclass(frozen=True)
+class Import:
+    """Make a model folder of a checkpoint of the public CAT-K code.
+
+    Nothing in the checkpoint is run. Every weight must be there with the right shape, and no other; otherwise all differences
+    are listed and nothing is written.
+    """
+
+    checkpoint: Positional[Path]
+    """Lightning .ckpt, or .safetensors with the keys of its state dict."""
+    vocabulary: list[Path]
+    """Token tables that it was trained with: npz with veh, ped, cyc and traj_src (may be two files), or a vocabulary file."""
+    out: Path
+    """Folder for the model."""
+    format: Annotated[Format, tyro.conf.arg(name="from")] = "catk"
+    """Whose checkpoint it is."""
+
+    def run(self) -> int:
+        """Read strictly, write the folder, say what was found."""
+        if (self.out / "config.json").exists():
+            raise ConfigError(f"{self.out}: holds a model already: name another folder.")
+        imported = import_catk(self.checkpoint, self.vocabulary)
+        imported.policy.save_pretrained(self.out, card=_card(self.checkpoint, imported))
+        weights = sum(p.numel() for p in imported.policy.parameters())
+        print(f"{self.out}: SMART {imported.size}, {weights} weights, every key accounted for.")
+        for note in imported.notes:
+            print(f"  {note}")
+        return 0
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write a model's weights with the keys of the public CAT-K code, and its token tables beside them.
+
+    Importing them again gives the same bits.
+    """
+
+    model: Positional[Path]
+    """Model folder."""
+    out: Positional[Path]
+    """File for the weights, .safetensors; the tables go to the same name with .vocabulary.npz."""
+    format: Annotated[Format, tyro.conf.arg(name="to")] = "catk"
+    """Whose keys to use."""
+
+    def run(self) -> int:
+        """Read the model folder, write both files."""
+        if self.out.suffix != ".safetensors":
+            raise ConfigError(f"{self.out}: weights are written as .safetensors: name the file so.")
+        policy = SmartPolicy.from_pretrained(self.model)
+        tables = self.out.with_suffix(".vocabulary.npz")
+        write_catk(policy, self.out)
+        write_catk_vocabulary(policy.vocabulary, tables)
+        print(f"{self.out}: weights\n{tables}: token tables")
+        if not policy.config.public_code_quirks:
+            print("  trained here: the public code treats an agent's first motion differently (docs/catk.md)")
+        return 0
+
+
+@dataclass(frozen=True)
+class Model:
+    """Take a model from the public CAT-K code, or hand one back."""
+
+    action: Annotated[Import, tyro.conf.subcommand("import")] | Annotated[Export, tyro.conf.subcommand("export")]
+
+    def run(self) -> int:
+        """Run the action."""
+        return self.action.run()
+
+
+def _card(checkpoint: Path, imported: CatkImport) -> str:
+    notes = "\n".join(f"* {note}" for note in imported.notes)
+    return f"""# SMART traffic model ({imported.size}), imported
+
+* from {checkpoint.name}, a checkpoint of the public CAT-K code
+{notes}
+* computes what the public code computes (`public_code_quirks`)
+* terms: those of the checkpoint, of its token tables (CAT-K's own: NVIDIA, non-commercial research) and of the data that it was
+  trained on (Waymo Open Motion Dataset: non-commercial)
+* command: rlftsim {" ".join(sys.argv[1:])}
+* rlftsim {__version__}
+"""

@@ -1,0 +1,210 @@
+"""Checkpoints of the public CAT-K code: strict import, and export back.
+
+policy = import_catk(Path("clsft.ckpt"), [Path("agent_vocab.npz"), Path("map_vocab.npz")]).policy
+policy.save_pretrained(Path("models/clsft"))
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from rlftsim.errors import CheckpointError, ConfigError
+from rlftsim.policies.smart.catk_keys import PREFIX, aliases, catk_name
+from rlftsim.policies.smart.catk_vocabulary import (
+    PUBLISHED_AGENT_FILE,
+    PUBLISHED_NUM_TOKENS,
+    is_published,
+    read_catk_vocabulary,
+)
+from rlftsim.policies.smart.config import SmartConfig, smart_mini, smart_nano, smart_tiny
+from rlftsim.policies.smart.lightning_file import read_lightning
+from rlftsim.policies.smart.network import SmartNetwork
+from rlftsim.policies.smart.policy import SmartPolicy
+from rlftsim.tokens.vocabulary import STEPS_PER_TOKEN
+
+PRESETS = {"nano": smart_nano, "mini": smart_mini, "tiny": smart_tiny}
+
+_FIELD_OF_SETTING = {
+    "hidden_dim": "dim",
+    "num_freq_bands": "num_frequencies",
+    "num_heads": "num_heads",
+    "head_dim": "head_dim",
+    "num_map_layers": "num_map_layers",
+    "num_agent_layers": "num_decoder_layers",
+    "pl2pl_radius": "map_radius_m",
+    "pl2a_radius": "agent_map_radius_m",
+    "a2a_radius": "agent_radius_m",
+    "dropout": "dropout",
+    "hist_drop_prob": "history_drop",
+}
+_SHAPE_PROBE = PREFIX + "agent_encoder.t_attn_layers.0.to_q.weight"
+_HEAD_BIAS = PREFIX + "agent_encoder.token_predict_head.mlp.3.bias"
+
+
+@dataclass(frozen=True, eq=False)
+class CatkImport:
+    """An imported model and what is known of it."""
+
+    policy: SmartPolicy
+    size: str
+    """nano, mini, tiny or custom."""
+    notes: tuple[str, ...]
+    """What a user should know: where the sizes come from, which vocabulary it is."""
+
+
+def import_catk(checkpoint: Path, vocabulary: Sequence[Path]) -> CatkImport:
+    """Read a checkpoint of the public CAT-K code.
+
+    Args:
+        checkpoint: `.safetensors` with the keys of the public code's state dict, or a Lightning checkpoint.
+        vocabulary: the token tables it was trained with, see `read_catk_vocabulary`.
+
+    Returns:
+        The model in evaluation mode, with `public_code_quirks` on, so that it computes what the public code computes.
+
+    Raises:
+        CheckpointError: a file is damaged or holds foreign objects; keys are missing, unknown, of the wrong shape or unequal where
+            they must be equal (all of them are listed); the vocabulary does not belong to the weights.
+    """
+    weights, settings = _read(checkpoint)
+    config, source = _config_of(weights, settings, checkpoint)
+    head = weights.get(_HEAD_BIAS, torch.zeros(PUBLISHED_NUM_TOKENS))
+    own = _translate(weights, SmartNetwork(config, head.numel()), str(checkpoint))
+    tables = read_catk_vocabulary(vocabulary)
+    if tables.num_tokens != head.numel() or not tables.token_mask.all():
+        raise CheckpointError(
+            f"{checkpoint}: predicts {head.numel()} tokens a class, the vocabulary holds "
+            f"{', '.join(str(int(n)) for n in tables.token_mask.sum(1))}: hand over the one it was trained with."
+        )
+    note = _vocabulary_note(settings, is_published(tables), checkpoint)
+    policy = SmartPolicy(config, tables)
+    policy.network.load_state_dict(own)
+    return CatkImport(policy.eval(), _size_name(config), (source, note))
+
+
+def export_catk(policy: SmartPolicy) -> dict[str, Tensor]:
+    """Copies of a model's weights under the public code's names, on the CPU; importing them again gives the same bits."""
+    named = {catk_name(k): v.detach().cpu().clone() for k, v in policy.network.state_dict().items()}
+    return named | {second: named[first].clone() for second, first in aliases(named).items()}
+
+
+def write_catk(policy: SmartPolicy, path: Path) -> None:
+    """Write `export_catk` as a safetensors file, by way of a temporary name."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(path.name + ".partial")
+    save_file(export_catk(policy), partial)
+    partial.replace(path)
+
+
+def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Weights by the public code's names, and the decoder's settings and token file names where the file has them."""
+    if path.suffix == ".safetensors":
+        try:
+            weights, settings = load_file(path), {}
+        except FileNotFoundError:
+            raise CheckpointError(f"{path}: no such file.") from None
+        except (SafetensorError, OSError) as error:
+            raise CheckpointError(f"{path}: damaged safetensors file ({error}).") from None
+    else:
+        file = read_lightning(path)
+        weights, settings = file.weights, file.settings.get("model_config") or {}
+    if not any(key.startswith(PREFIX) for key in weights):
+        weights = {PREFIX + key: value for key, value in weights.items()}
+    return weights, settings
+
+
+def _config_of(weights: dict[str, Tensor], settings: dict[str, Any], path: Path) -> tuple[SmartConfig, str]:
+    """The architecture: from the file's settings, else recognised by shapes."""
+    decoder = settings.get("decoder") or {}
+    values = {ours: decoder[theirs] for theirs, ours in _FIELD_OF_SETTING.items() if theirs in decoder}
+    if len(values) == len(_FIELD_OF_SETTING) and isinstance(decoder.get("time_span"), int):
+        try:
+            config = SmartConfig(**_typed(values), history_tokens=decoder["time_span"] // STEPS_PER_TOKEN)
+        except (TypeError, ValueError, ConfigError) as error:
+            raise CheckpointError(f"{path}: settings of the decoder make no sense: {error}") from None
+        return replace(config, public_code_quirks=True), "sizes and radii: from the checkpoint's settings"
+    for name, preset in PRESETS.items():
+        if _fingerprint(weights) == _expected_fingerprint(preset()):
+            return replace(preset(), public_code_quirks=True), f"sizes: recognised as {name}; radii: those of {name}"
+    raise CheckpointError(
+        f"{path}: not a SMART model of the public CAT-K code in one of the sizes {', '.join(PRESETS)} "
+        "(other sizes need the Lightning checkpoint, which says which)."
+    )
+
+
+def _typed(values: dict[str, Any]) -> dict[str, Any]:
+    """Radii and shares as floats, everything else as it is."""
+    kinds = {name: type(value) for name, value in SmartConfig().__dict__.items()}
+    return {name: kinds[name](value) for name, value in values.items()}
+
+
+def _fingerprint(weights: dict[str, Tensor]) -> tuple[int, int, int, int]:
+    """Width, inner width of the attention, and numbers of layers in the map encoder and the decoder; zeros where unknown."""
+    probe = weights.get(_SHAPE_PROBE)
+    inner, dim = probe.shape if probe is not None and probe.dim() == 2 else (0, 0)
+    layers = (
+        {key.split(".")[3] for key in weights if key.startswith(PREFIX + stem)}
+        for stem in ("map_encoder.pt2pt_layers.", "agent_encoder.t_attn_layers.")
+    )
+    return dim, inner, *(len(found) for found in layers)  # type: ignore[return-value]
+
+
+def _expected_fingerprint(config: SmartConfig) -> tuple[int, int, int, int]:
+    return config.dim, config.num_heads * config.head_dim, config.num_map_layers, config.num_decoder_layers
+
+
+def _size_name(config: SmartConfig) -> str:
+    named = (name for name, preset in PRESETS.items() if replace(preset(), public_code_quirks=True) == config)
+    return next(named, "custom")
+
+
+def _vocabulary_note(settings: dict[str, Any], published: bool, path: Path) -> str:
+    """Which vocabulary it is.
+
+    Raises:
+        CheckpointError: the checkpoint names the published table, and this is another one.
+    """
+    named = (settings.get("token_processor") or {}).get("agent_token_file")
+    if named == PUBLISHED_AGENT_FILE and not published:
+        raise CheckpointError(f"{path}: was trained with {named}, the vocabulary is another one: hand over that table.")
+    what = f"the published {PUBLISHED_AGENT_FILE}" if published else "not a published one"
+    if named is None:
+        return f"vocabulary: {what}; the checkpoint does not say which one it was trained with"
+    if published and named != PUBLISHED_AGENT_FILE:
+        return f"vocabulary: {what}; the checkpoint names {named}: make sure that it is the same table"
+    return f"vocabulary: {what}; the checkpoint names {named}"
+
+
+def _translate(weights: dict[str, Tensor], network: SmartNetwork, source: str) -> dict[str, Tensor]:
+    """Weights under our names.
+
+    Raises:
+        CheckpointError: lists everything that is missing, unknown, of the wrong shape or kind, or unequal to its second name.
+    """
+    own = {key: value for key, value in network.state_dict().items()}
+    names = {catk_name(key): key for key in own}
+    seconds = aliases(names)
+    shapes = {name: own[key].shape for name, key in names.items()}
+    shapes |= {second: shapes[first] for second, first in seconds.items()}
+    problems = [f"missing {name}" for name in sorted(shapes.keys() - weights.keys())]
+    problems += [f"unknown {name}" for name in sorted(weights.keys() - shapes.keys())]
+    for name in sorted(shapes.keys() & weights.keys()):
+        value = weights[name]
+        if value.shape != shapes[name]:
+            problems.append(f"{name} has shape {tuple(value.shape)} instead of {tuple(shapes[name])}")
+        elif value.dtype != torch.float32:
+            problems.append(f"{name} is {value.dtype} instead of torch.float32")
+        elif not value.isfinite().all():
+            problems.append(f"{name} holds values that are not finite")
+    for second, first in sorted(seconds.items()):
+        if second in weights and first in weights and not torch.equal(weights[second], weights[first]):
+            problems.append(f"{second} differs from {first}, which must be the same")
+    if problems:
+        raise CheckpointError(f"{source}: {len(problems)} weights do not fit: {'; '.join(problems)}.")
+    return {key: weights[name] for name, key in names.items()}

@@ -1,0 +1,94 @@
+"""Token tables of the public CAT-K code, which its checkpoints need and do not hold."""
+
+import hashlib
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from rlftsim.errors import CheckpointError, DataError
+from rlftsim.tokens.vocabulary import STEPS_PER_TOKEN, Vocabulary
+
+MOTION_TABLES = ("veh", "ped", "cyc")
+MAP_TABLE = "traj_src"
+_AGENT_SHAPE = (STEPS_PER_TOKEN + 1, 4, 2)
+_MAP_SHAPE = (11, 2)
+
+PUBLISHED_AGENT_FILE = "agent_vocab_555_s2.pkl"
+PUBLISHED_NUM_TOKENS = 2048
+_PUBLISHED = {
+    "veh": "131c0714b245d5357b9ed24bb5ecf0d437b8f0072a7a7b9746a9ab34c0dc9bad",
+    "ped": "3ba4fbdb7a6fc0ab1d0867e01af54cf2b26d5e09aa4b4586aa83630261cd80a9",
+    "cyc": "f670da05e7a5eb3c789dd93864462b6ea945fe2ef51556f75002e9dc437374ac",
+}
+"""sha256 of the float32 bytes of the table that CAT-K published."""
+
+
+def read_catk_vocabulary(paths: Sequence[Path]) -> Vocabulary:
+    """Token tables from npz files, or from one vocabulary file of this package.
+
+    Args:
+        paths: npz files that hold, between them, `veh`, `ped`, `cyc` [V, 6, 4, 2] and `traj_src` [P, 11, 2], metres; or a
+            single `.safetensors` written by `Vocabulary.save`.
+
+    Raises:
+        CheckpointError: a table is missing or has the wrong size, or a file cannot be read.
+    """
+    if len(paths) == 1 and paths[0].suffix == ".safetensors":
+        try:
+            return Vocabulary.load(paths[0])
+        except DataError as error:
+            raise CheckpointError(str(error)) from None
+    tables = {name: table for path in paths for name, table in _read_npz(path).items()}
+    where = ", ".join(str(p) for p in paths)
+    missing = [name for name in (*MOTION_TABLES, MAP_TABLE) if name not in tables]
+    if missing:
+        raise CheckpointError(f"{where}: no table {', '.join(missing)}: hand over veh, ped, cyc and traj_src.")
+    _check_sizes(tables, where)
+    corners = torch.from_numpy(np.stack([tables[name] for name in MOTION_TABLES]).astype(np.float32))
+    prototypes = torch.from_numpy(tables[MAP_TABLE].astype(np.float32))
+    mask = torch.ones(corners.shape[:2], dtype=torch.bool)
+    return Vocabulary(corners, mask, prototypes, origin=f"imported from {where}")
+
+
+def is_published(vocabulary: Vocabulary) -> bool:
+    """Whether the motion tokens are those that CAT-K published."""
+    tables = dict(zip(MOTION_TABLES, vocabulary.corners.cpu().numpy()))
+    return all(
+        hashlib.sha256(np.ascontiguousarray(t, np.float32).tobytes()).hexdigest() == _PUBLISHED[name]
+        for name, t in tables.items()
+    )
+
+
+def write_catk_vocabulary(vocabulary: Vocabulary, path: Path) -> None:
+    """Write the tables as npz, in the form `read_catk_vocabulary` takes."""
+    tables = dict(zip(MOTION_TABLES, vocabulary.corners.cpu().numpy()))
+    with path.open("wb") as file:
+        np.savez(file, **tables, **{MAP_TABLE: vocabulary.map_prototypes.cpu().numpy()})
+
+
+def _read_npz(path: Path) -> dict[str, np.ndarray]:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return {name: file[name] for name in (*MOTION_TABLES, MAP_TABLE) if name in file.files}
+    except FileNotFoundError:
+        raise CheckpointError(f"{path}: no such vocabulary.") from None
+    except (ValueError, OSError, AttributeError, zipfile.BadZipFile):
+        raise CheckpointError(f"{path}: not an npz of token tables (pickles are not read, see docs/catk.md).") from None
+
+
+def _check_sizes(tables: dict[str, np.ndarray], where: str) -> None:
+    wanted = {name: ("V", *_AGENT_SHAPE) for name in MOTION_TABLES} | {MAP_TABLE: ("P", *_MAP_SHAPE)}
+    wrong = [
+        f"{name} has shape {tables[name].shape} instead of ({', '.join(map(str, shape))})"
+        for name, shape in wanted.items()
+        if tables[name].shape[1:] != shape[1:] or tables[name].ndim != len(shape)
+    ]
+    counts = {len(tables[name]) for name in MOTION_TABLES}
+    if not wrong and len(counts) > 1:
+        wrong = [f"veh, ped and cyc have different numbers of tokens ({', '.join(map(str, sorted(counts)))})"]
+    wrong += [f"{name} holds values that are not finite" for name in wanted if not np.isfinite(tables[name]).all()]
+    if wrong:
+        raise CheckpointError(f"{where}: {'; '.join(wrong)}.")

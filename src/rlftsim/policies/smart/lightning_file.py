@@ -1,0 +1,94 @@
+"""Weights and settings of a Lightning checkpoint, without running anything that the file holds.
+
+Such files are pickles. They are read through torch's restricted unpickler; the few foreign classes that hold settings (OmegaConf)
+are replaced by name with an inert stand-in, everything else is refused.
+"""
+
+import collections
+import pickle
+import typing
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from rlftsim.errors import CheckpointError
+
+
+class _Inert:
+    """Takes the state of a foreign object and does nothing with it."""
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+
+
+_FOREIGN = (
+    "omegaconf.dictconfig.DictConfig",
+    "omegaconf.listconfig.ListConfig",
+    "omegaconf.nodes.AnyNode",
+    "omegaconf.base.ContainerMetadata",
+    "omegaconf.base.Metadata",
+)
+_HARMLESS = {
+    "typing.Any": typing.Any,
+    "collections.defaultdict": collections.defaultdict,
+    "builtins.list": list,
+    "builtins.dict": dict,
+    "builtins.int": int,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class LightningFile:
+    """What is used of a Lightning checkpoint."""
+
+    weights: dict[str, Tensor]
+    settings: dict[str, Any]
+    """The file's `hyper_parameters` as plain dictionaries, lists and values; empty where there are none."""
+
+
+def read_lightning(path: Path) -> LightningFile:
+    """Read weights and settings of a Lightning checkpoint.
+
+    Raises:
+        CheckpointError: no such file, not a checkpoint, no weights in it, or objects inside that would have to run code to be read.
+    """
+    content = _unpickle(path)
+    weights = content.get("state_dict") if isinstance(content, dict) else None
+    if not isinstance(weights, dict) or not all(isinstance(v, Tensor) for v in weights.values()):
+        raise CheckpointError(f"{path}: no weights under 'state_dict': is it a Lightning checkpoint of a model?")
+    settings = _plain(content.get("hyper_parameters", {}))
+    return LightningFile(dict(weights), settings if isinstance(settings, dict) else {})
+
+
+def _unpickle(path: Path) -> Any:
+    if not path.is_file():
+        raise CheckpointError(f"{path}: no such file.")
+    if not zipfile.is_zipfile(path):
+        raise CheckpointError(f"{path}: neither safetensors nor a Lightning checkpoint (a zip file by torch.save).")
+    try:
+        named = torch.serialization.get_unsafe_globals_in_checkpoint(path)
+        unknown = sorted(set(named) - set(_FOREIGN) - set(_HARMLESS))
+        if unknown:
+            raise CheckpointError(f"{path}: refused, it holds {', '.join(unknown)}: save it again with weights only.")
+        known = [(_Inert, name) for name in _FOREIGN] + [(value, name) for name, value in _HARMLESS.items()]
+        with torch.serialization.safe_globals(known):
+            return torch.load(path, map_location="cpu", weights_only=True)
+    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, KeyError, AttributeError, TypeError) as error:
+        first_line = str(error).strip().splitlines()[:1]
+        raise CheckpointError(f"{path}: damaged or not a checkpoint ({' '.join(first_line)}).") from None
+
+
+def _plain(value: Any) -> Any:
+    """Settings without their containers."""
+    if isinstance(value, _Inert):
+        state = value.__dict__
+        return _plain(state["_content"] if "_content" in state else state.get("_val"))
+    if isinstance(value, dict):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    return value if isinstance(value, str | int | float | bool) else None

@@ -1,0 +1,108 @@
+"""Scenario A, its golden numbers and the model that they were computed with. Everything here needs the official material."""
+
+import json
+import runpy
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.numpy import save_file
+
+import rlftsim.tokens.map_tokens as map_tokens
+from rlftsim.policies.smart.catk_checkpoint import import_catk
+from rlftsim.policies.smart.policy import SmartPolicy
+from rlftsim.scenario.batch import ScenarioBatch, collate
+from rlftsim.scenario.tfrecord import read_records
+from rlftsim.scenario.types import Scenario
+from rlftsim.scenario.womd import read_scenarios
+from rlftsim.scenario.womd_pb2 import Scenario as ScenarioMessage
+
+FRAMES = {"centred": "map", "absolute": "world"}
+"""Our name of each frame of the golden files."""
+
+
+@dataclass(frozen=True)
+class Golden:
+    """The golden files."""
+
+    folder: Path
+
+    def arrays(self, name: str) -> dict[str, np.ndarray]:
+        with np.load(self.folder / f"{name}.npz") as file:
+            return dict(file)
+
+    def scalars(self, name: str) -> dict:
+        return json.loads((self.folder / "scalars.json").read_text())[name]
+
+
+@pytest.fixture(scope="session")
+def golden(shared) -> Golden:
+    return Golden(shared / "golden" / "smart")
+
+
+@pytest.fixture(scope="session")
+def token_tables(shared) -> list[Path]:
+    return [shared / "data" / "tokens" / name for name in ("agent_vocab_555_s2.npz", "map_traj_token5.npz")]
+
+
+@pytest.fixture(scope="session")
+def record(shared) -> Path:
+    return shared / "data" / "womd" / "motion_data_one_scenario.tfrecord"
+
+
+@pytest.fixture(scope="session")
+def scenario_a(record) -> Scenario:
+    """Scenario A, its polygons cut as the public code cuts them: from the record's double precision.
+
+    `Scenario` holds float32, which moves 82 of 2121 map tokens by half a millimetre. What is derived here is remembered.
+    """
+    scenario = next(iter(read_scenarios(record)))
+    doubles = _polygons(record)
+    ours = map_tokens._polygon_sides
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(map_tokens, "_polygon_sides", lambda polygon: ours(doubles[polygon.tobytes()]))
+        map_tokens.split_map(scenario)
+    return scenario
+
+
+def _polygons(record: Path) -> dict[bytes, np.ndarray]:
+    """Polygons in double precision, by the bytes of their float32 version."""
+    _, data = next(iter(read_records(record)))
+    message = ScenarioMessage.FromString(data)
+    polygons = (
+        np.array([[p.x, p.y, p.z] for p in getattr(feature, kind).polygon])
+        for feature in message.map_features
+        for kind in ("crosswalk", "speed_bump", "driveway")
+        if feature.HasField(kind)
+    )
+    return {polygon.astype(np.float32).tobytes(): polygon for polygon in polygons}
+
+
+@pytest.fixture(scope="session")
+def batch_a(scenario_a, golden) -> Callable[[str], ScenarioBatch]:
+    """Scenario A in a frame ("centred" or "absolute").
+
+    The public code feeds the mean size over all recorded steps, the future included; here a model sees the size at the current step.
+    """
+    shape = torch.from_numpy(golden.arrays("scenario_A/preprocessed")["shape"])[None]
+    return cache(lambda frame: replace(collate([scenario_a], frame=FRAMES[frame]), size=shape))
+
+
+@pytest.fixture(scope="session")
+def nano(golden, token_tables) -> SmartPolicy:
+    """The public code's nano with the golden weights. Not to be changed: copy it."""
+    return import_catk(golden.folder / "nano_seed1003_lightning.ckpt", token_tables).policy
+
+
+@pytest.fixture(scope="session")
+def tiny(golden, token_tables, tmp_path_factory) -> SmartPolicy:
+    """The public code's tiny; its weights are drawn by the golden files' recipe."""
+    recipe = runpy.run_path(str(golden.folder / "make_weights.py"))
+    shapes = json.loads((golden.folder / "state_dict_shapes.json").read_text())["tiny"]
+    path = tmp_path_factory.mktemp("tiny") / "tiny.safetensors"
+    save_file(recipe["make_weights"](shapes, 1003), path)
+    return import_catk(path, token_tables).policy

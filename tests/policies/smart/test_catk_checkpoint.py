@@ -1,0 +1,275 @@
+"""Checkpoints of the public CAT-K code: import, export, and everything that is refused."""
+
+import json
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from rlftsim.cli.main import main
+from rlftsim.errors import CheckpointError
+from rlftsim.policies.smart.catk_checkpoint import export_catk, import_catk, write_catk
+from rlftsim.policies.smart.catk_keys import PREFIX, aliases
+from rlftsim.policies.smart.catk_vocabulary import is_published, read_catk_vocabulary, write_catk_vocabulary
+from rlftsim.policies.smart.config import SmartConfig, smart_mini, smart_nano, smart_tiny
+from rlftsim.policies.smart.policy import SmartPolicy
+from rlftsim.tokens.vocabulary import Vocabulary
+
+NUM_TOKENS = 5
+HEAD = f"{PREFIX}agent_encoder.token_predict_head.mlp.3.bias"
+SETTINGS = {
+    "hidden_dim": 16, "num_freq_bands": 4, "num_heads": 2, "head_dim": 4, "num_map_layers": 1, "num_agent_layers": 1,
+    "pl2pl_radius": 10, "pl2a_radius": 25, "a2a_radius": 35, "time_span": 15, "dropout": 0.1, "hist_drop_prob": 0.2,
+}  # fmt: skip
+
+
+def vocabulary(num_tokens=NUM_TOKENS):
+    generator = torch.Generator().manual_seed(2)
+    corners = torch.randn(3, num_tokens, 6, 4, 2, generator=generator)
+    prototypes = torch.randn(7, 11, 2, generator=generator)
+    return Vocabulary(corners, torch.ones(3, num_tokens, dtype=torch.bool), prototypes)
+
+
+def fresh(config, num_tokens=NUM_TOKENS):
+    torch.manual_seed(1)
+    return SmartPolicy(replace(config, public_code_quirks=True), vocabulary(num_tokens)).eval()
+
+
+@pytest.fixture(scope="module")
+def policy():
+    return fresh(smart_nano())
+
+
+@pytest.fixture
+def tables(policy, tmp_path):
+    write_catk_vocabulary(policy.vocabulary, tmp_path / "tables.npz")
+    return [tmp_path / "tables.npz"]
+
+
+def same(a, b):
+    a, b = a.network.state_dict(), b.network.state_dict()
+    return a.keys() == b.keys() and all(torch.equal(a[k], b[k]) for k in a)
+
+
+# ---- round trips -------------------------------------------------------------------------------------------------------
+
+
+def test_a_model_exported_and_imported_again_has_the_same_bits(policy, tables, tmp_path):
+    write_catk(policy, tmp_path / "out.safetensors")
+    imported = import_catk(tmp_path / "out.safetensors", tables)
+    assert imported.size == "nano"
+    assert imported.policy.config == policy.config
+    assert not imported.policy.training
+    assert same(imported.policy, policy)
+    assert torch.equal(imported.policy.vocabulary.corners, policy.vocabulary.corners)
+    assert torch.equal(imported.policy.vocabulary.map_prototypes, policy.vocabulary.map_prototypes)
+
+
+def test_an_export_is_a_copy(policy):
+    before = export_catk(policy)
+    export_catk(policy)[HEAD].add_(1)
+    assert torch.equal(export_catk(policy)[HEAD], before[HEAD])
+
+
+def test_an_imported_model_can_be_saved_as_one_of_ours(policy, tables, tmp_path):
+    write_catk(policy, tmp_path / "out.safetensors")
+    imported = import_catk(tmp_path / "out.safetensors", tables).policy
+    imported.save_pretrained(tmp_path / "model")
+    loaded = SmartPolicy.from_pretrained(tmp_path / "model")
+    assert loaded.config.public_code_quirks
+    assert same(loaded, policy)
+
+
+def test_a_vocabulary_of_ours_will_do(policy, tmp_path):
+    policy.vocabulary.save(tmp_path / "vocabulary.safetensors")
+    write_catk(policy, tmp_path / "out.safetensors")
+    assert same(import_catk(tmp_path / "out.safetensors", [tmp_path / "vocabulary.safetensors"]).policy, policy)
+
+
+def test_other_sizes_come_with_their_settings(tables, tmp_path):
+    config = SmartConfig(
+        dim=16, num_frequencies=4, num_heads=2, head_dim=4, num_map_layers=1, num_decoder_layers=1,
+        agent_map_radius_m=25.0, agent_radius_m=35.0, history_tokens=3, history_drop=0.2, public_code_quirks=True,
+    )  # fmt: skip
+    other = fresh(config)
+    content = {"state_dict": export_catk(other), "hyper_parameters": {"model_config": {"decoder": SETTINGS}}}
+    torch.save(content, tmp_path / "other.ckpt")
+    imported = import_catk(tmp_path / "other.ckpt", tables)
+    assert (imported.size, imported.policy.config) == ("custom", config)
+    assert same(imported.policy, other)
+    write_catk(other, tmp_path / "other.safetensors")
+    with pytest.raises(CheckpointError, match="one of the sizes nano, mini, tiny"):
+        import_catk(tmp_path / "other.safetensors", tables)
+
+
+def test_the_command_line_takes_and_returns_a_model(policy, tables, tmp_path, capsys):
+    write_catk(policy, tmp_path / "theirs.safetensors")
+    names = [str(tmp_path / name) for name in ("theirs.safetensors", "model", "back.safetensors")]
+    arguments = ["model", "import", "--from", "catk", names[0], "--vocabulary", str(tables[0]), "--out", names[1]]
+    assert main(arguments) == 0
+    assert "SMART nano" in capsys.readouterr().out
+    assert "non-commercial" in (tmp_path / "model" / "README.md").read_text()
+    assert main(["model", "export", names[1], "--to", "catk", names[2]]) == 0
+    assert (tmp_path / "back.safetensors").read_bytes() == (tmp_path / "theirs.safetensors").read_bytes()
+    assert (tmp_path / "back.vocabulary.npz").exists()
+    assert main(arguments) == 2
+    assert "holds a model already" in capsys.readouterr().err
+    assert main(["model", "export", names[1], "--to", "catk", str(tmp_path / "back.ckpt")]) == 2
+
+
+# ---- what is refused ---------------------------------------------------------------------------------------------------
+
+
+def write_changed(policy, tmp_path, change):
+    weights = export_catk(policy)
+    change(weights)
+    save_file(weights, tmp_path / "changed.safetensors")
+    return tmp_path / "changed.safetensors"
+
+
+def test_everything_that_does_not_fit_is_listed_at_once(policy, tables, tmp_path):
+    layer = f"{PREFIX}agent_encoder.a2a_attn_layers.2"
+
+    def change(weights):
+        del weights[f"{layer}.to_q.bias"]
+        weights[f"{layer}.to_k.bias"] = torch.zeros(32)
+        weights[f"{layer}.to_v.weight"] = torch.zeros(64, 32)
+        weights[f"{layer}.attn_prenorm_x_src.weight"] += 1
+        weights[f"{layer}.to_g.bias"] = weights[f"{layer}.to_g.bias"].half()
+        weights[f"{layer}.to_s.bias"][3] = torch.nan
+
+    with pytest.raises(CheckpointError) as caught:
+        import_catk(write_changed(policy, tmp_path, change), tables)
+    message = str(caught.value)
+    assert "6 weights do not fit" in message
+    for words in (
+        f"missing {layer}.to_q.bias",
+        f"unknown {layer}.to_k.bias",
+        f"{layer}.to_v.weight has shape (64, 32) instead of (32, 64)",
+        f"{layer}.attn_prenorm_x_src.weight differs from {layer}.attn_prenorm_x_dst.weight",
+        f"{layer}.to_g.bias is torch.float16",
+        f"{layer}.to_s.bias holds values that are not finite",
+    ):
+        assert words in message
+
+
+@pytest.mark.parametrize("alias", ["attn_prenorm_x_src", "attn_prenorm_x_dst"])
+def test_both_names_of_a_shared_norm_must_be_there(alias, policy, tables, tmp_path):
+    name = f"{PREFIX}map_encoder.pt2pt_layers.0.{alias}.bias"
+    with pytest.raises(CheckpointError, match=f"missing {name}"):
+        import_catk(write_changed(policy, tmp_path, lambda weights: weights.pop(name)), tables)
+
+
+def test_a_missing_head_is_listed_like_any_other_key(policy, tables, tmp_path):
+    with pytest.raises(CheckpointError, match=f"missing {HEAD}"):
+        import_catk(write_changed(policy, tmp_path, lambda weights: weights.pop(HEAD)), tables)
+
+
+class Foreign:
+    def __reduce__(self):
+        return (open, ("/nowhere/written-by-a-checkpoint", "w"))
+
+
+def test_foreign_objects_are_refused_and_not_run(policy, tables, tmp_path):
+    torch.save({"state_dict": export_catk(policy), "callbacks": Foreign()}, tmp_path / "foreign.ckpt")
+    with pytest.raises(CheckpointError, match=r"refused, it holds (io|_io)\.open") as caught:
+        import_catk(tmp_path / "foreign.ckpt", tables)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"", "neither safetensors nor a Lightning checkpoint"),
+        (pickle.dumps({"state_dict": {}}), "neither safetensors nor a Lightning checkpoint"),
+    ],
+    ids=["empty", "bare pickle"],
+)
+def test_files_of_other_kinds_are_refused(content, words, tables, tmp_path):
+    (tmp_path / "x.ckpt").write_bytes(content)
+    with pytest.raises(CheckpointError, match=words):
+        import_catk(tmp_path / "x.ckpt", tables)
+
+
+def test_damaged_and_missing_files_are_refused(policy, tables, tmp_path):
+    torch.save({"state_dict": export_catk(policy)}, tmp_path / "whole.ckpt")
+    data = (tmp_path / "whole.ckpt").read_bytes()
+    (tmp_path / "half.ckpt").write_bytes(data[: len(data) // 2])
+    (tmp_path / "half.safetensors").write_bytes(b"\x10" + bytes(20))
+    torch.save({"weights": 1}, tmp_path / "none.ckpt")
+    for name, words in {
+        "half.ckpt": "neither safetensors nor",
+        "half.safetensors": "damaged safetensors",
+        "none.ckpt": "no weights under 'state_dict'",
+        "absent.ckpt": "no such file",
+        "absent.safetensors": "no such file",
+    }.items():
+        with pytest.raises(CheckpointError, match=words):
+            import_catk(tmp_path / name, tables)
+
+
+def test_tables_of_the_wrong_size_are_refused(policy, tmp_path):
+    write_catk(policy, tmp_path / "out.safetensors")
+    good = dict(zip(("veh", "ped", "cyc"), policy.vocabulary.corners.numpy()))
+    good["traj_src"] = policy.vocabulary.map_prototypes.numpy()
+    short = {k: v[:3] if k != "traj_src" else v for k, v in good.items()}
+    cases = {
+        "no table traj_src": {k: v for k, v in good.items() if k != "traj_src"},
+        "ped has shape": good | {"ped": good["ped"][:, :5]},
+        "different numbers of tokens": good | {"cyc": good["cyc"][:3]},
+        "values that are not finite": good | {"veh": good["veh"] * np.nan},
+        "predicts 5 tokens a class, the vocabulary holds 3, 3, 3": short,
+    }
+    for words, tables in cases.items():
+        np.savez(tmp_path / "tables.npz", **tables)
+        with pytest.raises(CheckpointError, match=words):
+            import_catk(tmp_path / "out.safetensors", [tmp_path / "tables.npz"])
+    np.save(tmp_path / "tables.npy", np.array([{"veh": 1}], dtype=object))
+    (tmp_path / "tables.pkl").write_bytes(pickle.dumps(good))
+    for name, words in {"tables.npy": "pickles are not read", "tables.pkl": "not an npz", "no.npz": "no such"}.items():
+        with pytest.raises(CheckpointError, match=words):
+            import_catk(tmp_path / "out.safetensors", [tmp_path / name])
+
+
+def test_a_vocabulary_other_than_the_one_a_checkpoint_names_is_refused(policy, tables, tmp_path):
+    config = {"token_processor": {"agent_token_file": "agent_vocab_555_s2.pkl"}}
+    torch.save({"state_dict": export_catk(policy), "hyper_parameters": {"model_config": config}}, tmp_path / "x.ckpt")
+    with pytest.raises(CheckpointError, match=r"trained with agent_vocab_555_s2\.pkl, the vocabulary is another one"):
+        import_catk(tmp_path / "x.ckpt", tables)
+
+
+# ---- the public code's own files ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.official
+def test_a_lightning_file_and_safetensors_give_the_same_model(golden, token_tables, nano):
+    other = import_catk(golden.folder / "nano_seed1003.safetensors", token_tables)
+    assert same(other.policy, nano)
+    assert other.policy.config == nano.config == replace(smart_nano(), public_code_quirks=True)
+    assert is_published(nano.vocabulary)
+
+
+@pytest.mark.official
+def test_export_gives_back_every_key_and_bit_of_the_public_file(golden, nano):
+    theirs = load_file(golden.folder / "nano_seed1003.safetensors")
+    ours = export_catk(nano)
+    assert ours.keys() == theirs.keys()
+    assert all(torch.equal(ours[k], theirs[k]) for k in theirs)
+
+
+@pytest.mark.official
+@pytest.mark.parametrize("preset", [smart_nano, smart_mini, smart_tiny])
+def test_keys_and_shapes_of_every_size_are_the_public_ones(preset, golden):
+    shapes = json.loads((golden.folder / "state_dict_shapes.json").read_text())[preset.__name__.removeprefix("smart_")]
+    ours = export_catk(fresh(preset(), num_tokens=2048))
+    assert {k.removeprefix(PREFIX): list(v.shape) for k, v in ours.items()} == shapes
+    assert len(aliases(ours)) == 2 * (preset().num_map_layers + 2 * preset().num_decoder_layers)
+
+
+@pytest.mark.official
+def test_another_vocabulary_is_not_taken_for_the_published_one(token_tables, nano):
+    assert not is_published(replace(nano.vocabulary, corners=nano.vocabulary.corners + 1e-6))
+    assert read_catk_vocabulary(token_tables).num_tokens == 2048

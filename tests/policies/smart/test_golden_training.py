@@ -1,0 +1,147 @@
+"""Losses, gradients and optimiser steps on scenario A against the public code. Dropout and history drop are off, as there."""
+
+import copy
+
+import numpy as np
+import pytest
+import torch
+from torch.nn import functional
+
+from rlftsim.policies.smart.catk_keys import PREFIX, catk_name
+from rlftsim.training.catk import catk_loss, roll_out_closest
+
+pytestmark = pytest.mark.official
+LOSS_TOLERANCE = 1e-5
+GRADIENT_TOLERANCE = 1e-3
+"""Relative."""
+CURVE_TOLERANCE = 1e-3
+LEARNING_RATE, WEIGHT_DECAY, GRADIENT_CLIP = 5e-4, 0.01, 0.5
+frames = pytest.mark.parametrize("frame", ["centred", "absolute"])
+
+
+@pytest.fixture
+def policy(nano):
+    return copy.deepcopy(nano)
+
+
+def bc_loss(policy, batch, arrays, label_smoothing):
+    """Mean loss and number of terms."""
+    trained = torch.from_numpy(arrays["train_mask"])[None]
+    said = policy.teacher_forced(batch, trained)
+    logits, target = said.logits[said.target_mask], said.target[said.target_mask]
+    return functional.cross_entropy(logits, target, label_smoothing=label_smoothing), len(target)
+
+
+def gradient_norms(policy):
+    """By the public code's names, without its prefix."""
+    named = policy.network.named_parameters()
+    return {catk_name(name).removeprefix(PREFIX): float(p.grad.norm()) for name, p in named if p.grad is not None}
+
+
+def check_gradients(policy, total, by_parameter):
+    ours = gradient_norms(policy)
+    theirs = {own_name(name.removeprefix(PREFIX)): norm for name, norm in by_parameter.items()}
+    assert ours.keys() == theirs.keys()
+    off = {name: abs(ours[name] / norm - 1) for name, norm in theirs.items()}
+    wrong = {name: value for name, value in off.items() if value > GRADIENT_TOLERANCE}
+    assert wrong == {}
+    assert sum(n * n for n in ours.values()) ** 0.5 == pytest.approx(total, rel=GRADIENT_TOLERANCE)
+
+
+def own_name(name):
+    """The name that this package keeps of a norm with two names."""
+    return name if ".pt2a_" in name else name.replace("attn_prenorm_x_src", "attn_prenorm_x_dst")
+
+
+@frames
+def test_targets_are_those_of_the_public_code(frame, policy, batch_a, golden):
+    arrays = golden.arrays(f"nano/{frame}_train")
+    tokens = policy._tokenize(batch_a(frame))
+    np.testing.assert_array_equal(tokens.valid[0], arrays["valid_mask"])
+    np.testing.assert_array_equal(tokens.logged_valid[0], arrays["gt_valid_raw"])
+    counts = arrays["bc_target_valid"]
+    np.testing.assert_array_equal(tokens.valid[0, :, 2:] & tokens.valid[0, :, 1:-1], counts)
+    np.testing.assert_array_equal(tokens.next_token_id[0, :, 1:-1][counts], arrays["bc_target_idx"][counts])
+    rolling = (tokens.token_id[0, :, 2:].numpy() != arrays["bc_target_idx"])[counts].sum()
+    assert rolling == golden.scalars(f"nano_{frame}")["train"]["bc_target_vs_gtidx_mismatch"]
+
+
+@pytest.mark.parametrize(("frame", "label_smoothing"), [("centred", 0.1), ("absolute", 0.1), ("centred", 0.0)])
+def test_pre_training_loss_and_gradients(frame, label_smoothing, policy, batch_a, golden):
+    expected = golden.scalars(f"nano_{frame}")["train"]
+    loss, count = bc_loss(policy, batch_a(frame), golden.arrays(f"nano/{frame}_train"), label_smoothing)
+    assert count == expected["bc_n_loss_terms"]
+    assert loss.item() == pytest.approx(expected[f"bc_loss_ls{label_smoothing}"], abs=LOSS_TOLERANCE)
+    loss.backward()
+    total = expected[f"bc_gradnorm_ls{label_smoothing}"]
+    assert torch.nn.utils.get_total_norm([p.grad for p in policy.parameters()]).item() == pytest.approx(
+        total, rel=GRADIENT_TOLERANCE
+    )
+    if label_smoothing:
+        check_gradients(policy, total, expected["bc_grad"])
+
+
+def optimiser_curve(policy, batch, arrays, num_steps):
+    """Losses and gradient norms of some steps on one batch."""
+    optimizer = torch.optim.AdamW(policy.parameters(), lr=LEARNING_RATE, weight_decay=WEIGHT_DECAY)
+    losses, norms = [], []
+    for _ in range(num_steps):
+        optimizer.zero_grad()
+        loss, _ = bc_loss(policy, batch, arrays, 0.1)
+        loss.backward()
+        norms.append(torch.nn.utils.clip_grad_norm_(policy.parameters(), GRADIENT_CLIP).item())
+        optimizer.step()
+        losses.append(loss.item())
+    return losses, norms
+
+
+def check_six_steps(policy, frame, batch_a, golden):
+    expected, arrays = golden.scalars(f"nano_{frame}")["train"], golden.arrays(f"nano/{frame}_train")
+    losses, norms = optimiser_curve(policy, batch_a(frame), arrays, len(expected["bc_curve"]))
+    np.testing.assert_allclose(losses, expected["bc_curve"], atol=CURVE_TOLERANCE, rtol=0)
+    np.testing.assert_allclose(norms, expected["bc_curve_gradnorm"], rtol=CURVE_TOLERANCE)
+
+
+def test_six_optimiser_steps_in_absolute_coordinates(policy, batch_a, golden):
+    check_six_steps(policy, "absolute", batch_a, golden)
+
+
+@pytest.mark.slow
+@pytest.mark.xfail(
+    strict=True,
+    reason="losses of steps 4 and 6 differ by 1.06e-3 and 1.12e-3 (2e-4 of their value): the input of one ReLU is 1.3e-7 here and "
+    "below zero in the public code (typical size 0.7), so a part of the first gradient is missing there",
+)
+def test_six_optimiser_steps(policy, batch_a, golden):
+    check_six_steps(policy, "centred", batch_a, golden)
+
+
+@pytest.mark.slow
+def test_six_optimiser_steps_with_that_one_relu_on_the_other_side(policy, batch_a, golden):
+    with torch.no_grad():
+        policy.network.decoder.time_layers[2].feed_forward[1].bias[166] -= 2e-7
+    check_six_steps(policy, "centred", batch_a, golden)
+
+
+def test_closest_among_top_k_in_our_own_order_of_operations(policy, batch_a, golden):
+    expected = golden.arrays("nano/centred_train")
+    pursuing = roll_out_closest(policy, batch_a("centred"))
+    np.testing.assert_array_equal(pursuing.rollouts.decision[0, 0], expected["catk_idx"][:, 2:])
+
+
+@frames
+def test_closest_among_top_k(frame, policy, batch_a, golden):
+    arrays, batch = golden.arrays(f"nano/{frame}_train"), batch_a(frame)
+    pursuing = roll_out_closest(policy, batch, public_order_of_operations=True)
+    np.testing.assert_array_equal(pursuing.rollouts.decision[0, 0], arrays["catk_idx"][:, 2:])
+    ends = slice(4, None, 5)
+    assert np.abs(pursuing.rollouts.position[0, 0, :, ends].numpy() - arrays["catk_pos"][:, 2:]).max() < 1e-3
+    counts = arrays["catk_target_valid"]
+    np.testing.assert_array_equal(pursuing.target_mask[0, 0], counts)
+    np.testing.assert_array_equal(pursuing.target[0, 0][counts], arrays["catk_target_idx"][counts])
+
+    expected = golden.scalars(f"nano_{frame}")["train"]
+    loss = catk_loss(policy, batch, pursuing, torch.from_numpy(arrays["train_mask"])[None])
+    assert loss.item() == pytest.approx(expected["catk_loss"], abs=LOSS_TOLERANCE)
+    loss.backward()
+    check_gradients(policy, expected["catk_gradnorm"], expected["catk_grad"])
