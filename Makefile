@@ -8,7 +8,7 @@ PIP = $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constr
 OUT ?= runs/demo
 PYTEST_FLAGS ?=
 
-.PHONY: demo demo-quick test lint clean
+.PHONY: demo demo-quick test lint types clean
 .DEFAULT_GOAL := demo
 
 ## the whole pipeline on the synthetic scenarios, to runs/demo/report.html
@@ -35,6 +35,10 @@ $(BIN)/.installed: pyproject.toml constraints.txt
 $(BIN)/.installed-test: $(BIN)/.installed
 	$(PIP) -e ".[test]"
 	touch $@
+
+## static types (pyright fetches itself through npm)
+types: $(BIN)/.installed-test
+	$(BIN)/pyright --pythonpath $(BIN)/python src
 
 clean:
 	rm -rf $(VENV) runs

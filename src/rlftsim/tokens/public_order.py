@@ -91,7 +91,7 @@ def nearest_placed_tokens(
     for index, (table, exists) in enumerate(zip(vocabulary.end_corners(), vocabulary.token_mask)):
         rows = ((class_id == index) & valid).nonzero(as_tuple=True)
         parts = zip(*(v[rows].split(_ROWS_PER_CHUNK) for v in (target, position, heading)))
-        found = [_nearest_rows(*part, table[exists]) for part in parts]
+        found = [_nearest_rows(box, start, turn, table[exists]) for box, start, turn in parts]
         out[rows] = exists.nonzero()[:, 0][torch.cat(found)]
     return out
 

@@ -66,7 +66,7 @@ def write_catk_vocabulary(vocabulary: Vocabulary, path: Path) -> None:
     """Write the tables as npz, in the form `read_catk_vocabulary` takes."""
     tables = dict(zip(MOTION_TABLES, vocabulary.corners.cpu().numpy()))
     with path.open("wb") as file:
-        np.savez(file, **tables, **{MAP_TABLE: vocabulary.map_prototypes.cpu().numpy()})
+        np.savez(file, **tables, **{MAP_TABLE: vocabulary.map_prototypes.cpu().numpy()})  # type: ignore[arg-type]
 
 
 def _read_npz(path: Path) -> dict[str, np.ndarray]:

@@ -75,7 +75,7 @@ def _unpickle(path: Path) -> Any:
         if unknown:
             raise CheckpointError(f"{path}: refused, it holds {', '.join(unknown)}: save it again with weights only.")
         known = [(_Inert, name) for name in _FOREIGN] + [(value, name) for name, value in _HARMLESS.items()]
-        with torch.serialization.safe_globals(known):
+        with torch.serialization.safe_globals(list(known)):  # type: ignore[arg-type]
             return torch.load(path, map_location="cpu", weights_only=True)
     except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, KeyError, AttributeError, TypeError) as error:
         first_line = str(error).strip().splitlines()[:1]
