@@ -44,7 +44,7 @@ def smart_demo_rlftsim() -> SmartRecipe:
             max_trained_agents=None, checkpoint_every=50,
         ),
         finetune=FinetuneConfig(
-            epochs=5.0, batch_size=8, num_rollouts=4, learning_rate=3e-4, warmup_updates=5, checkpoint_every=20,
+            epochs=3.0, batch_size=8, num_rollouts=4, learning_rate=3e-4, warmup_updates=5, checkpoint_every=20,
             kl=KlConfig(target=0.05, initial_beta=0.01),
         ),
     )  # fmt: skip
