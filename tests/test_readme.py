@@ -48,12 +48,7 @@ def test_there_are_commands_and_a_wrong_one_would_be_seen():
         configure(RECIPES["smart-tiny"](), ["finetune.learnin-rate=1e-5"])
 
 
-NOT_A_VERB_YET = pytest.mark.xfail(strict=True, reason="documented before the command line knows it")
-COMING = {"score"} - set(VERBS)
-NAMED = [pytest.param(p, c, marks=NOT_A_VERB_YET if c.split()[1] in COMING else ()) for p, c in INLINE]
-
-
-@pytest.mark.parametrize(("page", "code"), NAMED, ids=[f"{p}: {c[8:40]}" for p, c in INLINE])
+@pytest.mark.parametrize(("page", "code"), INLINE, ids=[f"{p}: {c[8:40]}" for p, c in INLINE])
 def test_commands_named_in_passing_name_verbs_and_options_that_exist(page, code, capsys):
     words = shlex.split(code)[1:]
     assert words[0] in (*VERBS, "VERB")

@@ -15,3 +15,14 @@ class ConfigError(RlftsimError, ValueError):
 
 class CheckpointError(RlftsimError):
     """A checkpoint or run folder is damaged or does not fit: says which key or file and what to do."""
+
+
+def require_positive(config: object, names: tuple[str, ...]) -> None:
+    """Check fields of a configuration.
+
+    Raises:
+        ConfigError: one of them is not above zero; names it and its value.
+    """
+    for name in names:
+        if not getattr(config, name) > 0:
+            raise ConfigError(f"{name} must be positive, got {getattr(config, name)}.")

@@ -194,10 +194,26 @@ def test_simulating_again_keeps_what_is_there(tmp_path, capsys):
         status, out, _ = run(capsys, *arguments, "--scenario", name)
         assert status == 0
         assert "2 rollouts of 1 scenarios" in out
-    [file] = tmp_path.iterdir()
+    [file] = tmp_path.glob("*.npz")
     stamp = file.stat().st_mtime_ns
     run(capsys, *arguments, "--scenario", name)
     assert file.stat().st_mtime_ns == stamp
+
+
+def test_a_folder_of_other_rollouts_is_refused(tmp_path, capsys):
+    arguments = ["simulate", "constant_velocity", "--data", "synthetic", "--out", tmp_path, "--num-rollouts", "2"]
+    name = open_split("synthetic", "validation").scenario_ids[0]
+    assert run(capsys, *arguments, "--scenario", name)[0] == 0
+    status, _, err = run(capsys, *arguments, "--seed", "1", "--scenario", name)
+    assert status == 2
+    assert "holds rollouts of constant_velocity with another seed: name another --out" in err
+
+
+def test_settings_without_effect_are_refused(tmp_path, capsys):
+    words = ["pretrain", "smart-demo", "--data", "synthetic", "--vocabulary", tmp_path / "v", "--out", tmp_path / "run"]
+    status, _, err = run(capsys, *words, "--set", "finetune.reward=rloo")
+    assert status == 2
+    assert "finetune.reward has no effect here: only fields of model and pretrain can be set" in err
 
 
 def test_comparing_an_evaluation_with_itself(evaluation, capsys):

@@ -12,12 +12,12 @@ from rlftsim.errors import ConfigError, DataError
 from rlftsim.experiments import evaluate as module
 from rlftsim.experiments.evaluate import EvaluateConfig, Evaluation, evaluate
 from rlftsim.experiments.evaluation import SCORE_COLUMNS
-from rlftsim.experiments.fingerprint import fingerprint_policy
 from rlftsim.policies.smart.config import SmartConfig
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.realism import score
 from rlftsim.realism.from_rollouts import logged_states
 from rlftsim.rollout.baselines import ConstantVelocity
+from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
 from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
 

@@ -7,7 +7,7 @@ import tiny
 from rlftsim.errors import CheckpointError
 from rlftsim.training.finetune import FinetuneConfig
 from rlftsim.training.reference import KlConfig
-from rlftsim.training.run_folder import RunFolder, read_metrics, to_plain
+from rlftsim.training.run_folder import RunFolder, describe_inputs, read_metrics, to_plain
 
 
 def test_the_folder_holds_the_resolved_configuration_and_the_environment(tmp_path):
@@ -26,7 +26,7 @@ def test_the_same_settings_may_come_back(tmp_path):
 
 def test_other_settings_are_refused_by_name(tmp_path):
     RunFolder(tmp_path, FinetuneConfig())
-    with pytest.raises(CheckpointError, match=r"other settings or inputs \(kl, seed\): name another --out"):
+    with pytest.raises(CheckpointError, match=r"other settings or inputs \(kl.target, seed\): name another --out"):
         RunFolder(tmp_path, FinetuneConfig(kl=KlConfig(target=0.02), seed=1))
     with pytest.raises(CheckpointError, match="other settings"):
         RunFolder(tmp_path, tiny.PRETRAIN)
@@ -66,3 +66,26 @@ def test_configurations_become_plain_values():
     assert plain["betas"] == [0.8, 0.9]
     assert plain["device"]["accelerator"] == "auto"
     assert json.loads(json.dumps(plain)) == plain
+
+
+def test_another_vocabulary_or_radius_is_another_run(tmp_path, drawn_scenarios):
+    vocabulary = tiny.small_vocabulary(drawn_scenarios)
+    first = tiny.tiny_policy(vocabulary)
+    others = (
+        tiny.tiny_policy(replace(vocabulary, corners=vocabulary.corners * 1.01)),
+        tiny.tiny_policy(vocabulary, replace(tiny.MODEL, agent_radius_m=20.0)),
+    )
+    RunFolder(tmp_path, tiny.FINETUNE, describe_inputs(first, drawn_scenarios))
+    RunFolder(tmp_path, tiny.FINETUNE, describe_inputs(tiny.tiny_policy(vocabulary), drawn_scenarios))
+    for other in others:
+        with pytest.raises(CheckpointError, match="initial_policy"):
+            RunFolder(tmp_path, tiny.FINETUNE, describe_inputs(other, drawn_scenarios))
+    with pytest.raises(CheckpointError, match="scenarios"):
+        RunFolder(tmp_path, tiny.FINETUNE, describe_inputs(first, drawn_scenarios[:-1]))
+
+
+def test_precision_is_part_of_a_run_and_threads_are_not(tmp_path):
+    RunFolder(tmp_path, tiny.FINETUNE)
+    RunFolder(tmp_path, replace(tiny.FINETUNE, device=replace(tiny.FINETUNE.device, threads=3)))
+    with pytest.raises(CheckpointError, match=r"device\.precision"):
+        RunFolder(tmp_path, replace(tiny.FINETUNE, device=replace(tiny.FINETUNE.device, precision="bf16-mixed")))

@@ -18,6 +18,7 @@ from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
 from rlftsim.training.finetune import FinetuneConfig, finetune
 from rlftsim.training.parallel import DeviceConfig
 from rlftsim.training.pretrain import PretrainConfig, pretrain
+from rlftsim.training.reference import KlConfig
 
 NUM_SCENARIOS = 5
 CPU = DeviceConfig(accelerator="cpu", threads=1)
@@ -28,7 +29,14 @@ MODEL = SmartConfig(
 WITHOUT_CHANCE = replace(MODEL, dropout=0.0, history_drop=0.0)
 PRETRAIN = PretrainConfig(epochs=1.6, batch_size=1, learning_rate=1e-3, label_smoothing=0.0, checkpoint_every=2, device=CPU)  # fmt: skip
 FINETUNE = FinetuneConfig(
-    epochs=1.6, batch_size=1, num_rollouts=2, learning_rate=1e-3, warmup_updates=2, checkpoint_every=2, device=CPU
+    epochs=1.6,
+    batch_size=1,
+    num_rollouts=2,
+    learning_rate=1e-3,
+    warmup_updates=2,
+    checkpoint_every=2,
+    device=CPU,
+    kl=KlConfig(reference_every=2, reference_share=0.25),
 )
 """Eight updates on five scenarios, with a checkpoint after every second."""
 

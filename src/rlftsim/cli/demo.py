@@ -18,8 +18,8 @@ class Demo:
     pictures. Interrupted in any way, the same command goes on where it was.
     """
 
-    out: Path = Path("runs/demo")
-    """Folder for everything; the report is OUT/report.html."""
+    out: Path | None = None
+    """Folder for everything; the report is OUT/report.html. Left out, runs/demo or runs/demo-quick."""
     quick: bool = False
     """Every stage at its smallest: shows that all of them run, not that fine-tuning helps."""
 
@@ -32,6 +32,6 @@ class Demo:
             config = replace(
                 config, recipe=smart_demo_quick(), evaluate=replace(evaluation, num_rollouts=8, limit=8), num_scenes=2
             )
-        result = run_demo(config, self.out)
+        result = run_demo(config, self.out or Path("runs/demo-quick" if self.quick else "runs/demo"))
         print(f"report: {result.report}")
         return 0

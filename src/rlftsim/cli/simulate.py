@@ -1,6 +1,7 @@
 """The verb that rolls scenarios out: simulate."""
 
-from dataclasses import dataclass
+import json
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from tyro.conf import Positional
@@ -10,9 +11,14 @@ from rlftsim.errors import ConfigError
 from rlftsim.progress import progress_bar
 from rlftsim.recipes.models import load_policy
 from rlftsim.rollout.files import write_rollouts
-from rlftsim.rollout.policy import Sampling
+from rlftsim.rollout.fingerprint import fingerprint_policy
+from rlftsim.rollout.policy import Policy, Sampling
 from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import collate
+from rlftsim.scenario.dataset import ScenarioDataset, with_temporary_name
+
+ABOUT = "rollouts.json"
+"""Whose rollouts are in the folder."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +53,7 @@ class Simulate:
         unknown = [i for i in ids if i not in scenarios]
         if unknown:
             raise ConfigError(f"no scenario {', '.join(unknown)} in split {self.split!r} of {self.data}.")
+        self._claim(policy, sampling, scenarios)
         left = [i for i in ids if not (self.out / f"{i}.npz").exists()]
         with progress_bar("simulate", len(ids), len(ids) - len(left)) as advance:
             for scenario_id in left:
@@ -56,3 +63,27 @@ class Simulate:
                 advance()
         print(f"{self.out}: {self.num_rollouts} rollouts of {len(ids)} scenarios.")
         return 0
+
+    def _claim(self, policy: Policy, sampling: Sampling, scenarios: ScenarioDataset) -> None:
+        """Write down whose rollouts these are; refuse a folder that holds others.
+
+        Raises:
+            ConfigError: it does.
+        """
+        about = {
+            "model": self.model,
+            "policy": fingerprint_policy(policy),
+            "data": scenarios.manifest.index_sha256,
+            "seed": self.seed,
+            "num_rollouts": self.num_rollouts,
+            "sampling": asdict(sampling),
+        }
+        path = self.out / ABOUT
+        old = json.loads(path.read_text()) if path.exists() else about
+        differing = [name for name, value in about.items() if name != "model" and old.get(name) != value]
+        if differing:
+            raise ConfigError(
+                f"{self.out} holds rollouts of {old.get('model')} with another {', '.join(differing)}: name another --out."
+            )
+        self.out.mkdir(parents=True, exist_ok=True)
+        with_temporary_name(path, lambda temporary: temporary.write_text(json.dumps(about, indent=1) + "\n"))

@@ -40,7 +40,7 @@ class Tokens:
 
     def run(self) -> int:
         """Build, report, write."""
-        recipe = configure(RECIPES[self.recipe](), self.set)
+        recipe = configure(RECIPES[self.recipe](), self.set, sections=("tokens",))
         scenarios = open_split(self.data, self.split)
         say = Console(stderr=True)
         origin = f"{' '.join(sys.argv[1:])}; {len(scenarios)} scenarios; seed {recipe.tokens.seed}"
@@ -96,7 +96,7 @@ class Pretrain:
 
     def run(self) -> int:
         """Build the model and train it."""
-        recipe = configure(RECIPES[self.recipe](), self.set)
+        recipe = configure(RECIPES[self.recipe](), self.set, sections=("model", "pretrain"))
         scenarios = open_split(self.data, self.split)
         torch.manual_seed(recipe.pretrain.seed)
         policy = SmartPolicy(recipe.model, Vocabulary.load(self.vocabulary))
@@ -125,7 +125,7 @@ class Finetune:
 
     def run(self) -> int:
         """Load the model and fine-tune it."""
-        recipe = configure(RECIPES[self.recipe](), self.set)
+        recipe = configure(RECIPES[self.recipe](), self.set, sections=("finetune",))
         scenarios = open_split(self.data, self.split)
         card = model_card(
             f"fine-tuned ({recipe.finetune.reward}) from {self.model}", data_folder(self.data), len(scenarios)

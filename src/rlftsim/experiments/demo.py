@@ -121,8 +121,9 @@ def run_demo(config: DemoConfig, out: Path) -> DemoResult:
 
 
 def _vocabulary(training: ScenarioDataset, config: DemoConfig, path: Path) -> Vocabulary:
-    if not path.exists():
-        build_vocabulary(training, config.recipe.tokens, origin=f"demo on {config.data.name}")[0].save(path)
+    origin = f"demo on {config.data.name}, {config.recipe.tokens}"
+    if not path.exists() or Vocabulary.load(path).origin != origin:
+        build_vocabulary(training, config.recipe.tokens, origin=origin)[0].save(path)
     return Vocabulary.load(path)
 
 

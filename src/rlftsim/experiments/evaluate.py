@@ -16,10 +16,10 @@ from torch import nn
 
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.experiments.evaluation import EvaluateConfig, Evaluation, Provenance, Skipped, row_of_result
-from rlftsim.experiments.fingerprint import fingerprint_policy
 from rlftsim.experiments.parts import ResumableEvaluation
 from rlftsim.realism import SimulatedStates, build_scenario_log, metric_by_name, score
 from rlftsim.realism.from_rollouts import logged_states, states_of_rollouts
+from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import Policy
 from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import collate

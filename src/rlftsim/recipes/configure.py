@@ -11,12 +11,13 @@ Config = TypeVar("Config")
 Override = str
 
 
-def configure(config: Config, overrides: Sequence[Override]) -> Config:
+def configure(config: Config, overrides: Sequence[Override], *, sections: Sequence[str] | None = None) -> Config:
     """A configuration with some fields changed.
 
     Args:
         config: a frozen dataclass, nested ones inside.
         overrides: such as "finetune.kl.target=0.02"; "-" and "_" are the same in names.
+        sections: the top fields that have an effect; None = all.
 
     Raises:
         ConfigError: no such field (the known ones are listed), or a value of the wrong kind or range.
@@ -25,6 +26,8 @@ def configure(config: Config, overrides: Sequence[Override]) -> Config:
         name, separator, text = override.partition("=")
         if not separator:
             raise ConfigError(f"{override!r} is not field=value, such as pretrain.epochs=2.")
+        if sections is not None and name.split(".")[0] not in sections:
+            raise ConfigError(f"{name} has no effect here: only fields of {' and '.join(sections)} can be set.")
         config = _changed(config, name.replace("-", "_").split("."), text, name)
     return config
 

@@ -25,7 +25,7 @@ def load_policy(name: str) -> Policy:
         folder = folder / "model"
     if not folder.is_dir():
         raise ConfigError(f"{name!r} is neither a model folder nor one of {', '.join(NAMED)}.")
-    return SmartPolicy.from_pretrained(folder).eval()
+    return SmartPolicy.from_pretrained(folder).eval().requires_grad_(False)
 
 
 def load_policy_or_oracle(name: str) -> Policy | Literal["oracle"]:

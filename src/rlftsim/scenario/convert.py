@@ -147,8 +147,10 @@ def _plan(sources: list[Path], folder: Path, split: str | None, on_error: OnErro
     tasks = []
     for source in sources:
         name = source.absolute().relative_to(common).as_posix()
-        shard = f"{SHARDS}/{name}.arrow"
-        tasks.append(_Task(source, name, shard, split or infer_split(source), folder, on_error, None))
+        label = split or infer_split(source)
+        # files of two splits may have the same name: a split's shards have a folder of their own
+        place = name if name.startswith(f"{label}/") else f"{label}/{name}"
+        tasks.append(_Task(source, name, f"{SHARDS}/{place}.arrow", label, folder, on_error, None))
     return tasks
 
 

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from lightning_fabric import Fabric
 from torch import Tensor, nn
 
-from rlftsim.errors import ConfigError
+from rlftsim.errors import ConfigError, require_positive
 from rlftsim.progress import progress_bar
 from rlftsim.realism import RealismResult, metric_by_name, score_batch
 from rlftsim.realism.from_rollouts import states_of_rollouts
@@ -75,8 +75,16 @@ class FinetuneConfig:
             raise ConfigError(
                 f"MLOO needs at least 2 rollouts per scenario, got {self.num_rollouts}: set finetune.num_rollouts >= 2."
             )
-        if self.epochs <= 0 or self.batch_size < 1 or self.rollouts_per_pass < 1:
-            raise ConfigError(f"epochs, batch_size and rollouts_per_pass must be positive, got {self}.")
+        positive = (
+            "epochs",
+            "batch_size",
+            "rollouts_per_pass",
+            "learning_rate",
+            "checkpoint_every",
+            "max_kl",
+            "max_skipped_in_a_row",
+        )
+        require_positive(self, positive)
         metric_by_name(self.metric)
         reward_by_name(self.reward)
 
@@ -121,6 +129,10 @@ def finetune(policy: Policy, scenarios: Scenarios, out: Path, config: FinetuneCo
     """
     if not isinstance(policy, nn.Module):
         raise ConfigError(f"{type(policy).__name__} has no weights: there is nothing to fine-tune.")
+    if not hasattr(policy, "save_pretrained"):
+        raise ConfigError(
+            f"{type(policy).__name__} cannot be saved: give it a method save_pretrained(folder, *, card)."
+        )
     if not len(scenarios):
         raise ConfigError("no scenario to train on: is the data set empty, or the split misspelt?")
     fabric = start_fabric(config.device)
@@ -229,7 +241,7 @@ def _accumulate_gradients(
         [batch.num_scenarios, int(rollouts.decision_mask.sum())], device=fabric.device, dtype=torch.float64
     )
     num_scenarios, num_decisions = add_up(totals, fabric).tolist()
-    sums = torch.zeros(3, device=fabric.device, dtype=torch.float64)
+    sums = torch.zeros(2, device=fabric.device, dtype=torch.float64)
     gaps: list[Tensor] = []
     with fabric.autocast(), torch.no_grad():
         reference_context = learner.reference.encode(batch)
@@ -246,10 +258,10 @@ def _accumulate_gradients(
         loss = policy_gradient_loss(reward[:, part], by_rollout, int(num_scenarios))
         loss = loss + (learner.beta * kl - config.entropy_bonus * entropy) / max(num_decisions, 1.0)
         fabric.backward(loss)
-        sums += torch.stack([kl.detach(), entropy.detach(), loss.detach()])
+        sums += torch.stack([kl.detach(), entropy.detach()])
         gaps.append(torch.where(mask, log_prob.detach() - rows.log_prob, 0.0).abs().max())
     add_up_gradients(learner.parameters, fabric)
-    kl, entropy, _ = add_up(sums, fabric).tolist()
+    kl, entropy = add_up(sums, fabric).tolist()
     return _Sums(kl, entropy, float(torch.stack(gaps).max()), num_decisions)
 
 
@@ -284,7 +296,9 @@ def _describe(
     spread = (ends - ends.mean(1, keepdim=True)).norm(dim=-1)
     present = rollouts.decision_mask.any(-1)
     watched = {
+        "reward_mean": reward.mean(),
         "reward_std": reward.std(-1).mean(),
+        "reward_zero_rate": (reward == 0).all(-1).double().mean(),
         "rmm": scores.meta_metric.nanmean(),
         "kinematic": scores.kinematic.nanmean(),
         "interactive": scores.interactive.nanmean(),

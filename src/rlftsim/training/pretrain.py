@@ -13,7 +13,7 @@ from lightning_fabric import Fabric
 from torch import Tensor, nn
 from torch.nn import functional
 
-from rlftsim.errors import ConfigError
+from rlftsim.errors import ConfigError, require_positive
 from rlftsim.progress import progress_bar
 from rlftsim.rollout.noise import derive_seed
 from rlftsim.scenario.batch import ScenarioBatch
@@ -90,8 +90,9 @@ class PretrainConfig:
     device: DeviceConfig = field(default_factory=DeviceConfig)
 
     def __post_init__(self) -> None:
-        if self.epochs <= 0 or self.batch_size < 1 or self.micro_batch_size < 1:
-            raise ConfigError(f"epochs, batch_size and micro_batch_size must be positive, got {self}.")
+        require_positive(self, ("epochs", "batch_size", "micro_batch_size", "learning_rate", "checkpoint_every"))
+        if not 0 <= self.label_smoothing < 1:
+            raise ConfigError(f"label_smoothing is a share in [0, 1), got {self.label_smoothing}.")
 
     def num_updates(self, num_scenarios: int) -> int:
         """Optimiser steps of the run."""

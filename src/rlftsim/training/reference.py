@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import nn
 
-from rlftsim.errors import ConfigError
+from rlftsim.errors import ConfigError, require_positive
 
 
 @dataclass(frozen=True)
@@ -25,8 +25,9 @@ class KlConfig:
     """Alpha: how far the reference moves towards the policy."""
 
     def __post_init__(self) -> None:
-        if self.target <= 0 or self.horizon <= 0:
-            raise ConfigError(f"kl.target and kl.horizon must be positive, got {self.target} and {self.horizon}.")
+        require_positive(self, ("target", "horizon"))
+        if not 0 <= self.reference_share <= 1 or self.reference_every < 0:
+            raise ConfigError(f"kl.reference_share is a share and kl.reference_every not negative, got {self}.")
         if not 0 < self.min_beta <= self.initial_beta <= self.max_beta:
             raise ConfigError(f"need 0 < min_beta <= initial_beta <= max_beta, got {self}.")
 

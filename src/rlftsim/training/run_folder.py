@@ -21,31 +21,36 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from torch import nn
 from torch.utils.tensorboard import SummaryWriter
 
 from rlftsim import __version__
 from rlftsim.errors import CheckpointError
+from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.scenario.types import Scenarios
 from rlftsim.training.checkpoint import newest_checkpoint
 
 PACKAGES = ("torch", "numpy", "pyarrow", "lightning-fabric", "safetensors")
 
 
-MAY_CHANGE = {"device", "checkpoint_every"}
-"""Settings that a run may be continued with other values of."""
+MAY_CHANGE = {"checkpoint_every", "device.accelerator", "device.devices", "device.num_nodes", "device.threads"}
+"""Settings that a run may be continued with other values of: they change no estimate."""
 
 
-def describe_inputs(module: nn.Module, scenarios: Scenarios) -> dict[str, str]:
-    """What a run starts from, as short hashes: the weights before training, and which scenarios in which order."""
-    weights, ids = hashlib.blake2b(digest_size=8), hashlib.blake2b(digest_size=8)
-    for name, value in module.state_dict().items():
-        weights.update(name.encode())
-        weights.update(value.detach().cpu().contiguous().numpy().tobytes())
+def describe_inputs(policy: object, scenarios: Scenarios) -> dict[str, str]:
+    """What a run starts from, as hashes: weights, settings and vocabulary of the policy, and which scenarios in which order."""
+    ids = hashlib.blake2b(digest_size=16)
     known = getattr(scenarios, "scenario_ids", None)
     for scenario_id in known if known is not None else (scenarios[i].scenario_id for i in range(len(scenarios))):
-        ids.update(scenario_id.encode())
-    return {"initial_weights": weights.hexdigest(), "scenarios": ids.hexdigest()}
+        ids.update(f"{scenario_id}\n".encode())
+    return {"initial_policy": fingerprint_policy(policy), "scenarios": ids.hexdigest()}
+
+
+def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings by their dotted names."""
+    flat: dict[str, Any] = {}
+    for name, value in values.items():
+        flat |= flatten(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
+    return flat
 
 
 def to_plain(config: Any) -> Any:
@@ -112,10 +117,10 @@ class RunFolder:
         if not path.exists():
             return
         try:
-            old = json.loads(path.read_text())
-        except ValueError:
-            return
-        differing = sorted(k for k in (old.keys() | config.keys()) - MAY_CHANGE if old.get(k) != config.get(k))
+            old, new = flatten(json.loads(path.read_text())), flatten(config)
+        except ValueError as error:
+            raise CheckpointError(f"{path}: damaged ({error}): remove the folder {self.path} to start anew.") from None
+        differing = sorted(k for k in (old.keys() | new.keys()) - MAY_CHANGE if old.get(k) != new.get(k))
         if differing:
             raise CheckpointError(
                 f"{self.path} belongs to a run with other settings or inputs ({', '.join(differing)}): "
