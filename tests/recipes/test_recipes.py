@@ -3,11 +3,13 @@
 import contextlib
 import inspect
 from dataclasses import fields, is_dataclass
+from typing import get_args
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rlftsim.cli.train import RecipeName
 from rlftsim.errors import CheckpointError, ConfigError
 from rlftsim.recipes import smart
 from rlftsim.recipes.configure import configure
@@ -165,3 +167,7 @@ def test_where_the_oracle_is_no_answer_it_is_not_offered():
 def test_an_empty_folder_is_no_model(tmp_path):
     with pytest.raises(CheckpointError, match=r"not a model folder, config\.json is missing"):
         load_policy(str(tmp_path))
+
+
+def test_the_command_line_knows_every_recipe():
+    assert set(get_args(RecipeName)) == set(RECIPES)

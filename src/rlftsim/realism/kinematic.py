@@ -4,13 +4,13 @@ Source: Waymo Open Sim Agents Challenge, evaluator of 2025. Everything is float3
 step t needs t - 1 and t + 1 and is NaN where one of them is missing: speeds lose one step at each end, accelerations two.
 """
 
-import math
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from rlftsim.geometry import wrap_angle
 from rlftsim.realism.rounding import compute_sqrt
 from rlftsim.scenario.types import STEP_S
 
@@ -29,11 +29,6 @@ def compute_central_difference(values: Float[Tensor, "... T"]) -> Float[Tensor, 
     difference = torch.full_like(values, float("nan"))
     difference[..., 1:-1] = (values[..., 2:] - values[..., :-2]) / 2
     return difference
-
-
-def wrap_angle(angle: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
-    """Angle in [-pi, pi), by the floor-style remainder."""
-    return torch.remainder(angle + math.pi, 2 * math.pi) - math.pi
 
 
 def _compute_turn(angle: Float[Tensor, "... T"]) -> Float[Tensor, "... T"]:

@@ -155,7 +155,8 @@ class SmartPolicy(nn.Module):
 
     def score(self, context: SmartContext, rollouts: Rollouts) -> TokenDistribution:
         """Replay the decisions without the network, then look at all steps at once."""
-        state = self.begin(context, rollouts.num_rollouts, rollouts.goals, rollouts.log_prob)
+        no_noise = rollouts.log_prob[..., :0]
+        state = self.begin(context, rollouts.num_rollouts, rollouts.goals, no_noise)
         num_decisions = rollouts.decision.shape[3]
         for index in range(num_decisions - 1):
             start = index * STEPS_PER_TOKEN
