@@ -68,7 +68,7 @@ def test_the_page_needs_no_network_and_names_feature_agent_and_ceiling(scenario,
         assert text in page
 
 
-def test_pages_are_written_once_for_every_scenario(scenario, tmp_path):
+def test_every_scenario_has_a_page_and_other_rollouts_another_one(scenario, tmp_path):
     write_dataset([scenario, scenes.lone_agent(), scenes.without_road_edges()], tmp_path / "data")
     (tmp_path / "rollouts").mkdir()
     for one in (scenario, scenes.lone_agent(), scenes.without_road_edges()):
@@ -76,6 +76,17 @@ def test_pages_are_written_once_for_every_scenario(scenario, tmp_path):
     config = ScoreConfig(jobs=1, missing_map="skip")
     pages = explain_rollouts(tmp_path / "rollouts", tmp_path / "data", tmp_path / "out", config)
     assert [page.name for page in pages] == ["junction.html", "lone.html"]
-    before = pages[0].stat().st_mtime_ns
+    before = pages[0].read_text()
+    arrays = draw_arrays(scenario, num_rollouts=2)
+    write_npz(tmp_path / "rollouts" / "junction.npz", {**arrays, "x": arrays["x"] + 3})
     explain_rollouts(tmp_path / "rollouts", tmp_path / "data", tmp_path / "out", config)
-    assert pages[0].stat().st_mtime_ns == before
+    assert pages[0].read_text() != before
+
+
+def test_pages_of_several_sets_of_a_scenario_are_numbered(scenario, tmp_path):
+    write_dataset([scenario], tmp_path / "data")
+    for policy in "abc":
+        (tmp_path / "rollouts" / policy).mkdir(parents=True)
+        write_npz(tmp_path / "rollouts" / policy / "s.npz", draw_arrays(scenario, num_rollouts=2))
+    pages = explain_rollouts(tmp_path / "rollouts", tmp_path / "data", tmp_path / "out", ScoreConfig(jobs=1))
+    assert [page.name for page in pages] == ["junction.html", "junction-2.html", "junction-3.html"]

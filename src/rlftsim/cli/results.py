@@ -79,8 +79,8 @@ class Score:
             print(json.dumps(to_json(result), allow_nan=False))
         else:
             print_wide(format_scores(result))
-            for skipped in result.skipped:
-                print(f"  skipped {skipped.scenario_id}: {skipped.reason}")
+        for skipped in result.skipped:
+            print(f"  skipped {skipped.scenario_id}: {skipped.reason}", file=sys.stderr)
         if self.explain is not None:
             pages = explain_rollouts(self.rollouts, scenarios, self.explain, self.config)
             print(f"{self.explain}: {len(pages)} pages", file=sys.stderr)

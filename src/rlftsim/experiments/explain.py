@@ -24,9 +24,9 @@ def explain_rollouts(
     *,
     show_progress: bool = True,
 ) -> list[Path]:
-    """Write `out/<scenario id>.html` for every scenario with rollouts; pages that are there are kept.
+    """Write `out/<scenario id>.html` for every scenario with rollouts, anew. Returns the pages.
 
-    A second set of rollouts of the same scenario gets the name of its file in front. Returns the pages.
+    Further sets of rollouts of the same scenario are numbered: `<scenario id>-2.html`.
 
     Raises:
         DataError: as `score_rollouts`.
@@ -34,17 +34,19 @@ def explain_rollouts(
     entries, source = find_rollouts(rollouts)[: config.limit], open_scenarios(scenarios)
     check_entries(entries, source, config, scenarios)
     pages = {out / f"{name}.html": entry for name, entry in _page_names(entries).items()}
-    missing = [item for item in pages.items() if not item[0].exists()]
-    with progress_bar("explain", len(pages), len(pages) - len(missing), show=show_progress) as advance, one_thread():
-        run_tasks(partial(_write_page, source, config), missing, jobs=config.num_jobs, advance=advance)
-    return [page for page in pages if page.exists()]
+    with progress_bar("explain", len(pages), show=show_progress) as advance, one_thread():
+        written = run_tasks(
+            partial(_write_page, source, config), list(pages.items()), jobs=config.num_jobs, advance=advance
+        )
+    return [page for page, is_written in zip(pages, written) if is_written]
 
 
 def _page_names(entries: Sequence[RolloutEntry]) -> dict[str, RolloutEntry]:
     names: dict[str, RolloutEntry] = {}
     for entry in entries:
-        name = entry.scenario_id if entry.scenario_id not in names else f"{entry.file.stem}-{entry.scenario_id}"
-        names[Path(name).name or "scenario"] = entry
+        name = entry.scenario_id.replace("/", "_") or "scenario"
+        free = (n for n in (name, *(f"{name}-{k}" for k in range(2, len(entries) + 2))) if n not in names)
+        names[next(free)] = entry
     return names
 
 
@@ -54,13 +56,16 @@ def _write_page(
     item: tuple[Path, RolloutEntry],
     advance: Callable[[int], None],
     is_stopped: Callable[[], bool],
-) -> None:
+) -> bool:
+    """Write one page; False where there is nothing to explain."""
     path, entry = item
     if is_stopped():
-        return
+        return False
     scenario = source.by_id(entry.scenario_id) if entry.scenario_id in source else None
     # Without road edges there is no score to explain; scoring says so.
-    if scenario is not None and (config.missing_map == "error" or has_road_edge(scenario)):
+    is_scored = scenario is not None and (config.missing_map == "error" or has_road_edge(scenario))
+    if scenario is not None and is_scored:
         explanation = explain(scenario, read_states(entry), metric_by_name(config.metric))
         write_text(path, explanation_html(explanation))
     advance(1)
+    return is_scored

@@ -33,7 +33,7 @@ class ResumableEvaluation:
 
     def __post_init__(self) -> None:
         if not self.name or Path(self.name).name != self.name:
-            raise ConfigError(f"an evaluation's name becomes a file name, {self.name!r} cannot.")
+            raise ConfigError(f"an evaluation's name becomes a file name, {self.name!r} cannot: pass another name.")
 
     @property
     def result_path(self) -> Path:
@@ -65,7 +65,12 @@ class ResumableEvaluation:
         if finished is None:
             self._fill(task, groups, jobs=jobs, title=title, show_progress=show_progress)
             parts = [self._read_part(group) for group in groups]
-            finished = join_evaluations(self.name, self.provenance, [part for part in parts if part is not None])
+            whole = [part for part in parts if part is not None]
+            if len(whole) < len(parts):
+                raise DataError(
+                    f"{self.parts_folder}: parts vanished meanwhile (another process with the same name?): run again."
+                )
+            finished = join_evaluations(self.name, self.provenance, whole)
             finished.write(self.result_path)
         shutil.rmtree(self.parts_folder, ignore_errors=True)
         return finished

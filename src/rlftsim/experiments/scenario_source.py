@@ -121,7 +121,7 @@ def index_tfrecords(source: Path) -> RecordedScenarios:
                 raise DataError(f"{path}: record {record}: not a WOMD Scenario message, it has no scenario_id")
             places.setdefault(scenario_id, RecordPlace(path, offset + _HEADER_BYTES, len(data)))
             offset += len(data) + RECORD_OVERHEAD_BYTES
-            digest.update(f"{scenario_id} {len(data)}\n".encode())
+            digest.update(data)
     return RecordedScenarios(places, digest.hexdigest())
 
 

@@ -119,7 +119,7 @@ def score_rollouts(
             raise DataError(f"{rollouts}: none of its {len(entries)} scenarios is in {scenarios}: nothing to score.")
         num_rollouts = read_states(known).num_rollouts
         provenance = _describe(entries, source, scenarios, num_rollouts, config)
-        place = ResumableEvaluation(name or Path(rollouts).stem, provenance, Path(out or nowhere))
+        place = ResumableEvaluation(name or _name_of(rollouts), provenance, Path(out or nowhere))
         job = _Job(tuple(entries), source, config, place)
         result = place.run(
             partial(_score_group, job),
@@ -130,6 +130,14 @@ def score_rollouts(
         )
     _refuse_mapless(result.skipped, config)
     return result
+
+
+def _name_of(rollouts: Path) -> str:
+    """Name of a file or folder without the endings of rollout files."""
+    name = Path(rollouts).resolve().name
+    for ending in (".npz", ".binproto", ".pb"):
+        name = name.removesuffix(ending)
+    return name
 
 
 def to_json(evaluation: Evaluation) -> dict[str, Any]:

@@ -126,7 +126,7 @@ def build_log_target(log: ScenarioLog, config: MetricConfig) -> LogTarget:
     return LogTarget(steps, scored.sum((1, 2)), compute_outcomes(log.features, log)[0])
 
 
-log_target = lru_cache(maxsize=128)(build_log_target)
+log_target = lru_cache(maxsize=8)(build_log_target)
 """`build_log_target`, remembered (logs are compared by identity)."""
 
 
