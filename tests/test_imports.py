@@ -11,7 +11,7 @@ PACKAGE = Path(rlftsim.__file__).parent
 
 FLOORS = (
     ("errors",),
-    ("geometry", "progress", "workers"),
+    ("geometry", "progress", "tensor_file", "workers"),
     ("scenario",),
     ("tokens", "goals"),
     ("rollout",),

@@ -12,7 +12,7 @@ import pytest
 
 from rlftsim import __version__
 from rlftsim.cli.data import open_split
-from rlftsim.cli.main import VERBS, main
+from rlftsim.cli.main import VERBS, main, parse
 from rlftsim.cli.train import RecipeName
 from rlftsim.recipes.smart import RECIPES
 from rlftsim.scenario.synthetic import pack_path
@@ -227,3 +227,18 @@ def test_doctor_looks_at_everything(capsys):
     assert status in (0, 1)
     for what in ("Python", "torch", "threads", "GPU", "SUMO", "disk", "synthetic scenarios"):
         assert what in out
+
+
+def test_settings_may_be_given_once_or_many_times():
+    once = ["tokens", "--data", "d", "--set", "a=1", "b=2", "--out", "o"]
+    many = ["tokens", "--set", "a=1", "--data", "d", "--set", "b=2", "--out", "o"]
+    for words in (once, many):
+        assert parse(words).set == ["a=1", "b=2"]
+
+
+def test_a_model_folder_without_weights_or_with_garbage_is_refused_in_words(tmp_path, capsys):
+    for name, content in (("config.json", bytes(range(128, 256))), ("config.json", b"3")):
+        (tmp_path / name).write_bytes(content)
+        status, _, err = run(capsys, "simulate", tmp_path, "--data", "synthetic", "--out", tmp_path / "out")
+        assert (status, err.count("\n")) == (2, 1)
+        assert "damaged model folder" in err

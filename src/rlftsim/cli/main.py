@@ -80,10 +80,24 @@ def parse(words: Sequence[str]) -> Any:
     """
     import tyro
 
+    words = join_settings(words)
+
     module, name = VERBS[words[0]]
     verb = getattr(importlib.import_module(module), name)
     config = (tyro.conf.OmitSubcommandPrefixes,)
     return tyro.cli(verb, args=list(words[1:]), prog=f"rlftsim {words[0]}", config=config)
+
+
+def join_settings(words: Sequence[str]) -> list[str]:
+    """The same words with the values of all `--set` after the last one: it may be given once or many times."""
+    rest: list[str] = []
+    values: list[str] = []
+    is_value = False
+    for word in words:
+        is_value = word == "--set" or (is_value and not word.startswith("-"))
+        (values if is_value else rest).append(word)
+    settings = [value for value in values if value != "--set"]
+    return [*rest, "--set", *settings] if "--set" in values else rest
 
 
 def _run(words: list[str]) -> int:

@@ -10,6 +10,7 @@ import tyro
 from tyro.conf import Positional
 
 from rlftsim.cli.data import data_folder
+from rlftsim.errors import DataError
 from rlftsim.experiments.compare import compare, format_comparison, format_table
 from rlftsim.experiments.evaluate import EvaluateConfig, evaluate
 from rlftsim.experiments.evaluation import Evaluation
@@ -42,6 +43,8 @@ class Evaluate:
         name = self.name or (path.parent.name if path.name == "model" else path.name)
         policy = load_policy_or_oracle(self.model)
         result = evaluate(policy, data_folder(self.data), self.out, self.config, name=name)
+        if not len(result):
+            raise DataError(f"not one of {len(result.skipped)} scenarios could be scored: {result.skipped[0].reason}")
         print_wide(format_table(result))
         for skipped in result.skipped:
             print(f"  skipped {skipped.scenario_id}: {skipped.reason}")

@@ -47,6 +47,8 @@ class Simulate:
 
     def run(self) -> int:
         """Simulate scenario by scenario."""
+        if self.num_rollouts < 1:
+            raise ConfigError(f"--num-rollouts must be at least 1, got {self.num_rollouts}.")
         policy, sampling = load_policy(self.model), Sampling(self.temperature, self.top_k)
         scenarios = open_split(self.data, self.split)
         ids = self.scenario or scenarios.scenario_ids
@@ -81,7 +83,7 @@ class Simulate:
         path = self.out / ABOUT
         old = json.loads(path.read_text()) if path.exists() else about
         differing = [name for name, value in about.items() if name != "model" and old.get(name) != value]
-        if differing:
+        if differing and any(self.out.glob("*.npz")):
             raise ConfigError(
                 f"{self.out} holds rollouts of {old.get('model')} with another {', '.join(differing)}: name another --out."
             )

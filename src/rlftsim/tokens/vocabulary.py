@@ -11,12 +11,12 @@ from pathlib import Path
 import torch
 from jaxtyping import Bool, Float, Int64
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor
 
 from rlftsim.errors import DataError
 from rlftsim.geometry import pose_of_corners
 from rlftsim.scenario.types import ObjectType
+from rlftsim.tensor_file import save_tensors
 
 STEPS_PER_TOKEN = 5
 CLASS_NAMES = ("vehicle", "pedestrian", "cyclist")
@@ -80,10 +80,7 @@ class Vocabulary:
             "token_mask": self.token_mask.contiguous(),
             "map_prototypes": self.map_prototypes.contiguous(),
         }
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_name(path.name + ".partial")
-        save_file(tensors, partial, metadata={"format": FORMAT, "origin": json.dumps(self.origin)})
-        partial.replace(path)
+        save_tensors(path, tensors, {"format": FORMAT, "origin": json.dumps(self.origin)})
 
     @classmethod
     def load(cls, path: Path) -> "Vocabulary":

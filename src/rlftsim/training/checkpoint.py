@@ -11,11 +11,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from rlftsim.errors import CheckpointError
+from rlftsim.tensor_file import save_tensors
 
 PREFIX = "update-"
 KEPT = 2
@@ -46,10 +47,8 @@ def write_checkpoint(folder: Path, progress: Progress, modules: dict[str, nn.Mod
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
     for name, module in modules.items():
-        save_file(
-            {k: v.detach().cpu().contiguous() for k, v in module.state_dict().items()}, partial / f"{name}.safetensors"
-        )
-    save_file(_optimizer_tensors(optimizer), partial / "optimizer.safetensors")
+        save_tensors(partial / f"{name}.safetensors", module.state_dict())
+    save_tensors(partial / "optimizer.safetensors", _optimizer_tensors(optimizer))
     (partial / "progress.json").write_text(json.dumps({"update": progress.update, "numbers": progress.numbers}))
     for path in partial.iterdir():
         with path.open("rb") as file:

@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 from jaxtyping import Bool, Float, Int64
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from rlftsim.errors import CheckpointError
@@ -19,6 +19,7 @@ from rlftsim.policies.smart.distribution import TokenDistribution
 from rlftsim.policies.smart.network import Past, Scene, SmartNetwork, TokenSteps
 from rlftsim.rollout.types import AgentStates, Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
+from rlftsim.tensor_file import save_tensors
 from rlftsim.tokens import public_order
 from rlftsim.tokens.agent_tokens import HISTORY_TOKENS, AgentTokens, class_boxes, nearest_tokens, tokenize_agents
 from rlftsim.tokens.map_tokens import tokenize_map
@@ -202,9 +203,7 @@ class SmartPolicy(nn.Module):
         """Write config.json, model.safetensors, vocabulary.safetensors and README.md (the card) into a folder."""
         folder.mkdir(parents=True, exist_ok=True)
         self.vocabulary.to("cpu").save(folder / "vocabulary.safetensors")
-        partial = folder / "model.safetensors.partial"
-        save_file({k: v.detach().cpu().contiguous() for k, v in self.network.state_dict().items()}, partial)
-        partial.replace(folder / "model.safetensors")
+        save_tensors(folder / "model.safetensors", self.network.state_dict())
         (folder / "README.md").write_text(card or "A SMART traffic model. Origin unknown.\n")
         partial = folder / "config.json.partial"
         partial.write_text(json.dumps({"format": FORMAT, **asdict(self.config)}, indent=1) + "\n")
@@ -224,8 +223,10 @@ class SmartPolicy(nn.Module):
             weights = load_file(folder / "model.safetensors")
             policy = cls(SmartConfig(**values), Vocabulary.load(folder / "vocabulary.safetensors"))
         except FileNotFoundError as error:
-            raise CheckpointError(f"{folder}: not a model folder, {Path(error.filename).name} is missing.") from None
-        except (json.JSONDecodeError, TypeError, SafetensorError, OSError) as error:
+            raise CheckpointError(
+                f"{folder}: not a model folder, {Path(error.filename or 'model.safetensors').name} is missing."
+            ) from None
+        except (ValueError, TypeError, AttributeError, SafetensorError, OSError) as error:
             raise CheckpointError(f"{folder}: damaged model folder ({error}): write it again.") from None
         load_strictly(policy.network, weights, source=str(folder))
         return policy
