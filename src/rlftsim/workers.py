@@ -20,6 +20,11 @@ Task = Callable[[Any, Advance, Callable[[], bool]], Any]
 """Called with an item, a function that reports progress, and one that says whether to give up."""
 
 
+def usable_cores() -> int:
+    """Cores this process may run on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def run_tasks(task: Task, items: Sequence[Any], *, jobs: int, advance: Advance) -> list[Any]:
     """Call `task` for every item, in this process or in several with one thread each; results in the order of the items.
 

@@ -6,7 +6,6 @@ interrupted goes on with what is missing, see `experiments.parts`.
 
 import hashlib
 import math
-import os
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -34,6 +33,7 @@ from rlftsim.experiments.scenario_source import ScenarioSource, open_scenarios
 from rlftsim.realism import MetricConfig, SimulatedStates, build_scenario_log, metric_by_name, score
 from rlftsim.realism.map_based import select_polylines
 from rlftsim.scenario.types import ROAD_EDGE_TYPES, Scenario
+from rlftsim.workers import usable_cores
 
 _NO_ROAD_EDGE = "has no road edge, so the distance to it is undefined"
 _OFFICIAL_NAMES = {
@@ -81,8 +81,7 @@ class ScoreConfig:
     @property
     def num_jobs(self) -> int:
         """Processes to start."""
-        available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        return self.jobs or available
+        return self.jobs or usable_cores()
 
 
 def score_rollouts(

@@ -11,7 +11,7 @@ from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, TOTAL_STEPS, Scen
 
 def states_of_rollouts(batch: ScenarioBatch, rollouts: Rollouts) -> tuple[SimulatedStates, ...]:
     """Each scenario's rollouts without padding, in the world frame. Everybody keeps the height of the current step."""
-    world = (rollouts.position.double() + batch.origin[:, None, None, None].to(batch.device)).float()
+    world = batch.to_world(rollouts.position)
     states = []
     for b, scenario in enumerate(batch.scenarios):
         count = len(scenario.simulated_indices)

@@ -15,7 +15,7 @@ from rlftsim.scenario.types import CURRENT_STEP
 def write_rollouts(folder: Path, batch: ScenarioBatch, rollouts: Rollouts) -> list[Path]:
     """Write each scenario's rollouts to `folder/<scenario id>.npz`, whole or not at all. Returns the files."""
     folder.mkdir(parents=True, exist_ok=True)
-    world = (rollouts.position.double().cpu() + batch.origin[:, None, None, None].cpu()).float().numpy()
+    world = batch.to_world(rollouts.position).cpu().numpy()
     heading, z = rollouts.heading.float().cpu().numpy(), batch.z[:, :, CURRENT_STEP].cpu().numpy()
     files = []
     for b, scenario in enumerate(batch.scenarios):

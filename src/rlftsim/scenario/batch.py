@@ -50,6 +50,10 @@ class ScenarioBatch:
         """Where the tensors live."""
         return self.position.device
 
+    def to_world(self, position: Float[Tensor, "B N A T 2"]) -> Float[Tensor, "B N A T 2"]:
+        """Positions of the map frame in the world frame, float32; added in float64, so that only the result is rounded."""
+        return (position.double() + self.origin[:, None, None, None].to(position.device)).float()
+
     def to(self, device: torch.device | str) -> "ScenarioBatch":
         """The same batch on another device."""
         moved = {f.name: v.to(device) for f in fields(self) if isinstance(v := getattr(self, f.name), Tensor)}

@@ -31,7 +31,7 @@ from rlftsim.scenario.dataset import (
 from rlftsim.scenario.shards import SCHEMA_VERSION, ShardWriter, hash_file
 from rlftsim.scenario.tfrecord import RECORD_OVERHEAD_BYTES, OnError, SkippedRecord, read_records
 from rlftsim.scenario.womd import find_tfrecords, scenario_or_report
-from rlftsim.workers import run_tasks
+from rlftsim.workers import run_tasks, usable_cores
 
 WOMD_LICENCE_NOTE = (
     "Waymo Open Dataset material: Waymo Dataset License Agreement for Non-Commercial Use (waymo.com/open/terms). "
@@ -117,7 +117,7 @@ def convert(
     tasks = _plan(find_tfrecords(source), folder, split, on_error)
     with _claim(folder):
         tasks = _prepare(folder, tasks)
-        outcomes = _run(tasks, jobs or _usable_cores(), show_progress)
+        outcomes = _run(tasks, jobs or usable_cores(), show_progress)
         manifest = _finish(folder, [outcome.entry for outcome in outcomes], licence_note)
     return _report(folder, outcomes, manifest)
 
@@ -287,10 +287,6 @@ def _run(tasks: list[_Task], jobs: int, show_progress: bool) -> list[_Outcome]:
     total = sum(task.source.stat().st_size for task in tasks)
     with progress_bar("converting", total, unit="bytes", show=show_progress) as advance:
         return run_tasks(_convert_file, tasks, jobs=jobs, advance=advance)
-
-
-def _usable_cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _finish(folder: Path, new: list[ShardEntry], licence_note: str) -> Manifest:

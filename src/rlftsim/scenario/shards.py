@@ -156,10 +156,6 @@ class ShardReader:
             raise DataError(f"shard {self.path} is damaged ({error}): {_WAY_OUT}") from error
         return pa.table(columns, schema=pa.schema([*INDEX_FIELDS, pa.field("source_record", pa.int32())]))
 
-    def row_bytes(self, row: int) -> int:
-        """Size of the encoded arrays of a row in bytes."""
-        return sum(0 if data is None else len(data) for data in self._encoded(row).values())
-
     def read(self, row: int) -> Scenario:
         """Decode a row.
 

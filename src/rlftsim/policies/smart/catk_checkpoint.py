@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 from torch import Tensor
 
 from rlftsim.errors import CheckpointError, ConfigError
@@ -26,6 +26,7 @@ from rlftsim.policies.smart.config import SmartConfig, smart_mini, smart_nano, s
 from rlftsim.policies.smart.lightning_file import read_lightning
 from rlftsim.policies.smart.network import SmartNetwork
 from rlftsim.policies.smart.policy import SmartPolicy
+from rlftsim.tensor_file import save_tensors
 from rlftsim.tokens.vocabulary import STEPS_PER_TOKEN
 
 PRESETS = {"nano": smart_nano, "mini": smart_mini, "tiny": smart_tiny}
@@ -96,10 +97,7 @@ def export_catk(policy: SmartPolicy) -> dict[str, Tensor]:
 
 def write_catk(policy: SmartPolicy, path: Path) -> None:
     """Write `export_catk` as a safetensors file, by way of a temporary name."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
-    save_file(export_catk(policy), partial)
-    partial.replace(path)
+    save_tensors(path, export_catk(policy))
 
 
 def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
