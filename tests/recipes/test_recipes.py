@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from rlftsim.cli.train import RecipeName
 from rlftsim.errors import CheckpointError, ConfigError
-from rlftsim.recipes import smart
+from rlftsim.recipes import models, smart
 from rlftsim.recipes.configure import configure
 from rlftsim.recipes.models import load_policy, load_policy_or_oracle
 from rlftsim.recipes.smart import RECIPES, SmartRecipe, smart_demo_rlftsim, smart_tiny_rlftsim
@@ -171,3 +171,10 @@ def test_an_empty_folder_is_no_model(tmp_path):
 
 def test_the_command_line_knows_every_recipe():
     assert set(get_args(RecipeName)) == set(RECIPES)
+
+
+def test_a_gpu_that_is_not_there_is_refused_and_auto_does_without(monkeypatch):
+    monkeypatch.setattr(models.torch.cuda, "is_available", lambda: False)
+    assert models._find_device("auto").type == "cpu"
+    with pytest.raises(ConfigError, match="--device cuda, but torch sees no CUDA device"):
+        models._find_device("cuda")

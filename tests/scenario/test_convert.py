@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from rlftsim.errors import DataError
+from rlftsim.errors import ConfigError, DataError
 from rlftsim.scenario.convert import convert, infer_split
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.inspect import verify_dataset
@@ -54,6 +54,14 @@ def test_any_number_of_jobs_gives_the_same_bytes(source, tmp_path):
     run(source, tmp_path / "one", jobs=1)
     run(source, tmp_path / "two", jobs=2)
     assert contents(tmp_path / "one") == contents(tmp_path / "two")
+
+
+@pytest.mark.parametrize(
+    ("setting", "cause"), [({"jobs": 0}, "jobs must be at least 1, got 0"), ({"split": " "}, "no name")]
+)
+def test_impossible_settings_are_refused(source, tmp_path, setting, cause):
+    with pytest.raises(ConfigError, match=cause):
+        run(source, tmp_path / "data", **setting)
 
 
 def test_a_second_run_does_nothing_again(source, tmp_path):

@@ -5,6 +5,7 @@ import pytest
 from rlftsim.errors import DataError
 from rlftsim.scenario.dataset import write_dataset
 from rlftsim.scenario.inspect import Problem, dataset_stats, verify_dataset
+from rlftsim.scenario.types import Scenario
 from rlftsim.scenario.womd import scenario_from_bytes
 
 
@@ -47,6 +48,18 @@ def test_a_jump_between_valid_states_is_a_teleport(make_dataset, make_message):
     folder = make_dataset(jumping, hidden)
     assert found(folder) == [(Problem.TELEPORT, "a")]
     assert verify_dataset(folder)[0].detail == "track 100 moves 6.1 m from step 39 to 40"
+
+
+def test_a_state_that_is_no_number_is_found_and_never_written(make_dataset, make_message, tmp_path, monkeypatch):
+    scenario = scenario_from_bytes(make_message("a").SerializeToString())
+    scenario.tracks.position[0, 30, 1] = float("nan")
+    with pytest.raises(DataError, match="scenario a: track 100 has a NaN or infinite position at step 30"):
+        write_dataset([scenario], tmp_path / "refused")
+    assert not (tmp_path / "refused").exists()
+    with monkeypatch.context() as other_writer:
+        other_writer.setattr(Scenario, "refuse_not_finite", lambda _: None)
+        write_dataset([scenario], tmp_path / "data")
+    assert (Problem.NOT_FINITE, "a") in found(tmp_path / "data")
 
 
 def test_missing_map_and_nobody_to_evaluate_are_found(make_dataset, make_message):

@@ -17,7 +17,7 @@ from rlftsim.experiments.evaluation import Evaluation
 from rlftsim.experiments.explain import explain_rollouts
 from rlftsim.experiments.score import ScoreConfig, format_scores, score_rollouts, to_json
 from rlftsim.progress import print_wide
-from rlftsim.recipes.models import load_policy_or_oracle
+from rlftsim.recipes.models import Device, load_policy_or_oracle
 
 
 @dataclass(frozen=True)
@@ -35,13 +35,15 @@ class Evaluate:
     """Folder for the results."""
     name: str | None = None
     """Of the row and the file; left out, the model's name."""
+    device: Device = "auto"
+    """Where the model runs; several processes (jobs) need cpu."""
     config: Annotated[EvaluateConfig, tyro.conf.arg(name="")] = field(default_factory=EvaluateConfig)
 
     def run(self) -> int:
         """Evaluate and print the table."""
         path = Path(self.model)
         name = self.name or (path.parent.name if path.name == "model" else path.name)
-        policy = load_policy_or_oracle(self.model)
+        policy = load_policy_or_oracle(self.model, self.device)
         result = evaluate(policy, data_folder(self.data), self.out, self.config, name=name)
         if not len(result):
             raise DataError(f"not one of {len(result.skipped)} scenarios could be scored: {result.skipped[0].reason}")

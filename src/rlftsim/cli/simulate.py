@@ -9,10 +9,10 @@ from tyro.conf import Positional
 from rlftsim.cli.data import open_split
 from rlftsim.errors import ConfigError
 from rlftsim.progress import progress_bar
-from rlftsim.recipes.models import load_policy
+from rlftsim.recipes.models import Device, load_policy
 from rlftsim.rollout.files import write_rollouts
 from rlftsim.rollout.fingerprint import fingerprint_policy
-from rlftsim.rollout.policy import Policy, Sampling
+from rlftsim.rollout.policy import Policy, Sampling, device_of
 from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import ScenarioDataset, with_temporary_name
@@ -44,12 +44,13 @@ class Simulate:
     """Below 1 likely motions become likelier; 0 always takes the most likely one."""
     top_k: int | None = None
     """Sample among this many of the most likely motions only."""
+    device: Device = "auto"
 
     def run(self) -> int:
         """Simulate scenario by scenario."""
         if self.num_rollouts < 1:
             raise ConfigError(f"--num-rollouts must be at least 1, got {self.num_rollouts}.")
-        policy, sampling = load_policy(self.model), Sampling(self.temperature, self.top_k)
+        policy, sampling = load_policy(self.model, self.device), Sampling(self.temperature, self.top_k)
         scenarios = open_split(self.data, self.split)
         ids = self.scenario or scenarios.scenario_ids
         unknown = [i for i in ids if i not in scenarios]
@@ -59,7 +60,7 @@ class Simulate:
         left = [i for i in ids if not (self.out / f"{i}.npz").exists()]
         with progress_bar("simulate", len(ids), len(ids) - len(left)) as advance:
             for scenario_id in left:
-                batch = collate([scenarios.by_id(scenario_id)])
+                batch = collate([scenarios.by_id(scenario_id)]).to(device_of(policy))
                 rollouts = simulate(policy, batch, num_rollouts=self.num_rollouts, seed=self.seed, sampling=sampling)
                 write_rollouts(self.out, batch, rollouts)
                 advance()

@@ -20,7 +20,7 @@ from rlftsim.experiments.parts import ResumableEvaluation
 from rlftsim.realism import SimulatedStates, build_scenario_log, metric_by_name, score
 from rlftsim.realism.from_rollouts import logged_states, states_of_rollouts
 from rlftsim.rollout.fingerprint import fingerprint_policy
-from rlftsim.rollout.policy import Policy
+from rlftsim.rollout.policy import Policy, device_of
 from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import MANIFEST, ScenarioDataset
@@ -63,7 +63,9 @@ def evaluate(
     positions = _choose_scenarios(ScenarioDataset(dataset_folder, config.split), config)
     job = _Job(_frozen_copy(policy), dataset_folder, _describe(policy, dataset_folder, config), name, out)
     if config.jobs > 1 and job.device.type != "cpu":
-        raise ConfigError(f"evaluate.jobs={config.jobs} works on CPUs only, the policy is on {job.device}: set jobs=1.")
+        raise ConfigError(
+            f"evaluate.jobs={config.jobs} works on CPUs only, the policy is on {job.device}: use --jobs 1 or --device cpu."
+        )
     ids = _open(job).scenario_ids[: len(positions)]
     return job.parts.run(
         partial(_evaluate_group, job), ids, jobs=config.jobs, title=f"evaluate {name}", show_progress=show_progress
@@ -119,8 +121,7 @@ class _Job:
 
     @property
     def device(self) -> torch.device:
-        weights = self.policy.parameters() if isinstance(self.policy, nn.Module) else ()
-        return next((w.device for w in weights), torch.device("cpu"))
+        return device_of(self.policy)
 
 
 def _frozen_copy(policy: Policy | Oracle) -> Policy | Oracle:

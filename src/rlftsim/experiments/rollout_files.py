@@ -135,7 +135,9 @@ def _read_npz(path: Path, keys: Sequence[str]) -> dict[str, np.ndarray]:
                 raise DataError(f"{path}: no {', '.join(missing)} in it, only {', '.join(archive.files) or 'nothing'}.")
             return {key: archive[key] for key in keys}
     except _NPZ_DAMAGE as error:
-        raise DataError(f"{path}: not a readable npz ({error}).") from error
+        looks_pickled = isinstance(error, ValueError) and "pickle" in str(error)
+        cause = "an array of Python objects, or not an npz at all; neither is read" if looks_pickled else error
+        raise DataError(f"{path}: not a readable npz ({cause}).") from error
 
 
 def _states_of_npz(entry: RolloutEntry) -> SimulatedStates:

@@ -188,7 +188,7 @@ def check_entries(entries: Sequence[RolloutEntry], source: ScenarioSource, confi
     if unknown and config.missing_scenario == "error":
         raise DataError(
             f"{unknown[0]}: {len(unknown)} of {len(entries)} scenarios with rollouts, this one first, are not among the "
-            f"{len(source)} of {where}: give all scenarios, or set missing_scenario=skip to leave them out."
+            f"{len(source)} of {where}: give all scenarios, or leave them out with missing_scenario=skip (--missing-scenario skip)."
         )
     repeated = [scenario_id for scenario_id, count in Counter(e.scenario_id for e in entries).items() if count > 1]
     if repeated:
@@ -269,8 +269,8 @@ def _refuse_mapless(skipped: Sequence[Skipped], config: ScoreConfig) -> None:
     mapless = [scenario for scenario in skipped if scenario.reason == _NO_ROAD_EDGE]
     if mapless and config.missing_map == "error":
         raise DataError(
-            f"scenario {mapless[0].scenario_id} {_NO_ROAD_EDGE}, as for the official evaluator: set missing_map=skip to leave "
-            "such scenarios out."
+            f"scenario {mapless[0].scenario_id} {_NO_ROAD_EDGE}, as for the official evaluator: leave such "
+            "scenarios out with missing_map=skip (--missing-map skip)."
         )
 
 

@@ -11,8 +11,9 @@ Differences from a classical policy API, each for a reason:
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
+import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from rlftsim.errors import ConfigError
 from rlftsim.goals.types import Goals
@@ -104,3 +105,9 @@ class Policy(Protocol):
     def score(self, context: Any, rollouts: Rollouts) -> DecisionDistribution:
         """What `decide` would have said at each decision of these rollouts [B, N, A, L]; differentiable, one parallel pass."""
         ...
+
+
+def device_of(policy: object) -> torch.device:
+    """Where a policy computes: with its weights; the CPU if it has none."""
+    weights = policy.parameters() if isinstance(policy, nn.Module) else ()
+    return next((w.device for w in weights), torch.device("cpu"))

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from rlftsim.errors import DataError
+from rlftsim.errors import ConfigError, DataError
 from rlftsim.progress import progress_bar
 from rlftsim.scenario.dataset import (
     INCOMPLETE,
@@ -111,7 +111,12 @@ def convert(
     Raises:
         DataError: nothing to read, nothing readable in it, or a destination with something else in it; under "stop"
             also the first bad file or record.
+        ConfigError: fewer than one process, or a split without a name.
     """
+    if jobs is not None and jobs < 1:
+        raise ConfigError(f"jobs must be at least 1, got {jobs}: leave it out for one per core.")
+    if split is not None and not split.strip():
+        raise ConfigError("the split has no name: leave it out to read it off the folder or file.")
     folder = Path(destination)
     _check_destination(folder)
     tasks = _plan(find_tfrecords(source), folder, split, on_error)

@@ -195,7 +195,7 @@ class DatasetWriter:
         """Append a scenario.
 
         Raises:
-            DataError: there is one with this id already, or an array has another dtype than `types.py` says.
+            DataError: there is one with this id already, or it is not as `ShardWriter.add` wants it.
         """
         if scenario.scenario_id in self._ids:
             raise DataError(f"scenario {scenario.scenario_id} is in the data set already: ids must differ")
@@ -251,7 +251,8 @@ def write_dataset(
         The manifest written.
 
     Raises:
-        DataError: the folder is not empty, an id occurs twice, or an array has another dtype than `types.py` says.
+        DataError: the folder is not empty, an id occurs twice, an array has another dtype than `types.py` says, or a valid state
+            or map point is not finite.
     """
     with DatasetWriter(folder, licence_note=licence_note, provenance=provenance) as writer:
         for scenario in scenarios:

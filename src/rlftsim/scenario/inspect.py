@@ -33,6 +33,7 @@ class Problem(StrEnum):
     CONTRADICTORY_LIGHTS = "contradictory lights"
     TELEPORT = "teleport"
     MISSING_MAP = "missing map"
+    NOT_FINITE = "not finite"
     NO_EVALUATED_AGENTS = "no evaluated agents"
 
     @property
@@ -88,8 +89,8 @@ def verify_dataset(folder: str | os.PathLike[str]) -> list[Finding]:
     """Check every shard and every scenario of a data set.
 
     Damage: shards missing or not as the manifest says, index and manifest that do not belong together. Doubtful
-    content: a lane with two states at a step, consecutive valid positions that imply more than 60 m/s, no lanes or no
-    road edges, nobody to evaluate beside the ego.
+    content: NaN or infinite states or map points, a lane with two states at a step, consecutive valid positions that imply
+    more than 60 m/s, no lanes or no road edges, nobody to evaluate beside the ego.
 
     Returns:
         What was found, empty if all is well; damage first.
@@ -226,12 +227,21 @@ def _describe_missing_map(scenario: Scenario) -> str | None:
     return f"no {' and no '.join(missing)}" if missing else None
 
 
+def _describe_not_finite(scenario: Scenario) -> str | None:
+    try:
+        scenario.refuse_not_finite()
+    except DataError as error:
+        return str(error)
+    return None
+
+
 def _describe_nobody_to_evaluate(scenario: Scenario) -> str | None:
     others = scenario.evaluated_indices[scenario.evaluated_indices != scenario.ego_index]
     return None if len(others) else "no track to predict is valid at the current step, only the ego is evaluated"
 
 
 _CHECKS = {
+    Problem.NOT_FINITE: _describe_not_finite,
     Problem.CONTRADICTORY_LIGHTS: _describe_contradictory_lights,
     Problem.TELEPORT: _describe_teleport,
     Problem.MISSING_MAP: _describe_missing_map,

@@ -96,7 +96,8 @@ class ShardWriter:
         """Append a scenario.
 
         Raises:
-            DataError: an array of the scenario has another dtype than `types.py` says.
+            DataError: an array of the scenario has another dtype than `types.py` says, or a valid state or map point is not
+                finite.
         """
         row = _row_of(scenario, split, source_record)
         self._pending.append(row)
@@ -194,6 +195,10 @@ def _row_of(scenario: Scenario, split: str, source_record: int | None) -> dict[s
         array = arrays[name]
         if array is not None and array.dtype != dtype:
             raise DataError(f"scenario {scenario.scenario_id}: {name} is {array.dtype}, it must be {dtype}")
+    try:
+        scenario.refuse_not_finite()
+    except DataError as error:
+        raise DataError(f"scenario {scenario.scenario_id}: {error}") from None
     encoded = {name: None if array is None else encode_array(array) for name, array in arrays.items()}
     return {
         **asdict(compute_index_row(scenario, split)),

@@ -15,6 +15,8 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int8, Int32, Int64
 
+from rlftsim.errors import DataError
+
 STEP_S = 0.1
 HISTORY_STEPS = 11
 CURRENT_STEP = 10
@@ -163,6 +165,31 @@ class Scenario:
     difficulty: Int8[np.ndarray, "n"]
     objects_of_interest: Int64[np.ndarray, "m"]
     """Object ids."""
+
+    def refuse_not_finite(self) -> None:
+        """Look at every valid state and every map point.
+
+        Raises:
+            DataError: one holds a NaN or an infinite number: says which.
+        """
+        tracks = self.tracks
+        kinds = {
+            "position": tracks.position,
+            "size, heading or velocity": np.concatenate([tracks.size, tracks.heading[..., None], tracks.velocity], -1),
+        }
+        for kind, values in kinds.items():
+            bad = np.argwhere(tracks.valid & ~np.isfinite(values).all(-1))
+            if len(bad):
+                track, step = bad[0]
+                raise DataError(
+                    f"track {tracks.object_id[track]} has a NaN or infinite {kind} at step {step}, where it is marked valid"
+                )
+        lines = self.map_features
+        bad_points = np.flatnonzero(~np.isfinite(lines.points).all(1))
+        if len(bad_points):
+            owner = np.searchsorted(lines.offsets, bad_points[0], side="right") - 1
+            place = bad_points[0] - lines.offsets[owner]
+            raise DataError(f"map feature {lines.feature_id[owner]} has a NaN or infinite point (its point {place})")
 
     @property
     def num_steps(self) -> int:

@@ -136,7 +136,7 @@ def scenario_from_bytes(record: bytes) -> Scenario:
     tracks = _read_tracks(message)
     num_steps = tracks.valid.shape[1]
     ego_index = _read_ego_index(message, tracks)
-    return Scenario(
+    scenario = Scenario(
         scenario_id=message.scenario_id,
         timestamps_s=_read_timestamps(message, num_steps),
         tracks=tracks,
@@ -147,6 +147,8 @@ def scenario_from_bytes(record: bytes) -> Scenario:
         difficulty=np.array([item.difficulty for item in message.tracks_to_predict], np.int8),
         objects_of_interest=np.array(message.objects_of_interest, np.int64),
     )
+    scenario.refuse_not_finite()
+    return scenario
 
 
 def _read_tracks(message: womd_pb2.Scenario) -> Tracks:
@@ -182,7 +184,6 @@ def _read_tracks(message: womd_pb2.Scenario) -> Tracks:
     values = _to_float32(states)
     valid = states[..., 9] != 0
     object_id = np.array([track.id for track in message.tracks], np.int64)
-    _check_finite(values, valid, object_id)
     return Tracks(
         object_id=object_id,
         object_type=np.array([track.object_type for track in message.tracks], np.int8),
@@ -198,16 +199,6 @@ def _to_float32(values: np.ndarray) -> np.ndarray:
     """Nearest float32; what lies outside its range becomes infinite without a warning and is refused later."""
     with np.errstate(over="ignore"):
         return values.astype(np.float32)
-
-
-def _check_finite(values: np.ndarray, valid: np.ndarray, object_id: np.ndarray) -> None:
-    bad = valid & ~np.isfinite(values).all(-1)
-    if bad.any():
-        track, step = np.argwhere(bad)[0]
-        kind = "position" if not np.isfinite(values[track, step, :3]).all() else "size, heading or velocity"
-        raise DataError(
-            f"track {object_id[track]} has a NaN or infinite {kind} at step {step}, where it is marked valid"
-        )
 
 
 def _read_ego_index(message: womd_pb2.Scenario, tracks: Tracks) -> int:
@@ -280,12 +271,6 @@ def _read_map(features: Sequence[womd_pb2.MapFeature]) -> MapFeatures:
     np.cumsum([len(points) for _, points in typed_points], out=offsets[1:])
     feature_id = np.array([feature.id for feature in features], np.int64)
     points = _to_float32(np.array(flat, np.float64)).reshape(-1, 3)
-    bad = np.flatnonzero(~np.isfinite(points).all(1))
-    if len(bad):
-        owner = np.searchsorted(offsets, bad[0], side="right") - 1
-        raise DataError(
-            f"map feature {feature_id[owner]} has a NaN or infinite point (its point {bad[0] - offsets[owner]})"
-        )
     return MapFeatures(
         feature_id=feature_id,
         feature_type=np.array([kind for kind, _ in typed_points], np.int8),
