@@ -11,7 +11,7 @@ PACKAGE = Path(rlftsim.__file__).parent
 
 FLOORS = (
     ("errors",),
-    ("geometry", "progress", "tensor_file", "workers"),
+    ("files", "geometry", "progress", "workers"),
     ("scenario",),
     ("tokens", "goals"),
     ("rollout",),

@@ -1,12 +1,11 @@
 import json
-import os
 import re
 
 import numpy as np
 import pytest
 
 from rlftsim.errors import DataError
-from rlftsim.viewer.page import Animation, Panel, animation_html, write_page, write_text
+from rlftsim.viewer.page import Animation, Panel, animation_html, write_page
 from rlftsim.viewer.picture import to_png
 from rlftsim.viewer.scene import Trajectories, build_scene, logged_trajectories
 
@@ -88,19 +87,6 @@ def test_panel_of_another_scene_is_refused(animation):
     fewer = Trajectories(log.position[:, :2], log.heading[:, :2], log.valid[:, :2])
     with pytest.raises(DataError, match="2 agents, but scene drawn has 3"):
         Animation("Scene", animation.scene, [Panel("Logged", fewer)])
-
-
-def test_failed_write_leaves_the_old_file_and_no_other(tmp_path, monkeypatch):
-    write_text(tmp_path / "page.html", "old")
-
-    def fail(*_):
-        raise OSError("disk full")
-
-    monkeypatch.setattr(os, "replace", fail)
-    with pytest.raises(OSError, match="disk full"):
-        write_text(tmp_path / "page.html", "new")
-    assert [p.name for p in tmp_path.iterdir()] == ["page.html"]
-    assert (tmp_path / "page.html").read_text() == "old"
 
 
 def test_picture_is_a_png_of_all_panels(animation, tmp_path):

@@ -8,6 +8,7 @@ from tyro.conf import Positional
 
 from rlftsim.cli.data import open_split
 from rlftsim.errors import ConfigError
+from rlftsim.files import write_text
 from rlftsim.progress import progress_bar
 from rlftsim.recipes.models import Device, load_policy
 from rlftsim.rollout.files import write_rollouts
@@ -15,7 +16,7 @@ from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import Policy, Sampling, device_of
 from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import collate
-from rlftsim.scenario.dataset import ScenarioDataset, with_temporary_name
+from rlftsim.scenario.dataset import ScenarioDataset
 
 ABOUT = "rollouts.json"
 """Whose rollouts are in the folder."""
@@ -88,5 +89,4 @@ class Simulate:
             raise ConfigError(
                 f"{self.out} holds rollouts of {old.get('model')} with another {', '.join(differing)}: name another --out."
             )
-        self.out.mkdir(parents=True, exist_ok=True)
-        with_temporary_name(path, lambda temporary: temporary.write_text(json.dumps(about, indent=1) + "\n"))
+        write_text(path, json.dumps(about, indent=1) + "\n")

@@ -16,9 +16,9 @@ import pyarrow.parquet as pq
 
 import rlftsim
 from rlftsim.errors import ConfigError, DataError
+from rlftsim.files import write_whole
 from rlftsim.realism import FEATURE_NAMES, RealismResult, metric_by_name
 from rlftsim.rollout.policy import Sampling
-from rlftsim.scenario.dataset import with_temporary_name
 
 FORMAT = "rlftsim-evaluation-1"
 LIGHT = "traffic_light_violation"
@@ -196,8 +196,7 @@ class Evaluation:
             "skipped": [asdict(s) for s in self.skipped],
         }
         table = self.table.replace_schema_metadata({"rlftsim": json.dumps(about)})
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with_temporary_name(path, lambda temporary: pq.write_table(table, temporary, compression="zstd"))
+        write_whole(path, lambda temporary: pq.write_table(table, temporary, compression="zstd"))
 
     @classmethod
     def read(cls, path: Path) -> "Evaluation":

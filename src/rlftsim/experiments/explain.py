@@ -10,9 +10,9 @@ from rlftsim.experiments.parts import one_thread
 from rlftsim.experiments.rollout_files import RolloutEntry, find_rollouts, read_states
 from rlftsim.experiments.scenario_source import ScenarioSource, open_scenarios
 from rlftsim.experiments.score import ScoreConfig, check_entries, has_road_edge
+from rlftsim.files import write_text
 from rlftsim.progress import progress_bar
 from rlftsim.realism import metric_by_name
-from rlftsim.viewer.page import write_text
 from rlftsim.workers import run_tasks
 
 

@@ -5,12 +5,14 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
+from pathlib import Path
 
 import numpy as np
 from rich.table import Table
 
+from rlftsim.files import write_text
 from rlftsim.viewer.chart import Chart, chart_html, format_tick, nice_ticks
-from rlftsim.viewer.page import Animation, animation_html, page_html, read_asset, write_text
+from rlftsim.viewer.page import Animation, animation_html, page_html, read_asset
 
 NORMAL_QUANTILE_95 = 1.959964
 """Half-width of a 95 % interval in standard errors."""
@@ -169,7 +171,7 @@ COLUMNS = (
 
 def write_report(path: str | os.PathLike[str], report: Report) -> None:
     """Write the report as one self-contained HTML page. Nothing half-written is left at `path`."""
-    write_text(path, report_html(report))
+    write_text(Path(path), report_html(report))
 
 
 def report_html(report: Report) -> str:

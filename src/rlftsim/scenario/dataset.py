@@ -28,6 +28,7 @@ import pyarrow.parquet as pq
 
 import rlftsim
 from rlftsim.errors import DataError
+from rlftsim.files import write_text, write_whole
 from rlftsim.scenario.shards import INDEX_FIELDS, SCHEMA_VERSION, ShardReader, ShardWriter, hash_file
 from rlftsim.scenario.tfrecord import SkippedRecord
 from rlftsim.scenario.types import Scenario
@@ -278,7 +279,7 @@ def write_index_and_manifest(
     """
     entries = sorted(entries, key=lambda entry: entry.file)
     table, duplicates = build_index(folder, entries)
-    with_temporary_name(folder / INDEX, lambda path: pq.write_table(table, path, compression="zstd"))
+    write_whole(folder / INDEX, lambda path: pq.write_table(table, path, compression="zstd"))
     manifest = Manifest(
         shards=tuple(entries),
         num_scenarios=table.num_rows,
@@ -333,18 +334,8 @@ def shard_entry_from_json(values: Mapping[str, Any]) -> ShardEntry:
 
 
 def write_json(path: Path, values: Mapping[str, object]) -> None:
-    """Write plain values as JSON under a temporary name, then rename."""
-    text = json.dumps(values, indent=1, sort_keys=True) + "\n"
-    with_temporary_name(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
-
-
-def with_temporary_name(path: Path, write: Callable[[Path], object]) -> None:
-    """Let `write` write a temporary file beside `path`, then give it that name."""
-    temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
-    write(temporary)
-    with open(temporary, "rb") as file:
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
+    """Write plain values as JSON, whole or not at all."""
+    write_text(path, json.dumps(values, indent=1, sort_keys=True) + "\n")
 
 
 def build_index(folder: Path, entries: Iterable[ShardEntry]) -> tuple[pa.Table, list[SkippedRecord]]:

@@ -14,9 +14,9 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from rlftsim.errors import DataError
+from rlftsim.files import save_tensors
 from rlftsim.geometry import pose_of_corners
 from rlftsim.scenario.types import ObjectType
-from rlftsim.tensor_file import save_tensors
 
 STEPS_PER_TOKEN = 5
 CLASS_NAMES = ("vehicle", "pedestrian", "cyclist")

@@ -5,7 +5,6 @@ whole, so what carries the name is never half-written.
 """
 
 import json
-import os
 import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,7 +15,7 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from rlftsim.errors import CheckpointError
-from rlftsim.tensor_file import save_tensors
+from rlftsim.files import save_tensors, write_text
 
 PREFIX = "update-"
 KEPT = 2
@@ -49,10 +48,7 @@ def write_checkpoint(folder: Path, progress: Progress, modules: dict[str, nn.Mod
     for name, module in modules.items():
         save_tensors(partial / f"{name}.safetensors", module.state_dict())
     save_tensors(partial / "optimizer.safetensors", _optimizer_tensors(optimizer))
-    (partial / "progress.json").write_text(json.dumps({"update": progress.update, "numbers": progress.numbers}))
-    for path in partial.iterdir():
-        with path.open("rb") as file:
-            os.fsync(file.fileno())
+    write_text(partial / "progress.json", json.dumps({"update": progress.update, "numbers": progress.numbers}))
     shutil.rmtree(target, ignore_errors=True)
     partial.rename(target)
     for old in sorted(folder.glob(f"{PREFIX}*"))[:-KEPT]:

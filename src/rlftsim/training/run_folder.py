@@ -25,6 +25,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 from rlftsim import __version__
 from rlftsim.errors import CheckpointError
+from rlftsim.files import write_text
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.scenario.types import Scenarios
 from rlftsim.training.checkpoint import newest_checkpoint
@@ -62,14 +63,6 @@ def to_plain(config: Any) -> Any:
     if isinstance(config, list | tuple):
         return [to_plain(v) for v in config]
     return config if isinstance(config, str | int | float | bool | None) else str(config)
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a file whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.partial")
-    partial.write_text(text)
-    partial.replace(path)
 
 
 def describe_environment() -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 import json
 import os
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -12,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from rlftsim.errors import DataError
+from rlftsim.files import write_text
 from rlftsim.viewer.scene import SceneView, Trajectories
 
 SPEEDS = (0.25, 0.5, 1, 2, 4)
@@ -96,22 +96,7 @@ def write_page(path: str | os.PathLike[str], title: str, animations: Sequence[An
     """A page of animations and nothing else. Nothing half-written is left at `path`."""
     intro = f'<p class="lead">{escape(caption)}</p>' if caption else ""
     figures = "\n".join(animation_html(animation) for animation in animations)
-    write_text(path, page_html(title, f"<h1>{escape(title)}</h1>{intro}\n{figures}"))
-
-
-def write_text(path: str | os.PathLike[str], text: str) -> None:
-    """Write under a temporary name beside `path`, then rename."""
-    target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=".part")
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.write(text)
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, target)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    write_text(Path(path), page_html(title, f"<h1>{escape(title)}</h1>{intro}\n{figures}"))
 
 
 def embed_json(payload: Any) -> str:

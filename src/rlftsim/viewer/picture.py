@@ -1,7 +1,6 @@
 """One still picture of a scene: panels side by side, with the paths of all rollouts as thin lines."""
 
 import os
-import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +10,7 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from rlftsim.files import write_whole
 from rlftsim.scenario.types import CURRENT_STEP, ObjectType
 from rlftsim.viewer.page import Animation, Panel
 from rlftsim.viewer.scene import AgentBoxes, SceneView
@@ -56,18 +56,8 @@ def to_png(
 
 
 def _save(figure: Figure, target: Path, dots_per_inch: int) -> None:
-    """Write beside the target, then rename."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=".part")
-    os.close(handle)
-    try:
-        FigureCanvasAgg(figure)
-        figure.savefig(temporary, format="png", dpi=dots_per_inch, facecolor="white")
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, target)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    FigureCanvasAgg(figure)
+    write_whole(target, lambda path: figure.savefig(path, format="png", dpi=dots_per_inch, facecolor="white"))
 
 
 def _draw_panel(axis: Axes, scene: SceneView, panel: Panel, step: int) -> None:

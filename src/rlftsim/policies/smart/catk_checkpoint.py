@@ -15,6 +15,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from rlftsim.errors import CheckpointError, ConfigError
+from rlftsim.files import save_tensors
 from rlftsim.policies.smart.catk_keys import PREFIX, aliases, catk_name
 from rlftsim.policies.smart.catk_vocabulary import (
     PUBLISHED_AGENT_FILE,
@@ -26,7 +27,6 @@ from rlftsim.policies.smart.config import SmartConfig, smart_mini, smart_nano, s
 from rlftsim.policies.smart.lightning_file import read_lightning
 from rlftsim.policies.smart.network import SmartNetwork
 from rlftsim.policies.smart.policy import SmartPolicy
-from rlftsim.tensor_file import save_tensors
 from rlftsim.tokens.vocabulary import STEPS_PER_TOKEN
 
 PRESETS = {"nano": smart_nano, "mini": smart_mini, "tiny": smart_tiny}

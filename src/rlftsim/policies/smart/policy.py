@@ -11,6 +11,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from rlftsim.errors import CheckpointError
+from rlftsim.files import save_tensors, write_text
 from rlftsim.geometry import box_corners, pose_of_corners, rotate, wrap_angle
 from rlftsim.goals.types import Goals
 from rlftsim.policies.layers import normalize
@@ -19,7 +20,6 @@ from rlftsim.policies.smart.distribution import TokenDistribution
 from rlftsim.policies.smart.network import Past, Scene, SmartNetwork, TokenSteps
 from rlftsim.rollout.types import AgentStates, Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
-from rlftsim.tensor_file import save_tensors
 from rlftsim.tokens import public_order
 from rlftsim.tokens.agent_tokens import HISTORY_TOKENS, AgentTokens, class_boxes, nearest_tokens, tokenize_agents
 from rlftsim.tokens.map_tokens import tokenize_map
@@ -204,10 +204,8 @@ class SmartPolicy(nn.Module):
         folder.mkdir(parents=True, exist_ok=True)
         self.vocabulary.to("cpu").save(folder / "vocabulary.safetensors")
         save_tensors(folder / "model.safetensors", self.network.state_dict())
-        (folder / "README.md").write_text(card or "A SMART traffic model. Origin unknown.\n")
-        partial = folder / "config.json.partial"
-        partial.write_text(json.dumps({"format": FORMAT, **asdict(self.config)}, indent=1) + "\n")
-        partial.replace(folder / "config.json")
+        write_text(folder / "README.md", card or "A SMART traffic model. Origin unknown.\n")
+        write_text(folder / "config.json", json.dumps({"format": FORMAT, **asdict(self.config)}, indent=1) + "\n")
 
     @classmethod
     def from_pretrained(cls, folder: Path) -> "SmartPolicy":

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from rlftsim.errors import ConfigError, DataError, RlftsimError
+from rlftsim.files import write_text
 from rlftsim.progress import progress_bar
 from rlftsim.scenario.dataset import (
     INCOMPLETE,
@@ -19,7 +20,6 @@ from rlftsim.scenario.dataset import (
     Manifest,
     describe_shard,
     read_manifest,
-    with_temporary_name,
     write_index_and_manifest,
 )
 from rlftsim.scenario.shards import ShardReader, ShardWriter
@@ -267,7 +267,7 @@ def _claim(folder: Path, provenance: dict[str, object]) -> None:
     if folder.exists() and any(folder.iterdir()):
         raise DataError(f"{folder} is not empty: choose another folder or delete it")
     (folder / SHARDS).mkdir(parents=True)
-    with_temporary_name(marker, lambda path: path.write_text(json.dumps(provenance, indent=1), encoding="utf-8"))
+    write_text(marker, json.dumps(provenance, indent=1))
 
 
 def _make_shards(tasks: list[NetworkTask], folder: Path, jobs: int, show_progress: bool) -> None:

@@ -56,8 +56,8 @@ class Network:
     plan: StreetPlan
     lanes: dict[str, Lane]
     connectors: tuple[Connector, ...]
-    junction_shapes: dict[str, Float[np.ndarray, "n 2"]]
-    crosswalks: tuple[tuple[str, Float[np.ndarray, "n 2"], float], ...]
+    junction_shapes: dict[str, Float[np.ndarray, "_ 2"]]
+    crosswalks: tuple[tuple[str, Float[np.ndarray, "_ 2"], float], ...]
     """Junction, centre line, width in metres."""
     lights: tuple[str, ...]
 
@@ -91,7 +91,7 @@ def _read_lanes(root: ElementTree.Element, plan: StreetPlan) -> dict[str, Lane]:
     return lanes
 
 
-def join_shapes(shapes: list[Float[np.ndarray, "n 2"]]) -> Float[np.ndarray, "n 2"]:
+def join_shapes(shapes: list[Float[np.ndarray, "_ 2"]]) -> Float[np.ndarray, "n 2"]:
     """Polylines put end to end, doubled points removed."""
     points = np.concatenate(shapes)
     keep = np.append(True, np.linalg.norm(np.diff(points, axis=0), axis=1) > 1e-3)
