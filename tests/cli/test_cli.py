@@ -14,8 +14,12 @@ from rlftsim import __version__
 from rlftsim.cli.data import open_split
 from rlftsim.cli.main import VERBS, main, parse
 from rlftsim.cli.train import RecipeName
+from rlftsim.policies.smart.config import smart_demo
+from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.recipes.smart import RECIPES
 from rlftsim.scenario.synthetic import pack_path
+from rlftsim.tokens.vocabulary import Vocabulary
+from rlftsim.training.run_folder import read_metrics
 
 
 def run(capsys, *arguments) -> tuple[int, str, str]:
@@ -173,6 +177,14 @@ def test_pretraining_and_fine_tuning_by_command(vocabulary, tmp_path, capsys):
     status, out, _ = run(capsys, "finetune", "smart-demo", "--model", base, *common, "--out", tuned, "--set", *once)
     assert status == 0
     assert json.loads((tuned / "config.json").read_text())["num_rollouts"] == 2
+    # the same model, fine-tuned with CAT-K
+    few = ["catk.epochs=0.05", "catk.batch-size=1", "catk.device.threads=1", "catk.num-candidates=4"]
+    few += ["catk.validation.every=1", "catk.validation.num-scenarios=2", "catk.validation.num-rollouts=2"]
+    words = ["finetune", "smart-demo", "--method", "catk", "--model", base, *common, "--out", tmp_path / "catk"]
+    assert run(capsys, *words, "--set", *few)[0] == 0
+    assert json.loads((tmp_path / "catk" / "config.json").read_text())["num_candidates"] == 4
+    assert "CAT-K" in (tmp_path / "catk" / "model" / "README.md").read_text()
+    assert len([line for line in read_metrics(tmp_path / "catk") if line["validation_rmm"] > 0]) == 2
     # the same folder with other settings is another run
     status, _, err = run(
         capsys, "finetune", "smart-demo", "--model", base, *common, "--out", tuned, "--set", *once, "finetune.seed=1"
@@ -214,6 +226,30 @@ def test_settings_without_effect_are_refused(tmp_path, capsys):
     status, _, err = run(capsys, *words, "--set", "finetune.reward=rloo")
     assert status == 2
     assert "finetune.reward has no effect here: only fields of model and pretrain can be set" in err
+
+
+@pytest.mark.parametrize(
+    ("more", "expected"),
+    [
+        (
+            ["--method", "catk", "--set", "finetune.reward=rloo"],
+            "finetune.reward has no effect here: only fields of catk",
+        ),
+        (["--set", "catk.num_candidates=4"], "catk.num_candidates has no effect here: only fields of finetune"),
+        (["--method", "catk", "--set", "catk.choice=farthest"], "expected one of closest, top_k, trajeglish"),
+        (["--method", "catk", "--validation-split", "validation"], "--validation-split validation has no effect"),
+        (["--validation-split", "validation"], "--validation-split validation has no effect"),
+        (["--method", "catk", "--validation-split", "tests", "--set", "catk.validation.every=1"], "no split 'tests'"),
+    ],
+)
+def test_what_has_no_effect_on_a_method_is_refused(more, expected, tmp_path, vocabulary, capsys):
+    policy = SmartPolicy(smart_demo(), Vocabulary.load(vocabulary))
+    policy.save_pretrained(tmp_path / "base")
+    words = ["finetune", "smart-demo", "--model", tmp_path / "base", "--data", "synthetic", "--out", tmp_path / "o"]
+    status, _, err = run(capsys, *words, *more)
+    assert (status, err.count("\n")) == (2, 1)
+    assert expected in err
+    assert not (tmp_path / "o").exists()
 
 
 def test_comparing_an_evaluation_with_itself(evaluation, capsys):

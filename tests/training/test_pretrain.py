@@ -9,7 +9,9 @@ import torch
 import scenes
 from rlftsim.errors import ConfigError
 from rlftsim.scenario.batch import collate
-from rlftsim.training.pretrain import PretrainConfig, learning_rate, pretrain, trained_agents
+from rlftsim.training.data import trained_agents
+from rlftsim.training.imitation import learning_rate
+from rlftsim.training.pretrain import PretrainConfig, pretrain
 from rlftsim.training.run_folder import read_metrics
 
 
@@ -36,30 +38,31 @@ def test_gradients_do_not_depend_on_how_many_scenarios_are_in_memory(vocabulary,
             torch.testing.assert_close(gradients[name], gradient, atol=1e-6, rtol=1e-5, msg=name)
 
 
+NEAR = {"radius_m": 100.0, "limit": None, "seed": 0}
+
+
 def test_the_same_agents_are_trained_on_however_a_batch_is_cut(drawn_scenarios):
-    config = PretrainConfig(max_trained_agents=5)
-    whole = trained_agents(collate(drawn_scenarios), config, update=4)
+    few = {**NEAR, "limit": 5}
+    whole = trained_agents(collate(drawn_scenarios), 4, **few)
     for row, scenario in enumerate(drawn_scenarios):
-        alone = trained_agents(collate([scenario]), config, update=4)[0]
+        alone = trained_agents(collate([scenario]), 4, **few)[0]
         assert torch.equal(alone, whole[row, : len(alone)]), scenario.scenario_id
 
 
 def test_evaluated_agents_come_first_and_the_limit_holds():
     batch = collate([scenes.crowd(num_agents=60)])
-    chosen = trained_agents(batch, PretrainConfig(max_trained_agents=12), update=0)
+    chosen = trained_agents(batch, 0, **{**NEAR, "limit": 12})
     assert int(chosen.sum()) == 12
     assert bool((chosen | ~batch.evaluated_mask).all())
     assert int(batch.evaluated_mask.sum()) == 8
-    other = trained_agents(batch, PretrainConfig(max_trained_agents=12), update=1)
+    other = trained_agents(batch, 1, **{**NEAR, "limit": 12})
     assert not torch.equal(chosen, other)
 
 
 def test_without_a_limit_everybody_near_with_a_future_is_trained_on():
     batch = collate([scenes.with_gaps()])
-    chosen = trained_agents(batch, PretrainConfig(max_trained_agents=None), update=0)
-    assert torch.equal(chosen, batch.agent_mask)
-    near = trained_agents(batch, PretrainConfig(max_trained_agents=None, trained_radius_m=0.1), update=0)
-    assert torch.equal(near, batch.evaluated_mask)
+    assert torch.equal(trained_agents(batch, 0, **NEAR), batch.agent_mask)
+    assert torch.equal(trained_agents(batch, 0, **{**NEAR, "radius_m": 0.1}), batch.evaluated_mask)
 
 
 def test_the_learning_rate_warms_up_and_falls_along_a_cosine():

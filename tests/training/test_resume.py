@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -16,13 +15,12 @@ from safetensors.torch import load_file
 
 import rlftsim
 from rlftsim.training import finetune as finetune_module
-from rlftsim.training import pretrain as pretrain_module
-from rlftsim.training.finetune import finetune
-from rlftsim.training.pretrain import pretrain
+from rlftsim.training import imitation as imitation_module
 from rlftsim.training.run_folder import read_metrics
 
-MODULES = {"pretrain": pretrain_module, "finetune": finetune_module}
-WORK = {"pretrain": "_update", "finetune": "update_policy"}
+MODULES = {"pretrain": imitation_module, "catk": imitation_module, "finetune": finetune_module}
+WORK = {"pretrain": "_update", "catk": "_update", "finetune": "update_policy"}
+STAGES = list(MODULES)
 
 
 def weights(out: Path) -> dict[str, torch.Tensor]:
@@ -37,10 +35,7 @@ def assert_same_weights(first: Path, second: Path):
 
 
 def train(stage, vocabulary, scenarios, out, **changes):
-    policy = tiny.tiny_policy(vocabulary)
-    if stage == "pretrain":
-        return pretrain(policy, scenarios, out, replace(tiny.PRETRAIN, **changes))
-    return finetune(policy, scenarios, out, replace(tiny.FINETUNE, **changes))
+    return tiny.train(stage, tiny.tiny_policy(vocabulary), scenarios, out, **changes)
 
 
 def stop_at(monkeypatch, stage, update):
@@ -58,7 +53,7 @@ def stop_at(monkeypatch, stage, update):
     monkeypatch.setattr(module, name, interrupted)
 
 
-@pytest.mark.parametrize("stage", ["pretrain", "finetune"])
+@pytest.mark.parametrize("stage", STAGES)
 @pytest.mark.parametrize("update", [1, 4])
 def test_a_run_interrupted_inside_an_update_ends_as_if_it_never_was(
     stage, update, vocabulary, drawn_scenarios, tmp_path, monkeypatch
@@ -79,7 +74,7 @@ def test_a_run_interrupted_inside_an_update_ends_as_if_it_never_was(
         assert {k: mine[k] for k in timeless} == {k: other[k] for k in timeless}
 
 
-@pytest.mark.parametrize("stage", ["pretrain", "finetune"])
+@pytest.mark.parametrize("stage", STAGES)
 def test_a_finished_run_does_nothing_more(stage, vocabulary, drawn_scenarios, tmp_path, monkeypatch):
     changes = {"epochs": 0.5, "batch_size": 1}
     train(stage, vocabulary, drawn_scenarios, tmp_path, **changes)
@@ -133,12 +128,13 @@ def test_a_run_killed_at_a_random_moment_ends_as_if_it_never_was(stage, tmp_path
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("stage", ["pretrain", "finetune"])
+@pytest.mark.parametrize("stage", STAGES)
 def test_two_processes_find_the_gradient_of_one(stage, tmp_path):
     for processes in (1, 2):
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
         command = [sys.executable, tiny.__file__, stage, str(tmp_path / str(processes)), "--updates", "1"]
         command += ["--batch-size", "4", "--processes", str(processes)]
+        command += [] if stage == "finetune" else ["--micro-batch-size", "1"]
         done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
         assert done.returncode == 0, done.stderr[-2000:]
     one, two = (load_file(tmp_path / n / "gradients.safetensors") for n in ("1", "2"))
@@ -147,6 +143,6 @@ def test_two_processes_find_the_gradient_of_one(stage, tmp_path):
     for name, gradient in one.items():
         torch.testing.assert_close(two[name], gradient, atol=1e-6, rtol=1e-5, msg=name)
     a, b = (read_metrics(tmp_path / n)[0] for n in ("1", "2"))
-    watched = ["loss", "accuracy", "predictions"] if stage == "pretrain" else ["kl", "entropy", "gradient_norm", "rmm"]
+    watched = ["kl", "entropy", "gradient_norm", "rmm"] if stage == "finetune" else ["loss", "accuracy", "predictions"]
     for name in watched:
         assert b[name] == pytest.approx(a[name], rel=1e-5, abs=1e-6), name

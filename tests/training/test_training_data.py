@@ -1,9 +1,13 @@
 from collections import Counter
+from dataclasses import replace
 
+import numpy as np
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rlftsim.training.data import scenarios_of_update
+import scenes
+from rlftsim.training.data import batch_with_futures, scenarios_of_update, within_reach
 
 
 @given(num=st.integers(1, 40), size=st.integers(1, 16), epochs=st.integers(1, 4), seed=st.integers(0, 99))
@@ -28,3 +32,28 @@ def test_epochs_and_seeds_have_orders_of_their_own():
 def test_a_batch_larger_than_the_data_set_takes_some_scenarios_again():
     counts = Counter(scenarios_of_update(0, 7, 3, 0))
     assert sorted(counts.values()) == [2, 2, 3]
+
+
+def test_what_is_far_from_the_ego_is_not_seen():
+    [scenario] = [scenes.straight_road()]
+    tracks, ego = scenario.tracks, scenario.ego_index
+    other = next(i for i in scenario.simulated_indices if i != ego)
+    position, valid = tracks.position.copy(), np.ones_like(tracks.valid)
+    position[:] = position[ego]
+    position[other, :, 2] += 3.0
+    position[other, 40:, 0] += np.float32(4.0)  # 3, 4, 5: three metres above it counts
+    moved = replace(scenario, tracks=replace(tracks, position=position, valid=valid))
+    near = within_reach(moved, 5.0)
+    assert near.tracks.valid[other].tolist() == [True] * 40 + [False] * 51
+    assert near.tracks.valid[ego].all()
+    assert moved.tracks.valid.all()  # the scenario itself is untouched
+    assert within_reach(moved, 5.0) is near  # so that its tokens are remembered
+    assert within_reach(moved, 5.1) is moved
+    assert other not in within_reach(moved, 3.0).simulated_indices  # out of reach at the current step
+
+
+def test_a_batch_leaves_out_what_is_far(drawn_scenarios):
+    whole = batch_with_futures(drawn_scenarios, range(4))
+    near = batch_with_futures(drawn_scenarios, range(4), context_radius_m=20.0)
+    assert torch.equal(batch_with_futures(drawn_scenarios, range(4), context_radius_m=1e6).valid, whole.valid)
+    assert 0 < int(near.valid.sum()) < int(whole.valid.sum())

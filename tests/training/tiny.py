@@ -1,6 +1,6 @@
 """A model so small that a whole training run takes seconds, for tests; also a command, so that a run can be killed or spread.
 
-python tests/training/tiny.py pretrain|finetune OUT [--processes 2] [--updates 8]
+python tests/training/tiny.py pretrain|catk|finetune OUT [--processes 2] [--updates 8]
 """
 
 import argparse
@@ -15,6 +15,7 @@ from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.synthetic import pack_path
 from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
+from rlftsim.training.catk import CatkConfig, catk_finetune
 from rlftsim.training.finetune import FinetuneConfig, finetune
 from rlftsim.training.parallel import DeviceConfig
 from rlftsim.training.pretrain import PretrainConfig, pretrain
@@ -28,6 +29,7 @@ MODEL = SmartConfig(
 )  # fmt: skip
 WITHOUT_CHANCE = replace(MODEL, dropout=0.0, history_drop=0.0)
 PRETRAIN = PretrainConfig(epochs=1.6, batch_size=1, learning_rate=1e-3, label_smoothing=0.0, checkpoint_every=2, device=CPU)  # fmt: skip
+CATK = CatkConfig(epochs=1.6, batch_size=1, learning_rate=1e-3, num_candidates=8, checkpoint_every=2, device=CPU)
 FINETUNE = FinetuneConfig(
     epochs=1.6,
     batch_size=1,
@@ -70,7 +72,16 @@ def gradients_of(policy):
     return {name: p.grad.clone() for name, p in policy.named_parameters() if p.grad is not None}
 
 
-def run(stage, out, *, updates=8, processes=1, batch_size=1):
+def train(stage, policy, scenarios, out, held_out=None, **changes):
+    """Run a stage with other values for some of its fields."""
+    if stage == "pretrain":
+        return pretrain(policy, scenarios, out, replace(PRETRAIN, **changes), held_out=held_out)
+    if stage == "catk":
+        return catk_finetune(policy, scenarios, out, replace(CATK, **changes), held_out=held_out)
+    return finetune(policy, scenarios, out, replace(FINETUNE, **changes))
+
+
+def run(stage, out, *, updates=8, processes=1, batch_size=1, micro_batch_size=None):
     """Train on the pack's scenarios; also writes the gradients of the last update."""
     scenarios = pack_scenarios()
     policy = tiny_policy(small_vocabulary(scenarios), WITHOUT_CHANCE if batch_size > 1 else MODEL)
@@ -78,10 +89,9 @@ def run(stage, out, *, updates=8, processes=1, batch_size=1):
         "device": replace(CPU, devices=processes), "batch_size": batch_size,
         "epochs": updates * batch_size / NUM_SCENARIOS, "gradient_clip": 1e9 if batch_size > 1 else 1.0,
     }  # fmt: skip
-    if stage == "pretrain":
-        pretrain(policy, scenarios, out, replace(PRETRAIN, max_trained_agents=None, **changes))
-    else:
-        finetune(policy, scenarios, out, replace(FINETUNE, **changes))
+    if micro_batch_size:
+        changes |= {"micro_batch_size": micro_batch_size}
+    train(stage, policy, scenarios, out, **changes)
     if not torch.distributed.is_initialized() or torch.distributed.get_rank() == 0:
         save_file(gradients_of(policy), out / "gradients.safetensors")
     return policy
@@ -89,15 +99,17 @@ def run(stage, out, *, updates=8, processes=1, batch_size=1):
 
 def main():
     parser = argparse.ArgumentParser()
-    parser.add_argument("stage", choices=("pretrain", "finetune"))
+    parser.add_argument("stage", choices=("pretrain", "catk", "finetune"))
     parser.add_argument("out", type=Path)
     parser.add_argument("--updates", type=int, default=8)
     parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--batch-size", type=int, default=1)
+    parser.add_argument("--micro-batch-size", type=int)
     options = parser.parse_args()
     run(
         options.stage, options.out,
         updates=options.updates, processes=options.processes, batch_size=options.batch_size,
+        micro_batch_size=options.micro_batch_size,
     )  # fmt: skip
 
 

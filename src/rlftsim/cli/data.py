@@ -27,17 +27,21 @@ def data_folder(name: str) -> Path:
     return pack_path() if name == SYNTHETIC else Path(name)
 
 
+def splits_of(name: str) -> list[str]:
+    """Splits that a data set has scenarios in."""
+    return sorted(set(ScenarioDataset(data_folder(name)).index["split"].to_pylist()))
+
+
 def open_split(name: str, split: str) -> ScenarioDataset:
     """The scenarios of a split.
 
     Raises:
         DataError: there are none; says which splits there are.
     """
-    folder = data_folder(name)
-    scenarios = ScenarioDataset(folder, split, cache_size=CACHED_SCENARIOS)
+    scenarios = ScenarioDataset(data_folder(name), split, cache_size=CACHED_SCENARIOS)
     if not len(scenarios):
-        known = sorted(set(ScenarioDataset(folder).index["split"].to_pylist()))
-        raise DataError(f"{name} has no scenarios in split {split!r}: it has {', '.join(known) or 'none at all'}.")
+        known = ", ".join(splits_of(name)) or "none at all"
+        raise DataError(f"{name} has no scenarios in split {split!r}: it has {known}.")
     return scenarios
 
 

@@ -10,18 +10,23 @@ from rich.console import Console
 from rich.table import Table
 from tyro.conf import Positional
 
-from rlftsim.cli.data import data_folder, open_split
+from rlftsim.cli.data import data_folder, open_split, splits_of
+from rlftsim.errors import ConfigError
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.progress import print_wide
 from rlftsim.recipes.card import model_card
 from rlftsim.recipes.configure import Override, configure
 from rlftsim.recipes.models import load_policy
 from rlftsim.recipes.smart import RECIPES
+from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.tokens.clustering import CoverageReport, build_vocabulary, reconstruction_error
 from rlftsim.tokens.vocabulary import Vocabulary
+from rlftsim.training.catk import catk_finetune
 from rlftsim.training.finetune import finetune
 from rlftsim.training.pretrain import pretrain
 
+VALIDATION = "validation"
+"""Split that is validated on where none is named."""
 RecipeName = Literal["smart-tiny", "smart-mini", "smart-nano", "smart-demo"]
 
 
@@ -91,6 +96,9 @@ class Pretrain:
     vocabulary: Path
     """File that `rlftsim tokens` wrote."""
     split: str = "training"
+    validation_split: str | None = None
+    """What to validate on in closed loop, every so many updates: see pretrain.validation.every, which is 0 (never). Left out,
+    "validation" where the data set has it."""
     set: list[Override] = field(default_factory=list)
     """Other values for fields of the recipe, e.g. pretrain.epochs=2 model.dim=64."""
 
@@ -100,35 +108,62 @@ class Pretrain:
         scenarios = open_split(self.data, self.split)
         torch.manual_seed(recipe.pretrain.seed)
         policy = SmartPolicy(recipe.model, Vocabulary.load(self.vocabulary))
+        held_out = _held_out(self.data, self.validation_split, recipe.pretrain.validation.every)
         card = model_card("pre-trained", data_folder(self.data), len(scenarios))
-        print(f"model: {pretrain(policy, scenarios, self.out, recipe.pretrain, card=card)}")
+        model = pretrain(policy, scenarios, self.out, recipe.pretrain, held_out=held_out, card=card)
+        print(f"model: {model}")
         return 0
+
+
+def _held_out(data: str, split: str | None, every: int) -> ScenarioDataset | None:
+    """Scenarios to validate on; None = none are asked for, or the data set has no such split and none was named.
+
+    Raises:
+        ConfigError: a split is named, but there is no validation.
+        DataError: no such split.
+    """
+    if split is not None and not every:
+        raise ConfigError(f"--validation-split {split} has no effect: set validation.every to a number of updates.")
+    if not every or (split is None and VALIDATION not in splits_of(data)):
+        return None
+    return open_split(data, split or VALIDATION)
 
 
 @dataclass(frozen=True)
 class Finetune:
-    """Fine-tune a model closed-loop with a realism reward (RLFTSim).
+    """Fine-tune a model closed-loop: with a realism reward (RLFTSim) or, as a baseline, with CAT-K.
 
     Interrupted in any way, the same command goes on where it was. The result is in OUT/model.
     """
 
     recipe: Positional[RecipeName]
     model: str
-    """Model folder to start from; it is the reference, too."""
+    """Model folder to start from; rlft holds on to it as its reference, too."""
     data: str
     """Folder of a data set, or "synthetic"."""
     out: Path
     """Folder of the run: configuration, metrics, checkpoints, model."""
+    method: Literal["rlft", "catk"] = "rlft"
+    """rlft: policy gradient of a realism reward, fields finetune.*. catk: imitation along rollouts that keep near the record, the
+    closest among the top K tokens, fields catk.*."""
     split: str = "training"
+    validation_split: str | None = None
+    """For catk: what to validate on, see catk.validation.every, which is 0 (never). Left out, "validation" where the data set has it."""
     set: list[Override] = field(default_factory=list)
-    """Other values for fields of the recipe, e.g. finetune.learning-rate=1e-5 finetune.reward=rloo."""
+    """Other values for fields of the recipe, e.g. finetune.learning-rate=1e-5 finetune.reward=rloo, or catk.num-candidates=16."""
 
     def run(self) -> int:
         """Load the model and fine-tune it."""
-        recipe = configure(RECIPES[self.recipe](), self.set, sections=("finetune",))
-        scenarios = open_split(self.data, self.split)
-        card = model_card(
-            f"fine-tuned ({recipe.finetune.reward}) from {self.model}", data_folder(self.data), len(scenarios)
-        )
-        print(f"model: {finetune(load_policy(self.model), scenarios, self.out, recipe.finetune, card=card)}")
+        section = "finetune" if self.method == "rlft" else "catk"
+        recipe = configure(RECIPES[self.recipe](), self.set, sections=(section,))
+        scenarios, policy = open_split(self.data, self.split), load_policy(self.model)
+        how = recipe.finetune.reward if self.method == "rlft" else f"CAT-K, {recipe.catk.choice}"
+        card = model_card(f"fine-tuned ({how}) from {self.model}", data_folder(self.data), len(scenarios))
+        if self.method == "rlft":
+            _held_out(self.data, self.validation_split, every=0)
+            model = finetune(policy, scenarios, self.out, recipe.finetune, card=card)
+        else:
+            held_out = _held_out(self.data, self.validation_split, recipe.catk.validation.every)
+            model = catk_finetune(policy, scenarios, self.out, recipe.catk, held_out=held_out, card=card)
+        print(f"model: {model}")
         return 0

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field, replace
 
 from rlftsim.policies.smart.config import SmartConfig, smart_demo, smart_mini, smart_nano, smart_tiny
 from rlftsim.tokens.clustering import TokensConfig
+from rlftsim.training.catk import CatkConfig
 from rlftsim.training.finetune import FinetuneConfig
 from rlftsim.training.pretrain import PretrainConfig
 from rlftsim.training.reference import KlConfig
@@ -17,6 +18,7 @@ class SmartRecipe:
     model: SmartConfig = field(default_factory=SmartConfig)
     pretrain: PretrainConfig = field(default_factory=PretrainConfig)
     finetune: FinetuneConfig = field(default_factory=FinetuneConfig)
+    catk: CatkConfig = field(default_factory=CatkConfig)
 
 
 def smart_tiny_rlftsim() -> SmartRecipe:
@@ -31,7 +33,7 @@ def smart_mini_rlftsim() -> SmartRecipe:
 
 def smart_nano_rlftsim() -> SmartRecipe:
     """SMART-nano (1 M): fits one small GPU."""
-    return SmartRecipe(model=smart_nano(), pretrain=PretrainConfig(batch_size=16))
+    return SmartRecipe(model=smart_nano(), pretrain=PretrainConfig(batch_size=16), catk=CatkConfig(batch_size=16))
 
 
 def smart_demo_rlftsim() -> SmartRecipe:
@@ -47,6 +49,10 @@ def smart_demo_rlftsim() -> SmartRecipe:
             epochs=3.0, batch_size=8, num_rollouts=4, learning_rate=3e-4, warmup_updates=5, checkpoint_every=20,
             kl=KlConfig(target=0.05, initial_beta=0.01),
         ),
+        catk=CatkConfig(
+            epochs=3.0, batch_size=8, learning_rate=3e-4, warmup_updates=5, gradient_clip=1.0, max_trained_agents=None,
+            checkpoint_every=20,
+        ),
     )  # fmt: skip
 
 
@@ -58,6 +64,7 @@ def smart_demo_quick() -> SmartRecipe:
         tokens=replace(recipe.tokens, num_tokens=256, num_map_prototypes=64),
         pretrain=replace(recipe.pretrain, epochs=1.0),
         finetune=replace(recipe.finetune, epochs=0.25, batch_size=4),
+        catk=replace(recipe.catk, epochs=0.25, batch_size=4),
     )
 
 

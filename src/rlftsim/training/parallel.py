@@ -4,7 +4,8 @@ Every process works on its share of the global batch and adds up *sums*; the sum
 counts. So the estimator is that of one process with the same global batch, however scenarios and agents are spread.
 """
 
-from collections.abc import Iterable
+import os
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal, cast
 
@@ -13,6 +14,7 @@ from lightning_fabric import Fabric
 from torch import Tensor, nn
 
 from rlftsim.errors import ConfigError
+from rlftsim.training.batches import share_out
 
 
 @dataclass(frozen=True)
@@ -21,7 +23,7 @@ class DeviceConfig:
 
     accelerator: Literal["auto", "cpu", "cuda"] = "auto"
     devices: int = 1
-    """Processes on this machine; under torchrun, the number it starts."""
+    """Processes on this machine. Under torchrun it and `num_nodes` do not count: the processes are those that it starts."""
     num_nodes: int = 1
     precision: Literal["32-true", "bf16-mixed"] = "32-true"
     threads: int = 0
@@ -40,20 +42,33 @@ def start_fabric(config: DeviceConfig) -> Fabric:
         )
     if config.threads:
         torch.set_num_threads(config.threads)
-    strategy = "ddp" if config.devices * config.num_nodes > 1 else "auto"
+    devices, num_nodes = _processes_of_torchrun() or (config.devices, config.num_nodes)
     fabric = Fabric(
         accelerator=config.accelerator,
-        devices=config.devices,
-        num_nodes=config.num_nodes,
-        strategy=strategy,
+        devices=devices,
+        num_nodes=num_nodes,
+        strategy="ddp" if devices * num_nodes > 1 else "auto",
         precision=config.precision,
     )
     fabric.launch()
     return fabric
 
 
-def own_share(items: list[int], fabric: Fabric) -> list[int]:
+def _processes_of_torchrun() -> tuple[int, int] | None:
+    """Processes on each machine, and machines; None where torchrun started nothing."""
+    if "TORCHELASTIC_RUN_ID" not in os.environ:
+        return None
+    on_each = int(os.environ["LOCAL_WORLD_SIZE"])
+    return on_each, int(os.environ["WORLD_SIZE"]) // on_each
+
+
+def own_share(items: list[int], fabric: Fabric, costs: Sequence[float] | None = None) -> list[int]:
     """This process's part of a global batch.
+
+    Args:
+        items: of the global batch.
+        fabric: the processes.
+        costs: of each item; the parts then cost about the same, else they are equally many.
 
     Raises:
         ConfigError: the batch cannot be shared out.
@@ -62,7 +77,8 @@ def own_share(items: list[int], fabric: Fabric) -> list[int]:
         raise ConfigError(
             f"a batch of {len(items)} scenarios cannot be shared by {fabric.world_size} processes: raise batch_size."
         )
-    return items[fabric.global_rank :: fabric.world_size]
+    shares = share_out([1.0] * len(items) if costs is None else costs, fabric.world_size)
+    return [items[place] for place in shares[fabric.global_rank]]
 
 
 def add_up(values: Tensor, fabric: Fabric) -> Tensor:
@@ -73,9 +89,16 @@ def add_up(values: Tensor, fabric: Fabric) -> Tensor:
 
 
 def add_up_gradients(parameters: Iterable[nn.Parameter], fabric: Fabric) -> None:
-    """Sum every gradient over processes, in place, as one message."""
-    gradients = [p.grad for p in parameters if p.grad is not None]
-    if fabric.world_size == 1 or not gradients:
+    """Sum every gradient over processes, in place, as one message. A process that has none for a parameter adds zero."""
+    parameters = list(parameters)
+    if fabric.world_size == 1:
+        return
+    own = torch.tensor([p.grad is not None for p in parameters], dtype=torch.float32, device=fabric.device)
+    used = [p for p, count in zip(parameters, add_up(own, fabric).tolist()) if count]
+    for parameter in used:
+        parameter.grad = torch.zeros_like(parameter) if parameter.grad is None else parameter.grad
+    gradients = [p.grad for p in used if p.grad is not None]
+    if not gradients:
         return
     total = add_up(torch.cat([g.flatten() for g in gradients]), fabric)
     for gradient, part in zip(gradients, total.split([g.numel() for g in gradients])):

@@ -33,7 +33,14 @@ from rlftsim.training.checkpoint import newest_checkpoint
 PACKAGES = ("torch", "numpy", "pyarrow", "lightning-fabric", "safetensors")
 
 
-MAY_CHANGE = {"checkpoint_every", "device.accelerator", "device.devices", "device.num_nodes", "device.threads"}
+MAY_CHANGE = {
+    *("checkpoint_every", "device.accelerator", "device.devices", "device.num_nodes", "device.threads"),
+    *("micro_batch_size", "micro_batch_cost"),
+    *(
+        f"validation.{name}"
+        for name in ("every", "num_scenarios", "num_rollouts", "scenarios_per_pass", "metric", "seed")
+    ),
+}
 """Settings that a run may be continued with other values of: they change no estimate."""
 
 

@@ -8,7 +8,9 @@ import torch
 from torch.nn import functional
 
 from rlftsim.policies.smart.catk_keys import PREFIX, catk_name
+from rlftsim.scenario.batch import collate
 from rlftsim.training.catk import catk_loss, roll_out_closest
+from rlftsim.training.data import within_reach
 
 pytestmark = pytest.mark.official
 LOSS_TOLERANCE = 1e-5
@@ -64,6 +66,26 @@ def test_targets_are_those_of_the_public_code(frame, policy, batch_a, golden):
     np.testing.assert_array_equal(tokens.next_token_id[0, :, 1:-1][counts], arrays["bc_target_idx"][counts])
     rolling = (tokens.token_id[0, :, 2:].numpy() != arrays["bc_target_idx"])[counts].sum()
     assert rolling == golden.scalars(f"nano_{frame}")["train"]["bc_target_vs_gtidx_mismatch"]
+
+
+def test_steps_far_from_the_ego_are_left_out(scenario_a, policy, golden):
+    train = golden.arrays("nano/centred_train")
+    recorded = golden.arrays("scenario_A/preprocessed")
+    seen = policy._tokenize(collate([within_reach(scenario_a, 150.0)]))
+    np.testing.assert_array_equal(seen.valid[0], train["valid_mask"])
+    # at 60 m the mask bites: the public code's positions, its rule by hand, for agents that it leaves one stretch of
+    position, valid = recorded["position"], recorded["valid_mask"]
+    ego = recorded["role"][:, 0].argmax()
+    near = valid & (np.linalg.norm(position - position[ego], axis=-1) < 60.0)
+    kept = near[:, 10]
+    some = policy._tokenize(collate([within_reach(scenario_a, 60.0)]))
+    stretch = (np.diff(near[kept].astype(int), axis=1) == 1).sum(1) + near[kept][:, 0] == 1
+    late = near[kept].argmax(1) >= 6  # else begun earlier at constant velocity
+    ours = some.logged_valid[0].numpy()
+    assert ours.shape == (kept.sum(), 18)
+    plain = stretch & ~late
+    np.testing.assert_array_equal(ours[plain][:, 2:], near[kept][plain][:, 15::5])
+    assert 0 < near[kept][plain].sum() < valid[kept][plain].sum()
 
 
 @pytest.mark.parametrize(("frame", "label_smoothing"), [("centred", 0.1), ("absolute", 0.1), ("centred", 0.0)])

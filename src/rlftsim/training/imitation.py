@@ -1,0 +1,260 @@
+"""Learning by imitation: the loop that pre-training and CAT-K share. They differ in where a model's predictions come from.
+
+Pre-training asks for predictions along the recorded tracks, CAT-K along rollouts of the model's own. The loss is the cross-entropy of
+the token that leads to the record; its sum over everything that an update sees is divided by the number of predictions.
+"""
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int64
+from lightning_fabric import Fabric
+from torch import Tensor, nn
+from torch.nn import functional
+
+from rlftsim.errors import ConfigError, require_positive
+from rlftsim.progress import progress_bar
+from rlftsim.rollout.noise import derive_seed
+from rlftsim.scenario.batch import ScenarioBatch
+from rlftsim.scenario.types import Scenarios
+from rlftsim.training.batches import micro_batches, scenario_costs
+from rlftsim.training.checkpoint import Progress, newest_checkpoint, read_checkpoint, write_checkpoint
+from rlftsim.training.data import batch_with_futures, scenarios_of_update, trained_agents
+from rlftsim.training.parallel import DeviceConfig, add_up, add_up_gradients, own_share, start_fabric
+from rlftsim.training.run_folder import RunFolder, describe_inputs
+from rlftsim.training.validation import ValidationConfig, refuse_to_validate, validate
+
+IMPOSSIBLE = -1e8
+"""A token that cannot be chosen has a smaller logit than this."""
+
+
+@runtime_checkable
+class Prediction(Protocol):
+    """What a model says of next tokens, and what it should have said."""
+
+    @property
+    def logits(self) -> Float[Tensor, "R V"]:
+        """Of R predictions, over the vocabulary."""
+        ...
+
+    @property
+    def target(self) -> Int64[Tensor, "R"]:
+        """Token that should come next."""
+        ...
+
+    @property
+    def target_mask(self) -> Bool[Tensor, "R"]:
+        """True = the prediction counts."""
+        ...
+
+
+Predict = Callable[[ScenarioBatch, Bool[Tensor, "B A"], int], Prediction]
+"""Predictions, differentiable, for a batch, the agents that count and the number of the update (counted from 0)."""
+
+
+@dataclass(frozen=True)
+class ImitationConfig:
+    """How a model learns from the record. The defaults are those of the published SMART-tiny on WOMD."""
+
+    epochs: float = 32.0
+    """Passes over the training scenarios."""
+    batch_size: int = 80
+    """Scenarios per update, over all processes."""
+    micro_batch_size: int = 8
+    """Scenarios in memory at once, at most; gradients add up over the rest."""
+    micro_batch_cost: float | None = None
+    """Agents x thousand map points in memory at once, at most, so that crowded scenarios come in smaller groups. None = any."""
+    learning_rate: float = 5e-4
+    final_learning_rate_share: float = 0.01
+    """The learning rate falls to this share along a cosine."""
+    warmup_updates: int = 0
+    weight_decay: float = 0.01
+    gradient_clip: float = 0.5
+    label_smoothing: float = 0.1
+    """The loss of a perfect model is then not zero."""
+    context_radius_m: float | None = 150.0
+    """A step of an agent farther from the ego than this is taken as not recorded. None = everything is seen."""
+    trained_radius_m: float = 100.0
+    """Agents farther from the ego at the current step are context only."""
+    max_trained_agents: int | None = 32
+    """Of a scenario; the evaluated ones first, the rest at random. None = all."""
+    max_skipped_in_a_row: int = 5
+    """An update whose gradient is not finite is skipped; after so many in a row the run stops."""
+    checkpoint_every: int = 200
+    """Updates."""
+    seed: int = 0
+    validation: ValidationConfig = field(default_factory=ValidationConfig)
+    device: DeviceConfig = field(default_factory=DeviceConfig)
+
+    def __post_init__(self) -> None:
+        positive = ("epochs", "batch_size", "micro_batch_size", "learning_rate", "checkpoint_every", "trained_radius_m")
+        require_positive(self, positive)
+        require_positive(
+            self, tuple(n for n in ("micro_batch_cost", "context_radius_m") if getattr(self, n) is not None)
+        )
+        if not 0 <= self.label_smoothing < 1:
+            raise ConfigError(f"label_smoothing is a share in [0, 1), got {self.label_smoothing}.")
+
+    def num_updates(self, num_scenarios: int) -> int:
+        """Optimiser steps of the run."""
+        return max(math.ceil(self.epochs * num_scenarios / self.batch_size), 1)
+
+
+@dataclass(frozen=True, eq=False)
+class _Learner:
+    """What stays the same from update to update (its tensors do not)."""
+
+    model: nn.Module
+    optimizer: torch.optim.Optimizer
+    predict: Predict
+    scenarios: Scenarios
+    costs: Float[np.ndarray, "n"]
+    config: ImitationConfig
+    fabric: Fabric
+
+
+def imitate(
+    model: nn.Module,
+    scenarios: Scenarios,
+    out: Path,
+    config: ImitationConfig,
+    predict: Predict,
+    *,
+    title: str,
+    held_out: Scenarios | None = None,
+    card: str = "",
+) -> Path:
+    """Train the parameters of a model that require a gradient; go on where a run in `out` was stopped.
+
+    Args:
+        model: has `save_pretrained`.
+        scenarios: with their futures; scenarios without are refused.
+        out: the run's folder.
+        config: see its fields.
+        predict: the model's predictions.
+        title: what a person sees beside the progress bar.
+        held_out: scenarios to validate on; None = no validation.
+        card: README of the resulting model folder.
+
+    Returns:
+        The model folder, `out/model`.
+
+    Raises:
+        ConfigError: there is no scenario, or the model cannot be validated.
+        CheckpointError: `out` holds another run, or the run diverged.
+    """
+    if not len(scenarios):
+        raise ConfigError("no scenario to train on: is the data set empty, or the split misspelt?")
+    if held_out is not None and config.validation.every:
+        refuse_to_validate(model, held_out)
+    fabric = start_fabric(config.device)
+    run = RunFolder(out, config, describe_inputs(model, scenarios), writes=fabric.is_global_zero)
+    model.to(fabric.device).train()
+    trained = [p for p in model.parameters() if p.requires_grad]
+    optimizer = torch.optim.AdamW(trained, lr=config.learning_rate, weight_decay=config.weight_decay)
+    newest = newest_checkpoint(run.checkpoints)
+    done = read_checkpoint(newest, {"policy": model}, optimizer).update if newest else 0
+    run.continue_from(done)
+    learner = _Learner(model, optimizer, predict, scenarios, scenario_costs(scenarios), config, fabric)
+    total, skipped, realism = config.num_updates(len(scenarios)), 0, ""
+    with progress_bar(title, total, done) as advance:
+        for update in range(done, total):
+            start = time.perf_counter()
+            _set_learning_rate(optimizer, learning_rate(update, total, config))
+            values = _update(learner, update)
+            values["seconds"] = time.perf_counter() - start
+            if held_out is not None and config.validation.is_due(update + 1, total):
+                values |= validate(model, held_out, config.validation, fabric)
+                realism = f", RMM {values['validation_rmm']:.3f}"
+            run.log(update + 1, values)
+            skipped = 0 if math.isfinite(values["gradient_norm"]) else skipped + 1
+            if skipped >= config.max_skipped_in_a_row:
+                raise run.diverged(f"the gradients of {skipped} updates in a row are not finite", "lower learning_rate")
+            if fabric.is_global_zero and ((update + 1) % config.checkpoint_every == 0 or update + 1 == total):
+                write_checkpoint(run.checkpoints, Progress(update + 1), {"policy": model}, optimizer)
+            advance(note=f"loss {values['loss']:.3f}, right {values['accuracy']:.0%}{realism}")
+    run.close()
+    if fabric.is_global_zero:
+        model.eval().save_pretrained(run.model, card=card)  # type: ignore[operator]
+    return run.model
+
+
+def learning_rate(update: int, total: int, config: ImitationConfig) -> float:
+    """Linear warm-up, then a cosine from `learning_rate` to its final share."""
+    if update < config.warmup_updates:
+        return config.learning_rate * (update + 1) / config.warmup_updates
+    share = (update - config.warmup_updates) / max(total - config.warmup_updates, 1)
+    low = config.final_learning_rate_share
+    return config.learning_rate * (low + 0.5 * (1 - low) * (1 + math.cos(math.pi * share)))
+
+
+def _set_learning_rate(optimizer: torch.optim.Optimizer, value: float) -> None:
+    for group in optimizer.param_groups:
+        group["lr"] = value
+
+
+def _update(learner: _Learner, update: int) -> dict[str, float]:
+    """One optimiser step: sums of losses over micro batches and processes, divided by the number of predictions."""
+    config, fabric = learner.config, learner.fabric
+    torch.manual_seed(derive_seed(config.seed, "dropout", update, fabric.global_rank) % 2**63)
+    learner.optimizer.zero_grad(set_to_none=True)
+    sums = torch.zeros(4, device=fabric.device)  # loss, right, right among the best five, predictions
+    chosen = scenarios_of_update(update, config.batch_size, len(learner.scenarios), config.seed)
+    own = own_share(chosen, fabric, learner.costs[chosen].tolist())
+    for micro in micro_batches(own, learner.costs, max_count=config.micro_batch_size, max_cost=config.micro_batch_cost):
+        batch = batch_with_futures(learner.scenarios, micro, context_radius_m=config.context_radius_m)
+        loss, counts = _backward(learner, batch.to(fabric.device), update)
+        sums += torch.cat([loss[None], counts])
+    sums = add_up(sums, fabric)
+    parameters = list(learner.model.parameters())
+    add_up_gradients(parameters, fabric)
+    for parameter in parameters:
+        if parameter.grad is not None:
+            parameter.grad.div_(sums[3].clamp(min=1))
+    norm = torch.nn.utils.clip_grad_norm_(parameters, config.gradient_clip)
+    if math.isfinite(float(norm)):
+        learner.optimizer.step()
+    loss, right, among_five, count = sums.tolist()
+    count = max(count, 1.0)
+    return {
+        "loss": loss / count,
+        "accuracy": right / count,
+        "top5_accuracy": among_five / count,
+        "gradient_norm": float(norm),
+        "predictions": count,
+        "learning_rate": learner.optimizer.param_groups[0]["lr"],
+    }
+
+
+def _backward(learner: _Learner, batch: ScenarioBatch, update: int) -> tuple[Float[Tensor, ""], Float[Tensor, "3"]]:
+    """Add the gradient of a micro batch's summed loss; the loss and its counts."""
+    config = learner.config
+    trained = trained_agents(
+        batch, update, radius_m=config.trained_radius_m, limit=config.max_trained_agents, seed=config.seed
+    )
+    with learner.fabric.autocast():
+        prediction = learner.predict(batch, trained, update)
+    loss, counts = summed_loss(prediction, config.label_smoothing)
+    learner.fabric.backward(loss)
+    return loss.detach(), counts
+
+
+def summed_loss(prediction: Prediction, label_smoothing: float) -> tuple[Float[Tensor, ""], Float[Tensor, "3"]]:
+    """Summed cross-entropy (smoothed over the tokens that exist), and how many predictions were right, right among the best
+    five, and made at all. Zeros where nothing counts."""
+    logits, target = prediction.logits[prediction.target_mask], prediction.target[prediction.target_mask]
+    log_probs = functional.log_softmax(logits, -1)
+    exists = logits > IMPOSSIBLE
+    elsewhere = torch.where(exists, log_probs, 0.0).sum(-1) / exists.sum(-1)
+    of_target = log_probs.gather(-1, target[:, None])[:, 0]
+    loss = -((1 - label_smoothing) * of_target + label_smoothing * elsewhere).sum()
+    best = logits.detach().topk(min(5, logits.shape[-1]), dim=-1).indices == target[:, None]
+    return loss, torch.stack(
+        [best[:, 0].sum(), best.any(-1).sum(), torch.tensor(len(target), device=target.device)]
+    ).float()

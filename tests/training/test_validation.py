@@ -1,0 +1,100 @@
+"""Validation during training: the numbers of an evaluation, and not a trace in the weights."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import tiny
+import torch
+from safetensors.torch import load_file
+
+from rlftsim.errors import ConfigError, DataError
+from rlftsim.experiments.evaluate import EvaluateConfig, evaluate
+from rlftsim.policies.smart.policy import SmartPolicy
+from rlftsim.scenario.dataset import ScenarioDataset
+from rlftsim.scenario.synthetic import pack_path
+from rlftsim.training.run_folder import read_metrics
+from rlftsim.training.validation import ValidationConfig
+
+OFTEN = ValidationConfig(every=2, num_scenarios=3, num_rollouts=2, scenarios_per_pass=2)
+
+
+@pytest.fixture(scope="module")
+def held_out():
+    return ScenarioDataset(pack_path(), "validation")
+
+
+@pytest.mark.parametrize("stage", ["pretrain", "catk"])
+def test_validation_changes_nothing_of_the_training(stage, vocabulary, drawn_scenarios, held_out, tmp_path):
+    for name, settings in (("without", ValidationConfig()), ("with", OFTEN)):
+        policy = tiny.tiny_policy(vocabulary)
+        options = {"validation": settings, "epochs": 1.0}  # four updates of one scenario
+        tiny.train(stage, policy, drawn_scenarios, tmp_path / name, held_out=held_out, **options)
+    without, with_it = (load_file(tmp_path / n / "model" / "model.safetensors") for n in ("without", "with"))
+    assert all(torch.equal(value, with_it[name]) for name, value in without.items())
+    lines = read_metrics(tmp_path / "with")
+    assert ["validation_rmm" in line for line in lines] == [False, True, False, True]
+    for line, other in zip(lines, read_metrics(tmp_path / "without")):
+        assert line["loss"] == other["loss"]
+        assert "validation_rmm" not in other
+
+
+def test_the_last_validation_is_what_an_evaluation_of_the_model_finds(vocabulary, drawn_scenarios, held_out, tmp_path):
+    policy = tiny.tiny_policy(vocabulary)
+    everything = replace(OFTEN, every=100, num_scenarios=4)
+    tiny.train("pretrain", policy, drawn_scenarios, tmp_path, held_out=held_out, validation=everything, epochs=0.5)
+    line = read_metrics(tmp_path)[-1]
+    model = SmartPolicy.from_pretrained(tmp_path / "model")
+    found = evaluate(
+        model, pack_path(), tmp_path, EvaluateConfig(num_rollouts=2, seed=0), name="e", show_progress=False
+    )
+    rows = [found.scenario_ids.index(held_out.scenario_ids[i]) for i in everything.choose(len(held_out))]
+    assert len(set(rows)) == 4
+    rmm = np.array(found.values("meta_metric"))[rows]
+    error = 1.96 * rmm.std(ddof=1) / math.sqrt(4)
+    assert line["validation_rmm"] == pytest.approx(rmm.mean(), abs=1e-5)
+    assert line["validation_rmm_low"] == pytest.approx(rmm.mean() - error, abs=1e-5)
+    assert line["validation_rmm_high"] == pytest.approx(rmm.mean() + error, abs=1e-5)
+    ade = np.array(found.values("min_average_displacement_error"))[rows]
+    assert line["validation_min_ade_m"] == pytest.approx(ade.mean(), rel=1e-4)
+
+
+def test_a_run_may_go_on_with_another_validation(vocabulary, drawn_scenarios, held_out, tmp_path):
+    options = {"epochs": 0.5, "held_out": held_out}
+    tiny.train("pretrain", tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path, validation=OFTEN, **options)
+    other = replace(OFTEN, every=1, num_rollouts=3)
+    tiny.train("pretrain", tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path, validation=other, **options)
+
+
+class Mute(torch.nn.Module):
+    """Can be trained, cannot simulate."""
+
+    def teacher_forced(self, scenarios, trained):
+        raise AssertionError
+
+    def save_pretrained(self, folder, *, card=""):
+        raise AssertionError
+
+
+def test_what_cannot_be_validated_is_refused_before_the_run(vocabulary, drawn_scenarios, tmp_path):
+    options = {"validation": OFTEN}
+    with pytest.raises(ConfigError, match="Mute cannot simulate"):
+        tiny.train("pretrain", Mute(), drawn_scenarios, tmp_path, held_out=drawn_scenarios, **options)
+    with pytest.raises(ConfigError, match="no scenario to validate on"):
+        tiny.train("pretrain", tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path, held_out=[], **options)
+    with pytest.raises(ConfigError, match=r"validation\.every must be 0"):
+        ValidationConfig(every=-1)
+    with pytest.raises(ConfigError, match="num_rollouts must be positive"):
+        ValidationConfig(num_rollouts=0)
+    assert not (tmp_path / "config.json").exists()
+
+
+def test_scenarios_without_a_future_cannot_be_validated_on(vocabulary, drawn_scenarios, tmp_path):
+    scenario = drawn_scenarios[0]
+    arrays = {name: value[:, :11] if value.ndim > 1 else value for name, value in vars(scenario.tracks).items()}
+    short = replace(scenario, tracks=replace(scenario.tracks, **arrays), timestamps_s=scenario.timestamps_s[:11])
+    with pytest.raises(DataError, match="its future is withheld"):
+        tiny.train(
+            "pretrain", tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path, held_out=[short], validation=OFTEN, epochs=0.5
+        )  # fmt: skip
