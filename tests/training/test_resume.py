@@ -16,6 +16,7 @@ from safetensors.torch import load_file
 import rlftsim
 from rlftsim.training import finetune as finetune_module
 from rlftsim.training import imitation as imitation_module
+from rlftsim.training.batches import scenario_costs
 from rlftsim.training.run_folder import read_metrics
 
 MODULES = {"pretrain": imitation_module, "catk": imitation_module, "finetune": finetune_module}
@@ -127,22 +128,42 @@ def test_a_run_killed_at_a_random_moment_ends_as_if_it_never_was(stage, tmp_path
     assert [line["update"] for line in read_metrics(tmp_path / "killed")] == list(range(1, 9))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("stage", STAGES)
-def test_two_processes_find_the_gradient_of_one(stage, tmp_path):
-    for processes in (1, 2):
-        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-        command = [sys.executable, tiny.__file__, stage, str(tmp_path / str(processes)), "--updates", "1"]
-        command += ["--batch-size", "4", "--processes", str(processes)]
-        command += [] if stage == "finetune" else ["--micro-batch-size", "1"]
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
-        assert done.returncode == 0, done.stderr[-2000:]
-    one, two = (load_file(tmp_path / n / "gradients.safetensors") for n in ("1", "2"))
+def train_in_processes(stage, out, processes, *options, launcher=()):
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    command = [sys.executable, *launcher, tiny.__file__, stage, str(out), "--updates", "1", "--batch-size", "4"]
+    command += ["--processes", str(processes), *options]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr[-2000:]
+
+
+def assert_same_gradients(first: Path, second: Path, watched: list[str]):
+    assert [(folder / "processes").read_text() for folder in (first, second)] == ["1", "2"]
+    one, two = (load_file(folder / "gradients.safetensors") for folder in (first, second))
     assert one.keys() == two.keys()
     assert max(float(g.abs().max()) for g in one.values()) > 1e-3
     for name, gradient in one.items():
         torch.testing.assert_close(two[name], gradient, atol=1e-6, rtol=1e-5, msg=name)
-    a, b = (read_metrics(tmp_path / n)[0] for n in ("1", "2"))
-    watched = ["kl", "entropy", "gradient_norm", "rmm"] if stage == "finetune" else ["loss", "accuracy", "predictions"]
+    a, b = (read_metrics(folder)[0] for folder in (first, second))
     for name in watched:
         assert b[name] == pytest.approx(a[name], rel=1e-5, abs=1e-6), name
+
+
+@pytest.mark.slow
+def test_two_processes_find_the_gradient_of_one(tmp_path):
+    for processes in (1, 2):
+        train_in_processes("finetune", tmp_path / str(processes), processes)
+    assert_same_gradients(tmp_path / "1", tmp_path / "2", ["kl", "entropy", "gradient_norm", "rmm"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stage", ["pretrain", "catk"])
+def test_torchrun_finds_the_gradient_of_one_process(stage, tmp_path):
+    costs = scenario_costs(tiny.pack_scenarios())
+    budget = str(2.1 * costs.min())  # some pieces hold two scenarios, some one
+    assert costs.max() > 1.05 * costs.min()
+    train_in_processes(stage, tmp_path / "1", 1, "--micro-batch-cost", budget)
+    torchrun = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2")
+    train_in_processes(stage, tmp_path / "2", 1, "--micro-batch-cost", budget, launcher=torchrun)
+    watched = ["loss", "accuracy", "predictions", "validation_rmm", "validation_rmm_low", "validation_min_ade_m"]
+    assert_same_gradients(tmp_path / "1", tmp_path / "2", watched)
+    assert (tmp_path / "2" / "model" / "model.safetensors").exists()

@@ -20,6 +20,7 @@ from rlftsim.training.finetune import FinetuneConfig, finetune
 from rlftsim.training.parallel import DeviceConfig
 from rlftsim.training.pretrain import PretrainConfig, pretrain
 from rlftsim.training.reference import KlConfig
+from rlftsim.training.validation import ValidationConfig
 
 NUM_SCENARIOS = 5
 CPU = DeviceConfig(accelerator="cpu", threads=1)
@@ -81,19 +82,22 @@ def train(stage, policy, scenarios, out, held_out=None, **changes):
     return finetune(policy, scenarios, out, replace(FINETUNE, **changes))
 
 
-def run(stage, out, *, updates=8, processes=1, batch_size=1, micro_batch_size=None):
-    """Train on the pack's scenarios; also writes the gradients of the last update."""
+def run(stage, out, *, updates=8, processes=1, batch_size=1, micro_batch_cost=None):
+    """Train on the pack's scenarios; also writes the gradients of the last update. Validates where there is a budget."""
     scenarios = pack_scenarios()
     policy = tiny_policy(small_vocabulary(scenarios), WITHOUT_CHANCE if batch_size > 1 else MODEL)
     changes = {
         "device": replace(CPU, devices=processes), "batch_size": batch_size,
         "epochs": updates * batch_size / NUM_SCENARIOS, "gradient_clip": 1e9 if batch_size > 1 else 1.0,
     }  # fmt: skip
-    if micro_batch_size:
-        changes |= {"micro_batch_size": micro_batch_size}
-    train(stage, policy, scenarios, out, **changes)
-    if not torch.distributed.is_initialized() or torch.distributed.get_rank() == 0:
+    if micro_batch_cost:
+        validation = ValidationConfig(every=1, num_scenarios=3, num_rollouts=2)
+        changes |= {"micro_batch_cost": micro_batch_cost, "validation": validation}
+    train(stage, policy, scenarios, out, scenarios, **changes)
+    several = torch.distributed.is_initialized()
+    if not several or torch.distributed.get_rank() == 0:
         save_file(gradients_of(policy), out / "gradients.safetensors")
+        (out / "processes").write_text(str(torch.distributed.get_world_size() if several else 1))
     return policy
 
 
@@ -104,12 +108,12 @@ def main():
     parser.add_argument("--updates", type=int, default=8)
     parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--batch-size", type=int, default=1)
-    parser.add_argument("--micro-batch-size", type=int)
+    parser.add_argument("--micro-batch-cost", type=float)
     options = parser.parse_args()
     run(
         options.stage, options.out,
         updates=options.updates, processes=options.processes, batch_size=options.batch_size,
-        micro_batch_size=options.micro_batch_size,
+        micro_batch_cost=options.micro_batch_cost,
     )  # fmt: skip
 
 
