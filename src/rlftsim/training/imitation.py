@@ -69,7 +69,7 @@ class ImitationConfig:
     micro_batch_size: int = 8
     """Scenarios in memory at once, at most; gradients add up over the rest."""
     micro_batch_cost: float | None = None
-    """Agents x thousand map points in memory at once, at most, so that crowded scenarios come in smaller groups. None = any."""
+    """Thousands of map points in memory at once, an agent counted as 200, at most: large scenarios come in smaller groups. None = any."""
     learning_rate: float = 5e-4
     final_learning_rate_share: float = 0.01
     """The learning rate falls to this share along a cosine."""
