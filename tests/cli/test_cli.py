@@ -185,6 +185,8 @@ def test_pretraining_and_fine_tuning_by_command(vocabulary, tmp_path, capsys):
     assert json.loads((tmp_path / "catk" / "config.json").read_text())["num_candidates"] == 4
     assert "CAT-K" in (tmp_path / "catk" / "model" / "README.md").read_text()
     assert len([line for line in read_metrics(tmp_path / "catk") if line["validation_rmm"] > 0]) == 2
+    for run_folder in (base, tuned, tmp_path / "catk"):
+        assert (run_folder / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
     # the same folder with other settings is another run
     status, _, err = run(
         capsys, "finetune", "smart-demo", "--model", base, *common, "--out", tuned, "--set", *once, "finetune.seed=1"
@@ -228,28 +230,23 @@ def test_settings_without_effect_are_refused(tmp_path, capsys):
     assert "finetune.reward has no effect here: only fields of model and pretrain can be set" in err
 
 
-@pytest.mark.parametrize(
-    ("more", "expected"),
-    [
-        (
-            ["--method", "catk", "--set", "finetune.reward=rloo"],
-            "finetune.reward has no effect here: only fields of catk",
-        ),
+def test_what_has_no_effect_on_a_method_is_refused(tmp_path, vocabulary, capsys):
+    catk, every = ["--method", "catk"], ["--set", "catk.validation.every=1"]
+    wrong = [
+        ([*catk, "--set", "finetune.reward=rloo"], "finetune.reward has no effect here: only fields of catk"),
         (["--set", "catk.num_candidates=4"], "catk.num_candidates has no effect here: only fields of finetune"),
-        (["--method", "catk", "--set", "catk.choice=farthest"], "expected one of closest, top_k, trajeglish"),
-        (["--method", "catk", "--validation-split", "validation"], "--validation-split validation has no effect"),
+        ([*catk, "--set", "catk.choice=farthest"], "expected one of closest, top_k, trajeglish"),
+        ([*catk, "--validation-split", "validation"], "--validation-split validation has no effect"),
         (["--validation-split", "validation"], "--validation-split validation has no effect"),
-        (["--method", "catk", "--validation-split", "tests", "--set", "catk.validation.every=1"], "no split 'tests'"),
-    ],
-)
-def test_what_has_no_effect_on_a_method_is_refused(more, expected, tmp_path, vocabulary, capsys):
-    policy = SmartPolicy(smart_demo(), Vocabulary.load(vocabulary))
-    policy.save_pretrained(tmp_path / "base")
+        ([*catk, *every, "--validation-split", "tests"], "no split 'tests'"),
+    ]
+    SmartPolicy(smart_demo(), Vocabulary.load(vocabulary)).save_pretrained(tmp_path / "base")
     words = ["finetune", "smart-demo", "--model", tmp_path / "base", "--data", "synthetic", "--out", tmp_path / "o"]
-    status, _, err = run(capsys, *words, *more)
-    assert (status, err.count("\n")) == (2, 1)
-    assert expected in err
-    assert not (tmp_path / "o").exists()
+    for more, expected in wrong:
+        status, _, err = run(capsys, *words, *more)
+        assert (status, err.count("\n")) == (2, 1)
+        assert expected in err
+        assert not (tmp_path / "o").exists()
 
 
 def test_comparing_an_evaluation_with_itself(evaluation, capsys):

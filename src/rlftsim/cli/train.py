@@ -1,6 +1,8 @@
 """Verbs that make and change models: tokens, pretrain, finetune."""
 
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -12,6 +14,7 @@ from tyro.conf import Positional
 
 from rlftsim.cli.data import data_folder, open_split, splits_of
 from rlftsim.errors import ConfigError
+from rlftsim.experiments.learning_curve import write_learning_curve
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.progress import print_wide
 from rlftsim.recipes.card import model_card
@@ -23,6 +26,7 @@ from rlftsim.tokens.clustering import CoverageReport, build_vocabulary, reconstr
 from rlftsim.tokens.vocabulary import Vocabulary
 from rlftsim.training.catk import catk_finetune
 from rlftsim.training.finetune import finetune
+from rlftsim.training.parallel import is_first_process
 from rlftsim.training.pretrain import pretrain
 
 VALIDATION = "validation"
@@ -110,7 +114,8 @@ class Pretrain:
         policy = SmartPolicy(recipe.model, Vocabulary.load(self.vocabulary))
         held_out = _held_out(self.data, self.validation_split, recipe.pretrain.validation.every)
         card = model_card("pre-trained", data_folder(self.data), len(scenarios))
-        model = pretrain(policy, scenarios, self.out, recipe.pretrain, held_out=held_out, card=card)
+        with _drawn(self.out):
+            model = pretrain(policy, scenarios, self.out, recipe.pretrain, held_out=held_out, card=card)
         print(f"model: {model}")
         return 0
 
@@ -127,6 +132,16 @@ def _held_out(data: str, split: str | None, every: int) -> ScenarioDataset | Non
     if not every or (split is None and VALIDATION not in splits_of(data)):
         return None
     return open_split(data, split or VALIDATION)
+
+
+@contextmanager
+def _drawn(out: Path) -> Iterator[None]:
+    """A run whose learning curve is drawn however it ends."""
+    try:
+        yield
+    finally:
+        if is_first_process():
+            write_learning_curve(out)
 
 
 @dataclass(frozen=True)
@@ -159,11 +174,12 @@ class Finetune:
         scenarios, policy = open_split(self.data, self.split), load_policy(self.model)
         how = recipe.finetune.reward if self.method == "rlft" else f"CAT-K, {recipe.catk.choice}"
         card = model_card(f"fine-tuned ({how}) from {self.model}", data_folder(self.data), len(scenarios))
-        if self.method == "rlft":
-            _held_out(self.data, self.validation_split, every=0)
-            model = finetune(policy, scenarios, self.out, recipe.finetune, card=card)
-        else:
-            held_out = _held_out(self.data, self.validation_split, recipe.catk.validation.every)
-            model = catk_finetune(policy, scenarios, self.out, recipe.catk, held_out=held_out, card=card)
+        every = recipe.catk.validation.every if self.method == "catk" else 0
+        held_out = _held_out(self.data, self.validation_split, every)
+        with _drawn(self.out):
+            if self.method == "rlft":
+                model = finetune(policy, scenarios, self.out, recipe.finetune, card=card)
+            else:
+                model = catk_finetune(policy, scenarios, self.out, recipe.catk, held_out=held_out, card=card)
         print(f"model: {model}")
         return 0

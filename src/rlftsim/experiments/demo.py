@@ -5,7 +5,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -14,6 +13,7 @@ from rich.console import Console
 from rlftsim.experiments.compare import Comparison, compare
 from rlftsim.experiments.evaluate import EvaluateConfig, evaluate
 from rlftsim.experiments.evaluation import Evaluation
+from rlftsim.experiments.learning_curve import finetuning_charts, imitation_charts
 from rlftsim.experiments.report import (
     ChartGroup,
     Estimate,
@@ -38,7 +38,6 @@ from rlftsim.tokens.vocabulary import Vocabulary
 from rlftsim.training.finetune import finetune
 from rlftsim.training.pretrain import pretrain
 from rlftsim.training.run_folder import describe_environment, read_metrics
-from rlftsim.viewer.chart import Chart, Curve
 from rlftsim.viewer.page import Animation, Panel
 from rlftsim.viewer.picture import to_png
 from rlftsim.viewer.scene import build_scene, logged_trajectories, rollout_trajectories
@@ -213,27 +212,14 @@ def _paired_differences(base: Evaluation, tuned: Evaluation) -> list[float]:
 
 def _charts(out: Path, config: DemoConfig) -> list[ChartGroup]:
     before, after = read_metrics(out / "pretrain"), read_metrics(out / "finetune")
-
-    def chart(lines: list[dict[str, Any]], title: str, label: str, **named: str) -> Chart:
-        updates = [line["update"] for line in lines]
-        curves = [Curve(name, updates, [line[key] for line in lines]) for key, name in named.items()]
-        reference = ("target", config.recipe.finetune.kl.target) if "kl" in named else None
-        return Chart(title, "update", label, curves, reference=reference)
-
     return [
         ChartGroup(
             "Fine-tuning",
-            [
-                chart(after, "Realism of the training rollouts", "RMM", rmm="RMM"),
-                chart(after, "Reward", "std over a scenario's rollouts", reward_std="MLOO"),
-                chart(after, "Distance from the base model", "nats per decision", kl="KL"),
-                chart(after, "Strength of the KL penalty", "beta", beta="beta"),
-                chart(after, "Off-road and collision", "share of evaluated agents", offroad_rate="off-road", collision_rate="collision"),
-            ],
+            finetuning_charts(after, config.recipe.finetune.kl.target),
             "Training rollouts come in groups of 4, so their RMM is not comparable with the table's (groups of 32).",
         ),
-        ChartGroup("Pre-training", [chart(before, "Cross-entropy", "nats per token", loss="loss"), chart(before, "Next token right", "share", accuracy="first guess", top5_accuracy="among five")]),
-    ]  # fmt: skip
+        ChartGroup("Pre-training", imitation_charts(before)),
+    ]
 
 
 def _facts(config: DemoConfig, seconds: dict[str, float]) -> dict[str, str]:

@@ -62,6 +62,12 @@ def _processes_of_torchrun() -> tuple[int, int] | None:
     return on_each, int(os.environ["WORLD_SIZE"]) // on_each
 
 
+def is_first_process() -> bool:
+    """Whether this is the process of rank 0, or the only one: the one that writes."""
+    several = torch.distributed.is_available() and torch.distributed.is_initialized()
+    return not several or torch.distributed.get_rank() == 0
+
+
 def own_share(items: list[int], fabric: Fabric, costs: Sequence[float] | None = None) -> list[int]:
     """This process's part of a global batch.
 

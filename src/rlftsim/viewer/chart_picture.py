@@ -1,0 +1,46 @@
+"""Charts as one still picture, for where no page is at hand."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from rlftsim.viewer.chart import Chart
+from rlftsim.viewer.picture import save_png
+
+CHART_INCHES = (4.6, 3.4)
+COLOURS = ("#1d63d8", "#e07b00", "#11754b", "#a21caf")
+"""The page's, in the same order."""
+
+
+def charts_to_png(path: Path, charts: Sequence[Chart], *, dots_per_inch: int = 120) -> None:
+    """Draw charts side by side.
+
+    Args:
+        path: file to write; nothing half-written is left there.
+        charts: at least one.
+        dots_per_inch: of the picture.
+    """
+    width, height = CHART_INCHES
+    figure = Figure(figsize=(width * len(charts), height), layout="constrained")
+    for axis, chart in zip(figure.subplots(1, len(charts), squeeze=False)[0], charts):
+        _draw(axis, chart)
+    save_png(figure, path, dots_per_inch)
+
+
+def _draw(axis: Axes, chart: Chart) -> None:
+    axis.set_title(chart.title, fontsize=11, loc="left", fontweight="bold")
+    axis.set(xlabel=chart.x_label, ylabel=chart.y_label, yscale="log" if chart.log_y else "linear")
+    axis.grid(alpha=0.3)
+    for index, curve in enumerate(chart.curves):
+        marker = "o" if len(curve.x) < 20 else ""
+        colour = COLOURS[index % len(COLOURS)]
+        axis.plot(np.asarray(curve.x), np.asarray(curve.y), color=colour, lw=1.2, marker=marker, ms=3, label=curve.name)
+    if chart.reference:
+        axis.axhline(chart.reference[1], color="#79828f", ls="--", lw=1, label=chart.reference[0])
+    if len(axis.get_legend_handles_labels()[1]) > 1:
+        axis.legend(frameon=False, fontsize=8)
+    for side in ("top", "right"):
+        axis.spines[side].set_visible(False)
