@@ -47,7 +47,7 @@ def reward_of():
     names = []
 
     def register(reward):
-        names.append(f"test-{len(names)}")
+        names.append(f"test_{len(names)}")
         register_reward(names[-1])(reward)
         return names[-1]
 
@@ -166,7 +166,7 @@ def test_a_reward_that_is_no_number_counts_as_none(batch, learner, reward_of):
         return values
 
     rollouts = simulate(learner.policy, batch, num_rollouts=4, seed=0)
-    _, reward = compute_reward(batch, rollouts, replace(CONFIG, reward=reward_of(broken)))
+    reward = compute_reward(batch, rollouts, replace(CONFIG, reward=reward_of(broken)))[1].total
     assert reward[0].tolist() == [0.0] * 4
     assert reward[1].abs().min() > 0
 
@@ -174,7 +174,7 @@ def test_a_reward_that_is_no_number_counts_as_none(batch, learner, reward_of):
 def test_a_scenario_without_map_has_a_reward(learner):
     batch = collate([scenes.without_map()])
     rollouts = simulate(learner.policy, batch, num_rollouts=4, seed=0)
-    _, reward = compute_reward(batch, rollouts, CONFIG)
+    reward = compute_reward(batch, rollouts, CONFIG)[1].total
     assert reward.isfinite().all()
     assert reward.abs().max() > 0
     assert float(reward.sum()) == pytest.approx(0.0, abs=1e-6)
@@ -186,8 +186,9 @@ def poison_from(monkeypatch, update):
 
     def poisoned(*args):
         calls.append(1)
-        scores, reward = original(*args)
-        return scores, reward * torch.nan if len(calls) >= update else reward
+        scores, rewards = original(*args)
+        poison = torch.nan if len(calls) >= update else 1.0
+        return scores, replace(rewards, by_agent=rewards.by_agent * poison)
 
     monkeypatch.setattr(module, "compute_reward", poisoned)
 
