@@ -171,9 +171,7 @@ def installed(tmp_path, monkeypatch):
 
 def test_a_reward_of_an_installed_package_is_found_where_only_its_name_is_given(simulated, installed):
     installed(
-        "from rlftsim.recipes.configure import configure
-from rlftsim.recipes.smart import smart_demo_rlftsim
-from rlftsim.training.rewards import leave_one_out, register_reward\n"
+        "from rlftsim.training.rewards import leave_one_out, register_reward\n"
         "@register_reward('kindness')\n"
         "def kindness(scores, rollouts, batch, *, scale: float = 1.0):\n"
         "    return leave_one_out(-scale * scores.rollout_collision_rate)\n"
@@ -185,5 +183,5 @@ from rlftsim.training.rewards import leave_one_out, register_reward\n"
 
 def test_a_package_whose_rewards_are_broken_is_named(installed):
     installed("import a_module_that_is_not_there\n")
-    with pytest.raises(ConfigError, match="rewards of test_kindness cannot be imported .*a_module_that_is_not_there"):
+    with pytest.raises(ConfigError, match=r"rewards of test_kindness cannot be imported .*a_module_that_is_not_there"):
         reward_by_name("kindness")
