@@ -31,6 +31,11 @@ def print_wide(*tables: object) -> None:
         console.print(table)
 
 
+def say(line: str) -> None:
+    """A line that a person should see at once, beside the bar."""
+    print(line, file=sys.stderr, flush=True)
+
+
 @runtime_checkable
 class Advance(Protocol):
     """Told whenever work is done."""

@@ -47,7 +47,7 @@ def reward_of():
     names = []
 
     def register(reward):
-        names.append(f"test-{len(names)}")
+        names.append(f"test_{len(names)}")
         register_reward(names[-1])(reward)
         return names[-1]
 
@@ -99,6 +99,53 @@ def test_scored_log_probs_equal_the_sampled_ones_and_the_gap_is_logged(learner, 
     assert 0 <= values["score_gap"] < 1e-4
 
 
+def test_the_logged_gap_would_show_a_policy_that_is_scored_otherwise_than_sampled(learner, batch, fabric, monkeypatch):
+    original = module.simulate
+
+    def sampled_with_other_weights(policy, *args, **options):
+        other = copy.deepcopy(policy)
+        move_weights(other, 0.02)
+        return original(other, *args, **options)
+
+    monkeypatch.setattr(module, "simulate", sampled_with_other_weights)
+    assert update_policy(learner, batch, CONFIG, fabric)["score_gap"] > 1e-3
+
+
+def test_credit_by_agent_weighs_each_agents_decisions_by_what_it_earned(learner, batch, fabric):
+    config = replace(CONFIG, credit="agent", shared_credit=0.25)
+    found = gradients_with(learner, batch, fabric, config, beta=0.0)
+    seed = module.derive_seed(config.seed, "rollouts", learner.update)
+    rollouts = simulate(learner.policy, batch, num_rollouts=4, seed=seed)
+    earned = compute_reward(batch, rollouts, config)[1].by_agent  # [B, N, A]
+    learner.policy.zero_grad()
+    log_prob = learner.policy.score(learner.policy.encode(batch), rollouts).log_prob(rollouts.decision)
+    decisions = rollouts.decision_mask.sum((2, 3))  # of a rollout
+    by_hand = 0.0
+    for b in range(2):
+        for n in range(4):
+            for a in range(batch.agent_mask.shape[1]):
+                if batch.agent_mask[b, a]:
+                    by_hand = by_hand - earned[b, n, a] * log_prob[b, n, a].sum() / decisions[b, n] / 2
+    by_hand.backward()
+    for name, gradient in tiny.gradients_of(learner.policy).items():
+        torch.testing.assert_close(found[name], gradient, atol=1e-6, rtol=1e-4, msg=name)
+    by_rollout = gradients_with(learner, batch, fabric, CONFIG, beta=0.0)
+    assert any(not torch.allclose(found[name], by_rollout[name], atol=1e-6, rtol=1e-2) for name in found)
+
+
+def test_every_term_of_the_reward_is_logged_for_itself(learner, batch, fabric):
+    config = replace(CONFIG, reward="mloo - 0.1*minade_rloo")
+    values = update_policy(learner, batch, config, fabric)
+    alone = {n: update_policy(copy.deepcopy(learner), batch, replace(config, reward=n), fabric) for n in ("mloo",)}
+    assert {name for name in values if name.startswith("reward_")} == {
+        "reward_mean", "reward_std", "reward_zero_rate",
+        "reward_mloo_mean", "reward_mloo_std", "reward_minade_rloo_mean", "reward_minade_rloo_std",
+    }  # fmt: skip
+    assert alone["mloo"]["reward_mloo_std"] == alone["mloo"]["reward_std"]
+    assert values["reward_minade_rloo_std"] > values["reward_mloo_std"] > 0  # metres against shares of the metric
+    assert values["reward_mloo_mean"] == pytest.approx(0.0, abs=1e-6)
+
+
 def test_the_first_update_has_no_kl_and_the_next_one_has(learner, batch, fabric):
     assert update_policy(learner, batch, CONFIG, fabric)["kl"] == pytest.approx(0.0, abs=1e-6)
     assert update_policy(learner, batch, CONFIG, fabric)["kl"] > 1e-6
@@ -119,6 +166,25 @@ def test_gradients_do_not_depend_on_how_many_rollouts_are_scored_at_once(vocabul
             torch.testing.assert_close(gradients[name], gradient, atol=1e-6, rtol=1e-5, msg=name)
         for name in ("kl", "entropy", "gradient_norm"):
             assert values[name] == pytest.approx(logged[name], rel=1e-5), name
+
+
+def test_gradients_do_not_depend_on_how_many_scenarios_are_in_memory_at_once(vocabulary, drawn_scenarios, fabric):
+    batch, found = collate(drawn_scenarios), []  # of different sizes, one with gaps in its record
+    base = replace(CONFIG, num_rollouts=2, reward="mloo + 0.1*collision_offroad_ade", credit="agent")
+    for micro_batch_size in (8, 3, 1):
+        config = replace(base, micro_batch_size=micro_batch_size)
+        learner = prepare(tiny.tiny_policy(vocabulary), config, fabric.device)
+        move_weights(learner.reference)
+        values = update_policy(learner, batch, config, fabric)
+        found.append((tiny.gradients_of(learner.policy), values))
+    whole, logged = found[0]
+    assert max(float(g.abs().max()) for g in whole.values()) > 1e-3
+    for gradients, values in found[1:]:
+        for name, gradient in whole.items():
+            torch.testing.assert_close(gradients[name], gradient, atol=1e-6, rtol=1e-5, msg=name)
+        for name in logged.keys() - {"score_gap"}:
+            if not name.startswith("seconds"):
+                assert values[name] == pytest.approx(logged[name], rel=1e-4, abs=1e-5), name
 
 
 def gradients_with(learner, batch, fabric, config, beta):
@@ -166,7 +232,7 @@ def test_a_reward_that_is_no_number_counts_as_none(batch, learner, reward_of):
         return values
 
     rollouts = simulate(learner.policy, batch, num_rollouts=4, seed=0)
-    _, reward = compute_reward(batch, rollouts, replace(CONFIG, reward=reward_of(broken)))
+    reward = compute_reward(batch, rollouts, replace(CONFIG, reward=reward_of(broken)))[1].total
     assert reward[0].tolist() == [0.0] * 4
     assert reward[1].abs().min() > 0
 
@@ -174,7 +240,7 @@ def test_a_reward_that_is_no_number_counts_as_none(batch, learner, reward_of):
 def test_a_scenario_without_map_has_a_reward(learner):
     batch = collate([scenes.without_map()])
     rollouts = simulate(learner.policy, batch, num_rollouts=4, seed=0)
-    _, reward = compute_reward(batch, rollouts, CONFIG)
+    reward = compute_reward(batch, rollouts, CONFIG)[1].total
     assert reward.isfinite().all()
     assert reward.abs().max() > 0
     assert float(reward.sum()) == pytest.approx(0.0, abs=1e-6)
@@ -186,8 +252,9 @@ def poison_from(monkeypatch, update):
 
     def poisoned(*args):
         calls.append(1)
-        scores, reward = original(*args)
-        return scores, reward * torch.nan if len(calls) >= update else reward
+        scores, rewards = original(*args)
+        poison = torch.nan if len(calls) >= update else 1.0
+        return scores, replace(rewards, by_agent=rewards.by_agent * poison)
 
     monkeypatch.setattr(module, "compute_reward", poisoned)
 
@@ -218,17 +285,29 @@ def test_an_update_whose_kl_exploded_is_skipped(learner, batch, fabric):
 
 
 def test_a_run_that_diverges_stops_and_names_its_last_good_checkpoint(
-    vocabulary, drawn_scenarios, tmp_path, monkeypatch
+    vocabulary, drawn_scenarios, tmp_path, monkeypatch, capsys
 ):
     poison_from(monkeypatch, 4)  # three good updates, a checkpoint after the second
-    config = replace(tiny.FINETUNE, epochs=5.0, max_skipped_in_a_row=3)
+    config = replace(tiny.FINETUNE, epochs=1.5, max_skipped_in_a_row=3)
     with pytest.raises(CheckpointError, match=r"3 updates in a row .*update-00000002.*learning_rate"):
         finetune(tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path, config)
     assert [line["skipped"] for line in read_metrics(tmp_path)] == [0, 0, 0, 1, 2, 3]
+    said = [line for line in capsys.readouterr().err.splitlines() if "skipped" in line]
+    assert said == [
+        f"update {3 + n} skipped: its gradient is not finite ({n} in a row, the run stops at 3)" for n in (1, 2, 3)
+    ]
     assert not (tmp_path / "model").exists()
     monkeypatch.undo()  # and it goes on from there once the cause is gone
     finetune(tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path, config)
     assert (tmp_path / "model" / "config.json").exists()
+
+
+def test_a_run_whose_kl_exploded_says_so_and_stops(vocabulary, drawn_scenarios, tmp_path, capsys):
+    config = replace(tiny.FINETUNE, epochs=5.0, max_kl=1e-9, max_skipped_in_a_row=2)
+    with pytest.raises(CheckpointError, match=r"2 updates in a row .*KL above max_kl"):
+        finetune(tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path, config)
+    said = [line for line in capsys.readouterr().err.splitlines() if "skipped" in line]
+    assert "nats per decision is above max_kl=1e-09 (1 in a row, the run stops at 2)" in said[0]
 
 
 def test_the_reference_moves_every_so_many_updates(learner, batch, fabric):
@@ -246,6 +325,37 @@ def test_beta_adapts_to_the_kl_of_the_update(learner, batch, fabric):
     values = update_policy(learner, batch, CONFIG, fabric)  # KL 0, far below the target: beta falls by 0.2 / horizon
     assert values["beta"] == 0.1
     assert learner.beta == pytest.approx(0.1 * (1 - 0.2 / 5))
+
+
+def test_the_entropy_bonus_pulls_towards_the_uniform_distribution(learner, batch, fabric, reward_of):
+    config = replace(CONFIG, reward=reward_of(nothing), entropy_bonus=0.1, learning_rate=1e-2, warmup_updates=1)
+    values = [update_policy(learner, batch, config, fabric)["entropy"] for _ in range(3)]
+    assert values[0] < values[1] < values[2]
+
+
+def test_gradients_are_clipped_and_weights_decay(learner, batch, fabric, reward_of):
+    update_policy(learner, batch, replace(CONFIG, gradient_clip=1e-3), fabric)
+    norm = math.sqrt(sum(float(g.square().sum()) for g in tiny.gradients_of(learner.policy).values()))
+    assert norm == pytest.approx(1e-3, rel=1e-3)
+    # with nothing to learn a weight shrinks by learning_rate * weight_decay
+    config = replace(CONFIG, reward=reward_of(nothing), weight_decay=0.5, learning_rate=0.1, warmup_updates=1)
+    fresh = prepare(learner.policy, config, fabric.device)
+    before = snapshot(fresh.policy)
+    fresh.beta = 0.0
+    update_policy(fresh, batch, config, fabric)
+    name = next(name for name, p in fresh.policy.named_parameters() if p.requires_grad and p.dim() == 2)
+    torch.testing.assert_close(fresh.policy.state_dict()[name], before[name] * (1 - 0.1 * 0.5))
+
+
+def test_beta_of_a_run_follows_its_closed_form(vocabulary, drawn_scenarios, tmp_path):
+    config = replace(tiny.FINETUNE, epochs=1.5, kl=KlConfig(target=2e-4, horizon=2.0))
+    finetune(tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path, config)
+    lines, beta = read_metrics(tmp_path), 0.1
+    for line in lines:
+        assert line["beta"] == pytest.approx(beta, rel=1e-12)
+        error = max(-0.2, min(0.2, line["kl"] / 2e-4 - 1))
+        beta = max(1e-3, min(1e3, beta * (1 + error / 2)))
+    assert len({line["beta"] > lines[i - 1]["beta"] for i, line in enumerate(lines) if i}) == 2  # it fell and rose
 
 
 def test_the_learning_rate_warms_up(learner, batch, fabric):
@@ -285,6 +395,7 @@ def test_no_scenario_is_refused(vocabulary, tmp_path):
         ({"batch_size": 0}, "must be positive"),
         ({"reward": "joy"}, "unknown reward 'joy': known are .*mloo"),
         ({"metric": "1999"}, "known are 2025"),
+        ({"micro_batch_size": 0}, "micro_batch_size must be positive"),
     ],
 )
 def test_impossible_settings_are_refused_at_once(changes, words):

@@ -7,7 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rlftsim.training.policy_gradient import masked_sum, policy_gradient_loss, rollout_log_prob
+from rlftsim.training.policy_gradient import agent_log_prob, masked_sum, policy_gradient_loss
 
 # one scenario, two rollouts, one agent, three decisions; the last decision of the second rollout does not count
 LOG_PROB = torch.tensor([[[[-1.0, -2.0, -3.0]], [[-4.0, -6.0, -100.0]]]])
@@ -16,16 +16,16 @@ MASK = torch.tensor([[[[True, True, True]], [[True, True, False]]]])
 
 @pytest.mark.parametrize(("reduction", "expected"), [("mean", [-2.0, -5.0]), ("sum", [-6.0, -10.0])])
 def test_a_rollouts_log_prob_is_over_the_decisions_that_count(reduction, expected):
-    assert rollout_log_prob(LOG_PROB, MASK, reduction).tolist() == [expected]
+    assert agent_log_prob(LOG_PROB, MASK, reduction).sum(-1).tolist() == [expected]
 
 
 def test_a_rollout_in_which_nothing_counts_has_log_prob_zero():
-    assert rollout_log_prob(LOG_PROB, torch.zeros_like(MASK), "mean").tolist() == [[0.0, 0.0]]
+    assert agent_log_prob(LOG_PROB, torch.zeros_like(MASK), "mean").tolist() == [[[0.0], [0.0]]]
 
 
 def test_what_does_not_count_may_be_infinite():
     log_prob = torch.where(MASK, LOG_PROB, -torch.inf).requires_grad_()
-    rollout_log_prob(log_prob, MASK, "mean").sum().backward()
+    agent_log_prob(log_prob, MASK, "mean").sum().backward()
     assert log_prob.grad is not None
     assert log_prob.grad.isfinite().all()
     assert masked_sum(log_prob.detach(), MASK) == -16.0

@@ -19,9 +19,11 @@ from rlftsim.training import imitation as imitation_module
 from rlftsim.training.batches import scenario_costs
 from rlftsim.training.run_folder import read_metrics
 
-MODULES = {"pretrain": imitation_module, "catk": imitation_module, "finetune": finetune_module}
-WORK = {"pretrain": "_update", "catk": "_update", "finetune": "update_policy"}
-STAGES = list(MODULES)
+MODULES = {
+    "pretrain": imitation_module, "catk": imitation_module, "finetune": finetune_module, "everything": finetune_module
+}  # fmt: skip
+WORK = {"pretrain": "_update", "catk": "_update", "finetune": "update_policy", "everything": "update_policy"}
+STAGES = ["pretrain", "catk", "finetune"]
 
 
 def weights(out: Path) -> dict[str, torch.Tensor]:
@@ -54,8 +56,10 @@ def stop_at(monkeypatch, stage, update):
     monkeypatch.setattr(module, name, interrupted)
 
 
-@pytest.mark.parametrize("stage", STAGES)
-@pytest.mark.parametrize("update", [1, 4])
+@pytest.mark.parametrize(
+    ("stage", "update"),
+    [("pretrain", 1), ("pretrain", 4), ("catk", 1), ("catk", 4), ("finetune", 1), ("everything", 4)],
+)
 def test_a_run_interrupted_inside_an_update_ends_as_if_it_never_was(
     stage, update, vocabulary, drawn_scenarios, tmp_path, monkeypatch
 ):
@@ -128,15 +132,15 @@ def test_a_run_killed_at_a_random_moment_ends_as_if_it_never_was(stage, tmp_path
     assert [line["update"] for line in read_metrics(tmp_path / "killed")] == list(range(1, 9))
 
 
-def train_in_processes(stage, out, processes, *options, launcher=()):
+def train_in_processes(stage, out, processes, *options, batch_size=4, launcher=()):
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    command = [sys.executable, *launcher, tiny.__file__, stage, str(out), "--updates", "1", "--batch-size", "4"]
+    command = [sys.executable, *launcher, tiny.__file__, stage, str(out), "--updates", "1", "--batch-size", str(batch_size)]
     command += ["--processes", str(processes), *options]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr[-2000:]
 
 
-def assert_same_gradients(first: Path, second: Path, watched: list[str]):
+def assert_same_gradients(first: Path, second: Path):
     assert [(folder / "processes").read_text() for folder in (first, second)] == ["1", "2"]
     one, two = (load_file(folder / "gradients.safetensors") for folder in (first, second))
     assert one.keys() == two.keys()
@@ -144,15 +148,17 @@ def assert_same_gradients(first: Path, second: Path, watched: list[str]):
     for name, gradient in one.items():
         torch.testing.assert_close(two[name], gradient, atol=1e-6, rtol=1e-5, msg=name)
     a, b = (read_metrics(folder)[0] for folder in (first, second))
-    for name in watched:
+    assert a.keys() == b.keys()
+    own = {"time", "score_gap"}  # of a process
+    for name in (name for name in a if name not in own and not name.startswith("seconds")):
         assert b[name] == pytest.approx(a[name], rel=1e-5, abs=1e-6), name
 
 
 @pytest.mark.slow
 def test_two_processes_find_the_gradient_of_one(tmp_path):
     for processes in (1, 2):
-        train_in_processes("finetune", tmp_path / str(processes), processes)
-    assert_same_gradients(tmp_path / "1", tmp_path / "2", ["kl", "entropy", "gradient_norm", "rmm"])
+        train_in_processes("everything", tmp_path / str(processes), processes, batch_size=5)
+    assert_same_gradients(tmp_path / "1", tmp_path / "2")
 
 
 @pytest.mark.slow
@@ -164,6 +170,5 @@ def test_torchrun_finds_the_gradient_of_one_process(stage, tmp_path):
     train_in_processes(stage, tmp_path / "1", 1, "--micro-batch-cost", budget)
     torchrun = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2")
     train_in_processes(stage, tmp_path / "2", 1, "--micro-batch-cost", budget, launcher=torchrun)
-    watched = ["loss", "accuracy", "predictions", "validation_rmm", "validation_rmm_low", "validation_min_ade_m"]
-    assert_same_gradients(tmp_path / "1", tmp_path / "2", watched)
+    assert_same_gradients(tmp_path / "1", tmp_path / "2")
     assert (tmp_path / "2" / "model" / "model.safetensors").exists()

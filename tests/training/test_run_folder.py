@@ -7,7 +7,7 @@ import tiny
 from rlftsim.errors import CheckpointError
 from rlftsim.training.finetune import FinetuneConfig
 from rlftsim.training.reference import KlConfig
-from rlftsim.training.run_folder import RunFolder, describe_inputs, read_metrics, to_plain
+from rlftsim.training.run_folder import RunFolder, board_tag, describe_inputs, read_metrics, to_plain
 
 
 def test_the_folder_holds_the_resolved_configuration_and_the_environment(tmp_path):
@@ -89,3 +89,19 @@ def test_precision_is_part_of_a_run_and_threads_are_not(tmp_path):
     RunFolder(tmp_path, replace(tiny.FINETUNE, device=replace(tiny.FINETUNE.device, threads=3)))
     with pytest.raises(CheckpointError, match=r"device\.precision"):
         RunFolder(tmp_path, replace(tiny.FINETUNE, device=replace(tiny.FINETUNE.device, precision="bf16-mixed")))
+
+
+@pytest.mark.parametrize(
+    ("name", "tag"),
+    [
+        ("reward_mloo_std", "reward/reward_mloo_std"),
+        ("kl", "kl/kl"),
+        ("beta", "kl/beta"),
+        ("kinematic", "realism/kinematic"),
+        ("alarm_speed", "alarm/alarm_speed"),
+        ("seconds_step", "time/seconds_step"),
+        ("entropy", "entropy"),
+    ],
+)
+def test_tensorboard_shows_what_belongs_together_under_one_head(name, tag):
+    assert board_tag(name) == tag

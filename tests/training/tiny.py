@@ -1,6 +1,6 @@
 """A model so small that a whole training run takes seconds, for tests; also a command, so that a run can be killed or spread.
 
-python tests/training/tiny.py pretrain|catk|finetune OUT [--processes 2] [--updates 8]
+python tests/training/tiny.py pretrain|catk|finetune|everything OUT [--processes 2] [--updates 8]
 """
 
 import argparse
@@ -15,6 +15,7 @@ from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.synthetic import pack_path
 from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
+from rlftsim.training.alarms import AlarmConfig
 from rlftsim.training.catk import CatkConfig, catk_finetune
 from rlftsim.training.finetune import FinetuneConfig, finetune
 from rlftsim.training.parallel import DeviceConfig
@@ -42,6 +43,14 @@ FINETUNE = FinetuneConfig(
     kl=KlConfig(reference_every=2, reference_share=0.25),
 )
 """Eight updates on five scenarios, with a checkpoint after every second."""
+OF_EVERYTHING = replace(
+    FINETUNE,
+    reward="mloo + 0.5*rloo + 0.1*collision_offroad_ade",
+    credit="agent",
+    micro_batch_size=2,
+    alarms=AlarmConfig(first_updates=2, window=2),
+)
+"""The same with a sum of rewards, credit by agent, scenarios in pieces and alarms that look early."""
 
 
 def pack_scenarios(count=NUM_SCENARIOS):
@@ -79,7 +88,7 @@ def train(stage, policy, scenarios, out, held_out=None, **changes):
         return pretrain(policy, scenarios, out, replace(PRETRAIN, **changes), held_out=held_out)
     if stage == "catk":
         return catk_finetune(policy, scenarios, out, replace(CATK, **changes), held_out=held_out)
-    return finetune(policy, scenarios, out, replace(FINETUNE, **changes))
+    return finetune(policy, scenarios, out, replace(OF_EVERYTHING if stage == "everything" else FINETUNE, **changes))
 
 
 def run(stage, out, *, updates=8, processes=1, batch_size=1, micro_batch_cost=None):
@@ -103,7 +112,7 @@ def run(stage, out, *, updates=8, processes=1, batch_size=1, micro_batch_cost=No
 
 def main():
     parser = argparse.ArgumentParser()
-    parser.add_argument("stage", choices=("pretrain", "catk", "finetune"))
+    parser.add_argument("stage", choices=("pretrain", "catk", "finetune", "everything"))
     parser.add_argument("out", type=Path)
     parser.add_argument("--updates", type=int, default=8)
     parser.add_argument("--processes", type=int, default=1)

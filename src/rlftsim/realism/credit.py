@@ -67,16 +67,44 @@ def compute_credit(log: ScenarioLog, features: Features, config: MetricConfig = 
     Raises:
         DataError: fewer than two rollouts, so that none can be left out.
     """
+    distinct = _require_two(features)
+    terms = _log_likelihood_terms(log, features, config, slice(0, 1 + distinct))  # of all, and of all but each
+    return Credit(split_difference(terms[:1], terms[1:], config).transpose(1, 2), features.repeat)
+
+
+def compute_single_credit(
+    log: ScenarioLog, features: Features, config: MetricConfig = METRIC_2025
+) -> Float64[Tensor, "N E F"]:
+    """Shares of agents and features in how far a rollout's own RMM lies above the mean of the others' own.
+
+    Summed over agents and features: RMM_i - mean_{j != i} RMM_j, the reward `rloo`. Each difference RMM_i - RMM_j is split for itself.
+
+    Raises:
+        DataError: fewer than two rollouts, so that there are no others.
+    """
+    distinct = _require_two(features)
+    terms = _log_likelihood_terms(log, features, config, slice(1 + distinct, None))  # of each alone
+    between = split_difference(terms[:, None], terms[None], config)  # [N, N, F, E]
+    return (between.sum(1) * (features.repeat / (distinct * features.repeat - 1))).transpose(1, 2)
+
+
+def _require_two(features: Features) -> int:
+    """The number of distinct rollouts, if there are two rollouts at all."""
     distinct = len(features.linear_speed)
     if distinct * features.repeat < 2:
         raise DataError("Credit needs at least 2 rollouts, got 1: without it there is nothing to score.")
+    return distinct
+
+
+def _log_likelihood_terms(
+    log: ScenarioLog, features: Features, config: MetricConfig, sets: slice
+) -> Float64[Tensor, "S F E"]:
+    """What each agent adds to the mean log-probability of each feature under some of the sets of `form_sets`, nats."""
     target, table = log_target(log, config), histogram_table(config, features.linear_speed.device)
-    sets, size = form_sets(count_rollouts(features, log, config), features.repeat)
-    first = slice(0, 1 + distinct)  # all, and all but each
-    chosen = RolloutCounts(sets.bins[first].double(), sets.agreement[first].double(), sets.num_steps)
-    by_agent = compute_agent_log_likelihoods(chosen, size[first].double(), target, table)  # [1 + N, F, E]
-    terms = count_terms(target).double()[:, None]
-    return Credit(split_difference(by_agent[:1] / terms, by_agent[1:] / terms, config).transpose(1, 2), features.repeat)
+    counts, size = form_sets(count_rollouts(features, log, config), features.repeat)
+    chosen = RolloutCounts(counts.bins[sets].double(), counts.agreement[sets].double(), counts.num_steps)
+    by_agent = compute_agent_log_likelihoods(chosen, size[sets].double(), target, table)
+    return by_agent / count_terms(target).double()[:, None]
 
 
 def split_difference(

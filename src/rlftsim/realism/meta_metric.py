@@ -4,15 +4,13 @@ Source: Waymo Open Sim Agents Challenge. The leave-one-out and single-rollout va
 (equation 2) are made of; they cost one reduction over per-rollout counts.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import lru_cache
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from rlftsim.errors import DataError
 from rlftsim.realism.agents import SimulatedStates
 from rlftsim.realism.config import FEATURE_NAMES, METRIC_2025, SUB_SCORES, MetricConfig
 from rlftsim.realism.features import (
@@ -207,33 +205,3 @@ def score(
     if isinstance(log, Scenario):
         log = scenario_log(log, states.device, missing_map=missing_map, compute=compute)
     return score_features(log, compute_features(log, states, compute=compute), config)
-
-
-def score_batch(
-    scenarios: Sequence[Scenario | ScenarioLog],
-    states: Sequence[SimulatedStates],
-    config: MetricConfig = METRIC_2025,
-    *,
-    missing_map: MissingMap = "error",
-    compute: ComputeConfig = DEFAULT_COMPUTE,
-) -> RealismResult:
-    """Scores of B scenarios with N rollouts each, stacked: [B], [B, F] and [B, N].
-
-    Raises:
-        DataError: as `score`; also if there is no scenario or the numbers of scenarios or rollouts differ.
-    """
-    if len(scenarios) != len(states) or not scenarios:
-        raise DataError(f"Scoring needs one set of rollouts per scenario, got {len(states)} for {len(scenarios)}.")
-    sizes = sorted({item.num_rollouts for item in states})
-    if len(sizes) > 1:
-        raise DataError(f"Scenarios scored together need equally many rollouts, got {sizes}: score them one by one.")
-    results = [
-        score(scenario, item, config, missing_map=missing_map, compute=compute)
-        for scenario, item in zip(scenarios, states)
-    ]
-    stacked = {
-        field.name: torch.stack([getattr(result, field.name) for result in results])
-        for field in fields(RealismResult)
-        if field.name not in ("scenario_ids", "config")
-    }
-    return RealismResult(scenario_ids=tuple(r.scenario_ids[0] for r in results), config=config, **stacked)

@@ -59,6 +59,14 @@ class ScenarioBatch:
         moved = {f.name: v.to(device) for f in fields(self) if isinstance(v := getattr(self, f.name), Tensor)}
         return replace(self, **moved)
 
+    def split(self, size: int) -> tuple["ScenarioBatch", ...]:
+        """Batches of at most `size` of the scenarios each, in their order, padded as this one is."""
+        tensors = {f.name: v.split(size) for f in fields(self) if isinstance(v := getattr(self, f.name), Tensor)}
+        return tuple(
+            replace(self, scenarios=self.scenarios[i * size : (i + 1) * size], **dict(zip(tensors, parts)))
+            for i, parts in enumerate(zip(*tensors.values()))
+        )
+
 
 def collate(scenarios: Sequence[Scenario], *, max_agents: int | None = None, frame: Frame = "map") -> ScenarioBatch:
     """Batch of scenarios.

@@ -1,23 +1,23 @@
 """Closed-loop fine-tuning: sample, reward, score, update, reference. RLFTSim, section 4.
 
-`finetune` is the main path of this package; an update reads top to bottom in `_update`.
+`finetune` is the main path of this package; an update reads top to bottom in `update_policy`.
 """
 
 import copy
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from jaxtyping import Float
 from lightning_fabric import Fabric
 from torch import Tensor, nn
 
 from rlftsim.errors import ConfigError, require_positive
-from rlftsim.progress import progress_bar
-from rlftsim.realism import RealismResult, metric_by_name, score_batch
+from rlftsim.progress import progress_bar, say
+from rlftsim.realism import AgentScores, RealismResult, measure_batch, metric_by_name, score_measured
 from rlftsim.realism.from_rollouts import states_of_rollouts
 from rlftsim.rollout.noise import derive_seed
 from rlftsim.rollout.policy import Policy
@@ -25,13 +25,14 @@ from rlftsim.rollout.simulate import simulate
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import Scenarios
+from rlftsim.training.alarms import AlarmConfig, Alarms
 from rlftsim.training.checkpoint import Progress, newest_checkpoint, read_checkpoint, write_checkpoint
 from rlftsim.training.data import batch_with_futures, scenarios_of_update
+from rlftsim.training.experience import Experience, describe
 from rlftsim.training.parallel import DeviceConfig, add_up, add_up_gradients, own_share, start_fabric
-from rlftsim.training.policy_gradient import Reduction, masked_sum, policy_gradient_loss, rollout_log_prob
+from rlftsim.training.policy_gradient import Reduction, agent_log_prob, masked_sum, policy_gradient_loss
 from rlftsim.training.reference import KlConfig, adapt_beta, move_reference
-from rlftsim.training.rewards import Reward, reward_by_name
-from rlftsim.training.rewards.base import finite_or_zero
+from rlftsim.training.rewards import CreditTo, Rewards, compute_rewards, parse_reward, write_reward
 from rlftsim.training.run_folder import RunFolder, describe_inputs
 
 
@@ -45,13 +46,21 @@ class FinetuneConfig:
     """Scenarios per update, over all processes (B)."""
     num_rollouts: int = 4
     """Rollouts per scenario and update (N)."""
+    micro_batch_size: int = 8
+    """Scenarios in memory at once, in each process; fewer need less memory, the update is the same."""
     rollouts_per_pass: int = 4
-    """Rollouts that are scored with gradient at once; fewer need less memory, the update is the same."""
+    """Rollouts of each that are scored with gradient at once; fewer need less memory, the update is the same."""
     reward: str = "mloo"
+    """A registered reward, or a sum such as "mloo + 0.1*collision_offroad"; kept with its options' defaults filled in."""
     metric: str = "2025"
     """Configuration of the meta-metric the reward is made of."""
+    credit: CreditTo = "rollout"
+    """Whom a reward is owed to: every decision of the rollout alike, or to each agent its own share, see `rewards.composition`."""
+    shared_credit: float = 0.1
+    """With credit by agent: the share of what the others earned."""
     learning_rate: float = 3e-6
     warmup_updates: int = 100
+    """The learning rate rises linearly over them and is constant from then on."""
     betas: tuple[float, float] = (0.9, 0.999)
     weight_decay: float = 0.01
     gradient_clip: float = 1.0
@@ -65,6 +74,7 @@ class FinetuneConfig:
     """Nats per decision; an update that exceeds it, or is not finite, is skipped."""
     max_skipped_in_a_row: int = 5
     """After so many skipped updates the run stops with its last good checkpoint."""
+    alarms: AlarmConfig = field(default_factory=AlarmConfig)
     checkpoint_every: int = 50
     """Updates."""
     seed: int = 0
@@ -78,6 +88,7 @@ class FinetuneConfig:
         positive = (
             "epochs",
             "batch_size",
+            "micro_batch_size",
             "rollouts_per_pass",
             "learning_rate",
             "checkpoint_every",
@@ -85,8 +96,10 @@ class FinetuneConfig:
             "max_skipped_in_a_row",
         )
         require_positive(self, positive)
+        if not 0 <= self.shared_credit <= 1:
+            raise ConfigError(f"shared_credit is a share in [0, 1], got {self.shared_credit}.")
         metric_by_name(self.metric)
-        reward_by_name(self.reward)
+        object.__setattr__(self, "reward", write_reward(parse_reward(self.reward)))
 
     def num_updates(self, num_scenarios: int) -> int:
         """Optimiser steps of the run."""
@@ -103,6 +116,7 @@ class Learner:
     beta: float
     update: int = 0
     skipped_in_a_row: int = 0
+    alarms: Alarms = field(default_factory=Alarms)
 
     @property
     def parameters(self) -> list[nn.Parameter]:
@@ -147,7 +161,10 @@ def finetune(policy: Policy, scenarios: Scenarios, out: Path, config: FinetuneCo
             )
             batch = batch_with_futures(scenarios, chosen).to(fabric.device)
             values = update_policy(learner, batch, config, fabric)
-            run.log(learner.update, values)
+            levels, alarms = learner.alarms.watch(values, config.alarms)
+            run.log(learner.update, {**values, **levels})
+            if fabric.is_global_zero:
+                _tell(learner, values, alarms, config)
             _stop_if_diverged(learner, run, config)
             if fabric.is_global_zero and _is_checkpoint_due(learner, config, total):
                 write_checkpoint(run.checkpoints, _progress(learner), _modules(learner), learner.optimizer)
@@ -175,22 +192,25 @@ def prepare(policy: nn.Module, config: FinetuneConfig, device: torch.device) -> 
 
 def update_policy(learner: Learner, batch: ScenarioBatch, config: FinetuneConfig, fabric: Fabric) -> dict[str, float]:
     """One update: everything of RLFTSim's section 4.1, in order. Returns what is logged."""
-    clock = _Clock()
-    # 1 sample N rollouts of each scenario, without gradient
+    clock = _Clock(fabric.device)
     seed = derive_seed(config.seed, "rollouts", learner.update)
-    with fabric.autocast():
-        rollouts = simulate(learner.policy, batch, num_rollouts=config.num_rollouts, seed=seed)
-    clock.lap("rollout")
-    # 2 reward
-    scores, reward = compute_reward(batch, rollouts, config)
-    clock.lap("reward")
+    experiences = []
+    for part in batch.split(config.micro_batch_size):
+        # 1 sample N rollouts of each scenario, without gradient
+        with fabric.autocast():
+            rollouts = simulate(learner.policy, part, num_rollouts=config.num_rollouts, seed=seed)
+        clock.lap("rollout")
+        # 2 reward
+        scores, rewards = compute_reward(part, rollouts, config)
+        experiences.append(Experience(part, rollouts, scores, rewards))
+        clock.lap("reward")
     # 3 log-probabilities under policy and reference, 4 loss and gradients, slice by slice
-    sums = _accumulate_gradients(learner, batch, rollouts, reward, config, fabric)
+    sums = _accumulate_gradients(learner, experiences, config, fabric)
     clock.lap("backward")
     # 5 step, 6 penalty, 7 reference
     count = max(sums.count, 1.0)
     kl, norm = sums.kl / count, _step(learner, sums, config)
-    values = {**_describe(scores, reward, rollouts, fabric), "kl": kl, "entropy": sums.entropy / count}
+    values = {**describe(experiences, fabric), "kl": kl, "entropy": sums.entropy / count}
     values |= {
         "score_gap": sums.gap,
         "beta": learner.beta,
@@ -205,15 +225,18 @@ def update_policy(learner: Learner, batch: ScenarioBatch, config: FinetuneConfig
     return {**values, "learning_rate": learner.optimizer.param_groups[0]["lr"], **clock.seconds}
 
 
-def compute_reward(
-    batch: ScenarioBatch, rollouts: Rollouts, config: FinetuneConfig
-) -> tuple[RealismResult, Float[Tensor, "B N"]]:
-    """The rollouts' scores and their rewards. A scenario without map counts as on the road; one that has no finite score earns 0."""
-    reward: Reward = reward_by_name(config.reward)
-    states = states_of_rollouts(batch, rollouts)
-    scores = score_batch(batch.scenarios, states, metric_by_name(config.metric), missing_map="neutral")
-    values = reward(scores, rollouts, batch)
-    return scores, finite_or_zero(values)
+def compute_reward(batch: ScenarioBatch, rollouts: Rollouts, config: FinetuneConfig) -> tuple[RealismResult, Rewards]:
+    """The rollouts' scores and what they earn. Everything is made of features that are measured once.
+
+    A scenario without map counts as on the road; one that has no finite score earns 0.
+    """
+    metric = metric_by_name(config.metric)
+    measured = measure_batch(batch.scenarios, states_of_rollouts(batch, rollouts), missing_map="neutral")
+    scores = score_measured(measured, metric)
+    agents = AgentScores(measured, metric, batch.agent_mask.shape[1]) if config.credit == "agent" else None
+    return scores, compute_rewards(
+        parse_reward(config.reward), scores, rollouts, batch, agents, shared=config.shared_credit
+    )
 
 
 @dataclass
@@ -228,38 +251,34 @@ class _Sums:
 
 
 def _accumulate_gradients(
-    learner: Learner,
-    batch: ScenarioBatch,
-    rollouts: Rollouts,
-    reward: Float[Tensor, "B N"],
-    config: FinetuneConfig,
-    fabric: Fabric,
+    learner: Learner, experiences: Sequence[Experience], config: FinetuneConfig, fabric: Fabric
 ) -> _Sums:
     """Score the rollouts under policy and reference and leave the loss's gradient in the policy's parameters."""
     learner.optimizer.zero_grad(set_to_none=True)
-    totals = torch.tensor(
-        [batch.num_scenarios, int(rollouts.decision_mask.sum())], device=fabric.device, dtype=torch.float64
-    )
+    counts = [(e.batch.num_scenarios, int(e.rollouts.decision_mask.sum())) for e in experiences]
+    totals = torch.tensor(counts, device=fabric.device, dtype=torch.float64).sum(0)
     num_scenarios, num_decisions = add_up(totals, fabric).tolist()
     sums = torch.zeros(2, device=fabric.device, dtype=torch.float64)
     gaps: list[Tensor] = []
-    with fabric.autocast(), torch.no_grad():
-        reference_context = learner.reference.encode(batch)
-    for start in range(0, config.num_rollouts, config.rollouts_per_pass):
-        part = slice(start, start + config.rollouts_per_pass)
-        rows, mask = rollouts.select(part), rollouts.decision_mask[:, part]
-        with fabric.autocast():
-            scored = learner.policy.score(learner.policy.encode(batch), rows)
-            with torch.no_grad():
-                held = learner.reference.score(reference_context, rows)
-        log_prob = scored.log_prob(rows.decision)
-        kl, entropy = masked_sum(scored.kl(held), mask), masked_sum(scored.entropy(), mask)
-        by_rollout = rollout_log_prob(log_prob, mask, config.log_prob_reduction)
-        loss = policy_gradient_loss(reward[:, part], by_rollout, int(num_scenarios))
-        loss = loss + (learner.beta * kl - config.entropy_bonus * entropy) / max(num_decisions, 1.0)
-        fabric.backward(loss)
-        sums += torch.stack([kl.detach(), entropy.detach()])
-        gaps.append(torch.where(mask, log_prob.detach() - rows.log_prob, 0.0).abs().max())
+    for experience in experiences:
+        with fabric.autocast(), torch.no_grad():
+            reference_context = learner.reference.encode(experience.batch)
+        for start in range(0, config.num_rollouts, config.rollouts_per_pass):
+            part = slice(start, start + config.rollouts_per_pass)
+            rows, reward = experience.rollouts.select(part), experience.rewards.by_agent[:, part]
+            mask = rows.decision_mask
+            with fabric.autocast():
+                scored = learner.policy.score(learner.policy.encode(experience.batch), rows)
+                with torch.no_grad():
+                    held = learner.reference.score(reference_context, rows)
+            log_prob = scored.log_prob(rows.decision)
+            kl, entropy = masked_sum(scored.kl(held), mask), masked_sum(scored.entropy(), mask)
+            by_agent = agent_log_prob(log_prob, mask, config.log_prob_reduction)
+            loss = policy_gradient_loss(reward, by_agent, int(num_scenarios))
+            loss = loss + (learner.beta * kl - config.entropy_bonus * entropy) / max(num_decisions, 1.0)
+            fabric.backward(loss)
+            sums += torch.stack([kl.detach(), entropy.detach()])
+            gaps.append(torch.where(mask, log_prob.detach() - rows.log_prob, 0.0).abs().max())
     add_up_gradients(learner.parameters, fabric)
     kl, entropy = add_up(sums, fabric).tolist()
     return _Sums(kl, entropy, float(torch.stack(gaps).max()), num_decisions)
@@ -280,38 +299,24 @@ def _step(learner: Learner, sums: _Sums, config: FinetuneConfig) -> float:
     return norm
 
 
+def _tell(learner: Learner, values: dict[str, float], alarms: list[str], config: FinetuneConfig) -> None:
+    """Say what a person should know at once: an update that was skipped, and why; alarms that begin to ring."""
+    if learner.skipped_in_a_row:
+        cause = f"KL {values['kl']:.3g} nats per decision is above max_kl={config.max_kl:g}"
+        if not math.isfinite(values["gradient_norm"]):
+            cause = "its gradient is not finite"
+        limit = f"{learner.skipped_in_a_row} in a row, the run stops at {config.max_skipped_in_a_row}"
+        say(f"update {learner.update} skipped: {cause} ({limit})")
+    for alarm in alarms:
+        say(f"update {learner.update}, {alarm}")
+
+
 def _stop_if_diverged(learner: Learner, run: RunFolder, config: FinetuneConfig) -> None:
     if learner.skipped_in_a_row >= config.max_skipped_in_a_row:
         cause = (
             f"{learner.skipped_in_a_row} updates in a row were skipped, KL above max_kl={config.max_kl} or not finite"
         )
         raise run.diverged(cause, "lower learning_rate or raise kl.initial_beta")
-
-
-def _describe(
-    scores: RealismResult, reward: Float[Tensor, "B N"], rollouts: Rollouts, fabric: Fabric
-) -> dict[str, float]:
-    """Means over scenarios (and processes) of what a person wants to watch."""
-    ends = rollouts.position[..., -1, :]
-    spread = (ends - ends.mean(1, keepdim=True)).norm(dim=-1)
-    present = rollouts.decision_mask.any(-1)
-    watched = {
-        "reward_mean": reward.mean(),
-        "reward_std": reward.std(-1).mean(),
-        "reward_zero_rate": (reward == 0).all(-1).double().mean(),
-        "rmm": scores.meta_metric.nanmean(),
-        "kinematic": scores.kinematic.nanmean(),
-        "interactive": scores.interactive.nanmean(),
-        "map_based": scores.map_based.nanmean(),
-        "ade_m": scores.average_displacement_error.nanmean(),
-        "min_ade_m": scores.min_average_displacement_error.nanmean(),
-        "collision_rate": scores.collision_rate.mean(),
-        "offroad_rate": scores.offroad_rate.mean(),
-        "traffic_light_violation_rate": scores.traffic_light_violation_rate.mean(),
-        "diversity_m": spread[present].mean(),
-    }
-    values = add_up(torch.stack(list(watched.values())).double(), fabric) / fabric.world_size
-    return dict(zip(watched, values.tolist()))
 
 
 def _is_checkpoint_due(learner: Learner, config: FinetuneConfig, total: int) -> bool:
@@ -324,7 +329,7 @@ def _modules(learner: Learner) -> dict[str, nn.Module]:
 
 
 def _progress(learner: Learner) -> Progress:
-    return Progress(learner.update, {"beta": learner.beta})
+    return Progress(learner.update, {"beta": learner.beta, **learner.alarms.to_numbers()})
 
 
 def _resume(learner: Learner, run: RunFolder) -> None:
@@ -333,17 +338,22 @@ def _resume(learner: Learner, run: RunFolder) -> None:
     if newest:
         progress = read_checkpoint(newest, _modules(learner), learner.optimizer)
         learner.update, learner.beta = progress.update, progress.numbers["beta"]
+        learner.alarms.load_numbers(progress.numbers)
     run.continue_from(learner.update)
 
 
 class _Clock:
-    """Seconds between laps."""
+    """Seconds spent in each kind of lap, the device's work included."""
 
-    def __init__(self) -> None:
+    def __init__(self, device: torch.device) -> None:
         self.seconds: dict[str, float] = {}
+        self._device = device
         self._last = time.perf_counter()
 
     def lap(self, name: str) -> None:
+        if self._device.type == "cuda":
+            torch.cuda.synchronize(self._device)
         now = time.perf_counter()
-        self.seconds[f"seconds_{name}"] = now - self._last
+        name = f"seconds_{name}"
+        self.seconds[name] = self.seconds.get(name, 0.0) + now - self._last
         self._last = now

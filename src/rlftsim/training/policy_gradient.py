@@ -13,22 +13,25 @@ from torch import Tensor
 Reduction = Literal["mean", "sum"]
 
 
-def rollout_log_prob(
+def agent_log_prob(
     log_prob: Float[Tensor, "B N A L"], mask: Bool[Tensor, "B N A L"], reduction: Reduction
-) -> Float[Tensor, "B N"]:
-    """Log-probability of each rollout: the mean (or sum) over its agents' decisions that count."""
-    total = torch.where(mask, log_prob, 0.0).sum((-1, -2))
-    return total if reduction == "sum" else total / mask.sum((-1, -2)).clamp(min=1)
+) -> Float[Tensor, "B N A"]:
+    """Each agent's part of the log-probability of its rollout, which is the mean (or sum) over all agents' decisions that count.
+
+    Summed over agents it is the rollout's log-probability.
+    """
+    total = torch.where(mask, log_prob, 0.0).sum(-1)
+    return total if reduction == "sum" else total / mask.sum((-1, -2)).clamp(min=1)[..., None]
 
 
 def policy_gradient_loss(
-    reward: Float[Tensor, "B N"], log_prob: Float[Tensor, "B N"], num_scenarios: int
+    reward: Float[Tensor, "B N *A"], log_prob: Float[Tensor, "B N *A"], num_scenarios: int
 ) -> Float[Tensor, ""]:
     """Loss whose gradient is minus the policy gradient: - 1/B sum_b sum_i R[b, i] log pi(rollout i of b).
 
     Args:
-        reward: with its baseline inside; no gradient flows through it.
-        log_prob: of each rollout.
+        reward: of each rollout, or of each agent in it; with its baseline inside; no gradient flows through it.
+        log_prob: of the same.
         num_scenarios: B over all slices and processes.
     """
     return -(reward.detach() * log_prob).sum() / num_scenarios

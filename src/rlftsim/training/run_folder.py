@@ -44,6 +44,23 @@ MAY_CHANGE = {
 """Settings that a run may be continued with other values of: they change no estimate."""
 
 
+BOARD_GROUPS = {
+    "reward": ("reward_",),
+    "kl": ("kl", "beta"),
+    "realism": ("rmm", "kinematic", "interactive", "map_based"),
+    "alarm": ("alarm_",),
+    "validation": ("validation_",),
+    "time": ("seconds",),
+}
+"""How TensorBoard shows metrics together: by how their names begin."""
+
+
+def board_tag(name: str) -> str:
+    """A metric's name in TensorBoard: that of metrics.jsonl, behind its group if it has one."""
+    groups = [group for group, beginnings in BOARD_GROUPS.items() if name.startswith(beginnings)]
+    return "/".join([*groups, name])
+
+
 def describe_inputs(policy: object, scenarios: Scenarios) -> dict[str, str]:
     """What a run starts from, as hashes: weights, settings and vocabulary of the policy, and which scenarios in which order."""
     ids = hashlib.blake2b(digest_size=16)
@@ -150,7 +167,7 @@ class RunFolder:
             file.write(json.dumps({"update": update, "time": round(time.time(), 3), **values}) + "\n")
         if self._board is not None:
             for name, value in values.items():
-                self._board.add_scalar(name, value, update)
+                self._board.add_scalar(board_tag(name), value, update)
 
     def close(self) -> None:
         """Flush what is pending."""

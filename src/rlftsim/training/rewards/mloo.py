@@ -3,10 +3,10 @@
 from jaxtyping import Float
 from torch import Tensor
 
-from rlftsim.realism import RealismResult
+from rlftsim.realism import AgentScores, RealismResult
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
-from rlftsim.training.rewards.base import register_reward, require_two
+from rlftsim.training.rewards.base import register_reward, register_shares, require_two
 
 
 def compute_mloo(leave_one_out_rmm: Float[Tensor, "B N"]) -> Float[Tensor, "B N"]:
@@ -31,3 +31,9 @@ def compute_mloo(leave_one_out_rmm: Float[Tensor, "B N"]) -> Float[Tensor, "B N"
 def mloo(scores: RealismResult, rollouts: Rollouts, batch: ScenarioBatch) -> Float[Tensor, "B N"]:
     """The paper's reward."""
     return compute_mloo(scores.leave_one_out_meta_metric)
+
+
+@register_shares("mloo")
+def mloo_shares(scores: AgentScores, rollouts: Rollouts, batch: ScenarioBatch) -> Float[Tensor, "B N A"]:
+    """By the logarithmic mean (`realism.credit`)."""
+    return scores.leave_one_out

@@ -1,0 +1,111 @@
+"""Rewards as a person writes them: "mloo", "mloo + 0.1*collision_offroad", "0.5*(mloo + rloo)", "collision_offroad_ade(ade_weight=0.2)"."""
+
+import ast
+import inspect
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from rlftsim.errors import ConfigError
+from rlftsim.training.rewards.base import Reward, reward_by_name
+
+Option = float | int | bool | str
+
+
+@dataclass(frozen=True)
+class Term:
+    """A registered reward, how much it counts, and its options, defaults filled in."""
+
+    weight: float
+    name: str
+    options: tuple[tuple[str, Option], ...] = ()
+
+    def __str__(self) -> str:
+        options = ", ".join(f"{name}={value!r}" for name, value in self.options)
+        return f"{self.name}({options})" if options else self.name
+
+
+def parse_reward(text: str) -> tuple[Term, ...]:
+    """The terms of a sum of rewards.
+
+    Raises:
+        ConfigError: not a sum of rewards; a reward that is not registered or comes twice; an option that it does not have.
+    """
+    try:
+        terms = tuple(_terms(ast.parse(text.strip(), mode="eval").body, 1.0))
+    except ConfigError:
+        raise
+    except (SyntaxError, ValueError):
+        raise ConfigError(
+            f"reward {text!r} cannot be read: write a sum of rewards, such as 'mloo + 0.1*collision_offroad'."
+        ) from None
+    names = [term.name for term in terms]
+    for name in names:
+        if names.count(name) > 1:
+            raise ConfigError(f"reward {text!r} has {name} {names.count(name)} times: name it once, with one weight.")
+    return terms
+
+
+def write_reward(terms: tuple[Term, ...]) -> str:
+    """Terms in their one spelling, which `parse_reward` reads."""
+    signed = (f"{'-' if term.weight < 0 else '+'} {_times(abs(term.weight))}{term}" for term in terms)
+    return " ".join(signed).removeprefix("+ ")
+
+
+def _times(weight: float) -> str:
+    return "" if weight == 1 else f"{repr(weight).removesuffix('.0')}*"
+
+
+def _terms(node: ast.expr, factor: float) -> Iterator[Term]:
+    """The terms of a part of a sum that is multiplied by a factor. ValueError where it is something else."""
+    match node:
+        case ast.BinOp(left, ast.Add(), right):
+            yield from _terms(left, factor)
+            yield from _terms(right, factor)
+        case ast.BinOp(left, ast.Sub(), right):
+            yield from _terms(left, factor)
+            yield from _terms(right, -factor)
+        case ast.BinOp(left, ast.Mult(), right):
+            number, rest = (right, left) if _is_number(right) else (left, right)
+            yield from _terms(rest, factor * _number(number))
+        case ast.UnaryOp(ast.USub(), operand):
+            yield from _terms(operand, -factor)
+        case ast.Name(name):
+            yield Term(factor, name, _options(name, reward_by_name(name), {}))
+        case ast.Call(ast.Name(name), [], keywords):
+            given = {str(keyword.arg): ast.literal_eval(keyword.value) for keyword in keywords}
+            yield Term(factor, name, _options(name, reward_by_name(name), given))
+        case _:
+            raise ValueError(node)
+
+
+def _is_number(node: ast.expr) -> bool:
+    return isinstance(node, ast.Constant) or (isinstance(node, ast.UnaryOp) and _is_number(node.operand))
+
+
+def _number(node: ast.expr) -> float:
+    value = ast.literal_eval(node)
+    if type(value) not in (int, float) or not math.isfinite(value):
+        raise ValueError(value)
+    return float(value)
+
+
+def _options(name: str, reward: Reward, given: dict[str, Option]) -> tuple[tuple[str, Option], ...]:
+    """A reward's options with what is given in place of the defaults."""
+    parameters = inspect.signature(reward).parameters.values()
+    defaults = {p.name: p.default for p in parameters if p.kind is p.KEYWORD_ONLY}
+    for option in given:
+        if option not in defaults:
+            known = f"known are {', '.join(defaults)}" if defaults else "it has none"
+            raise ConfigError(f"reward {name} has no option {option!r}: {known}.")
+    values = {**defaults, **given}
+    return tuple((o, _as_kind_of(default, values[o], f"{name}({o}=...)")) for o, default in defaults.items())
+
+
+def _as_kind_of(default: Option, value: Option, where: str) -> Option:
+    """A value of the default's kind; whole numbers serve as any number."""
+    if isinstance(default, float) and type(value) is int:
+        value = float(value)
+    if type(value) is not type(default):
+        raise ConfigError(f"reward {where}: expected {type(default).__name__}, got {value!r}.")
+    return value
