@@ -247,19 +247,19 @@ def nearest_rows(boxes: Float[Tensor, "n 4 2"], table: Float[Tensor, "V 4 2"]) -
 def _nearest_of_part(boxes: Float[Tensor, "n 4 2"], table: Float[Tensor, "V 4 2"]) -> Int64[Tensor, "n"]:
     """Only tokens whose centre is near can win: the corners' distances sum to at least four times that of the centres."""
     if len(table) <= 2 * _CANDIDATES:
-        return _corner_distances(boxes, table).argmin(-1)
+        return corner_distances(boxes, table).argmin(-1)
     between = torch.cdist(boxes.mean(1), table.mean(1), compute_mode="donot_use_mm_for_euclid_dist")
     near = between.topk(_CANDIDATES, dim=-1, largest=False, sorted=False)
     candidates = near.indices.sort(-1).values
-    total = _corner_distances(boxes, table[candidates])
+    total = corner_distances(boxes, table[candidates])
     best = total.min(-1)
     found = candidates.gather(-1, best.indices[:, None])[:, 0]
     unsure = 4 * near.values.amax(-1) <= best.values * 1.0001 + 1e-4
-    found[unsure] = _corner_distances(boxes[unsure], table).argmin(-1)
+    found[unsure] = corner_distances(boxes[unsure], table).argmin(-1)
     return found
 
 
-def _corner_distances(boxes: Float[Tensor, "n 4 2"], table: Float[Tensor, "*n V 4 2"]) -> Float[Tensor, "n V"]:
+def corner_distances(boxes: Float[Tensor, "n 4 2"], table: Float[Tensor, "*n V 4 2"]) -> Float[Tensor, "n V"]:
     """Sums of corner distances."""
     total = sum((boxes[:, None, c] - table[..., c, :]).square().sum(-1).sqrt() for c in range(4))
     return torch.as_tensor(total)
