@@ -54,5 +54,5 @@ def test_with_the_published_vehicles_the_nearest_token_gets_9_percent_and_ten_ge
     vocabulary = Vocabulary(table, torch.ones(1, 2048, dtype=torch.bool), torch.zeros(1, 11, 2))
     every = torch.arange(2048)
     largest = neighbor_weights(vocabulary, torch.zeros_like(every), every).sort(-1, descending=True).values
-    assert largest[:, 0].mean() == pytest.approx(0.09, abs=0.01)
-    assert largest[:, :10].sum(-1).mean() == pytest.approx(0.38, abs=0.01)
+    assert largest[:, 0].median() == pytest.approx(0.09, abs=0.005)
+    assert largest[:, :10].sum(-1).mean() == pytest.approx(0.38, abs=0.015)

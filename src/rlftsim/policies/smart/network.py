@@ -156,7 +156,7 @@ def relation_features(
 class AgentDecoder(nn.Module):
     """Layers of attention over time, to the map and among agents; the head predicts the next token."""
 
-    def __init__(self, config: SmartConfig, num_tokens: int | tuple[int, ...]):
+    def __init__(self, config: SmartConfig, num_tokens: int, class_sizes: tuple[int, ...] = ()):
         super().__init__()
         self.config = config
         dim, frequencies = config.dim, config.num_frequencies
@@ -173,7 +173,7 @@ class AgentDecoder(nn.Module):
         self.time_layers = nn.ModuleList(RelationAttention(*sizes) for _ in layers)
         self.map_layers = nn.ModuleList(RelationAttention(*sizes, separate_source_norm=True) for _ in layers)
         self.agent_layers = nn.ModuleList(RelationAttention(*sizes) for _ in layers)
-        self.head = MlpLayer(dim, dim, num_tokens) if isinstance(num_tokens, int) else ClassHeads(dim, num_tokens)
+        self.head = ClassHeads(dim, class_sizes, num_tokens) if class_sizes else MlpLayer(dim, dim, num_tokens)
 
     def relations(self) -> Relations:
         """The relation embeddings, tabulated where nothing in them is trained."""
@@ -331,10 +331,10 @@ def _extend(past: Past | None, steps: TokenSteps, row: Int64[Tensor, "B N A K"])
 
 
 class SmartNetwork(nn.Module):
-    """Map encoder and agent decoder. `num_tokens`: of the head that all classes share, or of each class's own head."""
+    """Map encoder and agent decoder. `class_sizes`: tokens of each class's own head; without them all classes share one."""
 
-    def __init__(self, config: SmartConfig, num_tokens: int | tuple[int, ...]):
+    def __init__(self, config: SmartConfig, num_tokens: int, class_sizes: tuple[int, ...] = ()):
         super().__init__()
         self.map_encoder = MapEncoder(config)
-        self.decoder = AgentDecoder(config, num_tokens)
+        self.decoder = AgentDecoder(config, num_tokens, class_sizes)
         initialize(self)

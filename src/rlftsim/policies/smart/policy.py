@@ -84,8 +84,8 @@ class SmartPolicy(nn.Module):
         super().__init__()
         self.config = config
         self.vocabulary = vocabulary
-        own_sizes = tuple(vocabulary.token_mask.sum(1).tolist())
-        self.network = SmartNetwork(config, own_sizes if config.head_per_class else vocabulary.num_tokens)
+        class_sizes = tuple(vocabulary.token_mask.sum(1).tolist()) if config.head_per_class else ()
+        self.network = SmartNetwork(config, vocabulary.num_tokens, class_sizes)
 
     def _apply(self, fn, recurse: bool = True):
         """Moves to a device take the vocabulary along."""
