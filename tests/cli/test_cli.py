@@ -74,8 +74,18 @@ def vocabulary(tmp_path, capsys):
     arguments = ["tokens", "--data", "synthetic", "--split", "validation", "--out", path, "--recipe", "smart-demo"]
     status, out, _ = run(capsys, *arguments, "--set", *small)
     assert status == 0
-    assert "32 motion tokens a class" in out
+    assert "32 vehicle, " in out
+    assert "8 map pieces" in out
+    assert (tmp_path / "vocabulary.report" / "picture.png").exists()
     return path
+
+
+def test_a_vocabulary_can_be_looked_at_again(vocabulary, tmp_path, capsys):
+    arguments = ["tokens", "--data", "synthetic", "--split", "validation", "--check", vocabulary]
+    status, out, _ = run(capsys, *arguments, "--report", tmp_path / "other", "--set", "tokens.max-scenarios=2")
+    assert status == 0
+    assert "error of whole tracks: mean · 95 % · max [cm]" in out
+    assert "2 scenarios of synthetic, validation" in (tmp_path / "other" / "report.md").read_text()
 
 
 @pytest.fixture
@@ -103,9 +113,12 @@ WRONG = {
     "a baseline to fine-tune": ("finetune smart-demo --model constant_velocity --data synthetic --out {tmp}/o", "ConstantVelocity has no weights"),
     "a vocabulary that is not there": ("pretrain smart-demo --data synthetic --out {tmp}/o --vocabulary {tmp}/v", "no such vocabulary: build one with"),
     "a vocabulary that is none": ("pretrain smart-demo --data synthetic --out {tmp}/o --vocabulary {tmp}/garbage", "damaged vocabulary"),
-    "a field that does not exist": ("tokens --data synthetic --out {tmp}/v --set tokens.size=5", "no field 'size' here, known are num_tokens"),
+    "a field that does not exist": ("tokens --data synthetic --out {tmp}/v --set tokens.size=5", "no field 'size' here, known are kind, num_tokens"),
     "a value of the wrong kind": ("tokens --data synthetic --out {tmp}/v --set tokens.num_tokens=few", "expected int"),
     "a value out of range": ("tokens --data synthetic --out {tmp}/v --set tokens.num_tokens=1", "needs num_tokens >= 2"),
+    "a vocabulary neither to build nor to look at": ("tokens --data synthetic", "either --out FILE, to build a vocabulary, or --check FILE"),
+    "a vocabulary to look at that is not there": ("tokens --data synthetic --check {tmp}/v.safetensors", "no such vocabulary: build one with"),
+    "tables to look at that are none": ("tokens --data synthetic --check {tmp}/garbage", "not an npz of token tables"),
     "no value": ("tokens --data synthetic --out {tmp}/v --set tokens.num_tokens", "is not field=value"),
     "an unknown metric": ("evaluate oracle --data synthetic --out {tmp}/o --metric 1999", "Unknown metric '1999': known are 2025"),
     "no rollouts": ("evaluate oracle --data synthetic --out {tmp}/o --num-rollouts 0", "num_rollouts must be at least 1"),

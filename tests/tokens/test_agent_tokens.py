@@ -85,11 +85,11 @@ def test_tokens_do_not_depend_on_where_a_scene_is_or_looks(vocabulary, turn, shi
 
 
 def test_each_token_corrects_the_error_of_the_last(built, pack_scenarios):
-    vocabulary, (vehicles, *_) = built
+    vocabulary, (radius_m, *_) = built
     tokens = tokenize_agents(collate(pack_scenarios), vocabulary)
     error = (tokens.position - tokens.logged_position).norm(dim=-1)
     by_step = [float(error[..., k][tokens.valid[..., k]].mean()) for k in range(18)]
-    assert max(by_step) < vehicles.radius_m  # 18 errors that added up would be many disks away
+    assert max(by_step) < radius_m  # 18 errors that added up would be many disks away
 
 
 def test_the_nearest_token_is_nearest_by_corners(vocabulary):

@@ -9,8 +9,9 @@ import torch
 import scenes
 from rlftsim.errors import ConfigError
 from rlftsim.scenario.batch import collate
+from rlftsim.tokens.smoothing import neighbor_weights
 from rlftsim.training.data import trained_agents
-from rlftsim.training.imitation import learning_rate
+from rlftsim.training.imitation import learning_rate, summed_loss
 from rlftsim.training.pretrain import PretrainConfig, pretrain
 from rlftsim.training.run_folder import read_metrics
 
@@ -99,3 +100,34 @@ def test_the_loss_of_a_class_with_few_tokens_stays_a_plain_number(vocabulary, dr
     config = replace(tiny.PRETRAIN, epochs=0.25, label_smoothing=0.1)
     pretrain(tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path, config)
     assert read_metrics(tmp_path)[0]["loss"] < 20.0
+
+
+def test_smoothing_may_go_to_the_tokens_near_the_target(vocabulary, drawn_scenarios, tmp_path):
+    config = replace(tiny.PRETRAIN, epochs=0.25, batch_size=4, label_smoothing=0.3)
+    losses = {}
+    for kind in ("uniform", "spatial"):
+        policy = tiny.tiny_policy(vocabulary, tiny.WITHOUT_CHANCE)
+        pretrain(policy, drawn_scenarios, tmp_path / kind, replace(config, label_smoothing_kind=kind))
+        losses[kind] = read_metrics(tmp_path / kind)[0]["loss"]
+    batch = collate(drawn_scenarios)
+    said = tiny.tiny_policy(vocabulary, tiny.WITHOUT_CHANCE).teacher_forced(batch, batch.agent_mask)
+    rows = said.target_mask
+    targets, classes = said.target[rows], said.class_id[rows]
+    log_probs = said.logits[rows].log_softmax(-1)
+    weights = neighbor_weights(vocabulary, classes, targets)
+    near = (weights * log_probs.clamp(min=-100)).sum(-1)
+    expected = -(0.7 * log_probs.gather(-1, targets[:, None])[:, 0] + 0.3 * near).sum()
+    assert float(summed_loss(said, 0.3, vocabulary)[0]) == pytest.approx(float(expected), rel=1e-4)
+    assert losses["spatial"] != pytest.approx(losses["uniform"], rel=1e-3)
+
+
+def test_smoothing_among_near_tokens_needs_a_vocabulary(drawn_scenarios, tmp_path):
+    class Wordless(torch.nn.Linear):
+        def teacher_forced(self, scenarios, trained):
+            raise AssertionError
+
+        def save_pretrained(self, folder, *, card=""):
+            raise AssertionError
+
+    with pytest.raises(ConfigError, match=r"Wordless has no vocabulary.*label_smoothing_kind=uniform"):
+        pretrain(Wordless(1, 1), drawn_scenarios, tmp_path, replace(tiny.PRETRAIN, label_smoothing_kind="spatial"))

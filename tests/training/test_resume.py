@@ -134,7 +134,17 @@ def test_a_run_killed_at_a_random_moment_ends_as_if_it_never_was(stage, tmp_path
 
 def train_in_processes(stage, out, processes, *options, batch_size=4, launcher=()):
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    command = [sys.executable, *launcher, tiny.__file__, stage, str(out), "--updates", "1", "--batch-size", str(batch_size)]
+    command = [
+        sys.executable,
+        *launcher,
+        tiny.__file__,
+        stage,
+        str(out),
+        "--updates",
+        "1",
+        "--batch-size",
+        str(batch_size),
+    ]
     command += ["--processes", str(processes), *options]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr[-2000:]

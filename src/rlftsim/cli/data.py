@@ -32,13 +32,13 @@ def splits_of(name: str) -> list[str]:
     return sorted(set(ScenarioDataset(data_folder(name)).index["split"].to_pylist()))
 
 
-def open_split(name: str, split: str) -> ScenarioDataset:
-    """The scenarios of a split.
+def open_split(name: str, split: str, *, cached: int = CACHED_SCENARIOS) -> ScenarioDataset:
+    """The scenarios of a split, so many of them kept in memory.
 
     Raises:
         DataError: there are none; says which splits there are.
     """
-    scenarios = ScenarioDataset(data_folder(name), split, cache_size=CACHED_SCENARIOS)
+    scenarios = ScenarioDataset(data_folder(name), split, cache_size=cached)
     if not len(scenarios):
         known = ", ".join(splits_of(name)) or "none at all"
         raise DataError(f"{name} has no scenarios in split {split!r}: it has {known}.")

@@ -18,7 +18,7 @@ VERBS = {
     "convert": ("rlftsim.cli.data", "Convert"),
     "data": ("rlftsim.cli.data", "Data"),
     "synthesize": ("rlftsim.cli.data", "Synthesize"),
-    "tokens": ("rlftsim.cli.train", "Tokens"),
+    "tokens": ("rlftsim.cli.tokens", "Tokens"),
     "pretrain": ("rlftsim.cli.train", "Pretrain"),
     "finetune": ("rlftsim.cli.train", "Finetune"),
     "model": ("rlftsim.cli.model", "Model"),
@@ -40,7 +40,7 @@ usage: rlftsim VERB ...      rlftsim VERB --help explains a verb
   data         check a data set, or say what is in it
   synthesize   make synthetic scenarios with SUMO
 
-  tokens       build a vocabulary of motion and map tokens
+  tokens       build a vocabulary of motion and map tokens, or look at one
   pretrain     train a model to predict the next motion token
   finetune     fine-tune a model closed-loop with a realism reward
   model        take a checkpoint from the public CAT-K code, or hand one back

@@ -20,6 +20,8 @@ from rlftsim.tokens.vocabulary import CLASS_BOXES_M, STEPS_PER_TOKEN, Vocabulary
 HISTORY_TOKENS = 2
 MAX_HEADING_STEP_RAD = 1.5
 _ROWS_PER_CHUNK = 512
+_CANDIDATES = 64
+"""Tokens whose corners are compared; if that may not be enough, all are."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,16 +234,35 @@ def nearest_tokens(
     out = torch.zeros_like(class_id)
     for index, (table, exists) in enumerate(zip(vocabulary.end_corners(), vocabulary.token_mask)):
         rows = ((class_id == index) & valid).nonzero(as_tuple=True)
-        corners = local_corners[rows]  # [n, 4, 2]
-        found = [_nearest_rows(part, table[exists]) for part in corners.split(_ROWS_PER_CHUNK)]
-        if found:
-            out[rows] = exists.nonzero()[:, 0][torch.cat(found)]
+        out[rows] = exists.nonzero()[:, 0][nearest_rows(local_corners[rows], table[exists])]
     return out
 
 
-def _nearest_rows(corners: Float[Tensor, "n 4 2"], table: Float[Tensor, "V 4 2"]) -> Int64[Tensor, "n"]:
-    total = sum((corners[:, None, c] - table[:, c]).square().sum(-1).sqrt() for c in range(4))
-    return torch.as_tensor(total).argmin(-1)
+def nearest_rows(boxes: Float[Tensor, "n 4 2"], table: Float[Tensor, "V 4 2"]) -> Int64[Tensor, "n"]:
+    """Row of a table whose box has the smallest sum of corner distances to each box; the lowest on ties."""
+    parts = [_nearest_of_part(part, table) for part in boxes.split(_ROWS_PER_CHUNK)]
+    return torch.cat(parts) if parts else torch.zeros(0, dtype=torch.int64, device=boxes.device)
+
+
+def _nearest_of_part(boxes: Float[Tensor, "n 4 2"], table: Float[Tensor, "V 4 2"]) -> Int64[Tensor, "n"]:
+    """Only tokens whose centre is near can win: the corners' distances sum to at least four times that of the centres."""
+    if len(table) <= 2 * _CANDIDATES:
+        return corner_distances(boxes, table).argmin(-1)
+    between = torch.cdist(boxes.mean(1), table.mean(1), compute_mode="donot_use_mm_for_euclid_dist")
+    near = between.topk(_CANDIDATES, dim=-1, largest=False, sorted=False)
+    candidates = near.indices.sort(-1).values
+    total = corner_distances(boxes, table[candidates])
+    best = total.min(-1)
+    found = candidates.gather(-1, best.indices[:, None])[:, 0]
+    unsure = 4 * near.values.amax(-1) <= best.values * 1.0001 + 1e-4
+    found[unsure] = corner_distances(boxes[unsure], table).argmin(-1)
+    return found
+
+
+def corner_distances(boxes: Float[Tensor, "n 4 2"], table: Float[Tensor, "*n V 4 2"]) -> Float[Tensor, "n V"]:
+    """Sums of corner distances."""
+    total = sum((boxes[:, None, c] - table[..., c, :]).square().sum(-1).sqrt() for c in range(4))
+    return torch.as_tensor(total)
 
 
 def place_pose(

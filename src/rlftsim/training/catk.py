@@ -151,6 +151,8 @@ class PursuingRollouts:
     """Token that leads nearest to the record."""
     target_mask: Bool[Tensor, "B N A L"]
     """True = the next state was recorded, and the present one is not too far off the record."""
+    class_id: Int64[Tensor, "B A"]
+    """Whose tokens an agent takes."""
 
 
 def roll_out_closest(
@@ -199,7 +201,7 @@ def roll_out_closest(
 
     rollouts = simulate(policy, batch, num_rollouts=num_rollouts, seed=seed, context=context, choose=choose)
     target, mask = (torch.stack(part, -1) for part in zip(*targets))
-    return PursuingRollouts(rollouts, target, mask)
+    return PursuingRollouts(rollouts, target, mask, class_of_type(batch.object_type))
 
 
 @dataclass(frozen=True, eq=False)
@@ -296,6 +298,7 @@ class ClosedLoopPrediction:
     logits: Float[Tensor, "R V"]
     target: Int64[Tensor, "R"]
     target_mask: Bool[Tensor, "R"]
+    class_id: Int64[Tensor, "R"]
 
 
 def predict_along(
@@ -311,7 +314,9 @@ def predict_along(
     """
     scored: TokenLogits = policy.score(context, pursuing.rollouts)  # type: ignore[assignment]
     counts = pursuing.target_mask & pursuing.rollouts.decision_mask & trained[:, None, :, None]
-    return ClosedLoopPrediction(scored.logits, pursuing.target[scored.mask], counts[scored.mask])
+    class_id = pursuing.class_id[:, None, :, None].expand(counts.shape)
+    parts = (values[scored.mask] for values in (pursuing.target, counts, class_id))
+    return ClosedLoopPrediction(scored.logits, *parts)
 
 
 def catk_loss(

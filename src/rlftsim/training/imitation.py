@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -23,6 +23,8 @@ from rlftsim.progress import progress_bar
 from rlftsim.rollout.noise import derive_seed
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import Scenarios
+from rlftsim.tokens.smoothing import summed_log_prob_nearby
+from rlftsim.tokens.vocabulary import Vocabulary
 from rlftsim.training.batches import micro_batches, scenario_costs
 from rlftsim.training.checkpoint import Progress, newest_checkpoint, read_checkpoint, write_checkpoint
 from rlftsim.training.data import batch_with_futures, scenarios_of_update, trained_agents
@@ -53,6 +55,11 @@ class Prediction(Protocol):
         """True = the prediction counts."""
         ...
 
+    @property
+    def class_id(self) -> Int64[Tensor, "R"]:
+        """Class whose tokens these are."""
+        ...
+
 
 Predict = Callable[[ScenarioBatch, Bool[Tensor, "B A"], int], Prediction]
 """Predictions, differentiable, for a batch, the agents that count and the number of the update (counted from 0)."""
@@ -78,6 +85,8 @@ class ImitationConfig:
     gradient_clip: float = 0.5
     label_smoothing: float = 0.1
     """The loss of a perfect model is then not zero."""
+    label_smoothing_kind: Literal["uniform", "spatial"] = "uniform"
+    """Where the smoothed share goes: to all tokens alike, or to those that lead near the right one, see `tokens.smoothing`."""
     context_radius_m: float | None = 150.0
     """A step of an agent farther from the ego than this is taken as not recorded. None = everything is seen."""
     trained_radius_m: float = 100.0
@@ -151,6 +160,10 @@ def imitate(
     """
     if not len(scenarios):
         raise ConfigError("no scenario to train on: is the data set empty, or the split misspelt?")
+    if config.label_smoothing_kind == "spatial" and not isinstance(getattr(model, "vocabulary", None), Vocabulary):
+        raise ConfigError(
+            f"{type(model).__name__} has no vocabulary, so nothing is near a token: set label_smoothing_kind=uniform."
+        )
     if held_out is not None and config.validation.every:
         refuse_to_validate(model, held_out)
     fabric = start_fabric(config.device)
@@ -240,20 +253,32 @@ def _backward(learner: _Learner, batch: ScenarioBatch, update: int) -> tuple[Flo
     )
     with learner.fabric.autocast():
         prediction = learner.predict(batch, trained, update)
-    loss, counts = summed_loss(prediction, config.label_smoothing)
+    nearby = learner.model.vocabulary if config.label_smoothing_kind == "spatial" else None
+    loss, counts = summed_loss(prediction, config.label_smoothing, nearby)  # type: ignore[arg-type]
     learner.fabric.backward(loss)
     return loss.detach(), counts
 
 
-def summed_loss(prediction: Prediction, label_smoothing: float) -> tuple[Float[Tensor, ""], Float[Tensor, "3"]]:
-    """Summed cross-entropy (smoothed over the tokens that exist), and how many predictions were right, right among the best
-    five, and made at all. Zeros where nothing counts."""
+def summed_loss(
+    prediction: Prediction, label_smoothing: float, nearby: Vocabulary | None = None
+) -> tuple[Float[Tensor, ""], Float[Tensor, "3"]]:
+    """Summed cross-entropy, and how many predictions were right, right among the best five, and made at all. Zeros where nothing
+    counts.
+
+    Args:
+        prediction: what was said and what should have been.
+        label_smoothing: share of the target that goes elsewhere.
+        nearby: it goes to the tokens of this vocabulary near the target; None = evenly to all that exist, the target among them.
+    """
     logits, target = prediction.logits[prediction.target_mask], prediction.target[prediction.target_mask]
     log_probs = functional.log_softmax(logits, -1)
-    exists = logits > IMPOSSIBLE
-    elsewhere = torch.where(exists, log_probs, 0.0).sum(-1) / exists.sum(-1)
+    if nearby is None:
+        exists = logits > IMPOSSIBLE
+        elsewhere = (torch.where(exists, log_probs, 0.0).sum(-1) / exists.sum(-1)).sum()
+    else:
+        elsewhere = summed_log_prob_nearby(log_probs, target, prediction.class_id[prediction.target_mask], nearby)
     of_target = log_probs.gather(-1, target[:, None])[:, 0]
-    loss = -((1 - label_smoothing) * of_target + label_smoothing * elsewhere).sum()
+    loss = -((1 - label_smoothing) * of_target.sum() + label_smoothing * elsewhere)
     best = logits.detach().topk(min(5, logits.shape[-1]), dim=-1).indices == target[:, None]
     return loss, torch.stack(
         [best[:, 0].sum(), best.any(-1).sum(), torch.tensor(len(target), device=target.device)]

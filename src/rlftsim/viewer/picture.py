@@ -52,11 +52,11 @@ def to_png(
     names = {"ego": "ego", "evaluated": "evaluated agents", "other": "other agents"}
     handles = [Line2D([], [], color=COLOURS[role], lw=5, label=label) for role, label in names.items()]
     figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False, fontsize=10)
-    save_png(figure, Path(path), dots_per_inch)
+    save_figure(figure, Path(path), dots_per_inch)
 
 
-def save_png(figure: Figure, target: Path, dots_per_inch: int) -> None:
-    """Write a figure to a file, whole or not at all."""
+def save_figure(figure: Figure, target: Path, dots_per_inch: int) -> None:
+    """Write a figure as PNG, whole or not at all."""
     FigureCanvasAgg(figure)
     write_whole(target, lambda path: figure.savefig(path, format="png", dpi=dots_per_inch, facecolor="white"))
 

@@ -90,7 +90,16 @@ def import_catk(checkpoint: Path, vocabulary: Sequence[Path]) -> CatkImport:
 
 
 def export_catk(policy: SmartPolicy) -> dict[str, Tensor]:
-    """Copies of a model's weights under the public code's names, on the CPU; importing them again gives the same bits."""
+    """Copies of a model's weights under the public code's names, on the CPU; importing them again gives the same bits.
+
+    Raises:
+        CheckpointError: the model has a head for each class, the public code has one for all.
+    """
+    if policy.config.head_per_class:
+        raise CheckpointError(
+            "a model with head_per_class has no form in the public CAT-K code, which has one head for all classes: "
+            "train one with model.head_per_class=false."
+        )
     named = {catk_name(k): v.detach().cpu().clone() for k, v in policy.network.state_dict().items()}
     return named | {second: named[first].clone() for second, first in aliases(named).items()}
 

@@ -32,6 +32,9 @@ class SmartConfig:
     dropout: float = 0.1
     history_drop: float = 0.1
     """Share of (agent, step) pairs that are hidden from the attention over time, in pre-training only."""
+    head_per_class: bool = False
+    """Each class has a head of its own, as large as its vocabulary. False = one head as wide as the largest, an index means another
+    motion in each class."""
     public_code_quirks: bool = False
     """Repeat what the public code does where this package differs on purpose: an agent's first motion vector is its position,
     the sign of what lies exactly behind is left to rounding, and tokens are matched and placed in the order of operations of

@@ -25,6 +25,7 @@ from rlftsim.policies.layers import (
     normalize,
 )
 from rlftsim.policies.smart.config import SmartConfig
+from rlftsim.policies.smart.heads import ClassHeads
 from rlftsim.policies.smart.neighbors import Neighbors, Poses, nearest_within, pad_lists, relative_pose
 from rlftsim.tokens.map_tokens import NUM_KINDS, NUM_LIGHTS, NUM_TYPES, MapTokens
 from rlftsim.tokens.vocabulary import CLASS_NAMES
@@ -155,7 +156,7 @@ def relation_features(
 class AgentDecoder(nn.Module):
     """Layers of attention over time, to the map and among agents; the head predicts the next token."""
 
-    def __init__(self, config: SmartConfig, num_tokens: int):
+    def __init__(self, config: SmartConfig, num_tokens: int, class_sizes: tuple[int, ...] = ()):
         super().__init__()
         self.config = config
         dim, frequencies = config.dim, config.num_frequencies
@@ -172,7 +173,7 @@ class AgentDecoder(nn.Module):
         self.time_layers = nn.ModuleList(RelationAttention(*sizes) for _ in layers)
         self.map_layers = nn.ModuleList(RelationAttention(*sizes, separate_source_norm=True) for _ in layers)
         self.agent_layers = nn.ModuleList(RelationAttention(*sizes) for _ in layers)
-        self.head = MlpLayer(dim, dim, num_tokens)
+        self.head = ClassHeads(dim, class_sizes, num_tokens) if class_sizes else MlpLayer(dim, dim, num_tokens)
 
     def relations(self) -> Relations:
         """The relation embeddings, tabulated where nothing in them is trained."""
@@ -330,10 +331,10 @@ def _extend(past: Past | None, steps: TokenSteps, row: Int64[Tensor, "B N A K"])
 
 
 class SmartNetwork(nn.Module):
-    """Map encoder and agent decoder."""
+    """Map encoder and agent decoder. `class_sizes`: tokens of each class's own head; without them all classes share one."""
 
-    def __init__(self, config: SmartConfig, num_tokens: int):
+    def __init__(self, config: SmartConfig, num_tokens: int, class_sizes: tuple[int, ...] = ()):
         super().__init__()
         self.map_encoder = MapEncoder(config)
-        self.decoder = AgentDecoder(config, num_tokens)
+        self.decoder = AgentDecoder(config, num_tokens, class_sizes)
         initialize(self)

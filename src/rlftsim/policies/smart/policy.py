@@ -17,6 +17,7 @@ from rlftsim.goals.types import Goals
 from rlftsim.policies.layers import normalize
 from rlftsim.policies.smart.config import SmartConfig
 from rlftsim.policies.smart.distribution import TokenDistribution
+from rlftsim.policies.smart.heads import NEVER, ClassHeads
 from rlftsim.policies.smart.network import Past, Scene, SmartNetwork, TokenSteps
 from rlftsim.rollout.types import AgentStates, Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
@@ -25,7 +26,6 @@ from rlftsim.tokens.agent_tokens import HISTORY_TOKENS, AgentTokens, class_boxes
 from rlftsim.tokens.map_tokens import tokenize_map
 from rlftsim.tokens.vocabulary import STEPS_PER_TOKEN, Vocabulary, class_of_type
 
-NEVER = -1e9
 FORMAT = "rlftsim-smart-1"
 
 
@@ -66,6 +66,8 @@ class TeacherForced:
     """Token that came next."""
     target_mask: Bool[Tensor, "R"]
     """True = the next state was recorded and the agent is trained on."""
+    class_id: Int64[Tensor, "R"]
+    """Whose tokens they are."""
 
 
 class SmartPolicy(nn.Module):
@@ -82,7 +84,8 @@ class SmartPolicy(nn.Module):
         super().__init__()
         self.config = config
         self.vocabulary = vocabulary
-        self.network = SmartNetwork(config, vocabulary.num_tokens)
+        class_sizes = tuple(vocabulary.token_mask.sum(1).tolist()) if config.head_per_class else ()
+        self.network = SmartNetwork(config, vocabulary.num_tokens, class_sizes)
 
     def _apply(self, fn, recurse: bool = True):
         """Moves to a device take the vocabulary along."""
@@ -190,7 +193,8 @@ class SmartPolicy(nn.Module):
         decides[..., : HISTORY_TOKENS - 1] = False
         counts = (tokens.valid[..., 1:] & trained[..., None])[:, None][decides]
         logits = self._logits(rows[decides[steps.valid]], scenarios.object_type, decides)
-        return TeacherForced(logits, tokens.next_token_id[:, None, :, :-1][decides], counts)
+        class_id = class_of_type(scenarios.object_type)[:, None, :, None].expand(decides.shape)[decides]
+        return TeacherForced(logits, tokens.next_token_id[:, None, :, :-1][decides], counts, class_id)
 
     def fine_tuned_parts(self) -> tuple[nn.Module, ...]:
         """What closed-loop fine-tuning trains: the decoder's attention and the head, as the public CAT-K code does."""
@@ -286,7 +290,8 @@ class SmartPolicy(nn.Module):
         """Logits of the elements of a mask, tokens that a class lacks ruled out."""
         place = mask.nonzero(as_tuple=True)
         class_id = class_of_type(object_type)[place[0], place[2]]
-        logits = self.network.decoder.head(features).float()
+        head = self.network.decoder.head
+        logits = head(features, class_id) if isinstance(head, ClassHeads) else head(features).float()
         return logits.masked_fill(~self.vocabulary.token_mask[class_id], NEVER)
 
     def _unroll(

@@ -1,0 +1,156 @@
+"""What vocabularies are made of: half-second motions and map windows of a data set, in bounded memory.
+
+A *motion* is six poses (x, y, heading) at 10 Hz in the frame of the first: [6, 3].
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, Int64, UInt64
+from torch import Tensor
+
+from rlftsim.geometry import box_corners, rotate, wrap_angle
+from rlftsim.scenario.batch import collate
+from rlftsim.scenario.types import CURRENT_STEP, STEP_S, Scenario
+from rlftsim.tokens.agent_tokens import clean_tracks
+from rlftsim.tokens.vocabulary import CLASS_BOXES_M, STEPS_PER_TOKEN, class_of_type
+
+MIN_VALID_STEPS = 30
+MAX_SPEED_MPS = (45.0, 12.0, 25.0)
+"""Of each class; a single step that is faster is a glitch of the record."""
+MAX_STEP_TURN_RAD = np.deg2rad(30.0)
+"""Within 0.1 s; more is a glitch of the record."""
+MAX_TURN_RAD = 1.2
+"""Within half a second."""
+_MIRROR = np.array([1, -1, -1], np.float32)
+_KEY_M = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Motions:
+    """Half-second motions of a scenario's agents."""
+
+    poses: Float32[np.ndarray, "n 6 3"]
+    class_id: Int64[np.ndarray, "n"]
+    is_plausible: Bool[np.ndarray, "n"]
+    """False = a glitch of the record, not to be learned from."""
+
+    def of_class(self, index: int) -> Float32[np.ndarray, "m 6 3"]:
+        """The plausible ones of a class."""
+        return self.poses[self.is_plausible & (self.class_id == index)]
+
+
+def motions_of(scenario: Scenario) -> Motions:
+    """Motions of the simulated agents with at least 30 recorded steps, one after the other, in the frame of their start."""
+    batch = collate([scenario])
+    tracks = clean_tracks(batch)
+    enough = batch.valid.sum(-1) >= MIN_VALID_STEPS if scenario.has_future else batch.valid[..., CURRENT_STEP]
+    windows = tracks.valid.unfold(-1, STEPS_PER_TOKEN + 1, STEPS_PER_TOKEN).all(-1) & enough[..., None]
+    position = tracks.position.unfold(2, STEPS_PER_TOKEN + 1, STEPS_PER_TOKEN)[windows].transpose(1, 2)  # [n, 6, 2]
+    heading = tracks.heading.unfold(2, STEPS_PER_TOKEN + 1, STEPS_PER_TOKEN)[windows]
+    local = rotate(position - position[:, :1], -heading[:, :1])
+    poses = torch.cat([local, wrap_angle(heading - heading[:, :1])[..., None]], -1).numpy()
+    class_id = class_of_type(batch.object_type)[..., None].expand_as(windows)[windows].numpy()
+    return Motions(poses, class_id, is_plausible(poses, class_id))
+
+
+def is_plausible(poses: Float32[np.ndarray, "n 6 3"], class_id: Int64[np.ndarray, "n"] | int) -> Bool[np.ndarray, "n"]:
+    """Whether a motion can be driven, walked or cycled: no step too fast, no turn too sharp."""
+    step = np.diff(poses, axis=1)
+    speed = np.hypot(step[..., 0], step[..., 1]).max(1) / STEP_S
+    turn = np.abs((step[..., 2] + np.pi) % (2 * np.pi) - np.pi).max(1)
+    limit = np.array(MAX_SPEED_MPS)[class_id]
+    return (speed <= limit) & (turn <= MAX_STEP_TURN_RAD) & (np.abs(poses[..., 2]) <= MAX_TURN_RAD).all(1)
+
+
+def mirrored(poses: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+    """The same poses with left and right exchanged."""
+    return poses * _MIRROR
+
+
+def end_boxes(poses: Float[np.ndarray, "n t 3"], class_index: int) -> Float[Tensor, "n 4 2"]:
+    """Box of a class at the end of each motion."""
+    return boxes(poses[:, -1:], class_index)[:, 0]
+
+
+def boxes(poses: Float[np.ndarray, "n t 3"], class_index: int) -> Float[Tensor, "n t 4 2"]:
+    """Boxes of a class at each pose."""
+    tensor = torch.from_numpy(np.ascontiguousarray(poses, dtype=np.float32))
+    length, width = (torch.tensor(side) for side in CLASS_BOXES_M[class_index])
+    return box_corners(tensor[..., :2], tensor[..., 2], length, width)
+
+
+def motion_keys(poses: Float32[np.ndarray, "n 6 3"]) -> Int64[np.ndarray, "n 6"]:
+    """Motions that are the same to a centimetre (at their middle and end), or each other's mirror images, have the same key."""
+    key = np.round(poses[:, [2, 5]] / _KEY_M).astype(np.int64).reshape(len(poses), 6)
+    other = np.round(mirrored(poses[:, [2, 5]]) / _KEY_M).astype(np.int64).reshape(len(poses), 6)
+    first = np.argmax(key != other, axis=1)
+    rows = np.arange(len(key))
+    return np.where((key[rows, first] < other[rows, first])[:, None], other, key)
+
+
+def window_keys(windows: Float32[np.ndarray, "n 11 2"]) -> Int64[np.ndarray, "n 22"]:
+    """Map windows that are the same to 5 cm have the same key."""
+    return np.round(windows.reshape(len(windows), 22) / 0.05).astype(np.int64)
+
+
+def drawn_scenarios(num_scenarios: int, limit: int | None, seed: int) -> list[int]:
+    """Positions of at most `limit` scenarios, drawn evenly, in ascending order."""
+    if limit is None or num_scenarios <= limit:
+        return list(range(num_scenarios))
+    drawn = np.random.default_rng(seed).choice(num_scenarios, limit, replace=False)
+    return sorted(drawn.tolist())
+
+
+class DistinctSample:
+    """An even sample of the distinct rows of a stream of any length, in the memory of twice the sample.
+
+    A row's key is hashed; the rows with the smallest hashes stay. So every distinct key has the same chance whenever and however
+    often it comes, and the same seed draws the same keys in any order.
+
+    Args:
+        capacity: rows that are kept.
+        seed: of the hash.
+    """
+
+    def __init__(self, capacity: int, seed: int):
+        self.capacity = capacity
+        self.num_seen = 0
+        self._seed = seed
+        self._limit = np.uint64(2**64 - 1)
+        self._hashes: list[np.ndarray] = []
+        self._rows: list[np.ndarray] = []
+
+    def add(self, rows: Float32[np.ndarray, "n ..."], keys: Int64[np.ndarray, "n k"]) -> None:
+        """Offer rows."""
+        self.num_seen += len(rows)
+        hashes = _hash(keys, self._seed)
+        wanted = hashes < self._limit
+        self._hashes.append(hashes[wanted])
+        self._rows.append(rows[wanted])
+        if sum(map(len, self._hashes)) > 2 * self.capacity:
+            self._shrink()
+
+    def rows(self) -> Float32[np.ndarray, "m ..."]:
+        """The sample, in an order that says nothing."""
+        self._shrink()
+        return self._rows[0]
+
+    def _shrink(self) -> None:
+        hashes, first = np.unique(np.concatenate(self._hashes), return_index=True)
+        if len(hashes) > self.capacity:
+            self._limit = hashes[self.capacity]
+        self._hashes = [hashes[: self.capacity]]
+        self._rows = [np.concatenate(self._rows)[first[: self.capacity]]]
+
+
+def _hash(keys: Int64[np.ndarray, "n k"], seed: int) -> UInt64[np.ndarray, "n"]:
+    """64 well-mixed bits of each row (splitmix64)."""
+    state = np.full(len(keys), seed, np.uint64)
+    for column in keys.astype(np.uint64).T:
+        state = (state ^ column) + np.uint64(0x9E3779B97F4A7C15)
+        state = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        state = (state ^ (state >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        state ^= state >> np.uint64(31)
+    return state

@@ -1,0 +1,50 @@
+"""Label smoothing that knows where tokens lead (TrajTok): what is not certain is spread over the tokens near the right one.
+
+The other tokens of the class share it in proportion to 1 / (1e-4 + d)^2, d the mean distance in metres of their end box's corners to
+those of the target's. (TrajTok's code divides by the sum twice and so smooths next to nothing; this is the formula as meant.)
+The weights fall off so slowly that no short list of neighbours holds them: rows are computed for the distinct targets of a batch.
+"""
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from rlftsim.tokens.agent_tokens import corner_distances
+from rlftsim.tokens.vocabulary import Vocabulary
+
+SOFTNESS_M = 1e-4
+_ROWS_PER_CHUNK = 256
+
+
+@torch.no_grad()
+def neighbor_weights(
+    vocabulary: Vocabulary, class_id: Int64[Tensor, "U"], token_id: Int64[Tensor, "U"]
+) -> Float[Tensor, "U V"]:
+    """How the smoothed mass of target tokens is spread: each row sums to 1 over the other tokens of the class; all on the target
+    itself where it is the only one."""
+    ends = vocabulary.end_corners()
+    weights = ends.new_zeros(len(token_id), vocabulary.num_tokens)
+    for index, (table, exists) in enumerate(zip(ends, vocabulary.token_mask)):
+        for rows in (class_id == index).nonzero()[:, 0].split(_ROWS_PER_CHUNK):
+            distance = corner_distances(table[token_id[rows]], table) / 4
+            weights[rows] = exists / (SOFTNESS_M + distance).square()
+    weights.scatter_(1, token_id[:, None], 0.0)
+    total = weights.sum(1, keepdim=True)
+    weights.scatter_(1, token_id[:, None], (total == 0).to(weights.dtype))
+    return weights / torch.where(total == 0, 1.0, total)
+
+
+def summed_log_prob_nearby(
+    log_probs: Float[Tensor, "R V"],
+    target: Int64[Tensor, "R"],
+    class_id: Int64[Tensor, "R"],
+    vocabulary: Vocabulary,
+) -> Float[Tensor, ""]:
+    """Sum over rows of the expected log-probability of a token drawn by `neighbor_weights` of the row's target.
+
+    Rows with the same target are added up first, so the weights take the memory of the distinct targets.
+    """
+    distinct, group = (class_id * vocabulary.num_tokens + target).unique(return_inverse=True)
+    summed = log_probs.new_zeros(len(distinct), log_probs.shape[-1]).index_add(0, group, log_probs)
+    weights = neighbor_weights(vocabulary, distinct // vocabulary.num_tokens, distinct % vocabulary.num_tokens)
+    return (weights * torch.where(weights > 0, summed, 0.0)).sum()

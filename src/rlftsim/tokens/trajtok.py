@@ -1,0 +1,171 @@
+"""TrajTok: a vocabulary by rule and data. A token for every cell of a grid of end positions that the data use, or nearly use.
+
+After TrajTok (first place of the 2025 sim-agents challenge), with three of its defects mended: the grid of every class is
+symmetric, so are the tokens; a token made by rule ends with the heading that was asked for; and it neither starts nor ends at rest.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int64
+from scipy.ndimage import distance_transform_edt, uniform_filter
+
+from rlftsim.errors import ConfigError
+from rlftsim.tokens.motions import mirrored
+from rlftsim.tokens.vocabulary import STEPS_PER_TOKEN
+
+MAX_MEAN_STEP_TURN_RAD = np.deg2rad(10.0)
+"""A mean of motions that turns by more within 0.1 s is a blend of unlike ones: a rule makes a better token."""
+
+
+@dataclass(frozen=True)
+class Grid:
+    """End positions of one class: x from `x_min_m` to `x_max_m`, y from `-y_max_m` to `y_max_m`, both ends included."""
+
+    x_min_m: float
+    x_max_m: float
+    x_bins: int
+    y_max_m: float
+    y_bins: int
+    """From end to end; even, so that y = 0 is a grid line."""
+    min_motions: int
+    """A cell with fewer is empty."""
+
+    def __post_init__(self) -> None:
+        if not (self.x_min_m < 0 < self.x_max_m and self.y_max_m > 0 and self.x_bins > 1 and self.y_bins > 1):
+            raise ConfigError(f"a grid needs x_min_m < 0 < x_max_m, y_max_m > 0 and at least 2 bins, got {self}.")
+        zero = -self.x_min_m / self.spacing_m[0]
+        if abs(zero - round(zero)) > 1e-6 or self.y_bins % 2:
+            raise ConfigError(f"x = 0 and y = 0 must be lines of the grid (y_bins even), got {self}.")
+
+    @property
+    def spacing_m(self) -> tuple[float, float]:
+        """Of neighbouring lines, in x and y."""
+        return (self.x_max_m - self.x_min_m) / self.x_bins, 2 * self.y_max_m / self.y_bins
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Cells in x and y."""
+        return self.x_bins + 1, self.y_bins + 1
+
+    @property
+    def origin(self) -> tuple[int, int]:
+        """Cell of standing still."""
+        return round(-self.x_min_m / self.spacing_m[0]), self.y_bins // 2
+
+
+@dataclass(frozen=True)
+class TrajTokConfig:
+    """Grids and thresholds. The defaults are the published ones, the vehicle's y made symmetric."""
+
+    vehicle: Grid = field(default_factory=lambda: Grid(-5.0, 20.0, 250, 2.5, 80, 3))
+    pedestrian: Grid = field(default_factory=lambda: Grid(-1.5, 4.5, 120, 2.0, 80, 1))
+    cyclist: Grid = field(default_factory=lambda: Grid(-1.0, 8.0, 180, 1.0, 40, 1))
+    neighborhood: int = 9
+    """Cells along a side of the square that is looked at around a cell."""
+    num_neighbors: int = 20
+    """A used cell with fewer used ones around it is dropped; an unused one with more is added."""
+
+    def __post_init__(self) -> None:
+        if self.neighborhood < 3 or not self.neighborhood % 2:
+            raise ConfigError(f"neighborhood must be odd and at least 3, got {self.neighborhood}.")
+
+    @property
+    def grids(self) -> tuple[Grid, Grid, Grid]:
+        """In the order of the classes."""
+        return self.vehicle, self.pedestrian, self.cyclist
+
+
+class GridMotions:
+    """Counts and sums of motions by the cell they end in; memory does not grow with the data. Mirror images are counted, too."""
+
+    def __init__(self, grid: Grid):
+        self.grid = grid
+        self._count = np.zeros(grid.shape, np.int64)
+        self._sum = np.zeros((*grid.shape, STEPS_PER_TOKEN + 1, 3))
+
+    def add(self, motions: Float32[np.ndarray, "n 6 3"]) -> None:
+        """Count motions; those that end outside the grid are not."""
+        spacing = np.array(self.grid.spacing_m)
+        cell = np.round(motions[:, -1, :2] / spacing).astype(np.int64) + np.array(self.grid.origin)
+        inside = ((cell >= 0) & (cell < np.array(self.grid.shape))).all(1)
+        places = tuple(cell[inside].T)
+        np.add.at(self._count, places, 1)
+        np.add.at(self._sum, places, motions[inside].astype(np.float64))
+
+    @property
+    def count(self) -> Int64[np.ndarray, "X Y"]:
+        """Motions and mirror images in each cell."""
+        return self._count + self._count[:, ::-1]
+
+    @property
+    def mean(self) -> Float[np.ndarray, "X Y 6 3"]:
+        """Mean motion of each cell, zero where there is none."""
+        total = self._sum + self._sum[:, ::-1] * np.array([1, -1, -1])
+        return total / self.count.clip(min=1)[..., None, None]
+
+
+def rule_tokens(cells: GridMotions, config: TrajTokConfig) -> Float32[np.ndarray, "V 6 3"]:
+    """Tokens of one class, the first exactly still: left and right alike, one for each cell that is used after smoothing."""
+    grid = cells.grid
+    seen = cells.count >= grid.min_motions
+    kept = smoothed(seen, config)
+    kept[grid.origin] = True
+    mean = cells.mean
+    turns = np.abs(np.diff(mean[..., 2], axis=2)).max(2) > MAX_MEAN_STEP_TURN_RAD
+    by_rule = ~seen | turns
+    ends = _grid_points(grid)
+    heading = _end_headings(mean[..., -1, 2], kept & seen, grid)
+    tokens = np.where(by_rule[..., None, None], _curves(ends, heading), _moved_to(mean, ends))
+    half = grid.origin[1]
+    tokens[:, half, :, 1:] = 0.0
+    tokens[:, :half] = mirrored(tokens[:, :half:-1])
+    tokens[grid.origin] = 0.0
+    still = np.zeros(grid.shape, bool)
+    still[grid.origin] = True
+    return np.concatenate([tokens[still], tokens[kept & ~still]]).astype(np.float32)
+
+
+def smoothed(used: Bool[np.ndarray, "X Y"], config: TrajTokConfig) -> Bool[np.ndarray, "X Y"]:
+    """Used cells without the lonely ones, and unused ones that are surrounded."""
+    side = config.neighborhood
+    around = np.rint(uniform_filter(used.astype(np.float64), side, mode="constant") * side**2).astype(int) - used
+    return np.where(used, around >= config.num_neighbors, around > config.num_neighbors)
+
+
+def _grid_points(grid: Grid) -> Float[np.ndarray, "X Y 2"]:
+    x, y = ((np.arange(size) - zero) * spacing for size, zero, spacing in zip(grid.shape, grid.origin, grid.spacing_m))
+    return np.stack(np.meshgrid(x, y, indexing="ij"), -1)
+
+
+def _end_headings(
+    heading: Float[np.ndarray, "X Y"], known: Bool[np.ndarray, "X Y"], grid: Grid
+) -> Float[np.ndarray, "X Y"]:
+    """Heading of the nearest cell where one is known; 0 if there is none."""
+    if not known.any():
+        return np.zeros_like(heading)
+    nearest = distance_transform_edt(~known, sampling=grid.spacing_m, return_distances=False, return_indices=True)
+    return heading[tuple(nearest)]  # type: ignore[arg-type]
+
+
+def _moved_to(motions: Float[np.ndarray, "X Y 6 3"], ends: Float[np.ndarray, "X Y 2"]) -> Float[np.ndarray, "X Y 6 3"]:
+    """The motions with a growing share of the shift that brings them to other end points."""
+    share = np.linspace(0, 1, STEPS_PER_TOKEN + 1)
+    moved = motions.copy()
+    moved[..., :2] += share[:, None] * (ends - motions[..., -1, :2])[:, :, None]
+    return moved
+
+
+def _curves(ends: Float[np.ndarray, "X Y 2"], heading: Float[np.ndarray, "X Y"]) -> Float[np.ndarray, "X Y 6 3"]:
+    """Cubic curves from the origin to end points: tangents as long as the way, along the headings at the start (0) and at the end
+    (against them where the end lies behind). Headings change evenly."""
+    t = np.linspace(0, 1, STEPS_PER_TOKEN + 1)[:, None]
+    length = np.hypot(ends[..., 0], ends[..., 1]) * np.where(ends[..., 0] < 0, -1.0, 1.0)
+    start = np.stack([length, np.zeros_like(length)], -1)
+    finish = length[..., None] * np.stack([np.cos(heading), np.sin(heading)], -1)
+    position = (
+        (t**3 - 2 * t**2 + t) * start[:, :, None]
+        + (3 * t**2 - 2 * t**3) * ends[:, :, None]
+        + (t**3 - t**2) * finish[:, :, None]
+    )
+    return np.concatenate([position, t * heading[..., None, None]], -1)
