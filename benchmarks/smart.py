@@ -32,7 +32,8 @@ WEIGHTS_SEED = 1003
 NUM_ROLLOUTS = 32
 TOP_K = 48
 NUM_CANDIDATES = 32
-GRADIENT_CLIP = 0.5
+CONTEXT_RADIUS_M = 150.0
+"""In updates a step of an agent farther from the ego than this is taken as not recorded, by both sides."""
 LARGEST_BATCH_TRIED = 1024
 
 
@@ -145,11 +146,14 @@ class Inputs:
     recipe: Recipe
     rollouts_per_pass: int
 
-    def batch(self, records: str) -> Any:
+    def batch(self, records: str, context_radius_m: float | None = None) -> Any:
         from rlftsim.scenario.batch import collate
         from rlftsim.scenario.womd import scenario_from_bytes
+        from rlftsim.training.data import within_reach
 
         distinct = {r: scenario_from_bytes((self.folder / f"{r}.record").read_bytes()) for r in dict.fromkeys(records)}
+        if context_radius_m:
+            distinct = {r: within_reach(scenario, context_radius_m) for r, scenario in distinct.items()}
         return collate([distinct[r] for r in records]).to(self.recipe.device)
 
     def policy(self, size: str) -> Any:
@@ -235,7 +239,7 @@ def measure(inputs: Inputs, case: Case) -> dict[str, Any]:
     policy = inputs.policy(case.size)
     if case.task == "batch":
         return {"batch": largest_batch(inputs, policy, case)}
-    batch = inputs.batch(case.records)
+    batch = inputs.batch(case.records, None if case.task == "rollouts" else CONTEXT_RADIUS_M)
     if case.task == "rollouts":
         policy.requires_grad_(False)
         found = {"total_s": clock.time(lambda: roll_out(policy, batch, inputs))}
@@ -250,7 +254,7 @@ def pretraining_step(policy: Any) -> Callable[[Any], None]:
     import torch
     from torch.nn.functional import cross_entropy
 
-    from rlftsim.training.pretrain import PretrainConfig, trained_agents
+    from rlftsim.training.pretrain import PretrainConfig
 
     config = PretrainConfig()
     optimizer = torch.optim.AdamW(policy.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay)
@@ -258,7 +262,7 @@ def pretraining_step(policy: Any) -> Callable[[Any], None]:
 
     def step(batch: Any) -> None:
         optimizer.zero_grad(set_to_none=True)
-        said = policy.teacher_forced(batch, trained_agents(batch, config, 0))
+        said = policy.teacher_forced(batch, trained(batch))
         logits, target = said.logits[said.target_mask], said.target[said.target_mask]
         cross_entropy(logits, target, label_smoothing=config.label_smoothing).backward()
         torch.nn.utils.clip_grad_norm_(policy.parameters(), config.gradient_clip)
@@ -271,24 +275,34 @@ def fine_tuning_step(policy: Any, num_candidates: int) -> Callable[[Any], None]:
     """One update: a CAT-K rollout, its loss, backward, clipping, AdamW; only attention and head are trained."""
     import torch
 
-    from rlftsim.training.catk import catk_loss, roll_out_closest
-    from rlftsim.training.pretrain import PretrainConfig, trained_agents
+    from rlftsim.training.catk import CatkConfig, predict_along, roll_out_closest, train_parts
+    from rlftsim.training.imitation import summed_loss
 
-    policy.requires_grad_(False)
-    for part in policy.fine_tuned_parts():
-        part.requires_grad_(True)
+    config = CatkConfig()
+    train_parts(policy, "decoder")
     policy.train()
-    trained = [p for p in policy.parameters() if p.requires_grad]
-    optimizer = torch.optim.AdamW(trained, lr=5e-5)
+    weights = [p for p in policy.parameters() if p.requires_grad]
+    optimizer = torch.optim.AdamW(weights, lr=config.learning_rate, weight_decay=config.weight_decay)
 
     def step(batch: Any) -> None:
         optimizer.zero_grad(set_to_none=True)
-        pursuing = roll_out_closest(policy, batch, num_candidates=num_candidates)
-        catk_loss(policy, batch, pursuing, trained_agents(batch, PretrainConfig(), 0)).backward()
-        torch.nn.utils.clip_grad_norm_(trained, GRADIENT_CLIP)
+        context = policy.encode(batch)
+        pursuing = roll_out_closest(policy, batch, num_candidates=num_candidates, context=context)
+        loss, counts = summed_loss(predict_along(policy, context, pursuing, trained(batch)), config.label_smoothing)
+        (loss / counts[2]).backward()
+        torch.nn.utils.clip_grad_norm_(weights, config.gradient_clip)
         optimizer.step()
 
     return step
+
+
+def trained(batch: Any) -> Any:
+    """Agents that count in an update."""
+    from rlftsim.training.data import trained_agents
+    from rlftsim.training.pretrain import PretrainConfig
+
+    config = PretrainConfig()
+    return trained_agents(batch, 0, radius_m=config.trained_radius_m, limit=config.max_trained_agents, seed=config.seed)
 
 
 def largest_batch(inputs: Inputs, policy: Any, case: Case) -> int:
@@ -299,7 +313,7 @@ def largest_batch(inputs: Inputs, policy: Any, case: Case) -> int:
     while fits < LARGEST_BATCH_TRIED:
         count = max(2 * fits, 1)
         try:
-            step(inputs.batch((case.records * count)[:count]))
+            step(inputs.batch((case.records * count)[:count], CONTEXT_RADIUS_M))
         except torch.OutOfMemoryError:
             break
         fits = count

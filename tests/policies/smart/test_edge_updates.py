@@ -16,7 +16,7 @@ from rlftsim.scenario.batch import collate
 from rlftsim.scenario.types import ObjectType
 from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
 from rlftsim.training.catk import catk_loss, roll_out_closest
-from rlftsim.training.pretrain import PretrainConfig, trained_agents
+from rlftsim.training.data import trained_agents
 
 SMALL = SmartConfig(
     dim=16, num_heads=2, head_dim=8, num_map_layers=1, num_decoder_layers=1, num_frequencies=4, max_agent_neighbors=12
@@ -61,7 +61,7 @@ def update(policy, loss):
 @modes
 def test_a_pre_training_update(name, public, vocabulary):
     policy, batch = fresh(vocabulary, public).train(), collate([AWKWARD[name]])
-    said = policy.teacher_forced(batch, trained_agents(batch, PretrainConfig(), 0))
+    said = policy.teacher_forced(batch, trained_agents(batch, 0, radius_m=100.0, limit=32, seed=0))
     assert said.target_mask.any()
     moved = update(policy, cross_entropy(said.logits[said.target_mask], said.target[said.target_mask]))
     assert moved > 20
@@ -72,7 +72,9 @@ def test_a_closed_loop_update_and_rollouts_after_it(name, public, vocabulary):
     policy, batch = fresh(vocabulary, public).train(), collate([AWKWARD[name]])
     pursuing = roll_out_closest(policy, batch, num_candidates=8, public_order_of_operations=public)
     assert pursuing.rollouts.decision_mask.sum() == 16 * batch.agent_mask.sum()
-    moved = update(policy, catk_loss(policy, batch, pursuing, trained_agents(batch, PretrainConfig(), 0)))
+    moved = update(
+        policy, catk_loss(policy, batch, pursuing, trained_agents(batch, 0, radius_m=100.0, limit=32, seed=0))
+    )
     assert moved > 20
     rollouts = simulate(policy.eval(), batch, num_rollouts=2, seed=0)
     assert rollouts.position.isfinite().all()
