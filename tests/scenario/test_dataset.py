@@ -3,9 +3,11 @@ import pickle
 from dataclasses import replace
 
 import numpy as np
+import pyarrow as pa
 import pytest
 
 from rlftsim.errors import DataError
+from rlftsim.scenario import shards
 from rlftsim.scenario.dataset import DatasetWriter, ScenarioDataset, write_dataset
 from rlftsim.scenario.types import LaneTopology
 from rlftsim.scenario.womd import read_scenarios, scenario_from_bytes
@@ -40,6 +42,20 @@ def test_odd_values_and_missing_tables_come_back(tmp_path, scenarios, difference
     )
     write_dataset([one], tmp_path / "data")
     assert differences(one, ScenarioDataset(tmp_path / "data")[0]) == []
+
+
+def test_shards_from_before_the_rest_of_polygons_are_read(tmp_path, scenarios, differences, monkeypatch):
+    one = next(iter(scenarios))
+    rest = np.ones_like(one.map_features.points)
+    one = replace(one, map_features=replace(one.map_features, polygon_rest=rest))
+    write_dataset([one], tmp_path / "now")
+    assert differences(one, ScenarioDataset(tmp_path / "now")[0]) == []
+    columns = [name for name in shards._SCHEMA.names if name not in shards._ADDED_LATER]
+    earlier = pa.schema([shards._SCHEMA.field(name) for name in columns], metadata=shards._SCHEMA.metadata)
+    with monkeypatch.context() as patch:
+        patch.setattr(shards, "_SCHEMA", earlier)
+        write_dataset([replace(one, map_features=replace(one.map_features, polygon_rest=None))], tmp_path / "before")
+    assert ScenarioDataset(tmp_path / "before")[0].map_features.polygon_rest is None
 
 
 def test_scenarios_are_found_by_position_and_id(folder):

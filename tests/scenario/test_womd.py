@@ -41,6 +41,17 @@ def test_world_coordinates_are_rounded_to_float32(make_message):
     assert scenario.map_features.points[0, 0] == np.float32(8312.3593754321)
 
 
+def test_polygons_keep_what_rounding_takes_from_them(make_message):
+    message, exact = make_message(), 8312.3597
+    message.map_features[0].lane.polyline[0].x = exact
+    message.map_features.add(id=77).crosswalk.polygon.add(x=exact, y=-0.1, z=1.5)
+    features = parse(message).map_features
+    place = features.feature_id.tolist().index(77)
+    assert abs(exact - float(np.float32(exact))) > 1e-4
+    np.testing.assert_allclose(features.polygon(place), [[exact, -0.1, 1.5]], rtol=0, atol=1e-10)
+    assert (features.polygon_rest[: features.offsets[1]] == 0).all()  # the lane's
+
+
 def test_every_kind_of_map_feature_gets_its_type_and_points():
     features = [
         (womd_pb2.MapFeature(id=1, lane=womd_pb2.LaneCenter(type=3)), MapFeatureType.LANE_BIKE, "lane.polyline"),

@@ -39,7 +39,7 @@ def move_scenario(scenario: Scenario, turn_rad: float, shift_m: tuple[float, flo
     return replace(
         scenario,
         tracks=replace(tracks, position=moved(tracks.position), heading=heading.astype(np.float32), velocity=velocity),
-        map_features=replace(features, points=moved(features.points)),
+        map_features=replace(features, points=moved(features.points), polygon_rest=None),
         lights=replace(lights, stop_point=moved(lights.stop_point)),
     )
 

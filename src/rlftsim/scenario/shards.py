@@ -48,6 +48,9 @@ _ARRAY_DTYPES: Mapping[str, str] = {
     "map.points.x": "float32",
     "map.points.y": "float32",
     "map.points.z": "float32",
+    "map.polygon_rest.x": "float32",
+    "map.polygon_rest.y": "float32",
+    "map.polygon_rest.z": "float32",
     "topology.entry_lanes": "int64",
     "topology.exit_lanes": "int64",
     "topology.neighbors": "int64",
@@ -62,6 +65,8 @@ _ARRAY_DTYPES: Mapping[str, str] = {
     "lights.stop_point.y": "float32",
     "lights.stop_point.z": "float32",
 }
+_ADDED_LATER = ("map.polygon_rest.x", "map.polygon_rest.y", "map.polygon_rest.z")
+"""Columns that shards of earlier versions lack: None there."""
 _INDEX_TYPES = {str: pa.string(), int: pa.int32()}
 INDEX_FIELDS = tuple(pa.field(field.name, _INDEX_TYPES[field.type]) for field in fields(IndexRow))
 _SCHEMA = pa.schema(
@@ -142,7 +147,8 @@ class ShardReader:
         except (OSError, pa.ArrowException) as error:
             cause = "is missing" if not self.path.exists() else f"is damaged ({error})"
             raise DataError(f"shard {self.path} {cause}: {_WAY_OUT}") from error
-        if self._table.schema.names != _SCHEMA.names:
+        earlier = [name for name in _SCHEMA.names if name not in _ADDED_LATER]
+        if self._table.schema.names not in (_SCHEMA.names, earlier):
             raise DataError(f"shard {self.path} was written with another schema version: convert again")
 
     def __len__(self) -> int:
@@ -177,7 +183,8 @@ class ShardReader:
             raise DataError(f"shard {self.path}: row {row} is damaged ({error}): {_WAY_OUT}") from error
 
     def _encoded(self, row: int) -> dict[str, pa.Buffer | None]:
-        return {name: self._table[name][row].as_buffer() for name in _ARRAY_DTYPES}
+        known = self._table.schema.names
+        return {name: self._table[name][row].as_buffer() if name in known else None for name in _ARRAY_DTYPES}
 
 
 _WAY_OUT = "delete the file and run the conversion or generation that made it again"
@@ -220,7 +227,7 @@ def _checksum(encoded: Mapping[str, bytes | pa.Buffer | None]) -> int:
 def _to_arrays(scenario: Scenario) -> dict[str, np.ndarray | None]:
     """Arrays in the order of the columns, alike along their last axis; tables are transposed."""
     tracks, features, lights = scenario.tracks, scenario.map_features, scenario.lights
-    topology = features.topology
+    topology, rest = features.topology, features.polygon_rest
     return {
         "timestamps_s": scenario.timestamps_s,
         "tracks_to_predict": scenario.tracks_to_predict,
@@ -244,6 +251,7 @@ def _to_arrays(scenario: Scenario) -> dict[str, np.ndarray | None]:
         "map.points.x": features.points[:, 0],
         "map.points.y": features.points[:, 1],
         "map.points.z": features.points[:, 2],
+        **{f"map.polygon_rest.{c}": None if rest is None else rest[:, i] for i, c in enumerate("xyz")},
         "topology.entry_lanes": topology.entry_lanes.T,
         "topology.exit_lanes": topology.exit_lanes.T,
         "topology.neighbors": topology.neighbors.T,
@@ -284,6 +292,7 @@ def _from_arrays(scenario_id: str, ego_index: int, arrays: Mapping[str, np.ndarr
             feature_type=arrays["map.feature_type"],
             points=vector("map.points", "x y z"),
             offsets=arrays["map.offsets"],
+            polygon_rest=None if arrays["map.polygon_rest.x"] is None else vector("map.polygon_rest", "x y z"),
             topology=LaneTopology(
                 entry_lanes=table("entry_lanes"),
                 exit_lanes=table("exit_lanes"),

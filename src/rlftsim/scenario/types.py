@@ -2,7 +2,7 @@
 
 Units: metres, seconds, radians, metres per second. Headings are counter-clockwise from +x. Frame: the *world* frame of the
 record. Coordinates are float32 from reading on, because the official evaluator and the public SMART code round them so before
-they do anything else; `Scenario.origin` is in whole metres, so that subtracting it is exact.
+they do anything else (but for one thing: `MapFeatures.polygon_rest`); `Scenario.origin` is in whole metres, so that subtracting it is exact.
 
 Shapes: O objects, S steps at 10 Hz (91; 11 in a test split), F map features, P map points, K light states. Nothing here needs torch.
 """
@@ -13,7 +13,7 @@ from functools import cached_property
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int8, Int32, Int64
+from jaxtyping import Bool, Float, Float32, Float64, Int8, Int32, Int64
 
 from rlftsim.errors import DataError
 
@@ -126,6 +126,9 @@ class MapFeatures:
     points: Float32[np.ndarray, "P 3"]
     offsets: Int64[np.ndarray, "F+1"]
     topology: LaneTopology = field(default_factory=LaneTopology)
+    polygon_rest: Float32[np.ndarray, "P 3"] | None = None
+    """What float32 took from the points of crosswalks, bumps and driveways, zero elsewhere: the public SMART code cuts these in double
+    precision. None where a source has float32 alone, or the points have been moved."""
 
     def __len__(self) -> int:
         return len(self.feature_id)
@@ -133,6 +136,12 @@ class MapFeatures:
     def polyline(self, index: int | np.integer) -> Float32[np.ndarray, "n 3"]:
         """Points of feature `index`, world frame."""
         return self.points[self.offsets[index] : self.offsets[index + 1]]
+
+    def polygon(self, index: int | np.integer) -> Float64[np.ndarray, "n 3"]:
+        """Points of a crosswalk, bump or driveway, world frame, as precise as they are known."""
+        polygon = self.polyline(index).astype(np.float64)
+        own = slice(self.offsets[index], self.offsets[index + 1])
+        return polygon if self.polygon_rest is None else polygon + self.polygon_rest[own]
 
     def indices_of(self, types: tuple[int, ...]) -> Int64[np.ndarray, "n"]:
         """Indices of the features of the given types, in file order."""

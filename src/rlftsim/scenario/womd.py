@@ -30,6 +30,7 @@ from rlftsim.scenario.types import (
 
 _TFRECORD_NAME = re.compile(r"\.tfrecords?(-\d+-of-\d+)?$")
 _LEFT, _RIGHT = 0, 1
+_POLYGONS = ("crosswalk", "speed_bump", "driveway")
 
 
 def find_tfrecords(source: str | os.PathLike[str]) -> list[Path]:
@@ -270,13 +271,16 @@ def _read_map(features: Sequence[womd_pb2.MapFeature]) -> MapFeatures:
     offsets = np.zeros(len(features) + 1, np.int64)
     np.cumsum([len(points) for _, points in typed_points], out=offsets[1:])
     feature_id = np.array([feature.id for feature in features], np.int64)
-    points = _to_float32(np.array(flat, np.float64)).reshape(-1, 3)
+    doubles = np.array(flat, np.float64).reshape(-1, 3)
+    points = _to_float32(doubles)
+    is_polygon = np.repeat(np.array([kind in _POLYGONS for kind in kinds], bool), np.diff(offsets))
     return MapFeatures(
         feature_id=feature_id,
         feature_type=np.array([kind for kind, _ in typed_points], np.int8),
         points=points,
         offsets=offsets,
         topology=_read_topology(features, kinds),
+        polygon_rest=_to_float32(np.where(is_polygon[:, None], doubles - points, 0.0)),
     )
 
 

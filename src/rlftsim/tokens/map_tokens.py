@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Int8, Int64
+from jaxtyping import Bool, Float, Float32, Float64, Int8, Int64
 from torch import Tensor
 
 from rlftsim.geometry import rotate
@@ -124,7 +124,7 @@ def split_map(scenario: Scenario) -> MapPieces:
         feature_type = int(scenario.map_features.feature_type[index])
         lane_id = int(scenario.map_features.feature_id[index])
         if kind == 3:
-            polyline = _polygon_sides(polyline)
+            polyline = _polygon_sides(scenario.map_features.polygon(index))
         type_ = _TYPE_OF_FEATURE[feature_type]
         if kind == 0 and lane_id in stop_lanes and feature_type != MapFeatureType.LANE_BIKE:
             type_ = STOP_SIGN_LANE_TYPE
@@ -160,10 +160,10 @@ def _lights_now(scenario: Scenario) -> dict[int, int]:
     return dict(zip(scenario.lights.lane_id[now].tolist(), states))
 
 
-def _polygon_sides(polygon: np.ndarray) -> np.ndarray:
-    """A crosswalk-like polygon as its two longer sides, each there and back, a point every metre."""
+def _polygon_sides(polygon: Float64[np.ndarray, "n 3"]) -> Float32[np.ndarray, "m 3"]:
+    """A crosswalk-like polygon as its two longer sides, each there and back, a point every metre; rounded to float32 last."""
     corners = polygon[[int(len(polygon) * share) for share in (0, 0.25, 0.5, 0.75)]]
-    a, b, c, d = corners.astype(np.float64)
+    a, b, c, d = corners
     sides = ((a, b), (c, d)) if np.hypot(*(b - a)[:2]) > np.hypot(*(c - b)[:2]) else ((a, d), (c, b))
     lines = [_every_metre(start, end) for start, end in sides]
     return np.concatenate([part for line in lines for part in (line, line[::-1])]).astype(np.float32)

@@ -12,14 +12,11 @@ import pytest
 import torch
 from safetensors.numpy import save_file
 
-import rlftsim.tokens.map_tokens as map_tokens
 from rlftsim.policies.smart.catk_checkpoint import import_catk
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.scenario.batch import ScenarioBatch, collate
-from rlftsim.scenario.tfrecord import read_records
 from rlftsim.scenario.types import Scenario
 from rlftsim.scenario.womd import read_scenarios
-from rlftsim.scenario.womd_pb2 import Scenario as ScenarioMessage
 
 FRAMES = {"centred": "map", "absolute": "world"}
 """Our name of each frame of the golden files."""
@@ -56,30 +53,7 @@ def record(shared) -> Path:
 
 @pytest.fixture(scope="session")
 def scenario_a(record) -> Scenario:
-    """Scenario A, its polygons cut as the public code cuts them: from the record's double precision.
-
-    `Scenario` holds float32, which moves 82 of 2121 map tokens by half a millimetre. What is derived here is remembered.
-    """
-    scenario = next(iter(read_scenarios(record)))
-    doubles = _polygons(record)
-    ours = map_tokens._polygon_sides
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(map_tokens, "_polygon_sides", lambda polygon: ours(doubles[polygon.tobytes()]))
-        map_tokens.split_map(scenario)
-    return scenario
-
-
-def _polygons(record: Path) -> dict[bytes, np.ndarray]:
-    """Polygons in double precision, by the bytes of their float32 version."""
-    _, data = next(iter(read_records(record)))
-    message = ScenarioMessage.FromString(data)
-    polygons = (
-        np.array([[p.x, p.y, p.z] for p in getattr(feature, kind).polygon])
-        for feature in message.map_features
-        for kind in ("crosswalk", "speed_bump", "driveway")
-        if feature.HasField(kind)
-    )
-    return {polygon.astype(np.float32).tobytes(): polygon for polygon in polygons}
+    return next(iter(read_scenarios(record)))
 
 
 @pytest.fixture(scope="session")

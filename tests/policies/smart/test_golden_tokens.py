@@ -1,11 +1,13 @@
 """Preprocessing and tokens of scenario A against the public code."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from rlftsim.scenario.batch import collate
+from rlftsim.scenario.shards import ShardReader, ShardWriter
 from rlftsim.scenario.types import CURRENT_STEP
-from rlftsim.scenario.womd import read_scenarios
 from rlftsim.tokens.agent_tokens import clean_tracks, tokenize_agents
 from rlftsim.tokens.map_tokens import split_map, tokenize_map
 from rlftsim.tokens.public_order import fill_gaps_in_world
@@ -69,17 +71,27 @@ def test_map_pieces_are_those_of_the_public_code(scenario_a, preprocessed):
     np.testing.assert_array_equal(pieces.light, preprocessed["map_light_type"])
 
 
-def test_map_pieces_from_float32_polygons_differ_by_one_step(record, golden, preprocessed, nano):
-    scenario = next(iter(read_scenarios(record)))
+def test_without_the_rest_of_doubles_polygons_are_cut_one_float32_step_elsewhere(
+    scenario_a, golden, preprocessed, nano
+):
+    features = replace(scenario_a.map_features, polygon_rest=None)
+    scenario = replace(scenario_a, map_features=features)
     pieces = split_map(scenario)
     off = np.abs(pieces.points - preprocessed["map_traj_pos"]).max((1, 2))
     assert off.max() <= FRAME_STEP_M
     assert (pieces.type[off > 0] == 9).all()
-    np.testing.assert_array_equal(pieces.type, preprocessed["map_type"])
     tokens = tokenize_map(collate([scenario]), nano.vocabulary.map_prototypes)
     differs = tokens.token_id[0].numpy() != golden.arrays("scenario_A/tokens_centred")["map_token_idx"]
     assert (off > 0).sum() == 82
     assert differs.sum() == 7
+
+
+def test_map_pieces_come_back_from_a_data_set(scenario_a, preprocessed, tmp_path):
+    writer = ShardWriter(tmp_path / "a.arrow")
+    writer.add(scenario_a, "training")
+    writer.close()
+    pieces = split_map(ShardReader(tmp_path / "a.arrow").read(0))
+    np.testing.assert_array_equal(pieces.points, preprocessed["map_traj_pos"])
 
 
 @pytest.mark.parametrize("frame", ["centred", "absolute"])
