@@ -184,11 +184,7 @@ def _evaluate_scenario(job: _Job, scenario: Scenario) -> dict[str, object] | Ski
         states = logged_states(scenario, num_rollouts=config.num_rollouts, device=job.device)
     else:
         states = simulate_states(job.policy, scenario, config, job.device)
-    return row_of_result(
-        score(log, states, metric_by_name(config.metric)),
-        num_agents=len(scenario.simulated_indices),
-        num_evaluated=len(scenario.evaluated_indices),
-    )
+    return row_of_result(score(log, states, metric_by_name(config.metric)), scenario, states)
 
 
 def _open(job: _Job) -> ScenarioDataset:
