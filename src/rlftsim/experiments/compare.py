@@ -69,9 +69,7 @@ class PairedDifference:
                 return f"no difference: equal in all {self.count} scenarios."
             return f"difference: {self.difference:+.4f} in every one of the {self.count} scenarios."
         low, high = self.interval
-        numbers = (
-            f"{self.difference:+.4f}, {100 - 100 * self.alpha:g}% interval [{low:+.4f}, {high:+.4f}], p = {self.p_value:.2g}"
-        )
+        numbers = f"{self.difference:+.4f}, {100 - 100 * self.alpha:g}% interval [{low:+.4f}, {high:+.4f}], p = {self.p_value:.2g}"
         if not self.is_difference:
             return f"no difference at the {100 * self.alpha:g}% level: {numbers}."
         is_better = (self.difference > 0) == (direction_of(self.column) == "higher")
