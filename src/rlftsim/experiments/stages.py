@@ -50,3 +50,8 @@ def finetune_smart(base: Path, training: ScenarioDataset, config: FinetuneConfig
     """
     card = model_card(f"fine-tuned with {config.reward.upper()}", training.folder, len(training))
     return finetune(SmartPolicy.from_pretrained(base), training, out, config, card=card)
+
+
+def finetune_catk(base: Path, training: ScenarioDataset, config: object, out: Path) -> Path:
+    """Folder of a model fine-tuned with CAT-K from a base model."""
+    raise NotImplementedError
