@@ -19,9 +19,9 @@ TINY = SmartRecipe(
         max_map_neighbors=4, max_agent_map_neighbors=6, max_agent_neighbors=6, dropout=0.0, history_drop=0.0,
     ),
     pretrain=PretrainConfig(epochs=1.0, batch_size=2, learning_rate=1e-3, label_smoothing=0.0, device=CPU),
-    finetune=FinetuneConfig(epochs=1.0, batch_size=1, num_rollouts=2, learning_rate=1e-3, warmup_updates=1, device=CPU),
+    finetune=FinetuneConfig(epochs=0.5, batch_size=1, num_rollouts=2, learning_rate=1e-3, warmup_updates=1, device=CPU),
 )  # fmt: skip
-"""Four updates of fine-tuning on four scenarios."""
+"""Two updates of fine-tuning on four scenarios."""
 
 
 def evaluation(name, meta_metric, ids=None, columns=None, **config):

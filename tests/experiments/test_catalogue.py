@@ -122,7 +122,7 @@ def test_every_reward_is_a_contestant_with_the_recipes_budget():
     for one in reward_ablation.REWARDS.values():
         if one.credit == "rollout" and one.method in ("mloo", "rloo"):
             config = finetune_config(one, TINY.finetune)
-            assert (config.reward, config.epochs, config.batch_size, config.num_rollouts) == (one.method, 1.0, 1, 2)
+            assert (config.reward, config.epochs, config.batch_size, config.num_rollouts) == (one.method, 0.5, 1, 2)
 
 
 # ---- paired t-test ---------------------------------------------------------------------------------------------------
@@ -177,13 +177,13 @@ def test_variance_of_an_additive_metric_is_known():
     found = np.mean(
         [
             variance_scaling.variance_by_size(additive(rng.normal(0, 3.0, 32)), 32, sizes, rng)
-            for _ in range(400)
+            for _ in range(120)
         ],
         axis=0,
     )  # fmt: skip
     n = np.array(sizes)
-    np.testing.assert_allclose(found[0], 9.0 / (n * (n - 1)), rtol=0.06)
-    np.testing.assert_allclose(found[1], 9.0 * n / (n - 1), rtol=0.06)
+    np.testing.assert_allclose(found[0], 9.0 / (n * (n - 1)), rtol=0.12)
+    np.testing.assert_allclose(found[1], 9.0 * n / (n - 1), rtol=0.12)
 
 
 def test_slope_of_a_power_law_is_its_power():
@@ -245,8 +245,8 @@ def test_the_curve_compares_at_equal_length(workshop):
     measured = {name: row(name, around(gain, seed)) for seed, (name, gain) in enumerate(gains.items())}
     found = finetune_curve.conclude(measured, workshop)
     assert len(found.tables[0].rows) == 2 + 4 * 4
-    assert found.verdicts[0].startswith("best of its curve: RLFTSim, 0.5 epochs against base")
-    equal = next(v for v in found.verdicts if v.startswith("RLFTSim, 0.25 epochs against CAT-K, 0.25 epochs"))
+    assert found.verdicts[0].startswith("best of its curve: RLFTSim, 0.25 epochs against base")
+    equal = next(v for v in found.verdicts if v.startswith("RLFTSim, 0.125 epochs against CAT-K, 0.125 epochs"))
     assert "difference, for the better" in equal
     assert {c.method for contestants in rows.values() for c in contestants if isinstance(c, FineTuned)} == {"mloo", CATK}  # fmt: skip
 

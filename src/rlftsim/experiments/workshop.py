@@ -39,7 +39,7 @@ from rlftsim.experiments.evaluate import EvaluateConfig, evaluate
 from rlftsim.experiments.evaluation import SCHEMA, SCORE_COLUMNS, Evaluation
 from rlftsim.experiments.stages import find_vocabulary, finetune_catk, finetune_smart, open_training, pretrain_smart
 from rlftsim.policies.smart.policy import SmartPolicy
-from rlftsim.recipes.models import Device, load_policy, load_policy_or_oracle
+from rlftsim.recipes.models import Device, find_model, load_policy, load_policy_or_oracle
 from rlftsim.recipes.smart import SmartRecipe
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.scenario.dataset import MANIFEST, ScenarioDataset
@@ -196,13 +196,13 @@ class Workshop:
 
     def _result(self, contestant: Base | FineTuned) -> Path:
         if contestant == BASE and self.base_model:
-            return Path(self.base_model)
+            return find_model(self.base_model)
         return self.model_folder(contestant) / "model"
 
     def _pretrain(self, base: Base) -> None:
         config = self.recipe.pretrain if base.epochs is None else replace(self.recipe.pretrain, epochs=base.epochs)
         if self.base_model:
-            like = SmartPolicy.from_pretrained(Path(self.base_model))
+            like = SmartPolicy.from_pretrained(find_model(self.base_model))
             model, vocabulary = like.config, like.vocabulary
         else:
             origin = f"experiments on {self.data.name}, {self.recipe.tokens}"

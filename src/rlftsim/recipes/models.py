@@ -25,12 +25,21 @@ def load_policy(name: str, device: Device = "cpu") -> Policy:
     """
     if name in NAMED:
         return NAMED[name]()
+    return SmartPolicy.from_pretrained(find_model(name)).eval().requires_grad_(False).to(_find_device(device))
+
+
+def find_model(name: str) -> Path:
+    """The model folder of a name: itself, or the one inside a run's folder.
+
+    Raises:
+        ConfigError: there is no such folder.
+    """
     folder = Path(name)
     if (folder / "model" / "config.json").exists():
         folder = folder / "model"
     if not folder.is_dir():
         raise ConfigError(f"{name!r} is neither a model folder nor one of {', '.join(NAMED)}.")
-    return SmartPolicy.from_pretrained(folder).eval().requires_grad_(False).to(_find_device(device))
+    return folder
 
 
 def load_policy_or_oracle(name: str, device: Device = "cpu") -> Policy | Literal["oracle"]:

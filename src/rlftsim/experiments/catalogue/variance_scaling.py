@@ -18,7 +18,7 @@ from torch import Tensor
 
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.experiments.compare import MeanInterval, mean_interval
-from rlftsim.experiments.evaluate import EvaluateConfig, simulate_states
+from rlftsim.experiments.evaluate import EvaluateConfig, check_jobs, simulate_states
 from rlftsim.experiments.findings import Experiment, Findings, TextTable
 from rlftsim.experiments.parts import one_thread
 from rlftsim.experiments.workshop import Workshop
@@ -63,7 +63,10 @@ def measure(workshop: Workshop) -> Variances:
         raise ConfigError(
             f"a slope over N = 2, 3, 4, ... needs 4 rollouts at least, got {config.num_rollouts}: set --num-rollouts 32."
         )
-    job = _Job(load_policy(str(workshop.base()), workshop.device), workshop.data, config, sizes, workshop.out / "variances")
+    job = _Job(
+        load_policy(str(workshop.base()), workshop.device), workshop.data, config, sizes, workshop.out / "variances"
+    )
+    check_jobs(config, device_of(job.policy))
     chosen = range(min(len(dataset), config.limit or len(dataset)))
     ids = [dataset.scenario_ids[i] for i in chosen]
     missing = [i for i in chosen if _read(job.path_of(dataset.scenario_ids[i]), sizes) is None]
