@@ -7,6 +7,7 @@ from rlftsim.experiments.workshop import Row
 from rlftsim.policies.smart.config import SmartConfig
 from rlftsim.recipes.smart import SmartRecipe
 from rlftsim.tokens.clustering import TokensConfig
+from rlftsim.training.catk import CatkConfig
 from rlftsim.training.finetune import FinetuneConfig
 from rlftsim.training.parallel import DeviceConfig
 from rlftsim.training.pretrain import PretrainConfig
@@ -20,6 +21,7 @@ TINY = SmartRecipe(
     ),
     pretrain=PretrainConfig(epochs=1.0, batch_size=2, learning_rate=1e-3, label_smoothing=0.0, device=CPU),
     finetune=FinetuneConfig(epochs=0.5, batch_size=1, num_rollouts=2, learning_rate=1e-3, warmup_updates=1, device=CPU),
+    catk=CatkConfig(device=CPU),
 )  # fmt: skip
 """Two updates of fine-tuning on four scenarios."""
 

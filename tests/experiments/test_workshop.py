@@ -14,7 +14,7 @@ from rlftsim.cli.main import main
 from rlftsim.errors import CheckpointError, ConfigError
 from rlftsim.experiments import stages
 from rlftsim.experiments.catalogue import variance_scaling
-from rlftsim.experiments.contestants import BASE, ORACLE, Base, FineTuned, over_seeds
+from rlftsim.experiments.contestants import BASE, CATK, ORACLE, Base, FineTuned, over_seeds
 from rlftsim.experiments.evaluate import EvaluateConfig
 from rlftsim.experiments.findings import Experiment, Findings, result_table, run_experiment, verdict_line
 from rlftsim.experiments.report import SCORES
@@ -135,6 +135,16 @@ def test_a_longer_run_goes_on_from_a_shorter_one_to_the_same_weights(done):
         torch.testing.assert_close(found[name], values, rtol=0, atol=0)
 
 
+def test_catk_has_as_many_updates_of_as_many_scenarios(done):
+    catk = FineTuned(CATK)
+    measured = done.measure({"CAT-K": (catk,)})
+    config = json.loads((done.model_folder(catk) / "config.json").read_text())
+    lines = (done.model_folder(catk) / "metrics.jsonl").read_text().splitlines()
+    assert len(lines) == done.budget.updates == 2
+    assert (config["batch_size"], config["epochs"], config["seed"]) == (1, 0.5, 0)
+    assert len(measured["CAT-K"].mean) == 2
+
+
 def test_a_model_that_is_handed_in_is_the_base(done, data, tmp_path):
     workshop = Workshop(TINY, data, tmp_path, QUICK, base_model=str(done.model_folder(BASE)))
     weak = workshop.measure({"base": (BASE,), "weak": (Base(0.5),)})
@@ -209,6 +219,8 @@ def test_the_command_writes_its_files_and_says_where(tmp_path, capsys):
         ("oracle --data somewhere", "recipe synthetic brings its own scenarios"),
         ("oracle --recipe smart-demo --data somewhere", "somewhere is no data set"),
         ("oracle --set finetune.rate=1", "no field 'rate' here"),
+        ("oracle --set finetune.reward=rloo", "finetune.reward has no effect here: experiments vary it"),
+        ("oracle --set catk.batch-size=2", "catk.batch_size has no effect here"),
         ("oracle --seeds 0", "at least one seed, got 0"),
     ],
 )

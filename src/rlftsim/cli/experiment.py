@@ -1,5 +1,6 @@
 """The verb that answers a question of the paper: experiment."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
@@ -10,6 +11,7 @@ from tyro.conf import Positional
 from rlftsim.cli.data import SYNTHETIC, data_folder
 from rlftsim.errors import ConfigError
 from rlftsim.experiments.catalogue import EXPERIMENTS, experiment_by_name
+from rlftsim.experiments.contestants import VARIED
 from rlftsim.experiments.evaluate import EvaluateConfig
 from rlftsim.experiments.findings import run_experiment
 from rlftsim.experiments.workshop import Workshop
@@ -55,6 +57,7 @@ class RunExperiment:
     def run(self) -> int:
         """Run what is missing and print what was found."""
         experiment = experiment_by_name(self.name)
+        _refuse_varied(self.set)
         workshop = Workshop(
             recipe=configure(smart_synthetic() if self.recipe == SYNTHETIC else RECIPES[self.recipe](), self.set),
             data=self._data(),
@@ -86,3 +89,17 @@ class RunExperiment:
         if self.recipe != SYNTHETIC and self.data is None:
             raise ConfigError(f"recipe {self.recipe} needs scenarios: name a data set with --data.")
         return data_folder(self.data or SYNTHETIC)
+
+
+def _refuse_varied(overrides: Sequence[Override]) -> None:
+    """Refuse values that would have no effect.
+
+    Raises:
+        ConfigError: a field that experiments set themselves.
+    """
+    for override in overrides:
+        name = override.partition("=")[0].replace("-", "_")
+        if name in VARIED:
+            raise ConfigError(
+                f"{name} has no effect here: experiments vary it. All methods take their epochs and batch size from finetune."
+            )

@@ -3,8 +3,8 @@
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from rlftsim.errors import ConfigError
 from rlftsim.recipes.smart import SmartRecipe
+from rlftsim.training.catk import CatkConfig
 from rlftsim.training.finetune import FinetuneConfig
 
 WEAK_EPOCHS = 1.0
@@ -53,6 +53,8 @@ class FineTuned:
 
 
 CATK = "catk"
+VARIED = ("finetune.reward", "finetune.credit", "finetune.seed", "catk.seed", "catk.epochs", "catk.batch_size")
+"""Fields of a recipe that contestants set for themselves."""
 Contestant = Baseline | Base | FineTuned
 ORACLE, CONSTANT_VELOCITY, BASE = Baseline("oracle"), Baseline("constant_velocity"), Base()
 
@@ -74,6 +76,7 @@ def finetune_config(contestant: FineTuned, recipe: FinetuneConfig) -> FinetuneCo
     return replace(recipe, **changes)
 
 
-def catk_config(contestant: FineTuned, recipe: SmartRecipe) -> object:
-    """How a contestant is fine-tuned with CAT-K: as many updates of as many scenarios as with a reward."""
-    raise ConfigError("CAT-K fine-tuning is not part of this version: leave the experiment with CAT-K out.")
+def catk_config(contestant: FineTuned, recipe: SmartRecipe) -> CatkConfig:
+    """How a contestant is fine-tuned with CAT-K: the recipe's way, for as many updates of as many scenarios as with a reward."""
+    epochs = recipe.finetune.epochs * contestant.share
+    return replace(recipe.catk, seed=contestant.seed, epochs=epochs, batch_size=recipe.finetune.batch_size)

@@ -10,6 +10,7 @@ from rlftsim.recipes.card import model_card
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
 from rlftsim.tokens.vocabulary import Vocabulary
+from rlftsim.training.catk import CatkConfig, catk_finetune
 from rlftsim.training.finetune import FinetuneConfig, finetune
 from rlftsim.training.pretrain import PretrainConfig, pretrain
 
@@ -52,6 +53,11 @@ def finetune_smart(base: Path, training: ScenarioDataset, config: FinetuneConfig
     return finetune(SmartPolicy.from_pretrained(base), training, out, config, card=card)
 
 
-def finetune_catk(base: Path, training: ScenarioDataset, config: object, out: Path) -> Path:
-    """Folder of a model fine-tuned with CAT-K from a base model."""
-    raise NotImplementedError
+def finetune_catk(base: Path, training: ScenarioDataset, config: CatkConfig, out: Path) -> Path:
+    """Folder of a model fine-tuned with CAT-K from a base model.
+
+    Raises:
+        CheckpointError: `out` holds a run with other settings or another base model.
+    """
+    card = model_card("fine-tuned with CAT-K", training.folder, len(training))
+    return catk_finetune(SmartPolicy.from_pretrained(base), training, out, config, card=card)
