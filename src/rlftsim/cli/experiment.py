@@ -17,8 +17,9 @@ from rlftsim.experiments.findings import run_experiment
 from rlftsim.experiments.workshop import Workshop
 from rlftsim.progress import print_wide
 from rlftsim.recipes.configure import Override, configure
-from rlftsim.recipes.models import Device
+from rlftsim.recipes.models import Device, find_device
 from rlftsim.recipes.smart import RECIPES, smart_synthetic
+from rlftsim.workers import usable_cores
 
 QUESTIONS = "; ".join(f"{name}: {experiment.question}" for name, experiment in EXPERIMENTS.items())
 
@@ -47,8 +48,8 @@ class RunExperiment:
     """Year of the meta-metric in evaluations."""
     limit: int | None = None
     """Only the first so many held-out scenarios."""
-    jobs: int = 1
-    """Processes that evaluate, each with one thread. On CPUs only."""
+    jobs: int | None = None
+    """Processes that evaluate, each with one thread. Left out, as many as there are cores, or one on a GPU."""
     device: Device = "auto"
     """Where evaluations run; training has its own in the recipe (e.g. finetune.device.accelerator)."""
     set: list[Override] = field(default_factory=list)
@@ -63,7 +64,7 @@ class RunExperiment:
             data=self._data(),
             out=self.out,
             evaluation=EvaluateConfig(
-                num_rollouts=self.num_rollouts, metric=self.metric, limit=self.limit, jobs=self.jobs
+                num_rollouts=self.num_rollouts, metric=self.metric, limit=self.limit, jobs=self._num_jobs()
             ),
             num_seeds=experiment.default_seeds if self.seeds is None else self.seeds,
             base_model=self.base_model,
@@ -75,6 +76,11 @@ class RunExperiment:
             print(f"* {line}")
         print(f"{self.out / self.name}.md")
         return 0
+
+    def _num_jobs(self) -> int:
+        if self.jobs is not None:
+            return self.jobs
+        return 1 if find_device(self.device).type != "cpu" else usable_cores()
 
     def _data(self) -> Path:
         """Folder of the data set.
