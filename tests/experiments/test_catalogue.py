@@ -211,17 +211,25 @@ def test_scaling_is_fitted_with_an_interval_and_a_verdict(workshop):
     sizes = variance_scaling.SIZES
     measured = made_up_variances(sizes)
     found = variance_scaling.conclude(measured, workshop)
-    expected = variance_scaling.slope_of(variance_scaling.law(sizes)["mloo"], sizes)
-    slope = found.numbers["rewards"]["mloo"]
-    assert slope["slope"] == pytest.approx(expected, abs=0.01)
-    low, high = slope["slope_interval"]
-    assert low < slope["slope"] < high
-    assert found.verdicts[0].startswith("MLOO: no difference from the slope")
-    assert variance_scaling.scaling_of(measured.by_reward["mloo"], sizes).slope.count == 49
+    for slope, first in zip(found.numbers["rewards"]["mloo"]["slopes"], (2, 8)):
+        expected = variance_scaling.slope_of(variance_scaling.law(sizes)["mloo"], sizes, first)
+        assert (slope["from_size"], slope["scenarios"]) == (first, 49)
+        assert slope["of_law"] == pytest.approx(expected)
+        assert slope["slope"] == pytest.approx(expected, abs=0.01)
+        low, high = slope["interval"]
+        assert low < slope["slope"] < high
+    assert found.verdicts[0].startswith("MLOO, N ≥ 2: no difference from the slope")
     # a pure alpha / N² comes back
     exact = variance_scaling.scaling_of(np.array([[7.0 / n**2 for n in sizes]] * 3), sizes)
     assert exact.alpha == pytest.approx(7.0)
-    assert exact.slope.mean == pytest.approx(-2.0)
+    assert [slope.mean for slope in exact.slopes.values()] == pytest.approx([-2.0, -2.0])
+
+
+def test_a_slope_looks_at_large_numbers_only_when_told_to():
+    # flat up to 8, then with the square
+    curve = np.array([1.0, 1.0, 1.0, 0.25, 0.0625])
+    assert variance_scaling.slope_of(curve, (2, 4, 8, 16, 32), 8) == pytest.approx(-2.0)
+    assert variance_scaling.slope_of(curve, (2, 4, 8, 16, 32)) > -1.5
 
 
 def test_a_reward_that_falls_otherwise_is_a_difference(workshop):
@@ -230,6 +238,7 @@ def test_a_reward_that_falls_otherwise_is_a_difference(workshop):
     noise = np.exp(np.random.default_rng(0).normal(0, 0.01, (20, 4)))
     other = variance_scaling.Variances(tuple("abcdefghijklmnopqrst"), sizes, {"mloo": noise / n, "rloo": noise / n})
     found = variance_scaling.conclude(other, workshop)
+    assert len(found.verdicts) == 2  # two sizes from 8 on are too few for a slope of their own
     assert all("difference from the slope" in v and "no difference" not in v for v in found.verdicts)
 
 
@@ -298,6 +307,9 @@ def test_the_agenda_counts_and_estimates(capsys):
     with agenda.step("fine-tune b"):  # needed twice, counted once
         pass
     err = capsys.readouterr().err
-    assert "1/3  fine-tune a " in err
+    assert "1/3  fine-tune a\n" in err
     assert "2/3  fine-tune b  (less than a minute to go)" in err
     assert err.count("fine-tune b") == 1
+    with agenda.step("evaluate a"):
+        pass
+    assert "3/3  evaluate a  (finished before)" in capsys.readouterr().err

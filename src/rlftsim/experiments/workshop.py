@@ -22,7 +22,6 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from rich.console import Console
 
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.experiments.contestants import (
@@ -37,6 +36,7 @@ from rlftsim.experiments.contestants import (
 )
 from rlftsim.experiments.evaluate import EvaluateConfig, evaluate
 from rlftsim.experiments.evaluation import SCHEMA, SCORE_COLUMNS, Evaluation
+from rlftsim.experiments.parts import say
 from rlftsim.experiments.stages import find_vocabulary, finetune_catk, finetune_smart, open_training, pretrain_smart
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.recipes.models import Device, find_model, load_policy, load_policy_or_oracle
@@ -153,7 +153,8 @@ class Workshop:
         """A contestant in words."""
         if not isinstance(contestant, FineTuned):
             return contestant.name.replace("_", " ")
-        return f"{contestant.name} ({self._epochs(contestant):g} epochs)"
+        epochs = self._epochs(contestant)
+        return f"{contestant.name} ({epochs:g} epoch{'s' if epochs != 1 else ''})"
 
     def model_folder(self, contestant: Base | FineTuned) -> Path:
         """Folder of the run that makes a contestant."""
@@ -262,7 +263,6 @@ class Agenda:
         self._open = dict(steps)
         self._total = len(steps)
         self._seconds: dict[str, list[float]] = {}
-        self._say = Console(stderr=True, highlight=False)
 
     @contextmanager
     def step(self, title: str) -> Iterator[None]:
@@ -271,10 +271,12 @@ class Agenda:
             yield
             return
         number = self._total - len(self._open) + 1
-        self._say.rule(f"{number}/{self._total}  {title}{self._time_left()}", align="left")
+        is_done = self._open[title]
+        say(f"{number}/{self._total}  {title}{'  (finished before)' if is_done else self._time_left()}")
         start = time.monotonic()
         yield
-        if not self._open.pop(title):
+        del self._open[title]
+        if not is_done:
             self._seconds.setdefault(_kind(title), []).append(time.monotonic() - start)
 
     def _time_left(self) -> str:

@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 from matplotlib.ticker import NullFormatter, NullLocator
 
 from rlftsim.files import write_whole
@@ -119,7 +120,7 @@ def draw_verdicts(names: Sequence[str], verdicts: Int[np.ndarray, "n n"], *, tit
         colour, sign = {1: (BETTER, "+"), -1: (WORSE, "−"), 0: (NEITHER, "~")}[verdict]
         if row == column:
             colour, sign = OWN, ""
-        axis.add_patch(matplotlib.patches.Rectangle((column - 0.5, row - 0.5), 1, 1, fc=colour, ec="white", lw=2))  # type: ignore[attr-defined]
+        axis.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, fc=colour, ec="white", lw=2))
         axis.text(column, row, sign, ha="center", va="center", fontsize=13, fontweight="bold", color=INK)
     axis.set(xlim=(-0.5, len(names) - 0.5), ylim=(len(names) - 0.5, -0.5), aspect="equal")
     axis.set_xticks(range(len(names)), names, rotation=40, ha="right", rotation_mode="anchor")

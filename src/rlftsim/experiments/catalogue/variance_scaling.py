@@ -36,6 +36,9 @@ from rlftsim.workers import run_tasks
 
 SIZES = (2, 3, 4, 6, 8, 12, 16, 24, 32)
 REWARDS = ("mloo", "rloo")
+FROM_SIZES = (2, 8)
+"""Slopes are fitted from each of these on: over all N, and where N is large enough for laws of large numbers."""
+MIN_SIZES_FOR_A_SLOPE = 3
 MEMBERS_A_SIZE = 64
 """Rewards averaged over for each N, about; whole subsets of N are drawn until there are as many."""
 CLAIMED_SLOPE = {"mloo": -2.0, "rloo": 0.0}
@@ -59,7 +62,7 @@ def measure(workshop: Workshop) -> Variances:
     config = workshop.evaluation
     dataset = ScenarioDataset(workshop.data, config.split)
     sizes = tuple(size for size in SIZES if size <= config.num_rollouts)
-    if len(sizes) < 3:
+    if len(sizes) < MIN_SIZES_FOR_A_SLOPE:
         raise ConfigError(
             f"a slope over N = 2, 3, 4, ... needs 4 rollouts at least, got {config.num_rollouts}: set --num-rollouts 32."
         )
@@ -100,11 +103,12 @@ def variance_by_size(
     return variances
 
 
-def slope_of(variance: Float[np.ndarray, "sizes"], sizes: Sequence[int]) -> float:
-    """Of the straight line fitted to the logarithms; NaN where a variance is zero."""
+def slope_of(variance: Float[np.ndarray, "sizes"], sizes: Sequence[int], first: int = 0) -> float:
+    """Of the straight line fitted to the logarithms from the size `first` on; NaN where a variance is zero."""
+    used = np.array(sizes) >= first
     if not (variance > 0).all():
         return float("nan")
-    return float(np.polyfit(np.log(sizes), np.log(variance), 1)[0])
+    return float(np.polyfit(np.log(np.array(sizes)[used]), np.log(variance[used]), 1)[0])
 
 
 def law(sizes: Sequence[int]) -> dict[str, Float[np.ndarray, "sizes"]]:
@@ -124,34 +128,43 @@ class Scaling:
     high: Float[np.ndarray, "sizes"]
     alpha: float
     """Of alpha / N^2, fitted to the logarithms of `middle`."""
-    slope: MeanInterval
-    """Over the scenarios' own slopes."""
+    slopes: dict[int, MeanInterval]
+    """Over the scenarios' own slopes, by the smallest size they are fitted to."""
 
 
 def scaling_of(variance: Float[np.ndarray, "scenarios sizes"], sizes: Sequence[int]) -> Scaling:
     """Fit of one reward; scenarios in which a reward never varies are left out."""
     varied = np.log(variance[(variance > 0).all(1)])
     middle, spread = varied.mean(0), varied.std(0)
-    slopes = np.array([slope_of(line, sizes) for line in np.exp(varied)])
+    slopes = {
+        first: mean_interval(np.array([slope_of(line, sizes, first) for line in np.exp(varied)]))
+        for first in FROM_SIZES
+        if sum(size >= first for size in sizes) >= MIN_SIZES_FOR_A_SLOPE
+    }
     alpha = float(np.exp((middle + 2 * np.log(sizes)).mean()))
-    return Scaling(np.exp(middle), np.exp(middle - spread), np.exp(middle + spread), alpha, mean_interval(slopes))
+    return Scaling(np.exp(middle), np.exp(middle - spread), np.exp(middle + spread), alpha, slopes)
 
 
 def conclude(measured: Variances, workshop: Workshop) -> Findings:
     """Slopes with their intervals, beside what the paper claims and what independent rollouts would give."""
     sizes = measured.sizes
     scalings = {name: scaling_of(values, sizes) for name, values in measured.by_reward.items()}
-    expected = {name: slope_of(curve, sizes) for name, curve in law(sizes).items()}
+    expected = {
+        (name, first): slope_of(curve, sizes, first)
+        for name, curve in law(sizes).items()
+        for first in scalings[name].slopes
+    }
     rows = tuple((str(size), *(f"{scalings[name].middle[k]:.3g}" for name in REWARDS)) for k, size in enumerate(sizes))
-    note = f"Geometric mean over {scalings['mloo'].slope.count} scenarios; base model, metric {workshop.evaluation.metric}."
+    note = f"Geometric mean over the scenarios; base model, metric {workshop.evaluation.metric}."
     return Findings(
         title="Variance of the rewards against the number of rollouts",
         tables=(TextTable("Variance of a rollout's reward", ("N", "MLOO", "RLOO"), rows, note), _slopes(scalings, expected)),
-        verdicts=tuple(_verdict(name, scalings[name], expected[name]) for name in REWARDS),
+        verdicts=tuple(_verdict(name, first, scalings[name], expected[name, first]) for name, first in expected),
         notes=(
             "The paper fits alpha / N² to its MLOO curve (Fig. 3) and gives no slope; it finds RLOO to flatten out.",
             "Its proof has 1 / (N (N − 1)) for MLOO, which is steeper than 1 / N² at small N, and N / (N − 1) for RLOO: the "
-            "expected slopes are those of these laws over the same N.",
+            "slopes of independent rollouts are those of these laws over the same N. They hold where a score is a mean over rollouts; the "
+            "meta-metric is one only when N is large: of few rollouts it is a geometric mean of nearly empty histograms.",
             "Small variance alone makes no better gradient: a reward that is scaled down has it too. What matters is the "
             "variance beside the differences that a policy is to learn.",
         ),
@@ -161,9 +174,10 @@ def conclude(measured: Variances, workshop: Workshop) -> Findings:
                 name: {
                     "variance": s.middle.tolist(),
                     "alpha": s.alpha,
-                    "slope": s.slope.mean,
-                    "slope_interval": s.slope.interval,
-                    "slope_of_law": expected[name],
+                    "slopes": [
+                        {"from_size": first, "slope": m.mean, "interval": m.interval, "of_law": expected[name, first], "scenarios": m.count}
+                        for first, m in s.slopes.items()
+                    ],
                 }
                 for name, s in scalings.items()
             },
@@ -174,26 +188,28 @@ def conclude(measured: Variances, workshop: Workshop) -> Findings:
     )  # fmt: skip
 
 
-def _slopes(scalings: dict[str, Scaling], expected: dict[str, float]) -> TextTable:
+def _slopes(scalings: dict[str, Scaling], expected: dict[tuple[str, int], float]) -> TextTable:
     rows = []
-    for name, scaling in scalings.items():
-        low, high = scaling.slope.interval
-        alpha = f"{scaling.alpha:.3g}" if name == "mloo" else "–"
-        numbers = (f"{scaling.slope.mean:.3f}", f"[{low:.3f}, {high:.3f}]", f"{expected[name]:.3f}", f"{CLAIMED_SLOPE[name]:g}")  # fmt: skip
-        rows.append((name.upper(), alpha, *numbers))
-    headings = ("", "alpha of alpha / N²", "slope", "95 % interval", "slope of the proof's law", "the paper, large N")
-    return TextTable(
-        "Slope in logarithms", headings, tuple(rows), "Mean and interval over the scenarios' own slopes (Student's t)."
-    )
+    for (name, first), law_slope in expected.items():
+        slope = scalings[name].slopes[first]
+        low, high = slope.interval
+        numbers = (f"{slope.mean:.3f}", f"[{low:.3f}, {high:.3f}]", f"{law_slope:.3f}", f"{CLAIMED_SLOPE[name]:g}")
+        rows.append((f"{name.upper()}, N ≥ {first}", *numbers))
+    headings = ("", "slope", "95 % interval", "of independent rollouts", "the paper, large N")
+    note = "Mean and interval over the scenarios' own slopes (Student's t)."
+    return TextTable("Slope in logarithms", headings, tuple(rows), note)
 
 
-def _verdict(name: str, scaling: Scaling, expected: float) -> str:
-    low, high = scaling.slope.interval
-    numbers = f"slope {scaling.slope.mean:.3f}, 95% interval over scenarios [{low:.3f}, {high:.3f}]"
-    if scaling.slope.count < 2:
-        return f"{name.upper()}: no verdict: fewer than two scenarios in which the reward varies."
+def _verdict(name: str, first: int, scaling: Scaling, expected: float) -> str:
+    slope = scaling.slopes[first]
+    low, high = slope.interval
+    if slope.count < 2:
+        return f"{name.upper()}, N ≥ {first}: no verdict: fewer than two scenarios in which the reward varies."
     verdict = "no difference from" if low <= expected <= high else "difference from"
-    return f"{name.upper()}: {verdict} the slope {expected:.3f} of independent rollouts: {numbers}."
+    return (
+        f"{name.upper()}, N ≥ {first}: {verdict} the slope {expected:.3f} of independent rollouts: slope {slope.mean:.3f}, "
+        f"95% interval over {slope.count} scenarios [{low:.3f}, {high:.3f}]."
+    )
 
 
 def _figure(scalings: dict[str, Scaling], sizes: Sequence[int]) -> Figure:
