@@ -15,6 +15,7 @@ from rlftsim.errors import CheckpointError, ConfigError
 from rlftsim.experiments import stages
 from rlftsim.experiments.catalogue import variance_scaling
 from rlftsim.experiments.contestants import BASE, CATK, ORACLE, Base, FineTuned, over_seeds
+from rlftsim.experiments.demo import DemoConfig, run_demo
 from rlftsim.experiments.evaluate import EvaluateConfig
 from rlftsim.experiments.findings import Experiment, Findings, result_table, run_experiment, verdict_line
 from rlftsim.experiments.report import SCORES
@@ -219,6 +220,7 @@ def test_the_command_writes_its_files_and_says_where(tmp_path, capsys):
         ("oracle --data somewhere", "recipe synthetic brings its own scenarios"),
         ("oracle --recipe smart-demo --data somewhere", "somewhere is no data set"),
         ("oracle --set finetune.rate=1", "no field 'rate' here"),
+        ("oracle --set finetune.device.devices=2", "experiments train in one process"),
         ("oracle --set finetune.reward=rloo", "finetune.reward has no effect here: experiments vary it"),
         ("oracle --set catk.batch-size=2", "catk.batch_size has no effect here"),
         ("oracle --seeds 0", "at least one seed, got 0"),
@@ -229,3 +231,14 @@ def test_mistakes_end_in_a_line(words, message, tmp_path, capsys):
     err = capsys.readouterr().err
     assert message in err
     assert "Traceback" not in err
+    assert not (tmp_path / "out").exists()  # a mistake claims no folder
+
+
+def test_the_demo_runs_the_same_stages(data, tmp_path):
+    result = run_demo(DemoConfig(TINY, data, QUICK, num_scenes=1, rollouts_shown=2), tmp_path)
+    page = result.report.read_text()
+    assert [e.name for e in result.evaluations] == ["base", "fine-tuned", "constant velocity", "oracle"]
+    assert "what a perfect simulator would score" in page
+    assert "2 held-out scenarios, 4 rollouts each" in page
+    assert page.count("Scenario c") + page.count("Scenario d") >= 1
+    assert (tmp_path / "picture.png").exists()

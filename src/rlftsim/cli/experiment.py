@@ -21,6 +21,7 @@ from rlftsim.recipes.models import Device, find_device
 from rlftsim.recipes.smart import RECIPES, smart_synthetic
 from rlftsim.workers import usable_cores
 
+ExperimentRecipe = Literal["synthetic", "smart-tiny", "smart-mini", "smart-nano", "smart-demo"]
 QUESTIONS = "; ".join(f"{name}: {experiment.question}" for name, experiment in EXPERIMENTS.items())
 
 
@@ -34,7 +35,7 @@ class RunExperiment:
     name: Annotated[Positional[str], tyro.conf.arg(help=QUESTIONS)]
     out: Path = Path("runs/experiments")
     """Folder for everything: OUT/NAME.md, OUT/NAME.json and a figure, the runs and evaluations they are made of."""
-    recipe: Literal["synthetic", "smart-tiny", "smart-mini", "smart-nano", "smart-demo"] = SYNTHETIC
+    recipe: ExperimentRecipe = SYNTHETIC
     """synthetic: a small model on the scenarios that ship with the package. The others need DATA."""
     data: str | None = None
     """Folder of a data set with the splits training and validation."""

@@ -95,7 +95,7 @@ class Workshop:
     Raises:
         CheckpointError: the folder belongs to other settings, data or base model.
         DataError: no such data set.
-        ConfigError: no seed.
+        ConfigError: no seed, or training in several processes.
     """
 
     recipe: SmartRecipe
@@ -113,6 +113,14 @@ class Workshop:
     def __post_init__(self) -> None:
         if self.num_seeds < 1:
             raise ConfigError(f"an experiment needs at least one seed, got {self.num_seeds}.")
+        if any(
+            section.device.devices != 1 for section in (self.recipe.pretrain, self.recipe.finetune, self.recipe.catk)
+        ):
+            raise ConfigError(
+                "experiments train in one process: leave device.devices at 1, or train by `rlftsim finetune` and compare by "
+                "`rlftsim evaluate`."
+            )
+        _ = self.training  # a data set that is not there must not claim the folder
         RunFolder(self.out, self._what_counts())
 
     @cached_property
@@ -247,7 +255,7 @@ class Workshop:
         return {
             "recipe": {name: value for name, value in recipe.items() if name.partition(".")[2] not in MAY_CHANGE},
             "evaluation": {**self.evaluation.what_counts(), "limit": self.evaluation.limit},
-            "data": hash_file(self.data / MANIFEST) if (self.data / MANIFEST).exists() else str(self.data),
+            "data": hash_file(self.data / MANIFEST),
             "base_model": fingerprint_policy(load_policy(self.base_model)) if self.base_model else None,
         }
 

@@ -39,7 +39,7 @@ REWARDS = ("mloo", "rloo")
 FROM_SIZES = (2, 8)
 """Slopes are fitted from each of these on: over all N, and where N is large enough for laws of large numbers."""
 MIN_SIZES_FOR_A_SLOPE = 3
-MEMBERS_A_SIZE = 64
+MEMBERS_A_SIZE = 128
 """Rewards averaged over for each N, about; whole subsets of N are drawn until there are as many."""
 CLAIMED_SLOPE = {"mloo": -2.0, "rloo": 0.0}
 """Of the logarithm of the variance against that of N, as the paper has it for large N."""
