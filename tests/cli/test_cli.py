@@ -11,7 +11,8 @@ import typing
 import pytest
 
 from rlftsim import __version__
-from rlftsim.cli.data import open_split
+from rlftsim.cli.data import SYNTHETIC, open_split
+from rlftsim.cli.experiment import ExperimentRecipe
 from rlftsim.cli.main import VERBS, main, parse
 from rlftsim.cli.train import RecipeName
 from rlftsim.policies.smart.config import smart_demo
@@ -64,6 +65,7 @@ def test_help_does_not_wait_for_torch():
 
 def test_the_recipes_one_can_name_are_the_ones_there_are():
     assert typing.get_args(RecipeName) == tuple(RECIPES)
+    assert typing.get_args(ExperimentRecipe) == (SYNTHETIC, *RECIPES)
 
 
 @pytest.fixture

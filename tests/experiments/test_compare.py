@@ -3,25 +3,15 @@ import math
 from dataclasses import replace
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from made_up import evaluation
 from rich.console import Console
 from scipy import stats
 
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.experiments.compare import compare, compare_paired, format_comparison, format_table
-from rlftsim.experiments.evaluation import SCHEMA, SCORE_COLUMNS, EvaluateConfig, Evaluation, Provenance
-
-
-def evaluation(name, meta_metric, ids=None, **config):
-    ids = ids or [f"s{k}" for k in range(len(meta_metric))]
-    rows = [
-        {"scenario_id": i, "num_agents": 3, "num_evaluated": 2, **dict.fromkeys(SCORE_COLUMNS, 0.5), "meta_metric": v}
-        for i, v in zip(ids, meta_metric)
-    ]
-    provenance = Provenance(EvaluateConfig(**config), "Policy", "f" * 32, "/data", "a" * 64)
-    return Evaluation(name, provenance, pa.Table.from_pylist(rows, schema=SCHEMA))
+from rlftsim.experiments.evaluation import Evaluation
 
 
 def render(table):

@@ -175,6 +175,6 @@ def test_the_command_line_knows_every_recipe():
 
 def test_a_gpu_that_is_not_there_is_refused_and_auto_does_without(monkeypatch):
     monkeypatch.setattr(models.torch.cuda, "is_available", lambda: False)
-    assert models._find_device("auto").type == "cpu"
+    assert models.find_device("auto").type == "cpu"
     with pytest.raises(ConfigError, match="--device cuda, but torch sees no CUDA device"):
-        models._find_device("cuda")
+        models.find_device("cuda")

@@ -26,6 +26,7 @@ VERBS = {
     "score": ("rlftsim.cli.results", "Score"),
     "evaluate": ("rlftsim.cli.results", "Evaluate"),
     "compare": ("rlftsim.cli.results", "Compare"),
+    "experiment": ("rlftsim.cli.experiment", "RunExperiment"),
 }
 """Module and class of each verb, in the order a newcomer meets them."""
 
@@ -49,6 +50,7 @@ usage: rlftsim VERB ...      rlftsim VERB --help explains a verb
   score        score anybody's rollouts with the official realism meta-metric
   evaluate     measure a model with the official realism meta-metric
   compare      compare two evaluations scenario by scenario
+  experiment   answer a question of the paper with a table and a figure
 """
 
 INTERRUPTED = 130

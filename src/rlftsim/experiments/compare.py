@@ -69,11 +69,9 @@ class PairedDifference:
                 return f"no difference: equal in all {self.count} scenarios."
             return f"difference: {self.difference:+.4f} in every one of the {self.count} scenarios."
         low, high = self.interval
-        numbers = (
-            f"{self.difference:+.4f}, {1 - self.alpha:.0%} interval [{low:+.4f}, {high:+.4f}], p = {self.p_value:.2g}"
-        )
+        numbers = f"{self.difference:+.4f}, {100 - 100 * self.alpha:g}% interval [{low:+.4f}, {high:+.4f}], p = {self.p_value:.2g}"
         if not self.is_difference:
-            return f"no difference at the {self.alpha:.0%} level: {numbers}."
+            return f"no difference at the {100 * self.alpha:g}% level: {numbers}."
         is_better = (self.difference > 0) == (direction_of(self.column) == "higher")
         return f"difference, for the {'better' if is_better else 'worse'}: {numbers}."
 
@@ -130,11 +128,7 @@ def compare(a: Evaluation, b: Evaluation, *, alpha: float = 0.05) -> Comparison:
             raise DataError(
                 f"{a.name} and {b.name} cannot be compared, {setting} is {values[0]} and {values[1]}: evaluate both alike."
             )
-    place = {scenario_id: row for row, scenario_id in enumerate(b.scenario_ids)}
-    rows_a = [row for row, scenario_id in enumerate(a.scenario_ids) if scenario_id in place]
-    rows_b = [place[a.scenario_ids[row]] for row in rows_a]
-    if not rows_a:
-        raise DataError(f"{a.name} ({len(a)} scenarios) and {b.name} ({len(b)}) have no scenario in common.")
+    rows_a, rows_b = pair_rows(a, b)
     return Comparison(
         name_a=a.name,
         name_b=b.name,
@@ -148,25 +142,70 @@ def compare(a: Evaluation, b: Evaluation, *, alpha: float = 0.05) -> Comparison:
     )
 
 
-def compare_paired(column: str, a: np.ndarray, b: np.ndarray, *, alpha: float = 0.05) -> PairedDifference:
-    """Paired t-test of two columns [scenarios]; scenarios without a value in both are left out."""
-    known = np.isfinite(a) & np.isfinite(b)
-    a, b = a[known], b[known]
-    count = len(a)
+def pair_rows(a: Evaluation, b: Evaluation) -> tuple[list[int], list[int]]:
+    """Rows of the scenarios that both have, in the order of the first.
+
+    Raises:
+        DataError: they have none in common.
+    """
+    place = {scenario_id: row for row, scenario_id in enumerate(b.scenario_ids)}
+    rows_a = [row for row, scenario_id in enumerate(a.scenario_ids) if scenario_id in place]
+    if not rows_a:
+        raise DataError(f"{a.name} ({len(a)} scenarios) and {b.name} ({len(b)}) have no scenario in common.")
+    return rows_a, [place[a.scenario_ids[row]] for row in rows_a]
+
+
+def paired_values(a: Evaluation, b: Evaluation, column: str) -> tuple[list[str], np.ndarray, np.ndarray]:
+    """Ids of the scenarios that both have, and both columns [scenarios] there.
+
+    Raises:
+        DataError: they have none in common.
+        ConfigError: there is no such column.
+    """
+    rows_a, rows_b = pair_rows(a, b)
+    return [a.scenario_ids[row] for row in rows_a], a.values(column)[rows_a], b.values(column)[rows_b]
+
+
+@dataclass(frozen=True)
+class MeanInterval:
+    """A mean with what Student's t says about it."""
+
+    mean: float
+    standard_error: float
+    """NaN for fewer than two values."""
+    interval: tuple[float, float]
+    """Holds the true mean with probability 1 - alpha; NaN for fewer than two values."""
+    p_value: float
+    """Two-sided, of a true mean of 0; NaN where it cannot be told."""
+    count: int
+
+
+def mean_interval(values: np.ndarray, *, alpha: float = 0.05) -> MeanInterval:
+    """Mean, standard error, interval and one-sample t-test of values [n]; those that are not finite are left out."""
+    values = values[np.isfinite(values)]
+    count = len(values)
     if count == 0:
-        nan = math.nan
-        return PairedDifference(column, 0, nan, nan, nan, nan, (nan, nan), nan, alpha)
-    gain = b - a
-    mean, error, p_value, half = float(gain.mean()), math.nan, math.nan, math.nan
+        return MeanInterval(math.nan, math.nan, (math.nan, math.nan), math.nan, 0)
+    mean, error, p_value, half = float(values.mean()), math.nan, math.nan, math.nan
     if count > 1:
-        error = float(gain.std(ddof=1)) / math.sqrt(count)
-        if error < 1e-12 * max(abs(mean), 1.0):  # rounding alone: the same difference everywhere
+        error = float(values.std(ddof=1)) / math.sqrt(count)
+        if error < 1e-12 * max(abs(mean), 1.0):  # rounding alone: the same value everywhere
             error, half, p_value = 0.0, 0.0, float(mean == 0)
         else:
             half = float(stats.t.ppf(1 - alpha / 2, count - 1)) * error
             p_value = 2 * float(stats.t.sf(abs(mean) / error, count - 1))
-    interval = (mean - half, mean + half)
-    return PairedDifference(column, count, float(a.mean()), float(b.mean()), mean, error, interval, p_value, alpha)
+    return MeanInterval(mean, error, (mean - half, mean + half), p_value, count)
+
+
+def compare_paired(column: str, a: np.ndarray, b: np.ndarray, *, alpha: float = 0.05) -> PairedDifference:
+    """Paired t-test of two columns [scenarios]; scenarios without a value in both are left out."""
+    known = np.isfinite(a) & np.isfinite(b)
+    a, b = a[known], b[known]
+    gain = mean_interval(b - a, alpha=alpha)
+    means = (float(a.mean()), float(b.mean())) if gain.count else (math.nan, math.nan)
+    return PairedDifference(
+        column, gain.count, *means, gain.mean, gain.standard_error, gain.interval, gain.p_value, alpha
+    )
 
 
 def format_table(*evaluations: Evaluation, columns: Sequence[str] = TABLE_COLUMNS) -> Table:

@@ -7,25 +7,24 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-import torch
 from rich.console import Console
 
-from rlftsim.experiments.compare import Comparison, compare
+from rlftsim.experiments.compare import Comparison, compare, paired_values
 from rlftsim.experiments.evaluate import EvaluateConfig, evaluate
 from rlftsim.experiments.evaluation import Evaluation
 from rlftsim.experiments.learning_curve import finetuning_charts, imitation_charts
 from rlftsim.experiments.report import (
+    SCORES,
     ChartGroup,
-    Estimate,
     PairedComparison,
     Report,
     ResultRow,
     result_table,
     write_report,
 )
+from rlftsim.experiments.stages import find_vocabulary, finetune_smart, open_training, pretrain_smart
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.progress import print_wide
-from rlftsim.recipes.card import model_card
 from rlftsim.recipes.smart import SmartRecipe
 from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.rollout.policy import Policy
@@ -33,10 +32,6 @@ from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.types import Scenario
-from rlftsim.tokens.clustering import build_vocabulary
-from rlftsim.tokens.vocabulary import Vocabulary
-from rlftsim.training.finetune import finetune
-from rlftsim.training.pretrain import pretrain
 from rlftsim.training.run_folder import describe_environment, read_metrics
 from rlftsim.viewer.page import Animation, Panel
 from rlftsim.viewer.picture import to_png
@@ -45,6 +40,7 @@ from rlftsim.viewer.scene import build_scene, logged_trajectories, rollout_traje
 CLAIM = "closed-loop fine-tuning makes a traffic model more realistic"
 NO_CLAIM = "closed-loop fine-tuning of a traffic model"
 BASE, TUNED, FLOOR, CEILING = "base", "fine-tuned", "constant velocity", "oracle"
+NOTES = {CEILING: "the record itself: what a perfect simulator would score", FLOOR: "no model"}
 
 
 @dataclass(frozen=True)
@@ -98,13 +94,14 @@ def run_demo(config: DemoConfig, out: Path) -> DemoResult:
         RlftsimError: a stage failed; the message says which file and why.
     """
     stages = _Stages(Console(stderr=True))
-    training = ScenarioDataset(config.data, "training", cache_size=4096)
+    recipe, training = config.recipe, open_training(config.data)
     with stages("vocabulary: motion and map tokens from the training scenarios"):
-        vocabulary = _vocabulary(training, config, out / "vocabulary.safetensors")
+        origin = f"demo on {config.data.name}, {recipe.tokens}"
+        vocabulary = find_vocabulary(training, recipe.tokens, out / "vocabulary.safetensors", origin=origin)
     with stages("pre-training: predict the next token of every agent"):
-        base = _pretrained(vocabulary, training, config, out / "pretrain")
+        base = pretrain_smart(vocabulary, training, recipe.model, recipe.pretrain, out / "pretrain")
     with stages("fine-tuning: closed loop, MLOO reward, KL to the base model"):
-        tuned = _finetuned(base, training, config, out / "finetune")
+        tuned = finetune_smart(base, training, recipe.finetune, out / "finetune")
     with stages(f"evaluation: {config.evaluate.num_rollouts} rollouts of every held-out scenario"):
         contestants = {BASE: SmartPolicy.from_pretrained(base), TUNED: SmartPolicy.from_pretrained(tuned)}
         evaluations = _evaluated(contestants, config, out / "evaluations")
@@ -117,26 +114,6 @@ def run_demo(config: DemoConfig, out: Path) -> DemoResult:
     print_wide(result_table(report))
     print(f"fine-tuned against base, {comparison.pairing}: {comparison['meta_metric'].verdict}")
     return DemoResult(out / "report.html", comparison, evaluations)
-
-
-def _vocabulary(training: ScenarioDataset, config: DemoConfig, path: Path) -> Vocabulary:
-    origin = f"demo on {config.data.name}, {config.recipe.tokens}"
-    if not path.exists() or Vocabulary.load(path).origin != origin:
-        build_vocabulary(training, config.recipe.tokens, origin=origin)[0].save(path)
-    return Vocabulary.load(path)
-
-
-def _pretrained(vocabulary: Vocabulary, training: ScenarioDataset, config: DemoConfig, out: Path) -> Path:
-    torch.manual_seed(config.recipe.pretrain.seed)
-    policy = SmartPolicy(config.recipe.model, vocabulary)
-    return pretrain(
-        policy, training, out, config.recipe.pretrain, card=model_card("pre-trained", config.data, len(training))
-    )
-
-
-def _finetuned(base: Path, training: ScenarioDataset, config: DemoConfig, out: Path) -> Path:
-    card = model_card("fine-tuned with MLOO", config.data, len(training))
-    return finetune(SmartPolicy.from_pretrained(base), training, out, config.recipe.finetune, card=card)
 
 
 def _evaluated(contestants: dict[str, SmartPolicy], config: DemoConfig, out: Path) -> tuple[Evaluation, ...]:
@@ -167,11 +144,11 @@ def build_report(
             "A small next-token traffic model was pre-trained on synthetic scenarios and then fine-tuned closed-loop: it drives "
             "every agent itself, and the realism meta-metric of its own rollouts, left one out at a time (MLOO), is the reward.",
         ),
-        rows=[_row(e, emphasised=e is tuned) for e in evaluations],
+        rows=[ResultRow.of(e, SCORES, note=NOTES.get(e.name, ""), emphasised=e is tuned) for e in evaluations],
         table_note=f"{len(base)} held-out scenarios, {base.config.num_rollouts} rollouts each, metric {base.config.metric}; mean ± standard error over scenarios.",
         comparison=PairedComparison(
             BASE, TUNED, difference.difference, difference.interval, difference.p_value, difference.count,
-            differences=_paired_differences(base, tuned),
+            differences=_gains(base, tuned)[1],
         ),
         chart_groups=_charts(out, config),
         animations=animations,
@@ -184,30 +161,10 @@ def build_report(
     )  # fmt: skip
 
 
-def _row(evaluation: Evaluation, *, emphasised: bool) -> ResultRow:
-    def estimate(column: str) -> Estimate:
-        return Estimate.of(evaluation.values(column))
-
-    return ResultRow(
-        name=evaluation.name,
-        realism_meta_metric=estimate("meta_metric"),
-        kinematic=estimate("kinematic"),
-        interactive=estimate("interactive"),
-        map_based=estimate("map_based"),
-        min_average_displacement_error_m=estimate("min_average_displacement_error"),
-        collision_rate=estimate("collision_rate"),
-        offroad_rate=estimate("offroad_rate"),
-        note={CEILING: "the record itself: what a perfect simulator would score", FLOOR: "no model"}.get(
-            evaluation.name, ""
-        ),
-        emphasised=emphasised,
-    )
-
-
-def _paired_differences(base: Evaluation, tuned: Evaluation) -> list[float]:
-    by_id = dict(zip(tuned.scenario_ids, tuned.values("meta_metric")))
-    pairs = zip(base.scenario_ids, base.values("meta_metric"))
-    return [float(by_id[i] - value) for i, value in pairs if i in by_id]
+def _gains(base: Evaluation, tuned: Evaluation) -> tuple[list[str], np.ndarray]:
+    """Ids of the scenarios that both have, and what fine-tuning adds to the RMM of each."""
+    ids, before, after = paired_values(base, tuned, "meta_metric")
+    return ids, after - before
 
 
 def _charts(out: Path, config: DemoConfig) -> list[ChartGroup]:
@@ -247,10 +204,10 @@ def _animations(
     """Logged, base and fine-tuned side by side: the scenarios that gained most, and one in the middle."""
     base, tuned = evaluations[:2]
     scenarios = ScenarioDataset(config.data, config.evaluate.split)
-    gains = np.array(_paired_differences(base, tuned))
-    order = [base.scenario_ids[i] for i in np.argsort(-gains)]
+    ids, gains = _gains(base, tuned)
+    order = [ids[i] for i in np.argsort(-gains)]
     chosen = dict.fromkeys([*order[: max(config.num_scenes - 1, 1)], order[len(order) // 2]])
-    by_id = dict(zip(base.scenario_ids, gains))
+    by_id = dict(zip(ids, gains))
     return [_animation(scenarios.by_id(i), contestants, by_id[i], config) for i in list(chosen)[: config.num_scenes]]
 
 

@@ -62,14 +62,23 @@ def evaluate(
     dataset_folder, out = Path(dataset_folder), Path(out)
     positions = _choose_scenarios(ScenarioDataset(dataset_folder, config.split), config)
     job = _Job(_frozen_copy(policy), dataset_folder, _describe(policy, dataset_folder, config), name, out)
-    if config.jobs > 1 and job.device.type != "cpu":
-        raise ConfigError(
-            f"evaluate.jobs={config.jobs} works on CPUs only, the policy is on {job.device}: use --jobs 1 or --device cpu."
-        )
+    check_jobs(config, job.device)
     ids = _open(job).scenario_ids[: len(positions)]
     return job.parts.run(
         partial(_evaluate_group, job), ids, jobs=config.jobs, title=f"evaluate {name}", show_progress=show_progress
     )
+
+
+def check_jobs(config: EvaluateConfig, device: torch.device) -> None:
+    """Refuse several processes for a policy on a GPU.
+
+    Raises:
+        ConfigError: that was asked for.
+    """
+    if config.jobs > 1 and device.type != "cpu":
+        raise ConfigError(
+            f"evaluate.jobs={config.jobs} works on CPUs only, the policy is on {device}: use --jobs 1 or --device cpu."
+        )
 
 
 def simulate_states(
@@ -184,11 +193,7 @@ def _evaluate_scenario(job: _Job, scenario: Scenario) -> dict[str, object] | Ski
         states = logged_states(scenario, num_rollouts=config.num_rollouts, device=job.device)
     else:
         states = simulate_states(job.policy, scenario, config, job.device)
-    return row_of_result(
-        score(log, states, metric_by_name(config.metric)),
-        num_agents=len(scenario.simulated_indices),
-        num_evaluated=len(scenario.evaluated_indices),
-    )
+    return row_of_result(score(log, states, metric_by_name(config.metric)), scenario, states)
 
 
 def _open(job: _Job) -> ScenarioDataset:

@@ -17,8 +17,10 @@ import pyarrow.parquet as pq
 import rlftsim
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.files import write_whole
-from rlftsim.realism import FEATURE_NAMES, RealismResult, metric_by_name
+from rlftsim.realism import FEATURE_NAMES, RealismResult, SimulatedStates, metric_by_name
+from rlftsim.realism.miss import compute_miss_rates
 from rlftsim.rollout.policy import Sampling
+from rlftsim.scenario.types import Scenario
 
 FORMAT = "rlftsim-evaluation-1"
 LIGHT = "traffic_light_violation"
@@ -35,9 +37,11 @@ SCORE_COLUMNS = (
     "collision_rate",
     "offroad_rate",
     "traffic_light_violation_rate",
+    "miss_rate",
+    "passing_miss_rate",
 )
 """`meta_metric_light_one` is the meta-metric with the traffic light likelihood set to 1, as published tables of models without
-a light feature have it; `meta_metric` is the official one."""
+a light feature have it; `meta_metric` is the official one. Miss rates: see `realism.miss`."""
 SCHEMA = pa.schema(
     [
         pa.field("scenario_id", pa.string()),
@@ -228,20 +232,23 @@ def join_evaluations(name: str, provenance: Provenance, parts: list[Evaluation])
     return Evaluation(name, provenance, table, tuple(s for part in parts for s in part.skipped))
 
 
-def row_of_result(result: RealismResult, *, num_agents: int, num_evaluated: int) -> dict[str, object]:
-    """Row of `SCHEMA` for the scores of one scenario."""
+def row_of_result(result: RealismResult, scenario: Scenario, states: SimulatedStates) -> dict[str, object]:
+    """Row of `SCHEMA` for a scenario's rollouts and their scores."""
     light = result.likelihood(LIGHT)
     light_weight = dict(zip(FEATURE_NAMES, result.config.weights))[LIGHT]
     missing = light_weight * (1.0 - light) if light_weight else 0.0
+    misses = compute_miss_rates(scenario, states)
     scores = {
         "meta_metric_light_one": result.meta_metric + missing,
         **{name: result.likelihood(feature) for name, feature in zip(LIKELIHOOD_COLUMNS, FEATURE_NAMES)},
+        "miss_rate": misses.at_goal,
+        "passing_miss_rate": misses.passing,
     }
     numbers = {name: float(scores[name] if name in scores else getattr(result, name)) for name in SCORE_COLUMNS}
     return {
         "scenario_id": result.scenario_ids[0],
-        "num_agents": num_agents,
-        "num_evaluated": num_evaluated,
+        "num_agents": len(scenario.simulated_indices),
+        "num_evaluated": len(scenario.evaluated_indices),
         **numbers,
     }
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from rich.table import Table
 
+from rlftsim.experiments.evaluation import Evaluation, direction_of
 from rlftsim.files import write_text
 from rlftsim.viewer.chart import Chart, chart_html, format_tick, nice_ticks
 from rlftsim.viewer.page import Animation, animation_html, page_html, read_asset
@@ -60,8 +61,19 @@ class ResultRow:
     """Share in [0, 1]."""
     offroad_rate: Estimate | None = None
     """Share in [0, 1]."""
+    average_displacement_error_m: Estimate | None = None
+    miss_rate: Estimate | None = None
+    """Share in [0, 1]."""
     note: str = ""
     emphasised: bool = False
+
+    @classmethod
+    def of(
+        cls, evaluation: Evaluation, columns: Sequence["Column"], *, note: str = "", emphasised: bool = False
+    ) -> "ResultRow":
+        """The row of an evaluation, with these of `COLUMNS`."""
+        estimates = {column.field: Estimate.of(evaluation.values(column.source)) for column in columns}
+        return cls(evaluation.name, **estimates, note=note, emphasised=emphasised)
 
 
 @dataclass(frozen=True)
@@ -142,11 +154,22 @@ class Column:
     """How one field of `ResultRow` is shown."""
 
     field: str
+    source: str
+    """Column of an `Evaluation`."""
     heading: str
     meaning: str
-    higher_is_better: bool
     digits: int
     factor: float = 1.0
+
+    @property
+    def higher_is_better(self) -> bool:
+        """Which way is better."""
+        return direction_of(self.source) == "higher"
+
+    @property
+    def label(self) -> str:
+        """Heading with an arrow that says which way is better."""
+        return f"{self.heading} {'↑' if self.higher_is_better else '↓'}"
 
     def estimate(self, row: ResultRow) -> Estimate | None:
         """The row's value; None where it was not measured or has no finite mean."""
@@ -157,16 +180,36 @@ class Column:
         """A number in the column's unit and digits."""
         return format_number(self.factor * number, self.digits)
 
+    def cell(self, row: ResultRow) -> str:
+        """Mean ± standard error, or a dash."""
+        estimate = self.estimate(row)
+        if estimate is None:
+            return "–"
+        error = f" ± {self.text(estimate.standard_error)}" if estimate.standard_error is not None else ""
+        return f"{self.text(estimate.mean)}{error}"
 
+
+SCORES = (
+    Column("realism_meta_metric", "meta_metric", "RMM", "realism meta-metric", 4),
+    Column("kinematic", "kinematic", "kinematic", "kinematic sub-score", 4),
+    Column("interactive", "interactive", "interactive", "interactive sub-score", 4),
+    Column("map_based", "map_based", "map-based", "map-based sub-score", 4),
+    Column(
+        "min_average_displacement_error_m", "min_average_displacement_error", "minADE [m]",
+        "displacement from the log of the best rollout", 2,
+    ),
+    Column("collision_rate", "collision_rate", "collision [%]", "evaluated agents that collide", 2, 100.0),
+    Column("offroad_rate", "offroad_rate", "off-road [%]", "evaluated agents that leave the road", 2, 100.0),
+)  # fmt: skip
+"""What every table of policies shows."""
 COLUMNS = (
-    Column("realism_meta_metric", "RMM", "realism meta-metric", True, 4),
-    Column("kinematic", "kinematic", "kinematic sub-score", True, 4),
-    Column("interactive", "interactive", "interactive sub-score", True, 4),
-    Column("map_based", "map-based", "map-based sub-score", True, 4),
-    Column("min_average_displacement_error_m", "minADE [m]", "displacement from the log of the best rollout", False, 2),
-    Column("collision_rate", "collision [%]", "evaluated agents that collide", False, 2, 100.0),
-    Column("offroad_rate", "off-road [%]", "evaluated agents that leave the road", False, 2, 100.0),
-)
+    *SCORES,
+    Column(
+        "average_displacement_error_m", "average_displacement_error", "ADE [m]",
+        "displacement from the log, mean over rollouts", 2,
+    ),
+    Column("miss_rate", "miss_rate", "miss [%]", "evaluated agents that end too far from the log's end", 2, 100.0),
+)  # fmt: skip
 
 
 def write_report(path: str | os.PathLike[str], report: Report) -> None:
@@ -193,11 +236,11 @@ def result_table(report: Report) -> Table:
     """The result table for a terminal."""
     table = Table(title=report.title, caption=report.table_note or None, title_justify="left", caption_justify="left")
     table.add_column("policy", no_wrap=True)
-    shown = _shown_columns(report.rows)
+    shown = shown_columns(report.rows)
     for column in shown:
-        table.add_column(f"{column.heading} {_arrow(column)}".replace("[", r"\["), justify="right")
+        table.add_column(column.label.replace("[", r"\["), justify="right")
     for row in report.rows:
-        cells = [_plain_cell(column, column.estimate(row)) for column in shown]
+        cells = [column.cell(row) for column in shown]
         table.add_row(row.name.replace("[", r"\["), *cells, style="bold" if row.emphasised else None)
     return table
 
@@ -212,19 +255,9 @@ def _sentence(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
-def _shown_columns(rows: Sequence[ResultRow]) -> list[Column]:
+def shown_columns(rows: Sequence[ResultRow]) -> list[Column]:
+    """Columns that some row has."""
     return [column for column in COLUMNS if any(getattr(row, column.field) is not None for row in rows)]
-
-
-def _arrow(column: Column) -> str:
-    return "↑" if column.higher_is_better else "↓"
-
-
-def _plain_cell(column: Column, estimate: Estimate | None) -> str:
-    if estimate is None:
-        return "–"
-    error = f" ± {column.text(estimate.standard_error)}" if estimate.standard_error is not None else ""
-    return f"{column.text(estimate.mean)}{error}"
 
 
 def _heading_html(report: Report) -> str:
@@ -263,10 +296,10 @@ def _interval_text(interval: tuple[float, float], digits: int, factor: float = 1
 def _table_html(report: Report) -> str:
     if not report.rows:
         return ""
-    shown = _shown_columns(report.rows)
+    shown = shown_columns(report.rows)
     headings = "".join(
         f'<th scope="col"><abbr title="{escape(c.meaning)}; {"higher" if c.higher_is_better else "lower"} is better">'
-        f"{escape(c.heading)} {_arrow(c)}</abbr></th>"
+        f"{escape(c.label)}</abbr></th>"
         for c in shown
     )
     body = "".join(_table_row_html(row, shown) for row in report.rows)

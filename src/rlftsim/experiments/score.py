@@ -246,9 +246,7 @@ def _score_entry(job: _Job, entry: RolloutEntry) -> dict[str, object] | Skipped:
         result = score(build_scenario_log(scenario), states, metric_by_name(job.config.metric))
     except DataError as error:
         raise DataError(f"{entry}: {error}") from error
-    return row_of_result(
-        result, num_agents=len(scenario.simulated_indices), num_evaluated=len(scenario.evaluated_indices)
-    )
+    return row_of_result(result, scenario, states)
 
 
 def has_road_edge(scenario: Scenario) -> bool:

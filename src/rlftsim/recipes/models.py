@@ -25,12 +25,21 @@ def load_policy(name: str, device: Device = "cpu") -> Policy:
     """
     if name in NAMED:
         return NAMED[name]()
+    return SmartPolicy.from_pretrained(find_model(name)).eval().requires_grad_(False).to(find_device(device))
+
+
+def find_model(name: str) -> Path:
+    """The model folder of a name: itself, or the one inside a run's folder.
+
+    Raises:
+        ConfigError: there is no such folder.
+    """
     folder = Path(name)
     if (folder / "model" / "config.json").exists():
         folder = folder / "model"
     if not folder.is_dir():
         raise ConfigError(f"{name!r} is neither a model folder nor one of {', '.join(NAMED)}.")
-    return SmartPolicy.from_pretrained(folder).eval().requires_grad_(False).to(_find_device(device))
+    return folder
 
 
 def load_policy_or_oracle(name: str, device: Device = "cpu") -> Policy | Literal["oracle"]:
@@ -42,7 +51,12 @@ def load_policy_or_oracle(name: str, device: Device = "cpu") -> Policy | Literal
     return load_policy(name, device)
 
 
-def _find_device(device: Device) -> torch.device:
+def find_device(device: Device) -> torch.device:
+    """What a name stands for on this machine.
+
+    Raises:
+        ConfigError: a GPU is asked for where there is none.
+    """
     if device == "cuda" and not torch.cuda.is_available():
         raise ConfigError("--device cuda, but torch sees no CUDA device: use cpu, or install a CUDA build of torch.")
     return torch.device("cuda" if device != "cpu" and torch.cuda.is_available() else "cpu")

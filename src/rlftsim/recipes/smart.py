@@ -68,6 +68,12 @@ def smart_demo_quick() -> SmartRecipe:
     )
 
 
+def smart_synthetic() -> SmartRecipe:
+    """For experiments on the synthetic scenarios: the demo with shorter fine-tuning, because it is run many times."""
+    recipe = smart_demo_rlftsim()
+    return replace(recipe, finetune=replace(recipe.finetune, epochs=1.5))
+
+
 RECIPES = {
     "smart-tiny": smart_tiny_rlftsim,
     "smart-mini": smart_mini_rlftsim,

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from rlftsim.viewer.chart import Chart
-from rlftsim.viewer.picture import save_figure
+from rlftsim.viewer.figure import save_figure
 
 CHART_INCHES = (4.6, 3.4)
 COLOURS = ("#1d63d8", "#e07b00", "#11754b", "#a21caf")
@@ -27,7 +27,7 @@ def charts_to_png(path: Path, charts: Sequence[Chart], *, dots_per_inch: int = 1
     figure = Figure(figsize=(width * len(charts), height), layout="constrained")
     for axis, chart in zip(figure.subplots(1, len(charts), squeeze=False)[0], charts):
         _draw(axis, chart)
-    save_figure(figure, path, dots_per_inch)
+    save_figure(path, figure, dots_per_inch=dots_per_inch)
 
 
 def _draw(axis: Axes, chart: Chart) -> None:

@@ -9,7 +9,7 @@ from matplotlib.colors import LinearSegmentedColormap, LogNorm
 from matplotlib.figure import Figure
 
 from rlftsim.tokens.coverage import MAX_SPEED_BIN_MPS, ClassCoverage, Spread
-from rlftsim.viewer.picture import save_figure
+from rlftsim.viewer.figure import save_figure
 
 USE_COLOURS = LinearSegmentedColormap.from_list("use", ["#7cc4f0", "#1d63d8", "#0a1f4d"])
 DEAD, SPARE, INK, BARS = "#e5735c", "#8b94a1", "#24292f", "#c3ccd8"
@@ -40,7 +40,7 @@ def coverage_picture(path: Path, classes: tuple[ClassCoverage, ...], *, title: s
         for axis in row:
             axis.spines[["top", "right"]].set_visible(False)
             axis.tick_params(labelsize=9)
-    save_figure(figure, path, dots_per_inch)
+    save_figure(path, figure, dots_per_inch=dots_per_inch)
 
 
 def _draw_tokens(figure: Figure, axis: Axes, coverage: ClassCoverage) -> None:

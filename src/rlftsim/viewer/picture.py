@@ -5,13 +5,12 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from rlftsim.files import write_whole
 from rlftsim.scenario.types import CURRENT_STEP, ObjectType
+from rlftsim.viewer.figure import DOTS_PER_INCH, save_figure
 from rlftsim.viewer.page import Animation, Panel
 from rlftsim.viewer.scene import AgentBoxes, SceneView
 
@@ -34,7 +33,7 @@ MIN_PEDESTRIAN_RADIUS_M = 0.5
 
 
 def to_png(
-    path: str | os.PathLike[str], animation: Animation, *, step: int = CURRENT_STEP, dots_per_inch: int = 160
+    path: str | os.PathLike[str], animation: Animation, *, step: int = CURRENT_STEP, dots_per_inch: int = DOTS_PER_INCH
 ) -> None:
     """Draw the panels of an animation side by side, boxes at `step`, paths of evaluated agents from there on.
 
@@ -52,13 +51,7 @@ def to_png(
     names = {"ego": "ego", "evaluated": "evaluated agents", "other": "other agents"}
     handles = [Line2D([], [], color=COLOURS[role], lw=5, label=label) for role, label in names.items()]
     figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False, fontsize=10)
-    save_figure(figure, Path(path), dots_per_inch)
-
-
-def save_figure(figure: Figure, target: Path, dots_per_inch: int) -> None:
-    """Write a figure as PNG, whole or not at all."""
-    FigureCanvasAgg(figure)
-    write_whole(target, lambda path: figure.savefig(path, format="png", dpi=dots_per_inch, facecolor="white"))
+    save_figure(Path(path), figure, dots_per_inch=dots_per_inch)
 
 
 def _draw_panel(axis: Axes, scene: SceneView, panel: Panel, step: int) -> None:

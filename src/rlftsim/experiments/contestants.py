@@ -1,0 +1,82 @@
+"""Who takes part in an experiment: baselines, base models, and what fine-tuning makes of them. Descriptions only, nothing runs here."""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from rlftsim.recipes.smart import SmartRecipe
+from rlftsim.training.catk import CatkConfig
+from rlftsim.training.finetune import FinetuneConfig
+
+WEAK_EPOCHS = 1.0
+"""Pre-training of the paper's weaker base model."""
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """Somebody without weights."""
+
+    name: Literal["oracle", "constant_velocity"]
+
+
+@dataclass(frozen=True)
+class Base:
+    """A pre-trained model."""
+
+    epochs: float | None = None
+    """None = as the recipe has it, or the model that was handed in."""
+
+    @property
+    def name(self) -> str:
+        """Of its files."""
+        return "base" if self.epochs is None else f"base-{self.epochs:g}-epochs"
+
+
+@dataclass(frozen=True)
+class FineTuned:
+    """A base model after fine-tuning. Everything that is not said here is the recipe's: all have the same budget."""
+
+    method: str = "mloo"
+    """A reward's name, or "catk"."""
+    credit: Literal["rollout", "agent"] = "rollout"
+    """Who earns the reward."""
+    seed: int = 0
+    share: float = 1.0
+    """Of the recipe's fine-tuning epochs."""
+    base: Base = Base()
+
+    @property
+    def name(self) -> str:
+        """Of its files, without how long it was trained."""
+        credit = "" if self.credit == "rollout" else f"-{self.credit}"
+        base = "" if self.base == Base() else f"-from-{self.base.name}"
+        return f"{self.method}{credit}{base}-seed{self.seed}"
+
+
+CATK = "catk"
+VARIED = ("finetune.reward", "finetune.credit", "finetune.seed", "catk.seed", "catk.epochs", "catk.batch_size")
+"""Fields of a recipe that contestants set for themselves."""
+Contestant = Baseline | Base | FineTuned
+ORACLE, CONSTANT_VELOCITY, BASE = Baseline("oracle"), Baseline("constant_velocity"), Base()
+
+
+def over_seeds(contestant: FineTuned, num_seeds: int) -> tuple[FineTuned, ...]:
+    """The same with seeds 0, 1, ..."""
+    return tuple(replace(contestant, seed=seed) for seed in range(num_seeds))
+
+
+def finetune_config(contestant: FineTuned, recipe: FinetuneConfig) -> FinetuneConfig:
+    """How a contestant is fine-tuned with a reward.
+
+    Raises:
+        ConfigError: there is no such reward.
+    """
+    changes = {"reward": contestant.method, "seed": contestant.seed, "epochs": recipe.epochs * contestant.share}
+    if contestant.credit != "rollout":
+        changes["credit"] = contestant.credit
+    return replace(recipe, **changes)
+
+
+def catk_config(contestant: FineTuned, recipe: SmartRecipe) -> CatkConfig:
+    """How a contestant is fine-tuned with CAT-K: the recipe's way, for as many updates of as many scenarios as with a reward."""
+    epochs = recipe.finetune.epochs * contestant.share
+    return replace(recipe.catk, seed=contestant.seed, epochs=epochs, batch_size=recipe.finetune.batch_size)

@@ -1,0 +1,63 @@
+"""From a data set to trained policies, stage by stage. Each does what is missing in its folder and refuses another's."""
+
+from pathlib import Path
+
+import torch
+
+from rlftsim.policies.smart.config import SmartConfig
+from rlftsim.policies.smart.policy import SmartPolicy
+from rlftsim.recipes.card import model_card
+from rlftsim.scenario.dataset import ScenarioDataset
+from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
+from rlftsim.tokens.vocabulary import Vocabulary
+from rlftsim.training.catk import CatkConfig, catk_finetune
+from rlftsim.training.finetune import FinetuneConfig, finetune
+from rlftsim.training.pretrain import PretrainConfig, pretrain
+
+CACHED_SCENARIOS = 4096
+"""About a megabyte each; with them stay their tokens."""
+
+
+def open_training(data: Path) -> ScenarioDataset:
+    """The training scenarios of a data set."""
+    return ScenarioDataset(data, "training", cache_size=CACHED_SCENARIOS)
+
+
+def find_vocabulary(training: ScenarioDataset, config: TokensConfig, path: Path, *, origin: str) -> Vocabulary:
+    """The vocabulary in a file; built from the training scenarios where there is none of this origin."""
+    if not path.exists() or Vocabulary.load(path).origin != origin:
+        build_vocabulary(training, config, origin=origin)[0].save(path)
+    return Vocabulary.load(path)
+
+
+def pretrain_smart(
+    vocabulary: Vocabulary, training: ScenarioDataset, model: SmartConfig, config: PretrainConfig, out: Path
+) -> Path:
+    """Folder of a model pre-trained from fresh weights.
+
+    Raises:
+        CheckpointError: `out` holds a run with other settings.
+    """
+    torch.manual_seed(config.seed)
+    policy = SmartPolicy(model, vocabulary)
+    return pretrain(policy, training, out, config, card=model_card("pre-trained", training.folder, len(training)))
+
+
+def finetune_smart(base: Path, training: ScenarioDataset, config: FinetuneConfig, out: Path) -> Path:
+    """Folder of a model fine-tuned closed-loop from a base model.
+
+    Raises:
+        CheckpointError: `out` holds a run with other settings or another base model.
+    """
+    card = model_card(f"fine-tuned with {config.reward.upper()}", training.folder, len(training))
+    return finetune(SmartPolicy.from_pretrained(base), training, out, config, card=card)
+
+
+def finetune_catk(base: Path, training: ScenarioDataset, config: CatkConfig, out: Path) -> Path:
+    """Folder of a model fine-tuned with CAT-K from a base model.
+
+    Raises:
+        CheckpointError: `out` holds a run with other settings or another base model.
+    """
+    card = model_card("fine-tuned with CAT-K", training.folder, len(training))
+    return catk_finetune(SmartPolicy.from_pretrained(base), training, out, config, card=card)

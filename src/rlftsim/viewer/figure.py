@@ -1,0 +1,156 @@
+"""Figures of experiments as PNG or SVG files: curves with bands, intervals beside each other, a matrix of verdicts."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import matplotlib
+import numpy as np
+from jaxtyping import Float, Int
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from matplotlib.ticker import NullFormatter, NullLocator
+
+from rlftsim.files import write_whole
+
+COLOURS = ("#1d63d8", "#e07b00", "#16876b", "#a8328c", "#79828f")
+INK, PALE = "#222b36", "#c9cfd6"
+BETTER, WORSE, NEITHER, OWN = "#bfe3cf", "#f3c4bf", "#eef0ec", "#d7dbe0"
+DOTS_PER_INCH = 160
+
+
+@dataclass(frozen=True)
+class Band:
+    """A curve and the band around it."""
+
+    name: str
+    x: Float[np.ndarray, "n"]
+    y: Float[np.ndarray, "n"]
+    low: Float[np.ndarray, "n"] | None = None
+    high: Float[np.ndarray, "n"] | None = None
+    style: Literal["measured", "theory"] = "measured"
+    """What was measured has dots, a law is a dashed line."""
+    colour: int = 0
+    """Which of `COLOURS`."""
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A number with its interval and a name."""
+
+    name: str
+    mean: float
+    low: float
+    high: float
+    colour: int = 0
+
+
+def draw_bands(
+    bands: Sequence[Band], *, title: str, x_label: str, y_label: str, log: bool = False, ticks: Sequence[int] = ()
+) -> Figure:
+    """Curves that share both axes.
+
+    Args:
+        bands: the curves.
+        title: above them.
+        x_label: of the horizontal axis.
+        y_label: of the vertical axis.
+        log: both axes logarithmic.
+        ticks: marks of the horizontal axis; empty = chosen.
+    """
+    figure, axis = _axis(6.4, 4.4, title)
+    for band in bands:
+        colour = COLOURS[band.colour % len(COLOURS)]
+        if band.low is not None and band.high is not None:
+            axis.fill_between(band.x, band.low, band.high, color=colour, alpha=0.16, lw=0)
+        is_law = band.style == "theory"
+        axis.plot(band.x, band.y, "--" if is_law else "o-", color=colour, lw=1.4 if is_law else 2, ms=5, label=band.name)  # fmt: skip
+    if log:
+        axis.set(xscale="log", yscale="log")
+    if len(ticks):
+        axis.set_xticks(list(ticks), [f"{t:g}" for t in ticks])
+        axis.xaxis.set_minor_locator(NullLocator())
+        axis.xaxis.set_minor_formatter(NullFormatter())
+    axis.set(xlabel=x_label, ylabel=y_label)
+    axis.grid(color=PALE, lw=0.6, alpha=0.7)
+    axis.legend(frameon=False, fontsize=9)
+    return figure
+
+
+def draw_intervals(intervals: Sequence[Interval], *, title: str, x_label: str, zero: bool) -> Figure:
+    """A line for each number, the first on top.
+
+    Args:
+        intervals: the numbers.
+        title: above them.
+        x_label: what the numbers are.
+        zero: whether zero is marked, for differences.
+    """
+    figure, axis = _axis(6.4, 1.3 + 0.42 * len(intervals), title)
+    for row, item in enumerate(intervals):
+        colour = COLOURS[item.colour % len(COLOURS)]
+        axis.plot([item.low, item.high], [row, row], color=colour, lw=3, alpha=0.45, solid_capstyle="round")
+        axis.plot([item.mean], [row], "o", color=colour, ms=6)
+    if zero:
+        axis.axvline(0.0, color=INK, lw=1, ls=(0, (4, 3)))
+    axis.set_yticks(range(len(intervals)), [item.name for item in intervals])
+    axis.set(xlabel=x_label, ylim=(len(intervals) - 0.4, -0.6))
+    axis.grid(axis="x", color=PALE, lw=0.6, alpha=0.7)
+    axis.tick_params(axis="y", length=0)
+    axis.spines["left"].set_visible(False)
+    return figure
+
+
+def draw_verdicts(names: Sequence[str], verdicts: Int[np.ndarray, "n n"], *, title: str, note: str) -> Figure:
+    """Everybody against everybody.
+
+    Args:
+        names: of rows and columns.
+        verdicts: 1 the row is better than the column, -1 worse, 0 no difference; the diagonal is not looked at.
+        title: above the matrix.
+        note: below it.
+    """
+    size = 0.62 * len(names)
+    figure, axis = _axis(size + 3.4, size + 2.6, title)
+    for row, column in np.ndindex(*verdicts.shape):
+        verdict = int(verdicts[row, column])
+        colour, sign = {1: (BETTER, "+"), -1: (WORSE, "−"), 0: (NEITHER, "~")}[verdict]
+        if row == column:
+            colour, sign = OWN, ""
+        axis.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, fc=colour, ec="white", lw=2))
+        axis.text(column, row, sign, ha="center", va="center", fontsize=13, fontweight="bold", color=INK)
+    axis.set(xlim=(-0.5, len(names) - 0.5), ylim=(len(names) - 0.5, -0.5), aspect="equal")
+    axis.set_xticks(range(len(names)), names, rotation=40, ha="right", rotation_mode="anchor")
+    axis.set_yticks(range(len(names)), names)
+    axis.tick_params(length=0)
+    for side in axis.spines.values():
+        side.set_visible(False)
+    figure.supxlabel(note, fontsize=9, color=INK)
+    return figure
+
+
+def save_figure(path: Path, figure: Figure, *, dots_per_inch: int = DOTS_PER_INCH) -> None:
+    """Write a figure as PNG or SVG, by the ending. Raises as `write_whole`."""
+    kind = path.suffix.removeprefix(".")
+    FigureCanvasAgg(figure)
+    metadata = {"Date": None} if kind == "svg" else None
+    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "rlftsim"}):
+        write_whole(
+            path,
+            lambda temporary: figure.savefig(
+                temporary, format=kind, dpi=dots_per_inch, facecolor="white", metadata=metadata
+            ),
+        )
+
+
+def _axis(width: float, height: float, title: str) -> tuple[Figure, Axes]:
+    """An empty figure, inches."""
+    figure = Figure(figsize=(width, height), layout="constrained")
+    figure.suptitle(title, fontsize=12, fontweight="bold", color=INK, x=0.01, ha="left")
+    axis = figure.subplots()
+    for side in ("top", "right"):
+        axis.spines[side].set_visible(False)
+    return figure, axis

@@ -1,0 +1,244 @@
+"""Experiments from beginning to end with a tiny model on a few scenarios: what is trained once is not trained again."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from made_up import TINY
+from safetensors.torch import load_file
+
+import scenes
+from rlftsim.cli.main import main
+from rlftsim.errors import CheckpointError, ConfigError
+from rlftsim.experiments import stages
+from rlftsim.experiments.catalogue import variance_scaling
+from rlftsim.experiments.contestants import BASE, CATK, ORACLE, Base, FineTuned, over_seeds
+from rlftsim.experiments.demo import DemoConfig, run_demo
+from rlftsim.experiments.evaluate import EvaluateConfig
+from rlftsim.experiments.findings import Experiment, Findings, result_table, run_experiment, verdict_line
+from rlftsim.experiments.report import SCORES
+from rlftsim.experiments.workshop import Workshop
+from rlftsim.scenario.dataset import write_dataset
+
+QUICK = EvaluateConfig(num_rollouts=4)
+ROWS = {"base": (BASE,), "MLOO": over_seeds(FineTuned("mloo"), 1), "oracle": (ORACLE,)}
+
+
+@pytest.fixture(autouse=True)
+def _one_thread_as_before():
+    """Runs set the number of threads; the next test file shall not notice."""
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    """Four scenarios to train on, two to evaluate on."""
+    training = [scenes.straight_road("a"), scenes.junction_with_light(), scenes.with_gaps(), scenes.straight_road("b")]
+    held_out = [scenes.straight_road("c"), scenes.straight_road("d")]
+    folder = tmp_path_factory.mktemp("workshop") / "data"
+    splits = {scenario.scenario_id: "training" for scenario in training}
+    write_dataset([*training, *held_out], folder, split=lambda s: splits.get(s.scenario_id, "validation"))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def done(data, tmp_path_factory):
+    """A workshop in which base model and MLOO are trained and measured."""
+    workshop = Workshop(TINY, data, tmp_path_factory.mktemp("done"), QUICK)
+    workshop.measure(ROWS)
+    return workshop
+
+
+def stamps(folder):
+    """When results and checkpoints were written, and what the metrics of runs say."""
+    files = {p: p.stat().st_mtime_ns for p in folder.rglob("*") if p.suffix == ".parquet" or p.parent.name.startswith("update-")}  # fmt: skip
+    return {**files, **{p: p.read_text() for p in folder.rglob("metrics.jsonl")}}
+
+
+def test_a_finished_stage_is_not_repeated(done, capfd):
+    before = stamps(done.out)
+    again = replace(done).measure(ROWS)
+    assert stamps(done.out) == before
+    assert len(before) > 5
+    assert "fine-tune: " not in capfd.readouterr().err  # no update was made
+    assert [len(row.mean) for row in again.values()] == [2, 2, 2]
+
+
+def test_an_interrupted_experiment_does_what_is_missing(done, data, tmp_path, monkeypatch):
+    """Killed while the third contestant was trained: the first two stay as they are."""
+    rows = {"base": (BASE,), "MLOO": over_seeds(FineTuned("mloo"), 1), "RLOO": (FineTuned("rloo"),)}
+    workshop = Workshop(TINY, data, tmp_path, QUICK)
+    true_finetune = stages.finetune
+
+    def killed(policy, scenarios, out, config, **rest):
+        if config.reward == "rloo":
+            raise KeyboardInterrupt
+        return true_finetune(policy, scenarios, out, config, **rest)
+
+    monkeypatch.setattr(stages, "finetune", killed)
+    with pytest.raises(KeyboardInterrupt):
+        workshop.measure(rows)
+    monkeypatch.setattr(stages, "finetune", true_finetune)
+    before = stamps(tmp_path)
+    measured = workshop.measure(rows)
+    assert {path: stamp for path, stamp in stamps(tmp_path).items() if path in before} == before
+    # and the numbers are those of a workshop that was never stopped
+    never_stopped = done.measure(ROWS)
+    for name in ("base", "MLOO"):
+        np.testing.assert_array_equal(
+            measured[name].mean.values("meta_metric"), never_stopped[name].mean.values("meta_metric")
+        )
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (lambda w: {"recipe": replace(TINY, finetune=replace(TINY.finetune, epochs=4.0))}, r"recipe\.finetune\.epochs"),
+        (lambda w: {"recipe": replace(TINY, model=replace(TINY.model, dim=32))}, r"recipe\.model\.dim"),
+        (lambda w: {"evaluation": replace(QUICK, num_rollouts=8)}, r"evaluation\.num_rollouts"),
+        (lambda w: {"evaluation": replace(QUICK, limit=1)}, r"evaluation\.limit"),
+        (lambda w: {"base_model": str(w.out / "runs" / "base")}, "base_model"),
+    ],
+)
+def test_changed_settings_are_refused_by_name(done, change, named):
+    with pytest.raises(CheckpointError, match=rf"belongs to a run with other settings or inputs \({named}\)"):
+        replace(done, **change(done))
+
+
+def test_other_data_are_refused(done, tmp_path):
+    write_dataset([scenes.straight_road()], tmp_path / "other", split="training")
+    with pytest.raises(CheckpointError, match="data"):
+        replace(done, data=tmp_path / "other")
+
+
+def test_what_changes_no_result_may_change(done):
+    config = replace(TINY.finetune, checkpoint_every=7)
+    replace(done, evaluation=replace(QUICK, jobs=2), num_seeds=5, recipe=replace(TINY, finetune=config))
+    with pytest.raises(ConfigError, match="at least one seed, got 0"):
+        replace(done, num_seeds=0)
+
+
+def test_a_longer_run_goes_on_from_a_shorter_one_to_the_same_weights(done):
+    """Two updates at once, or one and then another."""
+    half, whole = FineTuned("mloo", seed=1, share=0.5), FineTuned("mloo", seed=1)
+    done.measure({"half": (half,), "whole": (whole,)})
+    steps = [json.loads(line) for line in (done.model_folder(whole) / "metrics.jsonl").read_text().splitlines()]
+    assert [line["update"] for line in steps] == [1, 2]
+    alone = done.out / "alone"
+    config = replace(TINY.finetune, seed=1)
+    stages.finetune_smart(done.base(), done.training, config, alone)
+    expected, found = (load_file(f / "model" / "model.safetensors") for f in (alone, done.model_folder(whole)))
+    for name, values in expected.items():
+        torch.testing.assert_close(found[name], values, rtol=0, atol=0)
+
+
+def test_catk_has_as_many_updates_of_as_many_scenarios(done):
+    catk = FineTuned(CATK)
+    measured = done.measure({"CAT-K": (catk,)})
+    config = json.loads((done.model_folder(catk) / "config.json").read_text())
+    lines = (done.model_folder(catk) / "metrics.jsonl").read_text().splitlines()
+    assert len(lines) == done.budget.updates == 2
+    assert (config["batch_size"], config["epochs"], config["seed"]) == (1, 0.5, 0)
+    assert len(measured["CAT-K"].mean) == 2
+
+
+def test_a_model_that_is_handed_in_is_the_base(done, data, tmp_path):
+    workshop = Workshop(TINY, data, tmp_path, QUICK, base_model=str(done.model_folder(BASE)))
+    weak = workshop.measure({"base": (BASE,), "weak": (Base(0.5),)})
+    assert not (tmp_path / "vocabulary.safetensors").exists()
+    assert not (tmp_path / "runs" / "base").exists()
+    given = done.measure(ROWS)["base"].mean
+    np.testing.assert_array_equal(weak["base"].mean.values("meta_metric"), given.values("meta_metric"))
+    assert (tmp_path / "runs" / "base-0.5-epochs" / "model").is_dir()
+
+
+def test_an_experiment_of_ones_own_needs_two_functions(done):
+    """Measure and conclude; the rest is written for it."""
+    experiment = Experiment(
+        question="Does anything move?",
+        measure=lambda workshop: workshop.measure(ROWS),
+        conclude=lambda rows, workshop: Findings(
+            title="Mine",
+            tables=(result_table("Ours", list(rows.values()), SCORES),),
+            verdicts=(verdict_line(rows["base"], rows["oracle"]),),
+            numbers={"nothing": float("nan")},
+        ),
+    )
+    run_experiment("mine", experiment, done)
+    text, numbers = (done.out / "mine.md").read_text(), json.loads((done.out / "mine.json").read_text())
+    assert text.startswith("# Mine\n\nDoes anything move?")
+    assert "oracle against base, 2 scenarios in both" in text
+    assert "| MLOO | 0." in text
+    assert numbers["nothing"] is None
+    assert numbers["budget"] == {"updates": 2, "scenarios_an_update": 1, "rollouts_a_scenario": 2}
+    assert not list(done.out.glob(".*.tmp"))
+
+
+def test_variances_are_measured_on_rollouts_of_the_base_model(done):
+    workshop = replace(done, out=done.out)
+    first = variance_scaling.measure(workshop)
+    assert first.sizes == (2, 3, 4)
+    assert all((values > 0).all() for values in first.by_reward.values())
+    # at N = 2 they are the same number but for the factor: MLOO is half of RLOO
+    np.testing.assert_allclose(first.by_reward["mloo"][:, 0], first.by_reward["rloo"][:, 0] / 4, rtol=1e-4)
+    files = sorted((done.out / "variances").iterdir())
+    files[0].write_text("{")  # damaged: measured again, the others are not
+    kept = files[1].stat().st_mtime_ns
+    again = variance_scaling.measure(workshop)
+    np.testing.assert_array_equal(again.by_reward["mloo"], first.by_reward["mloo"])
+    assert files[1].stat().st_mtime_ns == kept
+
+
+def test_a_slope_needs_rollouts(done, tmp_path):
+    few = replace(done, evaluation=replace(QUICK, num_rollouts=2), out=tmp_path)
+    with pytest.raises(ConfigError, match="needs 4 rollouts at least, got 2"):
+        variance_scaling.measure(few)
+
+
+# ---- the command ------------------------------------------------------------------------------------------------------
+
+
+def test_the_command_writes_its_files_and_says_where(tmp_path, capsys):
+    words = ["experiment", "oracle", "--out", str(tmp_path), "--limit", "2", "--num-rollouts", "4"]
+    assert main(words) == 0
+    out = capsys.readouterr().out
+    assert out.rstrip().endswith(f"{tmp_path}/oracle.md")
+    assert {p.name for p in tmp_path.glob("oracle.*")} == {"oracle.md", "oracle.json", "oracle.png", "oracle.svg"}
+    assert main([*words[:-1], "8"]) == 2
+    assert "other settings or inputs (evaluation.num_rollouts)" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("nothing", "no experiment 'nothing': there are benchmark"),
+        ("oracle --recipe smart-tiny", "recipe smart-tiny needs scenarios: name a data set with --data"),
+        ("oracle --data somewhere", "recipe synthetic brings its own scenarios"),
+        ("oracle --recipe smart-demo --data somewhere", "somewhere is no data set"),
+        ("oracle --set finetune.rate=1", "no field 'rate' here"),
+        ("oracle --set finetune.device.devices=2", "experiments train in one process"),
+        ("oracle --set finetune.reward=rloo", "finetune.reward has no effect here: experiments vary it"),
+        ("oracle --set catk.batch-size=2", "catk.batch_size has no effect here"),
+        ("oracle --seeds 0", "at least one seed, got 0"),
+    ],
+)
+def test_mistakes_end_in_a_line(words, message, tmp_path, capsys):
+    assert main(["experiment", *words.split(), "--out", str(tmp_path / "out")]) == 2
+    err = capsys.readouterr().err
+    assert message in err
+    assert "Traceback" not in err
+    assert not (tmp_path / "out").exists()  # a mistake claims no folder
+
+
+def test_the_demo_runs_the_same_stages(data, tmp_path):
+    result = run_demo(DemoConfig(TINY, data, QUICK, num_scenes=1, rollouts_shown=2), tmp_path)
+    page = result.report.read_text()
+    assert [e.name for e in result.evaluations] == ["base", "fine-tuned", "constant velocity", "oracle"]
+    assert "what a perfect simulator would score" in page
+    assert "2 held-out scenarios, 4 rollouts each" in page
+    assert page.count("Scenario c") + page.count("Scenario d") >= 1
+    assert (tmp_path / "picture.png").exists()
