@@ -70,10 +70,8 @@ def finetune_config(contestant: FineTuned, recipe: FinetuneConfig) -> FinetuneCo
     Raises:
         ConfigError: there is no such reward.
     """
-    changes = {"reward": contestant.method, "seed": contestant.seed, "epochs": recipe.epochs * contestant.share}
-    if contestant.credit != "rollout":
-        changes["credit"] = contestant.credit
-    return replace(recipe, **changes)
+    epochs = recipe.epochs * contestant.share
+    return replace(recipe, reward=contestant.method, seed=contestant.seed, epochs=epochs, credit=contestant.credit)
 
 
 def catk_config(contestant: FineTuned, recipe: SmartRecipe) -> CatkConfig:
