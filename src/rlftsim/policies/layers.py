@@ -3,15 +3,23 @@
 D width, H heads, d size of a head. Initialisation: linear maps Xavier-uniform with zero bias, embeddings N(0, 0.02).
 """
 
+import itertools
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 from torch.nn import functional
+from torch.utils.checkpoint import checkpoint
 
-EDGES_PER_PIECE = 8192
+FLOATS_PER_PIECE = {"cpu": 1 << 19}
+"""Size of the relations that are worked on together: on a processor they fit its cache."""
+FLOATS_PER_PIECE_ELSEWHERE = 1 << 26
+WIDTHS, LEAST_WIDTH_STEP = 8, 8
+"""Rows are worked on together whose numbers of neighbours differ by less than an eighth of the largest, or than eight."""
+IMPOSSIBLE = -1e9
 
 
 def initialize(module: nn.Module) -> None:
@@ -81,58 +89,139 @@ class FourierEmbedding(nn.Module):
 
 @dataclass(frozen=True)
 class Grid:
-    """Evenly spaced values of one input: `count` of them from `start` on, `spacing` apart."""
+    """Values of one input: `count` of them from `start` to `stop`, or of their square roots, so that small values lie closer."""
 
     start: float
-    spacing: float
+    stop: float
     count: int
+    of_roots: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class TabulatedEmbedding:
-    """A frozen FourierEmbedding, looked up: each input's share is a function of one number, interpolated linearly on a grid.
+    """A FourierEmbedding, looked up: each input's share is a function of one number, interpolated linearly on a grid.
 
-    With distances every centimetre and 2 049 angles, log-probabilities move by about 1e-5. Values outside a grid count as its end.
+    There are far fewer grid points than relations, so this is also the fast way to train: gradients flow through the table.
+    Values outside a grid count as its end.
     """
 
     table: Float[Tensor, "rows D"]
     start: Float[Tensor, "n"]
     spacing: Float[Tensor, "n"]
     last: Float[Tensor, "n"]
+    of_roots: Bool[Tensor, "n"]
     first_row: Int64[Tensor, "n"]
     out: nn.Module
 
     @classmethod
-    @torch.no_grad()
     def build(cls, embedding: FourierEmbedding, grids: tuple[Grid, ...]) -> "TabulatedEmbedding":
         """Evaluate each input's network on its grid."""
-        device = embedding.frequencies.weight.device
-        steps = [torch.arange(g.count, device=device) * g.spacing + g.start for g in grids]
-        counts = torch.tensor([0, *(g.count for g in grids)], device=device)
+        like = embedding.frequencies.weight
+        steps = [torch.linspace(g.start, g.stop, g.count, dtype=like.dtype, device=like.device) for g in grids]
+        steps = [v.square() if g.of_roots else v for v, g in zip(steps, grids)]
+        counts = torch.tensor([0, *(g.count for g in grids)], device=like.device)
         return cls(
-            table=torch.cat([embedding.embed_input(i, values) for i, values in enumerate(steps)]),
-            start=torch.tensor([g.start for g in grids], device=device),
-            spacing=torch.tensor([g.spacing for g in grids], device=device),
-            last=(counts[1:] - 1).float(),
+            table=torch.cat([embedding.embed_input(i, values) for i, values in enumerate(steps)]).to(like.dtype),
+            start=like.new_tensor([g.start for g in grids]),
+            spacing=like.new_tensor([(g.stop - g.start) / (g.count - 1) for g in grids]),
+            last=(counts[1:] - 1).to(like.dtype),
+            of_roots=torch.tensor([g.of_roots for g in grids], device=like.device),
             first_row=counts.cumsum(0)[:-1],
             out=embedding.out,
         )
 
-    @torch.no_grad()
     def __call__(self, values: Float[Tensor, "E n"]) -> Float[Tensor, "E D"]:
-        """Embedding of each row, in pieces that stay in the processor's cache."""
-        return torch.cat([self._look_up(part) for part in values.split(EDGES_PER_PIECE)])
-
-    def _look_up(self, values: Float[Tensor, "E n"]) -> Float[Tensor, "E D"]:
+        """Embedding of each row."""
+        values = torch.where(self.of_roots, values.abs().sqrt(), values)
         place = torch.minimum(((values - self.start) / self.spacing).clamp(min=0), self.last)
-        low = torch.minimum(place.floor(), (self.last - 1).clamp(min=0))
+        low = torch.minimum(place.floor(), self.last - 1)
         share = place - low
         row = low.long() + self.first_row
-        rows = torch.cat([row, row + (self.last > 0)], -1)
         total = functional.embedding_bag(
-            rows, self.table, mode="sum", per_sample_weights=torch.cat([1 - share, share], -1)
+            torch.cat([row, row + 1], -1), self.table, mode="sum", per_sample_weights=torch.cat([1 - share, share], -1)
         )
         return self.out(total)
+
+
+RelationEmbedding = FourierEmbedding | TabulatedEmbedding
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """Rows with about as many neighbours, r of them."""
+
+    neighbors: Int64[Tensor, "r K"]
+    """Rows of the sources; any valid row where the mask is False."""
+    bias: Float[Tensor, "r 1 K"]
+    """Added to scores: 0 for a neighbour, a large negative number for padding. Every row has a neighbour."""
+    known: Float[Tensor, "r K W"]
+    """Normalised embedding of each row's relation to each neighbour; behind it, where they are the same in all layers (W = 2D),
+    normalised features of the neighbours. Finite nonsense for padding."""
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """Whom rows attend to, shared by all layers: rows sorted by their number of neighbours and cut, so that little is padded."""
+
+    rows: Int64[Tensor, "n"]
+    """The rows that have neighbours, piece after piece."""
+    pieces: tuple[Piece, ...]
+
+    @property
+    def sizes(self) -> list[int]:
+        """Rows of each piece."""
+        return [len(piece.bias) for piece in self.pieces]
+
+
+def surround(
+    embedding: RelationEmbedding,
+    values: Float[Tensor, "R K n"],
+    neighbors: Int64[Tensor, "R K"],
+    mask: Bool[Tensor, "R K"],
+    *,
+    dim: int,
+    features: Float[Tensor, "S D"] | None = None,
+) -> Surroundings:
+    """Embed relations.
+
+    Args:
+        embedding: of what describes a relation.
+        values: what describes each row's relation to each neighbour.
+        neighbors: rows of the sources; any valid row where the mask is False.
+        mask: True = a neighbour.
+        dim: D.
+        features: normalised features of the sources, if they are the same in all layers.
+    """
+    columns = torch.arange(1, mask.shape[1] + 1, device=mask.device)
+    width, order = (mask * columns).amax(-1).sort()
+    widths = width.cpu().numpy()
+    empty = int(np.searchsorted(widths, 1))
+    rows = order[empty:]
+    pieces = []
+    pairs = FLOATS_PER_PIECE.get(mask.device.type, FLOATS_PER_PIECE_ELSEWHERE) // dim
+    for cut in _cut(widths[empty:], pairs):
+        part, of_part = rows[cut], slice(widths[empty:][cut].max(initial=1))
+        index = neighbors[part, of_part]
+        known = checkpoint(_describe, embedding, values[part, of_part], use_reentrant=False, preserve_rng_state=False)
+        if features is not None:
+            known = torch.cat([known, functional.embedding(index, features)], -1)
+        bias = torch.zeros_like(known[..., 0]).masked_fill_(~mask[part, of_part], IMPOSSIBLE)
+        pieces.append(Piece(index, bias[:, None], known))
+    return Surroundings(rows, tuple(pieces))
+
+
+def _describe(embedding: RelationEmbedding, values: Float[Tensor, "r K n"]) -> Float[Tensor, "r K D"]:
+    return normalize(embedding(values.flatten(0, 1))).unflatten(0, values.shape[:2])
+
+
+def _cut(widths: np.ndarray, pairs: int) -> list[slice]:
+    """Cut rows of increasing width into pieces of about so many pairs and of similar width; at least one piece, maybe empty."""
+    if not len(widths):
+        return [slice(0, 0)]
+    step = max(math.ceil(widths[-1] / WIDTHS), LEAST_WIDTH_STEP)
+    piece = (widths - 1) // step + widths.cumsum() // pairs
+    cuts = [0, *(np.flatnonzero(np.diff(piece)) + 1).tolist(), len(widths)]
+    return [slice(a, b) for a, b in itertools.pairwise(cuts)]
 
 
 class RelationAttention(nn.Module):
@@ -170,55 +259,53 @@ class RelationAttention(nn.Module):
         )
 
     def forward(
-        self,
-        x: Float[Tensor, "R D"],
-        source: Float[Tensor, "S D"],
-        relation: Float[Tensor, "R K D"],
-        neighbors: Int64[Tensor, "R K"],
-        neighbor_mask: Bool[Tensor, "R K"],
+        self, x: Float[Tensor, "R D"], source: Float[Tensor, "S D"] | None, around: Surroundings
     ) -> Float[Tensor, "R D"]:
         """New features of the rows.
 
         Args:
             x: features of the rows.
-            source: normalised (see `normalize`) features of everything that can be a neighbour.
-            relation: normalised embedding of each row's relation to each neighbour.
-            neighbors: rows of `source`; any valid row where the mask is False.
-            neighbor_mask: True = a neighbour. A row without any receives a message of exactly zero.
+            source: normalised (see `normalize`) features of everything that can be a neighbour; None = `around` holds them.
+            around: the neighbours of each row. A row without any receives a message of exactly zero.
         """
         target = self.target_norm(x)
-        message = self._message(target, source[neighbors], relation, neighbor_mask)
+        message = self._message(target, source, around)
         gate = torch.sigmoid(self.gate(torch.cat([message, target], -1)))
         x = x + self.out_norm(self.out(message + gate * (self.skip(target) - message)))
         return x + self.feed_forward(x)
 
     def _message(
-        self,
-        target: Float[Tensor, "R D"],
-        source: Float[Tensor, "R K D"],
-        relation: Float[Tensor, "R K D"],
-        mask: Bool[Tensor, "R K"],
+        self, target: Float[Tensor, "R D"], source: Float[Tensor, "S D"] | None, around: Surroundings
     ) -> Float[Tensor, "R inner"]:
         """Attention-weighted values of the neighbours, heads concatenated."""
+        message = target.new_zeros(len(target), self.num_heads * self.head_dim)
         source_norm = self.source_norm or self.target_norm
-        query = self.query(target).unflatten(-1, (self.num_heads, self.head_dim)) / math.sqrt(self.head_dim)
-        to_source, to_relation = (
-            torch.einsum("rhd,hdD->rhD", query, self._by_head(key.weight * norm.weight))
-            for key, norm in ((self.source_key, source_norm), (self.relation_key, self.relation_norm))
+        norms = (self.relation_norm, source_norm)
+        query = self.query(target[around.rows]).unflatten(-1, (self.num_heads, self.head_dim)) / math.sqrt(
+            self.head_dim
         )
-        scores = torch.baddbmm(to_source @ source.mT, to_relation, relation.mT)  # [R, H, K]
-        weights = torch.softmax(scores.masked_fill(~mask[:, None], -1e9), -1) * mask[:, None]
-        weights = functional.dropout(weights, self.dropout, self.training)
-        message = torch.zeros_like(query)
-        for values, projection, norm in (
-            (source, self.source_value, source_norm),
-            (relation, self.relation_value, self.relation_norm),
-        ):
-            constant = projection(norm.bias).unflatten(-1, (self.num_heads, self.head_dim))
-            gathered = weights @ values  # [R, H, D]
-            message = message + torch.einsum("rhD,hdD->rhd", gathered, self._by_head(projection.weight * norm.weight))
-            message = message + weights.sum(-1, keepdim=True) * constant
-        return message.flatten(-2)
+        keys = self._by_head((self.relation_key, self.source_key), norms)
+        asked = torch.einsum("rhd,hdE->rhE", query, keys).split(around.sizes)
+        gathered, received = zip(*(self._attend(*pair, source) for pair in zip(asked, around.pieces)))
+        values = (self.relation_value, self.source_value)
+        answer = torch.einsum("rhE,hdE->rhd", torch.cat(gathered), self._by_head(values, norms))
+        constant = torch.stack([value(norm.bias) for value, norm in zip(values, norms)]).sum(0)
+        answer = answer + torch.cat(received) * constant.unflatten(-1, (self.num_heads, self.head_dim))
+        return message.index_copy(0, around.rows, answer.flatten(-2))
 
-    def _by_head(self, weight: Float[Tensor, "inner D"]) -> Float[Tensor, "H d D"]:
-        return weight.unflatten(0, (self.num_heads, self.head_dim))
+    def _attend(
+        self, asked: Float[Tensor, "r H 2D"], piece: Piece, source: Float[Tensor, "S D"] | None
+    ) -> tuple[Float[Tensor, "r H 2D"], Float[Tensor, "r H 1"]]:
+        """Weighted sums of the neighbours' features and relations, and of the weights."""
+        known = (piece.known,) if source is None else (piece.known, functional.embedding(piece.neighbors, source))
+        scores = piece.bias.expand(-1, self.num_heads, -1)
+        for part, to_part in zip(known, asked.chunk(len(known), -1)):
+            scores = torch.baddbmm(scores, to_part, part.mT)  # [r, H, K]
+        weights = functional.dropout(torch.softmax(scores, -1), self.dropout, self.training)
+        gathered = [weights @ part for part in known]
+        return torch.cat(gathered, -1) if source is not None else gathered[0], weights.sum(-1, keepdim=True)
+
+    def _by_head(self, maps: tuple[nn.Linear, ...], norms: tuple[nn.LayerNorm, ...]) -> Float[Tensor, "H d 2D"]:
+        """Weights of maps of relations and sources with their norms' weights inside."""
+        folded = torch.cat([linear.weight * norm.weight for linear, norm in zip(maps, norms)], -1)
+        return folded.unflatten(0, (self.num_heads, self.head_dim))

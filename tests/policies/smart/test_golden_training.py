@@ -124,14 +124,23 @@ def check_six_steps(policy, frame, batch_a, golden):
     np.testing.assert_allclose(norms, expected["bc_curve_gradnorm"], rtol=CURVE_TOLERANCE)
 
 
+@torch.no_grad()
+def nudge(policy, layer, unit, amount):
+    """Move the input of a ReLU whose sign is left to rounding to the side that it has in the public code."""
+    policy.network.decoder.time_layers[layer].feed_forward[1].bias[unit] += amount
+
+
 def test_six_optimiser_steps_in_absolute_coordinates(policy, batch_a, golden):
+    """Two ReLUs have inputs of 3e-7 here (typical size 0.7) and are on the other side in the public code."""
+    nudge(policy, 1, 73, 2e-6)
+    nudge(policy, 2, 23, -2e-6)
     check_six_steps(policy, "absolute", batch_a, golden)
 
 
 @pytest.mark.slow
 @pytest.mark.xfail(
     strict=True,
-    reason="losses of steps 4 and 6 differ by 1.06e-3 and 1.12e-3 (2e-4 of their value): the input of one ReLU is 1.3e-7 here and "
+    reason="losses of steps 4 and 6 differ by 1.06e-3 and 1.12e-3 (2e-4 of their value): the input of one ReLU is about 2e-7 here and "
     "below zero in the public code (typical size 0.7), so a part of the first gradient is missing there",
 )
 def test_six_optimiser_steps(policy, batch_a, golden):
@@ -140,8 +149,7 @@ def test_six_optimiser_steps(policy, batch_a, golden):
 
 @pytest.mark.slow
 def test_six_optimiser_steps_with_that_one_relu_on_the_other_side(policy, batch_a, golden):
-    with torch.no_grad():
-        policy.network.decoder.time_layers[2].feed_forward[1].bias[166] -= 2e-7
+    nudge(policy, 2, 166, -1e-6)
     check_six_steps(policy, "centred", batch_a, golden)
 
 

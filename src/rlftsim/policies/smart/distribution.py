@@ -1,6 +1,6 @@
 """A categorical distribution over motion tokens for every agent that decides."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import torch
@@ -17,6 +17,8 @@ class TokenDistribution:
     logits: Float[Tensor, "R V"]
     """float32; tokens that do not exist hold a large negative number."""
     mask: Bool[Tensor, "*batch"]
+    _likeliest: dict[int, Int64[Tensor, "R K"]] = field(default_factory=dict, init=False, repr=False)
+    """Ids of the K most likely tokens, by K, once somebody asked for them."""
 
     @cached_property
     def log_probs(self) -> Float[Tensor, "R V"]:
@@ -28,10 +30,11 @@ class TokenDistribution:
         """Token ids, by inverting the cumulative distribution at the noise."""
         if sampling.temperature == 0:
             return self._dense(self.logits.argmax(-1))
-        cumulative = torch.softmax(self._truncated(sampling), -1).cumsum(-1)
+        logits, token_id = self._kept(sampling)
+        cumulative = torch.softmax(logits, -1).cumsum(-1)
         level = noise[self.mask] * cumulative[:, -1:]
-        chosen = torch.searchsorted(cumulative, level, right=True)[:, 0]
-        return self._dense(chosen.clamp(max=self.logits.shape[-1] - 1))
+        chosen = torch.searchsorted(cumulative, level, right=True).clamp(max=logits.shape[-1] - 1)
+        return self._dense((chosen if token_id is None else token_id.gather(-1, chosen))[:, 0])
 
     def log_prob(
         self,
@@ -41,8 +44,14 @@ class TokenDistribution:
         """Log-probability of token ids under the distribution that `sampling` draws from."""
         if sampling.temperature == 0:
             return self._dense(torch.zeros_like(self.logits[:, 0]))
-        log_probs = self.log_probs if sampling.is_full else torch.log_softmax(self._truncated(sampling), -1)
-        return self._dense(log_probs.gather(-1, decision[self.mask][:, None])[:, 0])
+        chosen = decision[self.mask][:, None]
+        if sampling.is_full:
+            return self._dense(self.log_probs.gather(-1, chosen)[:, 0])
+        logits, token_id = self._kept(sampling)
+        own = self.logits.gather(-1, chosen) / sampling.temperature
+        if token_id is not None:
+            own = own.masked_fill((token_id != chosen).all(-1, keepdim=True), -torch.inf)
+        return self._dense(own[:, 0] - logits.logsumexp(-1))
 
     def kl(self, other: "TokenDistribution") -> Float[Tensor, "*batch"]:
         """KL(self || other), nats."""
@@ -52,12 +61,14 @@ class TokenDistribution:
         """Entropy, nats."""
         return self._dense(-(self.log_probs.exp() * self.log_probs).sum(-1))
 
-    def _truncated(self, sampling: Sampling) -> Float[Tensor, "R V"]:
-        logits = self.logits / sampling.temperature
-        if sampling.top_k is None or sampling.top_k >= logits.shape[-1]:
-            return logits
-        kept = logits.topk(sampling.top_k, dim=-1)
-        return torch.full_like(logits, -torch.inf).scatter(-1, kept.indices, kept.values)
+    def _kept(self, sampling: Sampling) -> tuple[Float[Tensor, "R K"], Int64[Tensor, "R K"] | None]:
+        """Logits that `sampling` keeps, at its temperature, and their token ids in increasing order; None = it keeps all."""
+        if sampling.top_k is None or sampling.top_k >= self.logits.shape[-1]:
+            return self.logits / sampling.temperature, None
+        if sampling.top_k not in self._likeliest:
+            self._likeliest[sampling.top_k] = self.logits.topk(sampling.top_k, dim=-1).indices.sort(-1).values
+        token_id = self._likeliest[sampling.top_k]
+        return self.logits.gather(-1, token_id) / sampling.temperature, token_id
 
     def _dense(self, values: Tensor) -> Tensor:
         """Values of the R elements at their places, zero elsewhere."""

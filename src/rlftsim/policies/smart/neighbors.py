@@ -3,6 +3,7 @@
 R rows that look, K neighbours a row. A list is padded with index 0 where its mask is False.
 """
 
+import itertools
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -37,35 +38,54 @@ class Poses:
         return Poses(self.position[index], self.heading[index])
 
 
-def nearest_within(
-    targets: Float[Tensor, "... n 2"],
-    sources: Float[Tensor, "... m 2"],
-    allowed: Bool[Tensor, "... n m"] | None,
+def within(
+    position: Float[Tensor, "R 2"],
+    place: Int64[Tensor, "R"],
+    candidates: Float[Tensor, "P C 2"],
+    own: Int64[Tensor, "R"] | None,
     *,
     radius_m: float,
     limit: int | None,
-) -> tuple[Int64[Tensor, "... n K"], Bool[Tensor, "... n K"]]:
-    """Sources nearer than a radius (strictly), nearest first where a limit binds; `allowed` None = all of them.
+) -> Neighbors:
+    """Candidates nearer than a radius (strictly), the nearest of them where a limit binds.
 
-    K is the limit, or the largest number of neighbours that occurs; at least 1.
+    Args:
+        position: of the rows.
+        place: where each row looks: an entry of the candidates' first axis.
+        candidates: positions, infinite where there is nobody. Their flat index p * C + c is what neighbours are named by.
+        own: the candidate of its place that a row is itself, and does not look at.
+        radius_m: of their circle.
+        limit: most neighbours a row has; None = all.
     """
-    rows = max(PAIRS_PER_PIECE // max(sources.shape[-2], 1), 1)
-    pieces = targets.split(rows) if targets.dim() == 2 and allowed is None else (targets,)
-    squared = [_squared_distance(piece, sources, allowed) for piece in pieces]
-    if limit is None:
-        limit = max(int((s < radius_m**2).sum(-1).amax()) if s.numel() else 0 for s in squared)
-    width = min(max(limit, 1), sources.shape[-2])
-    nearest = [s.topk(width, dim=-1, largest=False, sorted=False) for s in squared]
-    return torch.cat([n.indices for n in nearest]), torch.cat([n.values for n in nearest]) < radius_m**2
+    num_candidates = candidates.shape[1]
+    x, y = candidates.unbind(-1)
+    lists, counts = [], []
+    piece = max(PAIRS_PER_PIECE // max(num_candidates, 1), 1)
+    for at, p, o in zip(
+        position.split(piece), place.split(piece), itertools.repeat(None) if own is None else own.split(piece)
+    ):
+        squared = (x[p] - at[:, :1]).square_().add_((y[p] - at[:, 1:]).square_())
+        near = squared < radius_m**2
+        if o is not None:
+            near.scatter_(1, o[:, None], False)
+        row, column = near.nonzero(as_tuple=True)
+        lists.append(p[row] * num_candidates + column)
+        counts.append(near.sum(-1))
+    neighbors = _padded(torch.cat([*lists, place.new_zeros(1)]), torch.cat(counts) if counts else place)
+    if limit is None or neighbors.index.shape[1] <= limit:
+        return neighbors
+    offset = candidates.flatten(0, 1)[neighbors.index] - position[:, None]
+    squared = offset.square().sum(-1).masked_fill(~neighbors.mask, torch.inf)
+    nearest = squared.topk(limit, dim=-1, largest=False)
+    return Neighbors(neighbors.index.gather(1, nearest.indices), nearest.values < torch.inf)
 
 
-def _squared_distance(
-    targets: Float[Tensor, "... n 2"], sources: Float[Tensor, "... m 2"], allowed: Bool[Tensor, "... n m"] | None
-) -> Float[Tensor, "... n m"]:
-    """Squared distances, infinite where not allowed; each axis in place, since memory traffic is all the cost."""
-    squared = (targets[..., :, None, 0] - sources[..., None, :, 0]).square_()
-    squared += (targets[..., :, None, 1] - sources[..., None, :, 1]).square_()
-    return squared if allowed is None else squared.masked_fill_(~allowed, torch.inf)
+def _padded(flat: Int64[Tensor, "E"], count: Int64[Tensor, "R"]) -> Neighbors:
+    """Lists behind each other, the last entry being nobody's, below each other."""
+    columns = torch.arange(max(int(count.max()) if len(count) else 0, 1), device=flat.device)
+    mask = columns < count[:, None]
+    entry = (count.cumsum(0) - count)[:, None] + columns
+    return Neighbors(flat[torch.where(mask, entry, len(flat) - 1)], mask)
 
 
 def relative_pose(row: Poses, other: Poses, *, seam_rad: float) -> Float[Tensor, "R K 3"]:
@@ -78,13 +98,3 @@ def relative_pose(row: Poses, other: Poses, *, seam_rad: float) -> Float[Tensor,
     angles = torch.stack([bearing, wrap_angle(other.heading - row.heading[:, None])], -1)
     angles = torch.where(angles < seam_rad - math.pi, angles + 2 * math.pi, angles)
     return torch.cat([offset.norm(dim=-1, keepdim=True), angles], -1)
-
-
-def pad_lists(lists: list[Neighbors]) -> Neighbors:
-    """Lists of different widths below each other."""
-    width = max(part.index.shape[1] for part in lists)
-    pad = [(0, width - part.index.shape[1]) for part in lists]
-    return Neighbors(
-        torch.cat([torch.nn.functional.pad(part.index, p) for part, p in zip(lists, pad)]),
-        torch.cat([torch.nn.functional.pad(part.mask, p) for part, p in zip(lists, pad)]),
-    )

@@ -6,7 +6,6 @@ scenario), a single step of a rollout and all steps of a scoring pass go through
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -20,18 +19,23 @@ from rlftsim.policies.layers import (
     MlpEmbedding,
     MlpLayer,
     RelationAttention,
+    RelationEmbedding,
+    Surroundings,
     TabulatedEmbedding,
     initialize,
     normalize,
+    surround,
 )
 from rlftsim.policies.smart.config import SmartConfig
 from rlftsim.policies.smart.heads import ClassHeads
-from rlftsim.policies.smart.neighbors import Neighbors, Poses, nearest_within, pad_lists, relative_pose
+from rlftsim.policies.smart.neighbors import Neighbors, Poses, relative_pose, within
 from rlftsim.tokens.map_tokens import NUM_KINDS, NUM_LIGHTS, NUM_TYPES, MapTokens
 from rlftsim.tokens.vocabulary import CLASS_NAMES
 
 MAX_LOOK_BACK_M = 160.0
 """Farthest that anybody gets while it is remembered (3 s at 50 m/s), for tables."""
+
+DISTANCES_PER_ROOT_M = 768
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,12 +55,9 @@ class Scene:
     relations: "Relations"
 
 
-RelationEmbedding = Callable[[Float[Tensor, "E n"]], Float[Tensor, "E D"]]
-
-
 @dataclass(frozen=True, eq=False)
 class Relations:
-    """How the decoder embeds relations: the networks themselves while they are trained, tables of them once they are frozen."""
+    """How the decoder embeds relations."""
 
     time: RelationEmbedding
     map: RelationEmbedding
@@ -121,36 +122,28 @@ class MapEncoder(nn.Module):
         x = x + self.feature_type(tokens.type) + self.kind(tokens.kind) + self.light(tokens.light)
         x = x.flatten(0, 1)
         rows = tokens.token_mask.flatten().nonzero()[:, 0]
-        neighbors = self._neighbors(tokens)
         poses = Poses(tokens.position.flatten(0, 1), tokens.heading.flatten())
-        embedding = _tabulated(self.relation, self.config.map_radius_m)
-        relation = relation_features(embedding, poses[rows], poses, neighbors, seam_rad=self.config.seam_rad)
+        around = self._look_around(tokens, poses, rows)
         updated = x[rows]
         for layer in self.layers:
-            source = x.index_copy(0, rows, normalize(updated))
-            updated = layer(updated, source, relation, neighbors.index, neighbors.mask)
+            updated = layer(updated, x.index_copy(0, rows, normalize(updated)), around)
         return x.index_copy(0, rows, updated)
 
-    def _neighbors(self, tokens: MapTokens) -> Neighbors:
-        lists = []
+    def _look_around(self, tokens: MapTokens, poses: Poses, rows: Int64[Tensor, "R"]) -> Surroundings:
+        """Other tokens of the same scenario within reach."""
         width = tokens.token_mask.shape[1]
-        for b, (position, mask) in enumerate(zip(tokens.position, tokens.token_mask)):
-            count = int(mask.sum())
-            own = position[:count]
-            other = ~torch.eye(count, dtype=torch.bool, device=own.device)
-            index, near = nearest_within(
-                own, own, other, radius_m=self.config.map_radius_m, limit=self.config.max_map_neighbors
-            )
-            lists.append(Neighbors(index + b * width, near))
-        return pad_lists(lists)
+        neighbors = within(
+            poses.position[rows], rows // width, nowhere_unless(tokens.token_mask, tokens.position), rows % width,
+            radius_m=self.config.map_radius_m, limit=self.config.max_map_neighbors,
+        )  # fmt: skip
+        embedding = _tabulated(self.relation, self.config.map_radius_m)
+        values = relative_pose(poses[rows], poses[neighbors.index], seam_rad=self.config.seam_rad)
+        return surround(embedding, values, neighbors.index, neighbors.mask, dim=self.config.dim)
 
 
-def relation_features(
-    embedding: RelationEmbedding, rows: Poses, sources: Poses, neighbors: Neighbors, *, seam_rad: float
-) -> Float[Tensor, "R K D"]:
-    """Normalised embedding of the relation of each row [R] to each of its neighbours among the sources [S]; zero where there is none."""
-    values = relative_pose(rows, sources[neighbors.index], seam_rad=seam_rad)
-    return _embed_where(embedding, values, neighbors.mask)
+def nowhere_unless(mask: Bool[Tensor, "*shape"], position: Float[Tensor, "*shape 2"]) -> Float[Tensor, "*shape 2"]:
+    """Positions, infinite where the mask is False, so that nobody is near."""
+    return position.masked_fill(~mask[..., None], torch.inf)
 
 
 class AgentDecoder(nn.Module):
@@ -176,8 +169,8 @@ class AgentDecoder(nn.Module):
         self.head = ClassHeads(dim, class_sizes, num_tokens) if class_sizes else MlpLayer(dim, dim, num_tokens)
 
     def relations(self) -> Relations:
-        """The relation embeddings, tabulated where nothing in them is trained."""
-        lag = Grid(-float(self.config.history_tokens), 1.0, self.config.history_tokens + 1)
+        """The relation embeddings, tabulated where that does no harm."""
+        lag = Grid(-float(self.config.history_tokens), 0.0, self.config.history_tokens + 1)
         return Relations(
             time=_tabulated(self.time_relation, MAX_LOOK_BACK_M, lag),
             map=_tabulated(self.map_relation, self.config.agent_map_radius_m),
@@ -210,18 +203,18 @@ class AgentDecoder(nn.Module):
         new_past = _extend(past, steps, torch.where(row_of >= 0, row_of + first_row, -1))
 
         x = self._embed_steps(scene, steps, rows)
-        time, time_relation = self._look_back(scene, new_past, steps, rows, hidden)
-        around, map_relation = self._look_at_map(scene, steps, rows)
-        others, agent_relation = self._look_at_agents(scene, steps, rows, row_of)
+        before = self._look_back(scene, new_past, steps, rows, hidden)
+        around = self._look_at_map(scene, steps, rows)
+        others = self._look_at_agents(scene, steps, rows, row_of)
         sources = []
         for index, layers in enumerate(zip(self.time_layers, self.map_layers, self.agent_layers)):
             time_layer, map_layer, agent_layer = layers
             own = normalize(x)
             source = own if past is None else torch.cat([past.sources[index], own])
             sources.append(source)
-            x = time_layer(x, source, time_relation, time.index, time.mask)
-            x = map_layer(x, scene.map_features, map_relation, around.index, around.mask)
-            x = agent_layer(x, normalize(x), agent_relation, others.index, others.mask)
+            x = time_layer(x, source, before)
+            x = map_layer(x, None, around)
+            x = agent_layer(x, normalize(x), others)
         return x, Past(new_past.position, new_past.heading, new_past.row, tuple(sources))
 
     def _embed_steps(self, scene: Scene, steps: TokenSteps, rows: tuple[Tensor, ...]) -> Float[Tensor, "R D"]:
@@ -239,7 +232,7 @@ class AgentDecoder(nn.Module):
         steps: TokenSteps,
         rows: tuple[Tensor, ...],
         hidden: Bool[Tensor, "B N A K"] | None,
-    ) -> tuple[Neighbors, Float[Tensor, "R W D"]]:
+    ) -> Surroundings:
         """Up to `history_tokens` earlier steps of the same agent."""
         scenario, rollout, agent, step = rows
         before = past.row.shape[-1] - steps.valid.shape[-1]
@@ -250,72 +243,63 @@ class AgentDecoder(nn.Module):
         mask = (row >= 0) & (column >= 0)
         if hidden is not None:
             mask = mask & ~hidden[place] & ~hidden[rows][:, None]
-        neighbors = Neighbors(row.clamp(min=0), mask)
         values = relative_pose(
             Poses(steps.position, steps.heading)[rows],
             Poses(past.position, past.heading)[place],
             seam_rad=self.config.seam_rad,
         )
         values = torch.cat([values, -lag[:, None].expand(len(step), -1, 1).to(values.dtype)], -1)
-        return neighbors, _embed_where(scene.relations.time, values, mask)
+        return surround(scene.relations.time, values, row.clamp(min=0), mask, dim=self.config.dim)
 
-    def _look_at_map(
-        self, scene: Scene, steps: TokenSteps, rows: tuple[Tensor, ...]
-    ) -> tuple[Neighbors, Float[Tensor, "R W D"]]:
+    def _look_at_map(self, scene: Scene, steps: TokenSteps, rows: tuple[Tensor, ...]) -> Surroundings:
         """Map tokens of the own scenario within reach."""
-        lists = []
-        width = scene.map_mask.shape[1]
-        position = steps.position[rows]
-        counts = torch.bincount(rows[0], minlength=len(scene.map_mask)).tolist()
-        for b, part in enumerate(position.split(counts)):
-            index, near = nearest_within(
-                part, scene.map_position[b][scene.map_mask[b]], None,
-                radius_m=self.config.agent_map_radius_m, limit=self.config.max_agent_map_neighbors,
-            )  # fmt: skip
-            lists.append(Neighbors(index + b * width, near))
-        neighbors = pad_lists(lists)
+        poses = Poses(steps.position, steps.heading)[rows]
+        neighbors = within(
+            poses.position, rows[0], nowhere_unless(scene.map_mask, scene.map_position), None,
+            radius_m=self.config.agent_map_radius_m, limit=self.config.max_agent_map_neighbors,
+        )  # fmt: skip
         sources = Poses(scene.map_position.flatten(0, 1), scene.map_heading.flatten())
-        return neighbors, relation_features(
-            scene.relations.map,
-            Poses(steps.position, steps.heading)[rows],
-            sources,
-            neighbors,
-            seam_rad=self.config.seam_rad,
-        )
+        return self._surround(scene.relations.map, poses, sources, neighbors, features=scene.map_features)
 
     def _look_at_agents(
         self, scene: Scene, steps: TokenSteps, rows: tuple[Tensor, ...], row_of: Int64[Tensor, "B N A K"]
-    ) -> tuple[Neighbors, Float[Tensor, "R W D"]]:
+    ) -> Surroundings:
         """Other agents of the same scenario, rollout and step within reach."""
-        position = steps.position.transpose(2, 3)  # [B, N, K, A, 2]
-        valid = steps.valid.transpose(2, 3)
-        other = ~torch.eye(valid.shape[-1], dtype=torch.bool, device=valid.device)
-        index, near = nearest_within(
-            position, position, valid[..., None, :] & valid[..., None] & other,
+        scenario, rollout, agent, step = rows
+        candidates = nowhere_unless(steps.valid, steps.position).transpose(2, 3)  # [B, N, K, A, 2]
+        _, num_rollouts, num_steps, _, _ = candidates.shape
+        poses = Poses(steps.position, steps.heading)[rows]
+        neighbors = within(
+            poses.position, (scenario * num_rollouts + rollout) * num_steps + step, candidates.flatten(0, 2), agent,
             radius_m=self.config.agent_radius_m, limit=self.config.max_agent_neighbors,
         )  # fmt: skip
-        scenario, rollout, agent, step = rows
-        index, near = index[scenario, rollout, step, agent], near[scenario, rollout, step, agent]
-        neighbors = Neighbors(row_of[scenario[:, None], rollout[:, None], index, step[:, None]].clamp(min=0), near)
-        poses = Poses(steps.position, steps.heading)[rows]
-        return neighbors, relation_features(
-            scene.relations.agent, poses, poses, neighbors, seam_rad=self.config.seam_rad
-        )
+        row = row_of.transpose(2, 3).flatten()[neighbors.index].clamp(min=0)
+        return self._surround(scene.relations.agent, poses, poses, Neighbors(row, neighbors.mask))
+
+    def _surround(
+        self,
+        embedding: RelationEmbedding,
+        poses: Poses,
+        sources: Poses,
+        neighbors: Neighbors,
+        *,
+        features: Float[Tensor, "S D"] | None = None,
+    ) -> Surroundings:
+        values = relative_pose(poses, sources[neighbors.index], seam_rad=self.config.seam_rad)
+        return surround(embedding, values, neighbors.index, neighbors.mask, dim=self.config.dim, features=features)
 
 
 def _tabulated(embedding: FourierEmbedding, reach_m: float, *more: Grid) -> RelationEmbedding:
-    """A table of an embedding of (distance, bearing, turn, ...) if it is frozen, else the embedding itself."""
-    angle = Grid(-math.pi, 2 * math.pi / 2048, 2049)
-    grids = (Grid(0.0, 0.01, round(reach_m * 100) + 1), angle, angle, *more)
-    return TabulatedEmbedding.build(embedding, grids) if embedding.is_frozen else embedding
+    """A table of an embedding of (distance, bearing, turn, ...), its distances 3 mm apart at 1 m and 14 mm at 30 m.
 
-
-def _embed_where(
-    embedding: RelationEmbedding, values: Float[Tensor, "R K n"], mask: Bool[Tensor, "R K"]
-) -> Float[Tensor, "R K D"]:
-    """Normalised embedding of relations, zero where there is none."""
-    embedded = normalize(embedding(values[mask]))
-    return embedded.new_zeros(*mask.shape, embedded.shape[-1]).masked_scatter(mask[..., None], embedded)
+    Not of one that is trained without dropout, where a gradient is taken to be exact: the embedding itself.
+    """
+    if not (embedding.is_frozen or embedding.training):
+        return embedding
+    root = math.sqrt(reach_m)
+    distance = Grid(0.0, root, round(root * DISTANCES_PER_ROOT_M) + 1, of_roots=True)
+    angle = Grid(-math.pi, math.pi, 2049)
+    return TabulatedEmbedding.build(embedding, (distance, angle, angle, *more))
 
 
 def _extend(past: Past | None, steps: TokenSteps, row: Int64[Tensor, "B N A K"]) -> Past:

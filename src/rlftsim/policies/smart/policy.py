@@ -1,7 +1,7 @@
 """SMART as a policy: a token of half a second for every agent, sixteen times."""
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import torch
@@ -45,6 +45,16 @@ class SmartContext:
     agent_mask: Bool[Tensor, "B A"]
 
 
+@dataclass(eq=False)
+class Sight:
+    """What the network made of a state, once somebody asked. It follows from the state: a memo, no part of its value."""
+
+    features: Float[Tensor, "B N A D"] | None = None
+    """Decoder features at the state's last step."""
+    past: Past | None = None
+    """The past that includes the state's last step."""
+
+
 @dataclass(frozen=True, eq=False)
 class SmartState:
     """Simulations under way. Steps that the network has not seen yet wait in `pending`; looking at them happens at most once."""
@@ -55,6 +65,7 @@ class SmartState:
     pending: TokenSteps | None
     poses: Float[Tensor, "B N A 5 3"] | None = None
     draws: Tensor | None = None
+    sight: Sight = field(default_factory=Sight)
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,8 +136,7 @@ class SmartPolicy(nn.Module):
     def decide(self, context: SmartContext, state: SmartState) -> TokenDistribution:
         """The next token of every agent."""
         mask = context.agent_mask[:, None].expand(state.heading.shape)
-        features, _ = self._look(context, state)
-        return self._distribution(context, features[mask], mask)
+        return self._distribution(context, self._look(context, state)[mask], mask)
 
     def advance(
         self,
@@ -150,9 +160,8 @@ class SmartPolicy(nn.Module):
             token_id=decision[..., None],
             valid=context.agent_mask[:, None, :, None].expand(*heading.shape, 1),
         )
-        seen = state.__dict__.get("seen")
-        if seen is not None:
-            past, pending = seen[1], block
+        if state.sight.past is not None:
+            past, pending = state.sight.past, block
         else:
             past, pending = state.past, block if state.pending is None else state.pending.then(block)
         return SmartState(position, heading, past, pending, poses)
@@ -267,17 +276,16 @@ class SmartPolicy(nn.Module):
         fields = (position, tokens.heading, motion, tokens.token_id, tokens.valid)
         return TokenSteps(*(v[:, None, :, steps] for v in fields))
 
-    def _look(self, context: SmartContext, state: SmartState) -> tuple[Float[Tensor, "B N A D"], Past]:
-        """Decoder features at the state's last step, and the past that includes it. Remembered on the state."""
-        if "seen" not in state.__dict__:
+    def _look(self, context: SmartContext, state: SmartState) -> Float[Tensor, "B N A D"]:
+        """Decoder features at the state's last step."""
+        sight = state.sight
+        if sight.features is None:
             if state.pending is None:
-                features = context.features[:, None].expand(*state.heading.shape, -1)
-                seen = (features, state.past)
+                sight.features, sight.past = context.features[:, None].expand(*state.heading.shape, -1), state.past
             else:
-                rows, past = self.network.decoder(context.scene, state.pending, state.past)
-                seen = (_place(rows, state.pending.valid)[..., -1, :], past)
-            state.__dict__["seen"] = seen
-        return state.__dict__["seen"]
+                rows, sight.past = self.network.decoder(context.scene, state.pending, state.past)
+                sight.features = _place(rows, state.pending.valid)[..., -1, :]
+        return sight.features
 
     def _distribution(
         self, context: SmartContext, features: Float[Tensor, "R D"], mask: Bool[Tensor, "*batch"]
