@@ -31,6 +31,7 @@ from rlftsim.tokens.agent_tokens import (
     tokens_towards,
 )
 from rlftsim.tokens.vocabulary import CLASS_BOXES_M, Vocabulary, class_of_type
+from rlftsim.training.freezing import TrainedParts, freeze_untrained
 from rlftsim.training.imitation import ImitationConfig, Prediction, imitate, summed_loss
 
 DEFAULT_NUM_CANDIDATES = 32
@@ -72,7 +73,7 @@ class CatkConfig(ImitationConfig):
     """How the rollouts decide: closest among the K most likely, top_k drawn from them, trajeglish drawn from the K nearest."""
     max_distance_lengths: float | None = None
     """A decision from farther off the record than so many lengths of its class's box does not count. None = all count."""
-    trained: Literal["decoder", "all"] = "decoder"
+    trained: TrainedParts = "decoder"
     """The parts a policy names for fine-tuning, or everything."""
 
     def __post_init__(self) -> None:
@@ -117,7 +118,7 @@ def catk_finetune(
         raise ConfigError(
             f"{type(policy).__name__} cannot be fine-tuned with CAT-K: it needs a vocabulary of tokens and save_pretrained."
         )
-    train_parts(policy, config.trained)
+    freeze_untrained(policy, config.trained)
 
     def along_rollouts(batch: ScenarioBatch, trained: Bool[Tensor, "B A"], update: int) -> Prediction:
         context = policy.encode(batch)
@@ -129,14 +130,6 @@ def catk_finetune(
         return predict_along(policy, context, pursuing, trained)
 
     return imitate(policy, scenarios, out, config, along_rollouts, title="CAT-K", held_out=held_out, card=card)
-
-
-def train_parts(policy: nn.Module, trained: Literal["decoder", "all"]) -> None:
-    """Freeze what is not trained: everything but the parts that a policy names for fine-tuning, if it names any."""
-    parts = getattr(policy, "fine_tuned_parts", None)
-    policy.requires_grad_(trained == "all" or parts is None)
-    for part in parts() if parts and trained == "decoder" else ():
-        part.requires_grad_(True)
 
 
 # ---- rollouts -----------------------------------------------------------------------------------------------------------

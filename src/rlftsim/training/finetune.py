@@ -9,7 +9,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from lightning_fabric import Fabric
@@ -29,6 +29,7 @@ from rlftsim.training.alarms import AlarmConfig, Alarms
 from rlftsim.training.checkpoint import Progress, newest_checkpoint, read_checkpoint, write_checkpoint
 from rlftsim.training.data import batch_with_futures, scenarios_of_update
 from rlftsim.training.experience import Experience, describe
+from rlftsim.training.freezing import TrainedParts, freeze_untrained
 from rlftsim.training.parallel import DeviceConfig, add_up, add_up_gradients, own_share, start_fabric
 from rlftsim.training.policy_gradient import Reduction, agent_log_prob, masked_sum, policy_gradient_loss
 from rlftsim.training.reference import KlConfig, adapt_beta, move_reference
@@ -67,7 +68,7 @@ class FinetuneConfig:
     entropy_bonus: float = 0.0
     log_prob_reduction: Reduction = "mean"
     """Over agents and decisions. The mean keeps the size of an update independent of how many agents a scene has."""
-    trained: Literal["decoder", "all"] = "decoder"
+    trained: TrainedParts = "decoder"
     """The parts a policy names for fine-tuning, or everything."""
     kl: KlConfig = field(default_factory=KlConfig)
     max_kl: float = 5.0
@@ -178,10 +179,7 @@ def finetune(policy: Policy, scenarios: Scenarios, out: Path, config: FinetuneCo
 def prepare(policy: nn.Module, config: FinetuneConfig, device: torch.device) -> Learner:
     """Freeze what is not trained, copy the reference, make the optimiser. Dropout is off from here on."""
     policy.to(device).eval()
-    parts = getattr(policy, "fine_tuned_parts", None)
-    policy.requires_grad_(config.trained == "all" or parts is None)
-    for part in parts() if parts and config.trained == "decoder" else ():
-        part.requires_grad_(True)
+    freeze_untrained(policy, config.trained)
     reference = copy.deepcopy(policy).requires_grad_(False)
     trained = [p for p in policy.parameters() if p.requires_grad]
     optimizer = torch.optim.AdamW(

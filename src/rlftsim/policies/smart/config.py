@@ -31,7 +31,8 @@ class SmartConfig:
     """Nearest agents an agent attends to; None = all within the radius."""
     dropout: float = 0.1
     history_drop: float = 0.1
-    """Share of (agent, step) pairs that are hidden from the attention over time, in pre-training only."""
+    """In training mode only: share of (agent, step) pairs that are hidden from the attention over time. In closed loop (CAT-K) each step
+    forgets earlier ones anew."""
     head_per_class: bool = False
     """Each class has a head of its own, as large as its vocabulary. False = one head as wide as the largest, an index means another
     motion in each class."""

@@ -243,6 +243,8 @@ class AgentDecoder(nn.Module):
         mask = (row >= 0) & (column >= 0)
         if hidden is not None:
             mask = mask & ~hidden[place] & ~hidden[rows][:, None]
+        elif self.training and self.config.history_drop:
+            mask = mask & (torch.rand(mask.shape, device=mask.device) >= self.config.history_drop)
         values = relative_pose(
             Poses(steps.position, steps.heading)[rows],
             Poses(past.position, past.heading)[place],
