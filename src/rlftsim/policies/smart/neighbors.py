@@ -47,7 +47,7 @@ def within(
     radius_m: float,
     limit: int | None,
 ) -> Neighbors:
-    """Candidates nearer than a radius (strictly), the nearest of them where a limit binds.
+    """Candidates nearer than a radius (strictly), the nearest of them where a limit binds; of equally near ones the first.
 
     Args:
         position: of the rows.
@@ -76,8 +76,8 @@ def within(
         return neighbors
     offset = candidates.flatten(0, 1)[neighbors.index] - position[:, None]
     squared = offset.square().sum(-1).masked_fill(~neighbors.mask, torch.inf)
-    nearest = squared.topk(limit, dim=-1, largest=False)
-    return Neighbors(neighbors.index.gather(1, nearest.indices), nearest.values < torch.inf)
+    nearest, column = (part[:, :limit] for part in squared.sort(dim=-1, stable=True))
+    return Neighbors(neighbors.index.gather(1, column), nearest < torch.inf)
 
 
 def _padded(flat: Int64[Tensor, "E"], count: Int64[Tensor, "R"]) -> Neighbors:
