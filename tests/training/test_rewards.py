@@ -1,5 +1,6 @@
 """Rewards: hand-made numbers, and what every leave-one-out reward has in common."""
 
+import sys
 from dataclasses import replace
 
 import pytest
@@ -10,6 +11,8 @@ from hypothesis import strategies as st
 from rlftsim.errors import ConfigError
 from rlftsim.realism import METRIC_2025, score_batch
 from rlftsim.realism.from_rollouts import states_of_rollouts
+from rlftsim.recipes.configure import configure
+from rlftsim.recipes.smart import smart_demo_rlftsim
 from rlftsim.training.rewards import leave_one_out, register_reward, reward_by_name
 from rlftsim.training.rewards.base import _REWARDS
 from rlftsim.training.rewards.mloo import compute_mloo
@@ -145,3 +148,40 @@ def test_an_unknown_reward_is_refused_with_the_known_ones():
 def test_a_name_that_no_sum_can_be_written_with_is_refused(name):
     with pytest.raises(ConfigError, match="a name is letters, digits and underscores, such as on_the_road"):
         register_reward(name)
+
+
+@pytest.fixture
+def installed(tmp_path, monkeypatch):
+    """Install a package made of one module that a test writes; its rewards are forgotten after the test."""
+    known = set(_REWARDS)
+
+    def install(source):
+        (tmp_path / "test_kindness.py").write_text(source)
+        about = tmp_path / "test_kindness-1.0.dist-info"
+        about.mkdir()
+        (about / "METADATA").write_text("Metadata-Version: 2.1\nName: test-kindness\nVersion: 1.0\n")
+        (about / "entry_points.txt").write_text("[rlftsim.rewards]\nkindness = test_kindness\n")
+        monkeypatch.syspath_prepend(tmp_path)
+
+    yield install
+    sys.modules.pop("test_kindness", None)
+    for name in set(_REWARDS) - known:
+        del _REWARDS[name]
+
+
+def test_a_reward_of_an_installed_package_is_found_where_only_its_name_is_given(simulated, installed):
+    installed(
+        "from rlftsim.training.rewards import leave_one_out, register_reward\n"
+        "@register_reward('kindness')\n"
+        "def kindness(scores, rollouts, batch, *, scale: float = 1.0):\n"
+        "    return leave_one_out(-scale * scores.rollout_collision_rate)\n"
+    )
+    config = configure(smart_demo_rlftsim(), ["finetune.reward=mloo + 0.1*kindness(scale=3)"]).finetune
+    assert config.reward == "mloo + 0.1*kindness(scale=3.0)"
+    assert reward_by_name("kindness")(*simulated).shape == (2, 4)
+
+
+def test_a_package_whose_rewards_are_broken_is_named(installed):
+    installed("import a_module_that_is_not_there\n")
+    with pytest.raises(ConfigError, match=r"rewards of test_kindness cannot be imported .*a_module_that_is_not_there"):
+        reward_by_name("kindness")

@@ -49,6 +49,7 @@ BOARD_GROUPS = {
     "kl": ("kl", "beta"),
     "realism": ("rmm", "kinematic", "interactive", "map_based"),
     "alarm": ("alarm_",),
+    "validation": ("validation_",),
     "time": ("seconds",),
 }
 """How TensorBoard shows metrics together: by how their names begin."""

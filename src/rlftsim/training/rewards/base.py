@@ -16,6 +16,7 @@ the agents, shape [B, N, A], that add up to it. It is asked where credit goes by
 """
 
 from collections.abc import Callable
+from importlib.metadata import entry_points
 from typing import TypeVar
 
 import torch
@@ -66,15 +67,31 @@ def _register(table: dict[str, Callable[..., Tensor]], name: str, what: str) -> 
     return register
 
 
+ENTRY_POINTS = "rlftsim.rewards"
+"""Entry points of installed packages: modules that register rewards when they are imported."""
+
+
 def reward_by_name(name: str) -> Reward:
-    """The reward of a name.
+    """The reward of a name; looked for in installed packages, too (`ENTRY_POINTS`).
 
     Raises:
-        ConfigError: unknown; lists the known ones.
+        ConfigError: unknown; lists the known ones. Or a package's rewards cannot be imported.
     """
+    if name not in _REWARDS:
+        _import_rewards_of_packages()
     if name not in _REWARDS:
         raise ConfigError(f"unknown reward {name!r}: known are {', '.join(sorted(_REWARDS))}.")
     return _REWARDS[name]
+
+
+def _import_rewards_of_packages() -> None:
+    for entry in entry_points(group=ENTRY_POINTS):
+        try:
+            entry.load()
+        except Exception as error:
+            raise ConfigError(
+                f"rewards of {entry.value} cannot be imported ({error}): mend or uninstall its package."
+            ) from error
 
 
 def shares_by_name(name: str) -> Shares | None:
