@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import tiny
 import torch
@@ -33,7 +35,11 @@ def vocabulary(drawn_scenarios):
 @pytest.fixture(scope="session")
 def measured(vocabulary):
     """Four rollouts of two scenarios with their scores: (scores, rollouts, batch, scores by agent)."""
-    batch = collate([scenes.straight_road(), scenes.junction_with_light()])
+    other = scenes.junction_with_light()
+    mirrored = replace(
+        other.tracks, object_id=other.tracks.object_id[::-1].copy()
+    )  # tracks are not in the order of ids
+    batch = collate([scenes.straight_road(), replace(other, tracks=mirrored)])
     rollouts = simulate(tiny.tiny_policy(vocabulary), batch, num_rollouts=4, seed=1)
     features = measure_batch(batch.scenarios, states_of_rollouts(batch, rollouts))
     agents = AgentScores(features, METRIC_2025, batch.agent_mask.shape[1])
