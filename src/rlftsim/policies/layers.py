@@ -294,8 +294,8 @@ class RelationAttention(nn.Module):
         return message.index_copy(0, around.rows, answer.flatten(-2))
 
     def _attend(
-        self, asked: Float[Tensor, "r H 2D"], piece: Piece, source: Float[Tensor, "S D"] | None
-    ) -> tuple[Float[Tensor, "r H 2D"], Float[Tensor, "r H 1"]]:
+        self, asked: Float[Tensor, "r H W"], piece: Piece, source: Float[Tensor, "S D"] | None
+    ) -> tuple[Float[Tensor, "r H W"], Float[Tensor, "r H 1"]]:
         """Weighted sums of the neighbours' features and relations, and of the weights."""
         known = (piece.known,) if source is None else (piece.known, functional.embedding(piece.neighbors, source))
         scores = piece.bias.expand(-1, self.num_heads, -1)
@@ -305,7 +305,7 @@ class RelationAttention(nn.Module):
         gathered = [weights @ part for part in known]
         return torch.cat(gathered, -1) if source is not None else gathered[0], weights.sum(-1, keepdim=True)
 
-    def _by_head(self, maps: tuple[nn.Linear, ...], norms: tuple[nn.LayerNorm, ...]) -> Float[Tensor, "H d 2D"]:
+    def _by_head(self, maps: tuple[nn.Linear, ...], norms: tuple[nn.LayerNorm, ...]) -> Float[Tensor, "H d W"]:
         """Weights of maps of relations and sources with their norms' weights inside."""
         folded = torch.cat([linear.weight * norm.weight for linear, norm in zip(maps, norms)], -1)
         return folded.unflatten(0, (self.num_heads, self.head_dim))
