@@ -138,17 +138,8 @@ def test_six_optimiser_steps_in_absolute_coordinates(policy, batch_a, golden):
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(
-    strict=True,
-    reason="losses of steps 4 and 6 differ by 1.06e-3 and 1.12e-3 (2e-4 of their value): the input of one ReLU is about 2e-7 here and "
-    "below zero in the public code (typical size 0.7), so a part of the first gradient is missing there",
-)
 def test_six_optimiser_steps(policy, batch_a, golden):
-    check_six_steps(policy, "centred", batch_a, golden)
-
-
-@pytest.mark.slow
-def test_six_optimiser_steps_with_that_one_relu_on_the_other_side(policy, batch_a, golden):
+    """The input of one ReLU is 2e-7 here (typical size 0.7) and below zero in the public code."""
     nudge(policy, 2, 166, -1e-6)
     check_six_steps(policy, "centred", batch_a, golden)
 

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
+from torch.nn import functional
 
 from rlftsim.geometry import angle_between, heading_vector, wrap_angle
 
@@ -47,7 +48,7 @@ def within(
     radius_m: float,
     limit: int | None,
 ) -> Neighbors:
-    """Candidates nearer than a radius (strictly), the nearest of them where a limit binds; of equally near ones the first.
+    """Candidates nearer than a radius (strictly), the nearest of them where a limit binds: a matter of the row and its candidates alone.
 
     Args:
         position: of the rows.
@@ -58,34 +59,45 @@ def within(
         limit: most neighbours a row has; None = all.
     """
     num_candidates = candidates.shape[1]
-    x, y = candidates.unbind(-1)
-    lists, counts = [], []
-    piece = max(PAIRS_PER_PIECE // max(num_candidates, 1), 1)
+    x, y = candidates[..., 0].contiguous(), candidates[..., 1].contiguous()
+    rows = max(PAIRS_PER_PIECE // max(num_candidates, 1), 1)
+    lists = []
     for at, p, o in zip(
-        position.split(piece), place.split(piece), itertools.repeat(None) if own is None else own.split(piece)
+        position.split(rows), place.split(rows), itertools.repeat(None) if own is None else own.split(rows)
     ):
-        squared = (x[p] - at[:, :1]).square_().add_((y[p] - at[:, 1:]).square_())
-        near = squared < radius_m**2
+        squared = x.index_select(0, p).sub_(at[:, :1]).square_()
+        squared += y.index_select(0, p).sub_(at[:, 1:]).square_()
         if o is not None:
-            near.scatter_(1, o[:, None], False)
-        row, column = near.nonzero(as_tuple=True)
-        lists.append(p[row] * num_candidates + column)
-        counts.append(near.sum(-1))
-    neighbors = _padded(torch.cat([*lists, place.new_zeros(1)]), torch.cat(counts) if counts else place)
-    if limit is None or neighbors.index.shape[1] <= limit:
-        return neighbors
-    offset = candidates.flatten(0, 1)[neighbors.index] - position[:, None]
-    squared = offset.square().sum(-1).masked_fill(~neighbors.mask, torch.inf)
-    nearest, column = (part[:, :limit] for part in squared.sort(dim=-1, stable=True))
-    return Neighbors(neighbors.index.gather(1, column), nearest < torch.inf)
+            squared.scatter_(1, o[:, None], torch.inf)
+        lists.append(_all_near(squared, radius_m) if limit is None else _nearest(squared, radius_m, limit))
+    near = _below_each_other(lists)
+    return Neighbors(near.index + place[:, None] * num_candidates, near.mask)
 
 
-def _padded(flat: Int64[Tensor, "E"], count: Int64[Tensor, "R"]) -> Neighbors:
-    """Lists behind each other, the last entry being nobody's, below each other."""
-    columns = torch.arange(max(int(count.max()) if len(count) else 0, 1), device=flat.device)
-    mask = columns < count[:, None]
-    entry = (count.cumsum(0) - count)[:, None] + columns
-    return Neighbors(flat[torch.where(mask, entry, len(flat) - 1)], mask)
+def _nearest(squared: Float[Tensor, "r C"], radius_m: float, limit: int) -> Neighbors:
+    nearest = squared.topk(min(limit, squared.shape[1]), dim=-1, largest=False)
+    return Neighbors(nearest.indices, nearest.values < radius_m**2)
+
+
+def _all_near(squared: Float[Tensor, "r C"], radius_m: float) -> Neighbors:
+    near = squared < radius_m**2
+    count = near.sum(-1, keepdim=True)
+    column = near.nonzero()[:, 1]
+    columns = torch.arange(max(int(count.max()) if len(count) else 0, 1), device=near.device)
+    mask = columns < count
+    entry = (count.cumsum(0) - count + columns).clamp(max=max(len(column) - 1, 0))
+    index = column[entry] if len(column) else torch.zeros_like(entry)
+    return Neighbors(index.masked_fill_(~mask, 0), mask)
+
+
+def _below_each_other(lists: list[Neighbors]) -> Neighbors:
+    """Lists of different widths below each other."""
+    width = max(part.index.shape[1] for part in lists)
+    pad = [(0, width - part.index.shape[1]) for part in lists]
+    return Neighbors(
+        torch.cat([functional.pad(part.index, p) for part, p in zip(lists, pad)]),
+        torch.cat([functional.pad(part.mask, p) for part, p in zip(lists, pad)]),
+    )
 
 
 def relative_pose(row: Poses, other: Poses, *, seam_rad: float) -> Float[Tensor, "R K 3"]:
