@@ -1,3 +1,5 @@
+import re
+
 import numpy as np
 import pytest
 from matplotlib.colors import to_hex
@@ -6,6 +8,7 @@ from matplotlib.patches import Rectangle
 from rlftsim.errors import DataError
 from rlftsim.viewer.figure import (  # fmt: skip
     BETTER,
+    COLOURS,
     NEITHER,
     WORSE,
     Band,
@@ -15,8 +18,14 @@ from rlftsim.viewer.figure import (  # fmt: skip
     draw_verdicts,
     save_figure,
 )
+from rlftsim.viewer.page import read_asset
 
 X = np.array([2.0, 4.0, 8.0])
+
+
+def test_curves_have_the_colours_of_the_page():
+    light = read_asset("page.css").split("@media")[0]
+    assert re.findall(r"--series-\d: (#\w+)", light) == list(COLOURS[:4])
 
 
 def test_both_kinds_of_files_are_written_whole(tmp_path):

@@ -39,7 +39,7 @@ def finetuning_charts(lines: Lines, kl_target: float | None = None) -> list[Char
     """Realism, reward, distance from the base model and what it costs: of fine-tuning with a reward."""
     return [
         _chart(lines, "Realism of the training rollouts", "RMM", rmm="RMM"),
-        _chart(lines, "Reward", "std over a scenario's rollouts", reward_std="MLOO"),
+        _chart(lines, "Reward", "std over a scenario's rollouts", reward_std="reward"),
         _chart(
             lines, "Distance from the base model", "nats per decision",
             reference=None if kl_target is None else ("target", kl_target), kl="KL",

@@ -8,11 +8,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from rlftsim.viewer.chart import Chart
-from rlftsim.viewer.figure import save_figure
+from rlftsim.viewer.figure import COLOURS, INK, save_figure
 
 CHART_INCHES = (4.6, 3.4)
-COLOURS = ("#1d63d8", "#e07b00", "#11754b", "#a21caf")
-"""The page's, in the same order."""
 
 
 def charts_to_png(path: Path, charts: Sequence[Chart], *, dots_per_inch: int = 120) -> None:
@@ -39,7 +37,7 @@ def _draw(axis: Axes, chart: Chart) -> None:
         colour = COLOURS[index % len(COLOURS)]
         axis.plot(np.asarray(curve.x), np.asarray(curve.y), color=colour, lw=1.2, marker=marker, ms=3, label=curve.name)
     if chart.reference:
-        axis.axhline(chart.reference[1], color="#79828f", ls="--", lw=1, label=chart.reference[0])
+        axis.axhline(chart.reference[1], color=INK, ls="--", lw=1, label=chart.reference[0])
     if len(axis.get_legend_handles_labels()[1]) > 1:
         axis.legend(frameon=False, fontsize=8)
     for side in ("top", "right"):

@@ -9,11 +9,11 @@ from matplotlib.colors import LinearSegmentedColormap, LogNorm
 from matplotlib.figure import Figure
 
 from rlftsim.tokens.coverage import MAX_SPEED_BIN_MPS, ClassCoverage, Spread
-from rlftsim.viewer.figure import save_figure
+from rlftsim.viewer.figure import COLOURS, INK, save_figure
 
 USE_COLOURS = LinearSegmentedColormap.from_list("use", ["#7cc4f0", "#1d63d8", "#0a1f4d"])
-DEAD, SPARE, INK, BARS = "#e5735c", "#8b94a1", "#24292f", "#c3ccd8"
-SINGLE, ROLLING = "#1d63d8", "#e07b00"
+DEAD, SPARE, BARS = "#e5735c", "#8b94a1", "#c3ccd8"
+SINGLE, ROLLING = COLOURS[:2]
 TICK_INCHES = 0.085
 SHOWN_SHARE = 0.998
 """Of the tokens, in x and in y; a single one far away would squeeze all others."""

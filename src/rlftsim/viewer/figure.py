@@ -16,8 +16,9 @@ from matplotlib.ticker import NullFormatter, NullLocator
 
 from rlftsim.files import write_whole
 
-COLOURS = ("#1d63d8", "#e07b00", "#16876b", "#a8328c", "#79828f")
-INK, PALE = "#222b36", "#c9cfd6"
+COLOURS = ("#1d63d8", "#e07b00", "#11754b", "#a21caf", "#79828f")
+"""Of curves; the first four are the page's (`page.css`), in the same order."""
+INK, PALE = "#24292f", "#c9cfd6"
 BETTER, WORSE, NEITHER, OWN = "#bfe3cf", "#f3c4bf", "#eef0ec", "#d7dbe0"
 DOTS_PER_INCH = 160
 
