@@ -22,6 +22,7 @@ from rlftsim.tokens.motions import (
     motion_keys,
     motions_of,
     window_keys,
+    with_mirror_images,
 )
 from rlftsim.tokens.trajtok import GridMotions, TrajTokConfig, rule_tokens
 from rlftsim.tokens.vocabulary import CLASS_NAMES, STEPS_PER_TOKEN, Vocabulary
@@ -176,7 +177,7 @@ def _without_dead(
     tokens: Float32[np.ndarray, "V 6 3"], motions: Float32[np.ndarray, "n 6 3"], class_index: int, config: TokensConfig
 ) -> Float32[np.ndarray, "W 6 3"]:
     """The first token and those that are nearest to some motion; of a mirrored pair, both or none."""
-    every = np.concatenate([motions, mirrored(motions)]) if config.mirror else motions
+    every = with_mirror_images(motions) if config.mirror else motions
     ends = end_boxes(every, class_index)
     while True:
         table = end_boxes(tokens, class_index)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int64
 from scipy.spatial import KDTree
 
-from rlftsim.tokens.motions import end_boxes, mirrored
+from rlftsim.tokens.motions import end_boxes, mirrored, straightened, with_mirror_images
 from rlftsim.tokens.vocabulary import STEPS_PER_TOKEN
 
 MIN_RADIUS_M = 0.02
@@ -77,7 +77,7 @@ def cluster_motions(
     if not len(motions):
         return _STILL, 0.0
     cloud = _motion_cloud(motions, class_index, mirror)
-    every = np.stack([motions, mirrored(motions)], 1).reshape(-1, *motions.shape[1:]) if mirror else motions
+    every = with_mirror_images(motions) if mirror else motions
     order = rng.permutation(len(every))
     radius = smallest_radius(cloud, order, coverage=coverage, limit=limit)
     disks, _ = lay_disks(cloud, order, radius, limit)
@@ -144,9 +144,8 @@ def _motion_cloud(motions: Float32[np.ndarray, "n 6 3"], class_index: int, mirro
     start = end_boxes(_STILL, class_index)[0].numpy()
     if not mirror:
         return Cloud(end_boxes(motions, class_index).numpy(), start)
-    both = np.stack([motions, mirrored(motions)], 1).reshape(-1, *motions.shape[1:])
-    straight = both * np.array([1, 0, 0], np.float32)
-    ends, on_axis = (end_boxes(m, class_index).numpy() for m in (both, straight))
+    both = with_mirror_images(motions)
+    ends, on_axis = (end_boxes(m, class_index).numpy() for m in (both, straightened(both)))
     return Cloud(ends, start, np.arange(len(both)) ^ 1, on_axis)
 
 
@@ -155,7 +154,7 @@ def _tokens_of(disk: Disk, motions: Float32[np.ndarray, "n 6 3"], mirror: bool) 
     token = mean_motion(motions[disk.members])[None]
     if disk.is_pair:
         return np.concatenate([token, mirrored(token)])
-    return token * np.array([1, 0, 0], np.float32) if mirror else token
+    return straightened(token) if mirror else token
 
 
 def mean_motion(motions: Float32[np.ndarray, "n 6 3"]) -> Float32[np.ndarray, "6 3"]:

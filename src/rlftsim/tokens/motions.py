@@ -69,6 +69,16 @@ def mirrored(poses: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
     return poses * _MIRROR
 
 
+def with_mirror_images(motions: Float32[np.ndarray, "n 6 3"]) -> Float32[np.ndarray, "m 6 3"]:
+    """Each motion followed by its mirror image."""
+    return np.stack([motions, mirrored(motions)], 1).reshape(-1, *motions.shape[1:])
+
+
+def straightened(motions: Float32[np.ndarray, "n 6 3"]) -> Float32[np.ndarray, "n 6 3"]:
+    """The motions moved onto the axis of the mirror: as far ahead, nothing to the side, no turn."""
+    return motions * np.array([1, 0, 0], np.float32)
+
+
 def end_boxes(poses: Float[np.ndarray, "n t 3"], class_index: int) -> Float[Tensor, "n 4 2"]:
     """Box of a class at the end of each motion."""
     return boxes(poses[:, -1:], class_index)[:, 0]

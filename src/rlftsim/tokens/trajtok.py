@@ -101,7 +101,7 @@ class GridMotions:
     @property
     def mean(self) -> Float[np.ndarray, "X Y 6 3"]:
         """Mean motion of each cell, zero where there is none."""
-        total = self._sum + self._sum[:, ::-1] * np.array([1, -1, -1])
+        total = self._sum + mirrored(self._sum[:, ::-1])
         return total / self.count.clip(min=1)[..., None, None]
 
 

@@ -158,14 +158,7 @@ def imitate(
         ConfigError: there is no scenario, or the model cannot be validated.
         CheckpointError: `out` holds another run, or the run diverged.
     """
-    if not len(scenarios):
-        raise ConfigError("no scenario to train on: is the data set empty, or the split misspelt?")
-    if config.label_smoothing_kind == "spatial" and not isinstance(getattr(model, "vocabulary", None), Vocabulary):
-        raise ConfigError(
-            f"{type(model).__name__} has no vocabulary, so nothing is near a token: set label_smoothing_kind=uniform."
-        )
-    if held_out is not None and config.validation.every:
-        refuse_to_validate(model, held_out)
+    _refuse_to_train(model, scenarios, config, held_out)
     fabric = start_fabric(config.device)
     run = RunFolder(out, config, describe_inputs(model, scenarios), writes=fabric.is_global_zero)
     model.to(fabric.device).train()
@@ -196,6 +189,20 @@ def imitate(
     if fabric.is_global_zero:
         model.eval().save_pretrained(run.model, card=card)  # type: ignore[operator]
     return run.model
+
+
+def _refuse_to_train(
+    model: nn.Module, scenarios: Scenarios, config: ImitationConfig, held_out: Scenarios | None
+) -> None:
+    """Say before a run what would end it."""
+    if not len(scenarios):
+        raise ConfigError("no scenario to train on: is the data set empty, or the split misspelt?")
+    if config.label_smoothing_kind == "spatial" and not isinstance(getattr(model, "vocabulary", None), Vocabulary):
+        raise ConfigError(
+            f"{type(model).__name__} has no vocabulary, so nothing is near a token: set label_smoothing_kind=uniform."
+        )
+    if held_out is not None and config.validation.every:
+        refuse_to_validate(model, held_out)
 
 
 def learning_rate(update: int, total: int, config: ImitationConfig) -> float:
@@ -233,14 +240,14 @@ def _update(learner: _Learner, update: int) -> dict[str, float]:
     norm = torch.nn.utils.clip_grad_norm_(parameters, config.gradient_clip)
     if math.isfinite(float(norm)):
         learner.optimizer.step()
-    loss, right, among_five, count = sums.tolist()
-    count = max(count, 1.0)
+    loss, right, among_five, predictions = sums.tolist()
+    count = max(predictions, 1.0)
     return {
         "loss": loss / count,
         "accuracy": right / count,
         "top5_accuracy": among_five / count,
         "gradient_norm": float(norm),
-        "predictions": count,
+        "predictions": predictions,
         "learning_rate": learner.optimizer.param_groups[0]["lr"],
     }
 
