@@ -11,7 +11,7 @@ PACKAGE = Path(rlftsim.__file__).parent
 
 FLOORS = (
     ("errors",),
-    ("files", "geometry", "progress", "workers"),
+    ("files", "geometry", "intervals", "progress", "workers"),
     ("scenario",),
     ("tokens", "goals"),
     ("rollout",),

@@ -219,10 +219,10 @@ def test_the_light_term_set_to_one_adds_what_it_lacks(data, tmp_path):
 def test_mean_and_standard_error_over_scenarios(data, tmp_path):
     result = evaluate(Wobble(), data, tmp_path, CONFIG, name="w")
     values = result.values("kinematic")
-    mean, error, count = result.mean_and_error("kinematic")
-    assert count == 6
-    assert mean == pytest.approx(values.mean())
-    assert error == pytest.approx(np.sqrt(((values - mean) ** 2).sum() / 5 / 6))
+    found = result.mean_and_error("kinematic")
+    assert found.count == 6
+    assert found.mean == pytest.approx(values.mean())
+    assert found.standard_error == pytest.approx(np.sqrt(((values - found.mean) ** 2).sum() / 5 / 6))
     with pytest.raises(ConfigError, match="no column 'rmm'"):
         result.mean_and_error("rmm")
 

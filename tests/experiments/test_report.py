@@ -9,7 +9,6 @@ from rich.console import Console
 
 from rlftsim.experiments.report import (
     ChartGroup,
-    Estimate,
     PairedComparison,
     Report,
     ResultRow,
@@ -17,6 +16,7 @@ from rlftsim.experiments.report import (
     result_table,
     write_report,
 )
+from rlftsim.intervals import MeanInterval, interval_around
 from rlftsim.viewer.chart import Chart, Curve
 from rlftsim.viewer.page import Animation, Panel
 from rlftsim.viewer.scene import AgentBoxes, MapLine, SceneView, Trajectories
@@ -44,6 +44,10 @@ class Nesting(HTMLParser):
         assert self.open.pop() == tag
 
 
+def measured(mean: float, error: float = math.nan) -> MeanInterval:
+    return interval_around(mean, error, 1000 if math.isfinite(error) else 1)
+
+
 def parse(html: str) -> list[str]:
     """Names of all elements, in order."""
     parser = Nesting()
@@ -68,9 +72,9 @@ def report() -> Report:
         title="Fine-tuning <demo>",
         summary=["Fine-tuned beats base & all."],
         rows=[
-            ResultRow("base", Estimate(0.7, 0.01), collision_rate=Estimate(0.051, 0.002)),
-            ResultRow("fine-tuned", Estimate(0.72, 0.01), collision_rate=Estimate(0.04), emphasised=True),
-            ResultRow("oracle", Estimate(0.9, 0.01), note="the log"),
+            ResultRow("base", measured(0.7, 0.01), collision_rate=measured(0.051, 0.002)),
+            ResultRow("fine-tuned", measured(0.72, 0.01), collision_rate=measured(0.04), emphasised=True),
+            ResultRow("oracle", measured(0.9, 0.01), note="the log"),
         ],
         comparison=PairedComparison(
             "base", "fine-tuned", 0.02, (0.01, 0.03), 0.0004, 3, differences=[0.01, 0.02, 0.03]
@@ -123,7 +127,7 @@ def test_each_part_may_be_missing(report, missing):
 
 def test_table_shows_mean_standard_error_and_interval(report):
     html = report_html(report)
-    # 0.7 ± 1.96 x 0.01; a rate of 0.051 is 5.1 %
+    # 0.7 ± 1.962 x 0.01 (t, 999 degrees of freedom); a rate of 0.051 is 5.1 %
     assert '<td title="95 % interval 0.6804 to 0.7196">0.7000 <span class="error">± 0.0100</span></td>' in html
     assert '5.10 <span class="error">± 0.20</span>' in html
     assert "<td>4.00</td>" in html  # no standard error, no interval
@@ -131,18 +135,9 @@ def test_table_shows_mean_standard_error_and_interval(report):
 
 
 def test_missing_and_undefined_numbers_are_dashes():
-    html = report_html(Report("t", rows=[ResultRow("a", Estimate(math.nan)), ResultRow("b", Estimate(0.5))]))
+    html = report_html(Report("t", rows=[ResultRow("a", measured(math.nan)), ResultRow("b", measured(0.5))]))
     assert html.count("<td>–</td>") == 1
     assert "nan" not in re.search(r"<table.*</table>", html)[0]
-
-
-def test_estimate_of_values_has_the_standard_error_of_the_mean():
-    # 1, 2, 3, 4: variance 5/3, divided by 4
-    estimate = Estimate.of([1, 2, 3, 4, math.nan])
-    assert estimate.mean == 2.5
-    assert estimate.standard_error == pytest.approx(math.sqrt(5 / 3 / 4))
-    assert Estimate.of([3.0]).limits is None
-    assert math.isnan(Estimate.of([]).mean)
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from safetensors.torch import load_file
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.experiments.evaluate import EvaluateConfig, evaluate
 from rlftsim.policies.smart.policy import SmartPolicy
-from rlftsim.scenario.dataset import ScenarioDataset
+from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
 from rlftsim.scenario.synthetic import pack_path
 from rlftsim.training.run_folder import read_metrics
 from rlftsim.training.validation import ValidationConfig
@@ -41,18 +41,21 @@ def test_validation_changes_nothing_of_the_training(stage, vocabulary, drawn_sce
 
 
 def test_the_last_validation_is_what_an_evaluation_of_the_model_finds(vocabulary, drawn_scenarios, held_out, tmp_path):
+    fewest = sorted(range(len(held_out)), key=lambda i: held_out.index["num_map_points"][i].as_py())[:5]
+    write_dataset([held_out[i] for i in fewest], tmp_path / "data", split="validation", licence_note="CC0-1.0")
+    held_out = ScenarioDataset(tmp_path / "data", "validation")
     policy = tiny.tiny_policy(vocabulary)
     everything = replace(OFTEN, every=100, num_scenarios=4)
     tiny.train("pretrain", policy, drawn_scenarios, tmp_path, held_out=held_out, validation=everything, epochs=0.5)
     line = read_metrics(tmp_path)[-1]
     model = SmartPolicy.from_pretrained(tmp_path / "model")
     found = evaluate(
-        model, pack_path(), tmp_path, EvaluateConfig(num_rollouts=2, seed=0), name="e", show_progress=False
+        model, tmp_path / "data", tmp_path, EvaluateConfig(num_rollouts=2, seed=0), name="e", show_progress=False
     )
     rows = [found.scenario_ids.index(held_out.scenario_ids[i]) for i in everything.choose(len(held_out))]
     assert len(set(rows)) == 4
     rmm = np.array(found.values("meta_metric"))[rows]
-    error = 1.96 * rmm.std(ddof=1) / math.sqrt(4)
+    error = 3.182446 * rmm.std(ddof=1) / math.sqrt(4)  # 97.5 % quantile of t with 3 degrees of freedom
     assert line["validation_rmm"] == pytest.approx(rmm.mean(), abs=1e-5)
     assert line["validation_rmm_low"] == pytest.approx(rmm.mean() - error, abs=1e-5)
     assert line["validation_rmm_high"] == pytest.approx(rmm.mean() + error, abs=1e-5)

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from rich.table import Table
-from scipy import stats
 
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.experiments.evaluation import SCORE_COLUMNS, Evaluation, direction_of
+from rlftsim.intervals import mean_interval
 
 TABLE_COLUMNS = (
     "meta_metric",
@@ -166,37 +166,6 @@ def paired_values(a: Evaluation, b: Evaluation, column: str) -> tuple[list[str],
     return [a.scenario_ids[row] for row in rows_a], a.values(column)[rows_a], b.values(column)[rows_b]
 
 
-@dataclass(frozen=True)
-class MeanInterval:
-    """A mean with what Student's t says about it."""
-
-    mean: float
-    standard_error: float
-    """NaN for fewer than two values."""
-    interval: tuple[float, float]
-    """Holds the true mean with probability 1 - alpha; NaN for fewer than two values."""
-    p_value: float
-    """Two-sided, of a true mean of 0; NaN where it cannot be told."""
-    count: int
-
-
-def mean_interval(values: np.ndarray, *, alpha: float = 0.05) -> MeanInterval:
-    """Mean, standard error, interval and one-sample t-test of values [n]; those that are not finite are left out."""
-    values = values[np.isfinite(values)]
-    count = len(values)
-    if count == 0:
-        return MeanInterval(math.nan, math.nan, (math.nan, math.nan), math.nan, 0)
-    mean, error, p_value, half = float(values.mean()), math.nan, math.nan, math.nan
-    if count > 1:
-        error = float(values.std(ddof=1)) / math.sqrt(count)
-        if error < 1e-12 * max(abs(mean), 1.0):  # rounding alone: the same value everywhere
-            error, half, p_value = 0.0, 0.0, float(mean == 0)
-        else:
-            half = float(stats.t.ppf(1 - alpha / 2, count - 1)) * error
-            p_value = 2 * float(stats.t.sf(abs(mean) / error, count - 1))
-    return MeanInterval(mean, error, (mean - half, mean + half), p_value, count)
-
-
 def compare_paired(column: str, a: np.ndarray, b: np.ndarray, *, alpha: float = 0.05) -> PairedDifference:
     """Paired t-test of two columns [scenarios]; scenarios without a value in both are left out."""
     known = np.isfinite(a) & np.isfinite(b)
@@ -220,7 +189,8 @@ def format_table(*evaluations: Evaluation, columns: Sequence[str] = TABLE_COLUMN
     for column in columns:
         table.add_column(_heading(column), justify="right")
     for evaluation in evaluations:
-        cells = [_plus_minus(*evaluation.mean_and_error(column)[:2]) for column in columns]
+        means = [evaluation.mean_and_error(column) for column in columns]
+        cells = [_plus_minus(found.mean, found.standard_error) for found in means]
         table.add_row(evaluation.name, str(len(evaluation)), *cells)
     return table
 

@@ -4,11 +4,10 @@ Columns: likelihoods and meta-metrics, higher is better; `*_error` in metres and
 """
 
 import json
-import math
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 import pyarrow as pa
@@ -17,13 +16,14 @@ import pyarrow.parquet as pq
 import rlftsim
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.files import write_whole
+from rlftsim.intervals import MeanInterval, mean_interval
 from rlftsim.realism import FEATURE_NAMES, RealismResult, SimulatedStates, metric_by_name
 from rlftsim.realism.miss import compute_miss_rates
+from rlftsim.realism.official_names import LIGHT
 from rlftsim.rollout.policy import Sampling
 from rlftsim.scenario.types import Scenario
 
 FORMAT = "rlftsim-evaluation-1"
-LIGHT = "traffic_light_violation"
 LIKELIHOOD_COLUMNS = tuple(f"{feature}_likelihood" for feature in FEATURE_NAMES)
 SCORE_COLUMNS = (
     "meta_metric",
@@ -134,17 +134,6 @@ class Provenance:
         return [name for name, value in mine.items() if value != theirs[name]]
 
 
-class MeanAndError(NamedTuple):
-    """Mean over scenarios."""
-
-    mean: float
-    """NaN without a single value."""
-    standard_error: float
-    """Standard deviation (n - 1) over the root of n; NaN for fewer than two scenarios."""
-    count: int
-    """Scenarios with a value."""
-
-
 @dataclass(frozen=True, eq=False)
 class Evaluation:
     """Scores of one policy on the scenarios of a data set."""
@@ -179,17 +168,13 @@ class Evaluation:
             raise ConfigError(f"an evaluation has no column {column!r}, only {', '.join(SCORE_COLUMNS)}.")
         return self.table[column].to_numpy()
 
-    def mean_and_error(self, column: str) -> MeanAndError:
-        """Mean and standard error over the scenarios that have a value.
+    def mean_and_error(self, column: str) -> MeanInterval:
+        """Mean, standard error and 95 % interval over the scenarios that have a value.
 
         Raises:
             ConfigError: there is no such column.
         """
-        values = self.values(column)
-        values = values[np.isfinite(values)]
-        mean = float(values.mean()) if len(values) else math.nan
-        error = float(values.std(ddof=1) / math.sqrt(len(values))) if len(values) > 1 else math.nan
-        return MeanAndError(mean, error, len(values))
+        return mean_interval(self.values(column))
 
     def write(self, path: Path) -> None:
         """Write as Parquet, whole or not at all."""
@@ -240,11 +225,10 @@ def row_of_result(result: RealismResult, scenario: Scenario, states: SimulatedSt
     misses = compute_miss_rates(scenario, states)
     scores = {
         "meta_metric_light_one": result.meta_metric + missing,
-        **{name: result.likelihood(feature) for name, feature in zip(LIKELIHOOD_COLUMNS, FEATURE_NAMES)},
         "miss_rate": misses.at_goal,
         "passing_miss_rate": misses.passing,
     }
-    numbers = {name: float(scores[name] if name in scores else getattr(result, name)) for name in SCORE_COLUMNS}
+    numbers = {name: float(scores[name] if name in scores else result.score_of(name)) for name in SCORE_COLUMNS}
     return {
         "scenario_id": result.scenario_ids[0],
         "num_agents": len(scenario.simulated_indices),

@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -11,14 +11,13 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from rlftsim.experiments.compare import compare, mean_interval
+from rlftsim.experiments.compare import compare
 from rlftsim.experiments.report import Column, ResultRow
 from rlftsim.experiments.workshop import Row, Workshop
 from rlftsim.files import write_text
+from rlftsim.intervals import mean_interval
 from rlftsim.training.run_folder import describe_environment, to_plain
 from rlftsim.viewer.figure import Interval, draw_intervals, save_figure
-
-NOT_COMPARABLE = "not comparable with ours: WOMD, another model"
 
 
 @dataclass(frozen=True)
@@ -105,11 +104,11 @@ def result_table(title: str, rows: Sequence[Row], columns: Sequence[Column]) -> 
 
 
 def row_numbers(rows: Sequence[Row], columns: Sequence[Column]) -> dict[str, Any]:
-    """Means, standard errors and the mean of every seed, by row and column of the evaluations."""
+    """Means with standard errors and 95 % intervals, and the mean of every seed, by row and column of the evaluations."""
     return {
         row.name: {
             column.source: {
-                **row.mean.mean_and_error(column.source)._asdict(),
+                **asdict(row.mean.mean_and_error(column.source)),
                 "by_seed": [evaluation.mean_and_error(column.source).mean for evaluation in row.by_seed],
             }
             for column in columns

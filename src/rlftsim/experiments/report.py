@@ -12,39 +12,9 @@ from rich.table import Table
 
 from rlftsim.experiments.evaluation import Evaluation, direction_of
 from rlftsim.files import write_text
+from rlftsim.intervals import MeanInterval
 from rlftsim.viewer.chart import Chart, chart_html, format_tick, nice_ticks
 from rlftsim.viewer.page import Animation, animation_html, page_html, read_asset
-
-NORMAL_QUANTILE_95 = 1.959964
-"""Half-width of a 95 % interval in standard errors."""
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """A mean over scenarios with its uncertainty."""
-
-    mean: float
-    standard_error: float | None = None
-    interval: tuple[float, float] | None = None
-    """95 %; None = mean ± 1.96 standard errors."""
-
-    @classmethod
-    def of(cls, values: Sequence[float] | Sequence[int] | np.ndarray) -> "Estimate":
-        """Mean and standard error of one value per scenario; values that are not finite are left out."""
-        finite = np.asarray(values, float)
-        finite = finite[np.isfinite(finite)]
-        if not len(finite):
-            return cls(math.nan)
-        error = float(finite.std(ddof=1) / math.sqrt(len(finite))) if len(finite) > 1 else None
-        return cls(float(finite.mean()), error)
-
-    @property
-    def limits(self) -> tuple[float, float] | None:
-        """The 95 % interval; None where the uncertainty is unknown."""
-        if self.interval is not None or self.standard_error is None:
-            return self.interval
-        half_width = NORMAL_QUANTILE_95 * self.standard_error
-        return self.mean - half_width, self.mean + half_width
 
 
 @dataclass(frozen=True)
@@ -52,17 +22,17 @@ class ResultRow:
     """One policy's results on the held-out scenarios. None = not measured."""
 
     name: str
-    realism_meta_metric: Estimate | None = None
-    kinematic: Estimate | None = None
-    interactive: Estimate | None = None
-    map_based: Estimate | None = None
-    min_average_displacement_error_m: Estimate | None = None
-    collision_rate: Estimate | None = None
+    realism_meta_metric: MeanInterval | None = None
+    kinematic: MeanInterval | None = None
+    interactive: MeanInterval | None = None
+    map_based: MeanInterval | None = None
+    min_average_displacement_error_m: MeanInterval | None = None
+    collision_rate: MeanInterval | None = None
     """Share in [0, 1]."""
-    offroad_rate: Estimate | None = None
+    offroad_rate: MeanInterval | None = None
     """Share in [0, 1]."""
-    average_displacement_error_m: Estimate | None = None
-    miss_rate: Estimate | None = None
+    average_displacement_error_m: MeanInterval | None = None
+    miss_rate: MeanInterval | None = None
     """Share in [0, 1]."""
     note: str = ""
     emphasised: bool = False
@@ -72,7 +42,7 @@ class ResultRow:
         cls, evaluation: Evaluation, columns: Sequence["Column"], *, note: str = "", emphasised: bool = False
     ) -> "ResultRow":
         """The row of an evaluation, with these of `COLUMNS`."""
-        estimates = {column.field: Estimate.of(evaluation.values(column.source)) for column in columns}
+        estimates = {column.field: evaluation.mean_and_error(column.source) for column in columns}
         return cls(evaluation.name, **estimates, note=note, emphasised=emphasised)
 
 
@@ -171,9 +141,9 @@ class Column:
         """Heading with an arrow that says which way is better."""
         return f"{self.heading} {'↑' if self.higher_is_better else '↓'}"
 
-    def estimate(self, row: ResultRow) -> Estimate | None:
+    def estimate(self, row: ResultRow) -> MeanInterval | None:
         """The row's value; None where it was not measured or has no finite mean."""
-        value: Estimate | None = getattr(row, self.field)
+        value: MeanInterval | None = getattr(row, self.field)
         return value if value is not None and math.isfinite(value.mean) else None
 
     def text(self, number: float) -> str:
@@ -185,7 +155,7 @@ class Column:
         estimate = self.estimate(row)
         if estimate is None:
             return "–"
-        error = f" ± {self.text(estimate.standard_error)}" if estimate.standard_error is not None else ""
+        error = f" ± {self.text(estimate.standard_error)}" if math.isfinite(estimate.standard_error) else ""
         return f"{self.text(estimate.mean)}{error}"
 
 
@@ -275,7 +245,7 @@ def _tiles_html(report: Report) -> str:
     for name in (comparison.first, comparison.second):
         estimate = by_name.get(name)
         if estimate is not None and comparison.metric == "RMM" and math.isfinite(estimate.mean):
-            tiles.append(_tile_html(f"RMM, {name}", format_number(estimate.mean, 4), estimate.limits))
+            tiles.append(_tile_html(f"RMM, {name}", format_number(estimate.mean, 4), estimate.interval))
     sign = "+" if comparison.mean_difference > 0 else ""
     tone = "good" if comparison.is_better else "bad" if comparison.is_worse else ""
     difference = sign + format_number(comparison.mean_difference, 4)
@@ -283,8 +253,10 @@ def _tiles_html(report: Report) -> str:
     return f'<div class="tiles">{"".join(tiles)}</div>'
 
 
-def _tile_html(what: str, value: str, interval: tuple[float, float] | None, tone: str = "") -> str:
-    limits = f'<div class="interval">95 % interval {_interval_text(interval, 4)}</div>' if interval else ""
+def _tile_html(what: str, value: str, interval: tuple[float, float], tone: str = "") -> str:
+    limits = (
+        f'<div class="interval">95 % interval {_interval_text(interval, 4)}</div>' if math.isfinite(interval[0]) else ""
+    )
     return f'<div class="card tile {tone}"><div class="what">{escape(what)}</div><div class="value">{value}</div>{limits}</div>'
 
 
@@ -318,12 +290,14 @@ def _table_row_html(row: ResultRow, columns: Sequence[Column]) -> str:
     return f'<tr{style}><th scope="row">{escape(row.name)}{note}</th>{cells}</tr>'
 
 
-def _cell_html(column: Column, estimate: Estimate | None) -> str:
+def _cell_html(column: Column, estimate: MeanInterval | None) -> str:
     if estimate is None:
         return "<td>–</td>"
-    error, limits = estimate.standard_error, estimate.limits
-    error_html = f' <span class="error">± {column.text(error)}</span>' if error is not None else ""
-    title = f' title="95 % interval {_interval_text(limits, column.digits, column.factor)}"' if limits else ""
+    error, limits = estimate.standard_error, estimate.interval
+    error_html = f' <span class="error">± {column.text(error)}</span>' if math.isfinite(error) else ""
+    title = (
+        f' title="95 % interval {_interval_text(limits, column.digits, column.factor)}"' if math.isfinite(error) else ""
+    )
     return f"<td{title}>{column.text(estimate.mean)}{error_html}</td>"
 
 

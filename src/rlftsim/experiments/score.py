@@ -18,7 +18,6 @@ from rich.table import Table
 
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.experiments.evaluation import (
-    LIGHT,
     SCORE_COLUMNS,
     EvaluateConfig,
     Evaluation,
@@ -27,32 +26,17 @@ from rlftsim.experiments.evaluation import (
     direction_of,
     row_of_result,
 )
-from rlftsim.experiments.parts import ResumableEvaluation, say
+from rlftsim.experiments.parts import ResumableEvaluation
 from rlftsim.experiments.rollout_files import RolloutEntry, find_rollouts, read_states
 from rlftsim.experiments.scenario_source import ScenarioSource, open_scenarios
+from rlftsim.progress import say
 from rlftsim.realism import MetricConfig, SimulatedStates, build_scenario_log, metric_by_name, score
 from rlftsim.realism.map_based import select_polylines
+from rlftsim.realism.official_names import is_reported, official_buckets, official_fields
 from rlftsim.scenario.types import ROAD_EDGE_TYPES, Scenario
 from rlftsim.workers import usable_cores
 
 _NO_ROAD_EDGE = "has no road edge, so the distance to it is undefined"
-_OFFICIAL_NAMES = {
-    "meta_metric": "metametric",
-    "average_displacement_error": "average_displacement_error",
-    "min_average_displacement_error": "min_average_displacement_error",
-    **{column: column for column in SCORE_COLUMNS if column.endswith("_likelihood")},
-    "collision_rate": "simulated_collision_rate",
-    "offroad_rate": "simulated_offroad_rate",
-    "traffic_light_violation_rate": "simulated_traffic_light_violation_rate",
-}
-_BUCKET_NAMES = {
-    "meta_metric": "realism_meta_metric",
-    "kinematic": "kinematic_metrics",
-    "interactive": "interactive_metrics",
-    "map_based": "map_based_metrics",
-    "min_average_displacement_error": "min_ade",
-    **{column: name for column, name in _OFFICIAL_NAMES.items() if column.endswith("_rate")},
-}
 
 
 @dataclass(frozen=True)
@@ -163,12 +147,14 @@ def format_scores(evaluation: Evaluation) -> Table:
     table = Table(title=title, title_justify="left")
     for heading in ("", "mean", "standard error", "scenarios", "metric"):
         table.add_column(heading, justify="left" if heading in ("", "metric") else "right", no_wrap=True)
-    for column in _reported_columns(metric, ("meta_metric", "meta_metric_light_one", *SCORE_COLUMNS[2:])):
-        mean, error, count = evaluation.mean_and_error(column)
+    for column in SCORE_COLUMNS:
+        if not is_reported(column, metric):
+            continue
+        found = evaluation.mean_and_error(column)
         arrow = "↑" if direction_of(column) == "higher" else "↓"
         label = "meta_metric, traffic light term set to 1" if column == "meta_metric_light_one" else column
-        spread = "" if math.isnan(error) else f"± {error:.4f}"
-        table.add_row(f"{label} {arrow}", f"{mean:.4f}", spread, str(count), metric.name)
+        spread = "" if math.isnan(found.standard_error) else f"± {found.standard_error:.4f}"
+        table.add_row(f"{label} {arrow}", f"{found.mean:.4f}", spread, str(found.count), metric.name)
     return table
 
 
@@ -272,14 +258,8 @@ def _refuse_mapless(skipped: Sequence[Skipped], config: ScoreConfig) -> None:
         )
 
 
-def _reported_columns(metric: MetricConfig, columns: Sequence[str]) -> list[str]:
-    """Those that the official result of that year has."""
-    return [column for column in columns if metric.reports_traffic_lights or LIGHT not in column]
-
-
 def _official_fields(values: dict[str, Any], metric: MetricConfig) -> dict[str, Any]:
     def named(names: dict[str, str]) -> dict[str, float | None]:
-        columns = _reported_columns(metric, list(names))
-        return {names[c]: values[c] if math.isfinite(values[c]) else None for c in columns}
+        return {official: values[c] if math.isfinite(values[c]) else None for c, official in names.items()}
 
-    return {**named(_OFFICIAL_NAMES), "buckets": named(_BUCKET_NAMES)}
+    return {**named(official_fields(metric)), "buckets": named(official_buckets(metric))}

@@ -23,6 +23,7 @@ from rlftsim.realism.features import (
     scenario_log,
 )
 from rlftsim.realism.likelihood import RolloutCounts, compute_likelihoods, count_rollouts, histogram_table, log_target
+from rlftsim.realism.official_names import official_buckets, official_fields
 from rlftsim.scenario.types import Scenario
 
 
@@ -64,48 +65,25 @@ class RealismResult:
         """Likelihood of one feature of `FEATURE_NAMES`."""
         return self.likelihoods[..., FEATURE_NAMES.index(feature)]
 
+    def score_of(self, name: str) -> Float[Tensor, "*B"]:
+        """A field, or `FEATURE_likelihood`."""
+        feature = name.removesuffix("_likelihood")
+        return self.likelihood(feature) if feature in FEATURE_NAMES else getattr(self, name)
+
     def to_official_fields(self) -> list[dict[str, object]]:
         """Plain numbers under the official messages' names, one entry per scenario; sub-scores under `buckets`."""
-        metrics = {name: values.reshape(-1).tolist() for name, values in self._official_metrics().items()}
-        buckets = {name: values.reshape(-1).tolist() for name, values in self._official_buckets().items()}
+        fields, buckets = (
+            {official: self.score_of(ours).reshape(-1).tolist() for ours, official in names.items()}
+            for names in (official_fields(self.config), official_buckets(self.config))
+        )
         return [
             {
                 "scenario_id": scenario_id,
-                **{name: column[row] for name, column in metrics.items()},
+                **{name: column[row] for name, column in fields.items()},
                 "buckets": {name: column[row] for name, column in buckets.items()},
             }
             for row, scenario_id in enumerate(self.scenario_ids)
         ]
-
-    def _official_rates(self) -> dict[str, Tensor]:
-        rates = {
-            "simulated_collision_rate": self.collision_rate,
-            "simulated_offroad_rate": self.offroad_rate,
-            "simulated_traffic_light_violation_rate": self.traffic_light_violation_rate,
-        }
-        return rates if self.config.reports_traffic_lights else dict(list(rates.items())[:2])
-
-    def _official_metrics(self) -> dict[str, Tensor]:
-        reported = [
-            name for name in FEATURE_NAMES if self.config.reports_traffic_lights or name != "traffic_light_violation"
-        ]
-        return {
-            "metametric": self.meta_metric,
-            "average_displacement_error": self.average_displacement_error,
-            "min_average_displacement_error": self.min_average_displacement_error,
-            **{f"{name}_likelihood": self.likelihood(name) for name in reported},
-            **self._official_rates(),
-        }
-
-    def _official_buckets(self) -> dict[str, Tensor]:
-        return {
-            "realism_meta_metric": self.meta_metric,
-            "kinematic_metrics": self.kinematic,
-            "interactive_metrics": self.interactive,
-            "map_based_metrics": self.map_based,
-            "min_ade": self.min_average_displacement_error,
-            **self._official_rates(),
-        }
 
 
 @lru_cache(maxsize=32)

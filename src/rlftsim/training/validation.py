@@ -1,7 +1,6 @@
 """Realism in closed loop of a model in training, on scenarios that it is not trained on. Changes nothing that the training sees."""
 
 import copy
-import math
 import time
 from dataclasses import dataclass
 
@@ -11,6 +10,7 @@ from lightning_fabric import Fabric
 from torch import nn
 
 from rlftsim.errors import ConfigError, require_positive
+from rlftsim.intervals import interval_around
 from rlftsim.realism import RealismResult, metric_by_name, score_batch
 from rlftsim.realism.from_rollouts import states_of_rollouts
 from rlftsim.rollout.policy import Policy
@@ -27,8 +27,6 @@ WATCHED = {
     "validation_min_ade_m": "min_average_displacement_error",
 }
 """What is logged, by its field of `RealismResult`."""
-QUANTILE_95 = 1.96
-"""Standard errors to either side of a mean that 95 % of a normal distribution lie within."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +85,7 @@ def validate(model: nn.Module, scenarios: Scenarios, config: ValidationConfig, f
         fabric: the processes.
 
     Returns:
-        Means over scenarios (`WATCHED`), the 95 % interval of the meta-metric's mean, and the seconds it took.
+        Means over scenarios (`WATCHED`), the 95 % interval of the meta-metric's mean (Student's t), and the seconds it took.
 
     Raises:
         DataError: a scenario withholds its future.
@@ -104,12 +102,10 @@ def validate(model: nn.Module, scenarios: Scenarios, config: ValidationConfig, f
         sums += torch.stack([finite.double(), values, values.square()]).sum(1)
     count, total, squares = add_up(sums, fabric)
     mean = total / count
-    variance = (squares - count * mean.square()).clamp(min=0) / (count - 1)
-    error = QUANTILE_95 * math.sqrt(float(variance[0] / count[0]))
-    logged = dict(zip(WATCHED, mean.tolist()))
-    rmm = logged["validation_rmm"]
-    interval = {"validation_rmm_low": rmm - error, "validation_rmm_high": rmm + error}
-    return {**logged, **interval, "seconds_validation": time.perf_counter() - start}
+    error = ((squares - count * mean.square()).clamp(min=0) / (count - 1) / count).sqrt()
+    low, high = interval_around(float(mean[0]), float(error[0]), int(count[0])).interval
+    logged = dict(zip(WATCHED, mean.tolist())) | {"validation_rmm_low": low, "validation_rmm_high": high}
+    return {**logged, "seconds_validation": time.perf_counter() - start}
 
 
 def _score(
