@@ -130,7 +130,7 @@ def test_a_longer_run_goes_on_from_a_shorter_one_to_the_same_weights(done):
     assert [line["update"] for line in steps] == [1, 2]
     alone = done.out / "alone"
     config = replace(TINY.finetune, seed=1)
-    stages.finetune_smart(done.base(), done.training, config, alone)
+    stages.finetune_with_reward(done.base(), done.training, config, alone)
     expected, found = (load_file(f / "model" / "model.safetensors") for f in (alone, done.model_folder(whole)))
     for name, values in expected.items():
         torch.testing.assert_close(found[name], values, rtol=0, atol=0)

@@ -6,23 +6,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-import torch
 from tyro.conf import Positional
 
-from rlftsim.cli.data import data_folder, open_split, splits_of
+from rlftsim.cli.data import open_split, splits_of
 from rlftsim.errors import ConfigError
 from rlftsim.experiments.learning_curve import write_learning_curve
-from rlftsim.policies.smart.policy import SmartPolicy
-from rlftsim.recipes.card import model_card
+from rlftsim.experiments.stages import finetune_with_catk, finetune_with_reward, pretrain_smart
 from rlftsim.recipes.configure import Override, configure
-from rlftsim.recipes.models import load_policy
 from rlftsim.recipes.smart import RECIPES
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.tokens.vocabulary import Vocabulary
-from rlftsim.training.catk import catk_finetune
-from rlftsim.training.finetune import finetune
 from rlftsim.training.parallel import is_first_process
-from rlftsim.training.pretrain import pretrain
 
 VALIDATION = "validation"
 """Split that is validated on where none is named."""
@@ -54,12 +48,10 @@ class Pretrain:
         """Build the model and train it."""
         recipe = configure(RECIPES[self.recipe](), self.set, sections=("model", "pretrain"))
         scenarios = open_split(self.data, self.split)
-        torch.manual_seed(recipe.pretrain.seed)
-        policy = SmartPolicy(recipe.model, Vocabulary.load(self.vocabulary))
+        vocabulary = Vocabulary.load(self.vocabulary)
         held_out = _held_out(self.data, self.validation_split, recipe.pretrain.validation.every)
-        card = model_card("pre-trained", data_folder(self.data), len(scenarios))
         with _drawn(self.out):
-            model = pretrain(policy, scenarios, self.out, recipe.pretrain, held_out=held_out, card=card)
+            model = pretrain_smart(vocabulary, scenarios, recipe.model, recipe.pretrain, self.out, held_out=held_out)
         print(f"model: {model}")
         return 0
 
@@ -115,15 +107,13 @@ class Finetune:
         """Load the model and fine-tune it."""
         section = "finetune" if self.method == "rlft" else "catk"
         recipe = configure(RECIPES[self.recipe](), self.set, sections=(section,))
-        scenarios, policy = open_split(self.data, self.split), load_policy(self.model)
-        how = recipe.finetune.reward if self.method == "rlft" else f"CAT-K, {recipe.catk.choice}"
-        card = model_card(f"fine-tuned ({how}) from {self.model}", data_folder(self.data), len(scenarios))
+        scenarios = open_split(self.data, self.split)
         every = recipe.catk.validation.every if self.method == "catk" else 0
         held_out = _held_out(self.data, self.validation_split, every)
         with _drawn(self.out):
             if self.method == "rlft":
-                model = finetune(policy, scenarios, self.out, recipe.finetune, card=card)
+                model = finetune_with_reward(self.model, scenarios, recipe.finetune, self.out)
             else:
-                model = catk_finetune(policy, scenarios, self.out, recipe.catk, held_out=held_out, card=card)
+                model = finetune_with_catk(self.model, scenarios, recipe.catk, self.out, held_out=held_out)
         print(f"model: {model}")
         return 0

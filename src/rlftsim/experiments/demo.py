@@ -22,7 +22,7 @@ from rlftsim.experiments.report import (
     result_table,
     write_report,
 )
-from rlftsim.experiments.stages import find_vocabulary, finetune_smart, open_training, pretrain_smart
+from rlftsim.experiments.stages import find_vocabulary, finetune_with_reward, open_training, pretrain_smart
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.progress import print_wide
 from rlftsim.recipes.smart import SmartRecipe
@@ -101,7 +101,7 @@ def run_demo(config: DemoConfig, out: Path) -> DemoResult:
     with stages("pre-training: predict the next token of every agent"):
         base = pretrain_smart(vocabulary, training, recipe.model, recipe.pretrain, out / "pretrain")
     with stages("fine-tuning: closed loop, MLOO reward, KL to the base model"):
-        tuned = finetune_smart(base, training, recipe.finetune, out / "finetune")
+        tuned = finetune_with_reward(base, training, recipe.finetune, out / "finetune")
     with stages(f"evaluation: {config.evaluate.num_rollouts} rollouts of every held-out scenario"):
         contestants = {BASE: SmartPolicy.from_pretrained(base), TUNED: SmartPolicy.from_pretrained(tuned)}
         evaluations = _evaluated(contestants, config, out / "evaluations")
@@ -173,7 +173,8 @@ def _charts(out: Path, config: DemoConfig) -> list[ChartGroup]:
         ChartGroup(
             "Fine-tuning",
             finetuning_charts(after, config.recipe.finetune.kl.target),
-            "Training rollouts come in groups of 4, so their RMM is not comparable with the table's (groups of 32).",
+            f"Training rollouts come in groups of {config.recipe.finetune.num_rollouts}, so their RMM is not comparable with the table's "
+            f"(groups of {config.evaluate.num_rollouts}).",
         ),
         ChartGroup("Pre-training", imitation_charts(before)),
     ]

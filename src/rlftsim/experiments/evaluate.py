@@ -4,7 +4,6 @@ A run that was interrupted goes on with what is missing, see `experiments.parts`
 """
 
 import copy
-import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -24,6 +23,7 @@ from rlftsim.rollout.policy import Policy, device_of
 from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import MANIFEST, ScenarioDataset
+from rlftsim.scenario.shards import hash_file
 from rlftsim.scenario.types import TOTAL_STEPS, Scenario
 
 __all__ = ["EvaluateConfig", "Evaluation", "Provenance", "Skipped", "evaluate", "simulate_states"]
@@ -60,7 +60,7 @@ def evaluate(
         ConfigError: an impossible name, or several processes for a policy that lives on a GPU.
     """
     dataset_folder, out = Path(dataset_folder), Path(out)
-    positions = _choose_scenarios(ScenarioDataset(dataset_folder, config.split), config)
+    positions = choose_scenarios(ScenarioDataset(dataset_folder, config.split), config)
     job = _Job(_frozen_copy(policy), dataset_folder, _describe(policy, dataset_folder, config), name, out)
     check_jobs(config, job.device)
     ids = _open(job).scenario_ids[: len(positions)]
@@ -145,12 +145,12 @@ def _describe(policy: Policy | Oracle, dataset_folder: Path, config: EvaluateCon
         policy="oracle" if is_oracle else type(policy).__name__,
         policy_fingerprint="oracle" if is_oracle else fingerprint_policy(policy),
         dataset=str(dataset_folder.resolve()),
-        manifest_sha256=hashlib.sha256((dataset_folder / MANIFEST).read_bytes()).hexdigest(),
+        manifest_sha256=hash_file(dataset_folder / MANIFEST),
     )
 
 
-def _choose_scenarios(dataset: ScenarioDataset, config: EvaluateConfig) -> range:
-    """Positions to evaluate.
+def choose_scenarios(dataset: ScenarioDataset, config: EvaluateConfig) -> range:
+    """Positions of the scenarios that are evaluated.
 
     Raises:
         DataError: none, or one without its future.

@@ -12,11 +12,10 @@ from pathlib import Path
 
 import pyarrow as pa
 import torch
-from rich.console import Console
 
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.experiments.evaluation import SCHEMA, Evaluation, Provenance, Skipped, join_evaluations
-from rlftsim.progress import progress_bar
+from rlftsim.progress import progress_bar, say
 from rlftsim.workers import Task, run_tasks
 
 SCENARIOS_PER_GROUP = 4
@@ -124,8 +123,3 @@ def one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(threads)
-
-
-def say(message: str) -> None:
-    """A line on stderr."""
-    Console(stderr=True, highlight=False, soft_wrap=True).print(message, markup=False)

@@ -7,6 +7,7 @@ import torch
 from rlftsim.policies.smart.config import SmartConfig
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.recipes.card import model_card
+from rlftsim.recipes.models import load_policy
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
 from rlftsim.tokens.vocabulary import Vocabulary
@@ -31,7 +32,13 @@ def find_vocabulary(training: ScenarioDataset, config: TokensConfig, path: Path,
 
 
 def pretrain_smart(
-    vocabulary: Vocabulary, training: ScenarioDataset, model: SmartConfig, config: PretrainConfig, out: Path
+    vocabulary: Vocabulary,
+    training: ScenarioDataset,
+    model: SmartConfig,
+    config: PretrainConfig,
+    out: Path,
+    *,
+    held_out: ScenarioDataset | None = None,
 ) -> Path:
     """Folder of a model pre-trained from fresh weights.
 
@@ -40,24 +47,32 @@ def pretrain_smart(
     """
     torch.manual_seed(config.seed)
     policy = SmartPolicy(model, vocabulary)
-    return pretrain(policy, training, out, config, card=model_card("pre-trained", training.folder, len(training)))
+    card = model_card("pre-trained", training.folder, len(training))
+    return pretrain(policy, training, out, config, held_out=held_out, card=card)
 
 
-def finetune_smart(base: Path, training: ScenarioDataset, config: FinetuneConfig, out: Path) -> Path:
+def finetune_with_reward(base: str | Path, training: ScenarioDataset, config: FinetuneConfig, out: Path) -> Path:
     """Folder of a model fine-tuned closed-loop from a base model.
 
     Raises:
         CheckpointError: `out` holds a run with other settings or another base model.
     """
-    card = model_card(f"fine-tuned with {config.reward.upper()}", training.folder, len(training))
-    return finetune(SmartPolicy.from_pretrained(base), training, out, config, card=card)
+    card = model_card(f"fine-tuned ({config.reward}) from {base}", training.folder, len(training))
+    return finetune(load_policy(str(base)), training, out, config, card=card)
 
 
-def finetune_catk(base: Path, training: ScenarioDataset, config: CatkConfig, out: Path) -> Path:
+def finetune_with_catk(
+    base: str | Path,
+    training: ScenarioDataset,
+    config: CatkConfig,
+    out: Path,
+    *,
+    held_out: ScenarioDataset | None = None,
+) -> Path:
     """Folder of a model fine-tuned with CAT-K from a base model.
 
     Raises:
         CheckpointError: `out` holds a run with other settings or another base model.
     """
-    card = model_card("fine-tuned with CAT-K", training.folder, len(training))
-    return catk_finetune(SmartPolicy.from_pretrained(base), training, out, config, card=card)
+    card = model_card(f"fine-tuned (CAT-K, {config.choice}) from {base}", training.folder, len(training))
+    return catk_finetune(load_policy(str(base)), training, out, config, held_out=held_out, card=card)

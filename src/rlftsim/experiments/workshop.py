@@ -36,9 +36,15 @@ from rlftsim.experiments.contestants import (
 )
 from rlftsim.experiments.evaluate import EvaluateConfig, evaluate
 from rlftsim.experiments.evaluation import SCHEMA, SCORE_COLUMNS, Evaluation
-from rlftsim.experiments.parts import say
-from rlftsim.experiments.stages import find_vocabulary, finetune_catk, finetune_smart, open_training, pretrain_smart
+from rlftsim.experiments.stages import (
+    find_vocabulary,
+    finetune_with_catk,
+    finetune_with_reward,
+    open_training,
+    pretrain_smart,
+)
 from rlftsim.policies.smart.policy import SmartPolicy
+from rlftsim.progress import say
 from rlftsim.recipes.models import Device, find_model, load_policy, load_policy_or_oracle
 from rlftsim.recipes.smart import SmartRecipe
 from rlftsim.rollout.fingerprint import fingerprint_policy
@@ -223,10 +229,10 @@ class Workshop:
     def _finetune(self, contestant: FineTuned) -> None:
         out, base = self.model_folder(contestant), self._result(contestant.base)
         if contestant.method == CATK:
-            finetune_catk(base, self.training, catk_config(contestant, self.recipe), out)
+            finetune_with_catk(base, self.training, catk_config(contestant, self.recipe), out)
             return
         self._start_from_shorter(out, self._epochs(contestant))
-        finetune_smart(base, self.training, finetune_config(contestant, self.recipe.finetune), out)
+        finetune_with_reward(base, self.training, finetune_config(contestant, self.recipe.finetune), out)
 
     def _start_from_shorter(self, out: Path, epochs: float) -> None:
         """Take over the end of a shorter run of the same contestant: a longer one passes through the same weights, because

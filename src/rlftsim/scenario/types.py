@@ -60,7 +60,6 @@ class MapFeatureType(IntEnum):
 
 
 LANE_TYPES = (0, 1, 2, 3)
-ROAD_LINE_TYPES = tuple(range(5, 14))
 ROAD_EDGE_TYPES = (14, 15, 16)
 
 

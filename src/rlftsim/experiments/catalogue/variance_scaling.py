@@ -17,12 +17,12 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.experiments.compare import MeanInterval, mean_interval
-from rlftsim.experiments.evaluate import EvaluateConfig, check_jobs, simulate_states
+from rlftsim.experiments.evaluate import EvaluateConfig, check_jobs, choose_scenarios, simulate_states
 from rlftsim.experiments.findings import Experiment, Findings, TextTable
 from rlftsim.experiments.parts import one_thread
 from rlftsim.experiments.workshop import Workshop
 from rlftsim.files import write_text
+from rlftsim.intervals import MeanInterval, mean_interval
 from rlftsim.progress import progress_bar
 from rlftsim.realism import Features, ScenarioLog, build_scenario_log, compute_features, metric_by_name, score_features
 from rlftsim.recipes.models import load_policy
@@ -70,7 +70,7 @@ def measure(workshop: Workshop) -> Variances:
         load_policy(str(workshop.base()), workshop.device), workshop.data, config, sizes, workshop.out / "variances"
     )
     check_jobs(config, device_of(job.policy))
-    chosen = range(min(len(dataset), config.limit or len(dataset)))
+    chosen = choose_scenarios(dataset, config)
     ids = [dataset.scenario_ids[i] for i in chosen]
     missing = [i for i in chosen if _read(job.path_of(dataset.scenario_ids[i]), sizes) is None]
     with progress_bar("variances", len(chosen), len(chosen) - len(missing)) as advance, one_thread():
