@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from rlftsim.experiments.columns import ResultRow
 from rlftsim.experiments.report import (
     ChartGroup,
     PairedComparison,
     Report,
-    ResultRow,
     report_html,
-    result_table,
+    report_table,
     write_report,
 )
 from rlftsim.intervals import MeanInterval, interval_around
@@ -157,7 +157,7 @@ def test_own_verdict_is_kept():
 
 def test_terminal_table_has_the_same_numbers(report):
     out = io.StringIO()
-    Console(file=out, width=120).print(result_table(report))
+    Console(file=out, width=120).print(report_table(report))
     text = out.getvalue()
     assert "0.7000 ± 0.0100" in text
     assert "collision [%] ↓" in text
@@ -165,4 +165,4 @@ def test_terminal_table_has_the_same_numbers(report):
 
 
 def test_report_without_rows_prints_an_empty_table():
-    Console(file=io.StringIO()).print(result_table(Report("Empty")))
+    Console(file=io.StringIO()).print(report_table(Report("Empty")))

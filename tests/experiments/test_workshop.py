@@ -14,11 +14,11 @@ from rlftsim.cli.main import main
 from rlftsim.errors import CheckpointError, ConfigError
 from rlftsim.experiments import stages
 from rlftsim.experiments.catalogue import variance_scaling
+from rlftsim.experiments.columns import SCORES
 from rlftsim.experiments.contestants import BASE, CATK, ORACLE, Base, FineTuned, over_seeds
 from rlftsim.experiments.demo import DemoConfig, run_demo
 from rlftsim.experiments.evaluate import EvaluateConfig
 from rlftsim.experiments.findings import Experiment, Findings, result_table, run_experiment, verdict_line
-from rlftsim.experiments.report import SCORES
 from rlftsim.experiments.workshop import Workshop
 from rlftsim.scenario.dataset import write_dataset
 

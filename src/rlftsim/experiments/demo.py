@@ -9,17 +9,16 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
+from rlftsim.experiments.columns import SCORES, ResultRow
 from rlftsim.experiments.compare import Comparison, compare, paired_values
 from rlftsim.experiments.evaluate import EvaluateConfig, evaluate
 from rlftsim.experiments.evaluation import Evaluation
 from rlftsim.experiments.learning_curve import finetuning_charts, imitation_charts
 from rlftsim.experiments.report import (
-    SCORES,
     ChartGroup,
     PairedComparison,
     Report,
-    ResultRow,
-    result_table,
+    report_table,
     write_report,
 )
 from rlftsim.experiments.stages import find_vocabulary, finetune_with_reward, open_training, pretrain_smart
@@ -111,7 +110,7 @@ def run_demo(config: DemoConfig, out: Path) -> DemoResult:
         report = build_report(evaluations, comparison, animations, config, out, stages.seconds)
         write_report(out / "report.html", report)
         to_png(out / "picture.png", animations[0])
-    print_wide(result_table(report))
+    print_wide(report_table(report))
     print(f"fine-tuned against base, {comparison.pairing}: {comparison['meta_metric'].verdict}")
     return DemoResult(out / "report.html", comparison, evaluations)
 

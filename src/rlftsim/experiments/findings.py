@@ -11,8 +11,8 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 from rich.table import Table
 
+from rlftsim.experiments.columns import Column, ResultRow
 from rlftsim.experiments.compare import compare
-from rlftsim.experiments.report import Column, ResultRow
 from rlftsim.experiments.workshop import Row, Workshop
 from rlftsim.files import write_text
 from rlftsim.intervals import mean_interval

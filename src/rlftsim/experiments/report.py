@@ -10,40 +10,11 @@ from pathlib import Path
 import numpy as np
 from rich.table import Table
 
-from rlftsim.experiments.evaluation import Evaluation, direction_of
+from rlftsim.experiments.columns import Column, ResultRow, format_number, shown_columns
 from rlftsim.files import write_text
 from rlftsim.intervals import MeanInterval
 from rlftsim.viewer.chart import Chart, chart_html, format_tick, nice_ticks
 from rlftsim.viewer.page import Animation, animation_html, page_html, read_asset
-
-
-@dataclass(frozen=True)
-class ResultRow:
-    """One policy's results on the held-out scenarios. None = not measured."""
-
-    name: str
-    realism_meta_metric: MeanInterval | None = None
-    kinematic: MeanInterval | None = None
-    interactive: MeanInterval | None = None
-    map_based: MeanInterval | None = None
-    min_average_displacement_error_m: MeanInterval | None = None
-    collision_rate: MeanInterval | None = None
-    """Share in [0, 1]."""
-    offroad_rate: MeanInterval | None = None
-    """Share in [0, 1]."""
-    average_displacement_error_m: MeanInterval | None = None
-    miss_rate: MeanInterval | None = None
-    """Share in [0, 1]."""
-    note: str = ""
-    emphasised: bool = False
-
-    @classmethod
-    def of(
-        cls, evaluation: Evaluation, columns: Sequence["Column"], *, note: str = "", emphasised: bool = False
-    ) -> "ResultRow":
-        """The row of an evaluation, with these of `COLUMNS`."""
-        estimates = {column.field: evaluation.mean_and_error(column.source) for column in columns}
-        return cls(evaluation.name, **estimates, note=note, emphasised=emphasised)
 
 
 @dataclass(frozen=True)
@@ -119,69 +90,6 @@ class Report:
     footnotes: Sequence[str] = ()
 
 
-@dataclass(frozen=True)
-class Column:
-    """How one field of `ResultRow` is shown."""
-
-    field: str
-    source: str
-    """Column of an `Evaluation`."""
-    heading: str
-    meaning: str
-    digits: int
-    factor: float = 1.0
-
-    @property
-    def higher_is_better(self) -> bool:
-        """Which way is better."""
-        return direction_of(self.source) == "higher"
-
-    @property
-    def label(self) -> str:
-        """Heading with an arrow that says which way is better."""
-        return f"{self.heading} {'↑' if self.higher_is_better else '↓'}"
-
-    def estimate(self, row: ResultRow) -> MeanInterval | None:
-        """The row's value; None where it was not measured or has no finite mean."""
-        value: MeanInterval | None = getattr(row, self.field)
-        return value if value is not None and math.isfinite(value.mean) else None
-
-    def text(self, number: float) -> str:
-        """A number in the column's unit and digits."""
-        return format_number(self.factor * number, self.digits)
-
-    def cell(self, row: ResultRow) -> str:
-        """Mean ± standard error, or a dash."""
-        estimate = self.estimate(row)
-        if estimate is None:
-            return "–"
-        error = f" ± {self.text(estimate.standard_error)}" if math.isfinite(estimate.standard_error) else ""
-        return f"{self.text(estimate.mean)}{error}"
-
-
-SCORES = (
-    Column("realism_meta_metric", "meta_metric", "RMM", "realism meta-metric", 4),
-    Column("kinematic", "kinematic", "kinematic", "kinematic sub-score", 4),
-    Column("interactive", "interactive", "interactive", "interactive sub-score", 4),
-    Column("map_based", "map_based", "map-based", "map-based sub-score", 4),
-    Column(
-        "min_average_displacement_error_m", "min_average_displacement_error", "minADE [m]",
-        "displacement from the log of the best rollout", 2,
-    ),
-    Column("collision_rate", "collision_rate", "collision [%]", "evaluated agents that collide", 2, 100.0),
-    Column("offroad_rate", "offroad_rate", "off-road [%]", "evaluated agents that leave the road", 2, 100.0),
-)  # fmt: skip
-"""What every table of policies shows."""
-COLUMNS = (
-    *SCORES,
-    Column(
-        "average_displacement_error_m", "average_displacement_error", "ADE [m]",
-        "displacement from the log, mean over rollouts", 2,
-    ),
-    Column("miss_rate", "miss_rate", "miss [%]", "evaluated agents that end too far from the log's end", 2, 100.0),
-)  # fmt: skip
-
-
 def write_report(path: str | os.PathLike[str], report: Report) -> None:
     """Write the report as one self-contained HTML page. Nothing half-written is left at `path`."""
     write_text(Path(path), report_html(report))
@@ -202,7 +110,7 @@ def report_html(report: Report) -> str:
     return page_html(report.title, "\n".join(s for s in sections if s), extra_js=read_asset("chart.js"))
 
 
-def result_table(report: Report) -> Table:
+def report_table(report: Report) -> Table:
     """The result table for a terminal."""
     table = Table(title=report.title, caption=report.table_note or None, title_justify="left", caption_justify="left")
     table.add_column("policy", no_wrap=True)
@@ -215,19 +123,9 @@ def result_table(report: Report) -> Table:
     return table
 
 
-def format_number(value: float, digits: int) -> str:
-    """Fixed digits, with a real minus sign."""
-    return f"{value:.{digits}f}".replace("-", "−")
-
-
 def _sentence(text: str) -> str:
     """With a capital first letter."""
     return text[:1].upper() + text[1:]
-
-
-def shown_columns(rows: Sequence[ResultRow]) -> list[Column]:
-    """Columns that some row has."""
-    return [column for column in COLUMNS if any(getattr(row, column.field) is not None for row in rows)]
 
 
 def _heading_html(report: Report) -> str:

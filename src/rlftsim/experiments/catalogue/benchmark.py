@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rlftsim.experiments.catalogue import published
+from rlftsim.experiments.columns import SCORES
 from rlftsim.experiments.compare import paired_values
 from rlftsim.experiments.contestants import BASE, CATK, CONSTANT_VELOCITY, ORACLE, Contestant, FineTuned, over_seeds
 from rlftsim.experiments.evaluation import Evaluation
@@ -20,7 +21,6 @@ from rlftsim.experiments.findings import (
     seeds_line,
     verdict_line,
 )
-from rlftsim.experiments.report import SCORES
 from rlftsim.experiments.workshop import Row, Workshop
 
 REFERENCE, IMITATION, TUNED, CEILING, FLOOR = "base", "CAT-K", "RLFTSim (MLOO)", "oracle", "constant velocity"

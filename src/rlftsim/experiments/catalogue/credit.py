@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 
 from rlftsim.experiments.catalogue.reward_ablation import REFERENCE, REWARDS
+from rlftsim.experiments.columns import COLUMNS
 from rlftsim.experiments.contestants import BASE, over_seeds
 from rlftsim.experiments.findings import (
     Experiment,
@@ -14,7 +15,6 @@ from rlftsim.experiments.findings import (
     seeds_line,
     verdict_line,
 )
-from rlftsim.experiments.report import COLUMNS
 from rlftsim.experiments.workshop import Row, Workshop
 
 COMPARED = ("MLOO", "MLOO, credit by agent")

@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from rlftsim.experiments.catalogue import published
+from rlftsim.experiments.columns import SCORES
 from rlftsim.experiments.compare import compare
 from rlftsim.experiments.contestants import BASE, CATK, WEAK_EPOCHS, Base, Contestant, FineTuned, over_seeds
 from rlftsim.experiments.findings import (
@@ -16,7 +17,6 @@ from rlftsim.experiments.findings import (
     row_numbers,
     verdict_line,
 )
-from rlftsim.experiments.report import SCORES
 from rlftsim.experiments.workshop import Row, Workshop
 from rlftsim.viewer.figure import Band, draw_bands
 

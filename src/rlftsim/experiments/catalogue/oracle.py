@@ -4,10 +4,10 @@ import math
 from collections.abc import Mapping
 
 from rlftsim.experiments.catalogue import published
+from rlftsim.experiments.columns import SCORES, format_number
 from rlftsim.experiments.contestants import ORACLE
 from rlftsim.experiments.evaluation import Evaluation
 from rlftsim.experiments.findings import Experiment, Findings, TextTable, result_table, row_numbers
-from rlftsim.experiments.report import SCORES, format_number
 from rlftsim.experiments.workshop import Row, Workshop
 from rlftsim.intervals import MeanInterval
 from rlftsim.realism import FEATURE_NAMES, metric_by_name
