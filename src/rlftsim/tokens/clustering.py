@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 
-from rlftsim.errors import ConfigError, DataError, require_positive
+from rlftsim.errors import ConfigError, DataError, given, require_finite, require_not_negative, require_positive
 from rlftsim.progress import progress_bar
 from rlftsim.scenario.types import STEP_S, Scenarios
 from rlftsim.tokens.agent_tokens import nearest_rows
@@ -60,7 +60,9 @@ class TokensConfig:
             raise ConfigError(f"a vocabulary needs num_tokens >= 2 and num_map_prototypes >= 1, got {self}.")
         if not 0 < self.coverage <= 1:
             raise ConfigError(f"coverage is a share in (0, 1], got {self.coverage}.")
-        require_positive(self, ("max_segments",) if self.max_scenarios is None else ("max_segments", "max_scenarios"))
+        require_positive(self, ("max_segments", *given(self, ("max_scenarios",))))
+        require_not_negative(self, ("straight_up_to_mps", "seed"))
+        require_finite(self, ("straight_up_to_mps",))
 
 
 def build_vocabulary(

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 
-from rlftsim.errors import ConfigError, require_positive
+from rlftsim.errors import ConfigError, given, require_positive
 from rlftsim.rollout.noise import derive_seed
 from rlftsim.rollout.policy import DecisionDistribution, Policy, Sampling
 from rlftsim.rollout.simulate import simulate
@@ -78,9 +78,7 @@ class CatkConfig(ImitationConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_positive(self, ("num_candidates",))
-        if self.max_distance_lengths is not None:
-            require_positive(self, ("max_distance_lengths",))
+        require_positive(self, ("num_candidates", *given(self, ("max_distance_lengths",))))
 
 
 def catk_finetune(

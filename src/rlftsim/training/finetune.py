@@ -15,7 +15,7 @@ import torch
 from lightning_fabric import Fabric
 from torch import Tensor, nn
 
-from rlftsim.errors import ConfigError, require_positive
+from rlftsim.errors import ConfigError, require_finite, require_not_negative, require_positive
 from rlftsim.progress import progress_bar, say
 from rlftsim.realism import AgentScores, RealismResult, measure_batch, metric_by_name, score_measured
 from rlftsim.realism.from_rollouts import states_of_rollouts
@@ -92,11 +92,16 @@ class FinetuneConfig:
             "micro_batch_size",
             "rollouts_per_pass",
             "learning_rate",
+            "gradient_clip",
             "checkpoint_every",
             "max_kl",
             "max_skipped_in_a_row",
         )
         require_positive(self, positive)
+        require_not_negative(self, ("warmup_updates", "weight_decay"))
+        require_finite(self, ("epochs", "learning_rate", "weight_decay", "entropy_bonus"))
+        if not all(0 <= beta < 1 for beta in self.betas):
+            raise ConfigError(f"betas are shares in [0, 1), got {self.betas}.")
         if not 0 <= self.shared_credit <= 1:
             raise ConfigError(f"shared_credit is a share in [0, 1], got {self.shared_credit}.")
         metric_by_name(self.metric)

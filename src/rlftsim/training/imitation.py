@@ -18,8 +18,8 @@ from lightning_fabric import Fabric
 from torch import Tensor, nn
 from torch.nn import functional
 
-from rlftsim.errors import ConfigError, require_positive
-from rlftsim.progress import progress_bar
+from rlftsim.errors import ConfigError, given, require_finite, require_not_negative, require_positive
+from rlftsim.progress import progress_bar, say
 from rlftsim.rollout.noise import derive_seed
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import Scenarios
@@ -102,11 +102,15 @@ class ImitationConfig:
     device: DeviceConfig = field(default_factory=DeviceConfig)
 
     def __post_init__(self) -> None:
-        positive = ("epochs", "batch_size", "micro_batch_size", "learning_rate", "checkpoint_every", "trained_radius_m")
-        require_positive(self, positive)
-        require_positive(
-            self, tuple(n for n in ("micro_batch_cost", "context_radius_m") if getattr(self, n) is not None)
-        )
+        positive = (
+            "epochs", "batch_size", "micro_batch_size", "learning_rate", "gradient_clip", "trained_radius_m",
+            "max_skipped_in_a_row", "checkpoint_every",
+        )  # fmt: skip
+        require_positive(self, (*positive, *given(self, ("micro_batch_cost", "context_radius_m"))))
+        require_not_negative(self, ("warmup_updates", "weight_decay", *given(self, ("max_trained_agents",))))
+        require_finite(self, ("epochs", "learning_rate", "weight_decay"))
+        if not 0 <= self.final_learning_rate_share <= 1:
+            raise ConfigError(f"final_learning_rate_share is a share in [0, 1], got {self.final_learning_rate_share}.")
         if not 0 <= self.label_smoothing < 1:
             raise ConfigError(f"label_smoothing is a share in [0, 1), got {self.label_smoothing}.")
 
@@ -180,10 +184,16 @@ def imitate(
                 realism = f", RMM {values['validation_rmm']:.3f}"
             run.log(update + 1, values)
             skipped = 0 if math.isfinite(values["gradient_norm"]) else skipped + 1
+            if skipped and fabric.is_global_zero:
+                limit = f"{skipped} in a row, the run stops at {config.max_skipped_in_a_row}"
+                say(f"update {update + 1} skipped: its gradient is not finite ({limit})")
             if skipped >= config.max_skipped_in_a_row:
                 raise run.diverged(f"the gradients of {skipped} updates in a row are not finite", "lower learning_rate")
-            if fabric.is_global_zero and ((update + 1) % config.checkpoint_every == 0 or update + 1 == total):
-                write_checkpoint(run.checkpoints, Progress(update + 1), {"policy": model}, optimizer)
+            if (update + 1) % config.checkpoint_every == 0 or update + 1 == total:
+                if not all(p.isfinite().all() for p in trained):
+                    raise run.diverged("weights are not finite any more", "lower learning_rate")
+                if fabric.is_global_zero:
+                    write_checkpoint(run.checkpoints, Progress(update + 1), {"policy": model}, optimizer)
             advance(note=f"loss {values['loss']:.3f}, right {values['accuracy']:.0%}{realism}")
     run.close()
     if fabric.is_global_zero:

@@ -13,7 +13,7 @@ import torch
 from lightning_fabric import Fabric
 from torch import Tensor, nn
 
-from rlftsim.errors import ConfigError
+from rlftsim.errors import ConfigError, require_not_negative, require_positive
 from rlftsim.training.batches import share_out
 
 
@@ -28,6 +28,10 @@ class DeviceConfig:
     precision: Literal["32-true", "bf16-mixed"] = "32-true"
     threads: int = 0
     """CPU threads of each process; 0 = torch's own choice. More than one needs OMP_WAIT_POLICY=PASSIVE on shared cores."""
+
+    def __post_init__(self) -> None:
+        require_positive(self, ("devices", "num_nodes"))
+        require_not_negative(self, ("threads",))
 
 
 def start_fabric(config: DeviceConfig) -> Fabric:

@@ -9,7 +9,7 @@ import torch
 from lightning_fabric import Fabric
 from torch import nn
 
-from rlftsim.errors import ConfigError, require_positive
+from rlftsim.errors import ConfigError, require_not_negative, require_positive
 from rlftsim.intervals import interval_around
 from rlftsim.realism import RealismResult, metric_by_name, score_batch
 from rlftsim.realism.from_rollouts import states_of_rollouts
@@ -50,6 +50,7 @@ class ValidationConfig:
         if self.every < 0:
             raise ConfigError(f"validation.every must be 0 (never) or more updates, got {self.every}.")
         require_positive(self, ("num_scenarios", "num_rollouts", "scenarios_per_pass"))
+        require_not_negative(self, ("seed",))
         metric_by_name(self.metric)
 
     def is_due(self, update: int, total: int) -> bool:

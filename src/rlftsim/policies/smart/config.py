@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from rlftsim.errors import ConfigError
+from rlftsim.errors import ConfigError, given, require_finite, require_positive
 
 
 @dataclass(frozen=True)
@@ -48,9 +48,19 @@ class SmartConfig:
         return 0.0 if self.public_code_quirks else 1e-3
 
     def __post_init__(self) -> None:
-        for name in ("dim", "num_heads", "head_dim", "num_map_layers", "num_decoder_layers", "history_tokens"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"{name} must be at least 1, got {getattr(self, name)}.")
+        sizes = (
+            "dim",
+            "num_heads",
+            "head_dim",
+            "num_map_layers",
+            "num_decoder_layers",
+            "num_frequencies",
+            "history_tokens",
+        )
+        radii = ("map_radius_m", "agent_map_radius_m", "agent_radius_m")
+        caps = ("max_map_neighbors", "max_agent_map_neighbors", "max_agent_neighbors")
+        require_positive(self, (*sizes, *radii, *given(self, caps)))
+        require_finite(self, radii)
         if not 0 <= self.dropout < 1 or not 0 <= self.history_drop < 1:
             raise ConfigError(
                 f"dropout and history_drop are shares in [0, 1), got {self.dropout} and {self.history_drop}."
