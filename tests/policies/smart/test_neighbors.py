@@ -15,9 +15,18 @@ def test_the_radius_is_strict_and_nobody_is_their_own_neighbour():
     assert not within(HERE, FIRST, PLACES, None, radius_m=1.0, limit=None).mask.any()
 
 
-def test_of_equally_near_ones_the_same_are_kept_whoever_else_looks():
+def test_of_equally_near_ones_the_first_are_kept_whoever_else_looks():
     alone = within(HERE, FIRST, PLACES, None, radius_m=2.0, limit=2)
     others = torch.cat([HERE, torch.tensor([[1.5, 0.0], [40.0, 0.0]])])
     together = within(others, FIRST.repeat(3), PLACES, None, radius_m=2.0, limit=2)
-    assert alone.index[0].tolist() == together.index[0].tolist()
+    assert alone.index[0].tolist() == together.index[0].tolist() == [0, 1]
     assert together.mask.tolist() == [[True, True], [True, True], [False, False]]
+
+
+def test_of_equally_near_ones_the_first_are_kept_however_much_padding_there_is():
+    angles = torch.arange(24) * (2 * torch.pi / 4)  # six in each of four places, all 1 m away
+    around = torch.stack([angles.cos().round(), angles.sin().round()], -1)
+    for padding in (0, 5, 1000, 5000):
+        candidates = torch.cat([around, torch.full((padding, 2), torch.inf)])[None]
+        found = within(HERE * 0, FIRST, candidates, None, radius_m=2.0, limit=7)
+        assert found.index.tolist() == [[0, 1, 2, 3, 4, 5, 6]], padding

@@ -48,7 +48,7 @@ def within(
     radius_m: float,
     limit: int | None,
 ) -> Neighbors:
-    """Candidates nearer than a radius (strictly), the nearest of them where a limit binds: a matter of the row and its candidates alone.
+    """Candidates nearer than a radius (strictly), the nearest of them where a limit binds, of equally near ones the first.
 
     Args:
         position: of the rows.
@@ -75,8 +75,13 @@ def within(
 
 
 def _nearest(squared: Float[Tensor, "r C"], radius_m: float, limit: int) -> Neighbors:
-    nearest = squared.topk(min(limit, squared.shape[1]), dim=-1, largest=False)
-    return Neighbors(nearest.indices, nearest.values < radius_m**2)
+    """Of equally near ones the first. (Which of them `topk` itself takes depends on how many candidates there are, padding included.)"""
+    columns = torch.arange(squared.shape[1], device=squared.device)
+    key = (
+        squared.float().view(torch.int32).long() << 32
+    ) | columns  # floats that are not negative sort as their bits do
+    index = key.topk(min(limit, squared.shape[1]), dim=-1, largest=False).values & 0xFFFFFFFF
+    return Neighbors(index, squared.gather(1, index) < radius_m**2)
 
 
 def _all_near(squared: Float[Tensor, "r C"], radius_m: float) -> Neighbors:
