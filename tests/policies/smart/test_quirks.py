@@ -95,6 +95,7 @@ class Said:
     logits: torch.Tensor
     target: torch.Tensor
     target_mask: torch.Tensor
+    class_id: torch.Tensor
 
 
 class Oracle(nn.Module):
@@ -110,7 +111,7 @@ class Oracle(nn.Module):
         logits = torch.full((7, NUM_TOKENS), math.log(others))
         target = torch.arange(7)
         logits[target, target] = math.log(self.probability)
-        return Said(logits + self.shift, target, torch.ones(7, dtype=torch.bool))
+        return Said(logits + self.shift, target, torch.ones(7, dtype=torch.bool), torch.zeros(7, dtype=torch.int64))
 
     def save_pretrained(self, folder, *, card=""):
         folder.mkdir()
