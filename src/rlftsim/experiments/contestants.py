@@ -6,6 +6,7 @@ from typing import Literal
 from rlftsim.recipes.smart import SmartRecipe
 from rlftsim.training.catk import CatkConfig
 from rlftsim.training.finetune import FinetuneConfig
+from rlftsim.training.rewards import CreditTo
 
 WEAK_EPOCHS = 1.0
 """Pre-training of the paper's weaker base model."""
@@ -37,8 +38,8 @@ class FineTuned:
 
     method: str = "mloo"
     """A reward's name, or "catk"."""
-    credit: Literal["rollout", "agent"] = "rollout"
-    """Who earns the reward."""
+    credit: CreditTo = "rollout"
+    """Whom the reward is owed to."""
     seed: int = 0
     share: float = 1.0
     """Of the recipe's fine-tuning epochs."""
