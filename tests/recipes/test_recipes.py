@@ -95,6 +95,12 @@ def test_later_overrides_win():
     assert (config.pretrain.seed, config.model.dim) == (2, 64)
 
 
+def test_fields_that_depend_on_each_other_may_come_in_any_order():
+    overrides = ["finetune.kl.min_beta=0.5", "finetune.kl.initial_beta=1"]
+    kl = configure(smart_demo_rlftsim(), overrides).finetune.kl
+    assert (kl.min_beta, kl.initial_beta) == (0.5, 1.0)
+
+
 def test_none_is_a_value_where_a_field_allows_it():
     config = configure(smart_tiny_rlftsim(), ["pretrain.max_trained_agents=none"])
     assert config.pretrain.max_trained_agents is None
@@ -123,6 +129,7 @@ def test_none_is_a_value_where_a_field_allows_it():
         ("pretrain.weight_decay=-1", "weight_decay must not be negative, got -1"),
         ("catk.gradient_clip=-1", "gradient_clip must be positive, got -1"),
         ("catk.final_learning_rate_share=nan", r"final_learning_rate_share is a share in \[0, 1\], got nan"),
+        ("pretrain.label_smoothing_kind=spatial", "has no effect: set label_smoothing"),
         ("pretrain.max_skipped_in_a_row=0", "max_skipped_in_a_row must be positive"),
         ("pretrain.validation.seed=-1", "seed must not be negative"),
         ("pretrain.device.devices=0", "devices must be positive"),

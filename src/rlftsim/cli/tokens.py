@@ -9,10 +9,10 @@ from rich.table import Table
 
 from rlftsim.cli.data import open_split
 from rlftsim.cli.train import RecipeName
-from rlftsim.errors import ConfigError
+from rlftsim.errors import ConfigError, DataError
 from rlftsim.experiments.vocabulary_report import ROWS, write_vocabulary_report
 from rlftsim.policies.smart.catk_vocabulary import read_catk_vocabulary
-from rlftsim.progress import print_wide
+from rlftsim.progress import print_wide, say
 from rlftsim.recipes.configure import Override, configure
 from rlftsim.recipes.smart import RECIPES
 from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
@@ -49,6 +49,8 @@ class Tokens:
         if (self.out is None) == (not self.check):
             raise ConfigError("tokens needs either --out FILE, to build a vocabulary, or --check FILE, to look at one.")
         config = configure(RECIPES[self.recipe](), self.set, sections=("tokens",)).tokens
+        if self.out is not None and self.out.exists():
+            _refuse_foreign(self.out)
         scenarios = open_split(self.data, self.split, cached=CACHED_SCENARIOS)
         if self.out is not None:
             origin = f"{' '.join(sys.argv[1:])}; {len(scenarios)} scenarios; seed {config.seed}"
@@ -65,6 +67,11 @@ class Tokens:
         compared = f"{self._num_compared(len(scenarios), config)} scenarios of {self.data}, {self.split}"
         write_vocabulary_report(folder, classes, vocabulary=where.name, data=compared)
         print_wide(_coverage_table(classes))
+        for coverage in classes:
+            if coverage.num_tokens == 1 and coverage.use.sum() > 1:
+                say(
+                    f"{coverage.class_name}s have a single token, which stands still: nothing can be learned of how they move."
+                )
         counts = ", ".join(f"{c.num_tokens} {c.class_name}" for c in classes)
         print(f"{where}: {counts} tokens, {len(vocabulary.map_prototypes)} map pieces. Report: {folder}/report.md")
         return 0
@@ -73,8 +80,20 @@ class Tokens:
         return num_scenarios if config.max_scenarios is None else min(num_scenarios, config.max_scenarios)
 
 
+def _refuse_foreign(path: Path) -> None:
+    """Refuse to write over what is no vocabulary.
+
+    Raises:
+        ConfigError: it is something else.
+    """
+    try:
+        Vocabulary.load(path)
+    except DataError:
+        raise ConfigError(f"{path} is there and no vocabulary: name another --out, or remove it.") from None
+
+
 def _read(paths: list[Path]) -> Vocabulary:
-    if len(paths) == 1 and paths[0].suffix == ".safetensors":
+    if len(paths) == 1 and paths[0].suffix != ".npz":
         return Vocabulary.load(paths[0])
     return read_catk_vocabulary(paths)
 

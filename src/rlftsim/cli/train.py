@@ -1,7 +1,7 @@
 """Verbs that make and change models: pretrain, finetune."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -9,9 +9,10 @@ from typing import Literal
 from tyro.conf import Positional
 
 from rlftsim.cli.data import open_split, splits_of
-from rlftsim.errors import ConfigError
+from rlftsim.errors import ConfigError, RlftsimError
 from rlftsim.experiments.learning_curve import write_learning_curve
 from rlftsim.experiments.stages import finetune_with_catk, finetune_with_reward, pretrain_smart
+from rlftsim.progress import say
 from rlftsim.recipes.configure import Override, configure
 from rlftsim.recipes.smart import RECIPES
 from rlftsim.scenario.dataset import ScenarioDataset
@@ -65,7 +66,10 @@ def _held_out(data: str, split: str | None, every: int) -> ScenarioDataset | Non
     """
     if split is not None and not every:
         raise ConfigError(f"--validation-split {split} has no effect: set validation.every to a number of updates.")
-    if not every or (split is None and VALIDATION not in splits_of(data)):
+    if not every:
+        return None
+    if split is None and VALIDATION not in splits_of(data):
+        say(f"no validation: {data} has no split {VALIDATION!r}, name another with --validation-split.")
         return None
     return open_split(data, split or VALIDATION)
 
@@ -75,9 +79,16 @@ def _drawn(out: Path) -> Iterator[None]:
     """A run whose learning curve is drawn however it ends."""
     try:
         yield
-    finally:
-        if is_first_process():
-            write_learning_curve(out)
+    except BaseException:
+        with suppress(RlftsimError):  # why the run ended matters more than why nothing could be drawn
+            _draw(out)
+        raise
+    _draw(out)
+
+
+def _draw(out: Path) -> None:
+    if is_first_process():
+        write_learning_curve(out)
 
 
 @dataclass(frozen=True)

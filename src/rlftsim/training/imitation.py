@@ -113,6 +113,10 @@ class ImitationConfig:
             raise ConfigError(f"final_learning_rate_share is a share in [0, 1], got {self.final_learning_rate_share}.")
         if not 0 <= self.label_smoothing < 1:
             raise ConfigError(f"label_smoothing is a share in [0, 1), got {self.label_smoothing}.")
+        if self.label_smoothing_kind == "spatial" and not self.label_smoothing:
+            raise ConfigError(
+                "label_smoothing_kind=spatial has no effect: set label_smoothing to a share, such as 0.1."
+            )
 
     def num_updates(self, num_scenarios: int) -> int:
         """Optimiser steps of the run."""
@@ -190,8 +194,8 @@ def imitate(
             if skipped >= config.max_skipped_in_a_row:
                 raise run.diverged(f"the gradients of {skipped} updates in a row are not finite", "lower learning_rate")
             if (update + 1) % config.checkpoint_every == 0 or update + 1 == total:
-                if not all(p.isfinite().all() for p in trained):
-                    raise run.diverged("weights are not finite any more", "lower learning_rate")
+                if not (math.isfinite(values["loss"]) and all(p.isfinite().all() for p in trained)):
+                    raise run.diverged("the loss or a weight is not finite any more", "lower learning_rate")
                 if fabric.is_global_zero:
                     write_checkpoint(run.checkpoints, Progress(update + 1), {"policy": model}, optimizer)
             advance(note=f"loss {values['loss']:.3f}, right {values['accuracy']:.0%}{realism}")
