@@ -120,7 +120,11 @@ WRONG = {
     "a value out of range": ("tokens --data synthetic --out {tmp}/v --set tokens.num_tokens=1", "needs num_tokens >= 2"),
     "a vocabulary neither to build nor to look at": ("tokens --data synthetic", "either --out FILE, to build a vocabulary, or --check FILE"),
     "a vocabulary to look at that is not there": ("tokens --data synthetic --check {tmp}/v.safetensors", "no such vocabulary: build one with"),
-    "tables to look at that are none": ("tokens --data synthetic --check {tmp}/garbage", "not an npz of token tables"),
+    "a vocabulary to look at that is none": ("tokens --data synthetic --check {tmp}/garbage", "damaged vocabulary"),
+    "tables to look at that are none": ("tokens --data synthetic --check {tmp}/garbage.npz", "not an npz of token tables"),
+    "tables in an empty file": ("tokens --data synthetic --check {tmp}/empty.npz", "not an npz of token tables"),
+    "a vocabulary in place of something else": ("tokens --data synthetic --out {tmp}/garbage", "is there and no vocabulary: name another --out"),
+    "rollouts that nobody knows the maker of": ("simulate constant_velocity --data synthetic --out {tmp}/whose", "rollouts.json: damaged .* name another --out"),
     "no value": ("tokens --data synthetic --out {tmp}/v --set tokens.num_tokens", "is not field=value"),
     "an unknown metric": ("evaluate oracle --data synthetic --out {tmp}/o --metric 1999", "Unknown metric '1999': known are 2025"),
     "no rollouts": ("evaluate oracle --data synthetic --out {tmp}/o --num-rollouts 0", "num_rollouts must be at least 1"),
@@ -137,6 +141,10 @@ WRONG = {
 @pytest.mark.parametrize("mistake", WRONG)
 def test_a_mistake_ends_in_one_line_and_status_2(mistake, tmp_path, capsys):
     (tmp_path / "garbage").write_bytes(b"garbage" * 9)
+    (tmp_path / "garbage.npz").write_bytes(b"garbage" * 9)
+    (tmp_path / "empty.npz").touch()
+    (tmp_path / "whose").mkdir()
+    (tmp_path / "whose" / "rollouts.json").write_text("{")
     shutil.copytree(pack_path(), tmp_path / "unfinished", ignore=shutil.ignore_patterns("*.arrow"))
     (tmp_path / "unfinished" / "INCOMPLETE").touch()
     (tmp_path / "broken").mkdir()

@@ -3,11 +3,12 @@
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from tyro.conf import Positional
 
 from rlftsim.cli.data import open_split
-from rlftsim.errors import ConfigError
+from rlftsim.errors import ConfigError, DataError
 from rlftsim.files import write_text
 from rlftsim.progress import progress_bar
 from rlftsim.recipes.models import Device, load_policy
@@ -83,10 +84,24 @@ class Simulate:
             "sampling": asdict(sampling),
         }
         path = self.out / ABOUT
-        old = json.loads(path.read_text()) if path.exists() else about
+        old = _read_about(path) if path.exists() else about
         differing = [name for name, value in about.items() if name != "model" and old.get(name) != value]
         if differing and any(self.out.glob("*.npz")):
             raise ConfigError(
                 f"{self.out} holds rollouts of {old.get('model')} with another {', '.join(differing)}: name another --out."
             )
         write_text(path, json.dumps(about, indent=1) + "\n")
+
+
+def _read_about(path: Path) -> dict[str, Any]:
+    """What `Simulate` wrote down.
+
+    Raises:
+        DataError: it is damaged.
+    """
+    try:
+        return dict(json.loads(path.read_text()))
+    except (ValueError, TypeError) as error:
+        raise DataError(
+            f"{path}: damaged ({error}), so nobody knows whose rollouts {path.parent} holds: name another --out."
+        ) from None

@@ -9,7 +9,7 @@ from rich.table import Table
 
 from rlftsim.cli.data import open_split
 from rlftsim.cli.train import RecipeName
-from rlftsim.errors import ConfigError
+from rlftsim.errors import ConfigError, DataError
 from rlftsim.experiments.vocabulary_report import ROWS, write_vocabulary_report
 from rlftsim.policies.smart.catk_vocabulary import read_catk_vocabulary
 from rlftsim.progress import print_wide
@@ -49,6 +49,8 @@ class Tokens:
         if (self.out is None) == (not self.check):
             raise ConfigError("tokens needs either --out FILE, to build a vocabulary, or --check FILE, to look at one.")
         config = configure(RECIPES[self.recipe](), self.set, sections=("tokens",)).tokens
+        if self.out is not None and self.out.exists():
+            _refuse_foreign(self.out)
         scenarios = open_split(self.data, self.split, cached=CACHED_SCENARIOS)
         if self.out is not None:
             origin = f"{' '.join(sys.argv[1:])}; {len(scenarios)} scenarios; seed {config.seed}"
@@ -73,8 +75,20 @@ class Tokens:
         return num_scenarios if config.max_scenarios is None else min(num_scenarios, config.max_scenarios)
 
 
+def _refuse_foreign(path: Path) -> None:
+    """Refuse to write over what is no vocabulary.
+
+    Raises:
+        ConfigError: it is something else.
+    """
+    try:
+        Vocabulary.load(path)
+    except DataError:
+        raise ConfigError(f"{path} is there and no vocabulary: name another --out, or remove it.") from None
+
+
 def _read(paths: list[Path]) -> Vocabulary:
-    if len(paths) == 1 and paths[0].suffix == ".safetensors":
+    if len(paths) == 1 and paths[0].suffix != ".npz":
         return Vocabulary.load(paths[0])
     return read_catk_vocabulary(paths)
 

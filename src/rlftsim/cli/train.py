@@ -12,6 +12,7 @@ from rlftsim.cli.data import open_split, splits_of
 from rlftsim.errors import ConfigError
 from rlftsim.experiments.learning_curve import write_learning_curve
 from rlftsim.experiments.stages import finetune_with_catk, finetune_with_reward, pretrain_smart
+from rlftsim.progress import say
 from rlftsim.recipes.configure import Override, configure
 from rlftsim.recipes.smart import RECIPES
 from rlftsim.scenario.dataset import ScenarioDataset
@@ -65,7 +66,10 @@ def _held_out(data: str, split: str | None, every: int) -> ScenarioDataset | Non
     """
     if split is not None and not every:
         raise ConfigError(f"--validation-split {split} has no effect: set validation.every to a number of updates.")
-    if not every or (split is None and VALIDATION not in splits_of(data)):
+    if not every:
+        return None
+    if split is None and VALIDATION not in splits_of(data):
+        say(f"no validation: {data} has no split {VALIDATION!r}, name another with --validation-split.")
         return None
     return open_split(data, split or VALIDATION)
 

@@ -126,7 +126,10 @@ class Workshop:
                 "experiments train in one process: leave device.devices at 1, or train by `rlftsim finetune` and compare by "
                 "`rlftsim evaluate`."
             )
-        _ = self.training  # a data set that is not there must not claim the folder
+        _ = self.training  # a data set that is not there must not claim the folder,
+        ScenarioDataset(
+            self.data, self.evaluation.split
+        )  # and one that nothing can be measured on must not be trained on
         RunFolder(self.out, self._what_counts())
 
     @cached_property

@@ -25,6 +25,8 @@ def load_policy(name: str, device: Device = "cpu") -> Policy:
     """
     if name in NAMED:
         return NAMED[name]()
+    if not Path(name).is_dir():
+        raise ConfigError(f"{name!r} is neither a model folder nor one of {', '.join(NAMED)}.")
     return SmartPolicy.from_pretrained(find_model(name)).eval().requires_grad_(False).to(find_device(device))
 
 
@@ -38,7 +40,7 @@ def find_model(name: str) -> Path:
     if (folder / "model" / "config.json").exists():
         folder = folder / "model"
     if not folder.is_dir():
-        raise ConfigError(f"{name!r} is neither a model folder nor one of {', '.join(NAMED)}.")
+        raise ConfigError(f"{name!r} is no model folder: there is none of that name.")
     return folder
 
 

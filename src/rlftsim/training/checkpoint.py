@@ -73,7 +73,7 @@ def read_checkpoint(path: Path, modules: dict[str, nn.Module], optimizer: Optimi
         _load_optimizer(optimizer, load_file(path / "optimizer.safetensors"))
         values = json.loads((path / "progress.json").read_text())
         return Progress(values["update"], values["numbers"])
-    except (OSError, SafetensorError, RuntimeError, KeyError, ValueError) as error:
+    except (OSError, SafetensorError, RuntimeError, KeyError, TypeError, ValueError) as error:
         raise CheckpointError(
             f"{path}: cannot go on from it ({error}): delete this folder to go on from an older one."
         ) from None

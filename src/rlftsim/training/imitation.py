@@ -190,8 +190,8 @@ def imitate(
             if skipped >= config.max_skipped_in_a_row:
                 raise run.diverged(f"the gradients of {skipped} updates in a row are not finite", "lower learning_rate")
             if (update + 1) % config.checkpoint_every == 0 or update + 1 == total:
-                if not all(p.isfinite().all() for p in trained):
-                    raise run.diverged("weights are not finite any more", "lower learning_rate")
+                if not (math.isfinite(values["loss"]) and all(p.isfinite().all() for p in trained)):
+                    raise run.diverged("the loss or a weight is not finite any more", "lower learning_rate")
                 if fabric.is_global_zero:
                     write_checkpoint(run.checkpoints, Progress(update + 1), {"policy": model}, optimizer)
             advance(note=f"loss {values['loss']:.3f}, right {values['accuracy']:.0%}{realism}")

@@ -135,7 +135,7 @@ class RunFolder:
             return
         try:
             old, new = flatten(json.loads(path.read_text())), flatten(config)
-        except ValueError as error:
+        except (ValueError, AttributeError) as error:
             raise CheckpointError(f"{path}: damaged ({error}): remove the folder {self.path} to start anew.") from None
         differing = sorted(k for k in (old.keys() | new.keys()) - MAY_CHANGE if old.get(k) != new.get(k))
         if differing:
@@ -183,8 +183,8 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
 
 
 def _update_of(line: str) -> float:
-    """Update of a line of metrics; infinite for a line that a kill cut short."""
+    """Update of a line of metrics; infinite for a line that a kill cut short, or that is none."""
     try:
         return float(json.loads(line)["update"])
-    except (ValueError, KeyError):
+    except (ValueError, KeyError, TypeError):
         return float("inf")

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from rlftsim.errors import CheckpointError, DataError
+from rlftsim.files import write_whole
 from rlftsim.tokens.vocabulary import STEPS_PER_TOKEN, Vocabulary
 
 MOTION_TABLES = ("veh", "ped", "cyc")
@@ -63,10 +64,15 @@ def is_published(vocabulary: Vocabulary) -> bool:
 
 
 def write_catk_vocabulary(vocabulary: Vocabulary, path: Path) -> None:
-    """Write the tables as npz, in the form `read_catk_vocabulary` takes."""
+    """Write the tables as npz, in the form `read_catk_vocabulary` takes. Raises as `write_whole`."""
     tables = dict(zip(MOTION_TABLES, vocabulary.corners.cpu().numpy()))
-    with path.open("wb") as file:
-        np.savez(file, **tables, **{MAP_TABLE: vocabulary.map_prototypes.cpu().numpy()})  # type: ignore[arg-type]
+    tables[MAP_TABLE] = vocabulary.map_prototypes.cpu().numpy()
+
+    def write(temporary: Path) -> None:
+        with temporary.open("wb") as file:
+            np.savez(file, **tables)  # type: ignore[arg-type]
+
+    write_whole(path, write)
 
 
 def _read_npz(path: Path) -> dict[str, np.ndarray]:
@@ -75,7 +81,7 @@ def _read_npz(path: Path) -> dict[str, np.ndarray]:
             return {name: file[name] for name in (*MOTION_TABLES, MAP_TABLE) if name in file.files}
     except FileNotFoundError:
         raise CheckpointError(f"{path}: no such vocabulary.") from None
-    except (ValueError, OSError, AttributeError, zipfile.BadZipFile):
+    except (ValueError, OSError, EOFError, AttributeError, zipfile.BadZipFile):
         raise CheckpointError(f"{path}: not an npz of token tables (pickles are not read, see docs/catk.md).") from None
 
 

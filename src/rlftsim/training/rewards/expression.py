@@ -73,7 +73,9 @@ def _terms(node: ast.expr, factor: float) -> Iterator[Term]:
         case ast.Name(name):
             yield Term(factor, name, _options(name, reward_by_name(name), {}))
         case ast.Call(ast.Name(name), [], keywords):
-            given = {str(keyword.arg): ast.literal_eval(keyword.value) for keyword in keywords}
+            given = {keyword.arg: ast.literal_eval(keyword.value) for keyword in keywords if keyword.arg}
+            if len(given) < len(keywords):
+                raise ValueError(node)  # an option twice, or **options
             yield Term(factor, name, _options(name, reward_by_name(name), given))
         case _:
             raise ValueError(node)
@@ -108,4 +110,6 @@ def _as_kind_of(default: Option, value: Option, where: str) -> Option:
         value = float(value)
     if type(value) is not type(default):
         raise ConfigError(f"reward {where}: expected {type(default).__name__}, got {value!r}.")
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ConfigError(f"reward {where}: expected a finite number, got {value!r}.")
     return value
