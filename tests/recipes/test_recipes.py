@@ -95,6 +95,12 @@ def test_later_overrides_win():
     assert (config.pretrain.seed, config.model.dim) == (2, 64)
 
 
+def test_fields_that_depend_on_each_other_may_come_in_any_order():
+    overrides = ["finetune.kl.min_beta=0.5", "finetune.kl.initial_beta=1"]
+    kl = configure(smart_demo_rlftsim(), overrides).finetune.kl
+    assert (kl.min_beta, kl.initial_beta) == (0.5, 1.0)
+
+
 def test_none_is_a_value_where_a_field_allows_it():
     config = configure(smart_tiny_rlftsim(), ["pretrain.max_trained_agents=none"])
     assert config.pretrain.max_trained_agents is None

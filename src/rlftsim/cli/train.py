@@ -1,7 +1,7 @@
 """Verbs that make and change models: pretrain, finetune."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -9,7 +9,7 @@ from typing import Literal
 from tyro.conf import Positional
 
 from rlftsim.cli.data import open_split, splits_of
-from rlftsim.errors import ConfigError
+from rlftsim.errors import ConfigError, RlftsimError
 from rlftsim.experiments.learning_curve import write_learning_curve
 from rlftsim.experiments.stages import finetune_with_catk, finetune_with_reward, pretrain_smart
 from rlftsim.progress import say
@@ -79,9 +79,16 @@ def _drawn(out: Path) -> Iterator[None]:
     """A run whose learning curve is drawn however it ends."""
     try:
         yield
-    finally:
-        if is_first_process():
-            write_learning_curve(out)
+    except BaseException:
+        with suppress(RlftsimError):  # why the run ended matters more than why nothing could be drawn
+            _draw(out)
+        raise
+    _draw(out)
+
+
+def _draw(out: Path) -> None:
+    if is_first_process():
+        write_learning_curve(out)
 
 
 @dataclass(frozen=True)

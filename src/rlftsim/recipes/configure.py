@@ -1,7 +1,7 @@
 """`field=value` on the command line changes a recipe."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from types import NoneType
 from typing import Any, Literal, NoReturn, TypeVar, get_args, get_origin, get_type_hints
 
@@ -22,31 +22,42 @@ def configure(config: Config, overrides: Sequence[Override], *, sections: Sequen
     Raises:
         ConfigError: no such field (the known ones are listed), or a value of the wrong kind or range.
     """
+    changes: dict[str, Any] = {}
     for override in overrides:
         name, separator, text = override.partition("=")
         if not separator:
             raise ConfigError(f"{override!r} is not field=value, such as pretrain.epochs=2.")
         if sections is not None and name.split(".")[0] not in sections:
             raise ConfigError(f"{name} has no effect here: only fields of {' and '.join(sections)} can be set.")
-        config = _changed(config, name.replace("-", "_").split("."), text, name)
-    return config
+        *above, field = name.replace("-", "_").split(".")
+        value = _value(config, [*above, field], text, name)
+        inner = changes
+        for part in above:
+            inner = inner.setdefault(part, {})
+        inner[field] = value
+    return _changed(config, changes)
 
 
-def _changed(config: Config, path: list[str], text: str, whole: str) -> Config:
-    known = [f.name for f in dataclasses.fields(config)]  # type: ignore[arg-type]
+def _value(config: Any, path: list[str], text: str, whole: str) -> Any:
+    """A text as the value of the field at a path."""
+    known = [f.name for f in dataclasses.fields(config)]
     if path[0] not in known:
         raise ConfigError(f"{whole}: no field {path[0]!r} here, known are {', '.join(known)}.")
     old = getattr(config, path[0])
     if len(path) > 1:
         if not dataclasses.is_dataclass(old):
             raise ConfigError(f"{whole}: {path[0]!r} has no fields of its own.")
-        new: Any = _changed(old, path[1:], text, whole)
-    elif dataclasses.is_dataclass(old):
+        return _value(old, path[1:], text, whole)
+    if dataclasses.is_dataclass(old):
         inner = ", ".join(f.name for f in dataclasses.fields(old))
         raise ConfigError(f"{whole}: name one of its fields: {inner}.")
-    else:
-        new = _parse(text, get_type_hints(type(config))[path[0]], whole)
-    return dataclasses.replace(config, **{path[0]: new})  # type: ignore[type-var]
+    return _parse(text, get_type_hints(type(config))[path[0]], whole)
+
+
+def _changed(config: Config, changes: Mapping[str, Any]) -> Config:
+    """All changes at once: fields that depend on each other may be given in any order."""
+    new = {n: _changed(getattr(config, n), v) if isinstance(v, Mapping) else v for n, v in changes.items()}
+    return dataclasses.replace(config, **new)  # type: ignore[type-var]
 
 
 def _parse(text: str, kind: Any, whole: str) -> Any:
