@@ -129,6 +129,7 @@ def test_none_is_a_value_where_a_field_allows_it():
         ("pretrain.weight_decay=-1", "weight_decay must not be negative, got -1"),
         ("catk.gradient_clip=-1", "gradient_clip must be positive, got -1"),
         ("catk.final_learning_rate_share=nan", r"final_learning_rate_share is a share in \[0, 1\], got nan"),
+        ("pretrain.label_smoothing_kind=spatial", "has no effect: set label_smoothing"),
         ("pretrain.max_skipped_in_a_row=0", "max_skipped_in_a_row must be positive"),
         ("pretrain.validation.seed=-1", "seed must not be negative"),
         ("pretrain.device.devices=0", "devices must be positive"),

@@ -130,4 +130,9 @@ def test_smoothing_among_near_tokens_needs_a_vocabulary(drawn_scenarios, tmp_pat
             raise AssertionError
 
     with pytest.raises(ConfigError, match=r"Wordless has no vocabulary.*label_smoothing_kind=uniform"):
-        pretrain(Wordless(1, 1), drawn_scenarios, tmp_path, replace(tiny.PRETRAIN, label_smoothing_kind="spatial"))
+        pretrain(
+            Wordless(1, 1),
+            drawn_scenarios,
+            tmp_path,
+            replace(tiny.PRETRAIN, label_smoothing=0.1, label_smoothing_kind="spatial"),
+        )

@@ -53,6 +53,8 @@ usage: rlftsim VERB ...      rlftsim VERB --help explains a verb
   experiment   answer a question of the paper with a table and a figure
 """
 
+STARTS_ANEW = ("doctor", "data", "tokens", "model", "compare")
+"""Verbs that keep nothing of what they were stopped in."""
 INTERRUPTED = 130
 USER_MISTAKE = 2
 
@@ -109,7 +111,8 @@ def _run(words: list[str]) -> int:
         print(f"rlftsim: {error}", file=sys.stderr)
         return USER_MISTAKE
     except KeyboardInterrupt:
-        print("\nrlftsim: stopped. The same command goes on where it was.", file=sys.stderr)
+        what_next = "starts anew" if words[0] in STARTS_ANEW else "goes on where it was"
+        print(f"\nrlftsim: stopped. The same command {what_next}.", file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:
         return 0

@@ -12,7 +12,7 @@ from rlftsim.cli.train import RecipeName
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.experiments.vocabulary_report import ROWS, write_vocabulary_report
 from rlftsim.policies.smart.catk_vocabulary import read_catk_vocabulary
-from rlftsim.progress import print_wide
+from rlftsim.progress import print_wide, say
 from rlftsim.recipes.configure import Override, configure
 from rlftsim.recipes.smart import RECIPES
 from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
@@ -67,6 +67,11 @@ class Tokens:
         compared = f"{self._num_compared(len(scenarios), config)} scenarios of {self.data}, {self.split}"
         write_vocabulary_report(folder, classes, vocabulary=where.name, data=compared)
         print_wide(_coverage_table(classes))
+        for coverage in classes:
+            if coverage.num_tokens == 1 and coverage.use.sum() > 1:
+                say(
+                    f"{coverage.class_name}s have a single token, which stands still: nothing can be learned of how they move."
+                )
         counts = ", ".join(f"{c.num_tokens} {c.class_name}" for c in classes)
         print(f"{where}: {counts} tokens, {len(vocabulary.map_prototypes)} map pieces. Report: {folder}/report.md")
         return 0

@@ -113,6 +113,10 @@ class ImitationConfig:
             raise ConfigError(f"final_learning_rate_share is a share in [0, 1], got {self.final_learning_rate_share}.")
         if not 0 <= self.label_smoothing < 1:
             raise ConfigError(f"label_smoothing is a share in [0, 1), got {self.label_smoothing}.")
+        if self.label_smoothing_kind == "spatial" and not self.label_smoothing:
+            raise ConfigError(
+                "label_smoothing_kind=spatial has no effect: set label_smoothing to a share, such as 0.1."
+            )
 
     def num_updates(self, num_scenarios: int) -> int:
         """Optimiser steps of the run."""
