@@ -11,7 +11,7 @@ from safetensors.torch import load_file
 
 import scenes
 from rlftsim.cli.main import main
-from rlftsim.errors import CheckpointError, ConfigError
+from rlftsim.errors import CheckpointError, ConfigError, DataError
 from rlftsim.experiments import stages
 from rlftsim.experiments.catalogue import variance_scaling
 from rlftsim.experiments.columns import SCORES
@@ -110,9 +110,21 @@ def test_changed_settings_are_refused_by_name(done, change, named):
 
 
 def test_other_data_are_refused(done, tmp_path):
-    write_dataset([scenes.straight_road()], tmp_path / "other", split="training")
+    one = scenes.straight_road()
+    write_dataset([one, replace(one, scenario_id="validation")], tmp_path / "other", split=_split_by_id)
     with pytest.raises(CheckpointError, match="data"):
         replace(done, data=tmp_path / "other")
+
+
+def _split_by_id(scenario):
+    return "validation" if scenario.scenario_id == "validation" else "training"
+
+
+def test_data_without_the_split_to_measure_on_are_refused_before_anything_is_trained(done, tmp_path):
+    write_dataset([scenes.straight_road()], tmp_path / "half", split="training")
+    with pytest.raises(DataError, match="no split 'validation', only training"):
+        replace(done, data=tmp_path / "half", out=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_what_changes_no_result_may_change(done):

@@ -103,6 +103,6 @@ def _coverage_table(classes: tuple[ClassCoverage, ...]) -> Table:
     table.add_column("")
     for coverage in classes:
         table.add_column(coverage.class_name, justify="right")
-    for name, text_of in ROWS.items():
-        table.add_row(escape(name), *(text_of(coverage) for coverage in classes))
+    for name, words in ROWS.items():
+        table.add_row(escape(name), *(words(coverage) for coverage in classes))
     return table

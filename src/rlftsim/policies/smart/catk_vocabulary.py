@@ -65,8 +65,8 @@ def is_published(vocabulary: Vocabulary) -> bool:
 
 def write_catk_vocabulary(vocabulary: Vocabulary, path: Path) -> None:
     """Write the tables as npz, in the form `read_catk_vocabulary` takes. Raises as `write_whole`."""
-    tables = dict(zip(MOTION_TABLES, vocabulary.corners.cpu().numpy()))
-    tables[MAP_TABLE] = vocabulary.map_prototypes.cpu().numpy()
+    motions = dict(zip(MOTION_TABLES, vocabulary.corners.cpu().numpy()))
+    tables = {**motions, MAP_TABLE: vocabulary.map_prototypes.cpu().numpy()}
 
     def write(temporary: Path) -> None:
         with temporary.open("wb") as file:
