@@ -275,11 +275,12 @@ def fine_tuning_step(policy: Any, num_candidates: int) -> Callable[[Any], None]:
     """One update: a CAT-K rollout, its loss, backward, clipping, AdamW; only attention and head are trained."""
     import torch
 
-    from rlftsim.training.catk import CatkConfig, predict_along, roll_out_closest, train_parts
+    from rlftsim.training.catk import CatkConfig, predict_along, roll_out_closest
+    from rlftsim.training.freezing import freeze_untrained
     from rlftsim.training.imitation import summed_loss
 
     config = CatkConfig()
-    train_parts(policy, "decoder")
+    freeze_untrained(policy, "decoder")
     policy.train()
     weights = [p for p in policy.parameters() if p.requires_grad]
     optimizer = torch.optim.AdamW(weights, lr=config.learning_rate, weight_decay=config.weight_decay)

@@ -146,7 +146,7 @@ def train_in_processes(stage, out, processes, *options, batch_size=4, launcher=(
         str(batch_size),
     ]
     command += ["--processes", str(processes), *options]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=400)
     assert done.returncode == 0, done.stderr[-2000:]
 
 

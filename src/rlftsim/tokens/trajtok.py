@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int64
 from scipy.ndimage import distance_transform_edt, uniform_filter
 
-from rlftsim.errors import ConfigError, require_finite, require_positive
+from rlftsim.errors import ConfigError, require_finite, require_not_negative, require_positive
 from rlftsim.tokens.motions import mirrored
 from rlftsim.tokens.vocabulary import STEPS_PER_TOKEN
 
@@ -71,7 +71,7 @@ class TrajTokConfig:
     def __post_init__(self) -> None:
         if self.neighborhood < 3 or not self.neighborhood % 2:
             raise ConfigError(f"neighborhood must be odd and at least 3, got {self.neighborhood}.")
-        require_positive(self, ("num_neighbors",))
+        require_not_negative(self, ("num_neighbors",))
 
     @property
     def grids(self) -> tuple[Grid, Grid, Grid]:

@@ -66,8 +66,8 @@ def test_a_synthetic_scenario_is_learnt_as_fast_as_ever():
     named_weights(policy)
     batch = collate([scenario])
     losses, accuracies = zip(*learn(policy, batch, batch.agent_mask, num_updates=12, learning_rate=3e-3))
-    assert losses[0] == pytest.approx(2.67891, rel=1e-4)
-    assert losses[3] == pytest.approx(0.8919, rel=0.01)
-    assert losses[-1] == pytest.approx(0.0970, rel=0.05)
-    assert accuracies[3] == pytest.approx(0.905, abs=0.02)
-    assert accuracies[-1] == 1.0
+    assert losses[0] == pytest.approx(2.06555, rel=1e-4)
+    assert losses[3] == pytest.approx(0.7203, rel=0.01)
+    assert losses[-1] == pytest.approx(0.1187, rel=0.05)
+    assert accuracies[3] == pytest.approx(0.821, abs=0.02)
+    assert accuracies[-1] > 0.98
