@@ -41,10 +41,11 @@ def around(gain, seed=0, spread=0.01):
 
 @pytest.fixture(scope="module")
 def workshop(tmp_path_factory):
-    """Four scenarios to train on; nothing is trained here."""
+    """Four scenarios to train on and one to measure on; nothing is trained here."""
     folder = tmp_path_factory.mktemp("catalogue")
     kinds = [scenes.straight_road(), scenes.junction_with_light(), scenes.with_gaps(), scenes.straight_road("again")]
-    write_dataset(kinds, folder / "data", split="training")
+    held_out = scenes.straight_road("held out")
+    write_dataset([*kinds, held_out], folder / "data", split=lambda s: "validation" if s is held_out else "training")
     return Workshop(TINY, folder / "data", folder / "out", EvaluateConfig(), num_seeds=2)
 
 

@@ -143,7 +143,7 @@ def test_none_is_a_value_where_a_field_allows_it():
         ("tokens.straight_up_to_mps=inf", "straight_up_to_mps must be a finite number"),
         ("tokens.seed=-1", "seed must not be negative"),
         ("tokens.trajtok.vehicle.x_max_m=inf", "x_max_m must be a finite number"),
-        ("tokens.trajtok.num_neighbors=0", "num_neighbors must be positive"),
+        ("tokens.trajtok.num_neighbors=-1", "num_neighbors must not be negative"),
     ],
 )
 def test_a_bad_override_is_refused_in_words(override, words):
