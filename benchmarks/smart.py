@@ -13,7 +13,6 @@ import json
 import multiprocessing
 import os
 import platform
-import resource
 import runpy
 import subprocess
 import sys
@@ -172,41 +171,10 @@ def alone(function: Callable[..., Any], *arguments: Any) -> Any:
         return pool.apply(function, arguments)
 
 
-class Clock:
-    """Seconds of calls: CPU time on a CPU, wall time between synchronisations on a GPU; peak memory beside them."""
-
-    def __init__(self, device: str):
-        self.on_gpu = device.startswith("cuda")
-        self.baseline_mib = self._peak_mib()
-
-    def time(self, call: Callable[[], Any]) -> float:
-        start = self._now()
-        call()
-        return self._now() - start
-
-    def added_mib(self) -> float:
-        """Peak since the libraries were loaded."""
-        return self._peak_mib() - self.baseline_mib
-
-    def _now(self) -> float:
-        import torch
-
-        if not self.on_gpu:
-            return time.process_time()
-        torch.cuda.synchronize()
-        return time.perf_counter()
-
-    def _peak_mib(self) -> float:
-        import torch
-
-        if self.on_gpu:
-            return torch.cuda.max_memory_allocated() / 2**20
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-
-
-def started_clock(recipe: Recipe, threads: int = 1) -> Clock:
+def started_clock(recipe: Recipe, threads: int = 1) -> Any:
     """A clock whose memory baseline has all libraries loaded."""
     import torch
+    from clock import Clock  # beside this file
 
     import rlftsim.policies.smart.catk_checkpoint
     import rlftsim.rollout.simulate

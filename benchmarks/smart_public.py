@@ -9,7 +9,6 @@ for its two functions, and the time inside them is reported.
 """
 
 import json
-import resource
 import subprocess
 import sys
 import time
@@ -20,6 +19,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from clock import Clock  # beside this file
 from torch import Tensor
 
 PREFIX = "encoder."
@@ -165,34 +165,6 @@ def copy_of(data: Data) -> Data:
 
 
 # ---- measurements --------------------------------------------------------------------------------------------------------
-
-
-class Clock:
-    """Seconds of calls: CPU time on a CPU, wall time between synchronisations on a GPU; peak memory beside them."""
-
-    def __init__(self, device: str):
-        self.on_gpu = device.startswith("cuda")
-        self.baseline_mib = 0.0 if self.on_gpu else self._peak_mib()
-
-    def time(self, call: Callable[[], Any]) -> float:
-        start = self._now()
-        call()
-        return self._now() - start
-
-    def added_mib(self) -> float:
-        """Peak since the libraries were loaded."""
-        return self._peak_mib() - self.baseline_mib
-
-    def _now(self) -> float:
-        if not self.on_gpu:
-            return time.process_time()
-        torch.cuda.synchronize()
-        return time.perf_counter()
-
-    def _peak_mib(self) -> float:
-        if self.on_gpu:
-            return torch.cuda.max_memory_allocated() / 2**20
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def sampling(criterium: str, num_k: int, temp: float) -> SimpleNamespace:
