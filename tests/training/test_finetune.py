@@ -151,6 +151,15 @@ def test_the_first_update_has_no_kl_and_the_next_one_has(learner, batch, fabric)
     assert update_policy(learner, batch, CONFIG, fabric)["kl"] > 1e-6
 
 
+def assert_same_gradients(found):
+    """Of several updates, each with what it logged."""
+    whole = found[0][0]
+    assert max(float(g.abs().max()) for g in whole.values()) > 1e-3
+    for gradients, _ in found[1:]:
+        for name, gradient in whole.items():
+            torch.testing.assert_close(gradients[name], gradient, atol=1e-6, rtol=1e-5, msg=name)
+
+
 def test_gradients_do_not_depend_on_how_many_rollouts_are_scored_at_once(vocabulary, batch, fabric):
     found = []
     for rollouts_per_pass in (4, 2, 1, 3):
@@ -159,11 +168,9 @@ def test_gradients_do_not_depend_on_how_many_rollouts_are_scored_at_once(vocabul
         move_weights(learner.reference)
         values = update_policy(learner, batch, config, fabric)
         found.append((tiny.gradients_of(learner.policy), values))
-    whole, logged = found[0]
-    assert max(float(g.abs().max()) for g in whole.values()) > 1e-3
-    for gradients, values in found[1:]:
-        for name, gradient in whole.items():
-            torch.testing.assert_close(gradients[name], gradient, atol=1e-6, rtol=1e-5, msg=name)
+    assert_same_gradients(found)
+    logged = found[0][1]
+    for _, values in found[1:]:
         for name in ("kl", "entropy", "gradient_norm"):
             assert values[name] == pytest.approx(logged[name], rel=1e-5), name
 
@@ -177,11 +184,9 @@ def test_gradients_do_not_depend_on_how_many_scenarios_are_in_memory_at_once(voc
         move_weights(learner.reference)
         values = update_policy(learner, batch, config, fabric)
         found.append((tiny.gradients_of(learner.policy), values))
-    whole, logged = found[0]
-    assert max(float(g.abs().max()) for g in whole.values()) > 1e-3
-    for gradients, values in found[1:]:
-        for name, gradient in whole.items():
-            torch.testing.assert_close(gradients[name], gradient, atol=1e-6, rtol=1e-5, msg=name)
+    assert_same_gradients(found)
+    logged = found[0][1]
+    for _, values in found[1:]:
         for name in logged.keys() - {"score_gap"}:
             if not name.startswith("seconds"):
                 assert values[name] == pytest.approx(logged[name], rel=1e-4, abs=1e-5), name

@@ -187,22 +187,36 @@ def imitate(
                 values |= validate(model, held_out, config.validation, fabric)
                 realism = f", RMM {values['validation_rmm']:.3f}"
             run.log(update + 1, values)
-            skipped = 0 if math.isfinite(values["gradient_norm"]) else skipped + 1
-            if skipped and fabric.is_global_zero:
-                limit = f"{skipped} in a row, the run stops at {config.max_skipped_in_a_row}"
-                say(f"update {update + 1} skipped: its gradient is not finite ({limit})")
-            if skipped >= config.max_skipped_in_a_row:
-                raise run.diverged(f"the gradients of {skipped} updates in a row are not finite", "lower learning_rate")
+            skipped = _skipped_in_a_row(skipped, update, values, run, learner)
             if (update + 1) % config.checkpoint_every == 0 or update + 1 == total:
-                if not (math.isfinite(values["loss"]) and all(p.isfinite().all() for p in trained)):
-                    raise run.diverged("the loss or a weight is not finite any more", "lower learning_rate")
-                if fabric.is_global_zero:
-                    write_checkpoint(run.checkpoints, Progress(update + 1), {"policy": model}, optimizer)
+                _keep(update, values, run, learner)
             advance(note=f"loss {values['loss']:.3f}, right {values['accuracy']:.0%}{realism}")
     run.close()
     if fabric.is_global_zero:
         model.eval().save_pretrained(run.model, card=card)  # type: ignore[operator]
     return run.model
+
+
+def _skipped_in_a_row(before: int, update: int, values: dict[str, float], run: RunFolder, learner: _Learner) -> int:
+    """Updates that were skipped up to this one without a good one between; says so, and ends a run that has too many."""
+    if math.isfinite(values["gradient_norm"]):
+        return 0
+    skipped, limit = before + 1, learner.config.max_skipped_in_a_row
+    if learner.fabric.is_global_zero:
+        in_a_row = f"{skipped} in a row, the run stops at {limit}"
+        say(f"update {update + 1} skipped: its gradient is not finite ({in_a_row})")
+    if skipped >= limit:
+        raise run.diverged(f"the gradients of {skipped} updates in a row are not finite", "lower learning_rate")
+    return skipped
+
+
+def _keep(update: int, values: dict[str, float], run: RunFolder, learner: _Learner) -> None:
+    """Write a checkpoint; a run whose loss or weights are lost ends instead."""
+    trained = [p for p in learner.model.parameters() if p.requires_grad]
+    if not (math.isfinite(values["loss"]) and all(p.isfinite().all() for p in trained)):
+        raise run.diverged("the loss or a weight is not finite any more", "lower learning_rate")
+    if learner.fabric.is_global_zero:
+        write_checkpoint(run.checkpoints, Progress(update + 1), {"policy": learner.model}, learner.optimizer)
 
 
 def _refuse_to_train(
