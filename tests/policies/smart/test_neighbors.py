@@ -1,6 +1,8 @@
 """Who is near."""
 
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from rlftsim.policies.smart.neighbors import within
 
@@ -30,3 +32,21 @@ def test_of_equally_near_ones_the_first_are_kept_however_much_padding_there_is()
         candidates = torch.cat([around, torch.full((padding, 2), torch.inf)])[None]
         found = within(HERE * 0, FIRST, candidates, None, radius_m=2.0, limit=7)
         assert found.index.tolist() == [[0, 1, 2, 3, 4, 5, 6]], padding
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.integers(0, 10_000), st.sampled_from([None, 7]), st.integers(1, 900), st.booleans())
+def test_the_same_are_found_however_many_there_are_to_choose_among(seed, limit, num_candidates, knows_itself):
+    draw = torch.Generator().manual_seed(seed)
+    candidates = torch.rand(3, num_candidates, 2, generator=draw) * 200 - 100
+    candidates[:, 700:] = torch.inf
+    place = torch.randint(0, 3, (150,), generator=draw)
+    own = torch.randint(0, num_candidates, (150,), generator=draw) if knows_itself else None
+    position = torch.rand(150, 2, generator=draw) * 250 - 125
+    found = within(position, place, candidates, own, radius_m=30.0, limit=limit)
+    distance = (candidates[place] - position[:, None]).norm(dim=-1)
+    if own is not None:
+        distance.scatter_(1, own[:, None], torch.inf)
+    for row, (away, p) in enumerate(zip(distance, place)):
+        expected = away.argsort(stable=True)[: int((away < 30.0).sum())][:limit] + p * num_candidates
+        assert sorted(found.index[row, found.mask[row]].tolist()) == sorted(expected.tolist())
