@@ -45,12 +45,17 @@ def test_the_last_validation_is_what_an_evaluation_of_the_model_finds(vocabulary
     write_dataset([held_out[i] for i in fewest], tmp_path / "data", split="validation", licence_note="CC0-1.0")
     held_out = ScenarioDataset(tmp_path / "data", "validation")
     policy = tiny.tiny_policy(vocabulary)
-    everything = replace(OFTEN, every=100, num_scenarios=4)
+    everything = replace(OFTEN, every=100, num_scenarios=4, top_k=3)
     tiny.train("pretrain", policy, drawn_scenarios, tmp_path, held_out=held_out, validation=everything, epochs=0.5)
     line = read_metrics(tmp_path)[-1]
     model = SmartPolicy.from_pretrained(tmp_path / "model")
     found = evaluate(
-        model, tmp_path / "data", tmp_path, EvaluateConfig(num_rollouts=2, seed=0), name="e", show_progress=False
+        model,
+        tmp_path / "data",
+        tmp_path,
+        EvaluateConfig(num_rollouts=2, seed=0, top_k=3),
+        name="e",
+        show_progress=False,
     )
     rows = [found.scenario_ids.index(held_out.scenario_ids[i]) for i in everything.choose(len(held_out))]
     assert len(set(rows)) == 4

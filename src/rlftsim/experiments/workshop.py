@@ -50,7 +50,7 @@ from rlftsim.recipes.smart import SmartRecipe
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.scenario.dataset import MANIFEST, ScenarioDataset
 from rlftsim.scenario.shards import hash_file
-from rlftsim.training.run_folder import MAY_CHANGE, RunFolder, flatten, to_plain
+from rlftsim.training.run_folder import RunFolder, flatten, may_change, to_plain
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,7 +262,7 @@ class Workshop:
         """What all stages of the folder share; what changes no result is left out."""
         recipe = flatten(to_plain(self.recipe))
         return {
-            "recipe": {name: value for name, value in recipe.items() if name.partition(".")[2] not in MAY_CHANGE},
+            "recipe": {name: value for name, value in recipe.items() if not may_change(name.partition(".")[2])},
             "evaluation": {**self.evaluation.what_counts(), "limit": self.evaluation.limit},
             "data": hash_file(self.data / MANIFEST),
             "base_model": fingerprint_policy(load_policy(self.base_model)) if self.base_model else None,

@@ -33,15 +33,16 @@ from rlftsim.training.checkpoint import newest_checkpoint
 PACKAGES = ("torch", "numpy", "pyarrow", "lightning-fabric", "safetensors")
 
 
-MAY_CHANGE = {
+MAY_CHANGE = (
     *("checkpoint_every", "device.accelerator", "device.devices", "device.num_nodes", "device.threads"),
-    *("micro_batch_size", "micro_batch_cost"),
-    *(
-        f"validation.{name}"
-        for name in ("every", "num_scenarios", "num_rollouts", "scenarios_per_pass", "metric", "seed")
-    ),
-}
-"""Settings that a run may be continued with other values of: they change no estimate."""
+    *("micro_batch_size", "micro_batch_cost", "rollouts_per_pass", "validation"),
+)
+"""Settings, or whole groups of them, that a run may be continued with other values of: they change no estimate."""
+
+
+def may_change(name: str) -> bool:
+    """Whether a run may be continued with another value of a setting, named with dots."""
+    return any(name == free or name.startswith(f"{free}.") for free in MAY_CHANGE)
 
 
 BOARD_GROUPS = {
@@ -137,7 +138,7 @@ class RunFolder:
             old, new = flatten(json.loads(path.read_text())), flatten(config)
         except (ValueError, AttributeError) as error:
             raise CheckpointError(f"{path}: damaged ({error}): remove the folder {self.path} to start anew.") from None
-        differing = sorted(k for k in (old.keys() | new.keys()) - MAY_CHANGE if old.get(k) != new.get(k))
+        differing = sorted(k for k in old.keys() | new.keys() if not may_change(k) and old.get(k) != new.get(k))
         if differing:
             raise CheckpointError(
                 f"{self.path} belongs to a run with other settings or inputs ({', '.join(differing)}): "

@@ -9,11 +9,11 @@ import torch
 from lightning_fabric import Fabric
 from torch import nn
 
-from rlftsim.errors import ConfigError, require_not_negative, require_positive
+from rlftsim.errors import ConfigError, given, require_not_negative, require_positive
 from rlftsim.intervals import interval_around
 from rlftsim.realism import RealismResult, metric_by_name, score_batch
 from rlftsim.realism.from_rollouts import states_of_rollouts
-from rlftsim.rollout.policy import Policy
+from rlftsim.rollout.policy import Policy, Sampling
 from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.types import Scenarios
 from rlftsim.training.data import batch_with_futures
@@ -41,6 +41,8 @@ class ValidationConfig:
     """Of each scenario. Fewer rollouts score lower: compare with an evaluation of the same number only."""
     scenarios_per_pass: int = 4
     """Simulated at once; fewer need less memory, the result is the same."""
+    top_k: int | None = None
+    """Sample among so many of the most likely decisions only, as models trained with label smoothing want it; None = among all."""
     metric: str = "2025"
     """Configuration of the meta-metric."""
     seed: int = 0
@@ -49,7 +51,7 @@ class ValidationConfig:
     def __post_init__(self) -> None:
         if self.every < 0:
             raise ConfigError(f"validation.every must be 0 (never) or more updates, got {self.every}.")
-        require_positive(self, ("num_scenarios", "num_rollouts", "scenarios_per_pass"))
+        require_positive(self, ("num_scenarios", "num_rollouts", "scenarios_per_pass", *given(self, ("top_k",))))
         require_not_negative(self, ("seed",))
         metric_by_name(self.metric)
 
@@ -115,6 +117,12 @@ def _score(
     """Scores of some scenarios' rollouts. One without a map counts as on the road."""
     batch = batch_with_futures(scenarios, chosen).to(fabric.device)
     with fabric.autocast():
-        rollouts = simulate(policy, batch, num_rollouts=config.num_rollouts, seed=config.seed)  # type: ignore[arg-type]
+        rollouts = simulate(
+            policy,  # type: ignore[arg-type]
+            batch,
+            num_rollouts=config.num_rollouts,
+            seed=config.seed,
+            sampling=Sampling(top_k=config.top_k),
+        )
     states = states_of_rollouts(batch, rollouts)
     return score_batch(batch.scenarios, states, metric_by_name(config.metric), missing_map="neutral")
