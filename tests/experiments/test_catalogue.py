@@ -18,6 +18,7 @@ from rlftsim.experiments.catalogue import (
     finetune_curve,
     oracle,
     paired_ttest,
+    qualitative,
     reward_ablation,
     variance_scaling,
 )
@@ -269,6 +270,13 @@ def test_the_oracle_says_what_each_feature_costs(workshop):
     assert cell(found, "linear speed", "likelihood") == "0.7000 ± 0.1000"
     assert cell(found, "time to collision", "likelihood") == "–"
     assert "0.8500" in found.verdicts[0]
+
+
+def test_scenarios_are_shown_by_rule_the_one_that_became_worst_included():
+    ids, before, after = ["a", "b", "c", "d", "e", "f"], np.array([0.5] * 6), np.array([0.4, 0.0, 0.5, 0.9, 0.1, 0.5])
+    chosen = qualitative.choose_scenarios(ids, before, after)
+    assert chosen == {"1. of 6": "b", "2. of 6": "e", "3. of 6": "a", "in the middle": "c", "last of 6": "d"}
+    assert qualitative.choose_scenarios(["a", "b"], before[:2], after[:2]) == {"1. of 2": "b", "2. of 2": "a"}
 
 
 def test_seeds_are_averaged_scenario_by_scenario():

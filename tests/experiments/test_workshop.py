@@ -13,7 +13,7 @@ import scenes
 from rlftsim.cli.main import main
 from rlftsim.errors import CheckpointError, ConfigError, DataError
 from rlftsim.experiments import stages
-from rlftsim.experiments.catalogue import variance_scaling
+from rlftsim.experiments.catalogue import qualitative, variance_scaling
 from rlftsim.experiments.columns import SCORES
 from rlftsim.experiments.contestants import BASE, CATK, ORACLE, Base, FineTuned, over_seeds
 from rlftsim.experiments.demo import DemoConfig, run_demo
@@ -209,6 +209,30 @@ def test_a_slope_needs_rollouts(done, tmp_path):
     few = replace(done, evaluation=replace(QUICK, num_rollouts=2), out=tmp_path)
     with pytest.raises(ConfigError, match="needs 4 rollouts at least, got 2"):
         variance_scaling.measure(few)
+
+
+def test_pairs_are_films_of_the_rollouts_that_were_scored(done):
+    findings = run_experiment("qualitative", qualitative.EXPERIMENT, done)
+    shown = json.loads((done.out / "qualitative.json").read_text())["pairs"]
+    assert 1 <= len(shown) <= 2  # of two scenarios
+    for number, pair in enumerate(shown, 1):
+        assert (done.out / f"qualitative-{number}.mp4").stat().st_size > 1000
+        assert (
+            f"![Scenario {pair['scenario_id']}](qualitative-{number}.webp)" in (done.out / "qualitative.md").read_text()
+        )
+    assert (done.out / "qualitative.html").read_text().count('<figure class="player"') == len(shown)
+    # what is shown is what was scored: the events that are counted are the marks on the picture
+    for pair, animation in zip(shown, findings.animations):
+        for panel, count in zip(animation.panels, pair["events"]):
+            seen = panel.trajectories
+            assert seen.num_rollouts == 1
+            assert count == sum(int(marks.any(-1).sum()) for marks in (seen.collides, seen.offroad))
+    rates = {row: done.measure(ROWS)[row].mean for row in ("base", "MLOO")}
+    for pair in shown:
+        for rate, scores in zip(pair["rates"], rates.values()):
+            place = scores.scenario_ids.index(pair["scenario_id"])
+            stored = scores.values("collision_rate")[place] + scores.values("offroad_rate")[place]
+            assert rate == pytest.approx(float(stored), abs=1e-5)
 
 
 # ---- the command ------------------------------------------------------------------------------------------------------

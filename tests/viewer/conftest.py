@@ -2,6 +2,8 @@ import numpy as np
 import pytest
 
 from rlftsim.scenario.types import LightStates, MapFeatures, MapFeatureType, Scenario, Tracks
+from rlftsim.viewer.page import Animation, Panel
+from rlftsim.viewer.scene import Trajectories, build_scene, logged_trajectories
 
 STEPS = 91
 CHROMIUM = "/usr/bin/chromium"
@@ -84,3 +86,17 @@ def browser():
             pytest.skip(f"no usable Chromium at {CHROMIUM}: {str(error).splitlines()[0]}")
         yield launched
         launched.close()
+
+
+@pytest.fixture
+def animation(scenario) -> Animation:
+    """The log beside two rollouts in which everybody stands 1 m and 2 m further along x."""
+    scene = build_scene(scenario)
+    log = logged_trajectories(scenario).with_overlaps(scene.agents)
+    moved = Trajectories(
+        np.concatenate([log.position + np.array([1, 0]), log.position + np.array([2, 0])]),
+        np.repeat(log.heading, 2, 0),
+        np.ones((2, *log.valid.shape[1:]), bool),
+        offroad=np.zeros((2, *log.valid.shape[1:]), bool),
+    )
+    return Animation("A <title>", scene, [Panel("Logged", log), Panel("Base & more", moved)], caption="</script>")

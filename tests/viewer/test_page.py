@@ -7,23 +7,9 @@ import pytest
 from rlftsim.errors import DataError
 from rlftsim.viewer.page import Animation, Panel, animation_html, write_page
 from rlftsim.viewer.picture import to_png
-from rlftsim.viewer.scene import Trajectories, build_scene, logged_trajectories
+from rlftsim.viewer.scene import Trajectories
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-
-
-@pytest.fixture
-def animation(scenario) -> Animation:
-    """The log beside two rollouts in which everybody stands 1 m and 2 m further along x."""
-    scene = build_scene(scenario)
-    log = logged_trajectories(scenario).with_overlaps(scene.agents)
-    moved = Trajectories(
-        np.concatenate([log.position + np.array([1, 0]), log.position + np.array([2, 0])]),
-        np.repeat(log.heading, 2, 0),
-        np.ones((2, *log.valid.shape[1:]), bool),
-        offroad=np.zeros((2, *log.valid.shape[1:]), bool),
-    )
-    return Animation("A <title>", scene, [Panel("Logged", log), Panel("Base & more", moved)], caption="</script>")
 
 
 @pytest.fixture

@@ -18,6 +18,8 @@ from rlftsim.files import write_text
 from rlftsim.intervals import mean_interval
 from rlftsim.training.run_folder import describe_environment, to_plain
 from rlftsim.viewer.figure import Interval, draw_intervals, save_figure
+from rlftsim.viewer.film import to_film
+from rlftsim.viewer.page import Animation, write_page
 
 
 @dataclass(frozen=True)
@@ -59,9 +61,12 @@ class Findings:
     numbers: Mapping[str, Any] = field(default_factory=dict)
     """The same for machines; what is not finite becomes null."""
     figure: Figure | None = None
+    animations: tuple[Animation, ...] = ()
 
 
 Measured = TypeVar("Measured")
+FILMS = {".webp": 2, ".mp4": 1}
+"""Endings of an animation's films and their steps between frames."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +82,8 @@ class Experiment(Generic[Measured]):
 
 
 def run_experiment(name: str, experiment: Experiment[Any], workshop: Workshop) -> Findings:
-    """Do what is missing and write `out/<name>.md`, `.json` and, with a figure, `.png` and `.svg`; each whole or not at all.
+    """Do what is missing and write `out/<name>.md` and `.json`; with a figure `.png` and `.svg`; with animations `.html`, where they can be
+    played with, and films of each, `-1.webp`, `-1.mp4`, ... Each whole or not at all.
 
     Raises:
         RlftsimError: a stage failed; the message says which and why.
@@ -86,6 +92,11 @@ def run_experiment(name: str, experiment: Experiment[Any], workshop: Workshop) -
     if findings.figure is not None:
         for ending in ("png", "svg"):
             save_figure(workshop.out / f"{name}.{ending}", findings.figure)
+    for number, animation in enumerate(findings.animations, 1):
+        for ending, every in FILMS.items():
+            to_film(workshop.out / f"{name}-{number}{ending}", animation, every=every)
+    if findings.animations:
+        write_page(workshop.out / f"{name}.html", findings.title, findings.animations, caption=experiment.question)
     write_text(workshop.out / f"{name}.json", json.dumps(_plain(name, experiment, findings, workshop), indent=1) + "\n")
     write_text(workshop.out / f"{name}.md", _markdown(name, experiment, findings, workshop))
     return findings
@@ -165,6 +176,13 @@ def _markdown(name: str, experiment: Experiment[Any], findings: Findings, worksh
         if table is findings.tables[0]:
             parts += ["\n".join(f"* {line}" for line in findings.verdicts)] if findings.verdicts else []
             parts += [f"![{findings.title}]({name}.png)"] if findings.figure is not None else []
+    for number, animation in enumerate(findings.animations, 1):
+        film = f"{name}-{number}"
+        parts += [
+            f"## {animation.title}",
+            f"{animation.caption} [Film]({film}.mp4)",
+            f"![{animation.title}]({film}.webp)",
+        ]
     parts += ["## What to know", "\n".join(f"* {line}" for line in (*findings.notes, *_facts(workshop)))]
     return "\n\n".join(parts) + "\n"
 

@@ -48,6 +48,7 @@ from rlftsim.progress import say
 from rlftsim.recipes.models import Device, find_model, load_policy, load_policy_or_oracle
 from rlftsim.recipes.smart import SmartRecipe
 from rlftsim.rollout.fingerprint import fingerprint_policy
+from rlftsim.rollout.policy import Policy
 from rlftsim.scenario.dataset import MANIFEST, ScenarioDataset
 from rlftsim.scenario.shards import hash_file
 from rlftsim.training.run_folder import RunFolder, flatten, may_change, to_plain
@@ -165,6 +166,10 @@ class Workshop:
     def base(self) -> Path:
         """Folder of the base model; pre-trained, if it is not there yet."""
         return Path(self._model(BASE, Agenda(self._steps([BASE], evaluated=False))))
+
+    def policy(self, contestant: Base | FineTuned) -> Policy:
+        """A contestant's policy, on the device of evaluations; trained, if it is not yet."""
+        return load_policy(self._model(contestant, Agenda(self._steps([contestant], evaluated=False))), self.device)
 
     def title(self, contestant: Contestant) -> str:
         """A contestant in words."""

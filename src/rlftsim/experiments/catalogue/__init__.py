@@ -9,6 +9,7 @@ from rlftsim.experiments.catalogue import (
     finetune_curve,
     oracle,
     paired_ttest,
+    qualitative,
     reward_ablation,
     variance_scaling,
 )
@@ -22,6 +23,7 @@ EXPERIMENTS: dict[str, Experiment[Any]] = {
     "finetune-curve": finetune_curve.EXPERIMENT,
     "oracle": oracle.EXPERIMENT,
     "credit": credit.EXPERIMENT,
+    "qualitative": qualitative.EXPERIMENT,
 }
 
 

@@ -1,0 +1,49 @@
+"""Scenes as films."""
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+from PIL import Image
+
+from rlftsim.errors import ConfigError
+from rlftsim.viewer.film import to_film
+
+
+def read_mp4(path):
+    frames = imageio_ffmpeg.read_frames(str(path))
+    meta = next(frames)
+    width, height = meta["size"]
+    return meta, [np.frombuffer(frame, np.uint8).reshape(height, width, 3) for frame in frames]
+
+
+def blue_columns(frame):
+    """Where the ego is in each half of a picture, left to right: its colour is nobody else's."""
+    frame = frame[: int(len(frame) * 0.85)].astype(int)  # above the legend
+    is_blue = (frame[..., 2] > 150) & (frame[..., 0] < 90)
+    return [float(np.nonzero(half)[1].mean()) for half in np.split(is_blue, [frame.shape[1] // 2], axis=1)]
+
+
+def test_an_mp4_plays_the_future_in_real_time_and_everybody_moves(animation, tmp_path):
+    to_film(tmp_path / "film.mp4", animation, dots_per_inch=50)
+    meta, frames = read_mp4(tmp_path / "film.mp4")
+    assert meta["fps"] == 10
+    assert len(frames) == 81 + 10  # from the current step on, and a second to look at the end
+    assert frames[0].shape[1] == 400
+    now, later = blue_columns(frames[0]), blue_columns(frames[20])
+    assert all(after - before > 10 for before, after in zip(now, later))  # the ego drives to the right in both panels
+
+
+def test_a_webp_plays_where_pictures_are_shown(animation, tmp_path):
+    to_film(tmp_path / "film.webp", animation, every=10, dots_per_inch=50)
+    with Image.open(tmp_path / "film.webp") as film:
+        assert film.is_animated
+        assert film.size == (400, 234)
+        first = np.array(film.convert("RGB"))
+        film.seek(2)
+        assert not np.array_equal(first, np.array(film.convert("RGB")))
+
+
+def test_other_endings_are_refused_by_name(animation, tmp_path):
+    with pytest.raises(ConfigError, match=r"film.avi: a film is .mp4 or .webp"):
+        to_film(tmp_path / "film.avi", animation)
+    assert not list(tmp_path.iterdir())
