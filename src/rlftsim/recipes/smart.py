@@ -46,8 +46,8 @@ def smart_demo_rlftsim() -> SmartRecipe:
             max_trained_agents=None, checkpoint_every=50,
         ),
         finetune=FinetuneConfig(
-            epochs=3.0, batch_size=8, num_rollouts=4, learning_rate=3e-4, warmup_updates=5, checkpoint_every=20,
-            kl=KlConfig(target=0.05, initial_beta=0.01),
+            epochs=1.5, batch_size=4, num_rollouts=8, rollouts_per_pass=8, learning_rate=3e-4, warmup_updates=5,
+            checkpoint_every=20, kl=KlConfig(target=0.05, initial_beta=0.01),
         ),
         catk=CatkConfig(
             epochs=3.0, batch_size=8, learning_rate=3e-4, warmup_updates=5, gradient_clip=1.0, max_trained_agents=None,
@@ -63,7 +63,7 @@ def smart_demo_quick() -> SmartRecipe:
         recipe,
         tokens=replace(recipe.tokens, num_tokens=256, num_map_prototypes=64),
         pretrain=replace(recipe.pretrain, epochs=1.0),
-        finetune=replace(recipe.finetune, epochs=0.25, batch_size=4),
+        finetune=replace(recipe.finetune, epochs=0.25, num_rollouts=4),
         catk=replace(recipe.catk, epochs=0.25, batch_size=4),
     )
 
@@ -71,7 +71,7 @@ def smart_demo_quick() -> SmartRecipe:
 def smart_synthetic() -> SmartRecipe:
     """For experiments on the synthetic scenarios: the demo with shorter fine-tuning, because it is run many times."""
     recipe = smart_demo_rlftsim()
-    return replace(recipe, finetune=replace(recipe.finetune, epochs=1.5))
+    return replace(recipe, finetune=replace(recipe.finetune, epochs=1.0))
 
 
 RECIPES = {
