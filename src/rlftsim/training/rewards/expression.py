@@ -29,7 +29,8 @@ def parse_reward(text: str) -> tuple[Term, ...]:
     """The terms of a sum of rewards.
 
     Raises:
-        ConfigError: not a sum of rewards; a reward that is not registered or comes twice; an option that it does not have.
+        ConfigError: not a sum of rewards; a reward that is not registered or comes twice; an option that it does not have;
+            nothing but weights of 0.
     """
     try:
         terms = tuple(_terms(ast.parse(text.strip(), mode="eval").body, 1.0))
@@ -43,6 +44,8 @@ def parse_reward(text: str) -> tuple[Term, ...]:
     for name in names:
         if names.count(name) > 1:
             raise ConfigError(f"reward {text!r} has {name} {names.count(name)} times: name it once, with one weight.")
+    if not any(term.weight for term in terms):
+        raise ConfigError(f"reward {text!r} is always 0: give one of its terms a weight.")
     return terms
 
 
@@ -68,8 +71,8 @@ def _terms(node: ast.expr, factor: float) -> Iterator[Term]:
         case ast.BinOp(left, ast.Mult(), right):
             number, rest = (right, left) if _is_number(right) else (left, right)
             yield from _terms(rest, factor * _number(number))
-        case ast.UnaryOp(ast.USub(), operand):
-            yield from _terms(operand, -factor)
+        case ast.UnaryOp(ast.USub() | ast.UAdd() as sign, operand):
+            yield from _terms(operand, -factor if isinstance(sign, ast.USub) else factor)
         case ast.Name(name):
             yield Term(factor, name, _options(name, reward_by_name(name), {}))
         case ast.Call(ast.Name(name), [], keywords):
