@@ -16,7 +16,7 @@ import platform
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -110,6 +110,12 @@ def _commit() -> str | None:
         return None
 
 
+def _some_of(names: Sequence[str], most: int = 8) -> str:
+    """Names in a line, not too many of them."""
+    rest = f" and {len(names) - most} more" if len(names) > most else ""
+    return f"{', '.join(names[:most])}{rest}"
+
+
 class RunFolder:
     """Opens a run's folder for the first time or to go on. Only the process of rank 0 writes.
 
@@ -141,7 +147,7 @@ class RunFolder:
         differing = sorted(k for k in old.keys() | new.keys() if not may_change(k) and old.get(k) != new.get(k))
         if differing:
             raise CheckpointError(
-                f"{self.path} belongs to a run with other settings or inputs ({', '.join(differing)}): "
+                f"{self.path} belongs to a run with other settings or inputs ({_some_of(differing)}): "
                 "name another --out, or remove the folder to start anew."
             )
 
