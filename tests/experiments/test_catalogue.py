@@ -112,6 +112,16 @@ def test_the_ablation_compares_each_reward_with_the_base_and_with_mloo(workshop)
     assert cell(found, "MLOO", "miss") == "50.00 ± 0.00"
 
 
+def test_the_ablation_says_how_far_each_reward_went(workshop):
+    run = workshop.model_folder(FineTuned("rloo"))
+    run.mkdir(parents=True)
+    lines = [{"update": n, "kl": n / 100, "entropy": 2.0, "diversity_m": 5.0, "speed_gap_mps": -1.0, "reward_std": 0.1} for n in range(10)]  # fmt: skip
+    (run / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    measured = {name: row(name, [0.5, 0.6]) for name in ("base", *reward_ablation.REWARDS)}
+    found = reward_ablation.conclude(measured, workshop).tables[1]
+    assert found.rows == (("RLOO", "0.085", "2", "5", "-1", "0.1"),)  # the last two of ten updates; others have no run
+
+
 def test_columns_in_percent_and_metres_are_the_evaluations_own(workshop):
     columns = {"collision_rate": [0.1, 0.3], "average_displacement_error": [2.0, 3.0]}
     measured = {name: row(name, [0.5, 0.6], **columns) for name in ("base", *credit.COMPARED)}
