@@ -100,7 +100,10 @@ def conclude(measured: Pairs, workshop: Workshop) -> Findings:
         for pair in measured.pairs
     )
     headings = ("place", "scenario", "rollout", "rate before", "rate after", "events before", "events after")
-    note = "Rate: evaluated agents that collide plus those that leave the road, a rollout's share of all, mean over rollouts."
+    note = (
+        "Events: evaluated agents that collide, plus those that leave the road; who does both counts twice. Rate: events an evaluated agent, mean "
+        "over rollouts."
+    )
     return Findings(
         title="The same scenario with the same noise, before and after fine-tuning",
         tables=(
@@ -108,7 +111,12 @@ def conclude(measured: Pairs, workshop: Workshop) -> Findings:
             TextTable("What is shown", headings, cells, note),
         ),
         verdicts=tuple(
-            verdict_line(before, after, column) for column in ("collision_rate", "offroad_rate", "meta_metric")
+            f"{heading}, {verdict_line(before, after, column)}"
+            for heading, column in (
+                ("Collisions", "collision_rate"),
+                ("Off-road driving", "offroad_rate"),
+                ("RMM", "meta_metric"),
+            )
         ),
         notes=(
             f"Scenarios are sorted by how far the rate falls. Shown are the {NUM_BEST} where it falls farthest, the one in the middle, and the "
@@ -157,8 +165,8 @@ def _pair(place: str, scenario: Scenario, policies: Mapping[str, Policy], worksh
     rates = [float(count.double().mean()) / len(scenario.evaluated_indices) for count in events]
     counts = [int(count[rollout]) for count in events]
     caption = (
-        f"{place}, rollout {rollout}: {counts[0]} evaluated agents collide or leave the road before, {counts[1]} after; "
-        f"over all rollouts {rates[0]:.2f} and {rates[1]:.2f} of an agent."
+        f"{place}, rollout {rollout}: {counts[0]} collisions and departures from the road before, {counts[1]} after; "
+        f"over all rollouts {rates[0]:.2f} and {rates[1]:.2f} events an agent."
     )
     title = f"Scenario {scenario.scenario_id}"
     return Pair(
