@@ -142,6 +142,11 @@ class TabulatedEmbedding:
         )
         return self.out(total)
 
+    @property
+    def is_frozen(self) -> bool:
+        """Whether no weight is trained."""
+        return not self.table.requires_grad
+
 
 RelationEmbedding = FourierEmbedding | TabulatedEmbedding
 
@@ -202,7 +207,7 @@ def surround(
     for cut in _cut(widths[empty:], pairs):
         part, of_part = rows[cut], slice(widths[empty:][cut].max(initial=1))
         index = neighbors[part, of_part]
-        known = checkpoint(_describe, embedding, values[part, of_part], use_reentrant=False, preserve_rng_state=False)
+        known = _describe(embedding, values[part, of_part])
         if features is not None:
             known = torch.cat([known, functional.embedding(index, features)], -1)
         bias = torch.zeros_like(known[..., 0]).masked_fill_(~mask[part, of_part], IMPOSSIBLE)
@@ -211,7 +216,14 @@ def surround(
 
 
 def _describe(embedding: RelationEmbedding, values: Float[Tensor, "r K n"]) -> Float[Tensor, "r K D"]:
-    return normalize(embedding(values.flatten(0, 1))).unflatten(0, values.shape[:2])
+    """Normalised embedding; where a gradient flows it is computed again in the backward pass instead of stored."""
+
+    def described() -> Float[Tensor, "r K D"]:
+        return normalize(embedding(values.flatten(0, 1))).unflatten(0, values.shape[:2])
+
+    if embedding.is_frozen or not torch.is_grad_enabled():
+        return described()
+    return checkpoint(described, use_reentrant=False, preserve_rng_state=False)
 
 
 def _cut(widths: np.ndarray, pairs: int) -> list[slice]:
@@ -298,12 +310,17 @@ class RelationAttention(nn.Module):
     ) -> tuple[Float[Tensor, "r H W"], Float[Tensor, "r H 1"]]:
         """Weighted sums of the neighbours' features and relations, and of the weights."""
         known = (piece.known,) if source is None else (piece.known, functional.embedding(piece.neighbors, source))
+        if not torch.is_grad_enabled() and not (self.training and self.dropout):
+            both = torch.cat(known, -1) if len(known) > 1 else piece.known
+            gathered = functional.scaled_dot_product_attention(
+                asked[:, None], both[:, None], both[:, None], attn_mask=piece.bias[:, None], scale=1.0
+            )
+            return gathered[:, 0], torch.ones_like(gathered[:, 0, :, :1])
         scores = piece.bias.expand(-1, self.num_heads, -1)
         for part, to_part in zip(known, asked.chunk(len(known), -1)):
             scores = torch.baddbmm(scores, to_part, part.mT)  # [r, H, K]
         weights = functional.dropout(torch.softmax(scores, -1), self.dropout, self.training)
-        gathered = [weights @ part for part in known]
-        return torch.cat(gathered, -1) if source is not None else gathered[0], weights.sum(-1, keepdim=True)
+        return torch.cat([weights @ part for part in known], -1), weights.sum(-1, keepdim=True)
 
     def _by_head(self, maps: tuple[nn.Linear, ...], norms: tuple[nn.LayerNorm, ...]) -> Float[Tensor, "H d W"]:
         """Weights of maps of relations and sources with their norms' weights inside."""
