@@ -180,7 +180,9 @@ def started_clock(recipe: Recipe, threads: int = 1) -> Any:
     import rlftsim.rollout.simulate
     import rlftsim.training.catk
     import rlftsim.training.pretrain  # noqa: F401
+    from rlftsim.processor import keep_freed_memory
 
+    keep_freed_memory()  # as the command line does
     torch.set_num_threads(threads)
     torch.set_float32_matmul_precision("high")
     torch.ones(1, device=recipe.device) + 1

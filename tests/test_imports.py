@@ -11,7 +11,8 @@ PACKAGE = Path(rlftsim.__file__).parent
 
 FLOORS = (
     ("errors",),
-    ("files", "geometry", "intervals", "progress", "workers"),
+    ("files", "geometry", "intervals", "processor", "progress"),
+    ("workers",),
     ("scenario",),
     ("tokens", "goals"),
     ("rollout",),
@@ -21,7 +22,7 @@ FLOORS = (
     ("experiments",),
     ("cli",),
 )
-"""From the ground up: 0 is what anybody may raise, 9 the command line. A room is a sub-package or a top-level module."""
+"""From the ground up: 0 is what anybody may raise, 10 the command line. A room is a sub-package or a top-level module."""
 
 FLOOR_OF = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
 NOT_THOUGH_BELOW = {("training", "policies"), ("training", "viewer")}

@@ -14,6 +14,7 @@ from multiprocessing.synchronize import Event
 from typing import Any
 
 from rlftsim.errors import ConfigError, DataError
+from rlftsim.processor import keep_freed_memory
 
 Advance = Callable[[int], None]
 Task = Callable[[Any, Advance, Callable[[], bool]], Any]
@@ -83,6 +84,7 @@ def _start_worker(task: bytes, line: _Line) -> None:
     global _task, _line
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group: the parent tells what to do
     threading.Thread(target=_exit_with_parent, daemon=True).start()
+    keep_freed_memory()
     os.environ["OMP_NUM_THREADS"] = "1"  # read when torch is imported, which unpickling the task may do
     _task, _line = pickle.loads(task), line
 

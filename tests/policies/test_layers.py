@@ -79,6 +79,42 @@ def test_messages_and_gradients_are_those_of_plain_attention(
         assert (a - b).abs().max() < 1e-10
 
 
+@pytest.mark.parametrize("sources_are_shared", [True, False])
+@pytest.mark.parametrize("is_tabulated", [True, False])
+def test_messages_without_gradient_are_those_with_one(is_tabulated, sources_are_shared, attention, embedding, scene):
+    values, neighbors, mask, x, sources = scene
+    shared, own = (normalize(sources), None) if sources_are_shared else (None, normalize(sources))
+    if is_tabulated:
+        angle = Grid(-math.pi, math.pi, 2049)
+        embedding = TabulatedEmbedding.build(embedding, (Grid(0.0, math.sqrt(30), 4207, of_roots=True), angle, angle))
+
+    def message():
+        around = surround(embedding, values, neighbors, mask, dim=DIM, features=shared)
+        return attention._message(attention.target_norm(x), own, around)
+
+    with torch.no_grad():
+        found = message()
+    assert not found.requires_grad
+    assert (found - message()).abs().max() < 1e-10
+
+
+def test_a_frozen_embedding_may_have_been_tabulated_without_gradient(attention, embedding, scene):
+    values, neighbors, mask, x, sources = scene
+    angle = Grid(-math.pi, math.pi, 2049)
+    with torch.no_grad():
+        table = TabulatedEmbedding.build(embedding, (Grid(0.0, math.sqrt(30), 4207, of_roots=True), angle, angle))
+    assert not table.is_frozen  # its last map is trained
+    gradients = []
+    for frozen in (False, True):
+        embedding.requires_grad_(not frozen)
+        around = surround(table, values, neighbors, mask, dim=DIM)
+        assert around.pieces[0].known.requires_grad != frozen
+        message = attention._message(attention.target_norm(x), normalize(sources), around)
+        gradients.append(torch.autograd.grad(message.square().sum(), (x, sources, attention.query.weight)))
+    for a, b in zip(*gradients):
+        assert (a - b).abs().max() < 1e-10
+
+
 def test_rows_are_cut_so_that_little_is_padded(embedding, scene):
     values, neighbors, mask, *_ = scene
     around = surround(embedding, values, neighbors, mask, dim=DIM)

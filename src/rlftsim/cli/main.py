@@ -11,6 +11,7 @@ from typing import Any
 
 from rlftsim import __version__
 from rlftsim.errors import RlftsimError
+from rlftsim.processor import keep_freed_memory
 
 VERBS = {
     "demo": ("rlftsim.cli.demo", "Demo"),
@@ -61,6 +62,7 @@ USER_MISTAKE = 2
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command line; returns the exit status."""
+    keep_freed_memory()
     words = list(sys.argv[1:] if arguments is None else arguments)
     if not words or words[0] in ("-h", "--help", "help"):
         print(OVERVIEW, end="")

@@ -6,11 +6,11 @@ from pathlib import Path
 
 from rlftsim.experiments.explain_page import explanation_html
 from rlftsim.experiments.explanation import explain
-from rlftsim.experiments.parts import one_thread
 from rlftsim.experiments.rollout_files import RolloutEntry, find_rollouts, read_states
 from rlftsim.experiments.scenario_source import ScenarioSource, open_scenarios
 from rlftsim.experiments.score import ScoreConfig, check_entries, has_road_edge
 from rlftsim.files import write_text
+from rlftsim.processor import one_thread
 from rlftsim.progress import progress_bar
 from rlftsim.realism import metric_by_name
 from rlftsim.workers import run_tasks

@@ -5,13 +5,11 @@ Groups are ranges of positions. A finished group is a file under `<name>.parts/`
 """
 
 import shutil
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import pyarrow as pa
-import torch
 
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.experiments.evaluation import SCHEMA, Evaluation, Provenance, Skipped, join_evaluations
@@ -112,14 +110,3 @@ class ResumableEvaluation:
         done = total - sum(len(group) for group in missing)
         with progress_bar(title, total, done, show=show_progress) as advance, one_thread():
             run_tasks(task, missing, jobs=jobs, advance=advance)
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """As many as in a worker process: the number of processes must not change a result."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)

@@ -20,6 +20,8 @@ FLOATS_PER_PIECE_ELSEWHERE = 1 << 26
 WIDTHS, LEAST_WIDTH_STEP = 8, 8
 """Rows are worked on together whose numbers of neighbours differ by less than an eighth of the largest, or than eight."""
 IMPOSSIBLE = -1e9
+EPSILON = 1e-5
+"""Added to variances before one is divided by their root."""
 
 
 def initialize(module: nn.Module) -> None:
@@ -35,7 +37,7 @@ def initialize(module: nn.Module) -> None:
 
 def normalize(x: Float[Tensor, "... D"]) -> Float[Tensor, "... D"]:
     """Layer norm without weights: shared by all layers that look at the same values, each folds its own weights in."""
-    return functional.layer_norm(x, x.shape[-1:])
+    return functional.layer_norm(x, x.shape[-1:], eps=EPSILON)
 
 
 class MlpEmbedding(nn.Sequential):
@@ -71,10 +73,15 @@ class FourierEmbedding(nn.Module):
 
     def forward(self, values: Float[Tensor, "E n"], extra: Float[Tensor, "E D"] | None = None) -> Float[Tensor, "E D"]:
         """Embedding of each row; `extra` (categorical embeddings) joins the sum over inputs."""
+        total = self.embed_inputs(values)
+        return self.out(total if extra is None else total + extra)
+
+    def embed_inputs(self, values: Float[Tensor, "E n"]) -> Float[Tensor, "E D"]:
+        """The sum over inputs."""
         total = self.embed_input(0, values[:, 0])
         for index in range(1, len(self.inputs)):
             total = total + self.embed_input(index, values[:, index])
-        return self.out(total if extra is None else total + extra)
+        return total
 
     def embed_input(self, index: int, values: Float[Tensor, "E"]) -> Float[Tensor, "E D"]:
         """What a single input adds to the sum."""
@@ -111,7 +118,7 @@ class TabulatedEmbedding:
     last: Float[Tensor, "n"]
     of_roots: Bool[Tensor, "n"]
     first_row: Int64[Tensor, "n"]
-    out: nn.Module
+    out: nn.Sequential
 
     @classmethod
     def build(cls, embedding: FourierEmbedding, grids: tuple[Grid, ...]) -> "TabulatedEmbedding":
@@ -132,15 +139,23 @@ class TabulatedEmbedding:
 
     def __call__(self, values: Float[Tensor, "E n"]) -> Float[Tensor, "E D"]:
         """Embedding of each row."""
+        return self.out(self.embed_inputs(values))
+
+    def embed_inputs(self, values: Float[Tensor, "E n"]) -> Float[Tensor, "E D"]:
+        """The sum over inputs."""
         values = torch.where(self.of_roots, values.abs().sqrt(), values)
         place = torch.minimum(((values - self.start) / self.spacing).clamp(min=0), self.last)
         low = torch.minimum(place.floor(), self.last - 1)
         share = place - low
         row = low.long() + self.first_row
-        total = functional.embedding_bag(
+        return functional.embedding_bag(
             torch.cat([row, row + 1], -1), self.table, mode="sum", per_sample_weights=torch.cat([1 - share, share], -1)
         )
-        return self.out(total)
+
+    @property
+    def is_frozen(self) -> bool:
+        """Whether no weight is trained."""
+        return not any(weight.requires_grad for weight in (self.table, *self.out.parameters()))
 
 
 RelationEmbedding = FourierEmbedding | TabulatedEmbedding
@@ -202,16 +217,49 @@ def surround(
     for cut in _cut(widths[empty:], pairs):
         part, of_part = rows[cut], slice(widths[empty:][cut].max(initial=1))
         index = neighbors[part, of_part]
-        known = checkpoint(_describe, embedding, values[part, of_part], use_reentrant=False, preserve_rng_state=False)
-        if features is not None:
-            known = torch.cat([known, functional.embedding(index, features)], -1)
+        known = _describe(embedding, values[part, of_part], index, features)
         bias = torch.zeros_like(known[..., 0]).masked_fill_(~mask[part, of_part], IMPOSSIBLE)
         pieces.append(Piece(index, bias[:, None], known))
     return Surroundings(rows, tuple(pieces))
 
 
-def _describe(embedding: RelationEmbedding, values: Float[Tensor, "r K n"]) -> Float[Tensor, "r K D"]:
-    return normalize(embedding(values.flatten(0, 1))).unflatten(0, values.shape[:2])
+def _describe(
+    embedding: RelationEmbedding,
+    values: Float[Tensor, "r K n"],
+    neighbors: Int64[Tensor, "r K"],
+    features: Float[Tensor, "S D"] | None,
+) -> Float[Tensor, "r K W"]:
+    """What a piece knows. Where a gradient flows, relations are embedded again in the backward pass instead of stored."""
+    is_constant = embedding.is_frozen and (features is None or not features.requires_grad)
+    if is_constant or not torch.is_grad_enabled():
+        return _describe_in_place(embedding, values, neighbors, features)
+
+    def described() -> Float[Tensor, "r K D"]:
+        return normalize(embedding(values.flatten(0, 1))).unflatten(0, values.shape[:2])
+
+    known = checkpoint(described, use_reentrant=False, preserve_rng_state=False)
+    return known if features is None else torch.cat([known, functional.embedding(neighbors, features)], -1)
+
+
+def _describe_in_place(
+    embedding: RelationEmbedding,
+    values: Float[Tensor, "r K n"],
+    neighbors: Int64[Tensor, "r K"],
+    features: Float[Tensor, "S D"] | None,
+) -> Float[Tensor, "r K W"]:
+    """The same without gradient and copies: a last map whose outputs have mean zero leaves only a division to normalise."""
+    *before, last = embedding.out
+    hidden = nn.Sequential(*before)(embedding.embed_inputs(values.flatten(0, 1)))
+    dim = last.out_features
+    known = hidden.new_empty(*values.shape[:2], dim if features is None else 2 * dim)
+    relation = known.flatten(0, 1)[:, :dim]
+    weight, bias = last.weight - last.weight.mean(0), last.bias - last.bias.mean()
+    torch.addmm(bias, hidden, weight.mT, out=relation)
+    variance = torch.linalg.vector_norm(relation, dim=-1, keepdim=True).square_() / dim
+    relation *= variance.add_(EPSILON).rsqrt_()
+    if features is not None:
+        torch.index_select(features, 0, neighbors.flatten(), out=known.flatten(0, 1)[:, dim:])
+    return known
 
 
 def _cut(widths: np.ndarray, pairs: int) -> list[slice]:
@@ -278,32 +326,48 @@ class RelationAttention(nn.Module):
         self, target: Float[Tensor, "R D"], source: Float[Tensor, "S D"] | None, around: Surroundings
     ) -> Float[Tensor, "R inner"]:
         """Attention-weighted values of the neighbours, heads concatenated."""
-        message = target.new_zeros(len(target), self.num_heads * self.head_dim)
         source_norm = self.source_norm or self.target_norm
         norms = (self.relation_norm, source_norm)
-        query = self.query(target[around.rows]).unflatten(-1, (self.num_heads, self.head_dim)) / math.sqrt(
-            self.head_dim
-        )
-        keys = self._by_head((self.relation_key, self.source_key), norms)
-        asked = torch.einsum("rhd,hdE->rhE", query, keys).split(around.sizes)
-        gathered, received = zip(*(self._attend(*pair, source) for pair in zip(asked, around.pieces)))
         values = (self.relation_value, self.source_value)
-        answer = torch.einsum("rhE,hdE->rhd", torch.cat(gathered), self._by_head(values, norms))
+        keys = self._by_head((self.relation_key, self.source_key), norms) / math.sqrt(self.head_dim)
+        projections = keys, self._by_head(values, norms).mT
         constant = torch.stack([value(norm.bias) for value, norm in zip(values, norms)]).sum(0)
-        answer = answer + torch.cat(received) * constant.unflatten(-1, (self.num_heads, self.head_dim))
+        query = self.query(target[around.rows]).unflatten(-1, (self.num_heads, self.head_dim)).split(around.sizes)
+        answers = [self._attend(*pair, *projections, source) for pair in zip(query, around.pieces)]
+        answer = torch.cat([gathered for gathered, _ in answers])
+        received = torch.cat([weight for _, weight in answers])
+        answer = answer + received * constant.unflatten(-1, (self.num_heads, self.head_dim))
+        message = target.new_zeros(len(target), self.num_heads * self.head_dim)
         return message.index_copy(0, around.rows, answer.flatten(-2))
 
     def _attend(
+        self,
+        query: Float[Tensor, "r H d"],
+        piece: Piece,
+        keys: Float[Tensor, "H d W"],
+        values: Float[Tensor, "H W d"],
+        source: Float[Tensor, "S D"] | None,
+    ) -> tuple[Float[Tensor, "r H d"], Float[Tensor, "r H 1"]]:
+        """Weighted sums of the neighbours' values, and of the weights."""
+        asked = (query.transpose(0, 1) @ keys).transpose(0, 1)
+        gathered, received = self._gather(asked, piece, source)
+        return (gathered.transpose(0, 1) @ values).transpose(0, 1), received
+
+    def _gather(
         self, asked: Float[Tensor, "r H W"], piece: Piece, source: Float[Tensor, "S D"] | None
     ) -> tuple[Float[Tensor, "r H W"], Float[Tensor, "r H 1"]]:
-        """Weighted sums of the neighbours' features and relations, and of the weights."""
+        """Weighted sums of the neighbours' relations and features, and of the weights."""
         known = (piece.known,) if source is None else (piece.known, functional.embedding(piece.neighbors, source))
+        if not torch.is_grad_enabled() and not (self.training and self.dropout):  # what the fused kernel is fast at
+            whole = (piece.known if source is None else torch.cat(known, -1))[:, None]
+            bias = piece.bias[:, None]
+            gathered = functional.scaled_dot_product_attention(asked[:, None], whole, whole, attn_mask=bias, scale=1.0)
+            return gathered[:, 0], torch.ones_like(gathered[:, 0, :, :1])
         scores = piece.bias.expand(-1, self.num_heads, -1)
         for part, to_part in zip(known, asked.chunk(len(known), -1)):
             scores = torch.baddbmm(scores, to_part, part.mT)  # [r, H, K]
         weights = functional.dropout(torch.softmax(scores, -1), self.dropout, self.training)
-        gathered = [weights @ part for part in known]
-        return torch.cat(gathered, -1) if source is not None else gathered[0], weights.sum(-1, keepdim=True)
+        return torch.cat([weights @ part for part in known], -1), weights.sum(-1, keepdim=True)
 
     def _by_head(self, maps: tuple[nn.Linear, ...], norms: tuple[nn.LayerNorm, ...]) -> Float[Tensor, "H d W"]:
         """Weights of maps of relations and sources with their norms' weights inside."""

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from rlftsim.errors import ConfigError
 from rlftsim.goals.types import Goals
+from rlftsim.processor import one_thread
 from rlftsim.rollout.noise import draw_noise
 from rlftsim.rollout.policy import DecisionDistribution, Policy, Sampling
 from rlftsim.rollout.types import AgentStates, Rollouts
@@ -26,6 +27,7 @@ def sample_decision(
     return distribution.sample(sampling, noise)
 
 
+@one_thread()
 @torch.no_grad()
 def simulate(
     policy: Policy,
@@ -39,7 +41,7 @@ def simulate(
     choose: Choose = sample_decision,
     force: Force | None = None,
 ) -> Rollouts:
-    """Simulate N futures of every scenario, all in one batch.
+    """Simulate N futures of every scenario, all in one batch; on a CPU with one thread.
 
     Args:
         policy: decides for every agent, the ego included.

@@ -26,8 +26,9 @@ class DeviceConfig:
     """Processes on this machine. Under torchrun it and `num_nodes` do not count: the processes are those that it starts."""
     num_nodes: int = 1
     precision: Literal["32-true", "bf16-mixed"] = "32-true"
-    threads: int = 0
-    """CPU threads of each process; 0 = torch's own choice. More than one needs OMP_WAIT_POLICY=PASSIVE on shared cores."""
+    threads: int = 1
+    """CPU threads of each process; 0 = torch's own choice. More than one needs OMP_WAIT_POLICY=PASSIVE on shared cores. Rollouts always use
+    one."""
 
     def __post_init__(self) -> None:
         require_positive(self, ("devices", "num_nodes"))

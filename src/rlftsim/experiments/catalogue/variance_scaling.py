@@ -19,10 +19,10 @@ from torch import Tensor
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.experiments.evaluate import EvaluateConfig, check_jobs, choose_scenarios, simulate_states
 from rlftsim.experiments.findings import Experiment, Findings, TextTable
-from rlftsim.experiments.parts import one_thread
 from rlftsim.experiments.workshop import Workshop
 from rlftsim.files import write_text
 from rlftsim.intervals import MeanInterval, mean_interval
+from rlftsim.processor import one_thread
 from rlftsim.progress import progress_bar
 from rlftsim.realism import Features, ScenarioLog, build_scenario_log, compute_features, metric_by_name, score_features
 from rlftsim.recipes.models import load_policy
