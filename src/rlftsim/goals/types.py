@@ -6,6 +6,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from rlftsim.errors import ConfigError
+
 
 @dataclass(frozen=True, eq=False)
 class Goals:
@@ -38,7 +40,15 @@ class Goals:
         return Goals(self.position[selected], self.goal_mask[selected])
 
     def repeat(self, num_rollouts: int) -> "Goals":
-        """The goals of a single rollout, asked in N of them; no copies."""
+        """The goals of a single rollout, asked in N of them, without copies; goals of N rollouts as they are.
+
+        Raises:
+            ConfigError: they are of another number of rollouts.
+        """
+        if self.num_rollouts not in (1, num_rollouts):
+            raise ConfigError(
+                f"goals of {self.num_rollouts} rollouts cannot be those of {num_rollouts}: give as many, or those of one."
+            )
         return Goals(self.position.expand(-1, num_rollouts, -1, -1), self.goal_mask.expand(-1, num_rollouts, -1))
 
     def only(self, chosen: Bool[Tensor, "B #N A"]) -> "Goals":
