@@ -55,6 +55,13 @@ class Goals:
         """The same, without the goals of agents that are not chosen."""
         return replace(self, goal_mask=self.goal_mask & chosen)
 
+    def where(self, condition: Bool[Tensor, "B N A"], other: "Goals") -> "Goals":
+        """These goals where a condition is True, other ones elsewhere."""
+        return Goals(
+            torch.where(condition[..., None], self.position, other.position),
+            torch.where(condition, self.goal_mask, other.goal_mask),
+        )
+
     def to(self, device: torch.device | str) -> "Goals":
         """The same goals on another device."""
         return Goals(self.position.to(device), self.goal_mask.to(device))

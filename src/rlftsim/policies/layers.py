@@ -340,10 +340,8 @@ class RelationAttention(nn.Module):
         query = self.query(target[pointers.rows]).unflatten(-1, (self.num_heads, self.head_dim))
         key = functional.linear((pointers.marked - pointers.relation) * norms[0].weight, self.relation_key.weight)
         score = (query * key.view_as(query)).sum(-1, keepdim=True) / math.sqrt(self.head_dim)
-        said = sum(
-            value(part * norm.weight + norm.bias)
-            for value, part, norm in zip(values, (pointers.marked, pointers.features), norms)
-        )
+        parts = zip(values, norms, (pointers.marked, pointers.features))
+        said = torch.stack([value(part * norm.weight + norm.bias) for value, norm, part in parts]).sum(0)
         change = torch.tanh(score / 2) * (said.view_as(own) - own)
         return message.index_add(0, pointers.rows, change.flatten(-2))
 

@@ -74,6 +74,12 @@ def smart_synthetic() -> SmartRecipe:
     return replace(recipe, finetune=replace(recipe.finetune, epochs=1.0))
 
 
+def goal_conditioned(recipe: SmartRecipe) -> SmartRecipe:
+    """The same recipe, its fine-tuning with goals: the paper's reward, everybody goes where the record ended."""
+    goals = replace(recipe.finetune.goals, share=1.0)
+    return replace(recipe, finetune=replace(recipe.finetune, goals=goals, reward="gcft"))
+
+
 RECIPES = {
     "smart-tiny": smart_tiny_rlftsim,
     "smart-mini": smart_mini_rlftsim,

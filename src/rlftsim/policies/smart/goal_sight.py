@@ -60,6 +60,13 @@ class GoalState(FourierEmbedding):
         nn.init.zeros_(last.weight)
         nn.init.zeros_(last.bias)
 
+    @torch.no_grad()
+    def know(self, relation: FourierEmbedding) -> None:
+        """Take over what another embedding knows of its first two inputs, if these are distance and bearing."""
+        self.frequencies.weight.copy_(relation.frequencies.weight[:2])
+        for own, known in zip(self.inputs, relation.inputs):
+            own.load_state_dict(known.state_dict())
+
     def look(
         self, goals: SeenGoals, poses: Poses, rows: tuple[Tensor, ...], *, seam_rad: float
     ) -> tuple[Int64[Tensor, "g"], Float[Tensor, "g D"]]:

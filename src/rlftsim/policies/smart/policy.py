@@ -17,7 +17,7 @@ from rlftsim.goals.types import Goals
 from rlftsim.policies.layers import normalize
 from rlftsim.policies.smart.config import GoalSight, SmartConfig
 from rlftsim.policies.smart.distribution import TokenDistribution
-from rlftsim.policies.smart.goal_sight import SeenGoals, see_goals
+from rlftsim.policies.smart.goal_sight import GoalState, SeenGoals, see_goals
 from rlftsim.policies.smart.heads import NEVER, ClassHeads
 from rlftsim.policies.smart.network import Past, Scene, SmartNetwork, TokenSteps, nowhere_unless
 from rlftsim.rollout.types import AgentStates, Rollouts
@@ -224,8 +224,12 @@ class SmartPolicy(nn.Module):
     def fine_tuned_parts(self) -> tuple[nn.Module, ...]:
         """What closed-loop fine-tuning trains: the decoder's attention and the head, as the public CAT-K code does, and the sight of goals."""
         decoder = self.network.decoder
-        parts = (decoder.time_layers, decoder.map_layers, decoder.agent_layers, decoder.head)
-        return parts if decoder.goal is None else (*parts, decoder.goal)
+        return decoder.time_layers, decoder.map_layers, decoder.agent_layers, decoder.head, *self.goal_parts()
+
+    def goal_parts(self) -> tuple[nn.Module, ...]:
+        """What sees goals; nothing in a model that does not."""
+        goal = self.network.decoder.goal
+        return () if goal is None else (goal,)
 
     # ---- goals ----------------------------------------------------------------------------------------------------
 
@@ -247,6 +251,9 @@ class SmartPolicy(nn.Module):
                 f"this model sees goals by {self.config.goal}, not by {goal}: start from a model that sees none."
             )
         policy = SmartPolicy(replace(self.config, goal=goal), self.vocabulary).to(next(self.parameters()).device)
+        decoder = policy.network.decoder
+        if isinstance(decoder.goal, GoalState):
+            decoder.goal.know(self.network.decoder.map_relation)
         new = {k: v for k, v in policy.network.state_dict().items() if k.startswith("decoder.goal.")}
         load_strictly(policy.network, {**self.network.state_dict(), **new}, source="the model to start from")
         return policy.train(self.training)
