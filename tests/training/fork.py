@@ -4,7 +4,6 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
-import tiny
 import torch
 from torch.nn.functional import cross_entropy
 
@@ -13,6 +12,7 @@ from rlftsim.policies.smart.config import SmartConfig
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.types import CURRENT_STEP, STEP_S, TOTAL_STEPS, MapFeatureType
+from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
 
 SPEED_MPS = 6.0
 STRAIGHT_M, BEND_M, ANGLE_RAD = 8.0, 24.0, 0.6
@@ -52,7 +52,7 @@ def scenario(side):
 def fork():
     """Both scenarios, and a policy that takes either branch."""
     both = [scenario(1), scenario(-1)]
-    vocabulary = tiny.build_vocabulary(both, tiny.TokensConfig(num_tokens=32, num_map_prototypes=16))[0]
+    vocabulary = build_vocabulary(both, TokensConfig(num_tokens=32, num_map_prototypes=16))[0]
     torch.manual_seed(0)
     policy, batch = SmartPolicy(MODEL, vocabulary), collate(both)
     optimizer = torch.optim.AdamW(policy.parameters(), lr=3e-3)
