@@ -3,7 +3,6 @@
 import fork
 import pytest
 import tiny
-import torch
 
 from rlftsim.goals.recorded import recorded_goals
 from rlftsim.rollout.simulate import simulate
