@@ -15,7 +15,7 @@ from rlftsim.experiments.stages import finetune_with_catk, finetune_with_reward,
 from rlftsim.policies.smart.config import GoalSight
 from rlftsim.progress import say
 from rlftsim.recipes.configure import Override, configure
-from rlftsim.recipes.smart import RECIPES, goal_conditioned
+from rlftsim.recipes.smart import RECIPES
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.tokens.vocabulary import Vocabulary
 from rlftsim.training.parallel import is_first_process
@@ -125,7 +125,7 @@ class Finetune:
         if self.goal is not None:
             if self.method == "catk":
                 raise ConfigError("--goal has no effect with --method catk, which knows no goals: leave it out.")
-            recipe = goal_conditioned(recipe)
+            recipe = recipe.with_goals()
         recipe = configure(recipe, self.set, sections=(section,))
         scenarios = open_split(self.data, self.split)
         every = recipe.catk.validation.every if self.method == "catk" else 0
