@@ -19,10 +19,16 @@ CONFIG = FinetuneConfig(
 )  # fmt: skip
 
 
-def ends_on_the_left_m(policy, batch, goals):
-    """How far to the left of where they started 64 rollouts of each scenario end. The branches end 21 m to either side."""
-    rollouts = simulate(policy, batch, num_rollouts=64, seed=9, goals=goals)
+def ends_on_the_left_m(policy, batch, goals, seed=9):
+    """How far to the left of where they started 64 rollouts of each scenario end. The branches end 16 m to either side."""
+    rollouts = simulate(policy, batch, num_rollouts=64, seed=seed, goals=goals)
     return (rollouts.position[..., -1, :] - batch.position[:, None, :, 10])[:, :, 0, 1]
+
+
+def obeys(policy, batch, goals, seed):
+    """Share of rollouts on the asked branch."""
+    left, right = ends_on_the_left_m(policy, batch, goals, seed)
+    return float((left.gt(0).float().mean() + right.lt(0).float().mean()) / 2)
 
 
 @pytest.mark.slow
@@ -37,11 +43,12 @@ def test_the_asked_branch_is_taken(sight):
     assert 0.2 < free.gt(0).float().mean() < 0.8
     fabric = start_fabric(CONFIG.device)
     learner = prepare(policy, CONFIG, fabric.device)
-    for _ in range(100):
+    for update in range(200):
         values = update_policy(learner, batch, CONFIG, fabric)
+        if update % 20 == 19 and obeys(policy, batch, goals, seed=1) > 0.97:
+            break
     assert values["goal_passed_rate"] >= values["goal_reached_rate"] > 0.7
-    left, right = ends_on_the_left_m(policy, batch, goals)
-    assert (left.gt(0).float().mean() + right.lt(0).float().mean()) / 2 >= 0.95
+    assert obeys(policy, batch, goals, seed=2) >= 0.95
     unasked = ends_on_the_left_m(policy, batch, None)
     assert (unasked.abs() > 10).float().mean() > 0.9  # asked nothing it still takes one of the branches
     assert ends_on_the_left_m(learner.reference, batch, None).equal(free)
