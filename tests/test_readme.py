@@ -36,7 +36,8 @@ def test_every_command_can_be_read(page, line):
     verb = parse(words)
     overrides = getattr(verb, "set", [])
     if overrides:
-        configure(RECIPES[verb.recipe](), overrides)
+        recipe = RECIPES[verb.recipe]()
+        configure(recipe.with_goals() if getattr(verb, "goal", None) else recipe, overrides)
 
 
 def test_there_are_commands_and_a_wrong_one_would_be_seen():

@@ -262,6 +262,9 @@ def test_what_has_no_effect_on_a_method_is_refused(tmp_path, vocabulary, capsys)
         ([*catk, "--validation-split", "validation"], "--validation-split validation has no effect"),
         (["--validation-split", "validation"], "--validation-split validation has no effect"),
         ([*catk, *every, "--validation-split", "tests"], "no split 'tests'"),
+        ([*catk, "--goal", "concat"], "--goal has no effect with --method catk"),
+        (["--set", "finetune.reward=gcft"], "needs goals: set finetune.goals.share above 0"),
+        (["--set", "finetune.goals.share=1"], "this model does not see goals: add --goal concat or --goal indication"),
     ]
     SmartPolicy(smart_demo(), Vocabulary.load(vocabulary)).save_pretrained(tmp_path / "base")
     words = ["finetune", "smart-demo", "--model", tmp_path / "base", "--data", "synthetic", "--out", tmp_path / "o"]

@@ -5,6 +5,7 @@ import tiny
 import torch
 
 import scenes
+from rlftsim.goals.types import Goals
 from rlftsim.realism import METRIC_2025, measure_batch
 from rlftsim.realism.agent_scores import AgentScores
 from rlftsim.realism.batch import score_measured
@@ -41,6 +42,9 @@ def measured(vocabulary):
     )  # tracks are not in the order of ids
     batch = collate([scenes.straight_road(), replace(other, tracks=mirrored)])
     rollouts = simulate(tiny.tiny_policy(vocabulary), batch, num_rollouts=4, seed=1)
+    # as if everybody had been asked to go where the first rollout ends
+    goals = Goals.of_scenarios(rollouts.position[:, 0, :, -1], batch.agent_mask).repeat(4)
+    rollouts = replace(rollouts, goals=goals)
     features = measure_batch(batch.scenarios, states_of_rollouts(batch, rollouts))
     agents = AgentScores(features, METRIC_2025, batch.agent_mask.shape[1])
     return score_measured(features, METRIC_2025), rollouts, batch, agents

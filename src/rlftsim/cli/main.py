@@ -22,6 +22,7 @@ VERBS = {
     "tokens": ("rlftsim.cli.tokens", "Tokens"),
     "pretrain": ("rlftsim.cli.train", "Pretrain"),
     "finetune": ("rlftsim.cli.train", "Finetune"),
+    "augment": ("rlftsim.cli.augment", "Augment"),
     "model": ("rlftsim.cli.model", "Model"),
     "simulate": ("rlftsim.cli.simulate", "Simulate"),
     "score": ("rlftsim.cli.results", "Score"),
@@ -44,7 +45,8 @@ usage: rlftsim VERB ...      rlftsim VERB --help explains a verb
 
   tokens       build a vocabulary of motion and map tokens, or look at one
   pretrain     train a model to predict the next motion token
-  finetune     fine-tune a model closed-loop with a realism reward
+  finetune     fine-tune a model closed-loop with a realism reward, with goals if asked
+  augment      draw further goals for fine-tuning with goals
   model        take a checkpoint from the public CAT-K code, or hand one back
   simulate     roll scenarios out with a model
 

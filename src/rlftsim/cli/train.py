@@ -12,6 +12,7 @@ from rlftsim.cli.data import open_split, splits_of
 from rlftsim.errors import ConfigError, RlftsimError
 from rlftsim.experiments.learning_curve import write_learning_curve
 from rlftsim.experiments.stages import finetune_with_catk, finetune_with_reward, pretrain_smart
+from rlftsim.policies.smart.config import GoalSight
 from rlftsim.progress import say
 from rlftsim.recipes.configure import Override, configure
 from rlftsim.recipes.smart import RECIPES
@@ -108,6 +109,9 @@ class Finetune:
     method: Literal["rlft", "catk"] = "rlft"
     """rlft: policy gradient of a realism reward, fields finetune.*. catk: imitation along rollouts that keep near the record, the
     closest among the top K tokens, fields catk.*."""
+    goal: GoalSight | None = None
+    """Fine-tune with goals: how the model is to see them, concat or indication. It then learns with reward gcft, every agent asked to go
+    where its record ends; see finetune.goals for other goals. Left out, the model keeps the sight it has."""
     split: str = "training"
     validation_split: str | None = None
     """For catk: what to validate on, see catk.validation.every, which is 0 (never). Left out, "validation" where the data set has it."""
@@ -117,13 +121,18 @@ class Finetune:
     def run(self) -> int:
         """Load the model and fine-tune it."""
         section = "finetune" if self.method == "rlft" else "catk"
-        recipe = configure(RECIPES[self.recipe](), self.set, sections=(section,))
+        recipe = RECIPES[self.recipe]()
+        if self.goal is not None:
+            if self.method == "catk":
+                raise ConfigError("--goal has no effect with --method catk, which knows no goals: leave it out.")
+            recipe = recipe.with_goals()
+        recipe = configure(recipe, self.set, sections=(section,))
         scenarios = open_split(self.data, self.split)
         every = recipe.catk.validation.every if self.method == "catk" else 0
         held_out = _held_out(self.data, self.validation_split, every)
         with _drawn(self.out):
             if self.method == "rlft":
-                model = finetune_with_reward(self.model, scenarios, recipe.finetune, self.out)
+                model = finetune_with_reward(self.model, scenarios, recipe.finetune, self.out, goal=self.goal)
             else:
                 model = finetune_with_catk(self.model, scenarios, recipe.catk, self.out, held_out=held_out)
         print(f"model: {model}")

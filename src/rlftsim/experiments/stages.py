@@ -4,7 +4,8 @@ from pathlib import Path
 
 import torch
 
-from rlftsim.policies.smart.config import SmartConfig
+from rlftsim.errors import ConfigError
+from rlftsim.policies.smart.config import GoalSight, SmartConfig
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.recipes.card import model_card
 from rlftsim.recipes.models import load_policy
@@ -51,14 +52,24 @@ def pretrain_smart(
     return pretrain(policy, training, out, config, held_out=held_out, card=card)
 
 
-def finetune_with_reward(base: str | Path, training: ScenarioDataset, config: FinetuneConfig, out: Path) -> Path:
-    """Folder of a model fine-tuned closed-loop from a base model.
+def finetune_with_reward(
+    base: str | Path, training: ScenarioDataset, config: FinetuneConfig, out: Path, *, goal: GoalSight | None = None
+) -> Path:
+    """Folder of a model fine-tuned closed-loop from a base model, which is given sight of goals if `goal` says how.
 
     Raises:
         CheckpointError: `out` holds a run with other settings or another base model.
+        ConfigError: the base model has no weights, or sees goals in another way.
     """
-    card = model_card(f"fine-tuned ({config.reward}) from {base}", training.folder, len(training))
-    return finetune(load_policy(str(base)), training, out, config, card=card)
+    how = config.reward if goal is None else f"{config.reward}, goals by {goal}"
+    card = model_card(f"fine-tuned ({how}) from {base}", training.folder, len(training))
+    policy = load_policy(str(base))
+    if goal is not None:
+        if not isinstance(policy, SmartPolicy):
+            raise ConfigError(f"{base} has no weights, so it cannot learn to see goals: name a model folder.")
+        torch.manual_seed(config.seed)
+        policy = policy.with_goal_sight(goal)
+    return finetune(policy, training, out, config, card=card)
 
 
 def finetune_with_catk(

@@ -20,6 +20,11 @@ class SmartRecipe:
     finetune: FinetuneConfig = field(default_factory=FinetuneConfig)
     catk: CatkConfig = field(default_factory=CatkConfig)
 
+    def with_goals(self) -> "SmartRecipe":
+        """The same, fine-tuning with goals: the paper's reward, everybody is asked to go where the record ends."""
+        goals = replace(self.finetune.goals, share=1.0)
+        return replace(self, finetune=replace(self.finetune, goals=goals, reward="gcft"))
+
 
 def smart_tiny_rlftsim() -> SmartRecipe:
     """The paper: SMART-tiny (7 M), pre-trained on WOMD for 32 epochs, fine-tuned for one."""

@@ -139,6 +139,15 @@ class _Subject:
         """Rollouts in which some agents are led for a while."""
         return self.simulate(self.batch, force=_lead_some(self.batch, self.policy.steps_per_decision))
 
+    @cached_property
+    def asked(self) -> Rollouts:
+        """Rollouts in which some agents have goals."""
+        batch = self.batch
+        index = torch.arange(batch.agent_mask.shape[1], device=batch.device)
+        shift = torch.tensor([20.0, 5.0], device=batch.device)
+        goals = Goals.of_scenarios(batch.position[:, :, CURRENT_STEP] + shift, batch.agent_mask & (index % 2 == 0))
+        return self.simulate(batch, goals=goals)
+
     @property
     def module(self) -> nn.Module:
         if not isinstance(self.policy, nn.Module) or not any(True for _ in self.policy.parameters()):
@@ -245,21 +254,23 @@ def scores_hold_with_forced_agents(subject: _Subject) -> str:
 
 def scores_hold_with_goals(subject: _Subject) -> str:
     """Scored log-probabilities equal the sampled ones where agents have goals."""
-    batch = subject.batch
-    index = torch.arange(batch.agent_mask.shape[1], device=batch.device)
-    shift = torch.tensor([20.0, 5.0], device=batch.device)
-    goals = Goals(
-        (batch.position[:, :, CURRENT_STEP] + shift)[:, None].expand(-1, NUM_ROLLOUTS, -1, -1),
-        (batch.agent_mask & (index % 2 == 0))[:, None].expand(-1, NUM_ROLLOUTS, -1),
-    )
-    rollouts = subject.simulate(batch, goals=goals)
-    return _within(_gap(subject.log_prob(batch, rollouts), rollouts.log_prob), SCORE_TOLERANCE, "largest gap")
+    scored = subject.log_prob(subject.batch, subject.asked)
+    return _within(_gap(scored, subject.asked.log_prob), SCORE_TOLERANCE, "largest gap")
+
+
+def goals_of_nobody_change_nothing(subject: _Subject) -> str:
+    """Rollouts and scores with goals that no agent has are those without goals."""
+    position = torch.full_like(subject.batch.position[:, :, CURRENT_STEP], math.nan)
+    nobody = Goals.of_scenarios(position, torch.zeros_like(subject.batch.agent_mask))
+    rollouts = subject.simulate(subject.batch, goals=nobody)
+    _within(_gap(rollouts.position, subject.rollouts.position), 0.0, "rollouts apart (m)")
+    return _within(_gap(subject.log_prob(subject.batch, rollouts), rollouts.log_prob), SCORE_TOLERANCE, "largest gap")
 
 
 def slices_of_scores_are_scores_of_slices(subject: _Subject) -> str:
     """The score of some of the rollouts is that part of the score of all."""
     gaps = []
-    for rollouts in (subject.rollouts, subject.steered):
+    for rollouts in (subject.rollouts, subject.steered, subject.asked):
         whole = subject.log_prob(subject.batch, rollouts)
         for part in (slice(0, 1), slice(1, NUM_ROLLOUTS)):
             gaps.append(_gap(subject.log_prob(subject.batch, rollouts.select(part)), whole[:, part]))
@@ -469,7 +480,7 @@ def _back_propagate(module: nn.Module, subject: _Subject, *, scale: float) -> No
     """Gradients of a policy-gradient loss whose rewards are `scale` times 1, 2, ..."""
     assert isinstance(module, Policy)
     module.zero_grad(set_to_none=True)
-    rollouts = subject.rollouts
+    rollouts = subject.asked  # so that what looks at goals takes part
     scored = module.score(module.encode(subject.batch), rollouts).log_prob(rollouts.decision)
     reward = scale * torch.arange(1.0, NUM_ROLLOUTS + 1, device=scored.device)[None, :, None, None]
     (-reward * torch.where(rollouts.decision_mask, scored, 0.0)).sum().backward()
@@ -497,7 +508,7 @@ def turned_and_shifted_scenes_score_alike(subject: _Subject) -> str:
         moved = [move_scenario(s, turn, SHIFT_M) for s in still.scenarios]
         batch = subject.collate(moved)
         offset = torch.from_numpy(_offsets(still.scenarios, moved)).to(subject.device)
-        for rollouts in (still.rollouts, still.steered):
+        for rollouts in (still.rollouts, still.steered, still.asked):
             scored = subject.log_prob(batch, _move_rollouts(rollouts, turn, offset))
             gaps[what] = max(gaps.get(what, 0.0), _gap(scored, subject.log_prob(still.batch, rollouts)))
     worst = max(gaps, key=lambda name: gaps[name])
@@ -541,13 +552,17 @@ def _offsets(before: Sequence[Scenario], after: Sequence[Scenario]) -> np.ndarra
 def _move_rollouts(rollouts: Rollouts, turn: float, offset: Tensor) -> Rollouts:
     def moved(position: Tensor) -> Tensor:
         angle = torch.full(position.shape[:-1], turn, device=position.device)
-        return rotate(position, angle) + offset[:, None, None, None]
+        return rotate(position, angle) + offset.view(-1, *[1] * (position.dim() - 2), 2)
 
-    forced = rollouts.forced
+    forced, goals = rollouts.forced, rollouts.goals
     if forced is not None:
         forced = AgentStates(moved(forced.position), wrap_angle(forced.heading + turn), forced.valid)
     return replace(
-        rollouts, position=moved(rollouts.position), heading=wrap_angle(rollouts.heading + turn), forced=forced
+        rollouts,
+        position=moved(rollouts.position),
+        heading=wrap_angle(rollouts.heading + turn),
+        forced=forced,
+        goals=goals and replace(goals, position=moved(goals.position)),
     )
 
 
@@ -562,6 +577,7 @@ CHECKS: tuple[Check, ...] = (
     scores_equal_what_was_sampled,
     scores_hold_with_forced_agents,
     scores_hold_with_goals,
+    goals_of_nobody_change_nothing,
     slices_of_scores_are_scores_of_slices,
     divergence_from_itself_is_zero,
     divergence_is_never_negative,

@@ -49,7 +49,8 @@ def simulate(
         num_rollouts: N, or a range of rollout ids: ids 8..15 of a seed are the same rollouts whether drawn alone or among 32.
         seed: of the noise; see `rollout.noise`.
         context: `policy.encode(batch)`, where it is at hand.
-        goals: what agents are asked to do; None = goal-free.
+        goals: what agents are asked to do, in each of the N rollouts or, where they are of a single one, in all of them; None =
+            goal-free.
         sampling: temperature and truncation.
         choose: picks decisions from a distribution; CAT-K is another one.
         force: called before every advance with the state and the step it starts at; may impose states on agents.
@@ -64,6 +65,7 @@ def simulate(
             f"cannot simulate {len(rollout_ids)} rollouts with {stride} steps per decision: need >= 1 and a divisor of 80."
         )
     num_decisions = FUTURE_STEPS // stride
+    goals = goals and goals.repeat(len(rollout_ids))
     context = policy.encode(batch) if context is None else context
     initial = draw_noise(batch, rollout_ids, seed=seed, purpose="begin", per_agent=policy.initial_noise_size)
     noise = draw_noise(batch, rollout_ids, seed=seed, purpose="decide", per_agent=num_decisions * policy.noise_size)

@@ -1,6 +1,6 @@
 """What an update learns from, and what a person wants to know of it."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -8,6 +8,7 @@ from jaxtyping import Float
 from lightning_fabric import Fabric
 from torch import Tensor
 
+from rlftsim.goals.attainment import is_passed, is_reached, rate
 from rlftsim.realism import RealismResult
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
@@ -24,6 +25,12 @@ class Experience:
     rollouts: Rollouts
     scores: RealismResult
     rewards: Rewards
+
+    def slices(self, size: int) -> Iterator[tuple[Rollouts, Float[Tensor, "B n A"]]]:
+        """So many of the rollouts of every scenario at once, and what each agent in them earned."""
+        for start in range(0, self.rollouts.num_rollouts, size):
+            part = slice(start, start + size)
+            yield self.rollouts.select(part), self.rewards.by_agent[:, part]
 
 
 def describe(experiences: Sequence[Experience], fabric: Fabric) -> dict[str, float]:
@@ -45,19 +52,33 @@ def describe_scenarios(experience: Experience) -> dict[str, Float[Tensor, "B"]]:
     }
     for term, values in zip(rewards.terms, rewards.by_term):
         reward |= {f"reward_{term.name}_mean": values.mean(-1), f"reward_{term.name}_std": values.std(-1)}
-    return reward | {
-        "rmm": scores.meta_metric,
-        "kinematic": scores.kinematic,
-        "interactive": scores.interactive,
-        "map_based": scores.map_based,
-        "ade_m": scores.average_displacement_error,
-        "min_ade_m": scores.min_average_displacement_error,
-        "collision_rate": scores.collision_rate,
-        "offroad_rate": scores.offroad_rate,
-        "traffic_light_violation_rate": scores.traffic_light_violation_rate,
-        "diversity_m": compute_diversity(experience.rollouts),
-        "speed_gap_mps": compute_speed_gap(experience.batch, experience.rollouts),
-    }
+    return (
+        reward
+        | describe_goals(experience)
+        | {
+            "rmm": scores.meta_metric,
+            "kinematic": scores.kinematic,
+            "interactive": scores.interactive,
+            "map_based": scores.map_based,
+            "ade_m": scores.average_displacement_error,
+            "min_ade_m": scores.min_average_displacement_error,
+            "collision_rate": scores.collision_rate,
+            "offroad_rate": scores.offroad_rate,
+            "traffic_light_violation_rate": scores.traffic_light_violation_rate,
+            "diversity_m": compute_diversity(experience.rollouts),
+            "speed_gap_mps": compute_speed_gap(experience.batch, experience.rollouts),
+        }
+    )
+
+
+def describe_goals(experience: Experience) -> dict[str, Float[Tensor, "B"]]:
+    """Shares of the evaluated agents with a goal that meet it; NaN for a scenario in which nobody has one. Nothing in goal-free runs."""
+    rollouts, goals = experience.rollouts, experience.rollouts.goals
+    if goals is None:
+        return {}
+    mask = goals.goal_mask & experience.batch.evaluated_mask[:, None]
+    ways = {"goal_reached_rate": is_reached, "goal_passed_rate": is_passed}
+    return {name: rate(is_met(rollouts.position, goals), mask).mean(-1) for name, is_met in ways.items()}
 
 
 def compute_diversity(rollouts: Rollouts) -> Float[Tensor, "B"]:

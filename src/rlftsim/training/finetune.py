@@ -7,7 +7,8 @@ import copy
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from lightning_fabric import Fabric
 from torch import Tensor, nn
 
 from rlftsim.errors import ConfigError, require_finite, require_not_negative, require_positive
+from rlftsim.goals.stored import StoredGoals
 from rlftsim.progress import progress_bar, say
 from rlftsim.realism import AgentScores, RealismResult, measure_batch, metric_by_name, score_measured
 from rlftsim.realism.from_rollouts import states_of_rollouts
@@ -30,6 +32,8 @@ from rlftsim.training.checkpoint import Progress, newest_checkpoint, read_checkp
 from rlftsim.training.data import batch_with_futures, scenarios_of_update
 from rlftsim.training.experience import Experience, describe
 from rlftsim.training.freezing import TrainedParts, freeze_untrained
+from rlftsim.training.goals import GoalConfig, choose_goals
+from rlftsim.training.hindsight import look_back
 from rlftsim.training.parallel import DeviceConfig, add_up, add_up_gradients, own_share, start_fabric
 from rlftsim.training.policy_gradient import Reduction, agent_log_prob, masked_sum, policy_gradient_loss
 from rlftsim.training.reference import KlConfig, adapt_beta, move_reference
@@ -75,6 +79,7 @@ class FinetuneConfig:
     """Nats per decision; an update that exceeds it, or is not finite, is skipped."""
     max_skipped_in_a_row: int = 5
     """After so many skipped updates the run stops with its last good checkpoint."""
+    goals: GoalConfig = field(default_factory=GoalConfig)
     alarms: AlarmConfig = field(default_factory=AlarmConfig)
     checkpoint_every: int = 50
     """Updates."""
@@ -106,6 +111,8 @@ class FinetuneConfig:
             raise ConfigError(f"shared_credit is a share in [0, 1], got {self.shared_credit}.")
         metric_by_name(self.metric)
         object.__setattr__(self, "reward", write_reward(parse_reward(self.reward)))
+        if not self.goals.share and any(term.name == "goal" for term in parse_reward(self.reward)):
+            raise ConfigError(f"reward {self.reward!r} needs goals: set finetune.goals.share above 0, such as 1.")
 
     def num_updates(self, num_scenarios: int) -> int:
         """Optimiser steps of the run."""
@@ -120,6 +127,8 @@ class Learner:
     reference: Any
     optimizer: torch.optim.Optimizer
     beta: float
+    augmented_goals: StoredGoals | None = None
+    """Goals beside the recorded ones."""
     update: int = 0
     skipped_in_a_row: int = 0
     alarms: Alarms = field(default_factory=Alarms)
@@ -155,6 +164,10 @@ def finetune(policy: Policy, scenarios: Scenarios, out: Path, config: FinetuneCo
         )
     if not len(scenarios):
         raise ConfigError("no scenario to train on: is the data set empty, or the split misspelt?")
+    if config.goals.share and not getattr(policy, "sees_goals", True):
+        raise ConfigError(
+            f"goals.share={config.goals.share:g}, but this model does not see goals: add --goal concat or --goal indication."
+        )
     fabric = start_fabric(config.device)
     run = RunFolder(out, config, describe_inputs(policy, scenarios), writes=fabric.is_global_zero)
     learner = prepare(policy, config, fabric.device)
@@ -186,34 +199,47 @@ def prepare(policy: nn.Module, config: FinetuneConfig, device: torch.device) -> 
     policy.to(device).eval()
     freeze_untrained(policy, config.trained)
     reference = copy.deepcopy(policy).requires_grad_(False)
-    trained = [p for p in policy.parameters() if p.requires_grad]
     optimizer = torch.optim.AdamW(
-        trained, lr=config.learning_rate, betas=config.betas, weight_decay=config.weight_decay
+        parameter_groups(policy, config), lr=config.learning_rate, betas=config.betas, weight_decay=config.weight_decay
     )
-    return Learner(policy, reference, optimizer, config.kl.initial_beta)
+    return Learner(policy, reference, optimizer, config.kl.initial_beta, config.goals.open_augmented())
+
+
+def parameter_groups(policy: nn.Module, config: FinetuneConfig) -> list[dict[str, Any]]:
+    """What is trained: the weights that see goals apart, their learning rate is scaled."""
+    parts = policy.goal_parts() if hasattr(policy, "goal_parts") else ()  # type: ignore[operator]
+    sight = [p for part in parts for p in part.parameters() if p.requires_grad]
+    ids = {id(p) for p in sight}
+    others = [p for p in policy.parameters() if p.requires_grad and id(p) not in ids]
+    groups = [{"params": others, "scale": 1.0}, {"params": sight, "scale": config.goals.learning_rate_scale}]
+    return [group for group in groups if group["params"]]
 
 
 def update_policy(learner: Learner, batch: ScenarioBatch, config: FinetuneConfig, fabric: Fabric) -> dict[str, float]:
     """One update: everything of RLFTSim's section 4.1, in order. Returns what is logged."""
     clock = _Clock(fabric.device)
-    seed = derive_seed(config.seed, "rollouts", learner.update)
+    seeds = {what: derive_seed(config.seed, what, learner.update) for what in ("rollouts", "goals")}
     experiences = []
     for part in batch.split(config.micro_batch_size):
+        goals = choose_goals(part, config.goals, learner.augmented_goals, seed=seeds["goals"])
         # 1 sample N rollouts of each scenario, without gradient
         with fabric.autocast():
-            rollouts = simulate(learner.policy, part, num_rollouts=config.num_rollouts, seed=seed)
+            rollouts = simulate(
+                learner.policy, part, num_rollouts=config.num_rollouts, seed=seeds["rollouts"], goals=goals
+            )
         clock.lap("rollout")
         # 2 reward
         scores, rewards = compute_reward(part, rollouts, config)
         experiences.append(Experience(part, rollouts, scores, rewards))
         clock.lap("reward")
     # 3 log-probabilities under policy and reference, 4 loss and gradients, slice by slice
-    sums = _accumulate_gradients(learner, experiences, config, fabric)
+    hindsight, ratios = _look_back(learner, experiences, config, fabric)
+    sums = _accumulate_gradients(learner, experiences, config, fabric, hindsight)
     clock.lap("backward")
     # 5 step, 6 penalty, 7 reference
     count = max(sums.count, 1.0)
     kl, norm = sums.kl / count, _step(learner, sums, config)
-    values = {**describe(experiences, fabric), "kl": kl, "entropy": sums.entropy / count}
+    values = {**describe(experiences, fabric), "kl": kl, "entropy": sums.entropy / count, **ratios}
     values |= {
         "score_gap": sums.gap,
         "beta": learner.beta,
@@ -242,6 +268,19 @@ def compute_reward(batch: ScenarioBatch, rollouts: Rollouts, config: FinetuneCon
     )
 
 
+def _look_back(
+    learner: Learner, experiences: Sequence[Experience], config: FinetuneConfig, fabric: Fabric
+) -> tuple[list[Experience], dict[str, float]]:
+    """The rollouts under other goals, and what is logged of them; nothing in a run without hindsight."""
+    if not config.goals.hindsight:
+        return [], {}
+    relabelled, ratio = look_back(
+        learner.policy, experiences, partial(compute_reward, config=config),
+        weight=config.goals.hindsight, at_once=config.rollouts_per_pass, fabric=fabric,
+    )  # fmt: skip
+    return relabelled, {"hindsight_ratio": ratio}
+
+
 @dataclass
 class _Sums:
     """What an update added up, over slices and processes."""
@@ -254,9 +293,17 @@ class _Sums:
 
 
 def _accumulate_gradients(
-    learner: Learner, experiences: Sequence[Experience], config: FinetuneConfig, fabric: Fabric
+    learner: Learner,
+    experiences: Sequence[Experience],
+    config: FinetuneConfig,
+    fabric: Fabric,
+    hindsight: Sequence[Experience] = (),
 ) -> _Sums:
-    """Score the rollouts under policy and reference and leave the loss's gradient in the policy's parameters."""
+    """Score the rollouts under policy and reference and leave the loss's gradient in the policy's parameters.
+
+    The reference is asked nothing: with or without goals, behaviour is held to what is realistic. Hindsight adds to the reward's
+    part of the loss alone.
+    """
     learner.optimizer.zero_grad(set_to_none=True)
     counts = [(e.batch.num_scenarios, int(e.rollouts.decision_mask.sum())) for e in experiences]
     totals = torch.tensor(counts, device=fabric.device, dtype=torch.float64).sum(0)
@@ -266,14 +313,12 @@ def _accumulate_gradients(
     for experience in experiences:
         with fabric.autocast(), torch.no_grad():
             reference_context = learner.reference.encode(experience.batch)
-        for start in range(0, config.num_rollouts, config.rollouts_per_pass):
-            part = slice(start, start + config.rollouts_per_pass)
-            rows, reward = experience.rollouts.select(part), experience.rewards.by_agent[:, part]
+        for rows, reward in experience.slices(config.rollouts_per_pass):
             mask = rows.decision_mask
             with fabric.autocast():
                 scored = learner.policy.score(learner.policy.encode(experience.batch), rows)
                 with torch.no_grad():
-                    held = learner.reference.score(reference_context, rows)
+                    held = learner.reference.score(reference_context, replace(rows, goals=None))
             log_prob = scored.log_prob(rows.decision)
             kl, entropy = masked_sum(scored.kl(held), mask), masked_sum(scored.entropy(), mask)
             by_agent = agent_log_prob(log_prob, mask, config.log_prob_reduction)
@@ -282,6 +327,12 @@ def _accumulate_gradients(
             fabric.backward(loss)
             sums += torch.stack([kl.detach(), entropy.detach()])
             gaps.append(torch.where(mask, log_prob.detach() - rows.log_prob, 0.0).abs().max())
+    for experience in hindsight:
+        for rows, reward in experience.slices(config.rollouts_per_pass):
+            with fabric.autocast():
+                scored = learner.policy.score(learner.policy.encode(experience.batch), rows)
+            by_agent = agent_log_prob(scored.log_prob(rows.decision), rows.decision_mask, config.log_prob_reduction)
+            fabric.backward(policy_gradient_loss(reward, by_agent, int(num_scenarios)))
     add_up_gradients(learner.parameters, fabric)
     kl, entropy = add_up(sums, fabric).tolist()
     return _Sums(kl, entropy, float(torch.stack(gaps).max()), num_decisions)
@@ -292,7 +343,7 @@ def _step(learner: Learner, sums: _Sums, config: FinetuneConfig) -> float:
     norm = float(torch.nn.utils.clip_grad_norm_(learner.parameters, config.gradient_clip))
     rate = config.learning_rate * min((learner.update + 1) / max(config.warmup_updates, 1), 1.0)
     for group in learner.optimizer.param_groups:
-        group["lr"] = rate
+        group["lr"] = rate * group["scale"]
     learner.update += 1
     if math.isfinite(norm) and sums.kl / max(sums.count, 1.0) <= config.max_kl:
         learner.optimizer.step()

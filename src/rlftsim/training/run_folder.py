@@ -50,6 +50,7 @@ BOARD_GROUPS = {
     "kl": ("kl", "beta"),
     "realism": ("rmm", "kinematic", "interactive", "map_based"),
     "alarm": ("alarm_",),
+    "goal": ("goal_", "hindsight_"),
     "validation": ("validation_",),
     "time": ("seconds",),
 }

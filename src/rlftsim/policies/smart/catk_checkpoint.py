@@ -95,6 +95,10 @@ def export_catk(policy: SmartPolicy) -> dict[str, Tensor]:
     Raises:
         CheckpointError: the model has a head for each class, the public code has one for all.
     """
+    if policy.sees_goals:
+        raise CheckpointError(
+            "a model that sees goals has no form in the public CAT-K code: export the one it came from."
+        )
     if policy.config.head_per_class:
         raise CheckpointError(
             "a model with head_per_class has no form in the public CAT-K code, which has one head for all classes: "

@@ -1,8 +1,12 @@
 """Sizes and radii of a SMART model."""
 
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 from rlftsim.errors import ConfigError, given, require_finite, require_positive
+
+GoalSight = Literal["concat", "indication"]
+"""How agents see their goals, see `goal_sight`."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +40,8 @@ class SmartConfig:
     head_per_class: bool = False
     """Each class has a head of its own, as large as its vocabulary. False = one head as wide as the largest, an index means another
     motion in each class."""
+    goal: GoalSight | None = None
+    """How agents see their goals; None = they do not, and goals have no effect."""
     public_code_quirks: bool = False
     """Repeat what the public code does where this package differs on purpose: an agent's first motion vector is its position,
     the sign of what lies exactly behind is left to rounding, and tokens are matched and placed in the order of operations of
@@ -61,6 +67,8 @@ class SmartConfig:
         caps = ("max_map_neighbors", "max_agent_map_neighbors", "max_agent_neighbors")
         require_positive(self, (*sizes, *radii, *given(self, caps)))
         require_finite(self, radii)
+        if self.goal is not None and self.goal not in get_args(GoalSight):
+            raise ConfigError(f"goal={self.goal!r} is no way to see goals: known are {', '.join(get_args(GoalSight))}.")
         if not 0 <= self.dropout < 1 or not 0 <= self.history_drop < 1:
             raise ConfigError(
                 f"dropout and history_drop are shares in [0, 1), got {self.dropout} and {self.history_drop}."

@@ -18,6 +18,7 @@ from rlftsim.policies.layers import (
     Grid,
     MlpEmbedding,
     MlpLayer,
+    Pointers,
     RelationAttention,
     RelationEmbedding,
     Surroundings,
@@ -27,6 +28,7 @@ from rlftsim.policies.layers import (
     surround,
 )
 from rlftsim.policies.smart.config import SmartConfig
+from rlftsim.policies.smart.goal_sight import GoalMark, GoalState, SeenGoals
 from rlftsim.policies.smart.heads import ClassHeads
 from rlftsim.policies.smart.neighbors import Neighbors, Poses, relative_pose, within
 from rlftsim.tokens.map_tokens import NUM_KINDS, NUM_LIGHTS, NUM_TYPES, MapTokens
@@ -80,6 +82,11 @@ class TokenSteps:
         pairs = ((getattr(self, name), getattr(other, name)) for name in self.__dataclass_fields__)
         return TokenSteps(*(torch.cat(pair, 3) for pair in pairs))
 
+    def repeat(self, num_rollouts: int) -> "TokenSteps":
+        """The steps of a single rollout, shared by N of them; no copies."""
+        fields = (getattr(self, name) for name in self.__dataclass_fields__)
+        return TokenSteps(*(v.expand(-1, num_rollouts, *v.shape[2:]) for v in fields))
+
 
 @dataclass(frozen=True, eq=False)
 class Past:
@@ -97,6 +104,10 @@ class Past:
         shapes = ((v, (-1, num_rollouts, *v.shape[2:])) for v in (self.position, self.heading, self.row))
         position, heading, row = (v.expand(shape) for v, shape in shapes)
         return Past(position, heading, row, self.sources)
+
+    def without_last_step(self) -> "Past":
+        """The past before its last step. (Rows of the sources that nobody refers to stay.)"""
+        return Past(self.position[..., :-1, :], self.heading[..., :-1], self.row[..., :-1], self.sources)
 
 
 class MapEncoder(nn.Module):
@@ -167,6 +178,7 @@ class AgentDecoder(nn.Module):
         self.map_layers = nn.ModuleList(RelationAttention(*sizes, separate_source_norm=True) for _ in layers)
         self.agent_layers = nn.ModuleList(RelationAttention(*sizes) for _ in layers)
         self.head = ClassHeads(dim, class_sizes, num_tokens) if class_sizes else MlpLayer(dim, dim, num_tokens)
+        self.goal = _goal_sight(config)
 
     def relations(self) -> Relations:
         """The relation embeddings, tabulated where that does no harm."""
@@ -186,7 +198,12 @@ class AgentDecoder(nn.Module):
         return torch.stack([embed(table.flatten(1)) for embed, table in zip(self.tokens, end_corners)])
 
     def forward(
-        self, scene: Scene, steps: TokenSteps, past: Past | None, hidden: Bool[Tensor, "B N A K"] | None = None
+        self,
+        scene: Scene,
+        steps: TokenSteps,
+        past: Past | None,
+        hidden: Bool[Tensor, "B N A K"] | None = None,
+        goals: SeenGoals | None = None,
     ) -> tuple[Float[Tensor, "R D"], Past]:
         """Features of the valid (agent, step) pairs of a block, in the order of `steps.valid.nonzero()`, and the new past.
 
@@ -195,6 +212,7 @@ class AgentDecoder(nn.Module):
             steps: the block.
             past: what earlier blocks left; None = the block begins the scenario.
             hidden: True = the pair takes no part in the attention over time.
+            goals: what agents are asked to do; None = nobody is asked anything.
         """
         rows = steps.valid.nonzero(as_tuple=True)
         first_row = 0 if past is None else past.sources[0].shape[0]
@@ -202,9 +220,10 @@ class AgentDecoder(nn.Module):
         row_of[rows] = torch.arange(len(rows[0]), device=row_of.device)
         new_past = _extend(past, steps, torch.where(row_of >= 0, row_of + first_row, -1))
 
-        x = self._embed_steps(scene, steps, rows)
+        x = self._embed_steps(scene, steps, rows, goals)
         before = self._look_back(scene, new_past, steps, rows, hidden)
         around = self._look_at_map(scene, steps, rows)
+        pointers = self._point_at_goals(scene, steps, rows, goals)
         others = self._look_at_agents(scene, steps, rows, row_of)
         sources = []
         for index, layers in enumerate(zip(self.time_layers, self.map_layers, self.agent_layers)):
@@ -213,15 +232,21 @@ class AgentDecoder(nn.Module):
             source = own if past is None else torch.cat([past.sources[index], own])
             sources.append(source)
             x = time_layer(x, source, before)
-            x = map_layer(x, None, around)
+            x = map_layer(x, None, around, pointers)
             x = agent_layer(x, normalize(x), others)
         return x, Past(new_past.position, new_past.heading, new_past.row, tuple(sources))
 
-    def _embed_steps(self, scene: Scene, steps: TokenSteps, rows: tuple[Tensor, ...]) -> Float[Tensor, "R D"]:
+    def _embed_steps(
+        self, scene: Scene, steps: TokenSteps, rows: tuple[Tensor, ...], goals: SeenGoals | None
+    ) -> Float[Tensor, "R D"]:
         scenario, _, agent, _ = rows
         motion, heading = steps.motion[rows], steps.heading[rows]
         motion_values = torch.stack([motion.norm(dim=-1), angle_between(heading_vector(heading), motion)], -1)
-        state = self.motion(motion_values, scene.agent_features[scenario, agent])
+        known = scene.agent_features[scenario, agent]
+        if goals is not None and isinstance(self.goal, GoalState):
+            poses = Poses(steps.position, steps.heading)[rows]
+            known = known.index_add(0, *self.goal.look(goals, poses, rows, seam_rad=self.config.seam_rad))
+        state = self.motion(motion_values, known)
         token = scene.token_features[scene.class_id[scenario, agent], steps.token_id[rows]]
         return self.fusion(torch.cat([token, state], -1))
 
@@ -263,6 +288,18 @@ class AgentDecoder(nn.Module):
         sources = Poses(scene.map_position.flatten(0, 1), scene.map_heading.flatten())
         return self._surround(scene.relations.map, poses, sources, neighbors, features=scene.map_features)
 
+    def _point_at_goals(
+        self, scene: Scene, steps: TokenSteps, rows: tuple[Tensor, ...], goals: SeenGoals | None
+    ) -> Pointers | None:
+        """Each agent's goal polyline; None where the model does not see goals so, or nobody has one."""
+        if goals is None or not isinstance(self.goal, GoalMark):
+            return None
+        poses = Poses(steps.position, steps.heading)[rows]
+        map_poses = Poses(scene.map_position.flatten(0, 1), scene.map_heading.flatten())
+        return self.goal.point(
+            goals, poses, rows, map_poses, scene.map_features, self.map_relation, seam_rad=self.config.seam_rad
+        )
+
     def _look_at_agents(
         self, scene: Scene, steps: TokenSteps, rows: tuple[Tensor, ...], row_of: Int64[Tensor, "B N A K"]
     ) -> Surroundings:
@@ -289,6 +326,16 @@ class AgentDecoder(nn.Module):
     ) -> Surroundings:
         values = relative_pose(poses, sources[neighbors.index], seam_rad=self.config.seam_rad)
         return surround(embedding, values, neighbors.index, neighbors.mask, dim=self.config.dim, features=features)
+
+
+def _goal_sight(config: SmartConfig) -> GoalState | GoalMark | None:
+    match config.goal:
+        case "concat":
+            return GoalState(config.dim, config.num_frequencies)
+        case "indication":
+            return GoalMark(config.dim)
+        case None:
+            return None
 
 
 def _tabulated(embedding: FourierEmbedding, reach_m: float, *more: Grid) -> RelationEmbedding:
@@ -324,3 +371,5 @@ class SmartNetwork(nn.Module):
         self.map_encoder = MapEncoder(config)
         self.decoder = AgentDecoder(config, num_tokens, class_sizes)
         initialize(self)
+        if self.decoder.goal is not None:
+            self.decoder.goal.start_blind()

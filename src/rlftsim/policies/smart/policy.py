@@ -1,7 +1,7 @@
 """SMART as a policy: a token of half a second for every agent, sixteen times."""
 
 import json
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import torch
@@ -10,15 +10,16 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
-from rlftsim.errors import CheckpointError
+from rlftsim.errors import CheckpointError, ConfigError
 from rlftsim.files import save_tensors, write_text
 from rlftsim.geometry import box_corners, pose_of_corners, rotate, wrap_angle
 from rlftsim.goals.types import Goals
 from rlftsim.policies.layers import normalize
-from rlftsim.policies.smart.config import SmartConfig
+from rlftsim.policies.smart.config import GoalSight, SmartConfig
 from rlftsim.policies.smart.distribution import TokenDistribution
+from rlftsim.policies.smart.goal_sight import GoalState, SeenGoals, see_goals
 from rlftsim.policies.smart.heads import NEVER, ClassHeads
-from rlftsim.policies.smart.network import Past, Scene, SmartNetwork, TokenSteps
+from rlftsim.policies.smart.network import Past, Scene, SmartNetwork, TokenSteps, nowhere_unless
 from rlftsim.rollout.types import AgentStates, Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.tokens import public_order
@@ -36,8 +37,10 @@ class SmartContext:
     scene: Scene
     past: Past
     """Of the two history tokens, with a single rollout."""
+    now: TokenSteps
+    """The last of them, at the current step: agents that are asked something look at it anew."""
     features: Float[Tensor, "B A D"]
-    """Decoder features at the current step; zeros for padding."""
+    """Decoder features at the current step of agents that are asked nothing; zeros for padding."""
     position: Float[Tensor, "B A 2"]
     """Where the history tokens led."""
     heading: Float[Tensor, "B A"]
@@ -65,6 +68,8 @@ class SmartState:
     pending: TokenSteps | None
     poses: Float[Tensor, "B N A 5 3"] | None = None
     draws: Tensor | None = None
+    goals: SeenGoals | None = None
+    """None = nobody is asked anything, or the model does not see goals."""
     sight: Sight = field(default_factory=Sight)
 
 
@@ -116,6 +121,7 @@ class SmartPolicy(nn.Module):
         return SmartContext(
             scene=scene,
             past=past,
+            now=self._recorded_steps(tokens, slice(HISTORY_TOKENS - 1, HISTORY_TOKENS)),
             features=features,
             position=tokens.position[:, :, HISTORY_TOKENS - 1],
             heading=tokens.heading[:, :, HISTORY_TOKENS - 1],
@@ -124,13 +130,21 @@ class SmartPolicy(nn.Module):
         )
 
     def begin(self, context: SmartContext, num_rollouts: int, goals: Goals | None, noise: Tensor) -> SmartState:
-        """The current step, N times, without copies of the history."""
+        """The current step, N times, without copies of the history. Where somebody has a goal, it has not been looked at yet."""
 
         def repeated(v: Tensor) -> Tensor:
             return v[:, None].expand(-1, num_rollouts, *v.shape[1:])
 
+        position, heading = repeated(context.position), repeated(context.heading)
+        if goals is None or not self.sees_goals or not goals.any:
+            return SmartState(position, heading, context.past.repeat(num_rollouts), pending=None)
+        scene = context.scene
         return SmartState(
-            repeated(context.position), repeated(context.heading), context.past.repeat(num_rollouts), pending=None
+            position,
+            heading,
+            context.past.without_last_step().repeat(num_rollouts),
+            pending=context.now.repeat(num_rollouts),
+            goals=see_goals(goals, nowhere_unless(scene.map_mask, scene.map_position)),
         )
 
     def decide(self, context: SmartContext, state: SmartState) -> TokenDistribution:
@@ -164,7 +178,7 @@ class SmartPolicy(nn.Module):
             past, pending = state.sight.past, block
         else:
             past, pending = state.past, block if state.pending is None else state.pending.then(block)
-        return SmartState(position, heading, past, pending, poses)
+        return SmartState(position, heading, past, pending, poses, goals=state.goals)
 
     def score(self, context: SmartContext, rollouts: Rollouts) -> TokenDistribution:
         """Replay the decisions without the network, then look at all steps at once."""
@@ -175,11 +189,13 @@ class SmartPolicy(nn.Module):
             start = index * STEPS_PER_TOKEN
             forced = rollouts.forced and rollouts.forced.steps(start, start + STEPS_PER_TOKEN)
             state = self.advance(context, state, rollouts.decision[..., index], forced)
-        first = context.features[:, None, :, None].expand(*state.heading.shape, 1, -1)
-        features = first
+        parts = []
+        if state.goals is None:  # the current step has been looked at
+            parts.append(context.features[:, None, :, None].expand(*state.heading.shape, 1, -1))
         if state.pending is not None:
-            rows, _ = self.network.decoder(context.scene, state.pending, state.past)
-            features = torch.cat([first, _place(rows, state.pending.valid)], 3)
+            rows, _ = self.network.decoder(context.scene, state.pending, state.past, goals=state.goals)
+            parts.append(_place(rows, state.pending.valid))
+        features = torch.cat(parts, 3)
         mask = context.agent_mask[:, None, :, None].expand(rollouts.decision.shape)
         return self._distribution(context, features[mask], mask)
 
@@ -206,9 +222,41 @@ class SmartPolicy(nn.Module):
         return TeacherForced(logits, tokens.next_token_id[:, None, :, :-1][decides], counts, class_id)
 
     def fine_tuned_parts(self) -> tuple[nn.Module, ...]:
-        """What closed-loop fine-tuning trains: the decoder's attention and the head, as the public CAT-K code does."""
+        """What closed-loop fine-tuning trains: the decoder's attention and the head, as the public CAT-K code does, and the sight of goals."""
         decoder = self.network.decoder
-        return decoder.time_layers, decoder.map_layers, decoder.agent_layers, decoder.head
+        return decoder.time_layers, decoder.map_layers, decoder.agent_layers, decoder.head, *self.goal_parts()
+
+    def goal_parts(self) -> tuple[nn.Module, ...]:
+        """What sees goals; nothing in a model that does not."""
+        goal = self.network.decoder.goal
+        return () if goal is None else (goal,)
+
+    # ---- goals ----------------------------------------------------------------------------------------------------
+
+    @property
+    def sees_goals(self) -> bool:
+        """Whether goals have an effect."""
+        return self.config.goal is not None
+
+    def with_goal_sight(self, goal: GoalSight) -> "SmartPolicy":
+        """The same policy with weights to see goals by, which say nothing yet; itself if it sees them so.
+
+        Raises:
+            ConfigError: it sees them in another way.
+        """
+        if self.config.goal == goal:
+            return self
+        if self.sees_goals:
+            raise ConfigError(
+                f"this model sees goals by {self.config.goal}, not by {goal}: start from a model that sees none."
+            )
+        policy = SmartPolicy(replace(self.config, goal=goal), self.vocabulary).to(next(self.parameters()).device)
+        decoder = policy.network.decoder
+        if isinstance(decoder.goal, GoalState):
+            decoder.goal.know(self.network.decoder.map_relation)
+        new = {k: v for k, v in policy.network.state_dict().items() if k.startswith("decoder.goal.")}
+        load_strictly(policy.network, {**self.network.state_dict(), **new}, source="the model to start from")
+        return policy.train(self.training)
 
     # ---- files ----------------------------------------------------------------------------------------------------
 
@@ -283,7 +331,7 @@ class SmartPolicy(nn.Module):
             if state.pending is None:
                 sight.features, sight.past = context.features[:, None].expand(*state.heading.shape, -1), state.past
             else:
-                rows, sight.past = self.network.decoder(context.scene, state.pending, state.past)
+                rows, sight.past = self.network.decoder(context.scene, state.pending, state.past, goals=state.goals)
                 sight.features = _place(rows, state.pending.valid)[..., -1, :]
         return sight.features
 

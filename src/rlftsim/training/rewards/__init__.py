@@ -2,6 +2,7 @@
 
 from rlftsim.training.rewards import collision_offroad as _collision_offroad
 from rlftsim.training.rewards import displacement as _displacement
+from rlftsim.training.rewards import goal as _goal
 from rlftsim.training.rewards import mloo as _mloo
 from rlftsim.training.rewards import rloo as _rloo
 from rlftsim.training.rewards.base import (
@@ -10,6 +11,7 @@ from rlftsim.training.rewards.base import (
     leave_one_out,
     register_reward,
     register_shares,
+    register_sum,
     reward_by_name,
 )
 from rlftsim.training.rewards.composition import CreditTo, Rewards, compute_rewards
@@ -26,8 +28,9 @@ __all__ = [
     "parse_reward",
     "register_reward",
     "register_shares",
+    "register_sum",
     "reward_by_name",
     "write_reward",
 ]
 
-del _collision_offroad, _displacement, _mloo, _rloo
+del _collision_offroad, _displacement, _goal, _mloo, _rloo

@@ -17,7 +17,7 @@ the agents, shape [B, N, A], that add up to it. It is asked where credit goes by
 
 from collections.abc import Callable
 from importlib.metadata import entry_points
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Float
@@ -29,11 +29,14 @@ Reward = Callable[..., Float[Tensor, "B N"]]
 """Called with `RealismResult`, `Rollouts`, `ScenarioBatch` and its options."""
 Shares = Callable[..., Float[Tensor, "B N A"]]
 """Called with `AgentScores`, `Rollouts`, `ScenarioBatch` and the reward's options."""
+Sum = Callable[..., str]
+"""Called with options; gives the sum of rewards that a name stands for."""
 
 _REWARDS: dict[str, Reward] = {}
 _SHARES: dict[str, Shares] = {}
+_SUMS: dict[str, Sum] = {}
 
-Function = TypeVar("Function", bound=Callable[..., Tensor])
+Function = TypeVar("Function", bound=Callable[..., Tensor | str])
 
 
 def register_reward(name: str) -> Callable[[Function], Function]:
@@ -54,12 +57,21 @@ def register_shares(name: str) -> Callable[[Function], Function]:
     return _register(_SHARES, name, "split of reward")
 
 
-def _register(table: dict[str, Callable[..., Tensor]], name: str, what: str) -> Callable[[Function], Function]:
+def register_sum(name: str) -> Callable[[Function], Function]:
+    """Make a sum of rewards known under a name: a function of options that gives its text.
+
+    Raises:
+        ConfigError: as `register_reward`.
+    """
+    return _register(_SUMS, name, "sum of rewards")
+
+
+def _register(table: dict[str, Callable[..., Any]], name: str, what: str) -> Callable[[Function], Function]:
     if not name.isidentifier():
         raise ConfigError(f"{what} {name!r}: a name is letters, digits and underscores, such as on_the_road.")
 
     def register(function: Function) -> Function:
-        if name in table:
+        if name in table or (table is not _SHARES and name in (_REWARDS | _SUMS)):
             raise ConfigError(f"{what} {name!r} is registered already: choose another name.")
         table[name] = function
         return function
@@ -80,8 +92,13 @@ def reward_by_name(name: str) -> Reward:
     if name not in _REWARDS:
         _import_rewards_of_packages()
     if name not in _REWARDS:
-        raise ConfigError(f"unknown reward {name!r}: known are {', '.join(sorted(_REWARDS))}.")
+        raise ConfigError(f"unknown reward {name!r}: known are {', '.join(sorted(_REWARDS | _SUMS))}.")
     return _REWARDS[name]
+
+
+def sum_by_name(name: str) -> Sum | None:
+    """The sum of rewards that a name stands for; None = it is no such name."""
+    return _SUMS.get(name)
 
 
 def _import_rewards_of_packages() -> None:

@@ -1,4 +1,7 @@
-"""Rewards as a person writes them: "mloo", "mloo + 0.1*collision_offroad", "0.5*(mloo + rloo)", "collision_offroad_ade(ade_weight=0.2)"."""
+"""Rewards as a person writes them: "mloo", "mloo + 0.1*collision_offroad", "0.5*(mloo + rloo)", "collision_offroad_ade(ade_weight=0.2)".
+
+A name may stand for a sum: "gcft" is "0.9*mloo + 0.1*goal(kind='soft')", and is kept so.
+"""
 
 import ast
 import inspect
@@ -7,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from rlftsim.errors import ConfigError
-from rlftsim.training.rewards.base import Reward, reward_by_name
+from rlftsim.training.rewards.base import Reward, Sum, reward_by_name, sum_by_name
 
 Option = float | int | bool | str
 
@@ -74,14 +77,24 @@ def _terms(node: ast.expr, factor: float) -> Iterator[Term]:
         case ast.UnaryOp(ast.USub() | ast.UAdd() as sign, operand):
             yield from _terms(operand, -factor if isinstance(sign, ast.USub) else factor)
         case ast.Name(name):
-            yield Term(factor, name, _options(name, reward_by_name(name), {}))
+            yield from _named(name, factor, {})
         case ast.Call(ast.Name(name), [], keywords):
             given = {keyword.arg: ast.literal_eval(keyword.value) for keyword in keywords if keyword.arg}
             if len(given) < len(keywords):
                 raise ValueError(node)  # an option twice, or **options
-            yield Term(factor, name, _options(name, reward_by_name(name), given))
+            yield from _named(name, factor, given)
         case _:
             raise ValueError(node)
+
+
+def _named(name: str, factor: float, given: dict[str, Option]) -> Iterator[Term]:
+    """A reward, or the terms of a sum that has a name."""
+    known_sum = sum_by_name(name)
+    if known_sum is None:
+        yield Term(factor, name, _options(name, reward_by_name(name), given))
+    else:
+        text = known_sum(**dict(_options(name, known_sum, given)))
+        yield from _terms(ast.parse(text, mode="eval").body, factor)
 
 
 def _is_number(node: ast.expr) -> bool:
@@ -95,7 +108,7 @@ def _number(node: ast.expr) -> float:
     return float(value)
 
 
-def _options(name: str, reward: Reward, given: dict[str, Option]) -> tuple[tuple[str, Option], ...]:
+def _options(name: str, reward: Reward | Sum, given: dict[str, Option]) -> tuple[tuple[str, Option], ...]:
     """A reward's options with what is given in place of the defaults."""
     parameters = inspect.signature(reward).parameters.values()
     defaults = {p.name: p.default for p in parameters if p.kind is p.KEYWORD_ONLY}

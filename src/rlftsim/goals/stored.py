@@ -1,0 +1,103 @@
+"""Goals of many scenarios in a folder of Parquet files beside a data set: scenario_id, object_id, x, y. Frame: world, metres.
+
+For what programs make, such as the augmented goals of a whole data set. A person's goals are JSON (`goals.goals_file`).
+"""
+
+from collections.abc import Mapping
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import torch
+from jaxtyping import Bool, Float, Int64
+
+from rlftsim.errors import DataError
+from rlftsim.files import write_whole
+from rlftsim.goals.types import Goals
+from rlftsim.scenario.batch import ScenarioBatch
+
+SCHEMA = pa.schema([("scenario_id", pa.string()), ("object_id", pa.int64()), ("x", pa.float64()), ("y", pa.float64())])
+Points = tuple[Int64[np.ndarray, "n"], Float[np.ndarray, "n 2"]]
+"""Object ids and their goals."""
+
+
+def write_goal_part(path: Path, goals: Mapping[str, Points]) -> None:
+    """Write one file of such a folder, whole or not at all.
+
+    Args:
+        path: of the file; a folder's files are read in the order of their names.
+        goals: by scenario id.
+    """
+    columns = {
+        "scenario_id": np.repeat(list(goals), [len(ids) for ids, _ in goals.values()]),
+        "object_id": np.concatenate([ids for ids, _ in goals.values()]),
+        "x": np.concatenate([points[:, 0] for _, points in goals.values()]),
+        "y": np.concatenate([points[:, 1] for _, points in goals.values()]),
+    }
+    table = pa.table({name: pa.array(values, SCHEMA.field(name).type) for name, values in columns.items()}, SCHEMA)
+    write_whole(path, lambda temporary: pq.write_table(table, temporary))
+
+
+class StoredGoals:
+    """The goals of a folder.
+
+    Raises:
+        DataError: it holds no goals, or a file is damaged.
+    """
+
+    def __init__(self, folder: Path):
+        files = sorted(folder.glob("*.parquet"))
+        if not files:
+            raise DataError(f"{folder}: holds no goals: write them by `rlftsim augment`.")
+        try:
+            self._table = pa.concat_tables([pq.read_table(file, schema=SCHEMA) for file in files]).combine_chunks()
+        except (pa.ArrowException, OSError) as error:
+            raise DataError(f"{folder}: damaged goals ({error}): remove the folder and write them again.") from None
+
+    @cached_property
+    def _rows(self) -> dict[str, slice]:
+        """Rows of each scenario: they stand together."""
+        ids = self._table["scenario_id"].to_numpy()
+        starts = np.flatnonzero(np.append(True, ids[1:] != ids[:-1])) if len(ids) else np.zeros(0, np.int64)
+        return {ids[a]: slice(a, b) for a, b in zip(starts.tolist(), [*starts[1:].tolist(), len(ids)])}
+
+    def __contains__(self, scenario_id: str) -> bool:
+        return scenario_id in self._rows
+
+    def __len__(self) -> int:
+        """Scenarios."""
+        return len(self._rows)
+
+    def of_scenario(self, scenario_id: str) -> Points:
+        """Object ids and goals of one of the scenarios."""
+        part = self._table.slice(self._rows[scenario_id].start, _length(self._rows[scenario_id]))
+        ids, x, y = (part[name].to_numpy() for name in ("object_id", "x", "y"))
+        return ids, np.stack([x, y], -1)
+
+    def of_batch(self, batch: ScenarioBatch) -> Goals:
+        """The goals of a batch, for a single rollout, in its frame; agents and scenarios that have none have no goal."""
+        mask, position = np.zeros(batch.agent_mask.shape, bool), np.zeros((*batch.agent_mask.shape, 2), np.float32)
+        for b, scenario in enumerate(batch.scenarios):
+            if scenario.scenario_id in self:
+                ids, points = self.of_scenario(scenario.scenario_id)
+                own = batch.object_id[b, : len(scenario.simulated_indices)].cpu().numpy()
+                rows, known = _places(own, ids)
+                mask[b, : len(own)] = known
+                position[b, : len(own)][known] = points[rows[known]] - batch.origin[b].cpu().numpy()
+        goals = Goals.of_scenarios(torch.from_numpy(position), torch.from_numpy(mask))
+        return goals.to(batch.device)
+
+
+def _length(rows: slice) -> int:
+    return rows.stop - rows.start
+
+
+def _places(
+    wanted: Int64[np.ndarray, "A"], ids: Int64[np.ndarray, "n"]
+) -> tuple[Int64[np.ndarray, "A"], Bool[np.ndarray, "A"]]:
+    """Where ids stand in a list, and whether they do."""
+    order = np.argsort(ids)
+    place = order[np.searchsorted(ids[order], wanted).clip(max=len(ids) - 1)]
+    return place, ids[place] == wanted

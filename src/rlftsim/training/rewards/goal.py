@@ -1,0 +1,55 @@
+"""Getting where one was asked to go, and the paper's mixture of that with realism (RLFTSim, equation 4)."""
+
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from rlftsim.errors import ConfigError
+from rlftsim.goals.attainment import is_passed, is_reached
+from rlftsim.realism import AgentScores, RealismResult
+from rlftsim.rollout.types import Rollouts
+from rlftsim.scenario.batch import ScenarioBatch
+from rlftsim.training.rewards.base import leave_one_out, register_reward, register_shares, register_sum
+
+KINDS = {"soft": is_passed, "hard": is_reached}
+"""soft: within 2 m of the goal at some step; hard: in the end."""
+
+
+@register_reward("goal")
+def goal(
+    scores: RealismResult, rollouts: Rollouts, batch: ScenarioBatch, *, kind: str = "soft"
+) -> Float[Tensor, "B N"]:
+    """Share of the evaluated agents with a goal that meet it, minus the mean of the other rollouts'. 0 where nobody has one."""
+    return _met(rollouts, batch, kind).sum(-1)
+
+
+@register_shares("goal")
+def goal_shares(
+    scores: AgentScores, rollouts: Rollouts, batch: ScenarioBatch, *, kind: str = "soft"
+) -> Float[Tensor, "B N A"]:
+    """Each agent's own."""
+    return _met(rollouts, batch, kind)
+
+
+def _met(rollouts: Rollouts, batch: ScenarioBatch, kind: str) -> Float[Tensor, "B N A"]:
+    """What each agent adds to the share, against the other rollouts."""
+    if kind not in KINDS:
+        raise ConfigError(f"reward goal(kind={kind!r}): known kinds are {', '.join(KINDS)}.")
+    if rollouts.goals is None:
+        return rollouts.heading.new_zeros(rollouts.heading.shape[:3])
+    counted = counted_agents(rollouts, batch)
+    met = KINDS[kind](rollouts.position, rollouts.goals) & counted
+    return leave_one_out(met.float() / counted.sum(-1, keepdim=True).clamp(min=1))
+
+
+def counted_agents(rollouts: Rollouts, batch: ScenarioBatch) -> Bool[Tensor, "B N A"]:
+    """The evaluated agents that have a goal."""
+    assert rollouts.goals is not None
+    return rollouts.goals.goal_mask & batch.evaluated_mask[:, None]
+
+
+@register_sum("gcft")
+def gcft(*, goal_weight: float = 0.1, kind: str = "soft") -> str:
+    """The paper's reward of goal-conditioned fine-tuning; its lambda is `goal_weight`."""
+    if not 0 <= goal_weight <= 1:
+        raise ConfigError(f"reward gcft(goal_weight={goal_weight}): a share in [0, 1] is expected.")
+    return f"{round(1 - goal_weight, 12)}*mloo + {goal_weight}*goal(kind={kind!r})"

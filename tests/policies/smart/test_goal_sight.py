@@ -1,0 +1,184 @@
+"""Models that see goals: nothing changes until they have learned to, and then only what is asked."""
+
+import copy
+from dataclasses import replace
+
+import pytest
+import torch
+
+import scenes
+from rlftsim.errors import CheckpointError, ConfigError, RlftsimError
+from rlftsim.goals.types import Goals
+from rlftsim.policies.smart.config import SmartConfig
+from rlftsim.policies.smart.goal_sight import see_goals
+from rlftsim.policies.smart.policy import SmartPolicy
+from rlftsim.rollout.check import check_policy
+from rlftsim.rollout.simulate import simulate
+from rlftsim.scenario.batch import collate
+from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
+
+BENDING = (scenes.bend(), scenes.bend("pair", 2), scenes.bend("single", 1))
+SMALL = SmartConfig(
+    dim=16, num_heads=2, head_dim=8, num_map_layers=1, num_decoder_layers=2, num_frequencies=4,
+    map_radius_m=12.0, max_map_neighbors=None,
+)  # fmt: skip
+each_sight = pytest.mark.parametrize("sight", ["concat", "indication"])
+
+
+@pytest.fixture(scope="module")
+def base():
+    """A model that sees no goals; a little bolder than fresh ones are."""
+    vocabulary = build_vocabulary([*BENDING, scenes.crowd(num_agents=40)], TokensConfig(num_tokens=48, num_map_prototypes=16))[0]  # fmt: skip
+    torch.manual_seed(3)
+    policy = SmartPolicy(SMALL, vocabulary).eval()
+    with torch.no_grad():
+        for name, weight in policy.named_parameters():
+            if name.startswith("network.decoder.head") and weight.dim() == 2:
+                weight.mul_(3.0)
+    return policy
+
+
+@pytest.fixture(scope="module")
+def batch():
+    return collate(BENDING)
+
+
+def far_goals(batch, chosen=slice(None)):
+    """Goals of every other agent, 100 m ahead: far outside of where agents look at the map."""
+    position = batch.position[:, :, 10] + torch.tensor([100.0, 30.0])
+    mask = torch.zeros_like(batch.agent_mask)
+    mask[:, ::2] = batch.agent_mask[:, ::2]
+    mask[:, chosen] &= True
+    return Goals.of_scenarios(position, mask)
+
+
+def learned(policy, sight, size=0.5):
+    """The policy with eyes that have seen something."""
+    policy = policy.with_goal_sight(sight)
+    generator = torch.Generator().manual_seed(11)
+    with torch.no_grad():
+        for weight in policy.network.decoder.goal.parameters():
+            weight.add_(size * torch.randn(weight.shape, generator=generator))
+    return policy
+
+
+def logits(policy, batch, rollouts):
+    return policy.score(policy.encode(batch), rollouts).logits
+
+
+@each_sight
+def test_a_model_that_just_got_eyes_says_what_it_said(sight, base, batch):
+    policy = base.with_goal_sight(sight)
+    rollouts = simulate(base, batch, num_rollouts=3, seed=5)
+    before = logits(base, batch, rollouts)
+    assert logits(policy, batch, rollouts).equal(before)  # bit for bit
+    goals = far_goals(batch)
+    asked = [replace(rollouts, goals=replace(goals, position=goals.position * s).repeat(3)) for s in (1.0, -0.3)]
+    with_goals = logits(policy, batch, asked[0])
+    assert with_goals.equal(logits(policy, batch, asked[1]))
+    # where somebody has a goal the current step is looked at together with the later ones: sums are taken in another order
+    torch.testing.assert_close(with_goals, before, atol=3e-6, rtol=0)
+    context = policy.encode(batch)
+    first = [policy.decide(context, policy.begin(context, 3, g, torch.zeros(0))) for g in (None, asked[0].goals)]
+    torch.testing.assert_close(first[0].logits, first[1].logits, atol=3e-6, rtol=0)
+    assert simulate(policy, batch, num_rollouts=3, seed=5, goals=goals).decision.equal(rollouts.decision)
+
+
+@each_sight
+def test_the_first_decision_and_every_other_look_at_the_goal(sight, base, batch):
+    policy, goals = learned(base, sight), far_goals(batch).repeat(1)
+    rollouts = simulate(policy, batch, num_rollouts=1, seed=5)
+    free = policy.score(policy.encode(batch), rollouts).log_prob(rollouts.decision)
+    asked = policy.score(policy.encode(batch), replace(rollouts, goals=goals)).log_prob(rollouts.decision)
+    differs = (asked - free).abs().amax((1,)) > 1e-4  # [B, A, L]
+    carriers = goals.goal_mask[:, 0]
+    assert differs[carriers].all()
+    alone = carriers.sum(-1) == batch.agent_mask.sum(-1)
+    assert alone.tolist() == [False, False, True]
+
+
+@each_sight
+def test_another_goal_is_another_behaviour(sight, base, batch):
+    policy = learned(base, sight)
+    one = far_goals(batch)
+    other = replace(one, position=one.position - torch.tensor([150.0, 10.0]))
+    paths = [simulate(policy, batch, num_rollouts=2, seed=5, goals=g).position for g in (one, other)]
+    assert not torch.equal(*paths)
+
+
+@each_sight
+def test_who_has_no_goal_is_asked_nothing(sight, base):
+    """A goal that is nobody's changes nothing; one agent's changes nothing for an agent that is out of its sight."""
+    policy = learned(base, sight)
+    batch = collate([scenes.crowd(num_agents=12)])
+    goals = far_goals(batch).repeat(2)
+    free = simulate(policy, batch, num_rollouts=2, seed=5)
+    nobody = goals.only(torch.zeros_like(goals.goal_mask))
+    nonsense = replace(nobody, position=torch.full_like(goals.position, torch.nan))
+    assert simulate(policy, batch, num_rollouts=2, seed=5, goals=nonsense).decision.equal(free.decision)
+    only_first = goals.only(torch.arange(12).expand_as(goals.goal_mask) == 0)
+    blind = copy.deepcopy(policy)
+    blind.network.decoder.config = replace(policy.config, agent_radius_m=1e-3)  # nobody sees anybody
+    context = blind.encode(batch)
+    said = [blind.decide(context, blind.begin(context, 2, g, torch.zeros(0))).log_probs for g in (None, only_first)]
+    gap = (said[0] - said[1]).abs().amax(-1).view(2, 12)
+    assert (gap[:, 0] > 1e-4).all()
+    assert (gap[:, 1:] < 1e-6).all()
+
+
+@each_sight
+def test_goals_may_differ_between_rollouts(sight, base, batch):
+    policy, goals = learned(base, sight), far_goals(batch).repeat(2)
+    first_only = goals.only(torch.tensor([True, False]).view(1, 2, 1).expand_as(goals.goal_mask))
+    mixed = simulate(policy, batch, num_rollouts=2, seed=5, goals=first_only)
+    free = simulate(policy, batch, num_rollouts=2, seed=5)
+    whole = simulate(policy, batch, num_rollouts=2, seed=5, goals=goals)
+    torch.testing.assert_close(mixed.position[:, 0], whole.position[:, 0], atol=1e-4, rtol=0)
+    torch.testing.assert_close(mixed.position[:, 1], free.position[:, 1], atol=1e-4, rtol=0)
+
+
+@each_sight
+def test_a_model_that_sees_goals_keeps_the_contract(sight, base):
+    report = check_policy(learned(base, sight), BENDING[1:])
+    assert report.is_passed, str(report)
+
+
+@each_sight
+def test_a_model_that_sees_goals_is_saved_and_read(sight, base, batch, tmp_path):
+    policy = learned(base, sight)
+    policy.save_pretrained(tmp_path)
+    again = SmartPolicy.from_pretrained(tmp_path).eval()
+    assert again.sees_goals
+    paths = [simulate(p, batch, num_rollouts=1, seed=5, goals=far_goals(batch)).position for p in (policy, again)]
+    assert torch.equal(*paths)
+
+
+def test_sight_is_given_once(base):
+    policy = base.with_goal_sight("concat")
+    assert policy.with_goal_sight("concat") is policy
+    with pytest.raises(ConfigError, match="sees goals by concat, not by indication"):
+        policy.with_goal_sight("indication")
+
+
+def test_a_way_to_see_goals_that_nobody_knows_is_refused(base, tmp_path):
+    base.save_pretrained(tmp_path)
+    config = tmp_path / "config.json"
+    config.write_text(config.read_text().replace('"goal": null', '"goal": "telepathy"'))
+    with pytest.raises(RlftsimError, match="telepathy"):
+        SmartPolicy.from_pretrained(tmp_path)
+
+
+def test_a_model_without_goals_cannot_be_read_as_one_with(base, tmp_path):
+    base.save_pretrained(tmp_path)
+    config = tmp_path / "config.json"
+    config.write_text(config.read_text().replace('"goal": null', '"goal": "concat"'))
+    with pytest.raises(CheckpointError, match=r"missing decoder\.goal\.frequencies"):
+        SmartPolicy.from_pretrained(tmp_path)
+
+
+def test_the_goal_polyline_is_the_nearest_token_of_the_own_scenario():
+    points = torch.tensor([[[0.0, 0.0], [10.0, 0.0], [torch.inf, torch.inf]], [[9.0, 1.0], [0.0, 2.0], [40.0, 0.0]]])
+    position = torch.tensor([[[[9.0, 1.0], [3.0, 0.0]]], [[[9.0, 1.0], [2000.0, 0.0]]]])
+    goals = Goals(position, torch.tensor([[[True, False]], [[True, True]]]))
+    # scenario 0: token 1, and no goal; scenario 1: token 3 + 0, and a goal that is nowhere near the map
+    assert see_goals(goals, points).polyline.tolist() == [[[1, -1]], [[3, -1]]]

@@ -1,0 +1,303 @@
+"""Fine-tuning with goals: who is asked what, what it earns, and hindsight."""
+
+import copy
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import tiny
+import torch
+
+import scenes
+from rlftsim.errors import CheckpointError, ConfigError, DataError
+from rlftsim.goals.recorded import recorded_goals
+from rlftsim.goals.stored import StoredGoals, write_goal_part
+from rlftsim.goals.types import Goals
+from rlftsim.rollout.policy import Sampling
+from rlftsim.rollout.simulate import simulate
+from rlftsim.rollout.types import Rollouts
+from rlftsim.scenario.batch import collate
+from rlftsim.training.augment import AugmentConfig, augment_goals
+from rlftsim.training.experience import Experience
+from rlftsim.training.finetune import FinetuneConfig, compute_reward, finetune, prepare, update_policy
+from rlftsim.training.goals import GoalConfig, choose_goals
+from rlftsim.training.hindsight import log_ratio, look_back, met_goals
+from rlftsim.training.parallel import start_fabric
+from rlftsim.training.rewards import parse_reward, reward_by_name, write_reward
+from rlftsim.training.rewards.base import shares_by_name
+from rlftsim.training.run_folder import read_metrics
+
+CONFIG = replace(tiny.FINETUNE, num_rollouts=3, reward="gcft", goals=GoalConfig(share=1.0))
+
+
+@pytest.fixture(scope="module")
+def fabric():
+    return start_fabric(tiny.CPU)
+
+
+@pytest.fixture
+def batch(drawn_scenarios):
+    return collate(drawn_scenarios[:2])
+
+
+@pytest.fixture(scope="module")
+def policy(vocabulary):
+    """Sees goals, and has seen some."""
+    policy = tiny.tiny_policy(vocabulary).eval().with_goal_sight("concat")
+    generator = torch.Generator().manual_seed(11)
+    with torch.no_grad():
+        for weight in policy.network.decoder.goal.out.parameters():
+            weight.add_(0.3 * torch.randn(weight.shape, generator=generator))
+    return policy
+
+
+# ---- the reward ----------------------------------------------------------------------------------------------------------
+
+
+def test_the_goal_reward_of_hand_made_paths(measured):
+    """Of the junction's 8 evaluated agents 4 have goals; the first rollout meets 2 of them, the second none, the third 1."""
+    batch = collate([scenes.junction_with_light()])
+    rows = batch.evaluated_mask[0].nonzero()[:4, 0]
+    mask = torch.zeros_like(batch.agent_mask)
+    mask[0, rows] = True
+    goals = recorded_goals(batch, mask).repeat(3)
+    position = goals.position[:, :, :, None].expand(-1, -1, -1, 80, -1) + 50.0
+    position = position.clone()
+    position[0, 0, rows[:2], 40] -= 50.0  # passed, not reached
+    position[0, 2, rows[3], -1] -= 50.0  # reached
+    rollouts = simulate_nothing(batch, position, goals)
+    shares = torch.tensor([0.5, 0.0, 0.25])
+    # minus the mean of the others: 0.5 - 0.125, 0 - 0.375, 0.25 - 0.25
+    soft = reward_by_name("goal")(measured[0], rollouts, batch)
+    torch.testing.assert_close(soft[0], torch.tensor([0.375, -0.375, 0.0]))
+    torch.testing.assert_close(soft[0], shares - (shares.sum() - shares) / 2)
+    hard = reward_by_name("goal")(measured[0], rollouts, batch, kind="hard")
+    torch.testing.assert_close(hard[0], torch.tensor([-0.125, -0.125, 0.25]))
+    own = shares_by_name("goal")(measured[3], rollouts, batch)
+    torch.testing.assert_close(own.sum(-1), soft)
+    assert own[0, :, rows[2]].eq(0).all()  # never met by anybody
+    with pytest.raises(ConfigError, match="known kinds are soft, hard"):
+        reward_by_name("goal")(measured[0], rollouts, batch, kind="medium")
+
+
+def simulate_nothing(batch, position, goals):
+    """Rollouts that go where they are put; nobody asks who decided."""
+    heading = position[..., 0]
+    none = torch.zeros(*heading.shape[:3], 16)
+    return Rollouts(position, heading, none.long(), none.bool(), none, goals=goals)
+
+
+def test_without_goals_there_is_no_goal_reward(measured):
+    scores, rollouts, batch, _ = measured
+    assert not reward_by_name("goal")(scores, replace(rollouts, goals=None), batch).any()
+    nobody = rollouts.goals.only(torch.zeros_like(rollouts.goals.goal_mask))
+    assert not reward_by_name("goal")(scores, replace(rollouts, goals=nobody), batch).any()
+
+
+def test_gcft_is_written_as_the_sum_it_is():
+    assert FinetuneConfig(reward="gcft", goals=GoalConfig(share=1.0)).reward == "0.9*mloo + 0.1*goal(kind='soft')"
+    hard = write_reward(parse_reward("gcft(goal_weight=0.5, kind='hard') + 0.1*collision_offroad"))
+    assert hard == "0.5*mloo + 0.5*goal(kind='hard') + 0.1*collision_offroad"
+    with pytest.raises(ConfigError, match="gcft has no option 'weight': known are goal_weight, kind"):
+        parse_reward("gcft(weight=0.5)")
+    with pytest.raises(ConfigError, match="a share in"):
+        parse_reward("gcft(goal_weight=2)")
+    with pytest.raises(ConfigError, match="needs goals: set finetune"):
+        FinetuneConfig(reward="gcft")
+
+
+# ---- who is asked what ---------------------------------------------------------------------------------------------------
+
+
+def test_everybody_some_or_nobody_has_a_goal(drawn_scenarios):
+    batch = collate(drawn_scenarios)
+    assert choose_goals(batch, GoalConfig(), None, seed=1) is None
+    everybody = choose_goals(batch, GoalConfig(share=1.0), None, seed=1)
+    assert everybody.goal_mask[:, 0].equal(recorded_goals(batch).goal_mask[:, 0])
+    some = choose_goals(batch, GoalConfig(share=0.5), None, seed=1)
+    assert 0.2 < some.goal_mask.sum() / everybody.goal_mask.sum() < 0.8
+    other = choose_goals(batch, GoalConfig(share=0.5), None, seed=2)
+    assert not other.goal_mask.equal(some.goal_mask)
+    # the same for a scenario however batches are composed
+    alone = choose_goals(collate(drawn_scenarios[1:2]), GoalConfig(share=0.5), None, seed=1)
+    width = alone.goal_mask.shape[-1]
+    assert alone.goal_mask[0].equal(some.goal_mask[1, :, :width])
+
+
+def test_contradictory_settings_are_refused():
+    with pytest.raises(ConfigError, match=r"goals\.share is a share"):
+        GoalConfig(share=1.5)
+    with pytest.raises(ConfigError, match=r"need goals: set goals\.share"):
+        GoalConfig(hindsight=1.0)
+
+
+# ---- the update ----------------------------------------------------------------------------------------------------------
+
+
+def test_an_update_with_goals_trains_their_sight_and_logs_their_rates(policy, batch, fabric):
+    learner = prepare(copy.deepcopy(policy), CONFIG, fabric.device)
+    before = {n: p.detach().clone() for n, p in learner.policy.named_parameters()}
+    values = update_policy(learner, batch, CONFIG, fabric)
+    assert {"goal_reached_rate", "goal_passed_rate", "reward_goal_std", "reward_mloo_std"} <= values.keys()
+    assert 0 <= values["goal_reached_rate"] <= values["goal_passed_rate"] <= 1
+    assert values["score_gap"] < 1e-4
+    changed = {n for n, p in learner.policy.named_parameters() if not torch.equal(p, before[n])}
+    assert any(name.startswith("network.decoder.goal") for name in changed)
+    assert not any("map_encoder" in name for name in changed)
+
+
+def test_the_reference_is_asked_nothing(policy, batch, fabric):
+    """The policy is its own reference, yet the KL is not zero: the goals alone make the difference."""
+    learner = prepare(copy.deepcopy(policy), CONFIG, fabric.device)
+    assert update_policy(learner, batch, CONFIG, fabric)["kl"] > 1e-3
+    free = replace(CONFIG, reward="mloo", goals=GoalConfig())
+    learner = prepare(copy.deepcopy(policy), free, fabric.device)
+    assert update_policy(learner, batch, free, fabric)["kl"] < 1e-6
+
+
+def test_the_sight_of_goals_may_learn_faster(policy, fabric):
+    config = replace(CONFIG, goals=GoalConfig(share=1.0, learning_rate_scale=10.0))
+    learner = prepare(copy.deepcopy(policy), config, fabric.device)
+    update_policy(learner, collate([scenes.lone_agent()]), config, fabric)
+    rates = {group["scale"]: group["lr"] for group in learner.optimizer.param_groups}
+    assert rates[10.0] == pytest.approx(10 * rates[1.0])
+    assert sum(len(group["params"]) for group in learner.optimizer.param_groups) == len(learner.parameters)
+
+
+def test_a_model_that_sees_no_goals_is_not_trained_with_goals(vocabulary, drawn_scenarios, tmp_path):
+    with pytest.raises(ConfigError, match="does not see goals: add --goal concat or --goal indication"):
+        finetune(tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path, CONFIG)
+
+
+# ---- hindsight -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def experience(policy, batch):
+    goals = recorded_goals(batch)
+    rollouts = simulate(policy, batch, num_rollouts=3, seed=2, goals=goals)
+    return Experience(batch, rollouts, *compute_reward(batch, rollouts, CONFIG))
+
+
+def test_under_its_own_goal_nothing_is_likelier(policy, experience):
+    rollouts = experience.rollouts
+    ratio = log_ratio(policy, experience.batch, rollouts, rollouts.goals, at_once=2).exp()
+    assert ratio.eq(1.0).all()
+
+
+def test_ratios_are_those_of_whole_sequences_of_decisions(policy, experience):
+    """Agent by agent, from the probabilities themselves."""
+    rollouts, batch = experience.rollouts, experience.batch
+    elsewhere = replace(rollouts.goals, position=rollouts.goals.position + 20.0)
+    ratio = log_ratio(policy, batch, rollouts, elsewhere, at_once=3)
+    context = policy.encode(batch)
+    with torch.no_grad():
+        old, new = (
+            policy.score(context, replace(rollouts, goals=goals)).log_prob(rollouts.decision)[1, 2, 0].double().exp()
+            for goals in (rollouts.goals, elsewhere)
+        )
+    assert float(ratio[1, 2, 0].exp()) == pytest.approx(float((new / old).prod()), rel=1e-3)
+    assert ratio.abs().max() > 0.01
+
+
+def test_hindsight_weights_have_mean_one_and_are_clipped(policy, experience, fabric):
+    seen = []
+
+    def measure(batch, rollouts):
+        seen.append(rollouts)
+        scores, rewards = compute_reward(batch, rollouts, CONFIG)
+        return scores, replace(rewards, by_agent=torch.ones_like(rewards.by_agent))
+
+    (back,), mean = look_back(policy, [experience], measure, weight=0.5, at_once=2, fabric=fabric)
+    deciding = back.rollouts.decision_mask.any(-1)
+    weights = back.rewards.by_agent  # the rewards were 1
+    assert float(weights[deciding].mean()) == pytest.approx(0.5, rel=1e-4)
+    assert 0 < float(weights.max()) * mean / 0.5 <= 10.0 + 1e-4
+    # the goals are where the most realistic rollout of each scenario ended, so that one meets all of them
+    best = experience.scores.single_meta_metric.argmax(-1)
+    goals = met_goals(experience.rollouts, experience.scores)
+    assert seen[0].goals.position.equal(goals.position)
+    for b, n in enumerate(best.tolist()):
+        assert seen[0].goals.position[b].eq(experience.rollouts.position[b, n, :, -1]).all()
+
+
+def test_hindsight_is_part_of_an_update(policy, batch, fabric):
+    config = replace(CONFIG, goals=GoalConfig(share=1.0, hindsight=1.0))
+    gradients = []
+    for c in (CONFIG, config):
+        learner = prepare(copy.deepcopy(policy), c, fabric.device)
+        values = update_policy(learner, batch, c, fabric)
+        gradients.append(tiny.gradients_of(learner.policy))
+    assert values["hindsight_ratio"] > 0
+    assert any(not torch.equal(g, gradients[0][name]) for name, g in gradients[1].items())
+
+
+# ---- goals beside a data set -----------------------------------------------------------------------------------------------
+
+
+def test_augmented_goals_are_where_the_most_realistic_rollout_ends(policy, drawn_scenarios, tmp_path):
+    config = AugmentConfig(num_rollouts=3, top_k=8, scenarios_per_part=2, seed=4)
+    assert augment_goals(policy, drawn_scenarios, tmp_path, config) == 4
+    files = sorted(tmp_path.glob("*.parquet"))
+    assert len(files) == 2
+    stored = StoredGoals(tmp_path)
+    assert len(stored) == len({s.scenario_id for s in drawn_scenarios})
+    batch = collate(drawn_scenarios[:1])
+    rollouts = simulate(policy, batch, num_rollouts=3, seed=4, goals=recorded_goals(batch), sampling=Sampling(top_k=8))
+    goals = stored.of_batch(batch)
+    best = compute_reward(batch, rollouts, CONFIG)[0].single_meta_metric.argmax()
+    torch.testing.assert_close(goals.position[:, 0], rollouts.position[:, best, :, -1], atol=1e-3, rtol=0)
+    # what is there is kept, what is missing is made again and is the same
+    kept = files[0].stat().st_mtime_ns
+    lost = files[1].read_bytes()
+    files[1].unlink()
+    augment_goals(policy, drawn_scenarios, tmp_path, config)
+    assert files[0].stat().st_mtime_ns == kept
+    assert files[1].read_bytes() == lost
+    with pytest.raises(CheckpointError, match="belongs to a run with other settings"):
+        augment_goals(policy, drawn_scenarios, tmp_path, replace(config, seed=5))
+
+
+def test_stored_goals_come_to_the_agents_they_are_of(drawn_scenarios, tmp_path):
+    scenario = drawn_scenarios[0]
+    ids, origin = scenario.tracks.object_id, scenario.origin
+    write_goal_part(tmp_path / "part-0.parquet", {scenario.scenario_id: (ids[[3, 1]], origin + np.array([[5.0, 6.0], [7.0, 8.0]]))})  # fmt: skip
+    batch = collate(drawn_scenarios[:2])
+    goals = StoredGoals(tmp_path).of_batch(batch)
+    places = {int(i): n for n, i in enumerate(batch.object_id[0].tolist())}
+    assert goals.goal_mask.nonzero().tolist() == sorted([[0, 0, places[int(i)]] for i in ids[[1, 3]]])
+    assert goals.position[0, 0, places[int(ids[3])]].tolist() == [5.0, 6.0]
+    mixed = [
+        choose_goals(batch, GoalConfig(share=1.0, augmented="x", augmented_share=s), StoredGoals(tmp_path), seed=1)
+        for s in (0.0, 1.0)
+    ]
+    assert mixed[0].position.equal(recorded_goals(batch).position)
+    assert mixed[1].goal_mask[0].equal(goals.goal_mask[0])  # its own, and only those
+    assert mixed[1].goal_mask[1].equal(recorded_goals(batch).goal_mask[1])  # there are none beside the recorded ones
+
+
+def test_a_folder_without_goals_is_refused(tmp_path):
+    with pytest.raises(DataError, match="holds no goals: write them by `rlftsim augment`"):
+        StoredGoals(tmp_path)
+    (tmp_path / "part-0.parquet").write_bytes(b"no table")
+    with pytest.raises(DataError, match="damaged goals"):
+        StoredGoals(tmp_path)
+
+
+def test_a_run_with_goals_of_all_kinds(policy, drawn_scenarios, tmp_path):
+    """Mixed mode, augmented goals, hindsight, credit by agent: three updates, logged, and a model that sees goals."""
+    augment_goals(policy, drawn_scenarios, tmp_path / "goals", AugmentConfig(num_rollouts=2, top_k=8))
+    goals = GoalConfig(share=0.7, augmented=str(tmp_path / "goals"), hindsight=0.5, learning_rate_scale=3.0)
+    config = replace(CONFIG, goals=goals, epochs=0.75, credit="agent", micro_batch_size=1)
+    model = finetune(copy.deepcopy(policy), drawn_scenarios, tmp_path / "run", config)
+    metrics = read_metrics(tmp_path / "run")
+    assert len(metrics) == 3
+    assert all(line["hindsight_ratio"] > 0 for line in metrics)
+    assert '"goal": "concat"' in (model / "config.json").read_text()
+
+
+def test_goals_of_two_rollouts_cannot_be_those_of_three(policy, batch):
+    goals = recorded_goals(batch).repeat(2)
+    with pytest.raises(ConfigError, match="goals of 2 rollouts cannot be those of 3"):
+        simulate(policy, batch, num_rollouts=3, seed=0, goals=goals)
+    assert isinstance(goals.rollouts(slice(0, 1)), Goals)
