@@ -39,7 +39,9 @@ def main() -> None:
     counts: Counter[str] = Counter()
     for position in order:
         scenario = scenarios[int(position)]
-        by_track = {int(t): propose_from_lanes(scenario, int(t), road_test(scenario)) for t in scenario.evaluated_indices}
+        by_track = {
+            int(t): propose_from_lanes(scenario, int(t), road_test(scenario)) for t in scenario.evaluated_indices
+        }
         count(counts, scenario, by_track)
         worth = [t for t, found in by_track.items() if len(found) > 1 and is_vehicle(scenario, t)]
         if worth and len(panels) < SAMPLE:

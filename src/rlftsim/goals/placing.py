@@ -13,7 +13,7 @@ from rlftsim.goals.types import Goals
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import CURRENT_STEP, HISTORY_STEPS, ObjectType, Scenario
 
-FASTEST_MPS = 45.0
+FASTEST_MPS = 60.0
 """Nobody is faster on average."""
 TOP_MPS = {ObjectType.PEDESTRIAN: 2.5, ObjectType.CYCLIST: 8.0}
 """Faster than that are few; vehicles are bounded by their acceleration."""
