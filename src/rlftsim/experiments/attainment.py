@@ -14,7 +14,7 @@ import torch
 
 from rlftsim.errors import DataError
 from rlftsim.experiments.contestants import Contestant
-from rlftsim.experiments.evaluate import EvaluateConfig, check_jobs, choose_scenarios, simulate_states
+from rlftsim.experiments.evaluate import EvaluateConfig, check_jobs, choose_scenarios, simulate_encoded
 from rlftsim.experiments.parts import one_thread
 from rlftsim.experiments.workshop import Workshop
 from rlftsim.files import write_text
@@ -26,8 +26,8 @@ from rlftsim.progress import progress_bar
 from rlftsim.realism import SimulatedStates
 from rlftsim.recipes.models import load_policy
 from rlftsim.rollout.policy import Policy, device_of, sees_goals
+from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import ScenarioDataset
-from rlftsim.scenario.types import Scenario
 from rlftsim.workers import run_tasks
 
 FOLDER = "attainment"
@@ -121,20 +121,23 @@ def _measure_scenario(
 ) -> None:
     """Simulate under each goal; once for all of them if the policy sees none."""
     scenario = ScenarioDataset(job.data, job.config.split, cache_size=1).by_id(scenario_id)
-    simulated = partial(simulate_states, job.policy, scenario, job.config, device_of(job.policy))
+    batch = collate([scenario]).to(device_of(job.policy))
+    with torch.no_grad():
+        context = job.policy.encode(batch)
+    simulated = partial(simulate_encoded, job.policy, batch, context, job.config)
     blind = None if sees_goals(job.policy) else simulated()
     rows = []
     for goal in job.goals[scenario_id]:
         if is_stopped():
             return
-        states = blind or simulated(goals_of=partial(goals_of_batch, [goal]))
-        reached, passed = _attained(scenario, states, goal)
+        states = blind or simulated(goals=goals_of_batch([goal], batch))
+        reached, passed = _attained(states, goal)
         rows.append({"goal": [goal.agent_id, goal.x, goal.y], "reached": reached, "passed": passed})
     write_text(job.path_of(scenario_id), json.dumps(rows) + "\n")
     advance(1)
 
 
-def _attained(scenario: Scenario, states: SimulatedStates, goal: GoalEntry) -> tuple[float, float]:
+def _attained(states: SimulatedStates, goal: GoalEntry) -> tuple[float, float]:
     """Shares of the rollouts that reach and that pass a goal."""
     row = int(np.flatnonzero(states.object_id == goal.agent_id)[0])
     way = torch.stack([states.x[:, row].double() - goal.x, states.y[:, row].double() - goal.y], -1).float()

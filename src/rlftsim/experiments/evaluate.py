@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import nn
@@ -113,7 +113,13 @@ def simulate_states(
     batch = collate([scenario]).to(device)
     with torch.no_grad():
         context = policy.encode(batch)
-    goals = goals_of and goals_of(batch)
+    return simulate_encoded(policy, batch, context, config, goals=goals_of and goals_of(batch))
+
+
+def simulate_encoded(
+    policy: Policy, batch: ScenarioBatch, context: Any, config: EvaluateConfig, *, goals: Goals | None = None
+) -> SimulatedStates:
+    """As `simulate_states`, of a scenario that the policy has encoded."""
     is_random = policy.initial_noise_size or (policy.noise_size and config.temperature > 0)
     ids = range(config.num_rollouts if is_random else 1)
     passes = []

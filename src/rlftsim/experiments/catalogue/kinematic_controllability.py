@@ -55,7 +55,7 @@ def goal_of(scenario: Scenario, offset_s: int) -> GoalEntry | None:
     return GoalEntry(scenario.scenario_id, int(tracks.object_id[ego]), float(position[0]), float(position[1]), label)
 
 
-def _carried_on(scenario: Scenario, seconds: float) -> Float[np.ndarray, "2"]:
+def _carried_on(scenario: Scenario, seconds: int) -> Float[np.ndarray, "2"]:
     """Way of the ego after the record's end by a bicycle model whose speed and steering stay: an arc."""
     tracks, ego = scenario.tracks, scenario.ego_index
     speed = float(np.linalg.norm(tracks.velocity[ego, LAST_STEP]))
@@ -157,14 +157,24 @@ def _figure(curves: Mapping[str, Mapping[str, Sequence[MeanInterval]]]) -> Figur
 
 
 def bands_of(curves: Mapping[str, Sequence[MeanInterval]]) -> tuple[Band, ...]:
-    """Curves of shares in percent; those of models without goals dashed, intervals beside each other."""
+    """Curves of shares in percent; those of models without goals dashed with open dots, intervals beside each other and cut at 0 and 100."""
     bands = []
     for number, (name, curve) in enumerate(curves.items()):
         place = np.arange(len(curve)) + 0.07 * (number - (len(curves) - 1) / 2)
         mean, low, high = (100 * np.array(v) for v in ([m.mean for m in curve], *zip(*(m.interval for m in curve))))
         sees = name in VARIANTS
         colour = list(VARIANTS).index(name) if sees else 4 + (name == START)
-        bands.append(Band(name, place, mean, low, high, style="measured" if sees else "theory", colour=colour))
+        bands.append(
+            Band(
+                name,
+                place,
+                mean,
+                low.clip(0, 100),
+                high.clip(0, 100),
+                style="measured" if sees else "theory",
+                colour=colour,
+            )
+        )
     return tuple(bands)
 
 

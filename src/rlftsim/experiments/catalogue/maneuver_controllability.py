@@ -193,7 +193,7 @@ def _figure(measured: Measured, rows: Sequence[str]) -> Figure:
     ticks = [m.value.replace("_", "\n") for m in shown]
     return draw_panels(
         panels, title="The ego asked for manoeuvres", x_label="", y_label="rollouts [%], 95 % interval", ticks=ticks,
-        columns=len(IS_IN),
+        columns=len(IS_IN), is_joined=False,
     )  # fmt: skip
 
 
