@@ -82,7 +82,7 @@ def draw_scene(animation: Animation) -> tuple[Figure, Sequence[Axes]]:
         if any(getattr(panel.trajectories, mark) is not None for panel in panels)
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False, fontsize=10)
-    return figure, axes
+    return figure, list(axes)
 
 
 def _draw_ground(axis: Axes, scene: SceneView, title: str) -> None:
