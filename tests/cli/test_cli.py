@@ -7,8 +7,10 @@ import shutil
 import subprocess
 import sys
 import typing
+from dataclasses import replace
 
 import pytest
+import torch
 
 from rlftsim import __version__
 from rlftsim.cli.data import SYNTHETIC, open_split
@@ -18,6 +20,7 @@ from rlftsim.cli.train import RecipeName
 from rlftsim.policies.smart.config import smart_demo
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.recipes.smart import RECIPES
+from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.scenario.synthetic import pack_path
 from rlftsim.tokens.vocabulary import Vocabulary
 from rlftsim.training.run_folder import read_metrics
@@ -130,6 +133,13 @@ WRONG = {
     "no rollouts": ("evaluate oracle --data synthetic --out {tmp}/o --num-rollouts 0", "num_rollouts must be at least 1"),
     "a temperature below zero": ("simulate constant_velocity --data synthetic --out {tmp}/o --temperature -1", "temperature must be >= 0"),
     "top-k of a policy without categories": ("simulate constant_velocity --data synthetic --out {tmp}/o --top-k 3", "top_k=3 needs a policy with categories"),
+    "goals of a policy that sees none": ("simulate constant_velocity --data synthetic --out {tmp}/o --goals {tmp}/goals.json", "constant_velocity does not see goals, 1 would have no effect"),
+    "a goal without its scenario": ("simulate constant_velocity --data synthetic --out {tmp}/o --goal 5=1,2", "--goal AGENT=X,Y needs to know the scenario"),
+    "a goal that is none": ("simulate constant_velocity --data synthetic --out {tmp}/o --scenario 9d639de83d6f5239 --goal 5=here", "--goal 5=here: not AGENT=X,Y"),
+    "a goals file that is not there": ("simulate constant_velocity --data synthetic --out {tmp}/o --goals {tmp}/no.json", "no such goals file: make one with"),
+    "a goal of an unknown agent": ("goals check {tmp}/goals.json --data synthetic", r"goals\[0\]: scenario 9d639de83d6f5239 has no agent 9999"),
+    "proposals for an unknown scenario": ("goals propose synthetic --scenario nobody", "no scenario nobody in synthetic"),
+    "proposals for an unknown agent": ("goals propose synthetic --scenario 9d639de83d6f5239 --agent 9999", "no agent 9999 in scenario 9d639de83d6f5239: there are "),
     "a tfrecord that is not there": ("convert {tmp}/x.tfrecord {tmp}/o", "no such file or folder"),
     "a folder without tfrecords": ("convert {tmp} {tmp}/o", "no tfrecord file in this folder"),
     "a destination that is taken": ("convert {tmp}/garbage {tmp}", "is not empty and not a data set"),
@@ -143,6 +153,9 @@ def test_a_mistake_ends_in_one_line_and_status_2(mistake, tmp_path, capsys):
     (tmp_path / "garbage").write_bytes(b"garbage" * 9)
     (tmp_path / "garbage.npz").write_bytes(b"garbage" * 9)
     (tmp_path / "empty.npz").touch()
+    (tmp_path / "goals.json").write_text(
+        '{"format": "rlftsim-goals-1", "goals": [{"scenario": "9d639de83d6f5239", "agent": 9999, "x": 1, "y": 2}]}'
+    )
     (tmp_path / "whose").mkdir()
     (tmp_path / "whose" / "rollouts.json").write_text("{")
     shutil.copytree(pack_path(), tmp_path / "unfinished", ignore=shutil.ignore_patterns("*.arrow"))
@@ -301,3 +314,64 @@ def test_a_model_folder_without_weights_or_with_garbage_is_refused_in_words(tmp_
         status, _, err = run(capsys, "simulate", tmp_path, "--data", "synthetic", "--out", tmp_path / "out")
         assert (status, err.count("\n")) == (2, 1)
         assert "damaged model folder" in err
+
+
+# ---- goals --------------------------------------------------------------------------------------------------------------
+
+SCENARIO, TURNS = "9d639de83d6f5239", 9
+"""An agent of this synthetic scenario stands before a junction and may go straight on, turn right or change lanes."""
+
+
+def test_proposals_are_printed_written_and_drawn(tmp_path, capsys):
+    arguments = ["goals", "propose", "synthetic", "--scenario", SCENARIO, "--agent", TURNS, "--choose", "right"]
+    status, out, _ = run(capsys, *arguments, "--out", tmp_path / "g.json", "--picture", tmp_path / "g.png")
+    assert status == 0
+    assert "right ← asked for" in out
+    file = json.loads((tmp_path / "g.json").read_text())
+    assert [(goal["agent"], goal["label"]) for goal in file["goals"]] == [(TURNS, "right")]
+    assert {goal["label"] for goal in file["alternatives"]} == {"straight", "lane_change_left"}
+    assert (tmp_path / "g.png").read_bytes().startswith(b"\x89PNG")
+    status, out, _ = run(capsys, "goals", "check", tmp_path / "g.json", "--data", "synthetic")
+    assert status == 0
+    assert f"agent {TURNS} (vehicle, 0.0 m/s) stands still" in out
+    assert "1 goals in 1 scenarios, 1 doubts" in out
+
+
+class SeesGoals(ConstantVelocity):
+    """Drives the straight line to its goal."""
+
+    sees_goals = True
+
+    def begin(self, context, num_rollouts, goals, noise):
+        state = super().begin(context, num_rollouts, goals, noise)
+        asked = goals.goal_mask[..., None] if goals is not None else False
+        velocity = (
+            torch.where(asked, (goals.position - state.position) / 8.0, state.velocity) if goals else state.velocity
+        )
+        return replace(state, velocity=velocity)
+
+
+def test_a_goal_is_given_to_the_model_and_who_got_there_is_said(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("rlftsim.cli.simulate.load_policy", lambda *_: SeesGoals())
+    arguments = ["simulate", "goal-seeker", "--data", "synthetic", "--scenario", SCENARIO, "--num-rollouts", "2"]
+    goals = ["--goal", f"{TURNS}=-74.19,19.77", "--goal", "52=3.28,-4.49"]
+    status, out, err = run(capsys, *arguments, "--out", tmp_path / "o", *goals, "--picture")
+    assert status == 0, err
+    assert out.count("100%") == 4  # two goals, both reached and passed
+    assert "stands still" in err
+    assert (tmp_path / "o" / f"{SCENARIO}.png").exists()
+    status, _, err = run(capsys, *arguments, "--out", tmp_path / "o")
+    assert (status, "with another goals" in err) == (2, True)
+    status, _, err = run(capsys, *arguments, "--out", tmp_path / "far", "--goal", f"{TURNS}=5000,0")
+    assert (status, "nobody gets there in 8 s" in err) == (2, True)
+    assert not (tmp_path / "far").exists()
+
+
+def test_only_the_scenarios_of_a_goals_file_are_simulated(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("rlftsim.cli.simulate.load_policy", lambda *_: SeesGoals())
+    run(capsys, "goals", "propose", "synthetic", "--scenario", SCENARIO, "--out", tmp_path / "g.json")
+    arguments = ["simulate", "goal-seeker", "--data", "synthetic", "--out", tmp_path / "o", "--num-rollouts", "1"]
+    status, out, _ = run(capsys, *arguments, "--goals", tmp_path / "g.json")
+    assert status == 0
+    assert [p.name for p in (tmp_path / "o").glob("*.npz")] == [f"{SCENARIO}.npz"]
+    assert "lane_change_right" in out

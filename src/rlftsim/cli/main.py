@@ -24,6 +24,7 @@ VERBS = {
     "finetune": ("rlftsim.cli.train", "Finetune"),
     "augment": ("rlftsim.cli.augment", "Augment"),
     "model": ("rlftsim.cli.model", "Model"),
+    "goals": ("rlftsim.cli.goals", "Goals"),
     "simulate": ("rlftsim.cli.simulate", "Simulate"),
     "score": ("rlftsim.cli.results", "Score"),
     "evaluate": ("rlftsim.cli.results", "Evaluate"),
@@ -48,6 +49,7 @@ usage: rlftsim VERB ...      rlftsim VERB --help explains a verb
   finetune     fine-tune a model closed-loop with a realism reward, with goals if asked
   augment      draw further goals for fine-tuning with goals
   model        take a checkpoint from the public CAT-K code, or hand one back
+  goals        say what agents may be asked to do, and write it to a file
   simulate     roll scenarios out with a model
 
   score        score anybody's rollouts with the official realism meta-metric
@@ -56,7 +58,7 @@ usage: rlftsim VERB ...      rlftsim VERB --help explains a verb
   experiment   answer a question of the paper with a table and a figure
 """
 
-STARTS_ANEW = ("doctor", "data", "tokens", "model", "compare")
+STARTS_ANEW = ("doctor", "data", "tokens", "model", "goals", "compare")
 """Verbs that keep nothing of what they were stopped in."""
 INTERRUPTED = 130
 USER_MISTAKE = 2

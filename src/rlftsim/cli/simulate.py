@@ -1,23 +1,30 @@
 """The verb that rolls scenarios out: simulate."""
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import tyro
 from tyro.conf import Positional
 
 from rlftsim.cli.data import open_split
+from rlftsim.cli.goal_outcomes import outcome_table, outcomes_of, picture_of
+from rlftsim.cli.goals import goals_asked, warn_of_doubts
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.files import write_text
-from rlftsim.progress import progress_bar
+from rlftsim.goals.goals_file import GoalsFile
+from rlftsim.goals.placing import goals_of_batch
+from rlftsim.progress import print_wide, progress_bar
 from rlftsim.recipes.models import Device, load_policy
 from rlftsim.rollout.files import write_rollouts
 from rlftsim.rollout.fingerprint import fingerprint_policy
-from rlftsim.rollout.policy import Policy, Sampling, device_of
+from rlftsim.rollout.policy import Policy, Sampling, device_of, sees_goals
 from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import ScenarioDataset
+from rlftsim.scenario.types import Scenario
+from rlftsim.viewer.goal_picture import draw_goals
 
 ABOUT = "rollouts.json"
 """Whose rollouts are in the folder."""
@@ -46,6 +53,12 @@ class Simulate:
     """Below 1 likely motions become likelier; 0 always takes the most likely one."""
     top_k: int | None = None
     """Sample among this many of the most likely motions only."""
+    goal: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
+    """AGENT=X,Y asks an agent of the one --scenario to go there, metres in the world frame of the record; may be given many times."""
+    goals: Path | None = None
+    """Goals file (docs/goals.md); without --scenario only its scenarios are simulated."""
+    picture: bool = False
+    """Draw OUT/SCENARIO.png: agents that have goals, or else the evaluated ones, and where they went."""
     device: Device = "auto"
 
     def run(self) -> int:
@@ -54,22 +67,61 @@ class Simulate:
             raise ConfigError(f"--num-rollouts must be at least 1, got {self.num_rollouts}.")
         policy, sampling = load_policy(self.model, self.device), Sampling(self.temperature, self.top_k)
         scenarios = open_split(self.data, self.split)
-        ids = self.scenario or scenarios.scenario_ids
+        asked = self._goals_asked(policy)
+        ids = self.scenario or list(asked.scenario_ids) or scenarios.scenario_ids
         unknown = [i for i in ids if i not in scenarios]
         if unknown:
             raise ConfigError(f"no scenario {', '.join(unknown)} in split {self.split!r} of {self.data}.")
-        self._claim(policy, sampling, scenarios)
+        for scenario_id in ids:
+            if asked.of_scenario(scenario_id):
+                warn_of_doubts(asked.of_scenario(scenario_id), scenarios.by_id(scenario_id))
+        self._claim(policy, sampling, scenarios, asked)
         left = [i for i in ids if not (self.out / f"{i}.npz").exists()]
         with progress_bar("simulate", len(ids), len(ids) - len(left)) as advance:
             for scenario_id in left:
                 batch = collate([scenarios.by_id(scenario_id)]).to(device_of(policy))
-                rollouts = simulate(policy, batch, num_rollouts=self.num_rollouts, seed=self.seed, sampling=sampling)
+                entries = asked.of_scenario(scenario_id)
+                goals = goals_of_batch(entries, batch) if entries else None
+                rollouts = simulate(
+                    policy, batch, num_rollouts=self.num_rollouts, seed=self.seed, sampling=sampling, goals=goals
+                )
                 write_rollouts(self.out, batch, rollouts)
                 advance()
+        self._report([scenarios.by_id(i) for i in ids if asked.of_scenario(i) or self.picture], asked)
         print(f"{self.out}: {self.num_rollouts} rollouts of {len(ids)} scenarios.")
         return 0
 
-    def _claim(self, policy: Policy, sampling: Sampling, scenarios: ScenarioDataset) -> None:
+    def _goals_asked(self, policy: Policy) -> GoalsFile:
+        """The goals of the command line.
+
+        Raises:
+            ConfigError: the model does not see goals.
+            DataError: they make no sense.
+        """
+        asked = goals_asked(self.goals, self.goal, self.scenario)
+        if asked.goals and not sees_goals(policy):
+            raise ConfigError(
+                f"{self.model} does not see goals, {len(asked.goals)} would have no effect: take a model that was fine-tuned with "
+                "goals (docs/goals.md), or leave --goal and --goals out."
+            )
+        return asked
+
+    def _report(self, scenarios: list[Scenario], asked: GoalsFile) -> None:
+        """Say who got where it was asked to go, and draw."""
+        outcomes = [
+            outcome
+            for scenario in scenarios
+            for outcome in outcomes_of(self.out, scenario, asked.of_scenario(scenario.scenario_id))
+        ]
+        if outcomes:
+            print_wide(outcome_table(outcomes))
+        if self.picture:
+            for scenario in scenarios:
+                path = self.out / f"{scenario.scenario_id}.png"
+                draw_goals(path, [picture_of(self.out, scenario, asked.of_scenario(scenario.scenario_id))])
+                print(path)
+
+    def _claim(self, policy: Policy, sampling: Sampling, scenarios: ScenarioDataset, asked: GoalsFile) -> None:
         """Write down whose rollouts these are; refuse a folder that holds others.
 
         Raises:
@@ -83,9 +135,12 @@ class Simulate:
             "num_rollouts": self.num_rollouts,
             "sampling": asdict(sampling),
         }
+        if asked.goals:
+            about["goals"] = [[e.scenario_id, e.agent_id, e.x, e.y] for e in asked.goals]
         path = self.out / ABOUT
         old = _read_about(path) if path.exists() else about
-        differing = [name for name, value in about.items() if name != "model" and old.get(name) != value]
+        names = [name for name in {**about, **old} if name != "model"]
+        differing = [name for name in names if old.get(name) != about.get(name)]
         if differing and any(self.out.glob("*.npz")):
             raise ConfigError(
                 f"{self.out} holds rollouts of {old.get('model')} with another {', '.join(differing)}: name another --out."

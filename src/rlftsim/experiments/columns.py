@@ -25,6 +25,8 @@ class ResultRow:
     average_displacement_error_m: MeanInterval | None = None
     miss_rate: MeanInterval | None = None
     """Share in [0, 1]."""
+    passing_miss_rate: MeanInterval | None = None
+    """Share in [0, 1]."""
     note: str = ""
     emphasised: bool = False
 
@@ -98,6 +100,15 @@ COLUMNS = (
     ),
     Column("miss_rate", "miss_rate", "miss [%]", "evaluated agents that end too far from the log's end", 2, 100.0),
 )  # fmt: skip
+
+GOAL_COLUMNS = (
+    Column(
+        "passing_miss_rate", "passing_miss_rate", "passing miss [%]", "evaluated agents that never come near the log's end", 2, 100.0,
+    ),
+    *SCORES[1:4],
+    SCORES[0],
+)  # fmt: skip
+"""What the table of goal conditioning shows."""
 
 
 def shown_columns(rows: Sequence[ResultRow]) -> list[Column]:

@@ -3,9 +3,11 @@
 from dataclasses import dataclass, replace
 from typing import Literal
 
+from rlftsim.policies.smart.config import GoalSight
 from rlftsim.recipes.smart import SmartRecipe
 from rlftsim.training.catk import CatkConfig
 from rlftsim.training.finetune import FinetuneConfig
+from rlftsim.training.goals import GoalConfig
 from rlftsim.training.rewards import CreditTo
 
 WEAK_EPOCHS = 1.0
@@ -33,6 +35,21 @@ class Base:
 
 
 @dataclass(frozen=True)
+class GoalTraining:
+    """How a model learns to follow goals."""
+
+    sight: GoalSight
+    """How it sees them."""
+    kind: Literal["soft", "hard"]
+    """What counts: coming by, or being there in the end."""
+
+    @property
+    def name(self) -> str:
+        """Of its files."""
+        return f"{self.sight}-{self.kind}"
+
+
+@dataclass(frozen=True)
 class FineTuned:
     """A base model after fine-tuning. Everything that is not said here is the recipe's: all have the same budget."""
 
@@ -43,17 +60,21 @@ class FineTuned:
     seed: int = 0
     share: float = 1.0
     """Of the recipe's fine-tuning epochs."""
-    base: Base = Base()
+    base: "Base | FineTuned" = Base()
+    """What the fine-tuning starts from."""
+    goals: GoalTraining | None = None
+    """None = goal-free."""
 
     @property
     def name(self) -> str:
         """Of its files, without how long it was trained."""
         credit = "" if self.credit == "rollout" else f"-{self.credit}"
         base = "" if self.base == Base() else f"-from-{self.base.name}"
-        return f"{self.method}{credit}{base}-seed{self.seed}"
+        goals = "" if self.goals is None else f"-{self.goals.name}"
+        return f"{self.method}{goals}{credit}{base}-seed{self.seed}"
 
 
-CATK = "catk"
+CATK, GCFT = "catk", "gcft"
 VARIED = ("finetune.reward", "finetune.credit", "finetune.seed", "catk.seed", "catk.epochs", "catk.batch_size")
 """Fields of a recipe that contestants set for themselves."""
 Contestant = Baseline | Base | FineTuned
@@ -71,8 +92,13 @@ def finetune_config(contestant: FineTuned, recipe: FinetuneConfig) -> FinetuneCo
     Raises:
         ConfigError: there is no such reward.
     """
-    epochs = recipe.epochs * contestant.share
-    return replace(recipe, reward=contestant.method, seed=contestant.seed, epochs=epochs, credit=contestant.credit)
+    reward, goals = contestant.method, GoalConfig()
+    if contestant.goals is not None:
+        reward = f"{contestant.method}(kind='{contestant.goals.kind}')"
+        goals = replace(recipe.goals, share=recipe.goals.share or 1.0)
+    return replace(
+        recipe, reward=reward, seed=contestant.seed, epochs=recipe.epochs * contestant.share, credit=contestant.credit, goals=goals,
+    )  # fmt: skip
 
 
 def catk_config(contestant: FineTuned, recipe: SmartRecipe) -> CatkConfig:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import nn
@@ -16,12 +16,14 @@ from torch import nn
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.experiments.evaluation import EvaluateConfig, Evaluation, Provenance, Skipped, row_of_result
 from rlftsim.experiments.parts import ResumableEvaluation
+from rlftsim.goals.recorded import recorded_goals
+from rlftsim.goals.types import Goals
 from rlftsim.realism import SimulatedStates, build_scenario_log, metric_by_name, score
 from rlftsim.realism.from_rollouts import logged_states, states_of_rollouts
 from rlftsim.rollout.fingerprint import fingerprint_policy
-from rlftsim.rollout.policy import Policy, device_of
+from rlftsim.rollout.policy import Policy, device_of, sees_goals
 from rlftsim.rollout.simulate import simulate
-from rlftsim.scenario.batch import collate
+from rlftsim.scenario.batch import ScenarioBatch, collate
 from rlftsim.scenario.dataset import MANIFEST, ScenarioDataset
 from rlftsim.scenario.shards import hash_file
 from rlftsim.scenario.types import TOTAL_STEPS, Scenario
@@ -57,8 +59,10 @@ def evaluate(
 
     Raises:
         DataError: no such data set or split, or scenarios whose future is withheld (a test split).
-        ConfigError: an impossible name, or several processes for a policy that lives on a GPU.
+        ConfigError: an impossible name, several processes for a policy that lives on a GPU, or goals for one that sees none.
     """
+    if config.goals != "none" and not sees_goals(policy):
+        raise ConfigError(f"evaluate.goals={config.goals} has no effect: {name} does not see goals, leave it out.")
     dataset_folder, out = Path(dataset_folder), Path(out)
     positions = choose_scenarios(ScenarioDataset(dataset_folder, config.split), config)
     job = _Job(_frozen_copy(policy), dataset_folder, _describe(policy, dataset_folder, config), name, out)
@@ -67,6 +71,11 @@ def evaluate(
     return job.parts.run(
         partial(_evaluate_group, job), ids, jobs=config.jobs, title=f"evaluate {name}", show_progress=show_progress
     )
+
+
+def evaluated_ends(batch: ScenarioBatch) -> Goals:
+    """Where the record left the evaluated agents, as their goals."""
+    return recorded_goals(batch, batch.evaluated_mask)
 
 
 def check_jobs(config: EvaluateConfig, device: torch.device) -> None:
@@ -82,9 +91,21 @@ def check_jobs(config: EvaluateConfig, device: torch.device) -> None:
 
 
 def simulate_states(
-    policy: Policy, scenario: Scenario, config: EvaluateConfig, device: torch.device
+    policy: Policy,
+    scenario: Scenario,
+    config: EvaluateConfig,
+    device: torch.device,
+    *,
+    goals_of: Callable[[ScenarioBatch], Goals] | None = None,
 ) -> SimulatedStates:
     """All rollouts of one scenario, simulated a few at a time; a deterministic policy is simulated once.
+
+    Args:
+        policy: who decides.
+        scenario: what is simulated.
+        config: rollouts, seed, sampling.
+        device: where.
+        goals_of: what agents are asked, the same in all rollouts; None = nothing.
 
     Raises:
         ConfigError: the policy cannot do what `config` asks, e.g. top-k without categories.
@@ -92,13 +113,20 @@ def simulate_states(
     batch = collate([scenario]).to(device)
     with torch.no_grad():
         context = policy.encode(batch)
+    return simulate_encoded(policy, batch, context, config, goals=goals_of and goals_of(batch))
+
+
+def simulate_encoded(
+    policy: Policy, batch: ScenarioBatch, context: Any, config: EvaluateConfig, *, goals: Goals | None = None
+) -> SimulatedStates:
+    """As `simulate_states`, of a scenario that the policy has encoded."""
     is_random = policy.initial_noise_size or (policy.noise_size and config.temperature > 0)
     ids = range(config.num_rollouts if is_random else 1)
     passes = []
     for first in range(0, len(ids), config.rollouts_per_pass):
         some = ids[first : first + config.rollouts_per_pass]
         rollouts = simulate(
-            policy, batch, num_rollouts=some, seed=config.seed, context=context, sampling=config.sampling
+            policy, batch, num_rollouts=some, seed=config.seed, context=context, sampling=config.sampling, goals=goals
         )
         passes.append(states_of_rollouts(batch, rollouts)[0])
     joined = _join_passes(passes)
@@ -192,7 +220,8 @@ def _evaluate_scenario(job: _Job, scenario: Scenario) -> dict[str, object] | Ski
     if isinstance(job.policy, str):
         states = logged_states(scenario, num_rollouts=config.num_rollouts, device=job.device)
     else:
-        states = simulate_states(job.policy, scenario, config, job.device)
+        goals_of = evaluated_ends if config.goals == "recorded" else None
+        states = simulate_states(job.policy, scenario, config, job.device, goals_of=goals_of)
     return row_of_result(score(log, states, metric_by_name(config.metric)), scenario, states)
 
 

@@ -52,6 +52,9 @@ SCHEMA = pa.schema(
 )
 
 
+GoalsGiven = Literal["none", "recorded"]
+
+
 def direction_of(column: str) -> Literal["higher", "lower"]:
     """Which way is better."""
     return "lower" if column.endswith(("_error", "_rate")) else "higher"
@@ -77,6 +80,8 @@ class EvaluateConfig:
     """Rollouts simulated together: bounds memory, and small passes stay in the processor's cache. Changes no result."""
     jobs: int = 1
     """Processes, each with one thread. Changes no result."""
+    goals: GoalsGiven = "none"
+    """What evaluated agents are asked: nothing, or to go where their record ends, for a model that sees goals."""
 
     def __post_init__(self) -> None:
         for name in ("num_rollouts", "rollouts_per_pass", "jobs", "limit"):
@@ -93,7 +98,7 @@ class EvaluateConfig:
 
     def what_counts(self) -> dict[str, object]:
         """The settings that results depend on, for one and the same scenario."""
-        ignored = ("limit", "rollouts_per_pass", "jobs")
+        ignored = ("limit", "rollouts_per_pass", "jobs", *(("goals",) if self.goals == "none" else ()))
         return {name: value for name, value in asdict(self).items() if name not in ignored}
 
 
@@ -131,7 +136,7 @@ class Provenance:
     def differences(self, other: "Provenance") -> list[str]:
         """Names of what counts and differs."""
         mine, theirs = self.what_counts(), other.what_counts()
-        return [name for name, value in mine.items() if value != theirs[name]]
+        return [name for name in {**mine, **theirs} if mine.get(name) != theirs.get(name)]
 
 
 @dataclass(frozen=True, eq=False)

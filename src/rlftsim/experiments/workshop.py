@@ -6,6 +6,7 @@ runs/base/                      a training run each, see `training.run_folder`
 runs/mloo-seed0/3-epochs/
 evaluations/*.parquet           an evaluation each
 variances/                      what `catalogue.variance_scaling` measures
+attainment/                     who got where it was asked to go, see `experiments.attainment`
 NAME.md, NAME.json, NAME.png    what an experiment found
 
 Stages are shared: what one experiment has trained the next one uses.
@@ -35,7 +36,7 @@ from rlftsim.experiments.contestants import (
     finetune_config,
 )
 from rlftsim.experiments.evaluate import EvaluateConfig, evaluate
-from rlftsim.experiments.evaluation import SCHEMA, SCORE_COLUMNS, Evaluation
+from rlftsim.experiments.evaluation import SCHEMA, SCORE_COLUMNS, Evaluation, GoalsGiven
 from rlftsim.experiments.stages import (
     find_vocabulary,
     finetune_with_catk,
@@ -144,28 +145,33 @@ class Workshop:
         config = self.recipe.finetune
         return Budget(config.num_updates(len(self.training)), config.batch_size, config.num_rollouts)
 
-    def measure(self, rows: Mapping[str, Sequence[Contestant]]) -> dict[str, Row]:
+    def measure(self, rows: Mapping[str, Sequence[Contestant]], *, goals: GoalsGiven = "none") -> dict[str, Row]:
         """Train and evaluate whoever is not yet, and return the rows by their names.
 
         Args:
             rows: by name, the contestants of a row: the same with several seeds.
+            goals: what agents are asked in the evaluation.
         """
         everybody = list(dict.fromkeys(c for contestants in rows.values() for c in contestants))
-        agenda = Agenda(self._steps(everybody))
+        agenda = Agenda(self._steps(everybody, goals=goals))
+        config = replace(self.evaluation, goals=goals)
         measured = {}
         for contestant in everybody:
             model = self._model(contestant, agenda)
-            with agenda.step(f"evaluate {self.title(contestant)}"):
+            with agenda.step(self._evaluation_title(contestant, goals)):
                 policy = load_policy_or_oracle(model, self.device)
-                folder = self.out / "evaluations"
-                measured[contestant] = evaluate(
-                    policy, self.data, folder, self.evaluation, name=self._evaluation_name(contestant)
-                )
+                folder, name = self.out / "evaluations", self.evaluation_name(contestant, goals)
+                measured[contestant] = evaluate(policy, self.data, folder, config, name=name)
         return {name: Row(name, tuple(measured[c] for c in contestants)) for name, contestants in rows.items()}
 
     def base(self) -> Path:
         """Folder of the base model; pre-trained, if it is not there yet."""
-        return Path(self._model(BASE, Agenda(self._steps([BASE], evaluated=False))))
+        return Path(self.models([BASE])[BASE])
+
+    def models(self, contestants: Sequence[Contestant]) -> dict[Contestant, str]:
+        """Names or folders of contestants' policies; whoever is not trained yet is trained."""
+        agenda = Agenda(self._steps(contestants, evaluated=False))
+        return {contestant: self._model(contestant, agenda) for contestant in contestants}
 
     def policy(self, contestant: Base | FineTuned) -> Policy:
         """A contestant's policy, on the device of evaluations; trained, if it is not yet."""
@@ -186,24 +192,25 @@ class Workshop:
 
     # ---- stages ---------------------------------------------------------------------------------------------------
 
-    def _steps(self, contestants: Sequence[Contestant], *, evaluated: bool = True) -> dict[str, bool]:
+    def _steps(
+        self, contestants: Sequence[Contestant], *, evaluated: bool = True, goals: GoalsGiven = "none"
+    ) -> dict[str, bool]:
         """Titles of the stages ahead, in their order, and whether each was finished before."""
         steps: dict[str, bool] = {}
         for contestant in contestants:
             for needed in self._lineage(contestant):
                 steps[self._training_title(needed)] = (self.model_folder(needed) / "model").exists()
             if evaluated:
-                path = self.out / "evaluations" / f"{self._evaluation_name(contestant)}.parquet"
-                steps[f"evaluate {self.title(contestant)}"] = path.exists()
+                path = self.out / "evaluations" / f"{self.evaluation_name(contestant, goals)}.parquet"
+                steps[self._evaluation_title(contestant, goals)] = path.exists()
         return steps
 
     def _lineage(self, contestant: Contestant) -> list[Base | FineTuned]:
         """What has to be trained for a contestant, the base model first."""
-        if isinstance(contestant, Baseline):
+        if isinstance(contestant, Baseline) or (contestant == BASE and self.base_model):
             return []
-        base = contestant.base if isinstance(contestant, FineTuned) else contestant
-        trained: list[Base | FineTuned] = [] if base == BASE and self.base_model else [base]
-        return [*trained, contestant] if isinstance(contestant, FineTuned) else trained
+        before = self._lineage(contestant.base) if isinstance(contestant, FineTuned) else []
+        return [*before, contestant]
 
     def _training_title(self, contestant: Base | FineTuned) -> str:
         return f"{'pre-train' if isinstance(contestant, Base) else 'fine-tune'} {self.title(contestant)}"
@@ -240,7 +247,9 @@ class Workshop:
             finetune_with_catk(base, self.training, catk_config(contestant, self.recipe), out)
             return
         self._start_from_shorter(out, self._epochs(contestant))
-        finetune_with_reward(base, self.training, finetune_config(contestant, self.recipe.finetune), out)
+        config = finetune_config(contestant, self.recipe.finetune)
+        sight = None if contestant.goals is None else contestant.goals.sight
+        finetune_with_reward(base, self.training, config, out, goal=sight)
 
     def _start_from_shorter(self, out: Path, epochs: float) -> None:
         """Take over the end of a shorter run of the same contestant: a longer one passes through the same weights, because
@@ -259,9 +268,13 @@ class Workshop:
     def _epochs(self, contestant: FineTuned) -> float:
         return self.recipe.finetune.epochs * contestant.share
 
-    def _evaluation_name(self, contestant: Contestant) -> str:
+    def evaluation_name(self, contestant: Contestant, goals: GoalsGiven = "none") -> str:
+        """Of a contestant's results."""
         suffix = f"-{self._epochs(contestant):g}-epochs" if isinstance(contestant, FineTuned) else ""
-        return f"{contestant.name}{suffix}"
+        return f"{contestant.name}{suffix}{'' if goals == 'none' else f'-{goals}-goals'}"
+
+    def _evaluation_title(self, contestant: Contestant, goals: GoalsGiven) -> str:
+        return f"evaluate {self.title(contestant)}{'' if goals == 'none' else f', {goals} goals'}"
 
     def _what_counts(self) -> dict[str, Any]:
         """What all stages of the folder share; what changes no result is left out."""

@@ -111,3 +111,8 @@ def device_of(policy: object) -> torch.device:
     """Where a policy computes: with its weights; the CPU if it has none."""
     weights = policy.parameters() if isinstance(policy, nn.Module) else ()
     return next((w.device for w in weights), torch.device("cpu"))
+
+
+def sees_goals(policy: object) -> bool:
+    """Whether goals have an effect on a policy: it says so by an attribute of this name."""
+    return bool(getattr(policy, "sees_goals", False))

@@ -16,7 +16,7 @@ from matplotlib.ticker import NullFormatter, NullLocator
 
 from rlftsim.files import write_whole
 
-COLOURS = ("#1d63d8", "#e07b00", "#11754b", "#a21caf", "#79828f")
+COLOURS = ("#1d63d8", "#e07b00", "#11754b", "#a21caf", "#79828f", "#24292f")
 """Of curves; the first four are the page's (`page.css`), in the same order."""
 INK, PALE = "#24292f", "#c9cfd6"
 BETTER, WORSE, NEITHER, OWN = "#bfe3cf", "#f3c4bf", "#eef0ec", "#d7dbe0"
@@ -79,6 +79,67 @@ def draw_bands(
     axis.grid(color=PALE, lw=0.6, alpha=0.7)
     axis.legend(frameon=False, fontsize=9)
     return figure
+
+
+@dataclass(frozen=True)
+class Panel:
+    """Curves that share an axis with others beside it."""
+
+    title: str
+    bands: tuple[Band, ...]
+
+
+def draw_panels(
+    panels: Sequence[Panel],
+    *,
+    title: str,
+    x_label: str,
+    y_label: str,
+    ticks: Sequence[str],
+    columns: int,
+    is_joined: bool = True,
+) -> Figure:
+    """Panels of percentages that share both axes, with one legend.
+
+    Args:
+        panels: the same names in each; the horizontal axis counts ticks from 0.
+        title: above them.
+        x_label: of the horizontal axes.
+        y_label: of the vertical axes.
+        ticks: names of the places 0, 1, ... of the horizontal axis.
+        columns: panels in a row.
+        is_joined: whether the places along the horizontal axis have an order, so that dots are joined.
+    """
+    rows = -(-len(panels) // columns)
+    figure = Figure(figsize=(4.4 * columns, 3.4 * rows + 0.8), layout="constrained")
+    figure.suptitle(title, fontsize=12, fontweight="bold", color=INK, x=0.01, ha="left")
+    axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).ravel()
+    for axis, panel in zip(axes, panels):
+        axis.set_title(panel.title, fontsize=10, loc="left", color=INK)
+        for band in panel.bands:
+            _draw_points(axis, band, is_joined=is_joined)
+        axis.set_xticks(range(len(ticks)), list(ticks), fontsize=8)
+        axis.set(ylim=(-3, 103))
+        axis.grid(color=PALE, lw=0.6, alpha=0.7)
+        for side in ("top", "right"):
+            axis.spines[side].set_visible(False)
+    for axis in axes[-columns:]:
+        axis.set_xlabel(x_label)
+    for axis in axes[::columns]:
+        axis.set_ylabel(y_label)
+    handles, names = axes[0].get_legend_handles_labels()
+    figure.legend(handles, names, loc="outside lower center", ncols=min(len(names), 3), frameon=False, fontsize=9)
+    return figure
+
+
+def _draw_points(axis: Axes, band: Band, *, is_joined: bool) -> None:
+    """Dots with their intervals, open ones for a theory."""
+    colour = COLOURS[band.colour % len(COLOURS)]
+    is_law = band.style == "theory"
+    line = ("--" if is_law else "-") if is_joined else ""
+    axis.plot(band.x, band.y, f"o{line}", color=colour, lw=1.2, ms=4, mfc="white" if is_law else colour, label=band.name, zorder=3)  # fmt: skip
+    if band.low is not None and band.high is not None:
+        axis.vlines(band.x, band.low, band.high, color=colour, lw=2, alpha=0.4)
 
 
 def draw_intervals(intervals: Sequence[Interval], *, title: str, x_label: str, zero: bool) -> Figure:

@@ -82,7 +82,7 @@ def draw_scene(animation: Animation) -> tuple[Figure, Sequence[Axes]]:
         if any(getattr(panel.trajectories, mark) is not None for panel in panels)
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False, fontsize=10)
-    return figure, axes
+    return figure, list(axes)
 
 
 def _draw_ground(axis: Axes, scene: SceneView, title: str) -> None:
@@ -92,10 +92,10 @@ def _draw_ground(axis: Axes, scene: SceneView, title: str) -> None:
     axis.set_title(title, fontsize=12, loc="left", fontweight="bold")
     for side in axis.spines.values():
         side.set_visible(False)
-    _draw_map(axis, scene, points_per_m=PANEL_INCHES * POINTS_PER_INCH / (2 * radius))
+    draw_map(axis, scene, points_per_m=PANEL_INCHES * POINTS_PER_INCH / (2 * radius))
 
 
-def _draw_map(axis: Axes, scene: SceneView, *, points_per_m: float) -> None:
+def draw_map(axis: Axes, scene: SceneView, *, points_per_m: float) -> None:
     """Road under crosswalks under lines under edges."""
     by_kind: dict[str, list[np.ndarray]] = {}
     for line in scene.lines:

@@ -7,6 +7,9 @@ from rlftsim.experiments.catalogue import (
     benchmark,
     credit,
     finetune_curve,
+    goal_conditioning,
+    kinematic_controllability,
+    maneuver_controllability,
     oracle,
     paired_ttest,
     qualitative,
@@ -24,6 +27,9 @@ EXPERIMENTS: dict[str, Experiment[Any]] = {
     "oracle": oracle.EXPERIMENT,
     "credit": credit.EXPERIMENT,
     "qualitative": qualitative.EXPERIMENT,
+    "goal-conditioning": goal_conditioning.EXPERIMENT,
+    "kinematic-controllability": kinematic_controllability.EXPERIMENT,
+    "maneuver-controllability": maneuver_controllability.EXPERIMENT,
 }
 
 

@@ -1,0 +1,156 @@
+"""Who gets where it is asked to go: every goal given alone, to a policy that sees it or, as a baseline, to one that does not.
+
+A file a scenario is kept, so an interrupted measurement goes on.
+"""
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from rlftsim.errors import DataError
+from rlftsim.experiments.contestants import Contestant
+from rlftsim.experiments.evaluate import EvaluateConfig, check_jobs, choose_scenarios, simulate_encoded
+from rlftsim.experiments.parts import one_thread
+from rlftsim.experiments.workshop import Workshop
+from rlftsim.files import write_text
+from rlftsim.goals.attainment import is_passed, is_reached
+from rlftsim.goals.goals_file import GoalEntry
+from rlftsim.goals.placing import goals_of_batch
+from rlftsim.goals.types import Goals
+from rlftsim.progress import progress_bar
+from rlftsim.realism import SimulatedStates
+from rlftsim.recipes.models import load_policy
+from rlftsim.rollout.policy import Policy, device_of, sees_goals
+from rlftsim.scenario.batch import collate
+from rlftsim.scenario.dataset import ScenarioDataset
+from rlftsim.workers import run_tasks
+
+FOLDER = "attainment"
+
+
+@dataclass(frozen=True)
+class Attained:
+    """What became of one goal: shares of the rollouts."""
+
+    entry: GoalEntry
+    reached: float
+    """Ends within 2 m."""
+    passed: float
+    """Comes within 2 m at some time."""
+
+
+def held_out(workshop: Workshop) -> tuple[ScenarioDataset, tuple[str, ...]]:
+    """The scenarios that a workshop measures on, and their ids."""
+    config = workshop.evaluation
+    dataset = ScenarioDataset(workshop.data, config.split)
+    return dataset, tuple(dataset.scenario_ids[i] for i in choose_scenarios(dataset, config))
+
+
+def measure_attainment(
+    workshop: Workshop, rows: Mapping[str, Contestant], goals: Sequence[GoalEntry], *, name: str
+) -> dict[str, tuple[Attained, ...]]:
+    """What becomes of every goal with each contestant, in the order of the goals; whoever is not trained yet is trained.
+
+    Args:
+        workshop: scenarios, settings, models.
+        rows: contestants by the names of their rows.
+        goals: each is given alone, whatever others its scenario has.
+        name: of the folder of results.
+    """
+    models = workshop.models(list(rows.values()))
+    by_scenario: dict[str, list[GoalEntry]] = {}
+    for goal in goals:
+        by_scenario.setdefault(goal.scenario_id, []).append(goal)
+    found = {}
+    for row, contestant in rows.items():
+        folder = workshop.out / FOLDER / name / workshop.evaluation_name(contestant)
+        policy = load_policy(models[contestant], workshop.device)
+        job = _Job(policy, workshop.data, workshop.evaluation, by_scenario, folder)
+        check_jobs(job.config, device_of(policy))
+        missing = [i for i in by_scenario if _read(job.path_of(i), by_scenario[i]) is None]
+        with progress_bar(f"goals, {row}", len(by_scenario), len(by_scenario) - len(missing)) as advance, one_thread():
+            run_tasks(partial(_measure_scenario, job), missing, jobs=job.config.jobs, advance=advance)
+        attained = [one for i in by_scenario for one in _read(job.path_of(i), by_scenario[i]) or ()]
+        if len(attained) < len(goals):
+            raise DataError(f"{folder}: results vanished meanwhile (another process in the same folder?): run again.")
+        by_goal = {_key(one.entry): one for one in attained}
+        found[row] = tuple(by_goal[_key(goal)] for goal in goals)
+    return found
+
+
+# ---- one scenario -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Job:
+    """Handed to other processes."""
+
+    policy: Policy
+    data: Path
+    config: EvaluateConfig
+    goals: Mapping[str, Sequence[GoalEntry]]
+    folder: Path
+
+    def path_of(self, scenario_id: str) -> Path:
+        return self.folder / f"{scenario_id}.json"
+
+
+def _key(entry: GoalEntry) -> tuple[str, int, float, float, str]:
+    return entry.scenario_id, entry.agent_id, entry.x, entry.y, entry.label
+
+
+def _read(path: Path, goals: Sequence[GoalEntry]) -> tuple[Attained, ...] | None:
+    """What was measured of these goals; None where it is missing, damaged or of others."""
+    try:
+        rows = json.loads(path.read_text())
+        asked = [[goal.agent_id, goal.x, goal.y] for goal in goals]
+        if [row["goal"] for row in rows] != asked:
+            return None
+        return tuple(Attained(goal, row["reached"], row["passed"]) for goal, row in zip(goals, rows))
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _measure_scenario(
+    job: _Job, scenario_id: str, advance: Callable[[int], None], is_stopped: Callable[[], bool]
+) -> None:
+    """Simulate under each goal; once for all of them if the policy sees none."""
+    scenario = ScenarioDataset(job.data, job.config.split, cache_size=1).by_id(scenario_id)
+    batch = collate([scenario]).to(device_of(job.policy))
+    with torch.no_grad():
+        context = job.policy.encode(batch)
+    simulated = partial(simulate_encoded, job.policy, batch, context, job.config)
+    blind = None if sees_goals(job.policy) else simulated()
+    rows = []
+    for goal in job.goals[scenario_id]:
+        if is_stopped():
+            return
+        states = blind or simulated(goals=goals_of_batch([goal], batch))
+        reached, passed = _attained(states, goal)
+        rows.append({"goal": [goal.agent_id, goal.x, goal.y], "reached": reached, "passed": passed})
+    write_text(job.path_of(scenario_id), json.dumps(rows) + "\n")
+    advance(1)
+
+
+def _attained(states: SimulatedStates, goal: GoalEntry) -> tuple[float, float]:
+    """Shares of the rollouts that reach and that pass a goal."""
+    row = int(np.flatnonzero(states.object_id == goal.agent_id)[0])
+    way = torch.stack([states.x[:, row].double() - goal.x, states.y[:, row].double() - goal.y], -1).float()
+    position = way[None, :, None]  # [1, N, 1, T, 2]
+    asked = Goals(
+        torch.zeros_like(position[..., 0, :]), torch.ones(position.shape[:3], dtype=torch.bool).to(way.device)
+    )
+    return float(is_reached(position, asked).double().mean()), float(is_passed(position, asked).double().mean())
+
+
+def by_scenario(values: Sequence[tuple[str, float]]) -> dict[str, float]:
+    """The mean of each scenario's values."""
+    collected: dict[str, list[float]] = {}
+    for scenario_id, value in values:
+        collected.setdefault(scenario_id, []).append(value)
+    return {scenario_id: float(np.mean(own)) for scenario_id, own in collected.items()}

@@ -1,0 +1,95 @@
+"""Table 3: how agents see their goals and what is rewarded, against how far they follow and what that costs in realism."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from rlftsim.experiments.catalogue import published
+from rlftsim.experiments.columns import GOAL_COLUMNS
+from rlftsim.experiments.contestants import GCFT, Contestant, FineTuned, GoalTraining, over_seeds
+from rlftsim.experiments.findings import Experiment, Findings, budget_note, result_table, row_numbers, verdict_line
+from rlftsim.experiments.workshop import Row, Workshop
+from rlftsim.viewer.figure import Interval, draw_intervals
+
+MISS = "passing_miss_rate"
+GOAL_FREE = FineTuned("mloo")
+"""The realism-aligned model that learning to follow goals starts from."""
+VARIANTS = {
+    "concatenation, soft": FineTuned(GCFT, base=GOAL_FREE, goals=GoalTraining("concat", "soft")),
+    "concatenation, hard": FineTuned(GCFT, base=GOAL_FREE, goals=GoalTraining("concat", "hard")),
+    "indication, soft": FineTuned(GCFT, base=GOAL_FREE, goals=GoalTraining("indication", "soft")),
+    "indication, hard": FineTuned(GCFT, base=GOAL_FREE, goals=GoalTraining("indication", "hard")),
+}
+START = "goal-free"
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Evaluations of the model without goals and of the variants, asked to go where the record ended, and asked nothing."""
+
+    start: Row
+    asked: Mapping[str, Row]
+    unasked: Mapping[str, Row]
+
+
+def rows(num_seeds: int) -> dict[str, tuple[Contestant, ...]]:
+    """The four variants."""
+    return {name: over_seeds(one, num_seeds) for name, one in VARIANTS.items()}
+
+
+def measure(workshop: Workshop) -> Measured:
+    """Everybody's evaluations."""
+    start = workshop.measure({START: (GOAL_FREE,)})[START]
+    variants = rows(workshop.num_seeds)
+    asked = workshop.measure(variants, goals="recorded")
+    return Measured(start, asked, workshop.measure(variants))
+
+
+def conclude(measured: Measured, workshop: Workshop) -> Findings:
+    """The table, what following costs, and what is left of the goal-free model."""
+    start, asked = measured.start, list(measured.asked.values())
+    unasked = [Row(f"{name}, asked nothing", row.by_seed) for name, row in measured.unasked.items()]
+    return Findings(
+        title="Goal conditioning: following goals, and what it costs in realism",
+        tables=(
+            result_table("Ours: evaluated agents asked to go where the record ends", [start, *asked], GOAL_COLUMNS),
+            result_table("Ours: the same models, asked nothing", [start, *unasked], GOAL_COLUMNS),
+            published.GOALS,
+        ),
+        verdicts=(
+            *(_misses_line(start, row) for row in asked),
+            *(f"passing misses: {verdict_line(start, row, MISS)}" for row in asked),
+            *(f"RMM: {verdict_line(start, row)}" for row in (*asked, *unasked)),
+        ),
+        notes=(
+            budget_note(workshop),
+            "The variants start from the goal-free row, so each has had its fine-tuning and as much again; what more goal-free fine-tuning does "
+            "is in finetune-curve.",
+            "A passing miss: an evaluated agent that at no simulated step is within WOMD's tolerance of where its record ends.",
+        ),
+        numbers={"rows": row_numbers([start, *asked, *unasked], GOAL_COLUMNS)},
+        figure=_figure([start, *asked]),
+    )  # fmt: skip
+
+
+def _misses_line(start: Row, row: Row) -> str:
+    before, after = (one.mean.mean_and_error(MISS).mean for one in (start, row))
+    relative = f"{after / before - 1:+.0%} relative" if before > 0 else "nobody missed before"
+    gain = row.mean.mean_and_error("meta_metric").mean - start.mean.mean_and_error("meta_metric").mean
+    return f"{row.name}: passing misses {before:.2%} → {after:.2%}, {relative}, at {gain:+.4f} RMM."
+
+
+def _figure(shown: Sequence[Row]):
+    intervals = []
+    for number, row in enumerate(shown):
+        estimate = row.mean.mean_and_error(MISS)
+        low, high = (100 * v for v in estimate.interval)
+        intervals.append(Interval(row.name, 100 * estimate.mean, low, high, colour=0 if number else 4))
+    label = "passing misses [%], mean over scenarios, 95 % interval"
+    return draw_intervals(intervals, title="Agents that never come near their goal", x_label=label, zero=False)
+
+
+EXPERIMENT = Experiment(
+    question="Do agents that see goals follow them, and what does it cost in realism?",
+    measure=measure,
+    conclude=conclude,
+)

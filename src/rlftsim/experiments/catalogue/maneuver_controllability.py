@@ -1,0 +1,204 @@
+"""The ego asked for manoeuvres: the recorded one, another one that the lanes allow, or either."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from rlftsim.errors import DataError
+from rlftsim.experiments.attainment import Attained, by_scenario, held_out, measure_attainment
+from rlftsim.experiments.catalogue import published
+from rlftsim.experiments.catalogue.goal_conditioning import START, VARIANTS
+from rlftsim.experiments.catalogue.kinematic_controllability import bands_of, contestants, gain_words
+from rlftsim.experiments.findings import Experiment, Findings, TextTable, budget_note
+from rlftsim.experiments.goal_proposals import RECORDED, entry_of, propose
+from rlftsim.experiments.workshop import Workshop
+from rlftsim.goals.goals_file import GoalsFile, read_goals, write_goals
+from rlftsim.goals.manoeuvre import Manoeuvre
+from rlftsim.intervals import MeanInterval, mean_interval
+from rlftsim.scenario.dataset import ScenarioDataset
+from rlftsim.viewer.figure import Panel, draw_panels
+
+NAME = "maneuver-controllability"
+WAYS = {"passed": "passed [%]", "reached": "reached [%]"}
+IS_IN: dict[str, Callable[[Attained], bool]] = {
+    "ground truth": lambda one: one.entry.label.endswith(RECORDED),
+    "alternative only": lambda one: not one.entry.label.endswith(RECORDED),
+}
+MIXED, ALTERNATIVE = "mixed", "alternative only"
+CONDITIONS = ("ground truth", MIXED, ALTERNATIVE)
+"""Mixed: half of the goals of a scenario recorded, half alternative."""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What became of every goal, by row."""
+
+    attained: Mapping[str, tuple[Attained, ...]]
+
+
+def goals_path(workshop: Workshop) -> Path:
+    """The goals file of a workshop; a person may edit it."""
+    return workshop.out / f"{NAME}.goals.json"
+
+
+def propose_goals(dataset: ScenarioDataset, scenario_ids: Sequence[str]) -> GoalsFile:
+    """Recorded and alternative manoeuvres of every ego that has both: the first are the goals, the others the alternatives."""
+    recorded, alternatives = [], []
+    for scenario_id in scenario_ids:
+        scenario = dataset.by_id(scenario_id)
+        proposals = propose(scenario, scenario.ego_index)
+        kept = [entry_of(scenario, proposal) for proposal in proposals]
+        is_recorded = [proposal.is_recorded for proposal in proposals]
+        if any(is_recorded) and not all(is_recorded):
+            recorded += [entry for entry, yes in zip(kept, is_recorded) if yes]
+            alternatives += [entry for entry, yes in zip(kept, is_recorded) if not yes]
+    return GoalsFile(tuple(recorded), tuple(alternatives))
+
+
+def measure(workshop: Workshop) -> Measured:
+    """Everybody's attainment of every goal.
+
+    Raises:
+        DataError: no ego has two manoeuvres to choose from, or the goals file was edited and makes no sense.
+    """
+    dataset, ids = held_out(workshop)
+    path = goals_path(workshop)
+    if not path.exists():
+        write_goals(path, propose_goals(dataset, ids))
+    file = read_goals(path)
+    goals = [goal for goal in (*file.goals, *file.alternatives) if goal.scenario_id in ids]
+    for goal in goals:
+        _manoeuvre(goal.label, str(goal))
+    if not file.alternatives or not goals:
+        raise DataError(
+            f"{path}: not one ego of {len(ids)} scenarios may do anything but what it did: take more scenarios."
+        )
+    return Measured(measure_attainment(workshop, contestants(), goals, name=NAME))
+
+
+def conclude(measured: Measured, workshop: Workshop) -> Findings:
+    """Shares by condition and by manoeuvre, beside the paper's."""
+    rows = list(measured.attained)
+    overall = {way: {row: _by_condition(measured, row, way) for row in rows} for way in WAYS}
+    return Findings(
+        title="Manoeuvre controllability: the ego is asked for what it did, or for something else",
+        tables=(
+            *(_condition_table(way, overall[way]) for way in WAYS),
+            *(_manoeuvre_table(measured, condition) for condition in IS_IN),
+            published.MANOEUVRES,
+        ),
+        verdicts=tuple(_verdict(measured, row, way) for way in WAYS for row in VARIANTS),
+        notes=(
+            budget_note(workshop),
+            f"The goals are in {NAME}.goals.json beside this table: recorded manoeuvres with their recorded ends, alternatives as the lanes propose them. "
+            "Edit them, and the same command measures the edited ones.",
+            "Only the ego has a goal, and only scenarios count in which it has a recorded and an alternative manoeuvre. Every goal is "
+            "given alone; mixed is half the one, half the other.",
+            "Lights, signs and other agents are not looked at when goals are proposed: some cannot be met without a violation.",
+        ),
+        numbers={
+            "conditions": {way: {row: {c: _plain(m) for c, m in zip(CONDITIONS, overall[way][row])} for row in rows} for way in WAYS},
+            "manoeuvres": {way: {row: {c: {m.value: _plain(e) for m, e in _by_manoeuvre(measured, row, way, c).items()} for c in IS_IN} for row in rows} for way in WAYS},
+            "goals": [{"scenario": one.entry.scenario_id, "label": one.entry.label} for one in measured.attained[rows[0]]],
+        },
+        figure=_figure(measured, rows),
+    )  # fmt: skip
+
+
+def _manoeuvre(label: str, place: str) -> Manoeuvre:
+    """The manoeuvre that a label names.
+
+    Raises:
+        DataError: it names none.
+    """
+    try:
+        return Manoeuvre(label.removesuffix(RECORDED))
+    except ValueError:
+        known = ", ".join(m.value for m in Manoeuvre)
+        raise DataError(f"{place}: label {label!r} names no manoeuvre: known are {known}, each with {RECORDED!r} if recorded.") from None  # fmt: skip
+
+
+def _shares(measured: Measured, row: str, way: str, condition: str) -> dict[str, float]:
+    """Mean share of the rollouts over a scenario's goals of a condition, by scenario."""
+    if condition == MIXED:
+        one, other = (_shares(measured, row, way, name) for name in IS_IN)
+        return {scenario_id: (one[scenario_id] + other[scenario_id]) / 2 for scenario_id in one if scenario_id in other}
+    chosen = [one for one in measured.attained[row] if IS_IN[condition](one)]
+    return by_scenario([(one.entry.scenario_id, getattr(one, way)) for one in chosen])
+
+
+def _by_condition(measured: Measured, row: str, way: str) -> list[MeanInterval]:
+    return [mean_interval(np.array(list(_shares(measured, row, way, c).values()))) for c in CONDITIONS]
+
+
+def _by_manoeuvre(measured: Measured, row: str, way: str, condition: str) -> dict[Manoeuvre, MeanInterval]:
+    values: dict[Manoeuvre, list[float]] = {m: [] for m in Manoeuvre}
+    for one in measured.attained[row]:
+        if IS_IN[condition](one):
+            values[_manoeuvre(one.entry.label, str(one.entry))].append(getattr(one, way))
+    return {m: mean_interval(np.array(own, float)) for m, own in values.items()}
+
+
+def _cell(estimate: MeanInterval) -> str:
+    if not estimate.count:
+        return "–"
+    error = f" ± {100 * estimate.standard_error:.1f}" if estimate.count > 1 else ""
+    return f"{100 * estimate.mean:.1f}{error}"
+
+
+def _condition_table(way: str, rows: Mapping[str, Sequence[MeanInterval]]) -> TextTable:
+    cells = tuple((row, *(_cell(estimate) for estimate in estimates)) for row, estimates in rows.items())
+    counts = [estimate.count for estimate in next(iter(rows.values()))]
+    note = f"Ego of {max(counts)} held-out scenarios; share of rollouts, mean ± standard error over scenarios."
+    return TextTable(f"Ours: {WAYS[way]} ↑", ("", *CONDITIONS), cells, note)
+
+
+def _manoeuvre_table(measured: Measured, condition: str) -> TextTable:
+    """Passed and reached for each manoeuvre."""
+    cells = []
+    for row in measured.attained:
+        passed, reached = (_by_manoeuvre(measured, row, way, condition) for way in WAYS)
+        cells.append(
+            (row, *(f"{_cell(passed[m])} / {_cell(reached[m])}" if passed[m].count else "–" for m in Manoeuvre))
+        )
+    counts = _by_manoeuvre(measured, next(iter(measured.attained)), "passed", condition)
+    headings = ("", *(f"{m.value.replace('_', ' ')} ({counts[m].count})" for m in Manoeuvre))
+    return TextTable(f"Ours: {condition}, passed / reached [%] ↑ (goals)", headings, tuple(cells))
+
+
+def _verdict(measured: Measured, row: str, way: str) -> str:
+    """A variant against the model without goals, alternatives only."""
+    before, after = (_shares(measured, name, way, ALTERNATIVE) for name in (START, row))
+    gain = mean_interval(np.array([after[i] - before[i] for i in after]))
+    mean = float(np.mean(list(before.values())))
+    times = f" ({(mean + gain.mean) / mean:.2f} times)" if mean > 0 else ""
+    return f"{row} against {START}, {way}, alternatives only{times}: {gain_words(gain)}"
+
+
+def _plain(estimate: MeanInterval) -> dict[str, object]:
+    return {"mean": estimate.mean, "standard_error": estimate.standard_error, "interval": estimate.interval, "count": estimate.count}  # fmt: skip
+
+
+def _figure(measured: Measured, rows: Sequence[str]) -> Figure:
+    """Conditions side by side, both ways below each other, manoeuvres along the axis."""
+    shown = [m for m in Manoeuvre if any(_by_manoeuvre(measured, rows[0], "passed", c)[m].count for c in IS_IN)]
+    panels = []
+    for way, label in WAYS.items():
+        for condition in IS_IN:
+            curves = {row: [_by_manoeuvre(measured, row, way, condition)[m] for m in shown] for row in rows}
+            panels.append(Panel(f"{condition}, {label.removesuffix(' [%]')}", bands_of(curves)))
+    ticks = [m.value.replace("_", "\n") for m in shown]
+    return draw_panels(
+        panels, title="The ego asked for manoeuvres", x_label="", y_label="rollouts [%], 95 % interval", ticks=ticks,
+        columns=len(IS_IN), is_joined=False,
+    )  # fmt: skip
+
+
+EXPERIMENT = Experiment(
+    question="Can the ego be asked for a manoeuvre, even for one that it did not make?",
+    measure=measure,
+    conclude=conclude,
+)

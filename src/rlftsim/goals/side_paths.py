@@ -1,0 +1,120 @@
+"""Ways that leave the own lane: into the next one, and round into the opposite direction. Frame: world, metres."""
+
+import numpy as np
+from jaxtyping import Float
+
+from rlftsim.goals.lane_paths import (
+    EASE_M,
+    SPACING_M,
+    LanePath,
+    Lanes,
+    Pose,
+    in_frame_of,
+    nearest_of_each_lane,
+    neighbor_lanes,
+    path_through,
+    paths_from,
+    wrap,
+)
+
+CHANGE_AFTER_M = (0, 10, 20, 30)
+"""Where a lane change may begin; the first place with a neighbouring lane is taken."""
+CHANGE_S = 3.5
+CHANGE_M = (18.0, 100.0)
+"""Length of a lane change: what is driven in so many seconds, but not less or more than this."""
+UTURN_RADIUS_M = (5.0, 15.0)
+"""Radii at which cars turn round, of the middle of the box."""
+UTURN_AFTER_M = tuple(range(0, 15, 2))
+"""How far into a junction a turn may begin."""
+LONGEST_UTURN_M = 7.0
+"""Longer vehicles do not turn round."""
+OPPOSITE_RAD = np.radians(20.0)
+TURNING_RAD, BEFORE_TURN_M = np.radians(5.0), 3
+"""A turn begins so far before the way has bent so much."""
+
+
+def change_length_m(speed_mps: float) -> float:
+    """Way that a lane change takes."""
+    return float(np.clip(CHANGE_S * speed_mps, *CHANGE_M))
+
+
+def lane_change_paths(
+    lanes: Lanes, own: LanePath, *, side: int, speed_mps: float, length_m: float
+) -> list[tuple[LanePath, int]]:
+    """Ways into the lane beside a path, each with the index at which the change is complete.
+
+    Args:
+        lanes: those that count.
+        own: a way along the own lane.
+        side: 1 left, -1 right.
+        speed_mps: while changing.
+        length_m: at most so long.
+    """
+    change_m = change_length_m(speed_mps)
+    for leave in CHANGE_AFTER_M:
+        if leave + change_m > min(length_m, own.length_m + change_m):
+            break
+        pose = own.pose(leave)
+        beside = neighbor_lanes(lanes, pose, side=side)
+        if beside:
+            rest = paths_from(lanes, pose, beside, length_m=length_m - leave, ease_m=change_m)
+            return [(path.after(own, leave), leave + int(change_m / SPACING_M)) for path in rest]
+    return []
+
+
+def uturn_paths(lanes: Lanes, turning: LanePath, *, length_m: float) -> list[LanePath]:
+    """Ways round to the left, in a half circle where a path turns left, into lanes that lead back.
+
+    Args:
+        lanes: those that count.
+        turning: a way that turns left.
+        length_m: at most so long.
+    """
+    bent = np.flatnonzero(np.abs(turning.turn - turning.turn[0]) >= TURNING_RAD)
+    begin = max(int(bent[0]) - BEFORE_TURN_M, 0) if len(bent) else len(turning.turn) - 1
+    entry = turning.pose(begin)
+    if neighbor_lanes(lanes, entry, side=1):
+        return []  # only from the leftmost lane
+    paths = []
+    for ahead in UTURN_AFTER_M:
+        pose = _moved(entry, ahead)
+        for point, radius in _opposite(lanes, pose):
+            half_circle = _half_circle(pose, radius)
+            end = Pose(half_circle[-1], pose.heading + np.pi)
+            head = np.concatenate([turning.points[:begin], _line(entry, ahead), half_circle])
+            limits = np.full(len(head), turning.speed_limit_mps[begin])
+            for rest in paths_from(lanes, end, [point], length_m=length_m - len(head) * SPACING_M, ease_m=EASE_M):
+                points = np.concatenate([head, rest.points[1:]])
+                paths.append(path_through(points, turning.start_heading, np.append(limits, rest.speed_limit_mps[1:])))
+    return paths
+
+
+def _moved(pose: Pose, ahead_m: int) -> Pose:
+    step = ahead_m * np.array([np.cos(pose.heading), np.sin(pose.heading), 0.0])
+    return Pose(pose.position + step, pose.heading)
+
+
+def _line(pose: Pose, ahead_m: int) -> Float[np.ndarray, "n 3"]:
+    """Points straight ahead, one every metre, the last one left out."""
+    way = np.array([np.cos(pose.heading), np.sin(pose.heading), 0.0])
+    return pose.position + SPACING_M * np.arange(ahead_m)[:, None] * way
+
+
+def _opposite(lanes: Lanes, pose: Pose) -> list[tuple[int, float]]:
+    """Points to the left of a pose on lanes that lead back, each with the radius of the half circle to it, the nearest first."""
+    graph = lanes.graph
+    ahead, left = in_frame_of(pose, graph.points)
+    low, high = UTURN_RADIUS_M
+    near = (np.abs(ahead) <= SPACING_M) & (left >= 2 * low) & (left <= 2 * high) & lanes.usable[graph.owner]
+    near &= np.abs(wrap(graph.heading - pose.heading - np.pi)) <= OPPOSITE_RAD
+    nearest = nearest_of_each_lane(graph, np.flatnonzero(near), left)
+    return [(point, float(left[point]) / 2) for point in nearest]
+
+
+def _half_circle(pose: Pose, radius: float) -> Float[np.ndarray, "n 3"]:
+    """From a pose round to the left."""
+    angle = np.linspace(0.0, np.pi, int(np.ceil(np.pi * radius / SPACING_M)) + 1)
+    ahead, left = radius * np.sin(angle), radius * (1.0 - np.cos(angle))
+    cos, sin = np.cos(pose.heading), np.sin(pose.heading)
+    step = np.stack([ahead * cos - left * sin, ahead * sin + left * cos, np.zeros_like(angle)], -1)
+    return pose.position + step

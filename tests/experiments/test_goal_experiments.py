@@ -1,0 +1,226 @@
+"""Controllability: goals of the ego, who attains them, and what is concluded from made-up shares."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from made_up import TINY, row
+
+import scenes
+from rlftsim.errors import ConfigError, DataError
+from rlftsim.experiments import attainment
+from rlftsim.experiments.attainment import Attained, measure_attainment
+from rlftsim.experiments.catalogue import goal_conditioning, kinematic_controllability, maneuver_controllability
+from rlftsim.experiments.contestants import BASE, Baseline, FineTuned, GoalTraining, finetune_config
+from rlftsim.experiments.evaluate import EvaluateConfig, evaluate
+from rlftsim.experiments.workshop import Workshop
+from rlftsim.goals.goals_file import GoalEntry, read_goals
+from rlftsim.rollout.baselines import ConstantVelocity
+from rlftsim.scenario.dataset import write_dataset
+
+QUICK = EvaluateConfig(num_rollouts=2)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    """One scenario to train on, three with an ego that goes straight, turns left, and stands."""
+    folder = tmp_path_factory.mktemp("goals") / "data"
+    standing = replace(scenes.straight_road("standing"), ego_index=5)
+    held_out = [scenes.straight_road("straight"), scenes.bend("bend"), standing]
+    write_dataset([scenes.straight_road("a"), *held_out], folder, split=lambda s: "training" if s.scenario_id == "a" else "validation")  # fmt: skip
+    return folder
+
+
+@pytest.fixture(scope="module")
+def workshop(data, tmp_path_factory):
+    return Workshop(TINY, data, tmp_path_factory.mktemp("workshop"), QUICK)
+
+
+# ---- contestants --------------------------------------------------------------------------------------------------------
+
+
+def test_variants_start_from_the_realism_aligned_model(workshop):
+    config = finetune_config(goal_conditioning.VARIANTS["indication, hard"], TINY.finetune)
+    assert (config.reward, config.goals.share) == ("0.9*mloo + 0.1*goal(kind='hard')", 1.0)
+    assert finetune_config(FineTuned("mloo"), replace(TINY.finetune, goals=config.goals)).goals.share == 0.0
+    variant = goal_conditioning.VARIANTS["concatenation, soft"]
+    assert variant.name == "gcft-concat-soft-from-mloo-seed0-seed0"
+    lineage = [one.name for one in workshop._lineage(variant)]
+    assert lineage == ["base", "mloo-seed0", variant.name]
+
+
+def test_goals_are_refused_for_models_that_see_none(data, tmp_path):
+    config = EvaluateConfig(num_rollouts=1, goals="recorded")
+    with pytest.raises(ConfigError, match="goals=recorded has no effect: cv does not see goals"):
+        evaluate(ConstantVelocity(), data, tmp_path, config, name="cv")
+    assert "goals" not in QUICK.what_counts()  # evaluations of before are still what they were
+    assert config.what_counts()["goals"] == "recorded"
+
+
+# ---- attainment ---------------------------------------------------------------------------------------------------------
+
+
+class Seeker(ConstantVelocity):
+    """Drives the straight line to its goal."""
+
+    sees_goals = True
+
+    def begin(self, context, num_rollouts, goals, noise):
+        state = super().begin(context, num_rollouts, goals, noise)
+        if goals is None:
+            return state
+        way = (goals.position - state.position) / 8.0
+        return replace(state, velocity=way.where(goals.goal_mask[..., None], state.velocity))
+
+
+def test_every_goal_is_given_alone_and_measured_once(workshop, monkeypatch):
+    policies = {"constant_velocity": ConstantVelocity(), "oracle": Seeker()}
+    monkeypatch.setattr(attainment, "load_policy", lambda name, device: policies[name])
+    straight_on = 1000.0 + 9.3 * 8
+    goals = [
+        GoalEntry("straight", 100, straight_on, -200.0),
+        GoalEntry("straight", 100, 1020.0, -200.0),  # come by, driven past
+        GoalEntry("straight", 100, 1040.0, -180.0),
+        GoalEntry("bend", 100, 1030.0, -190.0),
+    ]
+    rows = {"blind": Baseline("constant_velocity"), "seeker": Baseline("oracle")}
+    found = measure_attainment(workshop, rows, goals, name="test")
+    assert [(a.reached, a.passed) for a in found["blind"]] == [(1, 1), (0, 1), (0, 0), (0, 0)]
+    assert [(a.reached, a.passed) for a in found["seeker"]] == [(1, 1)] * 4
+    assert [a.entry for a in found["seeker"]] == goals
+    files = {p: p.stat().st_mtime_ns for p in (workshop.out / "attainment").rglob("*.json")}
+    assert len(files) == 4
+    # an edited goal is measured anew, the other scenario is not
+    edited = [*goals[:3], replace(goals[3], x=1031.0)]
+    measure_attainment(workshop, rows, edited, name="test")
+    changed = {p.stem for p, stamp in files.items() if p.stat().st_mtime_ns != stamp}
+    assert changed == {"bend"}
+
+
+# ---- kinematic ----------------------------------------------------------------------------------------------------------
+
+
+def test_goals_lie_on_the_recorded_way_and_its_continuation():
+    straight = scenes.straight_road()  # 9.3 m/s along x from (1000, -200)
+    for offset in (-3, 0, 2):
+        goal = kinematic_controllability.goal_of(straight, offset)
+        assert goal is not None
+        assert (goal.x, goal.y) == pytest.approx((1000 + 9.3 * (8 + offset), -200), abs=0.01)
+    # an arc goes on as the same arc: what the mover itself does three seconds later
+    mover = scenes.Mover(speed_mps=9.3, turn_rate_radps=0.103)
+    time, rate = 11.0, mover.turn_rate_radps
+    radius = mover.speed_mps / rate
+    expected = (1000 + radius * np.sin(rate * time), -200 + radius * (1 - np.cos(rate * time)))
+    goal = kinematic_controllability.goal_of(scenes.bend(), 3)
+    assert goal is not None
+    assert (goal.x, goal.y) == pytest.approx(expected, abs=0.02)
+    assert kinematic_controllability.goal_of(scenes.without_future(), 0) is None
+
+
+def made_up_shares(labels, shares):
+    """Attained goals of rows: scenario k has the labels in turn."""
+    return {
+        row: tuple(
+            Attained(GoalEntry(f"s{k}", 1, 0.0, 0.0, label), reached=values[k][n] / 2, passed=values[k][n])
+            for k in range(len(values))
+            for n, label in enumerate(labels)
+        )
+        for row, values in shares.items()
+    }
+
+
+def test_offsets_are_compared_scenario_by_scenario(workshop):
+    offsets = kinematic_controllability.OFFSETS_S
+    labels = [f"{h:+d} s" for h in offsets]
+    rows = list(kinematic_controllability.contestants())
+    low, high = [[0.2] * 7, [0.4] * 7, [0.6] * 7], [[0.3] * 7, [0.5] * 7, [0.7] * 7]
+    shares = {name: high if name == "indication, soft" else low for name in rows}
+    measured = kinematic_controllability.Measured(offsets * 3, made_up_shares(labels, shares))
+    found = kinematic_controllability.conclude(measured, workshop)
+    assert found.tables[0].rows[0][1] == "40.0 ± 11.5"  # of 20, 40, 60: 20 over the root of 3
+    verdict = next(v for v in found.verdicts if v.startswith("indication, soft against goal-free, passed"))
+    assert "difference, for the better: +10.0 points" in verdict
+    assert "no difference: +0.0" in next(v for v in found.verdicts if v.startswith("indication, hard"))
+    assert found.numbers["passed"]["base"][0]["scenarios"] == 3
+    assert found.figure is not None
+
+
+# ---- manoeuvres ---------------------------------------------------------------------------------------------------------
+
+
+def test_conditions_are_means_over_scenarios(workshop):
+    labels = ["straight (recorded)", "left", "right"]
+    rows = list(kinematic_controllability.contestants())
+    base, better = [[1.0, 0.0, 0.2], [0.8, 0.2, 0.2]], [[1.0, 0.4, 0.6], [0.8, 0.5, 0.5]]
+    shares = {name: better if name == "concatenation, soft" else base for name in rows}
+    measured = maneuver_controllability.Measured(made_up_shares(labels, shares))
+    found = maneuver_controllability.conclude(measured, workshop)
+    overall = found.numbers["conditions"]["passed"]
+    assert [overall["goal-free"][c]["mean"] for c in maneuver_controllability.CONDITIONS] == pytest.approx(
+        [0.9, 0.525, 0.15]
+    )
+    assert overall["concatenation, soft"]["alternative only"]["mean"] == pytest.approx(0.5)
+    assert found.numbers["conditions"]["reached"]["base"]["mixed"]["mean"] == pytest.approx(0.2625)
+    lefts = found.numbers["manoeuvres"]["passed"]["concatenation, soft"]["alternative only"]["left"]
+    assert (lefts["mean"], lefts["count"]) == (pytest.approx(0.45), 2)
+    verdict = next(v for v in found.verdicts if v.startswith("concatenation, soft against goal-free, passed"))
+    assert "alternatives only (3.33 times)" in verdict
+    assert found.tables[-1].title.startswith("The paper")
+
+
+def test_the_goals_are_written_for_a_person_to_edit(workshop, monkeypatch):
+    asked = []
+    monkeypatch.setattr(
+        maneuver_controllability, "measure_attainment", lambda w, rows, goals, name: asked.append(goals) or {}
+    )
+    monkeypatch.setattr(maneuver_controllability, "propose", made_up_proposals)
+    maneuver_controllability.measure(workshop)
+    path = maneuver_controllability.goals_path(workshop)
+    file = read_goals(path)
+    assert [goal.label for goal in file.goals] == ["straight (recorded)"]  # only where there is a choice
+    assert [goal.label for goal in file.alternatives] == ["left"]
+    path.write_text(path.read_text().replace('"left"', '"right"'))
+    maneuver_controllability.measure(workshop)
+    assert [goal.label for goal in asked[1]] == ["straight (recorded)", "right"]
+    path.write_text(path.read_text().replace('"right"', '"somewhere"'))
+    with pytest.raises(DataError, match=r"alternatives\[0\]: label 'somewhere' names no manoeuvre: known are straight"):
+        maneuver_controllability.measure(workshop)
+    path.unlink()
+
+
+def made_up_proposals(scenario, track):
+    from rlftsim.goals.manoeuvre import Manoeuvre
+    from rlftsim.goals.proposals import Proposal
+
+    way = scenario.tracks.position[track, 10:, :].astype(np.float64)
+    agent = int(scenario.tracks.object_id[track])
+    found = {"straight": [Manoeuvre.STRAIGHT, Manoeuvre.LEFT], "bend": [Manoeuvre.LEFT], "standing": []}
+    kinds = found[scenario.scenario_id]
+    return tuple(Proposal(agent, kind, way[-1, :2], way, is_recorded=n == 0) for n, kind in enumerate(kinds))
+
+
+# ---- goal conditioning --------------------------------------------------------------------------------------------------
+
+
+def test_following_is_told_with_its_cost(workshop):
+    start = row("goal-free", [0.60, 0.70], passing_miss_rate=[0.2, 0.4])
+    asked = {name: row(name, [0.59, 0.70], passing_miss_rate=[0.1, 0.2]) for name in goal_conditioning.VARIANTS}
+    unasked = {name: row(name, [0.60, 0.70], passing_miss_rate=[0.2, 0.4]) for name in goal_conditioning.VARIANTS}
+    found = goal_conditioning.conclude(goal_conditioning.Measured(start, asked, unasked), workshop)
+    assert found.verdicts[0] == "concatenation, soft: passing misses 30.00% → 15.00%, -50% relative, at -0.0050 RMM."
+    assert found.tables[0].rows[0][1] == "30.00 ± 10.00"
+    assert found.tables[1].rows[1][0] == "concatenation, soft, asked nothing"
+    assert "Tab. 3" in found.tables[2].title
+    assert json.dumps(found.numbers)
+
+
+@pytest.mark.slow
+def test_the_experiments_run_with_tiny_models(workshop):
+    variant = FineTuned("gcft", base=FineTuned("mloo"), goals=GoalTraining("indication", "soft"))
+    asked = workshop.measure({"soft": (variant,)}, goals="recorded")["soft"].mean
+    assert len(asked) == 3
+    assert (workshop.out / "evaluations" / "gcft-indication-soft-from-mloo-seed0-seed0-0.5-epochs-recorded-goals.parquet").exists()  # fmt: skip
+    goals = [GoalEntry("straight", 100, 1080.0, -200.0)]
+    found = measure_attainment(workshop, {"base": BASE, "soft": variant}, goals, name="tiny")
+    assert all(0 <= a.reached <= a.passed <= 1 for attained in found.values() for a in attained)
