@@ -15,13 +15,13 @@ import torch
 from rlftsim.errors import DataError
 from rlftsim.experiments.contestants import Contestant
 from rlftsim.experiments.evaluate import EvaluateConfig, check_jobs, choose_scenarios, simulate_encoded
-from rlftsim.experiments.parts import one_thread
 from rlftsim.experiments.workshop import Workshop
 from rlftsim.files import write_text
 from rlftsim.goals.attainment import is_passed, is_reached
 from rlftsim.goals.goals_file import GoalEntry
 from rlftsim.goals.placing import goals_of_batch
 from rlftsim.goals.types import Goals
+from rlftsim.processor import one_thread
 from rlftsim.progress import progress_bar
 from rlftsim.realism import SimulatedStates
 from rlftsim.recipes.models import load_policy

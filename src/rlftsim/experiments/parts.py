@@ -13,6 +13,7 @@ import pyarrow as pa
 
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.experiments.evaluation import SCHEMA, Evaluation, Provenance, Skipped, join_evaluations
+from rlftsim.processor import one_thread
 from rlftsim.progress import progress_bar, say
 from rlftsim.workers import Task, run_tasks
 

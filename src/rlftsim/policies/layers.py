@@ -262,8 +262,8 @@ def _describe_in_place(
     features: Float[Tensor, "S D"] | None,
 ) -> Float[Tensor, "r K W"]:
     """The same without gradient and copies: a last map whose outputs have mean zero leaves only a division to normalise."""
-    *before, last = embedding.out
-    hidden = nn.Sequential(*before)(embedding.embed_inputs(values.flatten(0, 1)))
+    last: nn.Linear = embedding.out[-1]  # type: ignore[assignment]
+    hidden = embedding.out[:-1](embedding.embed_inputs(values.flatten(0, 1)))
     dim = last.out_features
     known = hidden.new_empty(*values.shape[:2], dim if features is None else 2 * dim)
     relation = known.flatten(0, 1)[:, :dim]
