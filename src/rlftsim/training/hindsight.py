@@ -47,18 +47,19 @@ def look_back(
     Returns:
         The experiences, and the mean ratio of probabilities, over the agents of the whole batch, that weights are normalised by.
     """
-    asked = [replace(e.rollouts, goals=met_goals(e.rollouts, e.scores)) for e in experiences]
+    met = [met_goals(e.rollouts, e.scores) for e in experiences]
     with fabric.autocast():
         ratios = [
-            log_ratio(policy, e.batch, e.rollouts, new.goals, at_once=at_once).clamp(max=math.log(LARGEST_RATIO)).exp()
-            for e, new in zip(experiences, asked)
+            log_ratio(policy, e.batch, e.rollouts, goals, at_once=at_once).clamp(max=math.log(LARGEST_RATIO)).exp()
+            for e, goals in zip(experiences, met)
         ]
     deciding = [e.rollouts.decision_mask.any(-1) for e in experiences]
     sums = [torch.stack([r[who].sum(), who.sum().to(r)]) for r, who in zip(ratios, deciding)]
     total, count = add_up(torch.stack(sums).double().sum(0), fabric).tolist()
     mean = total / max(count, 1.0)
     relabelled = []
-    for e, new, ratio in zip(experiences, asked, ratios):
+    for e, goals, ratio in zip(experiences, met, ratios):
+        new = replace(e.rollouts, goals=goals)
         scores, rewards = measure(e.batch, new)
         relabelled.append(Experience(e.batch, new, scores, rewards.weighted(ratio * (weight / max(mean, 1e-6)))))
     return relabelled, mean
