@@ -147,7 +147,7 @@ def test_motion_embedding(nano, golden, batch_a):
 
 def edges_of(done: Pass, name: str) -> list[tuple[np.ndarray, np.ndarray]]:
     """Row and neighbour of each edge of the first layer of a kind."""
-    _, _, around = done.seen.inputs[f"{name}.0"][0]
+    _, _, around, *_ = done.seen.inputs[f"{name}.0"][0]
     rows, neighbors = [], []
     for of_piece, piece in zip(around.rows.split(around.sizes), around.pieces):
         row, column = (piece.bias[:, 0] == 0).nonzero(as_tuple=True)
@@ -210,6 +210,6 @@ def test_tiny(frame, tiny, golden, batch_a):
 
 def test_normalised_map_features_are_what_the_decoder_sees(nano, passes, batch_a):
     (of_map,) = passes["centred"].seen.outputs["map_encoder"]
-    _, _, around = passes["centred"].seen.inputs["decoder.map_layers.0"][0]
+    _, _, around, *_ = passes["centred"].seen.inputs["decoder.map_layers.0"][0]
     for piece in around.pieces:
         torch.testing.assert_close(piece.known[..., of_map.shape[-1] :], normalize(of_map)[piece.neighbors])
