@@ -325,6 +325,7 @@ class RelationAttention(nn.Module):
         x: Float[Tensor, "R D"],
         source: Float[Tensor, "S D"] | None,
         around: Surroundings,
+        *,
         pointers: Pointers | None = None,
     ) -> Float[Tensor, "R D"]:
         """New features of the rows.

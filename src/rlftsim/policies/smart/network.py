@@ -232,7 +232,7 @@ class AgentDecoder(nn.Module):
             source = own if past is None else torch.cat([past.sources[index], own])
             sources.append(source)
             x = time_layer(x, source, before)
-            x = map_layer(x, None, around, pointers)
+            x = map_layer(x, None, around, pointers=pointers)
             x = agent_layer(x, normalize(x), others)
         return x, Past(new_past.position, new_past.heading, new_past.row, tuple(sources))
 
