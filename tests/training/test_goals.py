@@ -2,6 +2,7 @@
 
 import copy
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -10,19 +11,23 @@ import torch
 
 import scenes
 from rlftsim.errors import CheckpointError, ConfigError, DataError
+from rlftsim.goals.attainment import is_reached
 from rlftsim.goals.recorded import recorded_goals
 from rlftsim.goals.stored import StoredGoals, write_goal_part
 from rlftsim.goals.types import Goals
+from rlftsim.rollout.noise import derive_seed
 from rlftsim.rollout.policy import Sampling
 from rlftsim.rollout.simulate import simulate
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import collate
+from rlftsim.training import finetune as finetuning
 from rlftsim.training.augment import AugmentConfig, augment_goals
 from rlftsim.training.experience import Experience
 from rlftsim.training.finetune import FinetuneConfig, compute_reward, finetune, prepare, update_policy
 from rlftsim.training.goals import GoalConfig, choose_goals
-from rlftsim.training.hindsight import log_ratio, look_back, met_goals
+from rlftsim.training.hindsight import clipped_ratio, look_back, met_goals
 from rlftsim.training.parallel import start_fabric
+from rlftsim.training.policy_gradient import agent_log_prob
 from rlftsim.training.rewards import parse_reward, reward_by_name, write_reward
 from rlftsim.training.rewards.base import shares_by_name
 from rlftsim.training.run_folder import read_metrics
@@ -78,6 +83,21 @@ def test_the_goal_reward_of_hand_made_paths(measured):
     assert own[0, :, rows[2]].eq(0).all()  # never met by anybody
     with pytest.raises(ConfigError, match="known kinds are soft, hard"):
         reward_by_name("goal")(measured[0], rollouts, batch, kind="medium")
+
+
+def test_goals_that_differ_between_rollouts_are_asked_of_all_the_others(measured):
+    """Each of three rollouts meets its own goal; the second meets the first one's, too: 1 - 1/2, 1 - 0 and 1 - 0."""
+    batch = collate([scenes.junction_with_light()])
+    row = batch.evaluated_mask[0].nonzero()[:1, 0]
+    mask = torch.zeros_like(batch.agent_mask)
+    mask[0, row] = True
+    position = torch.zeros(1, 3, mask.shape[1], 80, 2)
+    position[0, 0, row, -1, 0], position[0, 1, row, -1, 0], position[0, 2, row, -1, 0] = 10.0, 30.0, 50.0
+    position[0, 1, row, 40, 0] = 11.0
+    rollouts = simulate_nothing(batch, position, Goals(position[..., -1, :], mask[:, None].expand(-1, 3, -1)))
+    torch.testing.assert_close(reward_by_name("goal")(measured[0], rollouts, batch)[0], torch.tensor([0.5, 1.0, 1.0]))
+    hard = reward_by_name("goal")(measured[0], rollouts, batch, kind="hard")
+    torch.testing.assert_close(hard[0], torch.tensor([1.0, 1.0, 1.0]))
 
 
 def simulate_nothing(batch, position, goals):
@@ -179,46 +199,76 @@ def experience(policy, batch):
     return Experience(batch, rollouts, *compute_reward(batch, rollouts, CONFIG))
 
 
-def test_under_its_own_goal_nothing_is_likelier(policy, experience):
-    rollouts = experience.rollouts
-    ratio = log_ratio(policy, experience.batch, rollouts, rollouts.goals, at_once=2).exp()
-    assert ratio.eq(1.0).all()
+def log_prob_under(policy, experience, goals):
+    """Log-probability of all of an agent's decisions."""
+    rollouts = replace(experience.rollouts, goals=goals)
+    with torch.no_grad():
+        log_prob = policy.score(policy.encode(experience.batch), rollouts).log_prob(rollouts.decision)
+    return agent_log_prob(log_prob, rollouts.decision_mask, "sum")
+
+
+def test_under_its_own_goal_nothing_is_likelier(policy, experience, fabric, monkeypatch):
+    """A rollout that is scored again under the goals that were asked: a ratio of exactly 1, in an update."""
+    monkeypatch.setattr(finetuning, "look_back", lambda experiences, measure, goals: list(experiences))
+    config = replace(CONFIG, goals=GoalConfig(share=1.0, hindsight=1.0), rollouts_per_pass=2)
+    values = update_policy(prepare(policy, config, fabric.device), experience.batch, config, fabric)
+    assert values["hindsight_ratio"] == 1.0
 
 
 def test_ratios_are_those_of_whole_sequences_of_decisions(policy, experience):
-    """Agent by agent, from the probabilities themselves."""
+    """Agent by agent, from the probabilities themselves; none above 10."""
     rollouts, batch = experience.rollouts, experience.batch
     elsewhere = replace(rollouts.goals, position=rollouts.goals.position + 20.0)
-    ratio = log_ratio(policy, batch, rollouts, elsewhere, at_once=3)
+    old, new = (log_prob_under(policy, experience, goals) for goals in (rollouts.goals, elsewhere))
+    ratio = clipped_ratio(new, old)
     context = policy.encode(batch)
     with torch.no_grad():
-        old, new = (
+        before, after = (
             policy.score(context, replace(rollouts, goals=goals)).log_prob(rollouts.decision)[1, 2, 0].double().exp()
             for goals in (rollouts.goals, elsewhere)
         )
-    assert float(ratio[1, 2, 0].exp()) == pytest.approx(float((new / old).prod()), rel=1e-3)
-    assert ratio.abs().max() > 0.01
+    assert float(ratio[1, 2, 0]) == pytest.approx(float((after / before).prod()), rel=1e-3)
+    assert (ratio - 1).abs().max() > 0.01
+    assert float(clipped_ratio(new + 100.0, new)[0, 0, 0]) == pytest.approx(10.0)
 
 
-def test_hindsight_weights_have_mean_one_and_are_clipped(policy, experience, fabric):
-    seen = []
-
-    def measure(batch, rollouts):
-        seen.append(rollouts)
-        scores, rewards = compute_reward(batch, rollouts, CONFIG)
-        return scores, replace(rewards, by_agent=torch.ones_like(rewards.by_agent))
-
-    (back,), mean = look_back(policy, [experience], measure, weight=0.5, at_once=2, fabric=fabric)
-    deciding = back.rollouts.decision_mask.any(-1)
-    weights = back.rewards.by_agent  # the rewards were 1
-    assert float(weights[deciding].mean()) == pytest.approx(0.5, rel=1e-4)
-    assert 0 < float(weights.max()) * mean / 0.5 <= 10.0 + 1e-4
-    # the goals are where the most realistic rollout of each scenario ended, so that one meets all of them
+def test_the_goals_of_hindsight_are_met(policy, experience):
+    """In the most realistic rollout of each scenario, or every one by the rollout that it is of."""
+    rollouts = experience.rollouts
     best = experience.scores.single_meta_metric.argmax(-1)
-    goals = met_goals(experience.rollouts, experience.scores)
-    assert seen[0].goals.position.equal(goals.position)
+    goals = met_goals(rollouts, experience.scores, "most_realistic")
     for b, n in enumerate(best.tolist()):
-        assert seen[0].goals.position[b].eq(experience.rollouts.position[b, n, :, -1]).all()
+        assert goals.position[b].eq(rollouts.position[b, n, :, -1]).all()
+    own = met_goals(rollouts, experience.scores, "own")
+    assert is_reached(rollouts.position, own).equal(rollouts.goals.goal_mask)
+
+
+def test_hindsight_counts_as_often_as_it_is_likelier(policy, experience, fabric):
+    """The gradient of an update is what is earned under the goals that were asked plus the weight times that under others, each decision
+    counted by its agent's ratio over the mean ratio."""
+    config = replace(CONFIG, goals=GoalConfig(share=1.0, hindsight=0.5, hindsight_goals="own"), rollouts_per_pass=2)
+    batch = experience.batch
+    learner = prepare(copy.deepcopy(policy), config, fabric.device)
+    start = copy.deepcopy(learner.policy)
+    seed = derive_seed(config.seed, "rollouts", 0)
+    rollouts = simulate(start, batch, num_rollouts=config.num_rollouts, seed=seed, goals=recorded_goals(batch))
+    asked = Experience(batch, rollouts, *compute_reward(batch, rollouts, config))
+    (other,) = look_back([asked], partial(compute_reward, config=config), "own")
+    old, new = log_prob_under(start, asked, rollouts.goals), log_prob_under(start, asked, other.rollouts.goals)
+    ratio = (new - old).exp().clamp(max=10)
+    decides = rollouts.decision_mask.any(-1)
+    weight = 0.5 * ratio / ratio[decides].mean()
+    loss = 0.0
+    for e, factor in ((asked, 1.0), (other, weight)):
+        log_prob = start.score(start.encode(batch), e.rollouts).log_prob(rollouts.decision)
+        by_agent = agent_log_prob(log_prob, rollouts.decision_mask, "mean")
+        loss = loss - (e.rewards.by_agent * factor * by_agent).sum() / batch.num_scenarios
+    loss.backward()
+    learner.beta = 0.0
+    update_policy(learner, batch, replace(config, gradient_clip=1e9), fabric)
+    expected = tiny.gradients_of(start)
+    for name, gradient in tiny.gradients_of(learner.policy).items():
+        torch.testing.assert_close(gradient, expected[name], rtol=1e-3, atol=1e-6)
 
 
 def test_hindsight_is_part_of_an_update(policy, batch, fabric):

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from lightning_fabric import Fabric
 from torch import Tensor, nn
 
@@ -33,7 +34,7 @@ from rlftsim.training.data import batch_with_futures, scenarios_of_update
 from rlftsim.training.experience import Experience, describe
 from rlftsim.training.freezing import TrainedParts, freeze_untrained
 from rlftsim.training.goals import GoalConfig, choose_goals
-from rlftsim.training.hindsight import look_back
+from rlftsim.training.hindsight import clipped_ratio, look_back
 from rlftsim.training.parallel import DeviceConfig, add_up, add_up_gradients, own_share, start_fabric
 from rlftsim.training.policy_gradient import Reduction, agent_log_prob, masked_sum, policy_gradient_loss
 from rlftsim.training.reference import KlConfig, adapt_beta, move_reference
@@ -233,8 +234,9 @@ def update_policy(learner: Learner, batch: ScenarioBatch, config: FinetuneConfig
         experiences.append(Experience(part, rollouts, scores, rewards))
         clock.lap("reward")
     # 3 log-probabilities under policy and reference, 4 loss and gradients, slice by slice
-    hindsight, ratios = _look_back(learner, experiences, config, fabric)
-    sums = _accumulate_gradients(learner, experiences, config, fabric, hindsight)
+    sums, asked = _accumulate_gradients(learner, experiences, config, fabric)
+    ratios = _accumulate_hindsight(learner, experiences, asked, config, fabric)
+    add_up_gradients(learner.parameters, fabric)
     clock.lap("backward")
     # 5 step, 6 penalty, 7 reference
     count = max(sums.count, 1.0)
@@ -268,19 +270,6 @@ def compute_reward(batch: ScenarioBatch, rollouts: Rollouts, config: FinetuneCon
     )
 
 
-def _look_back(
-    learner: Learner, experiences: Sequence[Experience], config: FinetuneConfig, fabric: Fabric
-) -> tuple[list[Experience], dict[str, float]]:
-    """The rollouts under other goals, and what is logged of them; nothing in a run without hindsight."""
-    if not config.goals.hindsight:
-        return [], {}
-    relabelled, ratio = look_back(
-        learner.policy, experiences, partial(compute_reward, config=config),
-        weight=config.goals.hindsight, at_once=config.rollouts_per_pass, fabric=fabric,
-    )  # fmt: skip
-    return relabelled, {"hindsight_ratio": ratio}
-
-
 @dataclass
 class _Sums:
     """What an update added up, over slices and processes."""
@@ -292,25 +281,24 @@ class _Sums:
     count: float
 
 
-def _accumulate_gradients(
-    learner: Learner,
-    experiences: Sequence[Experience],
-    config: FinetuneConfig,
-    fabric: Fabric,
-    hindsight: Sequence[Experience] = (),
-) -> _Sums:
-    """Score the rollouts under policy and reference and leave the loss's gradient in the policy's parameters.
+AskedLogProb = list[list[Float[Tensor, "B n A"]]]
+"""By experience and slice: log-probability of all of an agent's decisions, under the goals that were asked."""
 
-    The reference is asked nothing: with or without goals, behaviour is held to what is realistic. Hindsight adds to the reward's
-    part of the loss alone.
+
+def _accumulate_gradients(
+    learner: Learner, experiences: Sequence[Experience], config: FinetuneConfig, fabric: Fabric
+) -> tuple[_Sums, AskedLogProb]:
+    """Score the rollouts under policy and reference and leave this process's gradient of the loss in the policy's parameters.
+
+    The reference is asked nothing: with or without goals, behaviour is held to what is realistic.
     """
     learner.optimizer.zero_grad(set_to_none=True)
-    counts = [(e.batch.num_scenarios, int(e.rollouts.decision_mask.sum())) for e in experiences]
-    totals = torch.tensor(counts, device=fabric.device, dtype=torch.float64).sum(0)
-    num_scenarios, num_decisions = add_up(totals, fabric).tolist()
+    num_scenarios, num_decisions = _count(experiences, fabric)
     sums = torch.zeros(2, device=fabric.device, dtype=torch.float64)
     gaps: list[Tensor] = []
+    asked: AskedLogProb = []
     for experience in experiences:
+        asked.append([])
         with fabric.autocast(), torch.no_grad():
             reference_context = learner.reference.encode(experience.batch)
         for rows, reward in experience.slices(config.rollouts_per_pass):
@@ -322,20 +310,57 @@ def _accumulate_gradients(
             log_prob = scored.log_prob(rows.decision)
             kl, entropy = masked_sum(scored.kl(held), mask), masked_sum(scored.entropy(), mask)
             by_agent = agent_log_prob(log_prob, mask, config.log_prob_reduction)
-            loss = policy_gradient_loss(reward, by_agent, int(num_scenarios))
+            loss = policy_gradient_loss(reward, by_agent, num_scenarios)
             loss = loss + (learner.beta * kl - config.entropy_bonus * entropy) / max(num_decisions, 1.0)
             fabric.backward(loss)
             sums += torch.stack([kl.detach(), entropy.detach()])
             gaps.append(torch.where(mask, log_prob.detach() - rows.log_prob, 0.0).abs().max())
-    for experience in hindsight:
-        for rows, reward in experience.slices(config.rollouts_per_pass):
+            asked[-1].append(agent_log_prob(log_prob.detach(), mask, "sum"))
+    kl, entropy = add_up(sums, fabric).tolist()
+    return _Sums(kl, entropy, float(torch.stack(gaps).max()), num_decisions), asked
+
+
+def _accumulate_hindsight(
+    learner: Learner, experiences: Sequence[Experience], asked: AskedLogProb, config: FinetuneConfig, fabric: Fabric
+) -> dict[str, float]:
+    """Add the gradient of the rewards' part of the loss under other goals. Returns what is logged; nothing in a run without hindsight.
+
+    What is earned is weighted by the ratio of probabilities, divided by its mean over the agents of the whole batch. The mean is known
+    in the end, so this gradient is gathered apart.
+    """
+    if not config.goals.hindsight:
+        return {}
+    gathered = [parameter.grad for parameter in learner.parameters]
+    learner.optimizer.zero_grad(set_to_none=True)
+    num_scenarios, _ = _count(experiences, fabric)
+    sums = torch.zeros(2, device=fabric.device, dtype=torch.float64)
+    others = look_back(experiences, partial(compute_reward, config=config), config.goals.hindsight_goals)
+    for experience, log_probs in zip(others, asked):
+        for (rows, reward), old in zip(experience.slices(config.rollouts_per_pass), log_probs):
+            mask, decides = rows.decision_mask, rows.decision_mask.any(-1)
             with fabric.autocast():
                 scored = learner.policy.score(learner.policy.encode(experience.batch), rows)
-            by_agent = agent_log_prob(scored.log_prob(rows.decision), rows.decision_mask, config.log_prob_reduction)
-            fabric.backward(policy_gradient_loss(reward, by_agent, int(num_scenarios)))
-    add_up_gradients(learner.parameters, fabric)
-    kl, entropy = add_up(sums, fabric).tolist()
-    return _Sums(kl, entropy, float(torch.stack(gaps).max()), num_decisions)
+            log_prob = scored.log_prob(rows.decision)
+            ratio = clipped_ratio(agent_log_prob(log_prob, mask, "sum"), old)
+            by_agent = agent_log_prob(log_prob, mask, config.log_prob_reduction)
+            fabric.backward(policy_gradient_loss(reward * ratio, by_agent, num_scenarios))
+            sums += torch.stack([ratio[decides].sum(), decides.sum()])
+    total, count = add_up(sums, fabric).tolist()
+    mean = total / max(count, 1.0)
+    for parameter, before in zip(learner.parameters, gathered):
+        if parameter.grad is not None:
+            parameter.grad *= config.goals.hindsight / max(mean, 1e-6)
+        if before is not None:
+            parameter.grad = before if parameter.grad is None else parameter.grad.add_(before)
+    return {"hindsight_ratio": mean}
+
+
+def _count(experiences: Sequence[Experience], fabric: Fabric) -> tuple[int, float]:
+    """Scenarios and decisions in the whole batch, other processes' included."""
+    counts = [(e.batch.num_scenarios, int(e.rollouts.decision_mask.sum())) for e in experiences]
+    totals = torch.tensor(counts, device=fabric.device, dtype=torch.float64).sum(0)
+    num_scenarios, num_decisions = add_up(totals, fabric).tolist()
+    return int(num_scenarios), num_decisions
 
 
 def _step(learner: Learner, sums: _Sums, config: FinetuneConfig) -> float:

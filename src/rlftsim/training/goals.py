@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from rlftsim.errors import ConfigError, require_not_negative, require_positive
 from rlftsim.goals.recorded import recorded_goals
@@ -9,6 +10,8 @@ from rlftsim.goals.stored import StoredGoals
 from rlftsim.goals.types import Goals
 from rlftsim.rollout.noise import draw_noise
 from rlftsim.scenario.batch import ScenarioBatch
+
+HindsightGoals = Literal["most_realistic", "own"]
 
 
 @dataclass(frozen=True)
@@ -23,7 +26,10 @@ class GoalConfig:
     augmented_share: float = 0.5
     """Chance of a scenario that has such goals to use them instead of where the record ended."""
     hindsight: float = 0.0
-    """Weight of the same rollouts under goals that one of them has met (`training.hindsight`); 0 = they are not used so."""
+    """Weight of the same rollouts under other goals that are met (`training.hindsight`); 0 = they are not used so."""
+    hindsight_goals: HindsightGoals = "most_realistic"
+    """Where the scenario's most realistic rollout ended, as in the paper; or own: each rollout is asked to go where it went, so that every
+    one of them shows how a goal is met."""
     learning_rate_scale: float = 1.0
     """Of the weights that see goals, which begin at zero, against that of all others."""
 

@@ -1,5 +1,6 @@
 """Getting where one was asked to go, and the paper's mixture of that with realism (RLFTSim, equation 4)."""
 
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -8,7 +9,7 @@ from rlftsim.goals.attainment import is_passed, is_reached
 from rlftsim.realism import AgentScores, RealismResult
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
-from rlftsim.training.rewards.base import leave_one_out, register_reward, register_shares, register_sum
+from rlftsim.training.rewards.base import register_reward, register_shares, register_sum, require_two
 
 KINDS = {"soft": is_passed, "hard": is_reached}
 """soft: within 2 m of the goal at some step; hard: in the end."""
@@ -18,7 +19,8 @@ KINDS = {"soft": is_passed, "hard": is_reached}
 def goal(
     scores: RealismResult, rollouts: Rollouts, batch: ScenarioBatch, *, kind: str = "soft"
 ) -> Float[Tensor, "B N"]:
-    """Share of the evaluated agents with a goal that meet it, minus the mean of the other rollouts'. 0 where nobody has one."""
+    """Share of the evaluated agents with a goal that meet it, minus the mean share of them in the other rollouts that meet the same goals. 0 where
+    nobody has one."""
     return _met(rollouts, batch, kind).sum(-1)
 
 
@@ -37,8 +39,20 @@ def _met(rollouts: Rollouts, batch: ScenarioBatch, kind: str) -> Float[Tensor, "
     if rollouts.goals is None:
         return rollouts.heading.new_zeros(rollouts.heading.shape[:3])
     counted = counted_agents(rollouts, batch)
-    met = KINDS[kind](rollouts.position, rollouts.goals) & counted
-    return leave_one_out(met.float() / counted.sum(-1, keepdim=True).clamp(min=1))
+    met = _met_by_all(rollouts, kind).float()  # [B, N, N, A]
+    own = met.diagonal(dim1=1, dim2=2).movedim(-1, 1)
+    advantage = (own - met.mean(2)) * (require_two(own) / (own.shape[1] - 1))
+    return torch.where(counted, advantage, 0.0) / counted.sum(-1, keepdim=True).clamp(min=1)
+
+
+def _met_by_all(rollouts: Rollouts, kind: str) -> Bool[Tensor, "B N N A"]:
+    """Whose goals are met by whom: those of rollout i by rollout j. All the same goals give N equal rows."""
+    goals, position = rollouts.goals, rollouts.position
+    assert goals is not None
+    count = rollouts.num_rollouts
+    num_different = 1 if (goals.position == goals.position[:, :1]).all() else count
+    rows = [KINDS[kind](position, goals.rollouts(slice(i, i + 1)).repeat(count)) for i in range(num_different)]
+    return torch.stack(rows, 1).expand(-1, count, -1, -1)
 
 
 def counted_agents(rollouts: Rollouts, batch: ScenarioBatch) -> Bool[Tensor, "B N A"]:
