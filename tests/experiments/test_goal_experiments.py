@@ -162,6 +162,8 @@ def test_conditions_are_means_over_scenarios(workshop):
     )
     assert overall["concatenation, soft"]["alternative only"]["mean"] == pytest.approx(0.5)
     assert found.numbers["conditions"]["reached"]["base"]["mixed"]["mean"] == pytest.approx(0.2625)
+    # whole goals: the first scenario's left is never passed, all the others sometimes
+    assert found.numbers["conditions"]["passed_once"]["base"]["alternative only"]["mean"] == pytest.approx(0.75)
     lefts = found.numbers["manoeuvres"]["passed"]["concatenation, soft"]["alternative only"]["left"]
     assert (lefts["mean"], lefts["count"]) == (pytest.approx(0.45), 2)
     verdict = next(v for v in found.verdicts if v.startswith("concatenation, soft against goal-free, passed"))

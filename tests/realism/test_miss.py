@@ -32,7 +32,7 @@ def speed_of_ego(scenario):
 
 def test_the_record_itself_misses_nothing():
     scenario = scenes.straight_road()
-    assert compute_miss_rates(scenario, logged_states(scenario, num_rollouts=3)) == (0.0, 0.0)
+    assert compute_miss_rates(scenario, logged_states(scenario, num_rollouts=3)) == (0.0, 0.0, 0.0)
 
 
 def test_a_box_not_a_disc(lone):
@@ -51,14 +51,15 @@ def test_passing_is_enough_for_the_passing_rate(lone):
     x[..., 69], y[..., 69] = states.x[..., 79], states.y[..., 79]
     x[..., 79] += 500.0
     rates = compute_miss_rates(lone, SimulatedStates(states.object_id, x, y, states.z, states.heading))
-    assert rates == (1.0, 0.0)
+    assert rates == (1.0, 0.0, 0.0)
 
 
 def test_shares_are_over_rollouts_and_agents(lone):
+    """Three of four rollouts meet; in all taken together nobody misses."""
     once = logged_states(lone, num_rollouts=1)
     off = moved(once, (0.0, 50.0))
     join = [torch.cat([getattr(once, f)] * 3 + [getattr(off, f)]) for f in ("x", "y", "z", "heading")]
-    assert compute_miss_rates(lone, SimulatedStates(once.object_id, *join)) == (0.25, 0.25)
+    assert compute_miss_rates(lone, SimulatedStates(once.object_id, *join)) == (0.25, 0.25, 0.0)
 
 
 def test_a_goal_is_where_an_agent_was_last_seen():

@@ -43,6 +43,16 @@ class Attained:
     passed: float
     """Comes within 2 m at some time."""
 
+    @property
+    def reached_once(self) -> float:
+        """1 if some rollout reaches it, else 0."""
+        return float(self.reached > 0)
+
+    @property
+    def passed_once(self) -> float:
+        """1 if some rollout passes it, else 0."""
+        return float(self.passed > 0)
+
 
 def held_out(workshop: Workshop) -> tuple[ScenarioDataset, tuple[str, ...]]:
     """The scenarios that a workshop measures on, and their ids."""

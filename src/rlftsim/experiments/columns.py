@@ -26,6 +26,7 @@ class ResultRow:
     miss_rate: MeanInterval | None = None
     """Share in [0, 1]."""
     passing_miss_rate: MeanInterval | None = None
+    min_passing_miss_rate: MeanInterval | None = None
     """Share in [0, 1]."""
     note: str = ""
     emphasised: bool = False
@@ -104,6 +105,10 @@ COLUMNS = (
 GOAL_COLUMNS = (
     Column(
         "passing_miss_rate", "passing_miss_rate", "passing miss [%]", "evaluated agents that never come near the log's end", 2, 100.0,
+    ),
+    Column(
+        "min_passing_miss_rate", "min_passing_miss_rate", "in all rollouts [%]",
+        "evaluated agents that never come near the log's end in any rollout", 2, 100.0,
     ),
     *SCORES[1:4],
     SCORES[0],

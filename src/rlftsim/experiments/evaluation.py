@@ -39,6 +39,7 @@ SCORE_COLUMNS = (
     "traffic_light_violation_rate",
     "miss_rate",
     "passing_miss_rate",
+    "min_passing_miss_rate",
 )
 """`meta_metric_light_one` is the meta-metric with the traffic light likelihood set to 1, as published tables of models without
 a light feature have it; `meta_metric` is the official one. Miss rates: see `realism.miss`."""
@@ -232,6 +233,7 @@ def row_of_result(result: RealismResult, scenario: Scenario, states: SimulatedSt
         "meta_metric_light_one": result.meta_metric + missing,
         "miss_rate": misses.at_goal,
         "passing_miss_rate": misses.passing,
+        "min_passing_miss_rate": misses.passing_in_all,
     }
     numbers = {name: float(scores[name] if name in scores else result.score_of(name)) for name in SCORE_COLUMNS}
     return {

@@ -15,12 +15,14 @@ from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, STEP_S, TOTAL_STE
 
 
 class MissRates(NamedTuple):
-    """Shares of (rollout, evaluated agent) pairs; NaN where nobody has a recorded future."""
+    """NaN where nobody has a recorded future."""
 
     at_goal: float
-    """Missed at the step at which the goal was recorded."""
+    """Missed at the step at which the goal was recorded: share of (rollout, evaluated agent) pairs."""
     passing: float
-    """Missed at every simulated step."""
+    """Missed at every simulated step: share of the same."""
+    passing_in_all: float
+    """Missed at every step of every rollout: share of evaluated agents, the challenge's way to count several predictions."""
 
 
 def compute_miss_rates(scenario: Scenario, states: SimulatedStates) -> MissRates:
@@ -34,7 +36,7 @@ def compute_miss_rates(scenario: Scenario, states: SimulatedStates) -> MissRates
     future_valid = tracks.valid[evaluated, CURRENT_STEP + 1 : TOTAL_STEPS]
     evaluated, future_valid = evaluated[future_valid.any(1)], future_valid[future_valid.any(1)]
     if not len(evaluated):
-        return MissRates(float("nan"), float("nan"))
+        return MissRates(*[float("nan")] * 3)
     last = FUTURE_STEPS - 1 - future_valid[:, ::-1].argmax(1)  # future step of the goal [E]
     goal_step = last + CURRENT_STEP + 1
     speed = np.linalg.norm(tracks.velocity[evaluated, CURRENT_STEP], axis=-1)
@@ -47,4 +49,5 @@ def compute_miss_rates(scenario: Scenario, states: SimulatedStates) -> MissRates
     tolerance = tolerance_m(torch.from_numpy(speed), torch.from_numpy((last + 1) * STEP_S)).to(position)
     met = is_within(position - goal[:, None], heading[:, None], tolerance[:, None])  # [N, E, T]
     at_goal = met.gather(2, torch.from_numpy(last).to(index).expand(len(met), -1)[..., None])
-    return MissRates(1.0 - float(at_goal.double().mean()), 1.0 - float(met.any(-1).double().mean()))
+    passes = met.any(-1)
+    return MissRates(*(1.0 - float(share.double().mean()) for share in (at_goal, passes, passes.any(0))))

@@ -64,7 +64,8 @@ def conclude(measured: Measured, workshop: Workshop) -> Findings:
             budget_note(workshop),
             "The variants start from the goal-free row, so each has had its fine-tuning and as much again; what more goal-free fine-tuning does "
             "is in finetune-curve.",
-            "A passing miss: an evaluated agent that at no simulated step is within WOMD's tolerance of where its record ends.",
+            "A passing miss: an evaluated agent that at no simulated step is within WOMD's tolerance of where its record ends; share of agents and "
+            "rollouts. In all rollouts: share of agents that miss in every one of them.",
         ),
         numbers={"rows": row_numbers([start, *asked, *unasked], GOAL_COLUMNS)},
         figure=_figure([start, *asked]),

@@ -23,6 +23,9 @@ from rlftsim.viewer.figure import Panel, draw_panels
 
 NAME = "maneuver-controllability"
 WAYS = {"passed": "passed [%]", "reached": "reached [%]"}
+"""Shares of the rollouts."""
+ONCE = {"passed_once": "goals passed in some rollout [%]", "reached_once": "goals reached in some rollout [%]"}
+"""Shares of the goals. The paper does not say how it counts several rollouts of a goal; its shares are those of whole goals."""
 IS_IN: dict[str, Callable[[Attained], bool]] = {
     "ground truth": lambda one: one.entry.label.endswith(RECORDED),
     "alternative only": lambda one: not one.entry.label.endswith(RECORDED),
@@ -82,15 +85,15 @@ def measure(workshop: Workshop) -> Measured:
 def conclude(measured: Measured, workshop: Workshop) -> Findings:
     """Shares by condition and by manoeuvre, beside the paper's."""
     rows = list(measured.attained)
-    overall = {way: {row: _by_condition(measured, row, way) for row in rows} for way in WAYS}
+    overall = {way: {row: _by_condition(measured, row, way) for row in rows} for way in (*WAYS, *ONCE)}
     return Findings(
         title="Manoeuvre controllability: the ego is asked for what it did, or for something else",
         tables=(
-            *(_condition_table(way, overall[way]) for way in WAYS),
+            *(_condition_table(title, overall[way]) for way, title in (WAYS | ONCE).items()),
             *(_manoeuvre_table(measured, condition) for condition in IS_IN),
             published.MANOEUVRES,
         ),
-        verdicts=tuple(_verdict(measured, row, way) for way in WAYS for row in VARIANTS),
+        verdicts=tuple(_verdict(measured, row, way) for way in (*WAYS, "passed_once") for row in VARIANTS),
         notes=(
             budget_note(workshop),
             f"The goals are in {NAME}.goals.json beside this table: recorded manoeuvres with their recorded ends, alternatives as the lanes propose them. "
@@ -100,7 +103,7 @@ def conclude(measured: Measured, workshop: Workshop) -> Findings:
             "Lights, signs and other agents are not looked at when goals are proposed: some cannot be met without a violation.",
         ),
         numbers={
-            "conditions": {way: {row: {c: _plain(m) for c, m in zip(CONDITIONS, overall[way][row])} for row in rows} for way in WAYS},
+            "conditions": {way: {row: {c: _plain(m) for c, m in zip(CONDITIONS, overall[way][row])} for row in rows} for way in overall},
             "manoeuvres": {way: {row: {c: {m.value: _plain(e) for m, e in _by_manoeuvre(measured, row, way, c).items()} for c in IS_IN} for row in rows} for way in WAYS},
             "goals": [{"scenario": one.entry.scenario_id, "label": one.entry.label} for one in measured.attained[rows[0]]],
         },
@@ -149,11 +152,11 @@ def _cell(estimate: MeanInterval) -> str:
     return f"{100 * estimate.mean:.1f}{error}"
 
 
-def _condition_table(way: str, rows: Mapping[str, Sequence[MeanInterval]]) -> TextTable:
+def _condition_table(title: str, rows: Mapping[str, Sequence[MeanInterval]]) -> TextTable:
     cells = tuple((row, *(_cell(estimate) for estimate in estimates)) for row, estimates in rows.items())
     counts = [estimate.count for estimate in next(iter(rows.values()))]
-    note = f"Ego of {max(counts)} held-out scenarios; share of rollouts, mean ± standard error over scenarios."
-    return TextTable(f"Ours: {WAYS[way]} ↑", ("", *CONDITIONS), cells, note)
+    note = f"Ego of {max(counts)} held-out scenarios; mean ± standard error over scenarios."
+    return TextTable(f"Ours: {title} ↑", ("", *CONDITIONS), cells, note)
 
 
 def _manoeuvre_table(measured: Measured, condition: str) -> TextTable:
@@ -175,7 +178,7 @@ def _verdict(measured: Measured, row: str, way: str) -> str:
     gain = mean_interval(np.array([after[i] - before[i] for i in after]))
     mean = float(np.mean(list(before.values())))
     times = f" ({(mean + gain.mean) / mean:.2f} times)" if mean > 0 else ""
-    return f"{row} against {START}, {way}, alternatives only{times}: {gain_words(gain)}"
+    return f"{row} against {START}, {way.replace('_', ' ')}, alternatives only{times}: {gain_words(gain)}"
 
 
 def _plain(estimate: MeanInterval) -> dict[str, object]:
