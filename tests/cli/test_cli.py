@@ -275,7 +275,8 @@ def test_what_has_no_effect_on_a_method_is_refused(tmp_path, vocabulary, capsys)
         ([*catk, "--validation-split", "validation"], "--validation-split validation has no effect"),
         (["--validation-split", "validation"], "--validation-split validation has no effect"),
         ([*catk, *every, "--validation-split", "tests"], "no split 'tests'"),
-        ([*catk, "--goal", "concat"], "--goal has no effect with --method catk"),
+        ([*catk, "--set", "catk.trained=goals"], "this model does not see goals: add --goal concat"),
+        ([*catk, "--set", "catk.goal_share=1"], "this model does not see goals: add --goal concat"),
         (["--set", "finetune.reward=gcft"], "needs goals: set finetune.goals.share above 0"),
         (["--set", "finetune.goals.share=1"], "this model does not see goals: add --goal concat or --goal indication"),
     ]

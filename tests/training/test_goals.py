@@ -15,6 +15,7 @@ from rlftsim.goals.attainment import is_reached
 from rlftsim.goals.recorded import recorded_goals
 from rlftsim.goals.stored import StoredGoals, write_goal_part
 from rlftsim.goals.types import Goals
+from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.rollout.noise import derive_seed
 from rlftsim.rollout.policy import Sampling
 from rlftsim.rollout.simulate import simulate
@@ -22,6 +23,7 @@ from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import collate
 from rlftsim.training import finetune as finetuning
 from rlftsim.training.augment import AugmentConfig, augment_goals
+from rlftsim.training.catk import catk_finetune
 from rlftsim.training.experience import Experience
 from rlftsim.training.finetune import FinetuneConfig, compute_reward, finetune, prepare, update_policy
 from rlftsim.training.goals import GoalConfig, choose_goals
@@ -211,7 +213,8 @@ def test_under_its_own_goal_nothing_is_likelier(policy, experience, fabric, monk
     """A rollout that is scored again under the goals that were asked: a ratio of exactly 1, in an update."""
     monkeypatch.setattr(finetuning, "look_back", lambda experiences, measure, goals: list(experiences))
     config = replace(CONFIG, goals=GoalConfig(share=1.0, hindsight=1.0), rollouts_per_pass=2)
-    values = update_policy(prepare(policy, config, fabric.device), experience.batch, config, fabric)
+    learner = prepare(copy.deepcopy(policy), config, fabric.device)
+    values = update_policy(learner, experience.batch, config, fabric)
     assert values["hindsight_ratio"] == 1.0
 
 
@@ -344,6 +347,25 @@ def test_a_run_with_goals_of_all_kinds(policy, drawn_scenarios, tmp_path):
     assert len(metrics) == 3
     assert all(line["hindsight_ratio"] > 0 for line in metrics)
     assert '"goal": "concat"' in (model / "config.json").read_text()
+
+
+def test_whoever_is_asked_nothing_goes_on_as_before_if_only_the_sight_of_goals_is_trained(
+    vocabulary, drawn_scenarios, tmp_path
+):
+    """CAT-K with goals, its candidates all tokens: imitation of the record by agents that know where it ends."""
+    base = tiny.tiny_policy(vocabulary)
+    start = copy.deepcopy(base).eval()
+    config = replace(tiny.CATK, trained="goals", goal_share=1.0, num_candidates=1000, learning_rate=1e-2, epochs=2.0)
+    model = catk_finetune(base.with_goal_sight("concat"), drawn_scenarios, tmp_path, config)
+    policy = SmartPolicy.from_pretrained(model).eval()
+    batch = collate(drawn_scenarios[:2])
+    goals = recorded_goals(batch)
+    asked, unasked, before = (
+        simulate(p, batch, num_rollouts=2, seed=3, goals=g) for p, g in ((policy, goals), (policy, None), (start, None))
+    )
+    assert unasked.decision.equal(before.decision)
+    assert unasked.log_prob.equal(before.log_prob)
+    assert not asked.log_prob.equal(before.log_prob)
 
 
 def test_goals_of_two_rollouts_cannot_be_those_of_three(policy, batch):

@@ -110,8 +110,9 @@ class Finetune:
     """rlft: policy gradient of a realism reward, fields finetune.*. catk: imitation along rollouts that keep near the record, the
     closest among the top K tokens, fields catk.*."""
     goal: GoalSight | None = None
-    """Fine-tune with goals: how the model is to see them, concat or indication. It then learns with reward gcft, every agent asked to go
-    where its record ends; see finetune.goals for other goals. Left out, the model keeps the sight it has."""
+    """Fine-tune with goals: how the model is to see them, concat or indication. Every agent is asked to go where its record ends; rlft then
+    takes the reward gcft (see finetune.goals for other goals), catk trains only the weights that see goals. Left out, the model keeps the
+    sight it has."""
     split: str = "training"
     validation_split: str | None = None
     """For catk: what to validate on, see catk.validation.every, which is 0 (never). Left out, "validation" where the data set has it."""
@@ -123,8 +124,6 @@ class Finetune:
         section = "finetune" if self.method == "rlft" else "catk"
         recipe = RECIPES[self.recipe]()
         if self.goal is not None:
-            if self.method == "catk":
-                raise ConfigError("--goal has no effect with --method catk, which knows no goals: leave it out.")
             recipe = recipe.with_goals()
         recipe = configure(recipe, self.set, sections=(section,))
         scenarios = open_split(self.data, self.split)
@@ -134,6 +133,8 @@ class Finetune:
             if self.method == "rlft":
                 model = finetune_with_reward(self.model, scenarios, recipe.finetune, self.out, goal=self.goal)
             else:
-                model = finetune_with_catk(self.model, scenarios, recipe.catk, self.out, held_out=held_out)
+                model = finetune_with_catk(
+                    self.model, scenarios, recipe.catk, self.out, goal=self.goal, held_out=held_out
+                )
         print(f"model: {model}")
         return 0

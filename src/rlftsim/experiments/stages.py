@@ -9,6 +9,7 @@ from rlftsim.policies.smart.config import GoalSight, SmartConfig
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.recipes.card import model_card
 from rlftsim.recipes.models import load_policy
+from rlftsim.rollout.policy import Policy
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
 from rlftsim.tokens.vocabulary import Vocabulary
@@ -61,15 +62,8 @@ def finetune_with_reward(
         CheckpointError: `out` holds a run with other settings or another base model.
         ConfigError: the base model has no weights, or sees goals in another way.
     """
-    how = config.reward if goal is None else f"{config.reward}, goals by {goal}"
-    card = model_card(f"fine-tuned ({how}) from {base}", training.folder, len(training))
-    policy = load_policy(str(base))
-    if goal is not None:
-        if not isinstance(policy, SmartPolicy):
-            raise ConfigError(f"{base} has no weights, so it cannot learn to see goals: name a model folder.")
-        torch.manual_seed(config.seed)
-        policy = policy.with_goal_sight(goal)
-    return finetune(policy, training, out, config, card=card)
+    card = model_card(f"fine-tuned ({config.reward}{_by(goal)}) from {base}", training.folder, len(training))
+    return finetune(_learner(base, goal, config.seed), training, out, config, card=card)
 
 
 def finetune_with_catk(
@@ -78,12 +72,29 @@ def finetune_with_catk(
     config: CatkConfig,
     out: Path,
     *,
+    goal: GoalSight | None = None,
     held_out: ScenarioDataset | None = None,
 ) -> Path:
-    """Folder of a model fine-tuned with CAT-K from a base model.
+    """Folder of a model fine-tuned with CAT-K from a base model, which is given sight of goals if `goal` says how.
 
     Raises:
         CheckpointError: `out` holds a run with other settings or another base model.
+        ConfigError: the base model has no weights, or sees goals in another way.
     """
-    card = model_card(f"fine-tuned (CAT-K, {config.choice}) from {base}", training.folder, len(training))
-    return catk_finetune(load_policy(str(base)), training, out, config, held_out=held_out, card=card)
+    card = model_card(f"fine-tuned (CAT-K, {config.choice}{_by(goal)}) from {base}", training.folder, len(training))
+    return catk_finetune(_learner(base, goal, config.seed), training, out, config, held_out=held_out, card=card)
+
+
+def _by(goal: GoalSight | None) -> str:
+    return "" if goal is None else f", goals by {goal}"
+
+
+def _learner(base: str | Path, goal: GoalSight | None, seed: int) -> Policy:
+    """A policy to fine-tune."""
+    policy = load_policy(str(base))
+    if goal is None:
+        return policy
+    if not isinstance(policy, SmartPolicy):
+        raise ConfigError(f"{base} has no weights, so it cannot learn to see goals: name a model folder.")
+    torch.manual_seed(seed)
+    return policy.with_goal_sight(goal)

@@ -21,9 +21,11 @@ class SmartRecipe:
     catk: CatkConfig = field(default_factory=CatkConfig)
 
     def with_goals(self) -> "SmartRecipe":
-        """The same, fine-tuning with goals: the paper's reward, everybody is asked to go where the record ends."""
+        """The same, fine-tuning with goals: everybody is asked to go where the record ends. With the paper's reward; or by CAT-K, which then
+        trains the weights that see goals and no others, on all tokens as candidates."""
         goals = replace(self.finetune.goals, share=1.0)
-        return replace(self, finetune=replace(self.finetune, goals=goals, reward="gcft"))
+        catk = replace(self.catk, goal_share=1.0, trained="goals", num_candidates=self.tokens.num_tokens)
+        return replace(self, finetune=replace(self.finetune, goals=goals, reward="gcft"), catk=catk)
 
 
 def smart_tiny_rlftsim() -> SmartRecipe:

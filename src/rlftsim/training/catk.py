@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 
 from rlftsim.errors import ConfigError, given, require_positive
+from rlftsim.goals.types import Goals
 from rlftsim.rollout.noise import derive_seed
 from rlftsim.rollout.policy import DecisionDistribution, Policy, Sampling
 from rlftsim.rollout.simulate import simulate
@@ -32,6 +33,7 @@ from rlftsim.tokens.agent_tokens import (
 )
 from rlftsim.tokens.vocabulary import CLASS_BOXES_M, Vocabulary, class_of_type
 from rlftsim.training.freezing import TrainedParts, freeze_untrained
+from rlftsim.training.goals import GoalConfig, choose_goals, refuse_goals
 from rlftsim.training.imitation import ImitationConfig, Prediction, imitate, summed_loss
 
 DEFAULT_NUM_CANDIDATES = 32
@@ -74,11 +76,15 @@ class CatkConfig(ImitationConfig):
     max_distance_lengths: float | None = None
     """A decision from farther off the record than so many lengths of its class's box does not count. None = all count."""
     trained: TrainedParts = "decoder"
-    """The parts a policy names for fine-tuning, or everything."""
+    """The parts a policy names for fine-tuning, the weights that see goals, or everything."""
+    goal_share: float = 0.0
+    """Chance of an agent to be asked to go where its record ends; for a policy that sees goals."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         require_positive(self, ("num_candidates", *given(self, ("max_distance_lengths",))))
+        if not 0 <= self.goal_share <= 1:
+            raise ConfigError(f"goal_share is a share in [0, 1], got {self.goal_share}.")
 
 
 def catk_finetune(
@@ -116,13 +122,16 @@ def catk_finetune(
         raise ConfigError(
             f"{type(policy).__name__} cannot be fine-tuned with CAT-K: it needs a vocabulary of tokens and save_pretrained."
         )
+    refuse_goals(policy, config.goal_share)
     freeze_untrained(policy, config.trained)
+    asked = GoalConfig(share=config.goal_share)
 
     def along_rollouts(batch: ScenarioBatch, trained: Bool[Tensor, "B A"], update: int) -> Prediction:
         context = policy.encode(batch)
+        goals = choose_goals(batch, asked, None, seed=derive_seed(config.seed, "goals", update))
         pursuing = roll_out_closest(
             policy, batch, num_candidates=config.num_candidates, choice=config.choice, context=context,
-            max_distance_lengths=config.max_distance_lengths, seed=derive_seed(config.seed, "rollouts", update),
+            max_distance_lengths=config.max_distance_lengths, seed=derive_seed(config.seed, "rollouts", update), goals=goals,
         )  # fmt: skip
         torch.clear_autocast_cache()  # or weights cast during the rollout, without gradient, would be used again
         return predict_along(policy, context, pursuing, trained)
@@ -156,6 +165,7 @@ def roll_out_closest(
     num_rollouts: int = 1,
     seed: int = 0,
     context: Any = None,
+    goals: Goals | None = None,
     public_order_of_operations: bool = False,
 ) -> PursuingRollouts:
     """Simulate with CAT-K.
@@ -171,6 +181,7 @@ def roll_out_closest(
         num_rollouts: N.
         seed: of what else is random in the policy, and of draws.
         context: `policy.encode(batch)`, where it is at hand.
+        goals: what agents are asked, see `simulate`.
         public_order_of_operations: round where the public code rounds, see `tokens.public_order`.
 
     Raises:
@@ -190,7 +201,9 @@ def roll_out_closest(
         targets.append((aim.best_token(), aim.recorded & aim.is_near(max_distance_lengths)))
         return pursue(distribution, aim, num_candidates, noise)  # type: ignore[arg-type]
 
-    rollouts = simulate(policy, batch, num_rollouts=num_rollouts, seed=seed, context=context, choose=choose)
+    rollouts = simulate(
+        policy, batch, num_rollouts=num_rollouts, seed=seed, context=context, goals=goals, choose=choose
+    )
     target, mask = (torch.stack(part, -1) for part in zip(*targets))
     return PursuingRollouts(rollouts, target, mask, class_of_type(batch.object_type))
 

@@ -33,7 +33,7 @@ from rlftsim.training.checkpoint import Progress, newest_checkpoint, read_checkp
 from rlftsim.training.data import batch_with_futures, scenarios_of_update
 from rlftsim.training.experience import Experience, describe
 from rlftsim.training.freezing import TrainedParts, freeze_untrained
-from rlftsim.training.goals import GoalConfig, choose_goals
+from rlftsim.training.goals import GoalConfig, choose_goals, refuse_goals
 from rlftsim.training.hindsight import clipped_ratio, look_back
 from rlftsim.training.parallel import DeviceConfig, add_up, add_up_gradients, own_share, start_fabric
 from rlftsim.training.policy_gradient import Reduction, agent_log_prob, masked_sum, policy_gradient_loss
@@ -165,10 +165,7 @@ def finetune(policy: Policy, scenarios: Scenarios, out: Path, config: FinetuneCo
         )
     if not len(scenarios):
         raise ConfigError("no scenario to train on: is the data set empty, or the split misspelt?")
-    if config.goals.share and not getattr(policy, "sees_goals", True):
-        raise ConfigError(
-            f"goals.share={config.goals.share:g}, but this model does not see goals: add --goal concat or --goal indication."
-        )
+    refuse_goals(policy, config.goals.share)
     fabric = start_fabric(config.device)
     run = RunFolder(out, config, describe_inputs(policy, scenarios), writes=fabric.is_global_zero)
     learner = prepare(policy, config, fabric.device)

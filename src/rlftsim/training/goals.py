@@ -9,6 +9,7 @@ from rlftsim.goals.recorded import recorded_goals
 from rlftsim.goals.stored import StoredGoals
 from rlftsim.goals.types import Goals
 from rlftsim.rollout.noise import draw_noise
+from rlftsim.rollout.policy import Policy, sees_goals
 from rlftsim.scenario.batch import ScenarioBatch
 
 HindsightGoals = Literal["most_realistic", "own"]
@@ -49,6 +50,18 @@ class GoalConfig:
             DataError: the folder holds no goals.
         """
         return None if self.augmented is None else StoredGoals(Path(self.augmented))
+
+
+def refuse_goals(policy: Policy, share: float) -> None:
+    """Refuse to train a policy with goals that it does not see.
+
+    Raises:
+        ConfigError: it does not.
+    """
+    if share and not sees_goals(policy):
+        raise ConfigError(
+            f"goals for a share of {share:g}, but this model does not see goals: add --goal concat or --goal indication."
+        )
 
 
 def choose_goals(batch: ScenarioBatch, config: GoalConfig, augmented: StoredGoals | None, *, seed: int) -> Goals | None:
