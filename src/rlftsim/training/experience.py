@@ -28,9 +28,16 @@ class Experience:
 
     def slices(self, size: int) -> Iterator[tuple[Rollouts, Float[Tensor, "B n A"]]]:
         """So many of the rollouts of every scenario at once, and what each agent in them earned."""
-        for start in range(0, self.rollouts.num_rollouts, size):
-            part = slice(start, start + size)
-            yield self.rollouts.select(part), self.rewards.by_agent[:, part]
+        return slices(self.rollouts, self.rewards.by_agent, size)
+
+
+def slices(
+    rollouts: Rollouts, earned: Float[Tensor, "B N A"], size: int
+) -> Iterator[tuple[Rollouts, Float[Tensor, "B n A"]]]:
+    """So many of the rollouts of every scenario at once, and what each agent in them earned."""
+    for start in range(0, rollouts.num_rollouts, size):
+        part = slice(start, start + size)
+        yield rollouts.select(part), earned[:, part]
 
 
 def describe(experiences: Sequence[Experience], fabric: Fabric) -> dict[str, float]:

@@ -8,7 +8,6 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +33,7 @@ from rlftsim.training.data import batch_with_futures, scenarios_of_update
 from rlftsim.training.experience import Experience, describe
 from rlftsim.training.freezing import TrainedParts, freeze_untrained
 from rlftsim.training.goals import GoalConfig, choose_goals, refuse_goals
-from rlftsim.training.hindsight import clipped_ratio, look_back
+from rlftsim.training.hindsight import clipped_ratio, goal_terms, look_back
 from rlftsim.training.parallel import DeviceConfig, add_up, add_up_gradients, own_share, start_fabric
 from rlftsim.training.policy_gradient import Reduction, agent_log_prob, masked_sum, policy_gradient_loss
 from rlftsim.training.reference import KlConfig, adapt_beta, move_reference
@@ -112,8 +111,13 @@ class FinetuneConfig:
             raise ConfigError(f"shared_credit is a share in [0, 1], got {self.shared_credit}.")
         metric_by_name(self.metric)
         object.__setattr__(self, "reward", write_reward(parse_reward(self.reward)))
-        if not self.goals.share and any(term.name == "goal" for term in parse_reward(self.reward)):
+        asks = bool(goal_terms(parse_reward(self.reward)))
+        if asks and not self.goals.share:
             raise ConfigError(f"reward {self.reward!r} needs goals: set finetune.goals.share above 0, such as 1.")
+        if self.goals.hindsight and not asks:
+            raise ConfigError(
+                f"goals.hindsight has no effect with reward {self.reward!r}: add a term, such as 0.1*goal."
+            )
 
     def num_updates(self, num_scenarios: int) -> int:
         """Optimiser steps of the run."""
@@ -278,7 +282,7 @@ class _Sums:
     count: float
 
 
-AskedLogProb = list[list[Float[Tensor, "B n A"]]]
+AskedLogProb = list[list[Float[Tensor, "_ _ _"]]]
 """By experience and slice: log-probability of all of an agent's decisions, under the goals that were asked."""
 
 
@@ -320,7 +324,7 @@ def _accumulate_gradients(
 def _accumulate_hindsight(
     learner: Learner, experiences: Sequence[Experience], asked: AskedLogProb, config: FinetuneConfig, fabric: Fabric
 ) -> dict[str, float]:
-    """Add the gradient of the rewards' part of the loss under other goals. Returns what is logged; nothing in a run without hindsight.
+    """Add the gradient of what is earned under other goals. Returns what is logged; nothing in a run without hindsight.
 
     What is earned is weighted by the ratio of probabilities, divided by its mean over the agents of the whole batch. The mean is known
     in the end, so this gradient is gathered apart.
@@ -331,12 +335,12 @@ def _accumulate_hindsight(
     learner.optimizer.zero_grad(set_to_none=True)
     num_scenarios, _ = _count(experiences, fabric)
     sums = torch.zeros(2, device=fabric.device, dtype=torch.float64)
-    others = look_back(experiences, partial(compute_reward, config=config), config.goals.hindsight_goals)
-    for experience, log_probs in zip(others, asked):
-        for (rows, reward), old in zip(experience.slices(config.rollouts_per_pass), log_probs):
+    others = look_back(experiences, parse_reward(config.reward), config.goals.hindsight_goals)
+    for other, log_probs in zip(others, asked):
+        for (rows, reward), old in zip(other.slices(config.rollouts_per_pass), log_probs):
             mask, decides = rows.decision_mask, rows.decision_mask.any(-1)
             with fabric.autocast():
-                scored = learner.policy.score(learner.policy.encode(experience.batch), rows)
+                scored = learner.policy.score(learner.policy.encode(other.batch), rows)
             log_prob = scored.log_prob(rows.decision)
             ratio = clipped_ratio(agent_log_prob(log_prob, mask, "sum"), old)
             by_agent = agent_log_prob(log_prob, mask, config.log_prob_reduction)

@@ -7,8 +7,8 @@ weighted by how much likelier they are under the others (hindsight policy gradie
 """
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 from jaxtyping import Float
 from torch import Tensor
@@ -18,26 +18,55 @@ from rlftsim.realism import RealismResult
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.training.augment import ends_of, most_realistic
-from rlftsim.training.experience import Experience
+from rlftsim.training.experience import Experience, slices
 from rlftsim.training.goals import HindsightGoals
-from rlftsim.training.rewards import Rewards
+from rlftsim.training.rewards import Term
+from rlftsim.training.rewards.goal import goal_advantage
 
 LARGEST_RATIO = 10.0
 """Ratios of probabilities are clipped to it."""
-Measure = Callable[[ScenarioBatch, Rollouts], tuple[RealismResult, Rewards]]
-"""Scores of rollouts, and what they earn."""
 
 
-def look_back(experiences: Sequence[Experience], measure: Measure, goals: HindsightGoals) -> list[Experience]:
-    """The rollouts as if they had been sampled under goals that are met, rewarded for these.
+@dataclass(frozen=True, eq=False)
+class Relabelled:
+    """Rollouts under other goals than they were sampled under."""
+
+    batch: ScenarioBatch
+    rollouts: Rollouts
+    earned: Float[Tensor, "B N A"]
+    """By each agent for the goals."""
+
+    def slices(self, size: int) -> Iterator[tuple[Rollouts, Float[Tensor, "B n A"]]]:
+        """So many of the rollouts of every scenario at once, and what each agent in them earned."""
+        return slices(self.rollouts, self.earned, size)
+
+
+def look_back(experiences: Sequence[Experience], terms: Sequence[Term], goals: HindsightGoals) -> list[Relabelled]:
+    """The rollouts as if they had been sampled under goals that are met, and what that earns.
+
+    Realism was rewarded before and does not depend on goals, so only goals count here; each agent earns its own share, because
+    each agent's decisions have a ratio of their own.
 
     Args:
         experiences: of this process.
-        measure: scores and rewards of rollouts.
+        terms: of the run's reward.
         goals: whose ends they are, see `GoalConfig.hindsight_goals`.
     """
-    seen = [replace(e.rollouts, goals=met_goals(e.rollouts, e.scores, goals)) for e in experiences]
-    return [Experience(e.batch, rollouts, *measure(e.batch, rollouts)) for e, rollouts in zip(experiences, seen)]
+    return [_relabel(experience, terms, goals) for experience in experiences]
+
+
+def _relabel(experience: Experience, terms: Sequence[Term], goals: HindsightGoals) -> Relabelled:
+    batch, rollouts = experience.batch, experience.rollouts
+    seen = replace(rollouts, goals=met_goals(rollouts, experience.scores, goals))
+    earned = rollouts.heading.new_zeros(rollouts.heading.shape[:3])
+    for term in goal_terms(terms):
+        earned = earned + term.weight * goal_advantage(seen, batch, **dict(term.options))  # type: ignore[arg-type]
+    return Relabelled(batch, seen, earned)
+
+
+def goal_terms(terms: Sequence[Term]) -> list[Term]:
+    """The terms of a reward that goals matter to."""
+    return [term for term in terms if term.name == "goal"]
 
 
 def met_goals(rollouts: Rollouts, scores: RealismResult, goals: HindsightGoals) -> Goals:

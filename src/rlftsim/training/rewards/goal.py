@@ -21,7 +21,7 @@ def goal(
 ) -> Float[Tensor, "B N"]:
     """Share of the evaluated agents with a goal that meet it, minus the mean share of them in the other rollouts that meet the same goals. 0 where
     nobody has one."""
-    return _met(rollouts, batch, kind).sum(-1)
+    return goal_advantage(rollouts, batch, kind).sum(-1)
 
 
 @register_shares("goal")
@@ -29,11 +29,11 @@ def goal_shares(
     scores: AgentScores, rollouts: Rollouts, batch: ScenarioBatch, *, kind: str = "soft"
 ) -> Float[Tensor, "B N A"]:
     """Each agent's own."""
-    return _met(rollouts, batch, kind)
+    return goal_advantage(rollouts, batch, kind)
 
 
-def _met(rollouts: Rollouts, batch: ScenarioBatch, kind: str) -> Float[Tensor, "B N A"]:
-    """What each agent adds to the share, against the other rollouts."""
+def goal_advantage(rollouts: Rollouts, batch: ScenarioBatch, kind: str = "soft") -> Float[Tensor, "B N A"]:
+    """What each agent adds to the share of those that meet their goals, minus what it would add on average in the other rollouts."""
     if kind not in KINDS:
         raise ConfigError(f"reward goal(kind={kind!r}): known kinds are {', '.join(KINDS)}.")
     if rollouts.goals is None:
