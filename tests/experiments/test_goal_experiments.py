@@ -42,7 +42,7 @@ def workshop(data, tmp_path_factory):
 
 def test_variants_start_from_the_realism_aligned_model(workshop):
     config = finetune_config(goal_conditioning.VARIANTS["indication, hard"], TINY.finetune)
-    assert (config.reward, config.goals.share) == ("0.9*mloo + 0.1*goal(kind='hard')", 1.0)
+    assert (config.reward, config.goals.share) == ("0.9*mloo + 0.1*goal(kind='hard', reach_m=0.0)", 1.0)
     assert finetune_config(FineTuned("mloo"), replace(TINY.finetune, goals=config.goals)).goals.share == 0.0
     variant = goal_conditioning.VARIANTS["concatenation, soft"]
     assert variant.name == "gcft-concat-soft-from-mloo-seed0-seed0"

@@ -29,12 +29,17 @@ SLOW_FACTOR = 0.5
 
 def is_reached(position: Float[Tensor, "B N A T 2"], goals: Goals) -> Bool[Tensor, "B N A"]:
     """Who ends within `NEAR_M` of its goal."""
-    return goals.goal_mask & ((position[..., -1, :] - goals.position).norm(dim=-1) <= NEAR_M)
+    return goals.goal_mask & (final_m(position, goals) <= NEAR_M)
 
 
 def is_passed(position: Float[Tensor, "B N A T 2"], goals: Goals) -> Bool[Tensor, "B N A"]:
     """Who is within `NEAR_M` of its goal at some step."""
     return goals.goal_mask & (closest_m(position, goals) <= NEAR_M)
+
+
+def final_m(position: Float[Tensor, "B N A T 2"], goals: Goals) -> Float[Tensor, "B N A"]:
+    """Distance to the goal in the end, m; meaningless without a goal."""
+    return (position[..., -1, :] - goals.position).norm(dim=-1)
 
 
 def closest_m(position: Float[Tensor, "B N A T 2"], goals: Goals) -> Float[Tensor, "B N A"]:

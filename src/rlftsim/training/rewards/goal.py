@@ -5,48 +5,60 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from rlftsim.errors import ConfigError
-from rlftsim.goals.attainment import is_passed, is_reached
+from rlftsim.goals.attainment import NEAR_M, closest_m, final_m
 from rlftsim.realism import AgentScores, RealismResult
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.training.rewards.base import register_reward, register_shares, register_sum, require_two
 
-KINDS = {"soft": is_passed, "hard": is_reached}
-"""soft: within 2 m of the goal at some step; hard: in the end."""
+KINDS = {"soft": closest_m, "hard": final_m}
+"""What must be at most 2 m. soft: the least distance to the goal over all steps; hard: the one in the end."""
 
 
 @register_reward("goal")
 def goal(
-    scores: RealismResult, rollouts: Rollouts, batch: ScenarioBatch, *, kind: str = "soft"
+    scores: RealismResult, rollouts: Rollouts, batch: ScenarioBatch, *, kind: str = "soft", reach_m: float = 0.0
 ) -> Float[Tensor, "B N"]:
     """Share of the evaluated agents with a goal that meet it, minus the mean share of them in the other rollouts that meet the same goals. 0 where
-    nobody has one."""
-    return goal_advantage(rollouts, batch, kind).sum(-1)
+    nobody has one.
+
+    With `reach_m` above 0 those that miss it by less than that count in part, the less the farther off they are.
+    """
+    return goal_advantage(rollouts, batch, kind, reach_m).sum(-1)
 
 
 @register_shares("goal")
 def goal_shares(
-    scores: AgentScores, rollouts: Rollouts, batch: ScenarioBatch, *, kind: str = "soft"
+    scores: AgentScores, rollouts: Rollouts, batch: ScenarioBatch, *, kind: str = "soft", reach_m: float = 0.0
 ) -> Float[Tensor, "B N A"]:
     """Each agent's own."""
-    return goal_advantage(rollouts, batch, kind)
+    return goal_advantage(rollouts, batch, kind, reach_m)
 
 
-def goal_advantage(rollouts: Rollouts, batch: ScenarioBatch, kind: str = "soft") -> Float[Tensor, "B N A"]:
-    """What each agent adds to the share of those that meet their goals, minus what it would add on average in the other rollouts."""
+def goal_advantage(
+    rollouts: Rollouts, batch: ScenarioBatch, kind: str = "soft", reach_m: float = 0.0
+) -> Float[Tensor, "B N A"]:
+    """What each agent adds to the share of those that meet their goals, minus what it would add on average in the other rollouts.
+
+    Raises:
+        ConfigError: no such kind, or a negative reach.
+    """
     if kind not in KINDS:
         raise ConfigError(f"reward goal(kind={kind!r}): known kinds are {', '.join(KINDS)}.")
+    if not 0 <= reach_m < torch.inf:
+        raise ConfigError(f"reward goal(reach_m={reach_m}): metres, at least 0; 0 counts only goals that are met.")
     if rollouts.goals is None:
         return rollouts.heading.new_zeros(rollouts.heading.shape[:3])
     counted = counted_agents(rollouts, batch)
-    met = _met_by_all(rollouts, kind).float()  # [B, N, N, A]
+    beyond = _distances(rollouts, kind) - NEAR_M  # [B, N, N, A]
+    met = (beyond <= 0).float() if reach_m == 0 else 1 - (beyond / reach_m).clamp(0, 1)
     own = met.diagonal(dim1=1, dim2=2).movedim(-1, 1)
     advantage = (own - met.mean(2)) * (require_two(own) / (own.shape[1] - 1))
     return torch.where(counted, advantage, 0.0) / counted.sum(-1, keepdim=True).clamp(min=1)
 
 
-def _met_by_all(rollouts: Rollouts, kind: str) -> Bool[Tensor, "B N N A"]:
-    """Whose goals are met by whom: those of rollout i by rollout j. All the same goals give N equal rows."""
+def _distances(rollouts: Rollouts, kind: str) -> Float[Tensor, "B N N A"]:
+    """From the goals of rollout i to the agents of rollout j, m. All the same goals give N equal rows."""
     goals, position = rollouts.goals, rollouts.position
     assert goals is not None
     count = rollouts.num_rollouts
@@ -62,8 +74,8 @@ def counted_agents(rollouts: Rollouts, batch: ScenarioBatch) -> Bool[Tensor, "B 
 
 
 @register_sum("gcft")
-def gcft(*, goal_weight: float = 0.1, kind: str = "soft") -> str:
-    """The paper's reward of goal-conditioned fine-tuning; its lambda is `goal_weight`."""
+def gcft(*, goal_weight: float = 0.1, kind: str = "soft", reach_m: float = 0.0) -> str:
+    """The paper's reward of goal-conditioned fine-tuning; its lambda is `goal_weight`. `reach_m` is ours, see `goal`."""
     if not 0 <= goal_weight <= 1:
         raise ConfigError(f"reward gcft(goal_weight={goal_weight}): a share in [0, 1] is expected.")
-    return f"{round(1 - goal_weight, 12)}*mloo + {goal_weight}*goal(kind={kind!r})"
+    return f"{round(1 - goal_weight, 12)}*mloo + {goal_weight}*goal(kind={kind!r}, reach_m={reach_m})"
