@@ -31,7 +31,7 @@ from rlftsim.training.alarms import AlarmConfig, Alarms
 from rlftsim.training.checkpoint import Progress, newest_checkpoint, read_checkpoint, write_checkpoint
 from rlftsim.training.data import batch_with_futures, scenarios_of_update
 from rlftsim.training.experience import Experience, describe
-from rlftsim.training.freezing import TrainedParts, freeze_untrained
+from rlftsim.training.freezing import TrainedParts, freeze_untrained, parameter_groups
 from rlftsim.training.goals import GoalConfig, choose_goals, refuse_goals
 from rlftsim.training.hindsight import clipped_ratio, goal_terms, look_back
 from rlftsim.training.parallel import DeviceConfig, add_up, add_up_gradients, own_share, start_fabric
@@ -202,19 +202,9 @@ def prepare(policy: nn.Module, config: FinetuneConfig, device: torch.device) -> 
     freeze_untrained(policy, config.trained)
     reference = copy.deepcopy(policy).requires_grad_(False)
     optimizer = torch.optim.AdamW(
-        parameter_groups(policy, config), lr=config.learning_rate, betas=config.betas, weight_decay=config.weight_decay
+        parameter_groups(policy, config.goals.learning_rate_scale), lr=config.learning_rate, betas=config.betas, weight_decay=config.weight_decay
     )
     return Learner(policy, reference, optimizer, config.kl.initial_beta, config.goals.open_augmented())
-
-
-def parameter_groups(policy: nn.Module, config: FinetuneConfig) -> list[dict[str, Any]]:
-    """What is trained: the weights that see goals apart, their learning rate is scaled."""
-    parts = policy.goal_parts() if hasattr(policy, "goal_parts") else ()  # type: ignore[operator]
-    sight = [p for part in parts for p in part.parameters() if p.requires_grad]
-    ids = {id(p) for p in sight}
-    others = [p for p in policy.parameters() if p.requires_grad and id(p) not in ids]
-    groups = [{"params": others, "scale": 1.0}, {"params": sight, "scale": config.goals.learning_rate_scale}]
-    return [group for group in groups if group["params"]]
 
 
 def update_policy(learner: Learner, batch: ScenarioBatch, config: FinetuneConfig, fabric: Fabric) -> dict[str, float]:
@@ -369,7 +359,7 @@ def _step(learner: Learner, sums: _Sums, config: FinetuneConfig) -> float:
     norm = float(torch.nn.utils.clip_grad_norm_(learner.parameters, config.gradient_clip))
     rate = config.learning_rate * min((learner.update + 1) / max(config.warmup_updates, 1), 1.0)
     for group in learner.optimizer.param_groups:
-        group["lr"] = rate * group.get("scale", 1.0)
+        group["lr"] = rate * group["scale"]
     learner.update += 1
     if math.isfinite(norm) and sums.kl / max(sums.count, 1.0) <= config.max_kl:
         learner.optimizer.step()

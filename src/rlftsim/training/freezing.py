@@ -1,6 +1,6 @@
-"""Which weights a fine-tuning trains."""
+"""Which weights a training trains, and how fast."""
 
-from typing import Literal
+from typing import Any, Literal
 
 from torch import nn
 
@@ -17,7 +17,7 @@ def freeze_untrained(policy: nn.Module, trained: TrainedParts) -> None:
         ConfigError: no weights see goals.
     """
     if trained == "goals":
-        parts = policy.goal_parts() if hasattr(policy, "goal_parts") else ()  # type: ignore[operator]
+        parts = _goal_parts(policy)
         if not parts:
             raise ConfigError(
                 "trained=goals, but this model does not see goals: add --goal concat or --goal indication."
@@ -28,3 +28,16 @@ def freeze_untrained(policy: nn.Module, trained: TrainedParts) -> None:
     policy.requires_grad_(False)
     for part in parts:
         part.requires_grad_(True)
+
+
+def parameter_groups(model: nn.Module, goal_scale: float) -> list[dict[str, Any]]:
+    """What is trained, as an optimiser takes it: the weights that see goals apart, their learning rate is scaled."""
+    sight = [p for part in _goal_parts(model) for p in part.parameters() if p.requires_grad]
+    ids = {id(p) for p in sight}
+    others = [p for p in model.parameters() if p.requires_grad and id(p) not in ids]
+    groups = [{"params": others, "scale": 1.0}, {"params": sight, "scale": goal_scale}]
+    return [group for group in groups if group["params"]]
+
+
+def _goal_parts(model: nn.Module) -> tuple[nn.Module, ...]:
+    return model.goal_parts() if hasattr(model, "goal_parts") else ()  # type: ignore[operator]

@@ -4,6 +4,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from jaxtyping import Bool
+from torch import Tensor
+
 from rlftsim.errors import ConfigError, require_not_negative, require_positive
 from rlftsim.goals.recorded import recorded_goals
 from rlftsim.goals.stored import StoredGoals
@@ -62,6 +65,12 @@ def refuse_goals(policy: Policy, share: float) -> None:
         raise ConfigError(
             f"goals for a share of {share:g}, but this model does not see goals: add --goal concat or --goal indication."
         )
+
+
+def choose_agents(batch: ScenarioBatch, share: float, *, seed: int) -> Bool[Tensor, "B A"]:
+    """A share of the agents, each by its own luck, which depends on the seed and the scenario alone."""
+    luck = draw_noise(batch, range(1), seed=seed, purpose="told", per_agent=1)  # [B, 1, A, 1]
+    return (luck[:, 0, :, 0] < share) & batch.agent_mask
 
 
 def choose_goals(batch: ScenarioBatch, config: GoalConfig, augmented: StoredGoals | None, *, seed: int) -> Goals | None:

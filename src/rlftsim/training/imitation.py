@@ -28,6 +28,7 @@ from rlftsim.tokens.vocabulary import Vocabulary
 from rlftsim.training.batches import micro_batches, scenario_costs
 from rlftsim.training.checkpoint import Progress, newest_checkpoint, read_checkpoint, write_checkpoint
 from rlftsim.training.data import batch_with_futures, scenarios_of_update, trained_agents
+from rlftsim.training.freezing import parameter_groups
 from rlftsim.training.parallel import DeviceConfig, add_up, add_up_gradients, own_share, start_fabric
 from rlftsim.training.run_folder import RunFolder, describe_inputs
 from rlftsim.training.validation import ValidationConfig, refuse_to_validate, validate
@@ -81,6 +82,8 @@ class ImitationConfig:
     final_learning_rate_share: float = 0.01
     """The learning rate falls to this share along a cosine."""
     warmup_updates: int = 0
+    goal_learning_rate_scale: float = 1.0
+    """Of the weights that see goals, if there are any, against that of all others."""
     weight_decay: float = 0.01
     gradient_clip: float = 0.5
     label_smoothing: float = 0.1
@@ -103,7 +106,7 @@ class ImitationConfig:
 
     def __post_init__(self) -> None:
         positive = (
-            "epochs", "batch_size", "micro_batch_size", "learning_rate", "gradient_clip", "trained_radius_m",
+            "epochs", "batch_size", "micro_batch_size", "learning_rate", "goal_learning_rate_scale", "gradient_clip", "trained_radius_m",
             "max_skipped_in_a_row", "checkpoint_every",
         )  # fmt: skip
         require_positive(self, (*positive, *given(self, ("micro_batch_cost", "context_radius_m"))))
@@ -170,8 +173,8 @@ def imitate(
     fabric = start_fabric(config.device)
     run = RunFolder(out, config, describe_inputs(model, scenarios), writes=fabric.is_global_zero)
     model.to(fabric.device).train()
-    trained = [p for p in model.parameters() if p.requires_grad]
-    optimizer = torch.optim.AdamW(trained, lr=config.learning_rate, weight_decay=config.weight_decay)
+    groups = parameter_groups(model, config.goal_learning_rate_scale)
+    optimizer = torch.optim.AdamW(groups, lr=config.learning_rate, weight_decay=config.weight_decay)
     newest = newest_checkpoint(run.checkpoints)
     done = read_checkpoint(newest, {"policy": model}, optimizer).update if newest else 0
     run.continue_from(done)
@@ -244,7 +247,7 @@ def learning_rate(update: int, total: int, config: ImitationConfig) -> float:
 
 def _set_learning_rate(optimizer: torch.optim.Optimizer, value: float) -> None:
     for group in optimizer.param_groups:
-        group["lr"] = value
+        group["lr"] = value * group["scale"]
 
 
 def _update(learner: _Learner, update: int) -> dict[str, float]:
