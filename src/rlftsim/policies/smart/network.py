@@ -245,7 +245,8 @@ class AgentDecoder(nn.Module):
         known = scene.agent_features[scenario, agent]
         if goals is not None and isinstance(self.goal, GoalState):
             poses = Poses(steps.position, steps.heading)[rows]
-            known = known.index_add(0, *self.goal.look(goals, poses, rows, seam_rad=self.config.seam_rad))
+            carriers, seen = self.goal.look(goals, poses, rows, seam_rad=self.config.seam_rad)
+            known = known.index_add(0, carriers, seen.to(known.dtype))
         state = self.motion(motion_values, known)
         token = scene.token_features[scene.class_id[scenario, agent], steps.token_id[rows]]
         return self.fusion(torch.cat([token, state], -1))
