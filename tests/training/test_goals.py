@@ -108,6 +108,22 @@ def test_goals_that_differ_between_rollouts_are_asked_of_all_the_others(measured
     torch.testing.assert_close(hard[0], torch.tensor([1.0, 1.0, 1.0]))
 
 
+@pytest.mark.parametrize("unused_m", [0.0, 10.0])
+def test_what_nobody_is_asked_earns_nothing(unused_m, measured):
+    """The second of three rollouts alone is asked to go to x = 10 m, and gets there: 1, whatever stands where the others have no goal."""
+    batch = collate([scenes.junction_with_light()])
+    row = batch.evaluated_mask[0].nonzero()[:1, 0]
+    mask = torch.zeros(1, 3, batch.agent_mask.shape[1], dtype=torch.bool)
+    mask[0, 1, row] = True
+    goals = torch.full((*mask.shape, 2), unused_m)
+    position = torch.zeros(*mask.shape, 80, 2) - 50.0
+    goals[0, 1, row] = position[0, 1, row, -1] = torch.tensor([10.0, 10.0])
+    rollouts = simulate_nothing(batch, position, Goals(goals, mask))
+    for kind in ("soft", "hard"):
+        reward = reward_by_name("goal")(measured[0], rollouts, batch, kind=kind)
+        torch.testing.assert_close(reward[0], torch.tensor([0.0, 1.0, 0.0]))
+
+
 def simulate_nothing(batch, position, goals):
     """Rollouts that go where they are put; nobody asks who decided."""
     heading = position[..., 0]
