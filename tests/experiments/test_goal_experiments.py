@@ -98,6 +98,23 @@ def test_every_goal_is_given_alone_and_measured_once(workshop, monkeypatch):
     assert changed == {"bend"}
 
 
+def test_another_model_of_the_same_name_is_measured_anew(workshop, monkeypatch):
+    goal = GoalEntry("straight", 100, 1020.0, -200.0)
+    rows = {"one": Baseline("constant_velocity")}
+    for policy, reached in ((ConstantVelocity(), 0.0), (Seeker(), 1.0), (ConstantVelocity(), 0.0)):
+        monkeypatch.setattr(attainment, "load_policy", lambda name, device, policy=policy: policy)
+        assert measure_attainment(workshop, rows, [goal], name="again")["one"][0].reached == reached
+
+
+def test_two_processes_measure_what_one_does(data, tmp_path, workshop):
+    goals = [GoalEntry("straight", 100, 1020.0, -200.0), GoalEntry("bend", 100, 1030.0, -190.0)]
+    rows = {"blind": Baseline("constant_velocity")}
+    spread = Workshop(TINY, data, tmp_path, replace(QUICK, jobs=2))
+    found = [measure_attainment(one, rows, goals, name="spread") for one in (workshop, spread)]
+    assert found[0] == found[1]
+    assert len(list(tmp_path.rglob("attainment/spread/**/*.json"))) == 2
+
+
 # ---- kinematic ----------------------------------------------------------------------------------------------------------
 
 

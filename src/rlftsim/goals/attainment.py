@@ -7,9 +7,11 @@ Three ways to ask, from hard to soft:
 * *missed in passing*: outside the goal's box at every simulated step. The box is the miss definition of the Waymo motion prediction
   challenge: along and across the heading at the goal, larger for long horizons, smaller for slow agents.
 
-Every function gives one truth value per (scenario, rollout, agent), False where there is no goal; `rate` takes the mean over those
-that have one.
+Who gets there is a truth value per (scenario, rollout, agent), False where there is no goal; `rate` takes the mean over those that have
+one, `outcome_of` over the rollouts of a single goal.
 """
+
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
@@ -45,6 +47,32 @@ def final_m(position: Float[Tensor, "B N A T 2"], goals: Goals) -> Float[Tensor,
 def closest_m(position: Float[Tensor, "B N A T 2"], goals: Goals) -> Float[Tensor, "B N A"]:
     """Distance to the goal at the step at which it is least, m; meaningless without a goal."""
     return (position - goals.position[..., None, :]).norm(dim=-1).amin(-1)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a single goal in some rollouts."""
+
+    reached: float
+    """Share of the rollouts that end within `NEAR_M`."""
+    passed: float
+    """Share of the rollouts that come within `NEAR_M` at some step."""
+    closest_m: float
+    """Mean over rollouts of the least distance."""
+
+
+def outcome_of(position: Float[Tensor, "N T 2"], goal: tuple[float, float]) -> Outcome:
+    """What became of an agent's goal. Both may be far from (0, 0), as in the world frame: they are subtracted in float64.
+
+    Args:
+        position: where the agent was simulated.
+        goal: where it should have gone.
+    """
+    away = (position.double() - torch.tensor(goal, dtype=torch.float64, device=position.device)).float()
+    away = away[None, :, None]  # [1, N, 1, T, 2]
+    here = Goals(torch.zeros_like(away[..., 0, :]), torch.ones_like(away[..., 0, 0], dtype=torch.bool))
+    found = (is_reached(away, here), is_passed(away, here), closest_m(away, here))
+    return Outcome(*(float(values.double().mean()) for values in found))
 
 
 def is_missed_in_passing(
