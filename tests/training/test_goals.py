@@ -346,6 +346,16 @@ def test_stored_goals_come_to_the_agents_they_are_of(drawn_scenarios, tmp_path):
     assert mixed[1].goal_mask[1].equal(recorded_goals(batch).goal_mask[1])  # there are none beside the recorded ones
 
 
+def test_a_folder_of_goals_says_whose_they_are(drawn_scenarios, tmp_path):
+    ids = [scenario.scenario_id for scenario in drawn_scenarios]
+    points = np.array([3, 5]), np.zeros((2, 2))
+    write_goal_part(tmp_path / "a" / "part-0.parquet", {ids[0]: points, ids[2]: points})
+    write_goal_part(tmp_path / "b" / "part-0.parquet", {ids[0]: points, ids[2]: (points[0], points[1] + 1e-3)})
+    stored = StoredGoals(tmp_path / "a")
+    assert (stored.count_among(ids), stored.count_among(ids[1:]), stored.count_among(["elsewhere"])) == (2, 1, 0)
+    assert stored.fingerprint == StoredGoals(tmp_path / "a").fingerprint != StoredGoals(tmp_path / "b").fingerprint
+
+
 def test_a_folder_without_goals_is_refused(tmp_path):
     with pytest.raises(DataError, match="holds no goals: write them by `rlftsim augment`"):
         StoredGoals(tmp_path)
