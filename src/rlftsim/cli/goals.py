@@ -92,7 +92,7 @@ class Propose:
 
 @dataclass(frozen=True)
 class Check:
-    """Check a goals file against its scenarios: who is asked, and what is doubtful."""
+    """Check a goals file, its alternatives included, against its scenarios: who is asked, and what is doubtful."""
 
     file: Positional[Path]
     """A goals file."""
@@ -104,13 +104,15 @@ class Check:
         scenarios, file = ScenarioDataset(data_folder(self.data)), read_goals(self.file)
         lines = [
             line
-            for scenario_id in file.scenario_ids
-            for entry in file.of_scenario(scenario_id)
-            for line in doubts(entry, _find(scenarios, scenario_id, self.data))
+            for entry in (*file.goals, *file.alternatives)
+            for line in doubts(entry, _find(scenarios, entry.scenario_id, self.data))
         ]
         for line in lines:
             print(line)
-        print(f"{self.file}: {len(file.goals)} goals in {len(file.scenario_ids)} scenarios, {len(lines)} doubts.")
+        print(
+            f"{self.file}: {len(file.goals)} goals in {len(file.scenario_ids)} scenarios, {len(file.alternatives)} alternatives, "
+            f"{len(lines)} doubts."
+        )
         return 0
 
 

@@ -159,11 +159,3 @@ def _way_of(states: SimulatedStates, agent_id: int) -> Float[torch.Tensor, "N T 
     """Where the rollouts took an agent, world frame."""
     row = int(np.flatnonzero(states.object_id == agent_id)[0])
     return torch.stack([states.x[:, row], states.y[:, row]], -1)
-
-
-def by_scenario(values: Sequence[tuple[str, float]]) -> dict[str, float]:
-    """The mean of each scenario's values."""
-    collected: dict[str, list[float]] = {}
-    for scenario_id, value in values:
-        collected.setdefault(scenario_id, []).append(value)
-    return {scenario_id: float(np.mean(own)) for scenario_id, own in collected.items()}
