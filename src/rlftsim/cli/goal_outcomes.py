@@ -11,7 +11,7 @@ from rich.table import Table
 from rlftsim.goals.attainment import Outcome, outcome_of
 from rlftsim.goals.goals_file import GoalEntry
 from rlftsim.scenario.types import Scenario
-from rlftsim.viewer.goal_picture import GoalMark, GoalPanel
+from rlftsim.viewer.goal_picture import DrawnGoal, GoalPanel
 
 
 def outcomes_of(folder: Path, scenario: Scenario, entries: Sequence[GoalEntry]) -> list[tuple[GoalEntry, Outcome]]:
@@ -34,12 +34,12 @@ def outcome_table(outcomes: Sequence[tuple[GoalEntry, Outcome]]) -> Table:
 def picture_of(folder: Path, scenario: Scenario, entries: Sequence[GoalEntry]) -> GoalPanel:
     """Goals and where their agents went; without goals where the evaluated agents went."""
     marks = [
-        GoalMark(e.agent_id, np.array([e.x, e.y]), e.label, driven=driven(folder, scenario, e.agent_id))
+        DrawnGoal(e.agent_id, np.array([e.x, e.y]), e.label, driven=driven(folder, scenario, e.agent_id))
         for e in entries
     ]
     if not entries:
         for agent in scenario.tracks.object_id[scenario.evaluated_indices].tolist():
-            marks.append(GoalMark(agent, driven=driven(folder, scenario, agent)))
+            marks.append(DrawnGoal(agent, driven=driven(folder, scenario, agent)))
     return GoalPanel(scenario.scenario_id, scenario, tuple(marks))
 
 

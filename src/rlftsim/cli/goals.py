@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Literal
 
 import numpy as np
 import tyro
@@ -18,11 +18,12 @@ from rlftsim.goals.proposals import Proposal, why_nothing
 from rlftsim.progress import print_wide, say
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.types import CURRENT_STEP, ObjectType, Scenario
-from rlftsim.viewer.goal_picture import GoalMark, GoalPanel, draw_goals
+from rlftsim.viewer.goal_picture import DrawnGoal, GoalPanel, draw_goals
 
 Choice = Literal[
     "alternative", "recorded", "straight", "left", "right", "left_uturn", "lane_change_left", "lane_change_right"
 ]
+"""The last six are those of `Manoeuvre`, spelt out for the command line."""
 
 
 @dataclass(frozen=True)
@@ -189,10 +190,6 @@ def _add_rows(
 
 def _panel(scenario: Scenario, track: int, proposals: tuple[Proposal, ...]) -> GoalPanel:
     marks = tuple(
-        GoalMark(p.object_id, p.position, label_of(p), p.way[:, :2], is_recorded=p.is_recorded) for p in proposals
+        DrawnGoal(p.object_id, p.position, label_of(p), p.way[:, :2], is_recorded=p.is_recorded) for p in proposals
     )
     return GoalPanel(f"{scenario.scenario_id}, agent {scenario.tracks.object_id[track]}", scenario, marks)
-
-
-MANOEUVRES = get_args(Choice)[2:]
-"""Those of `goals.manoeuvre`, spelt out for the command line."""

@@ -20,7 +20,7 @@ from torch import Tensor
 from rlftsim.goals.types import Goals
 
 NEAR_M = 2.0
-HORIZON_S = (3.0, 5.0, 8.0)
+TOLERANCE_HORIZON_S = (3.0, 5.0, 8.0)
 SIDEWAYS_M = (1.0, 1.8, 3.0)
 ALONG_M = (2.0, 3.6, 6.0)
 """Tolerances at these horizons; linear between, constant before and beyond."""
@@ -109,7 +109,7 @@ def tolerance_m(speed: Float[Tensor, "*shape"], horizon_s: Float[Tensor, "*shape
         horizon_s: time from the current step to the goal.
     """
     factor = _interpolate(speed, (SLOW_MPS, FAST_MPS), (SLOW_FACTOR, 1.0))
-    widths = [_interpolate(horizon_s, HORIZON_S, sizes) for sizes in (ALONG_M, SIDEWAYS_M)]
+    widths = [_interpolate(horizon_s, TOLERANCE_HORIZON_S, sizes) for sizes in (ALONG_M, SIDEWAYS_M)]
     return factor[..., None] * torch.stack(widths, -1)
 
 
