@@ -20,7 +20,7 @@ from rlftsim.goals.proposals import Driver, Proposal, propose_from_lanes, why_no
 from rlftsim.goals.reach import BRISK, HORIZON_S
 from rlftsim.goals.recorded_manoeuvre import recorded_manoeuvre
 from rlftsim.scenario.types import ObjectType, Scenario
-from rlftsim.viewer.goal_picture import GoalMark, GoalPanel, draw_goals
+from rlftsim.viewer.goal_picture import DrawnGoal, GoalPanel, draw_goals
 
 SAMPLE, COLUMNS, DOTS_PER_INCH = 20, 5, 62
 
@@ -61,7 +61,7 @@ def is_vehicle(scenario: Scenario, track: int) -> bool:
 def panel(number: int, scenario: Scenario, track: int, proposals: tuple[Proposal, ...]) -> GoalPanel:
     """The proposals of one agent."""
     speed = Driver.of(scenario, track).speed_mps
-    marks = tuple(GoalMark(p.object_id, p.position, p.manoeuvre.value, p.way[:, :2]) for p in proposals)
+    marks = tuple(DrawnGoal(p.object_id, p.position, p.manoeuvre.value, p.way[:, :2]) for p in proposals)
     title = f"{number}: {scenario.scenario_id}, agent {scenario.tracks.object_id[track]}, {speed:.1f} m/s"
     return GoalPanel(title, scenario, marks)
 

@@ -1,7 +1,8 @@
-"""The plane: angles, frames and boxes as pure functions on tensors. Metres, radians, counter-clockwise, headings in [-pi, pi)."""
+"""The plane: angles, frames and boxes as pure functions on tensors, angles on arrays, too. Metres, radians, counter-clockwise, headings in [-pi, pi)."""
 
 import math
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -10,6 +11,11 @@ from torch import Tensor
 def wrap_angle(angle: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
     """The same angle in [-pi, pi)."""
     return torch.remainder(angle + math.pi, 2 * math.pi) - math.pi
+
+
+def wrapped(angle: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
+    """As `wrap_angle`, of an array."""
+    return np.remainder(angle + np.pi, 2 * np.pi) - np.pi
 
 
 def heading_vector(heading: Float[Tensor, "..."]) -> Float[Tensor, "... 2"]:

@@ -15,8 +15,10 @@ import torch
 from rlftsim import __version__
 from rlftsim.cli.data import SYNTHETIC, open_split
 from rlftsim.cli.experiment import ExperimentRecipe
+from rlftsim.cli.goals import Choice
 from rlftsim.cli.main import VERBS, main, parse
 from rlftsim.cli.train import RecipeName
+from rlftsim.goals.manoeuvre import Manoeuvre
 from rlftsim.policies.smart.config import smart_demo
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.recipes.smart import RECIPES
@@ -335,7 +337,12 @@ def test_proposals_are_printed_written_and_drawn(tmp_path, capsys):
     status, out, _ = run(capsys, "goals", "check", tmp_path / "g.json", "--data", "synthetic")
     assert status == 0
     assert f"agent {TURNS} (vehicle, 0.0 m/s) stands still" in out
-    assert "1 goals in 1 scenarios, 1 doubts" in out
+    assert out.count("stands still") == 3  # the alternatives are checked, too
+    assert "1 goals in 1 scenarios, 2 alternatives, 3 doubts" in out
+
+
+def test_every_manoeuvre_can_be_chosen():
+    assert set(typing.get_args(Choice)) == {"alternative", "recorded", *Manoeuvre}
 
 
 class SeesGoals(ConstantVelocity):

@@ -12,10 +12,11 @@ from rlftsim.errors import ConfigError, DataError
 from rlftsim.experiments import attainment
 from rlftsim.experiments.attainment import Attained, measure_attainment
 from rlftsim.experiments.catalogue import goal_conditioning, kinematic_controllability, maneuver_controllability
+from rlftsim.experiments.catalogue.controllability import contestants
 from rlftsim.experiments.contestants import BASE, Baseline, FineTuned, GoalTraining, finetune_config
 from rlftsim.experiments.evaluate import EvaluateConfig, evaluate
 from rlftsim.experiments.workshop import Workshop
-from rlftsim.goals.goals_file import GoalEntry, read_goals
+from rlftsim.goals.goals_file import GoalEntry, GoalsFile, read_goals, write_goals
 from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.scenario.dataset import write_dataset
 
@@ -98,6 +99,23 @@ def test_every_goal_is_given_alone_and_measured_once(workshop, monkeypatch):
     assert changed == {"bend"}
 
 
+def test_another_model_of_the_same_name_is_measured_anew(workshop, monkeypatch):
+    goal = GoalEntry("straight", 100, 1020.0, -200.0)
+    rows = {"one": Baseline("constant_velocity")}
+    for policy, reached in ((ConstantVelocity(), 0.0), (Seeker(), 1.0), (ConstantVelocity(), 0.0)):
+        monkeypatch.setattr(attainment, "load_policy", lambda name, device, policy=policy: policy)
+        assert measure_attainment(workshop, rows, [goal], name="again")["one"][0].reached == reached
+
+
+def test_two_processes_measure_what_one_does(data, tmp_path, workshop):
+    goals = [GoalEntry("straight", 100, 1020.0, -200.0), GoalEntry("bend", 100, 1030.0, -190.0)]
+    rows = {"blind": Baseline("constant_velocity")}
+    spread = Workshop(TINY, data, tmp_path, replace(QUICK, jobs=2))
+    found = [measure_attainment(one, rows, goals, name="spread") for one in (workshop, spread)]
+    assert found[0] == found[1]
+    assert len(list(tmp_path.rglob("attainment/spread/**/*.json"))) == 2
+
+
 # ---- kinematic ----------------------------------------------------------------------------------------------------------
 
 
@@ -133,7 +151,7 @@ def made_up_shares(labels, shares):
 def test_offsets_are_compared_scenario_by_scenario(workshop):
     offsets = kinematic_controllability.OFFSETS_S
     labels = [f"{h:+d} s" for h in offsets]
-    rows = list(kinematic_controllability.contestants())
+    rows = list(contestants())
     low, high = [[0.2] * 7, [0.4] * 7, [0.6] * 7], [[0.3] * 7, [0.5] * 7, [0.7] * 7]
     shares = {name: high if name == "indication, soft" else low for name in rows}
     measured = kinematic_controllability.Measured(offsets * 3, made_up_shares(labels, shares))
@@ -146,12 +164,31 @@ def test_offsets_are_compared_scenario_by_scenario(workshop):
     assert found.figure is not None
 
 
+def test_the_ego_is_asked_for_every_offset(workshop, monkeypatch):
+    asked = {}
+    monkeypatch.setattr(
+        kinematic_controllability, "measure_attainment", lambda w, rows, goals, name: asked.update({name: goals}) or {}
+    )
+    measured = kinematic_controllability.measure(workshop)
+    goals = asked[kinematic_controllability.NAME]
+    assert measured.offsets_s == kinematic_controllability.OFFSETS_S * 3
+    assert [goal.label for goal in goals[:7]] == ["-3 s", "-2 s", "-1 s", "+0 s", "+1 s", "+2 s", "+3 s"]
+    assert [(goal.scenario_id, goal.agent_id) for goal in goals[::7]] == [
+        ("straight", 100),
+        ("bend", 100),
+        ("standing", 105),
+    ]
+    monkeypatch.setattr(kinematic_controllability, "goal_of", lambda scenario, offset_s: None)
+    with pytest.raises(DataError, match="not one of 3 scenarios is recorded to the end"):
+        kinematic_controllability.measure(workshop)
+
+
 # ---- manoeuvres ---------------------------------------------------------------------------------------------------------
 
 
 def test_conditions_are_means_over_scenarios(workshop):
     labels = ["straight (recorded)", "left", "right"]
-    rows = list(kinematic_controllability.contestants())
+    rows = list(contestants())
     base, better = [[1.0, 0.0, 0.2], [0.8, 0.2, 0.2]], [[1.0, 0.4, 0.6], [0.8, 0.5, 0.5]]
     shares = {name: better if name == "concatenation, soft" else base for name in rows}
     measured = maneuver_controllability.Measured(made_up_shares(labels, shares))
@@ -191,6 +228,24 @@ def test_the_goals_are_written_for_a_person_to_edit(workshop, monkeypatch):
     path.unlink()
 
 
+@pytest.mark.parametrize(
+    ("goals", "message"),
+    [
+        ([("straight", 105, "left")], r"agent 105 is not the ego of scenario straight, only the ego is asked here: write agent 100"),
+        ([("straight", 999, "left")], "has no agent 999"),
+        ([("straight", 100, "straight (recorded)"), ("elsewhere", 7, "left")], "may do anything but what it did: take more"),
+    ],
+)  # fmt: skip
+def test_an_edited_goal_is_refused_before_anything_is_trained(goals, message, workshop):
+    path = maneuver_controllability.goals_path(workshop)
+    entries = [GoalEntry(scenario_id, agent, 1040.0, -200.0, label) for scenario_id, agent, label in goals]
+    write_goals(path, GoalsFile(tuple(entries[:1]), tuple(entries[1:])))
+    with pytest.raises(DataError, match=message):
+        maneuver_controllability.measure(workshop)
+    assert not (workshop.out / "runs").exists()
+    path.unlink()
+
+
 def made_up_proposals(scenario, track):
     from rlftsim.goals.manoeuvre import Manoeuvre
     from rlftsim.goals.proposals import Proposal
@@ -203,6 +258,20 @@ def made_up_proposals(scenario, track):
 
 
 # ---- goal conditioning --------------------------------------------------------------------------------------------------
+
+
+def test_variants_are_measured_asked_and_unasked_for_every_seed(workshop, monkeypatch):
+    calls = []
+
+    def measure(self, rows, goals="none"):
+        calls.append((goals, {name: len(seeds) for name, seeds in rows.items()}))
+        return {name: row(name, [0.5]) for name in rows}
+
+    monkeypatch.setattr(Workshop, "measure", measure)
+    measured = goal_conditioning.measure(replace(workshop, num_seeds=2))
+    twice = dict.fromkeys(goal_conditioning.VARIANTS, 2)
+    assert calls == [("none", {"goal-free": 1}), ("recorded", twice), ("none", twice)]
+    assert list(measured.asked) == list(measured.unasked) == list(goal_conditioning.VARIANTS)
 
 
 def test_following_is_told_with_its_cost(workshop):

@@ -5,7 +5,15 @@ import pytest
 import torch
 
 import scenes
-from rlftsim.goals.attainment import closest_m, is_missed_in_passing, is_passed, is_reached, rate, tolerance_m
+from rlftsim.goals.attainment import (
+    closest_m,
+    is_missed_in_passing,
+    is_passed,
+    is_reached,
+    outcome_of,
+    rate,
+    tolerance_m,
+)
 from rlftsim.goals.recorded import recorded_ends, recorded_goals
 from rlftsim.goals.types import Goals
 from rlftsim.realism.from_rollouts import logged_states
@@ -31,6 +39,15 @@ def test_reaching_is_ending_near_and_passing_is_having_been_near():
     assert is_reached(position, goals).tolist() == [[[True, False, False]]]
     assert is_passed(position, goals).tolist() == [[[True, True, False]]]
     assert closest_m(position, goals)[0, 0, 2] == pytest.approx(2.1)
+
+
+def test_the_outcome_of_a_goal_is_counted_over_its_rollouts_even_far_from_the_origin():
+    # at most half a metre apart are numbers of float32 near 8 000 km: x = 10, 40 and 7 m; goal at 10 m, 1 m to the side
+    way = torch.stack([along_x(end)[0, 0, 0].double() for end in (10.0, 40.0, 7.0)])
+    far = torch.tensor([8.0e6, -8.0e6], dtype=torch.float64)
+    outcome = outcome_of(way + far, (8.0e6 + 10.0, -8.0e6 + 1.0))
+    assert (outcome.reached, outcome.passed) == (pytest.approx(1 / 3), pytest.approx(2 / 3))
+    assert outcome.closest_m == pytest.approx((1 + 1 + math.hypot(3, 1)) / 3)
 
 
 def test_who_has_no_goal_meets_none_and_counts_nowhere():

@@ -7,7 +7,8 @@ import pytest
 from junction import BACK, BESIDE, DOUBLE_LINE, LANE, driving, relative
 
 import scenes
-from rlftsim.goals.lane_paths import Pose, lanes_for, neighbor_lanes, path_through
+from rlftsim.goals import lane_paths
+from rlftsim.goals.lane_paths import Pose, lanes_for, neighbor_lanes, path_through, paths_from
 from rlftsim.goals.manoeuvre import Manoeuvre, manoeuvre_of_turn
 from rlftsim.goals.proposals import Driver, propose_from_lanes, why_nothing
 from rlftsim.goals.reach import reach_along
@@ -27,6 +28,16 @@ def proposed(scenario, track=0, road_test=None):
 def test_lanes_go_on_where_others_begin():
     graph = lane_graph(driving())
     assert graph.successors == ((1, 3, 5), (2,), (), (4,), (), (6,), ())
+
+
+def test_a_lane_with_many_ways_onward_leaves_room_for_the_others(monkeypatch):
+    """Of the own lane's three ways two are looked at, and so is the only one of the lane beside it."""
+    monkeypatch.setattr(lane_paths, "AT_MOST_PATHS", 2)
+    graph = lane_graph(driving(BESIDE))
+    starts = [int(graph.first[lane]) for lane in (0, len(graph) - 1)]
+    pose = Pose(graph.points[starts[0]], 0.0)
+    lanes = lanes_for(graph, ObjectType.VEHICLE)
+    assert len(paths_from(lanes, pose, starts, length_m=120.0, ease_m=15.0)) == 3
 
 
 def test_geometry_finds_the_successors_that_the_synthetic_records_list(pack):

@@ -108,6 +108,22 @@ def test_goals_that_differ_between_rollouts_are_asked_of_all_the_others(measured
     torch.testing.assert_close(hard[0], torch.tensor([1.0, 1.0, 1.0]))
 
 
+@pytest.mark.parametrize("unused_m", [0.0, 10.0])
+def test_what_nobody_is_asked_earns_nothing(unused_m, measured):
+    """The second of three rollouts alone is asked to go to x = 10 m, and gets there: 1, whatever stands where the others have no goal."""
+    batch = collate([scenes.junction_with_light()])
+    row = batch.evaluated_mask[0].nonzero()[:1, 0]
+    mask = torch.zeros(1, 3, batch.agent_mask.shape[1], dtype=torch.bool)
+    mask[0, 1, row] = True
+    goals = torch.full((*mask.shape, 2), unused_m)
+    position = torch.zeros(*mask.shape, 80, 2) - 50.0
+    goals[0, 1, row] = position[0, 1, row, -1] = torch.tensor([10.0, 10.0])
+    rollouts = simulate_nothing(batch, position, Goals(goals, mask))
+    for kind in ("soft", "hard"):
+        reward = reward_by_name("goal")(measured[0], rollouts, batch, kind=kind)
+        torch.testing.assert_close(reward[0], torch.tensor([0.0, 1.0, 0.0]))
+
+
 def simulate_nothing(batch, position, goals):
     """Rollouts that go where they are put; nobody asks who decided."""
     heading = position[..., 0]
@@ -328,6 +344,16 @@ def test_stored_goals_come_to_the_agents_they_are_of(drawn_scenarios, tmp_path):
     assert mixed[0].position.equal(recorded_goals(batch).position)
     assert mixed[1].goal_mask[0].equal(goals.goal_mask[0])  # its own, and only those
     assert mixed[1].goal_mask[1].equal(recorded_goals(batch).goal_mask[1])  # there are none beside the recorded ones
+
+
+def test_a_folder_of_goals_says_whose_they_are(drawn_scenarios, tmp_path):
+    ids = [scenario.scenario_id for scenario in drawn_scenarios]
+    points = np.array([3, 5]), np.zeros((2, 2))
+    write_goal_part(tmp_path / "a" / "part-0.parquet", {ids[0]: points, ids[2]: points})
+    write_goal_part(tmp_path / "b" / "part-0.parquet", {ids[0]: points, ids[2]: (points[0], points[1] + 1e-3)})
+    stored = StoredGoals(tmp_path / "a")
+    assert (stored.count_among(ids), stored.count_among(ids[1:]), stored.count_among(["elsewhere"])) == (2, 1, 0)
+    assert stored.fingerprint == StoredGoals(tmp_path / "a").fingerprint != StoredGoals(tmp_path / "b").fingerprint
 
 
 def test_a_folder_without_goals_is_refused(tmp_path):

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Literal
 
 import numpy as np
 import tyro
@@ -18,11 +18,12 @@ from rlftsim.goals.proposals import Proposal, why_nothing
 from rlftsim.progress import print_wide, say
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.types import CURRENT_STEP, ObjectType, Scenario
-from rlftsim.viewer.goal_picture import GoalMark, GoalPanel, draw_goals
+from rlftsim.viewer.goal_picture import DrawnGoal, GoalPanel, draw_goals
 
 Choice = Literal[
     "alternative", "recorded", "straight", "left", "right", "left_uturn", "lane_change_left", "lane_change_right"
 ]
+"""The last six are those of `Manoeuvre`, spelt out for the command line."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +93,7 @@ class Propose:
 
 @dataclass(frozen=True)
 class Check:
-    """Check a goals file against its scenarios: who is asked, and what is doubtful."""
+    """Check a goals file, its alternatives included, against its scenarios: who is asked, and what is doubtful."""
 
     file: Positional[Path]
     """A goals file."""
@@ -104,13 +105,15 @@ class Check:
         scenarios, file = ScenarioDataset(data_folder(self.data)), read_goals(self.file)
         lines = [
             line
-            for scenario_id in file.scenario_ids
-            for entry in file.of_scenario(scenario_id)
-            for line in doubts(entry, _find(scenarios, scenario_id, self.data))
+            for entry in (*file.goals, *file.alternatives)
+            for line in doubts(entry, _find(scenarios, entry.scenario_id, self.data))
         ]
         for line in lines:
             print(line)
-        print(f"{self.file}: {len(file.goals)} goals in {len(file.scenario_ids)} scenarios, {len(lines)} doubts.")
+        print(
+            f"{self.file}: {len(file.goals)} goals in {len(file.scenario_ids)} scenarios, {len(file.alternatives)} alternatives, "
+            f"{len(lines)} doubts."
+        )
         return 0
 
 
@@ -187,10 +190,6 @@ def _add_rows(
 
 def _panel(scenario: Scenario, track: int, proposals: tuple[Proposal, ...]) -> GoalPanel:
     marks = tuple(
-        GoalMark(p.object_id, p.position, label_of(p), p.way[:, :2], is_recorded=p.is_recorded) for p in proposals
+        DrawnGoal(p.object_id, p.position, label_of(p), p.way[:, :2], is_recorded=p.is_recorded) for p in proposals
     )
     return GoalPanel(f"{scenario.scenario_id}, agent {scenario.tracks.object_id[track]}", scenario, marks)
-
-
-MANOEUVRES = get_args(Choice)[2:]
-"""Those of `goals.manoeuvre`, spelt out for the command line."""

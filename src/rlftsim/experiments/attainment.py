@@ -1,6 +1,6 @@
 """Who gets where it is asked to go: every goal given alone, to a policy that sees it or, as a baseline, to one that does not.
 
-A file a scenario is kept, so an interrupted measurement goes on.
+A file a scenario is kept, with the model's fingerprint, so an interrupted measurement goes on and another model is measured anew.
 """
 
 import json
@@ -11,20 +11,22 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Float
 
+from rlftsim import __version__
 from rlftsim.errors import DataError
 from rlftsim.experiments.contestants import Contestant
 from rlftsim.experiments.evaluate import EvaluateConfig, check_jobs, choose_scenarios, simulate_encoded
 from rlftsim.experiments.workshop import Workshop
 from rlftsim.files import write_text
-from rlftsim.goals.attainment import is_passed, is_reached
+from rlftsim.goals.attainment import outcome_of
 from rlftsim.goals.goals_file import GoalEntry
 from rlftsim.goals.placing import goals_of_batch
-from rlftsim.goals.types import Goals
 from rlftsim.processor import one_thread
 from rlftsim.progress import progress_bar
 from rlftsim.realism import SimulatedStates
 from rlftsim.recipes.models import load_policy
+from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import Policy, device_of, sees_goals
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import ScenarioDataset
@@ -73,19 +75,19 @@ def measure_attainment(
         name: of the folder of results.
     """
     models = workshop.models(list(rows.values()))
-    by_scenario: dict[str, list[GoalEntry]] = {}
+    asked: dict[str, list[GoalEntry]] = {}
     for goal in goals:
-        by_scenario.setdefault(goal.scenario_id, []).append(goal)
+        asked.setdefault(goal.scenario_id, []).append(goal)
     found = {}
     for row, contestant in rows.items():
         folder = workshop.out / FOLDER / name / workshop.evaluation_name(contestant)
         policy = load_policy(models[contestant], workshop.device)
-        job = _Job(policy, workshop.data, workshop.evaluation, by_scenario, folder)
+        job = _Job(policy, fingerprint_policy(policy), workshop.data, workshop.evaluation, asked, folder)
         check_jobs(job.config, device_of(policy))
-        missing = [i for i in by_scenario if _read(job.path_of(i), by_scenario[i]) is None]
-        with progress_bar(f"goals, {row}", len(by_scenario), len(by_scenario) - len(missing)) as advance, one_thread():
+        missing = [i for i in asked if _read(job, i) is None]
+        with progress_bar(f"goals, {row}", len(asked), len(asked) - len(missing)) as advance, one_thread():
             run_tasks(partial(_measure_scenario, job), missing, jobs=job.config.jobs, advance=advance)
-        attained = [one for i in by_scenario for one in _read(job.path_of(i), by_scenario[i]) or ()]
+        attained = [one for i in asked for one in _read(job, i) or ()]
         if len(attained) < len(goals):
             raise DataError(f"{folder}: results vanished meanwhile (another process in the same folder?): run again.")
         by_goal = {_key(one.entry): one for one in attained}
@@ -101,6 +103,7 @@ class _Job:
     """Handed to other processes."""
 
     policy: Policy
+    fingerprint: str
     data: Path
     config: EvaluateConfig
     goals: Mapping[str, Sequence[GoalEntry]]
@@ -109,19 +112,24 @@ class _Job:
     def path_of(self, scenario_id: str) -> Path:
         return self.folder / f"{scenario_id}.json"
 
+    def whose(self, scenario_id: str) -> dict[str, object]:
+        """What a file of results must say to be those of this job."""
+        goals = [[goal.agent_id, goal.x, goal.y] for goal in self.goals[scenario_id]]
+        return {"rlftsim": __version__, "policy": self.fingerprint, "goals": goals}
+
 
 def _key(entry: GoalEntry) -> tuple[str, int, float, float, str]:
     return entry.scenario_id, entry.agent_id, entry.x, entry.y, entry.label
 
 
-def _read(path: Path, goals: Sequence[GoalEntry]) -> tuple[Attained, ...] | None:
-    """What was measured of these goals; None where it is missing, damaged or of others."""
+def _read(job: _Job, scenario_id: str) -> tuple[Attained, ...] | None:
+    """What was measured of a scenario's goals; None where it is missing, damaged, or of other goals or another model."""
     try:
-        rows = json.loads(path.read_text())
-        asked = [[goal.agent_id, goal.x, goal.y] for goal in goals]
-        if [row["goal"] for row in rows] != asked:
+        found, whose = json.loads(job.path_of(scenario_id).read_text()), job.whose(scenario_id)
+        if {name: found[name] for name in whose} != whose:
             return None
-        return tuple(Attained(goal, row["reached"], row["passed"]) for goal, row in zip(goals, rows))
+        shares = zip(job.goals[scenario_id], found["reached"], found["passed"], strict=True)
+        return tuple(Attained(goal, reached, passed) for goal, reached, passed in shares)
     except (OSError, ValueError, KeyError, TypeError):
         return None
 
@@ -136,31 +144,18 @@ def _measure_scenario(
         context = job.policy.encode(batch)
     simulated = partial(simulate_encoded, job.policy, batch, context, job.config)
     blind = None if sees_goals(job.policy) else simulated()
-    rows = []
+    outcomes = []
     for goal in job.goals[scenario_id]:
         if is_stopped():
             return
         states = blind or simulated(goals=goals_of_batch([goal], batch))
-        reached, passed = _attained(states, goal)
-        rows.append({"goal": [goal.agent_id, goal.x, goal.y], "reached": reached, "passed": passed})
-    write_text(job.path_of(scenario_id), json.dumps(rows) + "\n")
+        outcomes.append(outcome_of(_way_of(states, goal.agent_id), (goal.x, goal.y)))
+    shares = {"reached": [one.reached for one in outcomes], "passed": [one.passed for one in outcomes]}
+    write_text(job.path_of(scenario_id), json.dumps(job.whose(scenario_id) | shares) + "\n")
     advance(1)
 
 
-def _attained(states: SimulatedStates, goal: GoalEntry) -> tuple[float, float]:
-    """Shares of the rollouts that reach and that pass a goal."""
-    row = int(np.flatnonzero(states.object_id == goal.agent_id)[0])
-    way = torch.stack([states.x[:, row].double() - goal.x, states.y[:, row].double() - goal.y], -1).float()
-    position = way[None, :, None]  # [1, N, 1, T, 2]
-    asked = Goals(
-        torch.zeros_like(position[..., 0, :]), torch.ones(position.shape[:3], dtype=torch.bool).to(way.device)
-    )
-    return float(is_reached(position, asked).double().mean()), float(is_passed(position, asked).double().mean())
-
-
-def by_scenario(values: Sequence[tuple[str, float]]) -> dict[str, float]:
-    """The mean of each scenario's values."""
-    collected: dict[str, list[float]] = {}
-    for scenario_id, value in values:
-        collected.setdefault(scenario_id, []).append(value)
-    return {scenario_id: float(np.mean(own)) for scenario_id, own in collected.items()}
+def _way_of(states: SimulatedStates, agent_id: int) -> Float[torch.Tensor, "N T 2"]:
+    """Where the rollouts took an agent, world frame."""
+    row = int(np.flatnonzero(states.object_id == agent_id)[0])
+    return torch.stack([states.x[:, row], states.y[:, row]], -1)

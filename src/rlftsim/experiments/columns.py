@@ -26,8 +26,9 @@ class ResultRow:
     miss_rate: MeanInterval | None = None
     """Share in [0, 1]."""
     passing_miss_rate: MeanInterval | None = None
+    """Share of the evaluated agents and rollouts, in [0, 1]."""
     min_passing_miss_rate: MeanInterval | None = None
-    """Share in [0, 1]."""
+    """Share of the evaluated agents that miss in every rollout, in [0, 1]."""
     note: str = ""
     emphasised: bool = False
 

@@ -1,4 +1,4 @@
-"""Goals that a map and the record propose; those of the map are never off the road."""
+"""Goals that a map and the record propose; those of a map that has road edges are never off the road."""
 
 from functools import partial
 

@@ -7,9 +7,11 @@ Three ways to ask, from hard to soft:
 * *missed in passing*: outside the goal's box at every simulated step. The box is the miss definition of the Waymo motion prediction
   challenge: along and across the heading at the goal, larger for long horizons, smaller for slow agents.
 
-Every function gives one truth value per (scenario, rollout, agent), False where there is no goal; `rate` takes the mean over those
-that have one.
+Who gets there is a truth value per (scenario, rollout, agent), False where there is no goal; `rate` takes the mean over those that have
+one, `outcome_of` over the rollouts of a single goal.
 """
+
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
@@ -18,7 +20,7 @@ from torch import Tensor
 from rlftsim.goals.types import Goals
 
 NEAR_M = 2.0
-HORIZON_S = (3.0, 5.0, 8.0)
+TOLERANCE_HORIZON_S = (3.0, 5.0, 8.0)
 SIDEWAYS_M = (1.0, 1.8, 3.0)
 ALONG_M = (2.0, 3.6, 6.0)
 """Tolerances at these horizons; linear between, constant before and beyond."""
@@ -45,6 +47,32 @@ def final_m(position: Float[Tensor, "B N A T 2"], goals: Goals) -> Float[Tensor,
 def closest_m(position: Float[Tensor, "B N A T 2"], goals: Goals) -> Float[Tensor, "B N A"]:
     """Distance to the goal at the step at which it is least, m; meaningless without a goal."""
     return (position - goals.position[..., None, :]).norm(dim=-1).amin(-1)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a single goal in some rollouts."""
+
+    reached: float
+    """Share of the rollouts that end within `NEAR_M`."""
+    passed: float
+    """Share of the rollouts that come within `NEAR_M` at some step."""
+    closest_m: float
+    """Mean over rollouts of the least distance."""
+
+
+def outcome_of(position: Float[Tensor, "N T 2"], goal: tuple[float, float]) -> Outcome:
+    """What became of an agent's goal. Both may be far from (0, 0), as in the world frame: they are subtracted in float64.
+
+    Args:
+        position: where the agent was simulated.
+        goal: where it should have gone.
+    """
+    away = (position.double() - torch.tensor(goal, dtype=torch.float64, device=position.device)).float()
+    away = away[None, :, None]  # [1, N, 1, T, 2]
+    here = Goals(torch.zeros_like(away[..., 0, :]), torch.ones_like(away[..., 0, 0], dtype=torch.bool))
+    found = (is_reached(away, here), is_passed(away, here), closest_m(away, here))
+    return Outcome(*(float(values.double().mean()) for values in found))
 
 
 def is_missed_in_passing(
@@ -81,7 +109,7 @@ def tolerance_m(speed: Float[Tensor, "*shape"], horizon_s: Float[Tensor, "*shape
         horizon_s: time from the current step to the goal.
     """
     factor = _interpolate(speed, (SLOW_MPS, FAST_MPS), (SLOW_FACTOR, 1.0))
-    widths = [_interpolate(horizon_s, HORIZON_S, sizes) for sizes in (ALONG_M, SIDEWAYS_M)]
+    widths = [_interpolate(horizon_s, TOLERANCE_HORIZON_S, sizes) for sizes in (ALONG_M, SIDEWAYS_M)]
     return factor[..., None] * torch.stack(widths, -1)
 
 

@@ -10,6 +10,7 @@ from itertools import islice
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
+from rlftsim.geometry import wrapped
 from rlftsim.scenario.lane_graph import LaneGraph
 from rlftsim.scenario.types import MapFeatureType, ObjectType
 
@@ -24,7 +25,7 @@ CYCLIST_MPS = 6.0
 
 SPACING_M = 1.0
 AT_MOST_PATHS = 200
-"""Of one search. Grids of short pieces have thousands, most of them alike."""
+"""From one start. Grids of short pieces have thousands, most of them alike."""
 MAX_LANE_DISTANCE_M = 2.5
 ALSO_M = 1.0
 """A lane counts as the own one, too, if it is at most this much farther than the nearest."""
@@ -106,7 +107,7 @@ def own_lanes(lanes: Lanes, pose: Pose) -> list[int]:
     graph = lanes.graph
     distance = np.linalg.norm(graph.points[:, :2] - pose.position[:2], axis=1)
     near = np.flatnonzero((distance <= MAX_LANE_DISTANCE_M) & lanes.usable[graph.owner])
-    near = near[np.abs(wrap(graph.heading[near] - pose.heading)) <= SAME_DIRECTION_RAD]
+    near = near[np.abs(wrapped(graph.heading[near] - pose.heading)) <= SAME_DIRECTION_RAD]
     nearest = nearest_of_each_lane(graph, near, distance)
     return [p for p in nearest if distance[p] <= distance[nearest[0]] + ALSO_M]
 
@@ -125,7 +126,7 @@ def neighbor_lanes(lanes: Lanes, pose: Pose, *, side: int) -> list[int]:
     near = (
         (np.abs(ahead) <= SPACING_M) & (side * sideways >= low) & (side * sideways <= high) & lanes.usable[graph.owner]
     )
-    near &= np.abs(wrap(graph.heading - pose.heading)) <= PARALLEL_RAD
+    near &= np.abs(wrapped(graph.heading - pose.heading)) <= PARALLEL_RAD
     return nearest_of_each_lane(graph, np.flatnonzero(near), np.hypot(ahead, sideways))
 
 
@@ -146,8 +147,8 @@ def paths_from(lanes: Lanes, pose: Pose, starts: list[int], *, length_m: float, 
         length_m: at most so long; shorter where the lanes end.
         ease_m: over which the way comes to the middle of the lane.
     """
-    chains = ((start, chain) for start in starts for chain in _chains(lanes, start, length_m))
-    paths = (_follow(lanes, pose, start, chain, length_m, ease_m) for start, chain in islice(chains, AT_MOST_PATHS))
+    chains = ((start, chain) for start in starts for chain in islice(_chains(lanes, start, length_m), AT_MOST_PATHS))
+    paths = (_follow(lanes, pose, start, chain, length_m, ease_m) for start, chain in chains)
     return [path for path in paths if path is not None]
 
 
@@ -163,13 +164,8 @@ def path_through(points: Float[np.ndarray, "n 3"], start_heading: float, limits:
     index = np.arange(last + 1)
     way = points[np.minimum(index + SMOOTHED_M, last)] - points[np.maximum(index - SMOOTHED_M, 0)]
     direction = np.unwrap(np.arctan2(way[:, 1], way[:, 0]))
-    turn = direction - direction[0] + float(wrap(direction[0] - start_heading))
+    turn = direction - direction[0] + float(wrapped(direction[:1] - start_heading)[0])
     return LanePath(points, turn, start_heading, limits)
-
-
-def wrap(angle: Float[np.ndarray, "..."] | float) -> Float[np.ndarray, "..."]:
-    """The same angle in [-pi, pi)."""
-    return np.asarray(np.remainder(np.asarray(angle) + np.pi, 2 * np.pi) - np.pi)
 
 
 def smooth_step(x: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:

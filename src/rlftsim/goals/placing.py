@@ -3,13 +3,12 @@
 from collections.abc import Sequence
 
 import numpy as np
-import torch
 
 from rlftsim.errors import DataError
 from rlftsim.goals.attainment import NEAR_M
 from rlftsim.goals.goals_file import GoalEntry
 from rlftsim.goals.reach import BRISK, HORIZON_S
-from rlftsim.goals.types import Goals
+from rlftsim.goals.types import Goals, goals_at
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import CURRENT_STEP, HISTORY_STEPS, ObjectType, Scenario
 
@@ -91,13 +90,10 @@ def goals_of_batch(entries: Sequence[GoalEntry], batch: ScenarioBatch) -> Goals:
     Raises:
         DataError: an entry of one of these scenarios is impossible, see `track_of`.
     """
-    position = torch.zeros(*batch.agent_mask.shape, 2, dtype=torch.float64)
-    mask = torch.zeros(batch.agent_mask.shape, dtype=torch.bool)
-    for row, scenario in enumerate(batch.scenarios):
-        for entry in entries:
-            if entry.scenario_id == scenario.scenario_id:
-                agent = int(np.searchsorted(scenario.simulated_indices, track_of(entry, scenario)))
-                position[row, agent] = torch.tensor([entry.x, entry.y], dtype=torch.float64)
-                mask[row, agent] = True
-    centred = (position - batch.origin.cpu()[:, None]).float() * mask[..., None]
-    return Goals.of_scenarios(centred, mask).to(batch.device)
+    points = {}
+    for scenario in batch.scenarios:
+        own = [entry for entry in entries if entry.scenario_id == scenario.scenario_id]
+        ids = [scenario.tracks.object_id[track_of(entry, scenario)] for entry in own]
+        places = [(entry.x, entry.y) for entry in own]
+        points[scenario.scenario_id] = np.array(ids, np.int64), np.array(places, np.float64).reshape(-1, 2)
+    return goals_at(points, batch)

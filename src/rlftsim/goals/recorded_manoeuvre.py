@@ -20,7 +20,8 @@ from rlftsim.scenario.types import CURRENT_STEP, ObjectType, Scenario
 
 IN_LANE_M = 1.5
 """From the middle of a lane, for somebody who is in it."""
-SPARE_M = 10.0
+BEYOND_END_M = 10.0
+"""Ways along the lanes are looked at so far beyond the way driven."""
 
 
 def recorded_manoeuvre(scenario: Scenario, track: int) -> Proposal | None:
@@ -62,14 +63,14 @@ def _lane_change(scenario: Scenario, track: int, way: Float[np.ndarray, "S 3"]) 
         return None
     lanes = lanes_for(lane_graph(scenario), driver.kind)
     driven_m = float(np.linalg.norm(np.diff(way[:, :2], axis=0), axis=1).sum())
-    own = own_paths(driver, lanes, length_m=driven_m + SPARE_M)
+    own = own_paths(driver, lanes, length_m=driven_m + BEYOND_END_M)
     if not own or distance_to(own, way[-1]) < LANE_CHANGE_OFFSET_M:
         return None
     for manoeuvre, side in ((Manoeuvre.LANE_CHANGE_LEFT, 1), (Manoeuvre.LANE_CHANGE_RIGHT, -1)):
         beside = [
             path
             for one in own
-            for path, _ in lane_change_paths(lanes, one, side=side, speed_mps=0.0, length_m=driven_m + SPARE_M)
+            for path, _ in lane_change_paths(lanes, one, side=side, speed_mps=0.0, length_m=driven_m + BEYOND_END_M)
         ]
         if beside and distance_to(beside, way[-1]) < IN_LANE_M:
             return manoeuvre

@@ -3,6 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
+from rlftsim.geometry import wrapped
 from rlftsim.goals.lane_paths import (
     EASE_M,
     SPACING_M,
@@ -14,7 +15,6 @@ from rlftsim.goals.lane_paths import (
     neighbor_lanes,
     path_through,
     paths_from,
-    wrap,
 )
 
 CHANGE_AFTER_M = (0, 10, 20, 30)
@@ -106,7 +106,7 @@ def _opposite(lanes: Lanes, pose: Pose) -> list[tuple[int, float]]:
     ahead, left = in_frame_of(pose, graph.points)
     low, high = UTURN_RADIUS_M
     near = (np.abs(ahead) <= SPACING_M) & (left >= 2 * low) & (left <= 2 * high) & lanes.usable[graph.owner]
-    near &= np.abs(wrap(graph.heading - pose.heading - np.pi)) <= OPPOSITE_RAD
+    near &= np.abs(wrapped(graph.heading - pose.heading - np.pi)) <= OPPOSITE_RAD
     nearest = nearest_of_each_lane(graph, np.flatnonzero(near), left)
     return [(point, float(left[point]) / 2) for point in nearest]
 

@@ -3,24 +3,22 @@
 For what programs make, such as the augmented goals of a whole data set. A person's goals are JSON (`goals.goals_file`).
 """
 
-from collections.abc import Mapping
+import hashlib
+from collections.abc import Iterable, Mapping
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-import torch
-from jaxtyping import Bool, Float, Int64
 
 from rlftsim.errors import DataError
 from rlftsim.files import write_whole
-from rlftsim.goals.types import Goals
+from rlftsim.goals.types import Goals, Points, goals_at
 from rlftsim.scenario.batch import ScenarioBatch
+from rlftsim.scenario.shards import hash_file
 
 SCHEMA = pa.schema([("scenario_id", pa.string()), ("object_id", pa.int64()), ("x", pa.float64()), ("y", pa.float64())])
-Points = tuple[Int64[np.ndarray, "n"], Float[np.ndarray, "n 2"]]
-"""Object ids and their goals."""
 
 
 def write_goal_part(path: Path, goals: Mapping[str, Points]) -> None:
@@ -48,11 +46,13 @@ class StoredGoals:
     """
 
     def __init__(self, folder: Path):
-        files = sorted(folder.glob("*.parquet"))
-        if not files:
+        self._files = sorted(folder.glob("*.parquet"))
+        if not self._files:
             raise DataError(f"{folder}: holds no goals: write them by `rlftsim augment`.")
         try:
-            self._table = pa.concat_tables([pq.read_table(file, schema=SCHEMA) for file in files]).combine_chunks()
+            self._table = pa.concat_tables(
+                [pq.read_table(file, schema=SCHEMA) for file in self._files]
+            ).combine_chunks()
         except (pa.ArrowException, OSError) as error:
             raise DataError(f"{folder}: damaged goals ({error}): remove the folder and write them again.") from None
 
@@ -70,34 +70,23 @@ class StoredGoals:
         """Scenarios."""
         return len(self._rows)
 
+    @cached_property
+    def fingerprint(self) -> str:
+        """Hash of the files' bytes, in the order of their names."""
+        return hashlib.sha256("".join(map(hash_file, self._files)).encode()).hexdigest()
+
+    def count_among(self, scenario_ids: Iterable[str]) -> int:
+        """How many of some scenarios have goals here; 0 for those of another data set."""
+        return sum(scenario_id in self for scenario_id in scenario_ids)
+
     def of_scenario(self, scenario_id: str) -> Points:
         """Object ids and goals of one of the scenarios."""
-        part = self._table.slice(self._rows[scenario_id].start, _length(self._rows[scenario_id]))
+        rows = self._rows[scenario_id]
+        part = self._table.slice(rows.start, rows.stop - rows.start)
         ids, x, y = (part[name].to_numpy() for name in ("object_id", "x", "y"))
         return ids, np.stack([x, y], -1)
 
     def of_batch(self, batch: ScenarioBatch) -> Goals:
         """The goals of a batch, for a single rollout, in its frame; agents and scenarios that have none have no goal."""
-        mask, position = np.zeros(batch.agent_mask.shape, bool), np.zeros((*batch.agent_mask.shape, 2), np.float32)
-        for b, scenario in enumerate(batch.scenarios):
-            if scenario.scenario_id in self:
-                ids, points = self.of_scenario(scenario.scenario_id)
-                own = batch.object_id[b, : len(scenario.simulated_indices)].cpu().numpy()
-                rows, known = _places(own, ids)
-                mask[b, : len(own)] = known
-                position[b, : len(own)][known] = points[rows[known]] - batch.origin[b].cpu().numpy()
-        goals = Goals.of_scenarios(torch.from_numpy(position), torch.from_numpy(mask))
-        return goals.to(batch.device)
-
-
-def _length(rows: slice) -> int:
-    return rows.stop - rows.start
-
-
-def _places(
-    wanted: Int64[np.ndarray, "A"], ids: Int64[np.ndarray, "n"]
-) -> tuple[Int64[np.ndarray, "A"], Bool[np.ndarray, "A"]]:
-    """Where ids stand in a list, and whether they do."""
-    order = np.argsort(ids)
-    place = order[np.searchsorted(ids[order], wanted).clip(max=len(ids) - 1)]
-    return place, ids[place] == wanted
+        ids = [scenario.scenario_id for scenario in batch.scenarios if scenario.scenario_id in self]
+        return goals_at({scenario_id: self.of_scenario(scenario_id) for scenario_id in ids}, batch)

@@ -1,12 +1,18 @@
 """What an agent is asked to do."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from rlftsim.errors import ConfigError
+from rlftsim.scenario.batch import ScenarioBatch, origin_of
+
+Points = tuple[Int64[np.ndarray, "n"], Float[np.ndarray, "n 2"]]
+"""Object ids, each once, and a point of each. Frame: world, metres, float64."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,10 +41,6 @@ class Goals:
         """The goals of some of the rollouts."""
         return Goals(self.position[:, selected], self.goal_mask[:, selected])
 
-    def scenarios(self, selected: slice) -> "Goals":
-        """The goals of some of the scenarios."""
-        return Goals(self.position[selected], self.goal_mask[selected])
-
     def repeat(self, num_rollouts: int) -> "Goals":
         """The goals of a single rollout, asked in N of them, without copies; goals of N rollouts as they are.
 
@@ -65,3 +67,22 @@ class Goals:
     def to(self, device: torch.device | str) -> "Goals":
         """The same goals on another device."""
         return Goals(self.position.to(device), self.goal_mask.to(device))
+
+
+def goals_at(points: Mapping[str, Points], batch: ScenarioBatch) -> Goals:
+    """Points of the world as goals of a batch, for a single rollout, in its frame.
+
+    Args:
+        points: by scenario id; those of agents that nobody simulates are left out.
+        batch: scenarios and agents that have no point have no goal.
+    """
+    mask = np.zeros(batch.agent_mask.shape, bool)
+    position = np.zeros((*mask.shape, 2), np.float32)
+    for row, scenario in enumerate(batch.scenarios):
+        if scenario.scenario_id in points:
+            ids, places = points[scenario.scenario_id]
+            simulated = scenario.tracks.object_id[scenario.simulated_indices]
+            _, agents, asked = np.intersect1d(simulated, ids, return_indices=True)
+            mask[row, agents] = True
+            position[row, agents] = places[asked] - origin_of(scenario, batch.frame)
+    return Goals.of_scenarios(torch.from_numpy(position), torch.from_numpy(mask)).to(batch.device)

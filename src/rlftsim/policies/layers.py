@@ -263,7 +263,7 @@ def _describe_in_place(
 ) -> Float[Tensor, "r K W"]:
     """The same without gradient and copies: a last map whose outputs have mean zero leaves only a division to normalise."""
     last: nn.Linear = embedding.out[-1]  # type: ignore[assignment]
-    hidden = embedding.out[:-1](embedding.embed_inputs(values.flatten(0, 1)))
+    hidden = embedding.out[:-1](embedding.embed_inputs(values.flatten(0, 1))).to(last.weight.dtype)
     dim = last.out_features
     known = hidden.new_empty(*values.shape[:2], dim if features is None else 2 * dim)
     relation = known.flatten(0, 1)[:, :dim]
@@ -408,7 +408,7 @@ class RelationAttention(nn.Module):
         parts = zip(values, norms, (pointers.marked, pointers.features))
         said = torch.stack([value(part * norm.weight + norm.bias) for value, norm, part in parts]).sum(0)
         change = torch.tanh(score / 2) * (said.view_as(own) - own)
-        return message.index_add(0, pointers.rows, change.flatten(-2))
+        return message.index_add(0, pointers.rows, change.flatten(-2).to(message.dtype))
 
     def _by_head(self, maps: tuple[nn.Linear, ...], norms: tuple[nn.LayerNorm, ...]) -> Float[Tensor, "H d W"]:
         """Weights of maps of relations and sources with their norms' weights inside."""

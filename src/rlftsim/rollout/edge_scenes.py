@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from rlftsim.geometry import wrapped
 from rlftsim.scenario.types import CURRENT_STEP, LaneTopology, LightStates, MapFeatures, Scenario, Tracks
 
 EXACT_TURN_RAD = float(np.arctan2(4.0, 3.0))
@@ -34,7 +35,7 @@ def move_scenario(scenario: Scenario, turn_rad: float, shift_m: tuple[float, flo
         return ((points.astype(np.float64) - centre) @ matrix.T + centre + shift).astype(np.float32)
 
     tracks, features, lights = scenario.tracks, scenario.map_features, scenario.lights
-    heading = np.remainder(tracks.heading.astype(np.float64) + turn_rad + np.pi, 2 * np.pi) - np.pi
+    heading = wrapped(tracks.heading.astype(np.float64) + turn_rad)
     velocity = (tracks.velocity.astype(np.float64) @ matrix[:2, :2].T).astype(np.float32)
     return replace(
         scenario,

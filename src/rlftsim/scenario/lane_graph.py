@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int64
 
+from rlftsim.geometry import wrapped
 from rlftsim.scenario.derived import derived
 from rlftsim.scenario.types import LANE_TYPES, Scenario
 
@@ -98,7 +99,7 @@ def _successors(lines: list[Float[np.ndarray, "_ 3"]]) -> tuple[tuple[int, ...],
     into = _directions([line[: TANGENT_POINTS + 1] for line in lines])
     out_of = _directions([line[-TANGENT_POINTS - 1 :] for line in lines])
     gap = np.linalg.norm(ends[:, None] - starts[None], axis=-1)
-    bend = np.abs(np.remainder(into[None] - out_of[:, None] + np.pi, 2 * np.pi) - np.pi)
+    bend = np.abs(wrapped(into[None] - out_of[:, None]))
     joined = (gap <= JOINT_M) & (bend <= JOINT_RAD)
     np.fill_diagonal(joined, False)
     return tuple(tuple(np.flatnonzero(row).tolist()) for row in joined)

@@ -15,7 +15,8 @@ from torch import Tensor
 
 from rlftsim.errors import require_positive
 from rlftsim.goals.recorded import recorded_goals
-from rlftsim.goals.stored import Points, write_goal_part
+from rlftsim.goals.stored import write_goal_part
+from rlftsim.goals.types import Points
 from rlftsim.progress import progress_bar
 from rlftsim.realism import RealismResult, metric_by_name, score_batch
 from rlftsim.realism.from_rollouts import states_of_rollouts

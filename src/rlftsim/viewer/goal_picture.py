@@ -1,4 +1,4 @@
-"""Goals on a map: where agents are asked to go, the ways there, and where simulations took them. Frame: map."""
+"""Goals on a map: where agents are asked to go, the ways there, and where simulations took them. Handed over in the world frame, drawn in the map's."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -25,8 +25,8 @@ MIN_RADIUS_M = 30.0
 
 
 @dataclass(frozen=True, eq=False)
-class GoalMark:
-    """A goal of an agent."""
+class DrawnGoal:
+    """A goal of an agent, world frame, metres."""
 
     object_id: int
     position: Float[np.ndarray, "2"] | None = None
@@ -46,7 +46,7 @@ class GoalPanel:
 
     title: str
     scenario: Scenario
-    marks: tuple[GoalMark, ...]
+    marks: tuple[DrawnGoal, ...]
 
 
 def draw_goals(
@@ -78,7 +78,7 @@ def _draw_panel(axis: Axes, panel: GoalPanel) -> None:
         _draw_mark(axis, mark, panel.scenario.origin, GOAL_COLOURS[number % len(GOAL_COLOURS)])
 
 
-def _draw_mark(axis: Axes, mark: GoalMark, origin: Float[np.ndarray, "2"], colour: str) -> None:
+def _draw_mark(axis: Axes, mark: DrawnGoal, origin: Float[np.ndarray, "2"], colour: str) -> None:
     if mark.driven is not None:
         alpha = max(0.15, 1 / np.sqrt(len(mark.driven)))
         axis.add_collection(LineCollection(list(mark.driven - origin), colors=colour, lw=1, alpha=alpha), autolim=False)

@@ -144,6 +144,37 @@ def test_a_model_that_sees_goals_keeps_the_contract(sight, base):
     assert report.is_passed, str(report)
 
 
+def scored(policy, batch, rollouts):
+    """Mean log-probability of what was decided and its gradient."""
+    policy.zero_grad()
+    decided = policy.score(policy.encode(batch), rollouts).log_prob(rollouts.decision)[rollouts.decision_mask].mean()
+    decided.backward()
+    return float(decided.detach()), {
+        name: p.grad.clone() for name, p in policy.named_parameters() if p.grad is not None
+    }
+
+
+@each_sight
+@pytest.mark.parametrize("trained", ["all", "parts"])
+def test_goals_are_seen_in_half_precision_too(sight, trained, base, batch):
+    policy, goals = learned(base, sight), far_goals(batch)
+    if trained == "parts":
+        policy.requires_grad_(False)
+        for part in policy.fine_tuned_parts():
+            part.requires_grad_(True)
+    with torch.autocast("cpu", torch.bfloat16):
+        rollouts = simulate(policy, batch, num_rollouts=2, seed=5, goals=goals)
+        torch.clear_autocast_cache()  # as at the end of an update's rollouts
+        mixed, mixed_gradients = scored(policy, batch, rollouts)
+    exact, gradients = scored(policy, batch, rollouts)
+    assert mixed != exact
+    assert mixed == pytest.approx(exact, rel=0.02)
+    assert mixed_gradients.keys() == gradients.keys()
+    sizes = [sum(float(g.square().sum()) for g in found.values()) ** 0.5 for found in (mixed_gradients, gradients)]
+    assert sizes[0] == pytest.approx(sizes[1], rel=0.2)
+    assert any(".goal." in name for name in gradients)
+
+
 @each_sight
 def test_a_model_that_sees_goals_is_saved_and_read(sight, base, batch, tmp_path):
     policy = learned(base, sight)

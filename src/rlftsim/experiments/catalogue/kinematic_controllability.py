@@ -9,14 +9,23 @@ from matplotlib.figure import Figure
 
 from rlftsim.errors import DataError
 from rlftsim.experiments.attainment import Attained, held_out, measure_attainment
-from rlftsim.experiments.catalogue.goal_conditioning import GOAL_FREE, START, VARIANTS
-from rlftsim.experiments.contestants import BASE, Contestant
+from rlftsim.experiments.catalogue.controllability import (
+    SEED_NOTE,
+    WAYS,
+    bands_of,
+    contestants,
+    estimate,
+    gain_words,
+    paired_gain,
+    shares_by_scenario,
+)
+from rlftsim.experiments.catalogue.goal_conditioning import START, VARIANTS
 from rlftsim.experiments.findings import Experiment, Findings, TextTable, budget_note
 from rlftsim.experiments.workshop import Workshop
 from rlftsim.goals.goals_file import GoalEntry
-from rlftsim.intervals import MeanInterval, mean_interval
+from rlftsim.intervals import MeanInterval
 from rlftsim.scenario.types import STEP_S, TOTAL_STEPS, Scenario
-from rlftsim.viewer.figure import Band, Panel, draw_panels
+from rlftsim.viewer.figure import Panel, draw_panels
 
 NAME = "kinematic-controllability"
 OFFSETS_S = (-3, -2, -1, 0, 1, 2, 3)
@@ -26,7 +35,6 @@ YAW_RATE_STEPS = 5
 """Steps over which the turn rate at the end is read off the record."""
 MAX_CURVATURE_PER_M = 0.2
 """A car turns no tighter, however its recorded heading jitters."""
-WAYS = {"passed": "passed [%]", "reached": "reached [%]"}
 
 
 @dataclass(frozen=True)
@@ -35,11 +43,6 @@ class Measured:
 
     offsets_s: tuple[int, ...]
     attained: Mapping[str, tuple[Attained, ...]]
-
-
-def contestants() -> dict[str, Contestant]:
-    """The models that see no goals, and the four variants."""
-    return {"base": BASE, START: GOAL_FREE, **VARIANTS}
 
 
 def goal_of(scenario: Scenario, offset_s: int) -> GoalEntry | None:
@@ -92,6 +95,7 @@ def conclude(measured: Measured, workshop: Workshop) -> Findings:
         verdicts=tuple(_verdict(measured, row, way) for way in WAYS for row in VARIANTS),
         notes=(
             budget_note(workshop),
+            SEED_NOTE,
             "H < 0: where the recorded ego was at that time before the end; H > 0: where it would be if speed and steering stayed. Only the "
             "ego has a goal. Passed: within 2 m at any time, reached: within 2 m after 8 s.",
             "A model that sees no goals is measured against them all the same: what it attains, it attains by chance or because it is right.",
@@ -106,14 +110,14 @@ def conclude(measured: Measured, workshop: Workshop) -> Findings:
     )  # fmt: skip
 
 
-def _shares(measured: Measured, row: str, way: str, offset_s: int) -> dict[str, float]:
-    """Shares of the rollouts by scenario at one offset."""
-    chosen = (one for h, one in zip(measured.offsets_s, measured.attained[row]) if h == offset_s)
-    return {one.entry.scenario_id: getattr(one, way) for one in chosen}
+def _shares(measured: Measured, row: str, way: str, offsets_s: Sequence[int]) -> dict[str, float]:
+    """Shares of the rollouts by scenario at some offsets."""
+    chosen = (one for h, one in zip(measured.offsets_s, measured.attained[row]) if h in offsets_s)
+    return shares_by_scenario(chosen, way)
 
 
 def _curve(measured: Measured, row: str, way: str) -> list[MeanInterval]:
-    return [mean_interval(np.array(list(_shares(measured, row, way, h).values()))) for h in OFFSETS_S]
+    return [estimate(_shares(measured, row, way, (h,)).values()) for h in OFFSETS_S]
 
 
 def _table(way: str, curves: Mapping[str, Sequence[MeanInterval]]) -> TextTable:
@@ -126,25 +130,8 @@ def _table(way: str, curves: Mapping[str, Sequence[MeanInterval]]) -> TextTable:
 
 def _verdict(measured: Measured, row: str, way: str) -> str:
     """A variant against the model without goals, over all offsets but 0, scenario by scenario."""
-    gains: dict[str, list[float]] = {}
-    for h in OFFSETS_S:
-        if h:
-            before, after = (_shares(measured, name, way, h) for name in (START, row))
-            for scenario_id, value in after.items():
-                gains.setdefault(scenario_id, []).append(value - before[scenario_id])
-    gain = mean_interval(np.array([np.mean(own) for own in gains.values()]))
-    return f"{row} against {START}, {way}, H ≠ 0: {gain_words(gain)}"
-
-
-def gain_words(gain: MeanInterval) -> str:
-    """A paired difference of shares as a verdict, in percentage points."""
-    low, high = (100 * v for v in gain.interval)
-    if gain.count < 2:
-        return "no verdict: fewer than two scenarios."
-    verdict = "no difference" if low <= 0 <= high else f"difference, for the {'better' if gain.mean > 0 else 'worse'}"
-    return (
-        f"{verdict}: {100 * gain.mean:+.1f} points, 95% interval over {gain.count} scenarios [{low:+.1f}, {high:+.1f}]."
-    )
+    before, after = (_shares(measured, name, way, [h for h in OFFSETS_S if h]) for name in (START, row))
+    return f"{row} against {START}, {way}, H ≠ 0: {gain_words(paired_gain(before, after))}"
 
 
 def _figure(curves: Mapping[str, Mapping[str, Sequence[MeanInterval]]]) -> Figure:
@@ -154,28 +141,6 @@ def _figure(curves: Mapping[str, Mapping[str, Sequence[MeanInterval]]]) -> Figur
         panels, title="The ego asked to be there earlier or later", x_label="H [s]", y_label="rollouts [%], 95 % interval",
         ticks=ticks, columns=2,
     )  # fmt: skip
-
-
-def bands_of(curves: Mapping[str, Sequence[MeanInterval]]) -> tuple[Band, ...]:
-    """Curves of shares in percent; those of models without goals dashed with open dots, intervals beside each other and cut at 0 and 100."""
-    bands = []
-    for number, (name, curve) in enumerate(curves.items()):
-        place = np.arange(len(curve)) + 0.07 * (number - (len(curves) - 1) / 2)
-        mean, low, high = (100 * np.array(v) for v in ([m.mean for m in curve], *zip(*(m.interval for m in curve))))
-        sees = name in VARIANTS
-        colour = list(VARIANTS).index(name) if sees else 4 + (name == START)
-        bands.append(
-            Band(
-                name,
-                place,
-                mean,
-                low.clip(0, 100),
-                high.clip(0, 100),
-                style="measured" if sees else "theory",
-                colour=colour,
-            )
-        )
-    return tuple(bands)
 
 
 EXPERIMENT = Experiment(

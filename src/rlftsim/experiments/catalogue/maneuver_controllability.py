@@ -4,26 +4,34 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 from matplotlib.figure import Figure
 
 from rlftsim.errors import DataError
-from rlftsim.experiments.attainment import Attained, by_scenario, held_out, measure_attainment
+from rlftsim.experiments.attainment import Attained, held_out, measure_attainment
 from rlftsim.experiments.catalogue import published
+from rlftsim.experiments.catalogue.controllability import (
+    SEED_NOTE,
+    WAYS,
+    bands_of,
+    contestants,
+    estimate,
+    gain_words,
+    paired_gain,
+    shares_by_scenario,
+)
 from rlftsim.experiments.catalogue.goal_conditioning import START, VARIANTS
-from rlftsim.experiments.catalogue.kinematic_controllability import bands_of, contestants, gain_words
 from rlftsim.experiments.findings import Experiment, Findings, TextTable, budget_note
 from rlftsim.experiments.goal_proposals import RECORDED, entry_of, propose
 from rlftsim.experiments.workshop import Workshop
-from rlftsim.goals.goals_file import GoalsFile, read_goals, write_goals
+from rlftsim.goals.goals_file import GoalEntry, GoalsFile, read_goals, write_goals
 from rlftsim.goals.manoeuvre import Manoeuvre
-from rlftsim.intervals import MeanInterval, mean_interval
+from rlftsim.goals.placing import track_of
+from rlftsim.intervals import MeanInterval
 from rlftsim.scenario.dataset import ScenarioDataset
+from rlftsim.scenario.types import Scenario
 from rlftsim.viewer.figure import Panel, draw_panels
 
 NAME = "maneuver-controllability"
-WAYS = {"passed": "passed [%]", "reached": "reached [%]"}
-"""Shares of the rollouts."""
 ONCE = {"passed_once": "goals passed in some rollout [%]", "reached_once": "goals reached in some rollout [%]"}
 """Shares of the goals. The paper does not say how it counts several rollouts of a goal; its shares are those of whole goals."""
 IS_IN: dict[str, Callable[[Attained], bool]] = {
@@ -75,7 +83,8 @@ def measure(workshop: Workshop) -> Measured:
     goals = [goal for goal in (*file.goals, *file.alternatives) if goal.scenario_id in ids]
     for goal in goals:
         _manoeuvre(goal.label, str(goal))
-    if not file.alternatives or not goals:
+        _require_ego(goal, dataset.by_id(goal.scenario_id))
+    if all(goal.label.endswith(RECORDED) for goal in goals):
         raise DataError(
             f"{path}: not one ego of {len(ids)} scenarios may do anything but what it did: take more scenarios."
         )
@@ -96,6 +105,7 @@ def conclude(measured: Measured, workshop: Workshop) -> Findings:
         verdicts=tuple(_verdict(measured, row, way) for way in (*WAYS, "passed_once") for row in VARIANTS),
         notes=(
             budget_note(workshop),
+            SEED_NOTE,
             f"The goals are in {NAME}.goals.json beside this table: recorded manoeuvres with their recorded ends, alternatives as the lanes propose them. "
             "Edit them, and the same command measures the edited ones.",
             "Only the ego has a goal, and only scenarios count in which it has a recorded and an alternative manoeuvre. Every goal is "
@@ -124,17 +134,30 @@ def _manoeuvre(label: str, place: str) -> Manoeuvre:
         raise DataError(f"{place}: label {label!r} names no manoeuvre: known are {known}, each with {RECORDED!r} if recorded.") from None  # fmt: skip
 
 
+def _require_ego(goal: GoalEntry, scenario: Scenario) -> None:
+    """Refuse goals of others.
+
+    Raises:
+        DataError: another agent is asked, or the goal is impossible.
+    """
+    if track_of(goal, scenario) != scenario.ego_index:
+        ego = int(scenario.tracks.object_id[scenario.ego_index])
+        raise DataError(
+            f"{goal}: agent {goal.agent_id} is not the ego of scenario {scenario.scenario_id}, only the ego is asked here: "
+            f"write agent {ego}, or remove the entry."
+        )
+
+
 def _shares(measured: Measured, row: str, way: str, condition: str) -> dict[str, float]:
     """Mean share of the rollouts over a scenario's goals of a condition, by scenario."""
     if condition == MIXED:
         one, other = (_shares(measured, row, way, name) for name in IS_IN)
         return {scenario_id: (one[scenario_id] + other[scenario_id]) / 2 for scenario_id in one if scenario_id in other}
-    chosen = [one for one in measured.attained[row] if IS_IN[condition](one)]
-    return by_scenario([(one.entry.scenario_id, getattr(one, way)) for one in chosen])
+    return shares_by_scenario(filter(IS_IN[condition], measured.attained[row]), way)
 
 
 def _by_condition(measured: Measured, row: str, way: str) -> list[MeanInterval]:
-    return [mean_interval(np.array(list(_shares(measured, row, way, c).values()))) for c in CONDITIONS]
+    return [estimate(_shares(measured, row, way, c).values()) for c in CONDITIONS]
 
 
 def _by_manoeuvre(measured: Measured, row: str, way: str, condition: str) -> dict[Manoeuvre, MeanInterval]:
@@ -142,7 +165,7 @@ def _by_manoeuvre(measured: Measured, row: str, way: str, condition: str) -> dic
     for one in measured.attained[row]:
         if IS_IN[condition](one):
             values[_manoeuvre(one.entry.label, str(one.entry))].append(getattr(one, way))
-    return {m: mean_interval(np.array(own, float)) for m, own in values.items()}
+    return {m: estimate(own) for m, own in values.items()}
 
 
 def _cell(estimate: MeanInterval) -> str:
@@ -175,8 +198,7 @@ def _manoeuvre_table(measured: Measured, condition: str) -> TextTable:
 def _verdict(measured: Measured, row: str, way: str) -> str:
     """A variant against the model without goals, alternatives only."""
     before, after = (_shares(measured, name, way, ALTERNATIVE) for name in (START, row))
-    gain = mean_interval(np.array([after[i] - before[i] for i in after]))
-    mean = float(np.mean(list(before.values())))
+    gain, mean = paired_gain(before, after), estimate(before.values()).mean
     times = f" ({(mean + gain.mean) / mean:.2f} times)" if mean > 0 else ""
     return f"{row} against {START}, {way.replace('_', ' ')}, alternatives only{times}: {gain_words(gain)}"
 

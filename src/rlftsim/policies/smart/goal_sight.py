@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 
 from rlftsim.goals.types import Goals
-from rlftsim.policies.layers import FourierEmbedding, Pointers, normalize
+from rlftsim.policies.layers import FourierEmbedding, normalize
 from rlftsim.policies.smart.neighbors import Poses, relative_pose, within
 
 GOAL_POLYLINE_REACH_M = 200.0
@@ -95,36 +95,10 @@ class GoalMark(nn.Embedding):
         """A mark of zero is none."""
         nn.init.zeros_(self.weight)
 
-    def point(
-        self,
-        goals: SeenGoals,
-        poses: Poses,
-        rows: tuple[Tensor, ...],
-        map_poses: Poses,
-        map_features: Float[Tensor, "BM D"],
-        embedding: FourierEmbedding,
-        *,
-        seam_rad: float,
-    ) -> Pointers:
-        """Point the rows whose agents have goals to their polylines.
-
-        Args:
-            goals: of all agents.
-            poses: of the rows.
-            rows: scenario, rollout, agent and step of each.
-            map_poses: of all map tokens.
-            map_features: normalised features of the same.
-            embedding: of relations to the map; not its table, which ends where ordinary relations do.
-            seam_rad: see `relative_pose`.
-        """
-        polyline = goals.polyline[rows[:3]]
-        carriers = (polyline >= 0).nonzero()[:, 0]
-        token = polyline[carriers]
-        values = relative_pose(poses[carriers], map_poses[token[:, None]], seam_rad=seam_rad)[:, 0]
-        mark = self.weight.expand(len(carriers), -1)
-        return Pointers(
-            rows=carriers,
-            relation=normalize(embedding(values, torch.zeros_like(mark))),
-            marked=normalize(embedding(values, mark)),
-            features=map_features[token],
-        )
+    def mark(
+        self, embedding: FourierEmbedding, values: Float[Tensor, "g n"]
+    ) -> tuple[Float[Tensor, "g D"], Float[Tensor, "g D"]]:
+        """Normalised embeddings of relations, as they are and with the mark."""
+        mark = self.weight.expand(len(values), -1)
+        nothing = torch.zeros_like(mark)  # so that both round alike in half precision
+        return normalize(embedding(values, nothing)), normalize(embedding(values, mark))

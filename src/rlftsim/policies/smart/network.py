@@ -56,6 +56,11 @@ class Scene:
     """Embedding of every motion token."""
     relations: "Relations"
 
+    @property
+    def map_poses(self) -> Poses:
+        """Of all map tokens, scenarios one after the other."""
+        return Poses(self.map_position.flatten(0, 1), self.map_heading.flatten())
+
 
 @dataclass(frozen=True, eq=False)
 class Relations:
@@ -220,11 +225,12 @@ class AgentDecoder(nn.Module):
         row_of[rows] = torch.arange(len(rows[0]), device=row_of.device)
         new_past = _extend(past, steps, torch.where(row_of >= 0, row_of + first_row, -1))
 
-        x = self._embed_steps(scene, steps, rows, goals)
-        before = self._look_back(scene, new_past, steps, rows, hidden)
-        around = self._look_at_map(scene, steps, rows)
-        pointers = self._point_at_goals(scene, steps, rows, goals)
-        others = self._look_at_agents(scene, steps, rows, row_of)
+        poses = Poses(steps.position, steps.heading)[rows]
+        x = self._embed_steps(scene, steps, rows, poses, goals)
+        before = self._look_back(scene, new_past, steps, rows, poses, hidden)
+        around = self._look_at_map(scene, rows, poses)
+        pointers = self._point_at_goals(scene, rows, poses, goals)
+        others = self._look_at_agents(scene, steps, rows, poses, row_of)
         sources = []
         for index, layers in enumerate(zip(self.time_layers, self.map_layers, self.agent_layers)):
             time_layer, map_layer, agent_layer = layers
@@ -237,15 +243,15 @@ class AgentDecoder(nn.Module):
         return x, Past(new_past.position, new_past.heading, new_past.row, tuple(sources))
 
     def _embed_steps(
-        self, scene: Scene, steps: TokenSteps, rows: tuple[Tensor, ...], goals: SeenGoals | None
+        self, scene: Scene, steps: TokenSteps, rows: tuple[Tensor, ...], poses: Poses, goals: SeenGoals | None
     ) -> Float[Tensor, "R D"]:
         scenario, _, agent, _ = rows
-        motion, heading = steps.motion[rows], steps.heading[rows]
-        motion_values = torch.stack([motion.norm(dim=-1), angle_between(heading_vector(heading), motion)], -1)
+        motion = steps.motion[rows]
+        motion_values = torch.stack([motion.norm(dim=-1), angle_between(heading_vector(poses.heading), motion)], -1)
         known = scene.agent_features[scenario, agent]
         if goals is not None and isinstance(self.goal, GoalState):
-            poses = Poses(steps.position, steps.heading)[rows]
-            known = known.index_add(0, *self.goal.look(goals, poses, rows, seam_rad=self.config.seam_rad))
+            carriers, seen = self.goal.look(goals, poses, rows, seam_rad=self.config.seam_rad)
+            known = known.index_add(0, carriers, seen.to(known.dtype))
         state = self.motion(motion_values, known)
         token = scene.token_features[scene.class_id[scenario, agent], steps.token_id[rows]]
         return self.fusion(torch.cat([token, state], -1))
@@ -256,6 +262,7 @@ class AgentDecoder(nn.Module):
         past: Past,
         steps: TokenSteps,
         rows: tuple[Tensor, ...],
+        poses: Poses,
         hidden: Bool[Tensor, "B N A K"] | None,
     ) -> Surroundings:
         """Up to `history_tokens` earlier steps of the same agent."""
@@ -270,44 +277,43 @@ class AgentDecoder(nn.Module):
             mask = mask & ~hidden[place] & ~hidden[rows][:, None]
         elif self.training and self.config.history_drop:
             mask = mask & (torch.rand(mask.shape, device=mask.device) >= self.config.history_drop)
-        values = relative_pose(
-            Poses(steps.position, steps.heading)[rows],
-            Poses(past.position, past.heading)[place],
-            seam_rad=self.config.seam_rad,
-        )
+        values = relative_pose(poses, Poses(past.position, past.heading)[place], seam_rad=self.config.seam_rad)
         values = torch.cat([values, -lag[:, None].expand(len(step), -1, 1).to(values.dtype)], -1)
         return surround(scene.relations.time, values, row.clamp(min=0), mask, dim=self.config.dim)
 
-    def _look_at_map(self, scene: Scene, steps: TokenSteps, rows: tuple[Tensor, ...]) -> Surroundings:
+    def _look_at_map(self, scene: Scene, rows: tuple[Tensor, ...], poses: Poses) -> Surroundings:
         """Map tokens of the own scenario within reach."""
-        poses = Poses(steps.position, steps.heading)[rows]
         neighbors = within(
             poses.position, rows[0], nowhere_unless(scene.map_mask, scene.map_position), None,
             radius_m=self.config.agent_map_radius_m, limit=self.config.max_agent_map_neighbors,
         )  # fmt: skip
-        sources = Poses(scene.map_position.flatten(0, 1), scene.map_heading.flatten())
-        return self._surround(scene.relations.map, poses, sources, neighbors, features=scene.map_features)
+        return self._surround(scene.relations.map, poses, scene.map_poses, neighbors, features=scene.map_features)
 
     def _point_at_goals(
-        self, scene: Scene, steps: TokenSteps, rows: tuple[Tensor, ...], goals: SeenGoals | None
+        self, scene: Scene, rows: tuple[Tensor, ...], poses: Poses, goals: SeenGoals | None
     ) -> Pointers | None:
         """Each agent's goal polyline; None where the model does not see goals so, or nobody has one."""
         if goals is None or not isinstance(self.goal, GoalMark):
             return None
-        poses = Poses(steps.position, steps.heading)[rows]
-        map_poses = Poses(scene.map_position.flatten(0, 1), scene.map_heading.flatten())
-        return self.goal.point(
-            goals, poses, rows, map_poses, scene.map_features, self.map_relation, seam_rad=self.config.seam_rad
-        )
+        polyline = goals.polyline[rows[:3]]
+        carriers = (polyline >= 0).nonzero()[:, 0]
+        token = polyline[carriers]
+        values = relative_pose(poses[carriers], scene.map_poses[token[:, None]], seam_rad=self.config.seam_rad)[:, 0]
+        # the embedding itself: its table ends where ordinary relations do
+        return Pointers(carriers, *self.goal.mark(self.map_relation, values), scene.map_features[token])
 
     def _look_at_agents(
-        self, scene: Scene, steps: TokenSteps, rows: tuple[Tensor, ...], row_of: Int64[Tensor, "B N A K"]
+        self,
+        scene: Scene,
+        steps: TokenSteps,
+        rows: tuple[Tensor, ...],
+        poses: Poses,
+        row_of: Int64[Tensor, "B N A K"],
     ) -> Surroundings:
         """Other agents of the same scenario, rollout and step within reach."""
         scenario, rollout, agent, step = rows
         candidates = nowhere_unless(steps.valid, steps.position).transpose(2, 3)  # [B, N, K, A, 2]
         _, num_rollouts, num_steps, _, _ = candidates.shape
-        poses = Poses(steps.position, steps.heading)[rows]
         neighbors = within(
             poses.position, (scenario * num_rollouts + rollout) * num_steps + step, candidates.flatten(0, 2), agent,
             radius_m=self.config.agent_radius_m, limit=self.config.max_agent_neighbors,

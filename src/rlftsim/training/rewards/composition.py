@@ -13,7 +13,7 @@ the weighted sum of theirs.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import torch
@@ -41,10 +41,6 @@ class Rewards:
     """Their weighted sum."""
     by_agent: Float[Tensor, "B N A"]
     """What each agent's decisions earn: `total` for everybody, or W."""
-
-    def weighted(self, weight: Float[Tensor, "B N A"]) -> "Rewards":
-        """The same rewards, each agent's decisions counted so many times."""
-        return replace(self, by_agent=self.by_agent * weight)
 
 
 def compute_rewards(
