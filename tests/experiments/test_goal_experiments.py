@@ -43,10 +43,20 @@ def workshop(data, tmp_path_factory):
 
 def test_variants_start_from_the_realism_aligned_model(workshop):
     config = finetune_config(goal_conditioning.VARIANTS["indication, hard"], TINY.finetune)
-    assert (config.reward, config.goals.share) == ("0.9*mloo + 0.1*goal(kind='hard', reach_m=0.0)", 1.0)
-    assert finetune_config(FineTuned("mloo"), replace(TINY.finetune, goals=config.goals)).goals.share == 0.0
+    assert (config.reward, config.goals.share, config.goals.hindsight) == (
+        "0.9*mloo + 0.1*goal(kind='hard', reach_m=0.0)",
+        1.0,
+        1.0,
+    )
+    assert config.credit == "agent"
+    assert (
+        finetune_config(
+            FineTuned("mloo"), replace(TINY.finetune, goals=replace(config.goals, hindsight=0.0))
+        ).goals.share
+        == 0.0
+    )
     variant = goal_conditioning.VARIANTS["concatenation, soft"]
-    assert variant.name == "gcft-concat-soft-from-mloo-seed0-seed0"
+    assert variant.name == "gcft-concat-soft-agent-from-mloo-seed0-seed0"
     lineage = [one.name for one in workshop._lineage(variant)]
     assert lineage == ["base", "mloo-seed0", variant.name]
 

@@ -7,7 +7,7 @@ from rlftsim.policies.smart.config import GoalSight
 from rlftsim.recipes.smart import SmartRecipe
 from rlftsim.training.catk import CatkConfig
 from rlftsim.training.finetune import FinetuneConfig
-from rlftsim.training.goals import GoalConfig
+from rlftsim.training.goals import GoalConfig, with_goals_asked
 from rlftsim.training.rewards import CreditTo
 
 WEAK_EPOCHS = 1.0
@@ -95,7 +95,7 @@ def finetune_config(contestant: FineTuned, recipe: FinetuneConfig) -> FinetuneCo
     reward, goals = contestant.method, GoalConfig()
     if contestant.goals is not None:
         reward = f"{contestant.method}(kind='{contestant.goals.kind}')"
-        goals = replace(recipe.goals, share=recipe.goals.share or 1.0)
+        goals = with_goals_asked(recipe.goals)
     return replace(
         recipe, reward=reward, seed=contestant.seed, epochs=recipe.epochs * contestant.share, credit=contestant.credit, goals=goals,
     )  # fmt: skip

@@ -6,6 +6,7 @@ from rlftsim.policies.smart.config import SmartConfig, smart_demo, smart_mini, s
 from rlftsim.tokens.clustering import TokensConfig
 from rlftsim.training.catk import CatkConfig
 from rlftsim.training.finetune import FinetuneConfig
+from rlftsim.training.goals import GoalConfig, with_goals_asked
 from rlftsim.training.pretrain import PretrainConfig
 from rlftsim.training.reference import KlConfig
 
@@ -23,7 +24,7 @@ class SmartRecipe:
     def with_goals(self) -> "SmartRecipe":
         """The same, fine-tuning with goals: everybody is asked to go where the record ends. With the paper's reward; or by CAT-K, which then
         trains the weights that see goals and no others, on all tokens as candidates."""
-        goals = replace(self.finetune.goals, share=1.0)
+        goals = with_goals_asked(self.finetune.goals)
         catk = replace(self.catk, goal_share=1.0, trained="goals", num_candidates=self.tokens.num_tokens)
         return replace(self, finetune=replace(self.finetune, goals=goals, reward="gcft"), catk=catk)
 
@@ -54,7 +55,7 @@ def smart_demo_rlftsim() -> SmartRecipe:
         ),
         finetune=FinetuneConfig(
             epochs=1.5, batch_size=4, num_rollouts=8, rollouts_per_pass=8, learning_rate=3e-4, warmup_updates=5,
-            checkpoint_every=20, kl=KlConfig(target=0.05, initial_beta=0.01),
+            checkpoint_every=20, kl=KlConfig(target=0.05, initial_beta=0.01), goals=GoalConfig(learning_rate_scale=20.0),
         ),
         catk=CatkConfig(
             epochs=3.0, batch_size=8, learning_rate=3e-4, warmup_updates=5, gradient_clip=1.0, max_trained_agents=None,

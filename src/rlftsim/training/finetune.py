@@ -202,7 +202,10 @@ def prepare(policy: nn.Module, config: FinetuneConfig, device: torch.device) -> 
     freeze_untrained(policy, config.trained)
     reference = copy.deepcopy(policy).requires_grad_(False)
     optimizer = torch.optim.AdamW(
-        parameter_groups(policy, config.goals.learning_rate_scale), lr=config.learning_rate, betas=config.betas, weight_decay=config.weight_decay
+        parameter_groups(policy, config.goals.learning_rate_scale),
+        lr=config.learning_rate,
+        betas=config.betas,
+        weight_decay=config.weight_decay,
     )
     return Learner(policy, reference, optimizer, config.kl.initial_beta, config.goals.open_augmented())
 
@@ -325,7 +328,7 @@ def _accumulate_hindsight(
     learner.optimizer.zero_grad(set_to_none=True)
     num_scenarios, _ = _count(experiences, fabric)
     sums = torch.zeros(2, device=fabric.device, dtype=torch.float64)
-    others = look_back(experiences, parse_reward(config.reward), config.goals.hindsight_goals)
+    others = look_back(experiences, parse_reward(config.reward))
     for other, log_probs in zip(others, asked):
         for (rows, reward), old in zip(other.slices(config.rollouts_per_pass), log_probs):
             mask, decides = rows.decision_mask, rows.decision_mask.any(-1)

@@ -1,11 +1,7 @@
 """What agents are asked while a policy is fine-tuned."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
-
-from jaxtyping import Bool
-from torch import Tensor
 
 from rlftsim.errors import ConfigError, require_not_negative, require_positive
 from rlftsim.goals.recorded import recorded_goals
@@ -14,8 +10,6 @@ from rlftsim.goals.types import Goals
 from rlftsim.rollout.noise import draw_noise
 from rlftsim.rollout.policy import Policy, sees_goals
 from rlftsim.scenario.batch import ScenarioBatch
-
-HindsightGoals = Literal["most_realistic", "own"]
 
 
 @dataclass(frozen=True)
@@ -30,10 +24,7 @@ class GoalConfig:
     augmented_share: float = 0.5
     """Chance of a scenario that has such goals to use them instead of where the record ended."""
     hindsight: float = 0.0
-    """Weight of the same rollouts under other goals that are met (`training.hindsight`); 0 = they are not used so."""
-    hindsight_goals: HindsightGoals = "most_realistic"
-    """Where the scenario's most realistic rollout ended, as in the paper; or own: each rollout is asked to go where it went, so that every
-    one of them shows how a goal is met."""
+    """Weight of the same rollouts under goals that one of them has met (`training.hindsight`); 0 = they are not used so."""
     learning_rate_scale: float = 1.0
     """Of the weights that see goals, which begin at zero, against that of all others."""
 
@@ -55,6 +46,11 @@ class GoalConfig:
         return None if self.augmented is None else StoredGoals(Path(self.augmented))
 
 
+def with_goals_asked(config: GoalConfig) -> GoalConfig:
+    """The same, where it is silent as in the paper: everybody is asked, with hindsight."""
+    return replace(config, share=config.share or 1.0, hindsight=config.hindsight or 1.0)
+
+
 def refuse_goals(policy: Policy, share: float) -> None:
     """Refuse to train a policy with goals that it does not see.
 
@@ -65,12 +61,6 @@ def refuse_goals(policy: Policy, share: float) -> None:
         raise ConfigError(
             f"goals for a share of {share:g}, but this model does not see goals: add --goal concat or --goal indication."
         )
-
-
-def choose_agents(batch: ScenarioBatch, share: float, *, seed: int) -> Bool[Tensor, "B A"]:
-    """A share of the agents, each by its own luck, which depends on the seed and the scenario alone."""
-    luck = draw_noise(batch, range(1), seed=seed, purpose="told", per_agent=1)  # [B, 1, A, 1]
-    return (luck[:, 0, :, 0] < share) & batch.agent_mask
 
 
 def choose_goals(batch: ScenarioBatch, config: GoalConfig, augmented: StoredGoals | None, *, seed: int) -> Goals | None:

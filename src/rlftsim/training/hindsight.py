@@ -1,8 +1,8 @@
 """Hindsight within an update of fine-tuning with goals.
 
-Reaching a goal may be too rare to learn from. But every rollout gets somewhere: the rollouts of a scenario are looked at again as if other
-goals had been asked, ones that are known to be met. They were sampled under the first goals, so what each agent's decisions earn is
-weighted by how much likelier they are under the others (hindsight policy gradient, Rauber et al., 2019; RLFTSim, section 4.2).
+Reaching a goal may be too rare to learn from. But every rollout gets somewhere: the rollouts of a scenario are looked at again as if the
+goals had been where the most realistic of them ended. They were sampled under other goals, so what each agent's decisions earn is
+weighted by how much likelier they are under the new ones (hindsight policy gradient, Rauber et al., 2019; RLFTSim, section 4.2).
 `training.augment` uses the same idea before training.
 """
 
@@ -19,7 +19,6 @@ from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.training.augment import ends_of, most_realistic
 from rlftsim.training.experience import Experience, slices
-from rlftsim.training.goals import HindsightGoals
 from rlftsim.training.rewards import Term
 from rlftsim.training.rewards.goal import goal_advantage
 
@@ -41,8 +40,8 @@ class Relabelled:
         return slices(self.rollouts, self.earned, size)
 
 
-def look_back(experiences: Sequence[Experience], terms: Sequence[Term], goals: HindsightGoals) -> list[Relabelled]:
-    """The rollouts as if they had been sampled under goals that are met, and what that earns.
+def look_back(experiences: Sequence[Experience], terms: Sequence[Term]) -> list[Relabelled]:
+    """The rollouts as if they had been sampled under the goals that the most realistic one has met, and what that earns.
 
     Realism was rewarded before and does not depend on goals, so only goals count here; each agent earns its own share, because
     each agent's decisions have a ratio of their own.
@@ -50,14 +49,13 @@ def look_back(experiences: Sequence[Experience], terms: Sequence[Term], goals: H
     Args:
         experiences: of this process.
         terms: of the run's reward.
-        goals: whose ends they are, see `GoalConfig.hindsight_goals`.
     """
-    return [_relabel(experience, terms, goals) for experience in experiences]
+    return [_relabel(experience, terms) for experience in experiences]
 
 
-def _relabel(experience: Experience, terms: Sequence[Term], goals: HindsightGoals) -> Relabelled:
+def _relabel(experience: Experience, terms: Sequence[Term]) -> Relabelled:
     batch, rollouts = experience.batch, experience.rollouts
-    seen = replace(rollouts, goals=met_goals(rollouts, experience.scores, goals))
+    seen = replace(rollouts, goals=met_goals(rollouts, experience.scores))
     earned = rollouts.heading.new_zeros(rollouts.heading.shape[:3])
     for term in goal_terms(terms):
         earned = earned + term.weight * goal_advantage(seen, batch, **dict(term.options))  # type: ignore[arg-type]
@@ -69,11 +67,9 @@ def goal_terms(terms: Sequence[Term]) -> list[Term]:
     return [term for term in terms if term.name == "goal"]
 
 
-def met_goals(rollouts: Rollouts, scores: RealismResult, goals: HindsightGoals) -> Goals:
-    """For the agents that have goals: where their own rollout took them, or the most realistic one of their scenario."""
+def met_goals(rollouts: Rollouts, scores: RealismResult) -> Goals:
+    """For the agents that have goals: where the most realistic rollout of their scenario took them."""
     assert rollouts.goals is not None
-    if goals == "own":
-        return Goals(rollouts.position[..., -1, :], rollouts.goals.goal_mask)
     ends = Goals.of_scenarios(ends_of(rollouts, most_realistic(scores)), rollouts.goals.goal_mask[:, 0])
     return ends.repeat(rollouts.num_rollouts)
 

@@ -14,10 +14,10 @@ MISS = "passing_miss_rate"
 GOAL_FREE = FineTuned("mloo")
 """The realism-aligned model that learning to follow goals starts from."""
 VARIANTS = {
-    "concatenation, soft": FineTuned(GCFT, base=GOAL_FREE, goals=GoalTraining("concat", "soft")),
-    "concatenation, hard": FineTuned(GCFT, base=GOAL_FREE, goals=GoalTraining("concat", "hard")),
-    "indication, soft": FineTuned(GCFT, base=GOAL_FREE, goals=GoalTraining("indication", "soft")),
-    "indication, hard": FineTuned(GCFT, base=GOAL_FREE, goals=GoalTraining("indication", "hard")),
+    "concatenation, soft": FineTuned(GCFT, credit="agent", base=GOAL_FREE, goals=GoalTraining("concat", "soft")),
+    "concatenation, hard": FineTuned(GCFT, credit="agent", base=GOAL_FREE, goals=GoalTraining("concat", "hard")),
+    "indication, soft": FineTuned(GCFT, credit="agent", base=GOAL_FREE, goals=GoalTraining("indication", "soft")),
+    "indication, hard": FineTuned(GCFT, credit="agent", base=GOAL_FREE, goals=GoalTraining("indication", "hard")),
 }
 START = "goal-free"
 
