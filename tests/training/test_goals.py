@@ -176,6 +176,9 @@ def test_contradictory_settings_are_refused():
         GoalConfig(share=1.5)
     with pytest.raises(ConfigError, match=r"need goals: set goals\.share"):
         GoalConfig(hindsight=1.0)
+    for name in ("hindsight", "learning_rate_scale"):
+        with pytest.raises(ConfigError, match=f"{name} must be a finite number, got inf"):
+            GoalConfig(share=1.0, **{name: float("inf")})
     with pytest.raises(ConfigError, match=r"goals\.hindsight has no effect with reward 'mloo': add a term"):
         FinetuneConfig(goals=GoalConfig(share=1.0, hindsight=1.0))
 
@@ -391,6 +394,36 @@ def test_whoever_is_asked_nothing_goes_on_as_before_if_only_the_sight_of_goals_i
     assert unasked.decision.equal(before.decision)
     assert unasked.log_prob.equal(before.log_prob)
     assert not asked.log_prob.equal(before.log_prob)
+
+
+def test_augmented_goals_belong_to_a_run_wherever_they_lie(policy, drawn_scenarios, tmp_path):
+    """A typo claims no folder, a moved folder goes on, other goals under the same name do not."""
+    augment_goals(policy, drawn_scenarios, tmp_path / "goals", AugmentConfig(num_rollouts=2, top_k=8))
+    goals = GoalConfig(share=1.0, augmented=str(tmp_path / "gaols"))
+    config = replace(CONFIG, goals=goals, epochs=0.25)
+    with pytest.raises(DataError, match="holds no goals"):
+        finetune(copy.deepcopy(policy), drawn_scenarios, tmp_path / "run", config)
+    there = replace(config, goals=replace(goals, augmented=str(tmp_path / "goals")))
+    strangers = [replace(drawn_scenarios[0], scenario_id="elsewhere")]
+    with pytest.raises(DataError, match="its goals are of other scenarios"):
+        finetune(copy.deepcopy(policy), strangers, tmp_path / "run", there)
+    assert not (tmp_path / "run").exists()
+    (tmp_path / "goals").rename(tmp_path / "gaols")
+    finetune(copy.deepcopy(policy), drawn_scenarios, tmp_path / "run", config)
+    (tmp_path / "gaols").rename(tmp_path / "moved")
+    moved = replace(config, goals=replace(goals, augmented=str(tmp_path / "moved")))
+    finetune(copy.deepcopy(policy), drawn_scenarios, tmp_path / "run", moved)
+    scenario = drawn_scenarios[0]
+    point = (scenario.tracks.object_id[:1], scenario.origin[None] + 5.0)
+    write_goal_part(tmp_path / "moved" / "part-000009.parquet", {scenario.scenario_id: point})
+    with pytest.raises(CheckpointError, match="augmented_goals"):
+        finetune(copy.deepcopy(policy), drawn_scenarios, tmp_path / "run", moved)
+
+
+def test_rows_that_are_no_goals_are_refused(tmp_path):
+    write_goal_part(tmp_path / "part-0.parquet", {"s": (np.array([1]), np.array([[np.nan, 0.0]]))})
+    with pytest.raises(DataError, match="rows that are no goals"):
+        StoredGoals(tmp_path)
 
 
 def test_goals_of_two_rollouts_cannot_be_those_of_three(policy, batch):

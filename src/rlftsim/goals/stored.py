@@ -42,7 +42,7 @@ class StoredGoals:
     """The goals of a folder.
 
     Raises:
-        DataError: it holds no goals, or a file is damaged.
+        DataError: it holds no goals, a file is damaged, or a row is no goal.
     """
 
     def __init__(self, folder: Path):
@@ -55,6 +55,11 @@ class StoredGoals:
             ).combine_chunks()
         except (pa.ArrowException, OSError) as error:
             raise DataError(f"{folder}: damaged goals ({error}): remove the folder and write them again.") from None
+        points = np.stack([self._table[name].to_numpy().astype(float) for name in ("x", "y")])
+        if any(column.null_count for column in self._table.columns) or not np.isfinite(points).all():
+            raise DataError(
+                f"{folder}: holds rows that are no goals (a value is missing or not finite): write them by `rlftsim augment`."
+            )
 
     @cached_property
     def _rows(self) -> dict[str, slice]:

@@ -7,6 +7,7 @@ they do anything else (but for one thing: `MapFeatures.polygon_rest`); `Scenario
 Shapes: O objects, S steps at 10 Hz (91; 11 in a test split), F map features, P map points, K light states. Nothing here needs torch.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import cached_property
@@ -241,3 +242,9 @@ class Scenarios(Protocol):
     def __getitem__(self, position: int, /) -> Scenario:
         """One of them."""
         ...
+
+
+def scenario_ids_of(scenarios: Scenarios) -> Iterable[str]:
+    """Their ids in order; a data set knows them without reading its scenarios."""
+    known = getattr(scenarios, "scenario_ids", None)
+    return known if known is not None else (scenarios[i].scenario_id for i in range(len(scenarios)))

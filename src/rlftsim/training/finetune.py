@@ -170,9 +170,11 @@ def finetune(policy: Policy, scenarios: Scenarios, out: Path, config: FinetuneCo
     if not len(scenarios):
         raise ConfigError("no scenario to train on: is the data set empty, or the split misspelt?")
     refuse_goals(policy, config.goals.share)
+    augmented = config.goals.open_augmented(scenarios)
     fabric = start_fabric(config.device)
-    run = RunFolder(out, config, describe_inputs(policy, scenarios), writes=fabric.is_global_zero)
-    learner = prepare(policy, config, fabric.device)
+    inputs = describe_inputs(policy, scenarios) | ({"augmented_goals": augmented.fingerprint} if augmented else {})
+    run = RunFolder(out, config, inputs, writes=fabric.is_global_zero)
+    learner = prepare(policy, config, fabric.device, augmented)
     _resume(learner, run)
     total = config.num_updates(len(scenarios))
     with progress_bar("fine-tune", total, learner.update) as advance:
@@ -196,7 +198,9 @@ def finetune(policy: Policy, scenarios: Scenarios, out: Path, config: FinetuneCo
     return run.model
 
 
-def prepare(policy: nn.Module, config: FinetuneConfig, device: torch.device) -> Learner:
+def prepare(
+    policy: nn.Module, config: FinetuneConfig, device: torch.device, augmented: StoredGoals | None = None
+) -> Learner:
     """Freeze what is not trained, copy the reference, make the optimiser. Dropout is off from here on."""
     policy.to(device).eval()
     freeze_untrained(policy, config.trained)
@@ -207,7 +211,7 @@ def prepare(policy: nn.Module, config: FinetuneConfig, device: torch.device) -> 
         betas=config.betas,
         weight_decay=config.weight_decay,
     )
-    return Learner(policy, reference, optimizer, config.kl.initial_beta, config.goals.open_augmented())
+    return Learner(policy, reference, optimizer, config.kl.initial_beta, augmented)
 
 
 def update_policy(learner: Learner, batch: ScenarioBatch, config: FinetuneConfig, fabric: Fabric) -> dict[str, float]:

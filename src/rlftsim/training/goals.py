@@ -3,13 +3,15 @@
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from rlftsim.errors import ConfigError, require_not_negative, require_positive
+from rlftsim.errors import ConfigError, DataError, require_finite, require_not_negative, require_positive
 from rlftsim.goals.recorded import recorded_goals
 from rlftsim.goals.stored import StoredGoals
 from rlftsim.goals.types import Goals
+from rlftsim.progress import say
 from rlftsim.rollout.noise import draw_noise
 from rlftsim.rollout.policy import Policy, sees_goals
 from rlftsim.scenario.batch import ScenarioBatch
+from rlftsim.scenario.types import Scenarios, scenario_ids_of
 
 
 @dataclass(frozen=True)
@@ -32,18 +34,31 @@ class GoalConfig:
         for name in ("share", "augmented_share"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ConfigError(f"goals.{name} is a share in [0, 1], got {getattr(self, name)}.")
+        require_finite(self, ("hindsight", "learning_rate_scale"))
         require_not_negative(self, ("hindsight",))
         require_positive(self, ("learning_rate_scale",))
         if not self.share and (self.augmented or self.hindsight):
             raise ConfigError("goals.augmented and goals.hindsight need goals: set goals.share above 0, such as 1.")
 
-    def open_augmented(self) -> StoredGoals | None:
-        """The augmented goals; None = there are none.
+    def open_augmented(self, scenarios: Scenarios) -> StoredGoals | None:
+        """The augmented goals; None = there are none. Says so if some of the scenarios have none.
 
         Raises:
-            DataError: the folder holds no goals.
+            DataError: the folder holds no goals, or none of these scenarios.
         """
-        return None if self.augmented is None else StoredGoals(Path(self.augmented))
+        if self.augmented is None:
+            return None
+        stored = StoredGoals(Path(self.augmented))
+        count = stored.count_among(scenario_ids_of(scenarios))
+        if not count:
+            raise DataError(
+                f"{self.augmented}: its goals are of other scenarios: write them by `rlftsim augment` with the same data and split."
+            )
+        if count < len(scenarios):
+            say(
+                f"{self.augmented}: goals for {count} of {len(scenarios)} scenarios; the others go by their records alone"
+            )
+        return stored
 
 
 def with_goals_asked(config: GoalConfig) -> GoalConfig:

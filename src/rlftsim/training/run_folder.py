@@ -27,7 +27,7 @@ from rlftsim import __version__
 from rlftsim.errors import CheckpointError
 from rlftsim.files import write_text
 from rlftsim.rollout.fingerprint import fingerprint_policy
-from rlftsim.scenario.types import Scenarios
+from rlftsim.scenario.types import Scenarios, scenario_ids_of
 from rlftsim.training.checkpoint import newest_checkpoint
 
 PACKAGES = ("torch", "numpy", "pyarrow", "lightning-fabric", "safetensors")
@@ -35,9 +35,10 @@ PACKAGES = ("torch", "numpy", "pyarrow", "lightning-fabric", "safetensors")
 
 MAY_CHANGE = (
     *("checkpoint_every", "device.accelerator", "device.devices", "device.num_nodes", "device.threads"),
-    *("micro_batch_size", "micro_batch_cost", "rollouts_per_pass", "validation"),
+    *("micro_batch_size", "micro_batch_cost", "rollouts_per_pass", "validation", "goals.augmented"),
 )
-"""Settings, or whole groups of them, that a run may be continued with other values of: they change no estimate."""
+"""Settings, or whole groups of them, that a run may be continued with other values of: they change no estimate. (Where augmented goals lie
+may change; what they are is among a run's inputs.)"""
 
 
 def may_change(name: str) -> bool:
@@ -66,8 +67,7 @@ def board_tag(name: str) -> str:
 def describe_inputs(policy: object, scenarios: Scenarios) -> dict[str, str]:
     """What a run starts from, as hashes: weights, settings and vocabulary of the policy, and which scenarios in which order."""
     ids = hashlib.blake2b(digest_size=16)
-    known = getattr(scenarios, "scenario_ids", None)
-    for scenario_id in known if known is not None else (scenarios[i].scenario_id for i in range(len(scenarios))):
+    for scenario_id in scenario_ids_of(scenarios):
         ids.update(f"{scenario_id}\n".encode())
     return {"initial_policy": fingerprint_policy(policy), "scenarios": ids.hexdigest()}
 
