@@ -82,13 +82,13 @@ def test_the_goal_reward_of_hand_made_paths(measured):
     own = shares_by_name("goal")(measured[3], rollouts, batch)
     torch.testing.assert_close(own.sum(-1), soft)
     assert own[0, :, rows[2]].eq(0).all()  # never met by anybody
-    # with a reach of 96 m whoever stays 50 m (on both axes) from its goal has a part: 1 - (70.7 - 2) / 96
-    near = reward_by_name("goal")(measured[0], rollouts, batch, kind="hard", reach_m=96.0)
-    part = 1 - (50 * 2**0.5 - 2) / 96
-    ends = torch.tensor([part, part, (3 * part + 1) / 4])
-    torch.testing.assert_close(near[0], ends - (ends.sum() - ends) / 2)
-    with pytest.raises(ConfigError, match="metres, at least 0"):
-        reward_by_name("goal")(measured[0], rollouts, batch, reach_m=-1.0)
+    # in part: who stays 50 m on both axes from its goal has covered what is left of its way to it
+    part = reward_by_name("goal")(measured[0], rollouts, batch, kind="hard", partial=True)
+    ways = (goals.position[0, 0, rows] - batch.position[0, rows, 10]).norm(dim=-1) - 2.0
+    shares = 1 - ((50 * 2**0.5 - 2) / ways.clamp(min=2)).clamp(0, 1)
+    assert 0 < shares.max() < 1
+    ends = torch.stack([shares.mean(), shares.mean(), (shares[:3].sum() + 1) / 4])
+    torch.testing.assert_close(part[0], ends - (ends.sum() - ends) / 2)
     with pytest.raises(ConfigError, match="known kinds are soft, hard"):
         reward_by_name("goal")(measured[0], rollouts, batch, kind="medium")
 
@@ -141,10 +141,10 @@ def test_without_goals_there_is_no_goal_reward(measured):
 def test_gcft_is_written_as_the_sum_it_is():
     assert (
         FinetuneConfig(reward="gcft", goals=GoalConfig(share=1.0)).reward
-        == "0.9*mloo + 0.1*goal(kind='soft', reach_m=0.0)"
+        == "0.9*mloo + 0.1*goal(kind='soft', partial=False)"
     )
     hard = write_reward(parse_reward("gcft(goal_weight=0.5, kind='hard') + 0.1*collision_offroad"))
-    assert hard == "0.5*mloo + 0.5*goal(kind='hard', reach_m=0.0) + 0.1*collision_offroad"
+    assert hard == "0.5*mloo + 0.5*goal(kind='hard', partial=False) + 0.1*collision_offroad"
     with pytest.raises(ConfigError, match="gcft has no option 'weight': known are goal_weight, kind"):
         parse_reward("gcft(weight=0.5)")
     with pytest.raises(ConfigError, match="a share in"):

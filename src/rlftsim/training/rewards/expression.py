@@ -1,6 +1,6 @@
 """Rewards as a person writes them: "mloo", "mloo + 0.1*collision_offroad", "0.5*(mloo + rloo)", "collision_offroad_ade(ade_weight=0.2)".
 
-A name may stand for a sum: "gcft" is "0.9*mloo + 0.1*goal(kind='soft', reach_m=0.0)", and is kept so.
+A name may stand for a sum: "gcft" is "0.9*mloo + 0.1*goal(kind='soft', partial=False)", and is kept so.
 """
 
 import ast
