@@ -44,6 +44,7 @@ def test_what_is_written_is_read(tmp_path):
         ({"agent": "100"}, r"goals\[1\]: agent must be a whole number"),
         ({"agent": 1.5}, r"goals\[1\]: agent must be a whole number"),
         ({"agent": True}, r"goals\[1\]: agent must be a whole number"),
+        ({"agent": None}, r"goals\[1\]: agent must be a whole number, an object id of the record, is null"),
         ({"scenario": 5}, r"goals\[1\]: scenario must be text in quotes, is a number"),
         ({"label": 5}, r"goals\[1\]: label must be text"),
         ({"lable": "x"}, r"goals\[1\]: no field 'lable' here: did you mean 'label'"),
@@ -124,7 +125,9 @@ def entry(agent=100, x=1040.0, y=-200.0):
 
 def test_impossible_goals_are_refused():
     scenario = scenes.straight_road()
-    with pytest.raises(DataError, match=r"goals\[3\]: scenario straight has no agent 7: it simulates 6, 100, 101"):
+    with pytest.raises(
+        DataError, match=r"goals\[3\]: scenario straight has no agent 7: it simulates 6 agents: 100, 101"
+    ):
         doubts(entry(7), scenario)
     with pytest.raises(
         DataError, match=r"goals\[3\]: \(6000.0, -200.0\) is 5000 m from agent 100 at \(1000.0, -200.0\), nobody"

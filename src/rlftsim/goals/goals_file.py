@@ -81,7 +81,9 @@ def read_goals(path: Path) -> GoalsFile:
     except json.JSONDecodeError as error:
         raise DataError(f"{path}: not JSON, line {error.lineno}, column {error.colno}: {error.msg}.") from None
     except RecursionError:
-        raise DataError(f"{path}: brackets nested too deeply: goals are a list of entries, see docs/goals.md.") from None
+        raise DataError(
+            f"{path}: brackets nested too deeply: goals are a list of entries, see docs/goals.md."
+        ) from None
     if not isinstance(about, dict) or about.get("format") != FORMAT:
         raise DataError(f'{path}: not a goals file of this version: it must be an object with "format": "{FORMAT}".')
     _refuse_unknown(about, ("format", *SECTIONS), f"{path}")
@@ -169,7 +171,8 @@ def _entry(found: object, place: str) -> GoalEntry:
             raise DataError(f'{place}: {name} must be text in quotes, is {_kind(found[name])}.')  # fmt: skip
         _refuse_unshowable(found.get(name, ""), f"{place}: {name}")
     if isinstance(found["agent"], bool) or not isinstance(found["agent"], int):
-        raise DataError(f"{place}: agent must be a whole number, an object id of the record, is {found['agent']!r}.")
+        shown = found["agent"] if isinstance(found["agent"], float) else _kind(found["agent"])
+        raise DataError(f"{place}: agent must be a whole number, an object id of the record, is {shown}.")
     x, y = (_coordinate(found[name], f"{place}: {name}") for name in ("x", "y"))
     return GoalEntry(found["scenario"], found["agent"], x, y, found.get("label", ""), place)
 

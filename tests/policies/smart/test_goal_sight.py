@@ -233,7 +233,9 @@ def test_a_goal_far_from_the_map_or_nowhere_has_no_polyline(sight, lies, base):
 
 
 def test_a_goal_beyond_a_large_map_has_no_polyline():
-    points = torch.stack([torch.arange(300.0), torch.zeros(300)], -1)[None]  # so many that only those around are looked at
+    points = torch.stack([torch.arange(300.0), torch.zeros(300)], -1)[
+        None
+    ]  # so many that only those around are looked at
     position = torch.tensor([[[[100.2, 450.0], [torch.nan, 0.0]]]])
     seen = [see_goals(Goals(position, torch.tensor([[mask]])), points) for mask in ([True, False], [True, True])]
     assert [goals.polyline.tolist() for goals in seen] == [[[[-1, -1]]]] * 2
