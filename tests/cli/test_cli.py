@@ -385,6 +385,18 @@ def test_only_the_scenarios_of_a_goals_file_are_simulated(tmp_path, capsys, monk
     assert "lane_change_right" in out
 
 
+def test_an_evaluation_with_goals_says_so_and_replaces_none_without(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("rlftsim.cli.results.load_policy_or_oracle", lambda *_: SeesGoals())
+    arguments = ["evaluate", "goal-seeker", "--data", "synthetic", "--out", tmp_path, "--num-rollouts", "2", "--limit", "1"]  # fmt: skip
+    status, out, _ = run(capsys, *arguments, "--goals", "recorded")
+    assert (status, "goal missed" in " ".join(out.split())) == (0, True)
+    assert "goal-seeker: evaluated agents were asked to go where their record ends" in out
+    status, _, err = run(capsys, *arguments)
+    assert (status, "goal-seeker.parquet was measured with goals=recorded, not none: name this one apart" in err) == (2, True)  # fmt: skip
+    status, out, _ = run(capsys, *arguments, "--name", "free")
+    assert (status, "missed" in out) == (0, False)
+
+
 # ---- goals asked wrongly ------------------------------------------------------------------------------------------------
 
 

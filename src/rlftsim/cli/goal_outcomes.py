@@ -46,7 +46,7 @@ def outcome_table(outcomes: Sequence[tuple[GoalEntry, Outcome]]) -> Table:
         caption_justify="left",
     )
     for heading in ("scenario", "agent", "label", "reached", "passed", "closest [m]: best", "median"):
-        table.add_column(heading)
+        table.add_column(heading, overflow="fold")
     for entry, o in outcomes:
         numbers = (f"{o.reached:.0%}", f"{o.passed:.0%}", f"{o.best_m:.1f}", f"{o.median_m:.1f}")
         table.add_row(entry.scenario_id, str(entry.agent_id), entry.label, *numbers)

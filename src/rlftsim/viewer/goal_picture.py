@@ -22,7 +22,7 @@ from rlftsim.viewer.scene import AgentBoxes, SceneView, Trajectories, build_scen
 PANEL_INCHES = 4.2
 GOAL_COLOURS = ("#a21caf", "#0f766e", "#7c2d12", "#4d7c0f", "#111827", "#be185d")
 """None of them is that of an agent (`viewer.picture.COLOURS`)."""
-LONGEST_LABEL = 40
+LONGEST_LABEL = 30
 MARGIN_M = 14.0
 MIN_RADIUS_M = 30.0
 
@@ -122,16 +122,17 @@ def _draw_mark(axis: Axes, mark: DrawnGoal, origin: Float[np.ndarray, "2"], colo
     axis.add_patch(Circle(tuple(point), NEAR_M, fc="white", alpha=0.5, zorder=3.5))
     axis.add_patch(Circle(tuple(point), NEAR_M, fc="none", ec=colour, lw=0.8, zorder=5))
     axis.plot(*point[:, None], "x" if mark.is_recorded else "+", color=colour, ms=8, mew=0.6, zorder=5)
-    _write(axis, mark.name, point, colour, size=7)
+    _write(axis, mark.name, point, colour, size=7.0)
 
 
 def _write(axis: Axes, text: str, place: Float[np.ndarray, "2"], colour: str, *, size: float) -> None:
-    """Beside a place, as it is: a dollar sign begins no formula."""
+    """Beside a place, on the side where there is more room, as it is: a dollar sign begins no formula."""
+    is_right = place[0] > sum(axis.get_xlim()) / 2
     outline = [patheffects.withStroke(linewidth=2, foreground="white")]
     axis.annotate(
-        text, tuple(place), (4, 4), textcoords="offset points", fontsize=size, color=colour, zorder=6,
-        path_effects=outline, annotation_clip=True, parse_math=False,
-    )  # fmt: skip
+        text, tuple(place), (-4 if is_right else 4, 4), ha="right" if is_right else "left", textcoords="offset points",
+        fontsize=size, color=colour, zorder=6, path_effects=outline, annotation_clip=True, parse_math=False,
+    ).set_in_layout(False)  # fmt: skip
 
 
 def _focus(panel: GoalPanel, scene: SceneView) -> tuple[float, float, float]:
