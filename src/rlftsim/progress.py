@@ -23,10 +23,9 @@ FILE_WIDTH = 200
 
 
 def print_wide(*tables: object) -> None:
-    """Print tables; in a file or a pipe they are as wide as they need to be."""
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=FILE_WIDTH)
+    """Print tables, their texts as they are: brackets are no markup. In a file or a pipe they are as wide as they need to be."""
+    width = None if Console().is_terminal else FILE_WIDTH
+    console = Console(width=width, markup=False, emoji=False)
     for table in tables:
         console.print(table)
 
@@ -63,8 +62,8 @@ def progress_bar(
         return
     amount = DownloadColumn() if unit == "bytes" else MofNCompleteColumn()
     columns = (
-        TextColumn("{task.description}"), BarColumn(), amount, TimeElapsedColumn(),
-        TextColumn("ETA"), TimeRemainingColumn(), TextColumn("{task.fields[note]}"),
+        TextColumn("{task.description}", markup=False), BarColumn(), amount, TimeElapsedColumn(),
+        TextColumn("ETA"), TimeRemainingColumn(), TextColumn("{task.fields[note]}", markup=False),
     )  # fmt: skip
     with Progress(*columns, console=Console(stderr=True)) as bar:
         task = bar.add_task(title, total=total, completed=done, note="")

@@ -383,3 +383,109 @@ def test_only_the_scenarios_of_a_goals_file_are_simulated(tmp_path, capsys, monk
     assert status == 0
     assert [p.name for p in (tmp_path / "o").glob("*.npz")] == [f"{SCENARIO}.npz"]
     assert "lane_change_right" in out
+
+
+def test_an_evaluation_with_goals_says_so_and_replaces_none_without(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("rlftsim.cli.results.load_policy_or_oracle", lambda *_: SeesGoals())
+    arguments = ["evaluate", "goal-seeker", "--data", "synthetic", "--out", tmp_path, "--num-rollouts", "2", "--limit", "1"]  # fmt: skip
+    status, out, _ = run(capsys, *arguments, "--goals", "recorded")
+    assert (status, "goal missed" in " ".join(out.split())) == (0, True)
+    assert "goal-seeker: evaluated agents were asked to go where their record ends" in out
+    status, _, err = run(capsys, *arguments)
+    assert (status, "goal-seeker.parquet was measured with goals=recorded, not none: name this one apart" in err) == (2, True)  # fmt: skip
+    status, out, _ = run(capsys, *arguments, "--name", "free")
+    assert (status, "missed" in out) == (0, False)
+
+
+# ---- goals asked wrongly ------------------------------------------------------------------------------------------------
+
+
+def goals_file(path, *goals, alternatives=()):
+    entries = [[{"scenario": SCENARIO, "agent": a, "x": x, "y": y, **more} for a, x, y, more in part] for part in (goals, alternatives)]  # fmt: skip
+    path.write_text(json.dumps({"format": "rlftsim-goals-1", "goals": entries[0], "alternatives": entries[1]}))
+    return path
+
+
+@pytest.fixture
+def simulated(tmp_path, capsys, monkeypatch):
+    """Runs `simulate` with a model that drives to its goals; returns status, output and errors."""
+    monkeypatch.setattr("rlftsim.cli.simulate.load_policy", lambda *_: SeesGoals())
+    common = ["simulate", "goal-seeker", "--data", "synthetic", "--num-rollouts", "2", "--out", tmp_path / "o"]
+    return lambda *arguments: run(capsys, *common, *arguments)
+
+
+@pytest.mark.parametrize("label", ["[/bold] hm", "left [lane 3] :car:", r"a $\foo$ b", "x" * 300])
+def test_any_label_is_shown_as_it_is(label, tmp_path, simulated):
+    file = goals_file(tmp_path / "g.json", (TURNS, -74.19, 19.77, {"label": label}))
+    status, out, err = simulated("--goals", file, "--picture")
+    assert status == 0, err
+    assert label[:30] in out
+    assert "closest [m]: best" in out
+    assert (tmp_path / "o" / f"{SCENARIO}.png").stat().st_size > 10_000
+
+
+def test_a_goals_file_that_asks_nobody_is_refused(tmp_path, simulated):
+    alone = goals_file(tmp_path / "g.json", alternatives=[(TURNS, -74.19, 19.77, {})])
+    status, _, err = simulated("--goals", alone)
+    assert (status, 'nobody is asked: move one of its 1 alternatives to "goals"' in err) == (2, True)
+    file = goals_file(tmp_path / "g.json", (TURNS, -74.19, 19.77, {}))
+    other = open_split(SYNTHETIC, "validation").scenario_ids[-1]
+    status, _, err = simulated("--goals", file, "--scenario", other)
+    assert (status, f"such as {SCENARIO}, none in {other}" in err) == (2, True)
+    status, _, err = simulated("--goals", file, "--scenario", SCENARIO, other, SCENARIO)
+    assert (status, f"scenario {other} has no goals: it is simulated without" in err) == (0, True)
+    assert len(list((tmp_path / "o").glob("*.npz"))) == 2
+
+
+def test_a_scenario_of_another_split_or_data_set_is_said_to_be(tmp_path, capsys, simulated):
+    training = open_split(SYNTHETIC, "training").scenario_ids[0]
+    status, _, err = simulated("--scenario", training)
+    assert (status, "in split 'validation' of synthetic: it is in split 'training', add --split training" in err) == (
+        2,
+        True,
+    )
+    file = goals_file(tmp_path / "g.json", (TURNS, 0, 0, {"scenario": "nobody"}))
+    for status, _, err in (simulated("--goals", file), run(capsys, "goals", "check", file, "--data", "synthetic")):
+        assert (status, f"{file}: goals[0]: no scenario nobody in" in err) == (2, True)
+        assert "--data names another data set" in err
+
+
+def test_rollouts_that_are_damaged_or_of_nobody_are_not_taken_over(tmp_path, simulated):
+    arguments = ["--scenario", SCENARIO, "--goal", f"{TURNS}=-74.19,19.77"]
+    assert simulated(*arguments)[0] == 0
+    path = tmp_path / "o" / f"{SCENARIO}.npz"
+    path.write_bytes(path.read_bytes()[:1000])
+    status, _, err = simulated(*arguments)
+    assert (status, err.count("\n")) == (2, 2)  # the doubt, and the cause
+    assert f"{path} (scenario {SCENARIO})" in err
+    assert "remove it, then run the same command again" in err
+    (tmp_path / "o" / "rollouts.json").unlink()
+    status, _, err = simulated(*arguments)
+    assert (status, f"holds {SCENARIO}.npz but no rollouts.json" in err) == (2, True)
+
+
+PROPOSE = ["goals", "propose", "synthetic", "--scenario", SCENARIO]
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["--picture", "plot"], "plot: pictures are written as .png, .svg, .pdf: name the file so"),
+        (["--agent", "--picture", "a.png"], "--agent names nobody: give object ids, or leave it out"),
+        (["--agent", TURNS, "--choose", "left_uturn", "--out", "g.json"], "none of these agents can do left_uturn: they can do straight, right, lane_change_left (--choose)"),
+    ],
+)  # fmt: skip
+def test_proposals_that_cannot_be_are_refused(more, message, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    status, _, err = run(capsys, *PROPOSE, *more)
+    assert (status, message in err) == (2, True), err
+    assert not list(tmp_path.iterdir())
+    assert "--scenario names none" in run(capsys, *PROPOSE[:4])[2]
+
+
+def test_who_is_named_twice_is_asked_once_and_doubts_are_said_at_once(tmp_path, capsys):
+    file = tmp_path / "g.json"
+    status, out, err = run(capsys, *PROPOSE, SCENARIO, "--agent", TURNS, TURNS, "--out", file)
+    assert (status, "1 goals, 2 alternatives" in out) == (0, True)
+    assert "stands still, perhaps parked" in err
+    assert run(capsys, "goals", "check", file, "--data", "synthetic")[0] == 0

@@ -157,7 +157,7 @@ def test_own_verdict_is_kept():
 
 def test_terminal_table_has_the_same_numbers(report):
     out = io.StringIO()
-    Console(file=out, width=120).print(report_table(report))
+    Console(file=out, width=120, markup=False).print(report_table(report))
     text = out.getvalue()
     assert "0.7000 ± 0.0100" in text
     assert "collision [%] ↓" in text

@@ -47,7 +47,9 @@ def test_the_outcome_of_a_goal_is_counted_over_its_rollouts_even_far_from_the_or
     far = torch.tensor([8.0e6, -8.0e6], dtype=torch.float64)
     outcome = outcome_of(way + far, (8.0e6 + 10.0, -8.0e6 + 1.0))
     assert (outcome.reached, outcome.passed) == (pytest.approx(1 / 3), pytest.approx(2 / 3))
-    assert outcome.closest_m == pytest.approx((1 + 1 + math.hypot(3, 1)) / 3)
+    assert (outcome.best_m, outcome.median_m) == (pytest.approx(1.0), pytest.approx(1.0))
+    few = outcome_of(way[1:] + far, (8.0e6 + 10.0, -8.0e6 + 1.0))
+    assert few.median_m == pytest.approx((1 + math.hypot(3, 1)) / 2)
 
 
 def test_who_has_no_goal_meets_none_and_counts_nowhere():

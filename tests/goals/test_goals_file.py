@@ -44,9 +44,14 @@ def test_what_is_written_is_read(tmp_path):
         ({"agent": "100"}, r"goals\[1\]: agent must be a whole number"),
         ({"agent": 1.5}, r"goals\[1\]: agent must be a whole number"),
         ({"agent": True}, r"goals\[1\]: agent must be a whole number"),
+        ({"agent": None}, r"goals\[1\]: agent must be a whole number, an object id of the record, is null"),
         ({"scenario": 5}, r"goals\[1\]: scenario must be text in quotes, is a number"),
         ({"label": 5}, r"goals\[1\]: label must be text"),
         ({"lable": "x"}, r"goals\[1\]: no field 'lable' here: did you mean 'label'"),
+        ({"label": "\ud800"}, r"goals\[1\]: label has half a character, U\+D800, that cannot be shown"),
+        ({"label": "a\x1b[31m"}, r"goals\[1\]: label has a control character, U\+001B"),
+        ({"x": 10**400}, r"goals\[1\]: x is inf: a goal needs a finite point"),
+        ({"agent": 10**400}, r"goals\[1\]: agent must be a whole number"),
         ({"agent": 100}, r"goals\[1\]: agent 100 of scenario straight has a goal already \(.*goals\[0\]\)"),
     ],
 )
@@ -66,13 +71,23 @@ def test_a_wrong_entry_is_named(change, message, tmp_path):
         (f'{{"format": "{FORMAT}", "goals": {{}}}}', "goals: must be a list of goals, is an object"),
         (f'{{"format": "{FORMAT}", "goals": [5]}}', r"goals\[0\]: must be an object such as"),
         (f'{{"format": "{FORMAT}", "goals": [{{"x": 1}}]}}', r"goals\[0\]: scenario, agent, y missing"),
+        (f'{{"format": "{FORMAT}", "goals": [{{"scenario": "s", "agent": 1, "x": {"1" * 5000}, "y": 1}}]}}', r"goals\[0\]: x is inf"),
+        (f'{{"format": "{FORMAT}", "goals": [{{"scenario": "s", "agent": 1, "x": 1, "x": 2, "y": 1}}]}}', r"goals\[0\]: x is written more than once"),
+        (f'{{"format": "{FORMAT}", "goals": [], "goals": []}}', r"json: goals is written more than once: keep one of them"),
+        (f'{{"format": "{FORMAT}", "goals": {"[" * 200_000}', "brackets nested too deeply"),
         (f'{{"format": "{FORMAT}", "goal": []}}', "no field 'goal' here: did you mean 'goals'"),
     ],
-)
+)  # fmt: skip
 def test_a_wrong_file_is_refused(text, message, tmp_path):
     (tmp_path / "goals.json").write_text(text)
     with pytest.raises(DataError, match=message):
         read_goals(tmp_path / "goals.json")
+
+
+def test_a_byte_order_mark_is_no_mistake(tmp_path):
+    path = written(tmp_path, GOOD)
+    path.write_text(path.read_text(), encoding="utf-8-sig")
+    assert len(read_goals(path).goals) == 1
 
 
 def test_a_file_that_is_not_there_says_how_to_make_one(tmp_path):
@@ -110,7 +125,9 @@ def entry(agent=100, x=1040.0, y=-200.0):
 
 def test_impossible_goals_are_refused():
     scenario = scenes.straight_road()
-    with pytest.raises(DataError, match=r"goals\[3\]: scenario straight has no agent 7: it simulates 6, 100, 101"):
+    with pytest.raises(
+        DataError, match=r"goals\[3\]: scenario straight has no agent 7: it simulates 6 agents: 100, 101"
+    ):
         doubts(entry(7), scenario)
     with pytest.raises(
         DataError, match=r"goals\[3\]: \(6000.0, -200.0\) is 5000 m from agent 100 at \(1000.0, -200.0\), nobody"

@@ -45,6 +45,29 @@ def open_split(name: str, split: str, *, cached: int = CACHED_SCENARIOS) -> Scen
     return scenarios
 
 
+def refuse_unknown(scenarios: ScenarioDataset, scenario_id: str, name: str, place: object) -> None:
+    """Refuse a scenario that a data set, or its split, does not have.
+
+    Args:
+        scenarios: those of a split, or all.
+        scenario_id: what is asked for.
+        name: of the data set, as it was written.
+        place: what asks for it: a flag, or an entry of a file.
+
+    Raises:
+        DataError: names the split that has it, or else an id that there is.
+    """
+    if scenario_id in scenarios:
+        return
+    split = f"split {scenarios.split!r} of " if scenarios.split else ""
+    known = ScenarioDataset(scenarios.folder)
+    hint = f"it has {len(known)} others, such as {', '.join(known.scenario_ids[:2])}; --data names another data set."
+    if scenario_id in known:
+        other = known.index["split"][known.scenario_ids.index(scenario_id)]
+        hint = f"it is in split {str(other)!r}, add --split {other}."
+    raise DataError(f"{place}: no scenario {scenario_id} in {split}{name}: {hint}")
+
+
 @dataclass(frozen=True)
 class Convert:
     """Turn WOMD tfrecord shards into a portable data set.

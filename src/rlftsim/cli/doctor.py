@@ -13,6 +13,7 @@ from pathlib import Path
 
 import torch
 from rich.table import Table
+from rich.text import Text
 
 from rlftsim.progress import print_wide
 from rlftsim.scenario.inspect import verify_dataset
@@ -42,7 +43,7 @@ class Doctor:
         table = Table(show_header=False)
         colour = {GOOD: "green", WARNING: "yellow", BAD: "red"}
         for d in diagnoses:
-            table.add_row(d.what, f"[{colour[d.state]}]{d.state}[/]", d.found)
+            table.add_row(d.what, Text(d.state, style=colour[d.state]), d.found)
         print_wide(table)
         return int(any(d.state == BAD for d in diagnoses))
 

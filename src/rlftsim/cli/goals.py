@@ -1,5 +1,6 @@
 """The verb that says what agents may be asked to do: goals. And the goals of a command line, for verbs that simulate."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -9,7 +10,7 @@ import tyro
 from rich.table import Table
 from tyro.conf import Positional
 
-from rlftsim.cli.data import data_folder
+from rlftsim.cli.data import data_folder, refuse_unknown
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.experiments.goal_proposals import entry_of, label_of, propose
 from rlftsim.goals.goals_file import GoalEntry, GoalsFile, parse_goal, read_goals, refuse_twice, write_goals
@@ -18,6 +19,7 @@ from rlftsim.goals.proposals import Proposal, why_nothing
 from rlftsim.progress import print_wide, say
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.types import CURRENT_STEP, ObjectType, Scenario
+from rlftsim.viewer.figure import refuse_no_picture
 from rlftsim.viewer.goal_picture import DrawnGoal, GoalPanel, draw_goals
 
 Choice = Literal[
@@ -47,13 +49,16 @@ class Propose:
     out: Path | None = None
     """Goals file to write; left out, the proposals are only printed."""
     picture: Path | None = None
-    """PNG to draw the proposals into, a panel for each agent."""
+    """PNG, SVG or PDF to draw the proposals into, a panel for each agent."""
 
     def run(self) -> int:
-        """Propose, print, write, draw."""
+        """Propose, print, draw, write."""
+        self._refuse_nothing()
         scenarios = ScenarioDataset(data_folder(self.data))
         asked, alternatives, panels = [], [], []
-        for scenario in (_find(scenarios, scenario_id, self.data) for scenario_id in self.scenario):
+        for scenario_id in dict.fromkeys(self.scenario):
+            refuse_unknown(scenarios, scenario_id, self.data, "--scenario")
+            scenario = scenarios.by_id(scenario_id)
             table = Table(title=f"scenario {scenario.scenario_id}", title_justify="left")
             for heading in ("agent", "kind", "m/s", "manoeuvre", "goal (x, y)", "away [m]"):
                 table.add_column(heading)
@@ -65,13 +70,42 @@ class Propose:
                 _add_rows(table, scenario, track, proposals, chosen)
                 panels.append(_panel(scenario, track, proposals))
             print_wide(table)
-        if self.out is not None:
-            write_goals(self.out, GoalsFile(tuple(asked), tuple(alternatives)))
-            print(f"{self.out}: {len(asked)} goals, {len(alternatives)} alternatives.")
+            warn_of_doubts([entry for entry in asked if entry.scenario_id == scenario_id], scenario)
         if self.picture is not None:
             draw_goals(self.picture, panels, columns=min(len(panels), 4))
             print(self.picture)
+        if self.out is not None:
+            self._refuse_unasked(asked, alternatives)
+            write_goals(self.out, GoalsFile(tuple(asked), tuple(alternatives)))
+            print(f"{self.out}: {len(asked)} goals, {len(alternatives)} alternatives.")
         return 0
+
+    def _refuse_nothing(self) -> None:
+        """Refuse flags without values, and a picture that cannot be one, before anything is looked at.
+
+        Raises:
+            ConfigError: there are.
+        """
+        if not self.scenario:
+            raise ConfigError("--scenario names none: give the id of at least one.")
+        if self.agent is not None and not self.agent:
+            raise ConfigError("--agent names nobody: give object ids, or leave it out for the evaluated agents.")
+        if self.picture is not None:
+            refuse_no_picture(self.picture)
+
+    def _refuse_unasked(self, asked: list[GoalEntry], alternatives: list[GoalEntry]) -> None:
+        """Refuse to write a file that asks nobody.
+
+        Raises:
+            DataError: it would; says what could be asked.
+        """
+        if asked:
+            return
+        labels = dict.fromkeys(entry.label for entry in alternatives)
+        can = f"they can do {', '.join(labels)} (--choose)" if labels else "nothing can be proposed for them"
+        raise DataError(
+            f"{self.out} not written, none of these agents can do {self.choose}: {can}; or name others with --agent."
+        )
 
     def _tracks(self, scenario: Scenario) -> list[int]:
         """Whom to propose for.
@@ -88,7 +122,7 @@ class Propose:
                 f"no agent {', '.join(unknown)} in scenario {scenario.scenario_id}: there are "
                 f"{', '.join(map(str, sorted(by_id)))}."
             )
-        return [by_id[agent] for agent in self.agent]
+        return [by_id[agent] for agent in dict.fromkeys(self.agent)]
 
 
 @dataclass(frozen=True)
@@ -106,7 +140,7 @@ class Check:
         lines = [
             line
             for entry in (*file.goals, *file.alternatives)
-            for line in doubts(entry, _find(scenarios, entry.scenario_id, self.data))
+            for line in doubts(entry, _find(scenarios, entry, self.data))
         ]
         for line in lines:
             print(line)
@@ -136,6 +170,8 @@ def goals_asked(file: Path | None, written: list[str], scenario_ids: list[str] |
         ConfigError: goals written out need to know which scenario is meant.
     """
     found = GoalsFile(()) if file is None else read_goals(file)
+    if file is not None:
+        _refuse_unused(file, found, scenario_ids)
     if not written:
         return found
     if scenario_ids is None or len(scenario_ids) != 1:
@@ -147,7 +183,24 @@ def goals_asked(file: Path | None, written: list[str], scenario_ids: list[str] |
     return GoalsFile(entries, found.alternatives)
 
 
-def warn_of_doubts(entries: tuple[GoalEntry, ...], scenario: Scenario) -> None:
+def _refuse_unused(file: Path, found: GoalsFile, scenario_ids: list[str] | None) -> None:
+    """Refuse a file that asks for nothing in the scenarios that are simulated.
+
+    Raises:
+        DataError: it does.
+    """
+    if not found.goals:
+        kept = f'move one of its {len(found.alternatives)} alternatives to "goals"' if found.alternatives else "add one"
+        raise DataError(f'{file}: has no entry in "goals", so nobody is asked: {kept}, or leave --goals out.')
+    if scenario_ids and not any(found.of_scenario(scenario_id) for scenario_id in scenario_ids):
+        others = found.scenario_ids
+        raise DataError(
+            f"{file}: has goals in {len(others)} scenarios, such as {others[0]}, none in {', '.join(scenario_ids)}: name another "
+            "--scenario, or leave --goals or --scenario out."
+        )
+
+
+def warn_of_doubts(entries: Sequence[GoalEntry], scenario: Scenario) -> None:
     """Say what will most likely happen otherwise than it was asked for.
 
     Raises:
@@ -158,10 +211,9 @@ def warn_of_doubts(entries: tuple[GoalEntry, ...], scenario: Scenario) -> None:
             say(f"  {line}")
 
 
-def _find(scenarios: ScenarioDataset, scenario_id: str, name: str) -> Scenario:
-    if scenario_id not in scenarios:
-        raise DataError(f"no scenario {scenario_id} in {name}: its {len(scenarios)} scenarios have other ids.")
-    return scenarios.by_id(scenario_id)
+def _find(scenarios: ScenarioDataset, entry: GoalEntry, name: str) -> Scenario:
+    refuse_unknown(scenarios, entry.scenario_id, name, entry)
+    return scenarios.by_id(entry.scenario_id)
 
 
 def _choose(proposals: tuple[Proposal, ...], choice: Choice) -> Proposal | None:
@@ -189,7 +241,6 @@ def _add_rows(
 
 
 def _panel(scenario: Scenario, track: int, proposals: tuple[Proposal, ...]) -> GoalPanel:
-    marks = tuple(
-        DrawnGoal(p.object_id, p.position, label_of(p), p.way[:, :2], is_recorded=p.is_recorded) for p in proposals
-    )
-    return GoalPanel(f"{scenario.scenario_id}, agent {scenario.tracks.object_id[track]}", scenario, marks)
+    agent = int(scenario.tracks.object_id[track])
+    marks = tuple(DrawnGoal(agent, p.position, label_of(p), p.way[:, :2], is_recorded=p.is_recorded) for p in proposals)
+    return GoalPanel(f"{scenario.scenario_id}, agent {agent}", scenario, marks or (DrawnGoal(agent),))

@@ -10,8 +10,8 @@ import tyro
 from tyro.conf import Positional
 
 from rlftsim.cli.data import data_folder
-from rlftsim.errors import DataError
-from rlftsim.experiments.compare import compare, format_comparison, format_table
+from rlftsim.errors import ConfigError, DataError
+from rlftsim.experiments.compare import columns_of, compare, format_comparison, format_table
 from rlftsim.experiments.evaluate import EvaluateConfig, evaluate
 from rlftsim.experiments.evaluation import Evaluation
 from rlftsim.experiments.explain import explain_rollouts
@@ -43,6 +43,7 @@ class Evaluate:
         """Evaluate and print the table."""
         path = Path(self.model)
         name = self.name or (path.parent.name if path.name == "model" else path.name)
+        self._refuse_other_goals(self.out / f"{name}.parquet")
         policy = load_policy_or_oracle(self.model, self.device)
         result = evaluate(policy, data_folder(self.data), self.out, self.config, name=name)
         if not len(result):
@@ -52,6 +53,21 @@ class Evaluate:
             print(f"  skipped {skipped.scenario_id}: {skipped.reason}")
         print(f"{self.out / name}.parquet")
         return 0
+
+    def _refuse_other_goals(self, path: Path) -> None:
+        """Refuse to replace what the model does with goals by what it does without, or the other way round.
+
+        Raises:
+            ConfigError: an evaluation of that name asked otherwise.
+        """
+        try:
+            old = Evaluation.read(path).config.goals
+        except DataError:  # none, or one that cannot be read and is replaced
+            return
+        if old != self.config.goals:
+            raise ConfigError(
+                f"{path} was measured with goals={old}, not {self.config.goals}: name this one apart with --name, or remove the file."
+            )
 
 
 @dataclass(frozen=True)
@@ -106,5 +122,6 @@ class Compare:
     def run(self) -> int:
         """Print both tables."""
         a, b = Evaluation.read(self.first), Evaluation.read(self.second)
-        print_wide(format_table(a, b), format_comparison(compare(a, b, alpha=self.alpha)))
+        comparison = compare(a, b, alpha=self.alpha)
+        print_wide(format_table(a, b), format_comparison(comparison, columns=columns_of(a, b)))
         return 0

@@ -8,14 +8,14 @@ from typing import Any
 import tyro
 from tyro.conf import Positional
 
-from rlftsim.cli.data import open_split
-from rlftsim.cli.goal_outcomes import outcome_table, outcomes_of, picture_of
+from rlftsim.cli.data import open_split, refuse_unknown
+from rlftsim.cli.goal_outcomes import outcome_table, outcomes_of, picture_of, read_rollouts
 from rlftsim.cli.goals import goals_asked, warn_of_doubts
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.files import write_text
 from rlftsim.goals.goals_file import GoalsFile
 from rlftsim.goals.placing import goals_of_batch
-from rlftsim.progress import print_wide, progress_bar
+from rlftsim.progress import print_wide, progress_bar, say
 from rlftsim.recipes.models import Device, load_policy
 from rlftsim.rollout.files import write_rollouts
 from rlftsim.rollout.fingerprint import fingerprint_policy
@@ -28,6 +28,7 @@ from rlftsim.viewer.goal_picture import draw_goals
 
 ABOUT = "rollouts.json"
 """Whose rollouts are in the folder."""
+PICTURE_INCHES = 7.0
 
 
 @dataclass(frozen=True)
@@ -65,16 +66,21 @@ class Simulate:
         """Simulate scenario by scenario."""
         if self.num_rollouts < 1:
             raise ConfigError(f"--num-rollouts must be at least 1, got {self.num_rollouts}.")
+        if self.scenario is not None and not self.scenario:
+            raise ConfigError("--scenario names none: give ids, or leave it out for all.")
         policy, sampling = load_policy(self.model, self.device), Sampling(self.temperature, self.top_k)
         scenarios = open_split(self.data, self.split)
         asked = self._goals_asked(policy)
-        ids = self.scenario or list(asked.scenario_ids) or scenarios.scenario_ids
-        unknown = [i for i in ids if i not in scenarios]
-        if unknown:
-            raise ConfigError(f"no scenario {', '.join(unknown)} in split {self.split!r} of {self.data}.")
+        ids = list(dict.fromkeys(self.scenario or asked.scenario_ids or scenarios.scenario_ids))
         for scenario_id in ids:
-            if asked.of_scenario(scenario_id):
-                warn_of_doubts(asked.of_scenario(scenario_id), scenarios.by_id(scenario_id))
+            entries = asked.of_scenario(scenario_id)
+            refuse_unknown(
+                scenarios, scenario_id, self.data, "--scenario" if self.scenario else next(iter(entries), "")
+            )
+            if entries:
+                warn_of_doubts(entries, scenarios.by_id(scenario_id))
+            elif asked.goals:
+                say(f"  scenario {scenario_id} has no goals: it is simulated without.")
         self._claim(policy, sampling, scenarios, asked)
         left = [i for i in ids if not (self.out / f"{i}.npz").exists()]
         with progress_bar("simulate", len(ids), len(ids) - len(left)) as advance:
@@ -108,18 +114,17 @@ class Simulate:
 
     def _report(self, scenarios: list[Scenario], asked: GoalsFile) -> None:
         """Say who got where it was asked to go, and draw."""
-        outcomes = [
-            outcome
-            for scenario in scenarios
-            for outcome in outcomes_of(self.out, scenario, asked.of_scenario(scenario.scenario_id))
-        ]
+        outcomes, pictures = [], []
+        for scenario in scenarios:
+            states, entries = read_rollouts(self.out, scenario), asked.of_scenario(scenario.scenario_id)
+            outcomes += outcomes_of(states, entries)
+            if self.picture:
+                pictures.append(self.out / f"{scenario.scenario_id}.png")
+                draw_goals(pictures[-1], [picture_of(states, scenario, entries)], panel_inches=PICTURE_INCHES)
         if outcomes:
             print_wide(outcome_table(outcomes))
-        if self.picture:
-            for scenario in scenarios:
-                path = self.out / f"{scenario.scenario_id}.png"
-                draw_goals(path, [picture_of(self.out, scenario, asked.of_scenario(scenario.scenario_id))])
-                print(path)
+        for path in pictures:
+            print(path)
 
     def _claim(self, policy: Policy, sampling: Sampling, scenarios: ScenarioDataset, asked: GoalsFile) -> None:
         """Write down whose rollouts these are; refuse a folder that holds others.
@@ -138,10 +143,15 @@ class Simulate:
         if asked.goals:
             about["goals"] = [[e.scenario_id, e.agent_id, e.x, e.y] for e in asked.goals]
         path = self.out / ABOUT
+        rollouts = sorted(self.out.glob("*.npz"))
+        if rollouts and not path.exists():
+            raise ConfigError(
+                f"{self.out} holds {rollouts[0].name} but no {ABOUT}, so nobody knows whose rollouts it holds: name another --out."
+            )
         old = _read_about(path) if path.exists() else about
         names = [name for name in {**about, **old} if name != "model"]
         differing = [name for name in names if old.get(name) != about.get(name)]
-        if differing and any(self.out.glob("*.npz")):
+        if differing and rollouts:
             raise ConfigError(
                 f"{self.out} holds rollouts of {old.get('model')} with another {', '.join(differing)}: name another --out."
             )

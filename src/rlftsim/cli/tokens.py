@@ -4,7 +4,6 @@ import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from rich.markup import escape
 from rich.table import Table
 
 from rlftsim.cli.data import open_split
@@ -104,5 +103,5 @@ def _coverage_table(classes: tuple[ClassCoverage, ...]) -> Table:
     for coverage in classes:
         table.add_column(coverage.class_name, justify="right")
     for name, words in ROWS.items():
-        table.add_row(escape(name), *(words(coverage) for coverage in classes))
+        table.add_row(name, *(words(coverage) for coverage in classes))
     return table

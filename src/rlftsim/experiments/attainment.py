@@ -9,9 +9,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import torch
-from jaxtyping import Float
 
 from rlftsim import __version__
 from rlftsim.errors import DataError
@@ -24,7 +22,6 @@ from rlftsim.goals.goals_file import GoalEntry
 from rlftsim.goals.placing import goals_of_batch
 from rlftsim.processor import one_thread
 from rlftsim.progress import progress_bar
-from rlftsim.realism import SimulatedStates
 from rlftsim.recipes.models import load_policy
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import Policy, device_of, sees_goals
@@ -149,13 +146,7 @@ def _measure_scenario(
         if is_stopped():
             return
         states = blind or simulated(goals=goals_of_batch([goal], batch))
-        outcomes.append(outcome_of(_way_of(states, goal.agent_id), (goal.x, goal.y)))
+        outcomes.append(outcome_of(states.way_of(goal.agent_id), (goal.x, goal.y)))
     shares = {"reached": [one.reached for one in outcomes], "passed": [one.passed for one in outcomes]}
     write_text(job.path_of(scenario_id), json.dumps(job.whose(scenario_id) | shares) + "\n")
     advance(1)
-
-
-def _way_of(states: SimulatedStates, agent_id: int) -> Float[torch.Tensor, "N T 2"]:
-    """Where the rollouts took an agent, world frame."""
-    row = int(np.flatnonzero(states.object_id == agent_id)[0])
-    return torch.stack([states.x[:, row], states.y[:, row]], -1)

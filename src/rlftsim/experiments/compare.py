@@ -22,6 +22,8 @@ TABLE_COLUMNS = (
     "offroad_rate",
     "traffic_light_violation_rate",
 )
+GOAL_COLUMNS = ("passing_miss_rate", "min_passing_miss_rate")
+"""Shown where agents had goals: whether they came near them."""
 _HEADINGS = {
     "meta_metric": "RMM",
     "meta_metric_light_one": "RMM, light = 1",
@@ -29,6 +31,8 @@ _HEADINGS = {
     "min_average_displacement_error": "minADE (m)",
     "average_displacement_error": "ADE (m)",
     "traffic_light_violation_rate": "red light rate",
+    "passing_miss_rate": "goal missed",
+    "min_passing_miss_rate": "in all rollouts",
 }
 _ARROWS = {"higher": "↑", "lower": "↓"}
 
@@ -177,13 +181,24 @@ def compare_paired(column: str, a: np.ndarray, b: np.ndarray, *, alpha: float = 
     )
 
 
-def format_table(*evaluations: Evaluation, columns: Sequence[str] = TABLE_COLUMNS) -> Table:
+def format_table(*evaluations: Evaluation, columns: Sequence[str] | None = None) -> Table:
     """One row per evaluation: mean ± standard error over its scenarios. Arrows say which way is better.
+
+    Args:
+        evaluations: the rows.
+        columns: None = `TABLE_COLUMNS`, and `GOAL_COLUMNS` where agents of some evaluation had goals.
 
     Raises:
         ConfigError: there is no such column.
     """
-    table = Table()
+    asked = [evaluation.name for evaluation in evaluations if evaluation.config.goals != "none"]
+    columns = columns or columns_of(*evaluations)
+    caption = (
+        f"{', '.join(asked)}: evaluated agents were asked to go where their record ends; who never comes near has missed."
+        if asked
+        else None
+    )
+    table = Table(caption=caption, caption_justify="left")
     table.add_column("policy", no_wrap=True)
     table.add_column("scenarios", justify="right")
     for column in columns:
@@ -193,6 +208,12 @@ def format_table(*evaluations: Evaluation, columns: Sequence[str] = TABLE_COLUMN
         cells = [_plus_minus(found.mean, found.standard_error) for found in means]
         table.add_row(evaluation.name, str(len(evaluation)), *cells)
     return table
+
+
+def columns_of(*evaluations: Evaluation) -> tuple[str, ...]:
+    """What a table of some evaluations shows."""
+    have_goals = any(evaluation.config.goals != "none" for evaluation in evaluations)
+    return (*TABLE_COLUMNS, *(GOAL_COLUMNS if have_goals else ()))
 
 
 def format_comparison(comparison: Comparison, *, columns: Sequence[str] = TABLE_COLUMNS) -> Table:

@@ -41,9 +41,9 @@ class TextTable:
         """For `print_wide`."""
         table = Table(title=self.title, caption=self.note or None, title_justify="left", caption_justify="left")
         for i, heading in enumerate(self.headings):
-            table.add_column(heading.replace("[", r"\["), justify="right" if i else "left", no_wrap=not i)
+            table.add_column(heading, justify="right" if i else "left", no_wrap=not i)
         for cells in self.rows:
-            table.add_row(*(cell.replace("[", r"\[") for cell in cells))
+            table.add_row(*cells)
         return table
 
 

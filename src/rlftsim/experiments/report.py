@@ -111,15 +111,15 @@ def report_html(report: Report) -> str:
 
 
 def report_table(report: Report) -> Table:
-    """The result table for a terminal."""
+    """The result table, for `print_wide`."""
     table = Table(title=report.title, caption=report.table_note or None, title_justify="left", caption_justify="left")
     table.add_column("policy", no_wrap=True)
     shown = shown_columns(report.rows)
     for column in shown:
-        table.add_column(column.label.replace("[", r"\["), justify="right")
+        table.add_column(column.label, justify="right")
     for row in report.rows:
         cells = [column.cell(row) for column in shown]
-        table.add_row(row.name.replace("[", r"\["), *cells, style="bold" if row.emphasised else None)
+        table.add_row(row.name, *cells, style="bold" if row.emphasised else None)
     return table
 
 

@@ -57,8 +57,10 @@ class Outcome:
     """Share of the rollouts that end within `NEAR_M`."""
     passed: float
     """Share of the rollouts that come within `NEAR_M` at some step."""
-    closest_m: float
-    """Mean over rollouts of the least distance."""
+    best_m: float
+    """Least distance in the rollout that comes nearest."""
+    median_m: float
+    """Median over rollouts of the least distance."""
 
 
 def outcome_of(position: Float[Tensor, "N T 2"], goal: tuple[float, float]) -> Outcome:
@@ -71,8 +73,9 @@ def outcome_of(position: Float[Tensor, "N T 2"], goal: tuple[float, float]) -> O
     away = (position.double() - torch.tensor(goal, dtype=torch.float64, device=position.device)).float()
     away = away[None, :, None]  # [1, N, 1, T, 2]
     here = Goals(torch.zeros_like(away[..., 0, :]), torch.ones_like(away[..., 0, 0], dtype=torch.bool))
-    found = (is_reached(away, here), is_passed(away, here), closest_m(away, here))
-    return Outcome(*(float(values.double().mean()) for values in found))
+    shares = (float(met.double().mean()) for met in (is_reached(away, here), is_passed(away, here)))
+    closest = closest_m(away, here).double()
+    return Outcome(*shares, best_m=float(closest.min()), median_m=float(closest.quantile(0.5)))
 
 
 def is_missed_in_passing(

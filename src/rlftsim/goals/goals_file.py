@@ -13,6 +13,7 @@ goal; to ask for an alternative, swap the two entries.
 import difflib
 import json
 import math
+import unicodedata
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,6 +25,10 @@ from rlftsim.files import write_text
 FORMAT = "rlftsim-goals-1"
 FIELDS = ("scenario", "agent", "x", "y", "label")
 SECTIONS = ("goals", "alternatives")
+LONGEST_WHOLE = 20
+"""Digits of a whole number that may be an object id; longer ones are coordinates, written oddly."""
+UNSHOWABLE = {"Cc": "a control character", "Cs": "half a character"}
+"""By Unicode category."""
 
 
 @dataclass(frozen=True)
@@ -67,13 +72,18 @@ def read_goals(path: Path) -> GoalsFile:
         DataError: it is not there, no JSON, or an entry is wrong: names file, entry and field.
     """
     try:
-        about = json.loads(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8-sig")
+        about = json.loads(text, object_pairs_hook=_Object, parse_int=_whole)
     except FileNotFoundError:
         raise DataError(f"{path}: no such goals file: make one with `rlftsim goals propose`.") from None
     except UnicodeDecodeError:
         raise DataError(f"{path}: not a text file: goals are JSON, see docs/goals.md.") from None
     except json.JSONDecodeError as error:
         raise DataError(f"{path}: not JSON, line {error.lineno}, column {error.colno}: {error.msg}.") from None
+    except RecursionError:
+        raise DataError(
+            f"{path}: brackets nested too deeply: goals are a list of entries, see docs/goals.md."
+        ) from None
     if not isinstance(about, dict) or about.get("format") != FORMAT:
         raise DataError(f'{path}: not a goals file of this version: it must be an object with "format": "{FORMAT}".')
     _refuse_unknown(about, ("format", *SECTIONS), f"{path}")
@@ -130,6 +140,19 @@ def refuse_twice(entries: Sequence[GoalEntry]) -> None:
             )
 
 
+class _Object(dict[str, Any]):
+    """A JSON object that remembers the keys it was written with more than once."""
+
+    def __init__(self, pairs: Sequence[tuple[str, Any]]):
+        super().__init__(pairs)
+        names = [name for name, _ in pairs]
+        self.repeated = [name for name in self if names.count(name) > 1]
+
+
+def _whole(digits: str) -> int | float:
+    return int(digits) if len(digits) <= LONGEST_WHOLE else float(digits)
+
+
 def _entries(found: object, place: str) -> tuple[GoalEntry, ...]:
     if not isinstance(found, list):
         raise DataError(f"{place}: must be a list of goals, is {_kind(found)}.")
@@ -146,8 +169,10 @@ def _entry(found: object, place: str) -> GoalEntry:
     for name in ("scenario", "label"):
         if not isinstance(found.get(name, ""), str):
             raise DataError(f'{place}: {name} must be text in quotes, is {_kind(found[name])}.')  # fmt: skip
+        _refuse_unshowable(found.get(name, ""), f"{place}: {name}")
     if isinstance(found["agent"], bool) or not isinstance(found["agent"], int):
-        raise DataError(f"{place}: agent must be a whole number, an object id of the record, is {found['agent']!r}.")
+        shown = found["agent"] if isinstance(found["agent"], float) else _kind(found["agent"])
+        raise DataError(f"{place}: agent must be a whole number, an object id of the record, is {shown}.")
     x, y = (_coordinate(found[name], f"{place}: {name}") for name in ("x", "y"))
     return GoalEntry(found["scenario"], found["agent"], x, y, found.get("label", ""), place)
 
@@ -166,11 +191,20 @@ def _refuse_unknown(found: Mapping[str, Any], known: Sequence[str], place: str) 
             near = difflib.get_close_matches(name, known, 1)
             hint = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(known)}."
             raise DataError(f"{place}: no field {name!r} here: {hint}")
+    if isinstance(found, _Object) and found.repeated:
+        raise DataError(f"{place}: {', '.join(found.repeated)} is written more than once: keep one of them.")
+
+
+def _refuse_unshowable(text: str, place: str) -> None:
+    for character in text:
+        kind = UNSHOWABLE.get(unicodedata.category(character))
+        if kind:
+            raise DataError(f"{place} has {kind}, U+{ord(character):04X}, that cannot be shown: write it without.")
 
 
 def _kind(value: object) -> str:
     """A JSON value in words."""
-    names = {str: "text", list: "a list", dict: "an object", bool: "true or false", type(None): "null"}
+    names = {str: "text", list: "a list", _Object: "an object", bool: "true or false", type(None): "null"}
     return names.get(type(value), "a number")
 
 

@@ -33,7 +33,7 @@ def track_of(entry: GoalEntry, scenario: Scenario) -> int:
         ids = sorted(tracks.object_id[simulated].tolist())
         listed = ", ".join(str(i) for i in ids[:LISTED]) + (", ..." if len(ids) > LISTED else "")
         raise DataError(
-            f"{entry}: scenario {scenario.scenario_id} has no agent {entry.agent_id}: it simulates {len(ids)}, {listed}."
+            f"{entry}: scenario {scenario.scenario_id} has no agent {entry.agent_id}: it simulates {len(ids)} agents: {listed}."
         )
     if found[0] not in simulated:
         raise DataError(

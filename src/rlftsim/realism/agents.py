@@ -32,6 +32,11 @@ class SimulatedStates:
     repeat: int = 1
     """Each rollout stands for this many identical ones: 32 equal rollouts are scored at the cost of one."""
 
+    def way_of(self, object_id: int) -> Float[Tensor, "N T 2"]:
+        """Where the rollouts took an agent that they have."""
+        row = int(np.flatnonzero(self.object_id == object_id)[0])
+        return torch.stack([self.x[:, row], self.y[:, row]], -1)
+
     def __post_init__(self) -> None:
         object.__setattr__(self, "object_id", np.asarray(self.object_id, np.int64))
         expected = (*self.x.shape[:1], len(self.object_id), FUTURE_STEPS)

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import NullFormatter, NullLocator
 
+from rlftsim.errors import ConfigError
 from rlftsim.files import write_whole
 
 COLOURS = ("#1d63d8", "#e07b00", "#11754b", "#a21caf", "#79828f", "#24292f")
@@ -21,6 +22,7 @@ COLOURS = ("#1d63d8", "#e07b00", "#11754b", "#a21caf", "#79828f", "#24292f")
 INK, PALE = "#24292f", "#c9cfd6"
 BETTER, WORSE, NEITHER, OWN = "#bfe3cf", "#f3c4bf", "#eef0ec", "#d7dbe0"
 DOTS_PER_INCH = 160
+PICTURES = (".png", ".svg", ".pdf")
 
 
 @dataclass(frozen=True)
@@ -194,11 +196,22 @@ def draw_verdicts(names: Sequence[str], verdicts: Int[np.ndarray, "n n"], *, tit
     return figure
 
 
+def refuse_no_picture(path: Path) -> None:
+    """Refuse a name of another ending than pictures have.
+
+    Raises:
+        ConfigError: it has.
+    """
+    if path.suffix not in PICTURES:
+        raise ConfigError(f"{path}: pictures are written as {', '.join(PICTURES)}: name the file so.")
+
+
 def save_figure(path: Path, figure: Figure, *, dots_per_inch: int = DOTS_PER_INCH) -> None:
-    """Write a figure as PNG or SVG, by the ending. Raises as `write_whole`."""
+    """Write a figure as PNG, SVG or PDF, by the ending. Raises as `write_whole` and `refuse_no_picture`."""
+    refuse_no_picture(path)
     kind = path.suffix.removeprefix(".")
     FigureCanvasAgg(figure)
-    metadata = {"Date": None} if kind == "svg" else None
+    metadata = {"png": None, "svg": {"Date": None}, "pdf": {"CreationDate": None}}[kind]
     with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "rlftsim"}):
         write_whole(
             path,

@@ -10,16 +10,19 @@ from matplotlib import patheffects
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle
 
 from rlftsim.goals.attainment import NEAR_M
 from rlftsim.scenario.types import CURRENT_STEP, Scenario
 from rlftsim.viewer.figure import DOTS_PER_INCH, INK, save_figure
 from rlftsim.viewer.page import Panel
 from rlftsim.viewer.picture import POINTS_PER_INCH, agent_shapes, draw_map, light_dots
-from rlftsim.viewer.scene import SceneView, build_scene, logged_trajectories
+from rlftsim.viewer.scene import AgentBoxes, SceneView, Trajectories, build_scene, logged_trajectories
 
 PANEL_INCHES = 4.2
-GOAL_COLOURS = ("#a21caf", "#1d63d8", "#11754b", "#e07b00", "#b42318", "#0e7490")
+GOAL_COLOURS = ("#a21caf", "#0f766e", "#7c2d12", "#4d7c0f", "#111827", "#be185d")
+"""None of them is that of an agent (`viewer.picture.COLOURS`)."""
+LONGEST_LABEL = 30
 MARGIN_M = 14.0
 MIN_RADIUS_M = 30.0
 
@@ -37,7 +40,14 @@ class DrawnGoal:
     driven: Float[np.ndarray, "N T 2"] | None = None
     """Where simulations took the agent."""
     is_recorded: bool = False
-    """Drawn as a square, not as a star."""
+    """Marked by an x, not by a cross."""
+
+    @property
+    def name(self) -> str:
+        """What stands beside the goal: who is asked, and the label, cut where it is long."""
+        label = self.label.replace("_", " ")
+        cut = label if len(label) <= LONGEST_LABEL else f"{label[: LONGEST_LABEL - 1]}…"
+        return f"{self.object_id}: {cut}" if label else str(self.object_id)
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,51 +60,79 @@ class GoalPanel:
 
 
 def draw_goals(
-    path: Path, panels: Sequence[GoalPanel], *, columns: int = 1, dots_per_inch: int = DOTS_PER_INCH
+    path: Path,
+    panels: Sequence[GoalPanel],
+    *,
+    columns: int = 1,
+    panel_inches: float = PANEL_INCHES,
+    dots_per_inch: int = DOTS_PER_INCH,
 ) -> None:
-    """Write a picture with a panel for each scenario. Raises as `write_whole`."""
+    """Write a picture with a panel for each scenario. Raises as `save_figure`.
+
+    Args:
+        path: .png, .svg or .pdf.
+        panels: at least one.
+        columns: panels in a row.
+        panel_inches: width of a panel.
+        dots_per_inch: of a PNG.
+    """
     rows = -(-len(panels) // columns)
-    figure = Figure(figsize=(PANEL_INCHES * columns, (PANEL_INCHES + 0.3) * rows), layout="constrained")
+    figure = Figure(figsize=(panel_inches * columns, (panel_inches + 0.3) * rows), layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False).ravel()
     for axis in axes:
         axis.set_axis_off()
     for axis, panel in zip(axes, panels):
-        _draw_panel(axis, panel)
+        _draw_panel(axis, panel, panel_inches)
     save_figure(path, figure, dots_per_inch=dots_per_inch)
 
 
-def _draw_panel(axis: Axes, panel: GoalPanel) -> None:
+def _draw_panel(axis: Axes, panel: GoalPanel, inches: float) -> None:
     scene, log = build_scene(panel.scenario), logged_trajectories(panel.scenario)
     x, y, radius = _focus(panel, scene)
     axis.set_axis_on()
     axis.set(xlim=(x - radius, x + radius), ylim=(y - radius, y + radius), xticks=[], yticks=[], aspect="equal")
     axis.set_facecolor("#eef0ec")
     axis.set_title(panel.title, fontsize=8, loc="left", color=INK)
-    draw_map(axis, scene, points_per_m=PANEL_INCHES * POINTS_PER_INCH / (2 * radius))
+    draw_map(axis, scene, points_per_m=inches * POINTS_PER_INCH / (2 * radius))
     for shape in agent_shapes(scene.agents, Panel(panel.title, log), CURRENT_STEP):
         axis.add_collection(shape, autolim=False)
     light_dots(axis, scene, CURRENT_STEP)
+    _write_ids(axis, scene.agents, log)
     for number, mark in enumerate(panel.marks):
         _draw_mark(axis, mark, panel.scenario.origin, GOAL_COLOURS[number % len(GOAL_COLOURS)])
+
+
+def _write_ids(axis: Axes, agents: AgentBoxes, log: Trajectories) -> None:
+    """The object id of everybody who is there, as goals name them."""
+    for agent in np.flatnonzero(log.valid[0, :, CURRENT_STEP]):
+        _write(axis, str(agents.object_id[agent]), log.position[0, agent, CURRENT_STEP], INK, size=5.5)
 
 
 def _draw_mark(axis: Axes, mark: DrawnGoal, origin: Float[np.ndarray, "2"], colour: str) -> None:
     if mark.driven is not None:
         alpha = max(0.15, 1 / np.sqrt(len(mark.driven)))
-        axis.add_collection(LineCollection(list(mark.driven - origin), colors=colour, lw=1, alpha=alpha), autolim=False)
+        driven = mark.driven - origin
+        axis.add_collection(LineCollection(list(driven), colors=colour, lw=1, alpha=alpha), autolim=False)
+        axis.plot(*driven[:, -1].T, ".", color=colour, ms=3, mec="none", alpha=max(alpha, 0.5), zorder=4)
     if mark.way is not None:
         axis.plot(*(mark.way - origin).T, color=colour, lw=1.4, zorder=4)
     if mark.position is None:
         return
-    x, y = mark.position - origin
-    angle = np.linspace(0, 2 * np.pi, 40)
-    axis.plot(x + NEAR_M * np.cos(angle), y + NEAR_M * np.sin(angle), color=colour, lw=0.8, zorder=4)
-    axis.plot([x], [y], "s" if mark.is_recorded else "*", color=colour, ms=5 if mark.is_recorded else 9, zorder=5)
+    point = mark.position - origin
+    axis.add_patch(Circle(tuple(point), NEAR_M, fc="white", alpha=0.5, zorder=3.5))
+    axis.add_patch(Circle(tuple(point), NEAR_M, fc="none", ec=colour, lw=0.8, zorder=5))
+    axis.plot(*point[:, None], "x" if mark.is_recorded else "+", color=colour, ms=8, mew=0.6, zorder=5)
+    _write(axis, mark.name, point, colour, size=7.0)
+
+
+def _write(axis: Axes, text: str, place: Float[np.ndarray, "2"], colour: str, *, size: float) -> None:
+    """Beside a place, on the side where there is more room, as it is: a dollar sign begins no formula."""
+    is_right = place[0] > sum(axis.get_xlim()) / 2
     outline = [patheffects.withStroke(linewidth=2, foreground="white")]
     axis.annotate(
-        mark.label.replace("_", " "), (x, y), (4, 4), textcoords="offset points", fontsize=7, color=colour, zorder=6,
-        path_effects=outline, annotation_clip=True,
-    )  # fmt: skip
+        text, tuple(place), (-4 if is_right else 4, 4), ha="right" if is_right else "left", textcoords="offset points",
+        fontsize=size, color=colour, zorder=6, path_effects=outline, annotation_clip=True, parse_math=False,
+    ).set_in_layout(False)  # fmt: skip
 
 
 def _focus(panel: GoalPanel, scene: SceneView) -> tuple[float, float, float]:

@@ -214,3 +214,29 @@ def test_the_goal_polyline_is_the_nearest_token_of_the_own_scenario():
     goals = Goals(position, torch.tensor([[[True, False]], [[True, True]]]))
     # scenario 0: token 1, and no goal; scenario 1: token 3 + 0, and a goal that is nowhere near the map
     assert see_goals(goals, points).polyline.tolist() == [[[1, -1]], [[3, -1]]]
+
+
+@each_sight
+@pytest.mark.parametrize("lies", ["beyond all of the map", "nowhere"])
+def test_a_goal_far_from_the_map_or_nowhere_has_no_polyline(sight, lies, base):
+    policy, batch = learned(base, sight), collate([scenes.crowd(num_agents=40)])
+    goals = far_goals(batch)
+    near = goals.position + (1000.0 if lies == "beyond all of the map" else torch.nan)
+    first = torch.zeros_like(goals.goal_mask)
+    first[:, :, 0] = True
+    asked = replace(goals, position=torch.where(first[..., None], near, goals.position))
+    paths = [simulate(policy, batch, num_rollouts=1, seed=5, goals=g).position for g in (asked, asked.only(first))]
+    assert all(path.isfinite().all() for path in paths)
+    free = simulate(policy, batch, num_rollouts=1, seed=5).position
+    is_seen = sight == "concat" and lies == "beyond all of the map"
+    assert paths[1].equal(free) != is_seen
+
+
+def test_a_goal_beyond_a_large_map_has_no_polyline():
+    points = torch.stack([torch.arange(300.0), torch.zeros(300)], -1)[
+        None
+    ]  # so many that only those around are looked at
+    position = torch.tensor([[[[100.2, 450.0], [torch.nan, 0.0]]]])
+    seen = [see_goals(Goals(position, torch.tensor([[mask]])), points) for mask in ([True, False], [True, True])]
+    assert [goals.polyline.tolist() for goals in seen] == [[[[-1, -1]]]] * 2
+    assert seen[1].goal_mask.tolist() == [[[True, False]]]  # what is no point is no goal

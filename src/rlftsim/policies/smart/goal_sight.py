@@ -32,12 +32,13 @@ class SeenGoals:
 
 
 def see_goals(goals: Goals, map_position: Float[Tensor, "B M 2"]) -> SeenGoals:
-    """Find the polyline of each goal.
+    """Find the polyline of each goal; a goal that is no finite point is none.
 
     Args:
         goals: what is asked.
         map_position: points of the map tokens, infinite for padding.
     """
+    goals = goals.only(goals.position.isfinite().all(-1))
     place = goals.goal_mask.nonzero(as_tuple=True)
     near = within(
         goals.position[place], place[0], map_position, None, radius_m=GOAL_POLYLINE_REACH_M, limit=1

@@ -55,8 +55,10 @@ def within(
 ) -> Neighbors:
     """Candidates nearer than a radius (strictly), the nearest of them where a limit binds, of equally near ones the first.
 
+    Lists have at least one entry (K >= 1), padding where nobody has a neighbour.
+
     Args:
-        position: of the rows.
+        position: of the rows, finite.
         place: where each row looks: an entry of the candidates' first axis.
         candidates: positions, infinite where there is nobody. Their flat index p * C + c is what neighbours are named by.
         own: the candidate of its place that a row is itself, and does not look at.
@@ -73,7 +75,7 @@ def within(
             squared.masked_fill_(view.columns == own[view.rows, None], torch.inf)
         near = _all_near(squared, radius_m) if limit is None else _nearest(squared, radius_m, limit)
         found.append((view.rows, view.columns[near.index] if len(view.columns) else near.index, near.mask))
-    width = max((mask.shape[1] for _, _, mask in found), default=1)
+    width = max([1, *(mask.shape[1] for _, _, mask in found)])
     index, is_near = place.new_zeros(len(place), width), place.new_zeros(len(place), width, dtype=torch.bool)
     for rows, columns, mask in found:
         index[:, : mask.shape[1]].index_copy_(0, rows, columns.masked_fill_(~mask, 0))
