@@ -18,10 +18,10 @@ from rlftsim.experiments.workshop import Workshop
 from rlftsim.progress import print_wide
 from rlftsim.recipes.configure import Override, configure
 from rlftsim.recipes.models import Device, find_device
-from rlftsim.recipes.smart import RECIPES, smart_synthetic
+from rlftsim.recipes.smart import RECIPES, RecipeName, smart_synthetic
 from rlftsim.workers import usable_cores
 
-ExperimentRecipe = Literal["synthetic", "smart-tiny", "smart-mini", "smart-nano", "smart-demo"]
+ExperimentRecipe = Literal["synthetic"] | RecipeName
 QUESTIONS = "; ".join(f"{name}: {experiment.question}" for name, experiment in EXPERIMENTS.items())
 
 

@@ -7,13 +7,12 @@ from pathlib import Path
 from rich.table import Table
 
 from rlftsim.cli.data import open_split
-from rlftsim.cli.train import RecipeName
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.experiments.vocabulary_report import ROWS, write_vocabulary_report
 from rlftsim.policies.smart.catk_vocabulary import read_catk_vocabulary
 from rlftsim.progress import print_wide, say
 from rlftsim.recipes.configure import Override, configure
-from rlftsim.recipes.smart import RECIPES
+from rlftsim.recipes.smart import RECIPES, RecipeName
 from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
 from rlftsim.tokens.coverage import ClassCoverage, measure_coverage
 from rlftsim.tokens.vocabulary import Vocabulary

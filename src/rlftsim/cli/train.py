@@ -15,14 +15,13 @@ from rlftsim.experiments.stages import finetune_with_catk, finetune_with_reward,
 from rlftsim.policies.smart.config import GoalSight
 from rlftsim.progress import say
 from rlftsim.recipes.configure import Override, configure
-from rlftsim.recipes.smart import RECIPES
+from rlftsim.recipes.smart import RECIPES, RecipeName
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.tokens.vocabulary import Vocabulary
 from rlftsim.training.parallel import is_first_process
 
 VALIDATION = "validation"
 """Split that is validated on where none is named."""
-RecipeName = Literal["smart-tiny", "smart-mini", "smart-nano", "smart-demo"]
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,8 @@
 """SMART's sizes with the numbers they are trained by. A variant calls one of these and changes fields."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 from rlftsim.policies.smart.config import SmartConfig, smart_demo, smart_mini, smart_nano, smart_tiny
 from rlftsim.tokens.clustering import TokensConfig
@@ -82,7 +84,8 @@ def smart_synthetic() -> SmartRecipe:
     return replace(recipe, finetune=replace(recipe.finetune, epochs=1.0))
 
 
-RECIPES = {
+RecipeName = Literal["smart-tiny", "smart-mini", "smart-nano", "smart-demo"]
+RECIPES: dict[RecipeName, Callable[[], SmartRecipe]] = {
     "smart-tiny": smart_tiny_rlftsim,
     "smart-mini": smart_mini_rlftsim,
     "smart-nano": smart_nano_rlftsim,
