@@ -21,7 +21,7 @@ from rlftsim.recipes.models import Device, find_device
 from rlftsim.recipes.smart import RECIPES, RecipeName, smart_synthetic
 from rlftsim.workers import usable_cores
 
-ExperimentRecipe = Literal["synthetic"] | RecipeName
+ExperimentRecipe = Literal["synthetic", RecipeName]
 QUESTIONS = "; ".join(f"{name}: {experiment.question}" for name, experiment in EXPERIMENTS.items())
 
 
