@@ -120,7 +120,7 @@ def test_none_is_a_value_where_a_field_allows_it():
         ("pretrain.batch_size=true", "expected int"),
         ("pretrain.batch_size=none", "expected int"),
         ("tokens.mirror=1", "expected bool"),
-        ("finetune.trained=some", "expected one of decoder, all"),
+        ("finetune.trained=some", "expected one of decoder, goals, all"),
         ("finetune.reward=joy", "unknown reward 'joy': known are collision_offroad"),
         ("finetune.num_rollouts=1", "at least 2 rollouts"),
         ("model.dropout=1.5", r"shares in \[0, 1\)"),

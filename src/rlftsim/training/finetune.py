@@ -366,7 +366,7 @@ def _step(learner: Learner, sums: _Sums, config: FinetuneConfig) -> float:
     norm = float(torch.nn.utils.clip_grad_norm_(learner.parameters, config.gradient_clip))
     rate = config.learning_rate * min((learner.update + 1) / max(config.warmup_updates, 1), 1.0)
     for group in learner.optimizer.param_groups:
-        group["lr"] = rate * group["scale"]
+        group["lr"] = rate * group.get("scale", 1.0)
     learner.update += 1
     if math.isfinite(norm) and sums.kl / max(sums.count, 1.0) <= config.max_kl:
         learner.optimizer.step()

@@ -247,7 +247,7 @@ def learning_rate(update: int, total: int, config: ImitationConfig) -> float:
 
 def _set_learning_rate(optimizer: torch.optim.Optimizer, value: float) -> None:
     for group in optimizer.param_groups:
-        group["lr"] = value * group["scale"]
+        group["lr"] = value * group.get("scale", 1.0)
 
 
 def _update(learner: _Learner, update: int) -> dict[str, float]:
