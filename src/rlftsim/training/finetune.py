@@ -232,8 +232,9 @@ def update_policy(learner: Learner, batch: ScenarioBatch, config: FinetuneConfig
         experiences.append(Experience(part, rollouts, scores, rewards))
         clock.lap("reward")
     # 3 log-probabilities under policy and reference, 4 loss and gradients, slice by slice
-    sums, asked = _accumulate_gradients(learner, experiences, config, fabric)
-    ratios = _accumulate_hindsight(learner, experiences, asked, config, fabric)
+    num_scenarios, num_decisions = _count(experiences, fabric)
+    sums, asked = _accumulate_gradients(learner, experiences, config, fabric, num_scenarios, num_decisions)
+    ratios = _accumulate_hindsight(learner, experiences, asked, config, fabric, num_scenarios)
     add_up_gradients(learner.parameters, fabric)
     clock.lap("backward")
     # 5 step, 6 penalty, 7 reference
@@ -284,14 +285,18 @@ AskedLogProb = list[list[Float[Tensor, "_ _ _"]]]
 
 
 def _accumulate_gradients(
-    learner: Learner, experiences: Sequence[Experience], config: FinetuneConfig, fabric: Fabric
+    learner: Learner,
+    experiences: Sequence[Experience],
+    config: FinetuneConfig,
+    fabric: Fabric,
+    num_scenarios: int,
+    num_decisions: float,
 ) -> tuple[_Sums, AskedLogProb]:
     """Score the rollouts under policy and reference and leave this process's gradient of the loss in the policy's parameters.
 
     The reference is asked nothing: with or without goals, behaviour is held to what is realistic.
     """
     learner.optimizer.zero_grad(set_to_none=True)
-    num_scenarios, num_decisions = _count(experiences, fabric)
     sums = torch.zeros(2, device=fabric.device, dtype=torch.float64)
     gaps: list[Tensor] = []
     asked: AskedLogProb = []
@@ -319,7 +324,12 @@ def _accumulate_gradients(
 
 
 def _accumulate_hindsight(
-    learner: Learner, experiences: Sequence[Experience], asked: AskedLogProb, config: FinetuneConfig, fabric: Fabric
+    learner: Learner,
+    experiences: Sequence[Experience],
+    asked: AskedLogProb,
+    config: FinetuneConfig,
+    fabric: Fabric,
+    num_scenarios: int,
 ) -> dict[str, float]:
     """Add the gradient of what is earned under other goals. Returns what is logged; nothing in a run without hindsight.
 
@@ -330,7 +340,6 @@ def _accumulate_hindsight(
         return {}
     gathered = [parameter.grad for parameter in learner.parameters]
     learner.optimizer.zero_grad(set_to_none=True)
-    num_scenarios, _ = _count(experiences, fabric)
     sums = torch.zeros(2, device=fabric.device, dtype=torch.float64)
     others = look_back(experiences, parse_reward(config.reward))
     for other, log_probs in zip(others, asked):

@@ -33,6 +33,14 @@ def estimate(values: Iterable[float]) -> MeanInterval:
     return mean_interval(np.array(list(values), float))
 
 
+def cell(share: MeanInterval) -> str:
+    """A mean share in percent with its standard error, where there is one; a dash without a single share."""
+    if not share.count:
+        return "–"
+    error = f" ± {100 * share.standard_error:.1f}" if share.count > 1 else ""
+    return f"{100 * share.mean:.1f}{error}"
+
+
 def paired_gain(before: Mapping[str, float], after: Mapping[str, float]) -> MeanInterval:
     """What shares gain, scenario by scenario."""
     return estimate(after[scenario_id] - before[scenario_id] for scenario_id in after)

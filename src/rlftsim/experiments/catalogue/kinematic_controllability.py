@@ -13,6 +13,7 @@ from rlftsim.experiments.catalogue.controllability import (
     SEED_NOTE,
     WAYS,
     bands_of,
+    cell,
     contestants,
     estimate,
     gain_words,
@@ -121,7 +122,7 @@ def _curve(measured: Measured, row: str, way: str) -> list[MeanInterval]:
 
 
 def _table(way: str, curves: Mapping[str, Sequence[MeanInterval]]) -> TextTable:
-    rows = tuple((row, *(f"{100 * m.mean:.1f} ± {100 * m.standard_error:.1f}" for m in curve)) for row, curve in curves.items())  # fmt: skip
+    rows = tuple((row, *(cell(share) for share in curve)) for row, curve in curves.items())
     count = max(m.count for curve in curves.values() for m in curve)
     headings = ("", *(f"{h:+d} s" for h in OFFSETS_S))
     note = f"Ego of {count} held-out scenarios; share of rollouts, mean ± standard error over scenarios."

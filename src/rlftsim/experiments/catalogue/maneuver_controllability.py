@@ -13,6 +13,7 @@ from rlftsim.experiments.catalogue.controllability import (
     SEED_NOTE,
     WAYS,
     bands_of,
+    cell,
     contestants,
     estimate,
     gain_words,
@@ -168,16 +169,9 @@ def _by_manoeuvre(measured: Measured, row: str, way: str, condition: str) -> dic
     return {m: estimate(own) for m, own in values.items()}
 
 
-def _cell(estimate: MeanInterval) -> str:
-    if not estimate.count:
-        return "–"
-    error = f" ± {100 * estimate.standard_error:.1f}" if estimate.count > 1 else ""
-    return f"{100 * estimate.mean:.1f}{error}"
-
-
 def _condition_table(title: str, rows: Mapping[str, Sequence[MeanInterval]]) -> TextTable:
-    cells = tuple((row, *(_cell(estimate) for estimate in estimates)) for row, estimates in rows.items())
-    counts = [estimate.count for estimate in next(iter(rows.values()))]
+    cells = tuple((row, *(cell(share) for share in shares)) for row, shares in rows.items())
+    counts = [share.count for share in next(iter(rows.values()))]
     note = f"Ego of {max(counts)} held-out scenarios; mean ± standard error over scenarios."
     return TextTable(f"Ours: {title} ↑", ("", *CONDITIONS), cells, note)
 
@@ -187,9 +181,7 @@ def _manoeuvre_table(measured: Measured, condition: str) -> TextTable:
     cells = []
     for row in measured.attained:
         passed, reached = (_by_manoeuvre(measured, row, way, condition) for way in WAYS)
-        cells.append(
-            (row, *(f"{_cell(passed[m])} / {_cell(reached[m])}" if passed[m].count else "–" for m in Manoeuvre))
-        )
+        cells.append((row, *(f"{cell(passed[m])} / {cell(reached[m])}" if passed[m].count else "–" for m in Manoeuvre)))
     counts = _by_manoeuvre(measured, next(iter(measured.attained)), "passed", condition)
     headings = ("", *(f"{m.value.replace('_', ' ')} ({counts[m].count})" for m in Manoeuvre))
     return TextTable(f"Ours: {condition}, passed / reached [%] ↑ (goals)", headings, tuple(cells))
@@ -203,8 +195,8 @@ def _verdict(measured: Measured, row: str, way: str) -> str:
     return f"{row} against {START}, {way.replace('_', ' ')}, alternatives only{times}: {gain_words(gain)}"
 
 
-def _plain(estimate: MeanInterval) -> dict[str, object]:
-    return {"mean": estimate.mean, "standard_error": estimate.standard_error, "interval": estimate.interval, "count": estimate.count}  # fmt: skip
+def _plain(share: MeanInterval) -> dict[str, object]:
+    return {"mean": share.mean, "standard_error": share.standard_error, "interval": share.interval, "count": share.count}  # fmt: skip
 
 
 def _figure(measured: Measured, rows: Sequence[str]) -> Figure:
