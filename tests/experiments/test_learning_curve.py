@@ -4,7 +4,10 @@ import json
 
 from rlftsim.experiments.learning_curve import finetuning_charts, imitation_charts, write_learning_curve
 
-LINES = [{"update": u, "loss": 3.0 / u, "accuracy": 0.1 * u, "top5_accuracy": 0.2 * u} for u in range(1, 5)]
+LINES = [
+    {"update": u, "loss": 3.0 / u, "accuracy": 0.1 * u, "top5_accuracy": 0.2 * u, "entropy": 4.0 / u}
+    for u in range(1, 5)
+]
 SCORES = {"validation_rmm": 0.6, "validation_rmm_low": 0.5, "validation_rmm_high": 0.7}
 
 

@@ -1,3 +1,4 @@
+import json
 import math
 from dataclasses import replace
 from itertools import pairwise
@@ -11,7 +12,7 @@ from rlftsim.errors import ConfigError
 from rlftsim.scenario.batch import collate
 from rlftsim.tokens.smoothing import neighbor_weights
 from rlftsim.training.data import trained_agents
-from rlftsim.training.imitation import learning_rate, summed_loss
+from rlftsim.training.imitation import _say_if_unsure, learning_rate, summed_loss
 from rlftsim.training.pretrain import PretrainConfig, pretrain
 from rlftsim.training.run_folder import read_metrics
 
@@ -119,6 +120,27 @@ def test_smoothing_may_go_to_the_tokens_near_the_target(vocabulary, drawn_scenar
     expected = -(0.7 * log_probs.gather(-1, targets[:, None])[:, 0] + 0.3 * near).sum()
     assert float(summed_loss(said, 0.3, vocabulary)[0]) == pytest.approx(float(expected), rel=1e-4)
     assert losses["spatial"] != pytest.approx(losses["uniform"], rel=1e-3)
+
+
+def test_the_entropy_of_predictions_is_logged(vocabulary, drawn_scenarios, tmp_path):
+    policy = tiny.tiny_policy(vocabulary, tiny.WITHOUT_CHANCE)
+    batch = collate(drawn_scenarios)
+    said = policy.teacher_forced(batch, batch.agent_mask)
+    entropies = torch.distributions.Categorical(logits=said.logits[said.target_mask]).entropy()
+    _, (_, _, entropy, count) = summed_loss(said, 0.0)
+    assert float(entropy / count) == pytest.approx(float(entropies.mean()), rel=1e-5)
+    config = replace(tiny.PRETRAIN, epochs=1.0, batch_size=len(drawn_scenarios))
+    pretrain(policy, drawn_scenarios, tmp_path, config)
+    assert read_metrics(tmp_path)[0]["entropy"] == pytest.approx(float(entropies.mean()), rel=0.2)
+
+
+@pytest.mark.parametrize(("entropy", "is_said"), [(1.9, True), (1.05, False)])
+def test_a_model_that_is_less_sure_than_right_is_told_of(tmp_path, capsys, entropy, is_said):
+    lines = [{"update": u, "loss": 1.0, "entropy": 9.0 if u < 19 else entropy} for u in range(1, 21)]
+    (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    _say_if_unsure(tmp_path, 20, tiny.PRETRAIN)
+    said = " ".join(capsys.readouterr().err.split())
+    assert ("entropy 1.90, loss 1.00" in said and "smaller batch_size" in said) == is_said
 
 
 def test_smoothing_among_near_tokens_needs_a_vocabulary(drawn_scenarios, tmp_path):

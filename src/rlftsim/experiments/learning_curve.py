@@ -29,7 +29,7 @@ def imitation_charts(lines: Lines) -> list[Chart]:
         validation_rmm="RMM", validation_rmm_low="low", validation_rmm_high="high",
     )  # fmt: skip
     return [
-        _chart(lines, "Cross-entropy", "nats per token", loss="loss"),
+        _chart(lines, "Cross-entropy", "nats per token", loss="loss", entropy="entropy of predictions"),
         _chart(lines, "Next token right", "share", accuracy="first guess", top5_accuracy="among five"),
         *([realism] if len(realism.curves[0].x) else []),
     ]

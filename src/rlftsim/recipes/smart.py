@@ -47,13 +47,13 @@ def smart_nano_rlftsim() -> SmartRecipe:
 
 
 def smart_demo_rlftsim() -> SmartRecipe:
-    """Minutes on two CPU cores, for a few hundred scenarios: a small model, a short pre-training, large fine-tuning steps."""
+    """Minutes on two CPU cores, for a few hundred scenarios: a small model, a pre-training of many small updates, large fine-tuning steps."""
     return SmartRecipe(
         tokens=TokensConfig(num_tokens=1024, num_map_prototypes=256),
         model=smart_demo(),
         pretrain=PretrainConfig(
-            epochs=10.0, batch_size=8, learning_rate=2e-3, warmup_updates=10, gradient_clip=1.0, label_smoothing=0.0,
-            max_trained_agents=None, checkpoint_every=50,
+            epochs=10.0, batch_size=2, learning_rate=3e-3, warmup_updates=40, gradient_clip=1.0, label_smoothing=0.0,
+            max_trained_agents=None, checkpoint_every=200,
         ),
         finetune=FinetuneConfig(
             epochs=1.5, batch_size=4, num_rollouts=8, rollouts_per_pass=8, learning_rate=3e-4, warmup_updates=5,

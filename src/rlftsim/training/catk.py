@@ -335,4 +335,4 @@ def catk_loss(
         trained: True = the agent's decisions count.
     """
     loss, counts = summed_loss(predict_along(policy, policy.encode(batch), pursuing, trained), 0.0)
-    return loss / counts[2].clamp(min=1)
+    return loss / counts[-1].clamp(min=1)

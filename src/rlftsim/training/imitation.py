@@ -30,11 +30,13 @@ from rlftsim.training.checkpoint import Progress, newest_checkpoint, read_checkp
 from rlftsim.training.data import batch_with_futures, scenarios_of_update, trained_agents
 from rlftsim.training.freezing import parameter_groups
 from rlftsim.training.parallel import DeviceConfig, add_up, add_up_gradients, own_share, start_fabric
-from rlftsim.training.run_folder import RunFolder, describe_inputs
+from rlftsim.training.run_folder import RunFolder, describe_inputs, read_metrics
 from rlftsim.training.validation import ValidationConfig, refuse_to_validate, validate
 
 IMPOSSIBLE = -1e8
 """A token that cannot be chosen has a smaller logit than this."""
+UNSURE_FACTOR = 1.1
+"""A model is called unsure if the entropy of its predictions is so many times its loss."""
 
 
 @runtime_checkable
@@ -196,8 +198,21 @@ def imitate(
             advance(note=f"loss {values['loss']:.3f}, right {values['accuracy']:.0%}{realism}")
     run.close()
     if fabric.is_global_zero:
+        _say_if_unsure(run.path, total, config)
         model.eval().save_pretrained(run.model, card=card)  # type: ignore[operator]
     return run.model
+
+
+def _say_if_unsure(folder: Path, total: int, config: ImitationConfig) -> None:
+    """Say so where a model ends less sure than right. At a minimum of the cross-entropy no scale of the logits is better than theirs, and
+    there mean entropy and mean loss are equal; a larger entropy is a tail of unlikely tokens, which rollouts draw from sixteen times."""
+    last = [line for line in read_metrics(folder)[-math.ceil(total / 10) :] if "entropy" in line]
+    loss, entropy = (sum(line[name] for line in last) / max(len(last), 1) for name in ("loss", "entropy"))
+    if config.label_smoothing == 0 and entropy > UNSURE_FACTOR * loss:
+        say(
+            f"the model is less sure than it is right (entropy {entropy:.2f}, loss {loss:.2f} nats at the end), so its rollouts stray: "
+            "give it more updates (a smaller batch_size, more epochs) or a larger learning_rate."
+        )
 
 
 def _skipped_in_a_row(before: int, update: int, values: dict[str, float], run: RunFolder, learner: _Learner) -> int:
@@ -255,7 +270,7 @@ def _update(learner: _Learner, update: int) -> dict[str, float]:
     config, fabric = learner.config, learner.fabric
     torch.manual_seed(derive_seed(config.seed, "dropout", update, fabric.global_rank) % 2**63)
     learner.optimizer.zero_grad(set_to_none=True)
-    sums = torch.zeros(4, device=fabric.device)  # loss, right, right among the best five, predictions
+    sums = torch.zeros(5, device=fabric.device)  # loss, right, right among the best five, entropy, predictions
     chosen = scenarios_of_update(update, config.batch_size, len(learner.scenarios), config.seed)
     own = own_share(chosen, fabric, learner.costs[chosen].tolist())
     for micro in micro_batches(own, learner.costs, max_count=config.micro_batch_size, max_cost=config.micro_batch_cost):
@@ -267,23 +282,24 @@ def _update(learner: _Learner, update: int) -> dict[str, float]:
     add_up_gradients(parameters, fabric)
     for parameter in parameters:
         if parameter.grad is not None:
-            parameter.grad.div_(sums[3].clamp(min=1))
+            parameter.grad.div_(sums[-1].clamp(min=1))
     norm = torch.nn.utils.clip_grad_norm_(parameters, config.gradient_clip)
     if math.isfinite(float(norm)):
         learner.optimizer.step()
-    loss, right, among_five, predictions = sums.tolist()
+    loss, right, among_five, entropy, predictions = sums.tolist()
     count = max(predictions, 1.0)
     return {
         "loss": loss / count,
         "accuracy": right / count,
         "top5_accuracy": among_five / count,
+        "entropy": entropy / count,
         "gradient_norm": float(norm),
         "predictions": predictions,
         "learning_rate": learner.optimizer.param_groups[0]["lr"],
     }
 
 
-def _backward(learner: _Learner, batch: ScenarioBatch, update: int) -> tuple[Float[Tensor, ""], Float[Tensor, "3"]]:
+def _backward(learner: _Learner, batch: ScenarioBatch, update: int) -> tuple[Float[Tensor, ""], Float[Tensor, "4"]]:
     """Add the gradient of a micro batch's summed loss; the loss and its counts."""
     config = learner.config
     trained = trained_agents(
@@ -299,9 +315,9 @@ def _backward(learner: _Learner, batch: ScenarioBatch, update: int) -> tuple[Flo
 
 def summed_loss(
     prediction: Prediction, label_smoothing: float, nearby: Vocabulary | None = None
-) -> tuple[Float[Tensor, ""], Float[Tensor, "3"]]:
-    """Summed cross-entropy, and how many predictions were right, right among the best five, and made at all. Zeros where nothing
-    counts.
+) -> tuple[Float[Tensor, ""], Float[Tensor, "4"]]:
+    """Summed cross-entropy, and how many predictions were right, right among the best five, the sum of their entropies (nats), and how many were
+    made at all. Zeros where nothing counts.
 
     Args:
         prediction: what was said and what should have been.
@@ -318,6 +334,6 @@ def summed_loss(
     of_target = log_probs.gather(-1, target[:, None])[:, 0]
     loss = -((1 - label_smoothing) * of_target.sum() + label_smoothing * elsewhere)
     best = logits.detach().topk(min(5, logits.shape[-1]), dim=-1).indices == target[:, None]
-    return loss, torch.stack(
-        [best[:, 0].sum(), best.any(-1).sum(), torch.tensor(len(target), device=target.device)]
-    ).float()
+    entropy = -(log_probs.detach().exp() * log_probs.detach()).sum()
+    count = torch.tensor(len(target), device=target.device)
+    return loss, torch.stack([best[:, 0].sum(), best.any(-1).sum(), entropy, count]).float()

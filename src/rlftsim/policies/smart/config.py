@@ -98,5 +98,5 @@ def smart_demo() -> SmartConfig:
     return SmartConfig(
         dim=48, num_heads=4, head_dim=12, num_map_layers=1, num_decoder_layers=2, num_frequencies=8,
         map_radius_m=11.0, agent_map_radius_m=30.0, agent_radius_m=30.0, history_tokens=4,
-        max_map_neighbors=8, max_agent_map_neighbors=16, max_agent_neighbors=8,
+        max_map_neighbors=8, max_agent_map_neighbors=16, max_agent_neighbors=8, dropout=0.0, history_drop=0.0,
     )  # fmt: skip
