@@ -1,4 +1,3 @@
-import json
 import math
 from dataclasses import replace
 from itertools import pairwise
@@ -12,7 +11,7 @@ from rlftsim.errors import ConfigError
 from rlftsim.scenario.batch import collate
 from rlftsim.tokens.smoothing import neighbor_weights
 from rlftsim.training.data import trained_agents
-from rlftsim.training.imitation import _say_if_unsure, learning_rate, summed_loss
+from rlftsim.training.imitation import learning_rate, summed_loss
 from rlftsim.training.pretrain import PretrainConfig, pretrain
 from rlftsim.training.run_folder import read_metrics
 
@@ -132,15 +131,6 @@ def test_the_entropy_of_predictions_is_logged(vocabulary, drawn_scenarios, tmp_p
     config = replace(tiny.PRETRAIN, epochs=1.0, batch_size=len(drawn_scenarios))
     pretrain(policy, drawn_scenarios, tmp_path, config)
     assert read_metrics(tmp_path)[0]["entropy"] == pytest.approx(float(entropies.mean()), rel=0.2)
-
-
-@pytest.mark.parametrize(("entropy", "is_said"), [(1.9, True), (1.05, False)])
-def test_a_model_that_is_less_sure_than_right_is_told_of(tmp_path, capsys, entropy, is_said):
-    lines = [{"update": u, "loss": 1.0, "entropy": 9.0 if u < 19 else entropy} for u in range(1, 21)]
-    (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    _say_if_unsure(tmp_path, 20, tiny.PRETRAIN)
-    said = " ".join(capsys.readouterr().err.split())
-    assert ("entropy 1.90, loss 1.00" in said and "smaller batch_size" in said) == is_said
 
 
 def test_smoothing_among_near_tokens_needs_a_vocabulary(drawn_scenarios, tmp_path):

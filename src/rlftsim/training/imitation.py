@@ -30,13 +30,11 @@ from rlftsim.training.checkpoint import Progress, newest_checkpoint, read_checkp
 from rlftsim.training.data import batch_with_futures, scenarios_of_update, trained_agents
 from rlftsim.training.freezing import parameter_groups
 from rlftsim.training.parallel import DeviceConfig, add_up, add_up_gradients, own_share, start_fabric
-from rlftsim.training.run_folder import RunFolder, describe_inputs, read_metrics
+from rlftsim.training.run_folder import RunFolder, describe_inputs
 from rlftsim.training.validation import ValidationConfig, refuse_to_validate, validate
 
 IMPOSSIBLE = -1e8
 """A token that cannot be chosen has a smaller logit than this."""
-UNSURE_FACTOR = 1.1
-"""A model is called unsure if the entropy of its predictions is so many times its loss."""
 
 
 @runtime_checkable
@@ -198,21 +196,8 @@ def imitate(
             advance(note=f"loss {values['loss']:.3f}, right {values['accuracy']:.0%}{realism}")
     run.close()
     if fabric.is_global_zero:
-        _say_if_unsure(run.path, total, config)
         model.eval().save_pretrained(run.model, card=card)  # type: ignore[operator]
     return run.model
-
-
-def _say_if_unsure(folder: Path, total: int, config: ImitationConfig) -> None:
-    """Say so where a model ends less sure than right. At a minimum of the cross-entropy no scale of the logits is better than theirs, and
-    there mean entropy and mean loss are equal; a larger entropy is a tail of unlikely tokens, which rollouts draw from sixteen times."""
-    last = [line for line in read_metrics(folder)[-math.ceil(total / 10) :] if "entropy" in line]
-    loss, entropy = (sum(line[name] for line in last) / max(len(last), 1) for name in ("loss", "entropy"))
-    if config.label_smoothing == 0 and entropy > UNSURE_FACTOR * loss:
-        say(
-            f"the model is less sure than it is right (entropy {entropy:.2f}, loss {loss:.2f} nats at the end), so its rollouts stray: "
-            "give it more updates (a smaller batch_size, more epochs) or a larger learning_rate."
-        )
 
 
 def _skipped_in_a_row(before: int, update: int, values: dict[str, float], run: RunFolder, learner: _Learner) -> int:
