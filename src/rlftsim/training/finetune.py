@@ -31,7 +31,7 @@ from rlftsim.training.alarms import AlarmConfig, Alarms
 from rlftsim.training.checkpoint import Progress, newest_checkpoint, read_checkpoint, write_checkpoint
 from rlftsim.training.data import batch_with_futures, scenarios_of_update
 from rlftsim.training.experience import Experience, describe
-from rlftsim.training.freezing import TrainedParts, freeze_untrained, parameter_groups
+from rlftsim.training.freezing import TrainedParts, freeze_untrained, parameter_groups, set_learning_rate
 from rlftsim.training.goals import GoalConfig, choose_goals, refuse_goals
 from rlftsim.training.hindsight import clipped_ratio, goal_terms, look_back
 from rlftsim.training.parallel import DeviceConfig, add_up, add_up_gradients, own_share, start_fabric
@@ -374,8 +374,7 @@ def _step(learner: Learner, sums: _Sums, config: FinetuneConfig) -> float:
     """Take the optimiser's step, or skip it where something is not finite or the KL exploded. Returns the gradient norm."""
     norm = float(torch.nn.utils.clip_grad_norm_(learner.parameters, config.gradient_clip))
     rate = config.learning_rate * min((learner.update + 1) / max(config.warmup_updates, 1), 1.0)
-    for group in learner.optimizer.param_groups:
-        group["lr"] = rate * group.get("scale", 1.0)
+    set_learning_rate(learner.optimizer, rate)
     learner.update += 1
     if math.isfinite(norm) and sums.kl / max(sums.count, 1.0) <= config.max_kl:
         learner.optimizer.step()

@@ -3,6 +3,7 @@
 from typing import Any, Literal
 
 from torch import nn
+from torch.optim import Optimizer
 
 from rlftsim.errors import ConfigError
 
@@ -41,3 +42,9 @@ def parameter_groups(model: nn.Module, goal_scale: float) -> list[dict[str, Any]
 
 def _goal_parts(model: nn.Module) -> tuple[nn.Module, ...]:
     return model.goal_parts() if hasattr(model, "goal_parts") else ()  # type: ignore[operator]
+
+
+def set_learning_rate(optimizer: Optimizer, value: float) -> None:
+    """The learning rate of the next step: each group's by its scale, which is 1 where the optimiser was not built of `parameter_groups`."""
+    for group in optimizer.param_groups:
+        group["lr"] = value * group.get("scale", 1.0)

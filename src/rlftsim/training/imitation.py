@@ -28,7 +28,7 @@ from rlftsim.tokens.vocabulary import Vocabulary
 from rlftsim.training.batches import micro_batches, scenario_costs
 from rlftsim.training.checkpoint import Progress, newest_checkpoint, read_checkpoint, write_checkpoint
 from rlftsim.training.data import batch_with_futures, scenarios_of_update, trained_agents
-from rlftsim.training.freezing import parameter_groups
+from rlftsim.training.freezing import parameter_groups, set_learning_rate
 from rlftsim.training.parallel import DeviceConfig, add_up, add_up_gradients, own_share, start_fabric
 from rlftsim.training.run_folder import RunFolder, describe_inputs
 from rlftsim.training.validation import ValidationConfig, refuse_to_validate, validate
@@ -183,7 +183,7 @@ def imitate(
     with progress_bar(title, total, done) as advance:
         for update in range(done, total):
             start = time.perf_counter()
-            _set_learning_rate(optimizer, learning_rate(update, total, config))
+            set_learning_rate(optimizer, learning_rate(update, total, config))
             values = _update(learner, update)
             values["seconds"] = time.perf_counter() - start
             if held_out is not None and config.validation.is_due(update + 1, total):
@@ -243,11 +243,6 @@ def learning_rate(update: int, total: int, config: ImitationConfig) -> float:
     share = (update - config.warmup_updates) / max(total - config.warmup_updates, 1)
     low = config.final_learning_rate_share
     return config.learning_rate * (low + 0.5 * (1 - low) * (1 + math.cos(math.pi * share)))
-
-
-def _set_learning_rate(optimizer: torch.optim.Optimizer, value: float) -> None:
-    for group in optimizer.param_groups:
-        group["lr"] = value * group.get("scale", 1.0)
 
 
 def _update(learner: _Learner, update: int) -> dict[str, float]:
