@@ -80,7 +80,7 @@ def _drawn(out: Path) -> Iterator[None]:
     try:
         yield
     except BaseException:
-        with suppress(RlftsimError):  # why the run ended matters more than why nothing could be drawn
+        with suppress(RlftsimError, OSError):  # why the run ended matters more than why nothing could be drawn
             _draw(out)
         raise
     _draw(out)
