@@ -117,7 +117,7 @@ def test_smoothing_may_go_to_the_tokens_near_the_target(vocabulary, drawn_scenar
     weights = neighbor_weights(vocabulary, classes, targets)
     near = (weights * log_probs.clamp(min=-100)).sum(-1)
     expected = -(0.7 * log_probs.gather(-1, targets[:, None])[:, 0] + 0.3 * near).sum()
-    assert float(summed_loss(said, 0.3, vocabulary)[0].detach()) == pytest.approx(float(expected), rel=1e-4)
+    assert float(summed_loss(said, 0.3, vocabulary)[0].detach()) == pytest.approx(float(expected.detach()), rel=1e-4)
     assert losses["spatial"] != pytest.approx(losses["uniform"], rel=1e-3)
 
 
