@@ -223,7 +223,16 @@ def test_pretraining_and_fine_tuning_by_command(vocabulary, tmp_path, capsys):
     assert json.loads((tmp_path / "catk" / "config.json").read_text())["num_candidates"] == 4
     assert "CAT-K" in (tmp_path / "catk" / "model" / "README.md").read_text()
     assert len([line for line in read_metrics(tmp_path / "catk") if line["validation_rmm"] > 0]) == 2
-    for run_folder in (base, tuned, tmp_path / "catk"):
+    # the same model, told where its own rollouts led
+    few = ["gcsl.epochs=0.05", "gcsl.num-rollouts=2", "gcsl.device.threads=1"]
+    words = ["finetune", "smart-demo", "--method", "gcsl", "--goal", "indication", "--model", base, *common]
+    assert run(capsys, *words, "--out", tmp_path / "gcsl", "--set", *few)[0] == 0
+    assert '"goal_aim": true' in (tmp_path / "gcsl" / "model" / "config.json").read_text()
+    assert (
+        "told where its own rollouts led, goals by indication"
+        in (tmp_path / "gcsl" / "model" / "README.md").read_text()
+    )
+    for run_folder in (base, tuned, tmp_path / "catk", tmp_path / "gcsl"):
         assert (run_folder / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
     # the same folder with other settings is another run
     status, _, err = run(
@@ -279,6 +288,8 @@ def test_what_has_no_effect_on_a_method_is_refused(tmp_path, vocabulary, capsys)
         ([*catk, *every, "--validation-split", "tests"], "no split 'tests'"),
         ([*catk, "--set", "catk.trained=goals"], "this model does not see goals: add --goal concat"),
         ([*catk, "--set", "catk.goal_share=1"], "this model does not see goals: add --goal concat"),
+        (["--method", "gcsl"], "this model does not see goals: add --goal concat"),
+        (["--no-goal-aim"], "--no-goal-aim has no effect: name a --goal"),
         (["--set", "finetune.reward=gcft"], "needs goals: set finetune.goals.share above 0"),
         (["--set", "finetune.goals.share=1"], "this model does not see goals: add --goal concat or --goal indication"),
     ]

@@ -56,9 +56,10 @@ def test_variants_start_from_the_realism_aligned_model(workshop):
         == 0.0
     )
     variant = goal_conditioning.VARIANTS["concatenation, soft"]
-    assert variant.name == "gcft-concat-soft-agent-from-mloo-seed0-seed0"
+    told = "gcsl-concat-from-mloo-seed0-seed0"
+    assert variant.name == f"gcft-concat-soft-agent-from-{told}-seed0"
     lineage = [one.name for one in workshop._lineage(variant)]
-    assert lineage == ["base", "mloo-seed0", variant.name]
+    assert lineage == ["base", "mloo-seed0", told, variant.name]
 
 
 def test_goals_are_refused_for_models_that_see_none(data, tmp_path):
@@ -280,7 +281,8 @@ def test_variants_are_measured_asked_and_unasked_for_every_seed(workshop, monkey
     monkeypatch.setattr(Workshop, "measure", measure)
     measured = goal_conditioning.measure(replace(workshop, num_seeds=2))
     twice = dict.fromkeys(goal_conditioning.VARIANTS, 2)
-    assert calls == [("none", {"goal-free": 1}), ("recorded", twice), ("none", twice)]
+    told = dict.fromkeys(goal_conditioning.TOLD, 1)
+    assert calls == [("none", {"goal-free": 1}), ("recorded", told), ("recorded", twice), ("none", twice)]
     assert list(measured.asked) == list(measured.unasked) == list(goal_conditioning.VARIANTS)
 
 
@@ -288,8 +290,10 @@ def test_following_is_told_with_its_cost(workshop):
     start = row("goal-free", [0.60, 0.70], passing_miss_rate=[0.2, 0.4])
     asked = {name: row(name, [0.59, 0.70], passing_miss_rate=[0.1, 0.2]) for name in goal_conditioning.VARIANTS}
     unasked = {name: row(name, [0.60, 0.70], passing_miss_rate=[0.2, 0.4]) for name in goal_conditioning.VARIANTS}
-    found = goal_conditioning.conclude(goal_conditioning.Measured(start, asked, unasked), workshop)
-    assert found.verdicts[0] == "concatenation, soft: passing misses 30.00% → 15.00%, -50% relative, at -0.0050 RMM."
+    told = {name: row(name, [0.59, 0.70], passing_miss_rate=[0.2, 0.2]) for name in goal_conditioning.TOLD}
+    found = goal_conditioning.conclude(goal_conditioning.Measured(start, told, asked, unasked), workshop)
+    assert found.verdicts[0] == "concatenation, told: passing misses 30.00% → 20.00%, -33% relative, at -0.0050 RMM."
+    assert found.verdicts[2] == "concatenation, soft: passing misses 30.00% → 15.00%, -50% relative, at -0.0050 RMM."
     assert found.tables[0].rows[0][1] == "30.00 ± 10.00"
     assert found.tables[1].rows[1][0] == "concatenation, soft, asked nothing"
     assert "Tab. 3" in found.tables[2].title
@@ -298,10 +302,11 @@ def test_following_is_told_with_its_cost(workshop):
 
 @pytest.mark.slow
 def test_the_experiments_run_with_tiny_models(workshop):
-    variant = FineTuned("gcft", base=FineTuned("mloo"), goals=GoalTraining("indication", "soft"))
+    told = FineTuned("gcsl", base=FineTuned("mloo"), goals=GoalTraining("indication"))
+    variant = FineTuned("gcft", base=told, goals=GoalTraining("indication", "soft"))
     asked = workshop.measure({"soft": (variant,)}, goals="recorded")["soft"].mean
     assert len(asked) == 3
-    assert (workshop.out / "evaluations" / "gcft-indication-soft-from-mloo-seed0-seed0-0.5-epochs-recorded-goals.parquet").exists()  # fmt: skip
+    assert (workshop.out / "evaluations" / "gcft-indication-soft-from-gcsl-indication-from-mloo-seed0-seed0-seed0-0.5-epochs-recorded-goals.parquet").exists()  # fmt: skip
     goals = [GoalEntry("straight", 100, 1080.0, -200.0)]
     found = measure_attainment(workshop, {"base": BASE, "soft": variant}, goals, name="tiny")
     assert all(0 <= a.reached <= a.passed <= 1 for attained in found.values() for a in attained)

@@ -37,7 +37,7 @@ def test_the_asked_branch_is_taken(sight):
     scenarios, base = fork.fork()
     batch = collate(scenarios)
     goals = recorded_goals(batch)  # in the first scenario on the left branch, in the second on the right one
-    policy = base.with_goal_sight(sight)
+    policy = base.with_goal_sight(sight, aim=False)  # as in the paper
     asked, free = ends_on_the_left_m(policy, batch, goals), ends_on_the_left_m(base, batch, None)
     assert asked.equal(free)  # it cannot tell yet
     assert 0.2 < free.gt(0).float().mean() < 0.8

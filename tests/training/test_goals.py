@@ -25,6 +25,7 @@ from rlftsim.training.augment import AugmentConfig, augment_goals
 from rlftsim.training.catk import catk_finetune
 from rlftsim.training.experience import Experience
 from rlftsim.training.finetune import FinetuneConfig, compute_reward, finetune, prepare, update_policy
+from rlftsim.training.gcsl import GcslConfig, gcsl_finetune, told_its_ends
 from rlftsim.training.goals import GoalConfig, choose_goals
 from rlftsim.training.hindsight import clipped_ratio, look_back, met_goals
 from rlftsim.training.parallel import start_fabric
@@ -32,6 +33,7 @@ from rlftsim.training.policy_gradient import agent_log_prob
 from rlftsim.training.rewards import parse_reward, reward_by_name, write_reward
 from rlftsim.training.rewards.base import shares_by_name
 from rlftsim.training.run_folder import read_metrics
+from rlftsim.training.validation import ValidationConfig
 
 CONFIG = replace(tiny.FINETUNE, num_rollouts=3, reward="gcft", goals=GoalConfig(share=1.0))
 
@@ -394,6 +396,42 @@ def test_whoever_is_asked_nothing_goes_on_as_before_if_only_the_sight_of_goals_i
     assert unasked.decision.equal(before.decision)
     assert unasked.log_prob.equal(before.log_prob)
     assert not asked.log_prob.equal(before.log_prob)
+
+
+def ends(rollouts):
+    return rollouts.position[..., -1, :]
+
+
+def test_a_policy_learns_where_its_own_rollouts_led(vocabulary, drawn_scenarios, tmp_path):
+    """What it does asked nothing stays; of what it did, what led somewhere becomes likelier where it is asked to go there."""
+    base = tiny.tiny_policy(vocabulary).eval()
+    start = copy.deepcopy(base)
+    config = GcslConfig(epochs=12.0, batch_size=1, learning_rate=3e-2, max_trained_agents=None, device=tiny.CPU)
+    model = gcsl_finetune(base.with_goal_sight("indication"), drawn_scenarios, tmp_path, config)
+    policy = SmartPolicy.from_pretrained(model).eval()
+    batch = collate(drawn_scenarios[:2])
+    before = simulate(start, batch, num_rollouts=8, seed=31)
+    unasked = simulate(policy, batch, num_rollouts=8, seed=31)
+    assert unasked.decision.equal(before.decision)
+    assert unasked.log_prob.equal(before.log_prob)
+    told = policy.score(policy.encode(batch), told_its_ends(before)).log_prob(before.decision)
+    mask = before.decision_mask
+    assert (told - before.log_prob)[mask].mean() > 0.02
+    # asked to go where another of its rollouts went, it ends nearer to that than by chance
+    elsewhere = ends(simulate(start, batch, num_rollouts=8, seed=32))
+    asked = ends(simulate(policy, batch, num_rollouts=8, seed=31, goals=Goals(elsewhere, mask.any(-1))))
+    by_chance, on_purpose = ((e - elsewhere).norm(dim=-1)[mask.any(-1)].mean() for e in (ends(before), asked))
+    assert on_purpose < 0.8 * by_chance
+    lines = read_metrics(tmp_path)
+    assert lines[-1]["loss"] < lines[0]["loss"]
+
+
+def test_learning_from_own_rollouts_needs_sight_and_is_not_validated(vocabulary, drawn_scenarios, tmp_path):
+    with pytest.raises(ConfigError, match="does not see goals: add --goal concat"):
+        gcsl_finetune(tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path / "run", GcslConfig(device=tiny.CPU))
+    with pytest.raises(ConfigError, match="does not change"):
+        GcslConfig(validation=ValidationConfig(every=5))
+    assert not (tmp_path / "run").exists()
 
 
 def test_augmented_goals_belong_to_a_run_wherever_they_lie(policy, drawn_scenarios, tmp_path):

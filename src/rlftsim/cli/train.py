@@ -11,7 +11,7 @@ from tyro.conf import Positional
 from rlftsim.cli.data import open_split, splits_of
 from rlftsim.errors import ConfigError, RlftsimError
 from rlftsim.experiments.learning_curve import write_learning_curve
-from rlftsim.experiments.stages import finetune_with_catk, finetune_with_reward, pretrain_smart
+from rlftsim.experiments.stages import finetune_with_catk, finetune_with_reward, pretrain_smart, teach_goals
 from rlftsim.policies.smart.config import GoalSight
 from rlftsim.progress import say
 from rlftsim.recipes.configure import Override, configure
@@ -93,7 +93,7 @@ def _draw(out: Path) -> None:
 
 @dataclass(frozen=True)
 class Finetune:
-    """Fine-tune a model closed-loop: with a realism reward (RLFTSim) or, as a baseline, with CAT-K.
+    """Fine-tune a model closed-loop: with a realism reward (RLFTSim), as a baseline with CAT-K, or on where its own rollouts led.
 
     Interrupted in any way, the same command goes on where it was. The result is in OUT/model.
     """
@@ -105,13 +105,16 @@ class Finetune:
     """Folder of a data set, or "synthetic"."""
     out: Path
     """Folder of the run: configuration, metrics, checkpoints, model."""
-    method: Literal["rlft", "catk"] = "rlft"
+    method: Literal["rlft", "catk", "gcsl"] = "rlft"
     """rlft: policy gradient of a realism reward, fields finetune.*. catk: imitation along rollouts that keep near the record, the
-    closest among the top K tokens, fields catk.*."""
+    closest among the top K tokens, fields catk.*. gcsl: learn what goals are from the model's own rollouts, told where they ended, before
+    rlft with goals; trains only the weights that see goals, fields gcsl.*."""
     goal: GoalSight | None = None
     """Fine-tune with goals: how the model is to see them, concat or indication. Every agent is asked to go where its record ends; rlft then
     takes the reward gcft (see finetune.goals for other goals), catk trains only the weights that see goals. Left out, the model keeps the
     sight it has."""
+    goal_aim: bool = True
+    """With --goal: weigh tokens by where they lead, too, which is not in the paper and is learned in minutes."""
     split: str = "training"
     validation_split: str | None = None
     """For catk: what to validate on, see catk.validation.every, which is 0 (never). Left out, "validation" where the data set has it."""
@@ -120,20 +123,24 @@ class Finetune:
 
     def run(self) -> int:
         """Load the model and fine-tune it."""
-        section = "finetune" if self.method == "rlft" else "catk"
+        section = "finetune" if self.method == "rlft" else self.method
         recipe = RECIPES[self.recipe]()
         if self.goal is not None:
             recipe = recipe.with_goals()
+        elif not self.goal_aim:
+            raise ConfigError("--no-goal-aim has no effect: name a --goal.")
         recipe = configure(recipe, self.set, sections=(section,))
         scenarios = open_split(self.data, self.split)
         every = recipe.catk.validation.every if self.method == "catk" else 0
         held_out = _held_out(self.data, self.validation_split, every)
+        start = {"base": self.model, "training": scenarios, "out": self.out, "goal": self.goal, "aim": self.goal_aim}
         with _drawn(self.out):
-            if self.method == "rlft":
-                model = finetune_with_reward(self.model, scenarios, recipe.finetune, self.out, goal=self.goal)
-            else:
-                model = finetune_with_catk(
-                    self.model, scenarios, recipe.catk, self.out, goal=self.goal, held_out=held_out
-                )
+            match self.method:
+                case "rlft":
+                    model = finetune_with_reward(config=recipe.finetune, **start)
+                case "catk":
+                    model = finetune_with_catk(config=recipe.catk, held_out=held_out, **start)
+                case "gcsl":
+                    model = teach_goals(config=recipe.gcsl, **start)
         print(f"model: {model}")
         return 0

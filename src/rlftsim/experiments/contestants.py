@@ -7,6 +7,7 @@ from rlftsim.policies.smart.config import GoalSight
 from rlftsim.recipes.smart import SmartRecipe
 from rlftsim.training.catk import CatkConfig
 from rlftsim.training.finetune import FinetuneConfig
+from rlftsim.training.gcsl import GcslConfig
 from rlftsim.training.goals import GoalConfig, with_goals_asked
 from rlftsim.training.rewards import CreditTo
 
@@ -34,19 +35,22 @@ class Base:
         return "base" if self.epochs is None else f"base-{self.epochs:g}-epochs"
 
 
+GoalKind = Literal["soft", "hard"]
+
+
 @dataclass(frozen=True)
 class GoalTraining:
     """How a model learns to follow goals."""
 
     sight: GoalSight
     """How it sees them."""
-    kind: Literal["soft", "hard"]
-    """What counts: coming by, or being there in the end."""
+    kind: GoalKind | None = None
+    """What is rewarded: coming by, or being there in the end. None = nothing, it is told where its own rollouts led."""
 
     @property
     def name(self) -> str:
         """Of its files."""
-        return f"{self.sight}-{self.kind}"
+        return self.sight if self.kind is None else f"{self.sight}-{self.kind}"
 
 
 @dataclass(frozen=True)
@@ -54,7 +58,7 @@ class FineTuned:
     """A base model after fine-tuning. Everything that is not said here is the recipe's: all have the same budget."""
 
     method: str = "mloo"
-    """A reward's name, or "catk"."""
+    """A reward's name, or "catk" or "gcsl"."""
     credit: CreditTo = "rollout"
     """Whom the reward is owed to."""
     seed: int = 0
@@ -74,8 +78,10 @@ class FineTuned:
         return f"{self.method}{goals}{credit}{base}-seed{self.seed}"
 
 
-CATK, GCFT = "catk", "gcft"
-VARIED = ("finetune.reward", "finetune.credit", "finetune.seed", "catk.seed", "catk.epochs", "catk.batch_size")
+CATK, GCFT, GCSL = "catk", "gcft", "gcsl"
+VARIED = (
+    "finetune.reward", "finetune.credit", "finetune.seed", "catk.seed", "catk.epochs", "catk.batch_size", "gcsl.seed",
+)  # fmt: skip
 """Fields of a recipe that contestants set for themselves."""
 Contestant = Baseline | Base | FineTuned
 ORACLE, CONSTANT_VELOCITY, BASE = Baseline("oracle"), Baseline("constant_velocity"), Base()
@@ -105,3 +111,8 @@ def catk_config(contestant: FineTuned, recipe: SmartRecipe) -> CatkConfig:
     """How a contestant is fine-tuned with CAT-K: the recipe's way, for as many updates of as many scenarios as with a reward."""
     epochs = recipe.finetune.epochs * contestant.share
     return replace(recipe.catk, seed=contestant.seed, epochs=epochs, batch_size=recipe.finetune.batch_size)
+
+
+def gcsl_config(contestant: FineTuned, recipe: GcslConfig) -> GcslConfig:
+    """How a contestant learns what goals are."""
+    return replace(recipe, seed=contestant.seed, epochs=recipe.epochs * contestant.share)

@@ -15,6 +15,7 @@ from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
 from rlftsim.tokens.vocabulary import Vocabulary
 from rlftsim.training.catk import CatkConfig, catk_finetune
 from rlftsim.training.finetune import FinetuneConfig, finetune
+from rlftsim.training.gcsl import GcslConfig, gcsl_finetune
 from rlftsim.training.pretrain import PretrainConfig, pretrain
 
 CACHED_SCENARIOS = 4096
@@ -54,7 +55,13 @@ def pretrain_smart(
 
 
 def finetune_with_reward(
-    base: str | Path, training: ScenarioDataset, config: FinetuneConfig, out: Path, *, goal: GoalSight | None = None
+    base: str | Path,
+    training: ScenarioDataset,
+    config: FinetuneConfig,
+    out: Path,
+    *,
+    goal: GoalSight | None = None,
+    aim: bool = True,
 ) -> Path:
     """Folder of a model fine-tuned closed-loop from a base model, which is given sight of goals if `goal` says how.
 
@@ -63,7 +70,7 @@ def finetune_with_reward(
         ConfigError: the base model has no weights, or sees goals in another way.
     """
     card = model_card(f"fine-tuned ({config.reward}{_by(goal)}) from {base}", training.folder, len(training))
-    return finetune(_learner(base, goal, config.seed), training, out, config, card=card)
+    return finetune(_learner(base, goal, config.seed, aim), training, out, config, card=card)
 
 
 def finetune_with_catk(
@@ -73,6 +80,7 @@ def finetune_with_catk(
     out: Path,
     *,
     goal: GoalSight | None = None,
+    aim: bool = True,
     held_out: ScenarioDataset | None = None,
 ) -> Path:
     """Folder of a model fine-tuned with CAT-K from a base model, which is given sight of goals if `goal` says how.
@@ -82,14 +90,33 @@ def finetune_with_catk(
         ConfigError: the base model has no weights, or sees goals in another way.
     """
     card = model_card(f"fine-tuned (CAT-K, {config.choice}{_by(goal)}) from {base}", training.folder, len(training))
-    return catk_finetune(_learner(base, goal, config.seed), training, out, config, held_out=held_out, card=card)
+    return catk_finetune(_learner(base, goal, config.seed, aim), training, out, config, held_out=held_out, card=card)
+
+
+def teach_goals(
+    base: str | Path,
+    training: ScenarioDataset,
+    config: GcslConfig,
+    out: Path,
+    *,
+    goal: GoalSight | None = None,
+    aim: bool = True,
+) -> Path:
+    """Folder of a model that knows what goals are, from a base model, which is given sight of goals if `goal` says how.
+
+    Raises:
+        CheckpointError: `out` holds a run with other settings or another base model.
+        ConfigError: the base model has no weights, sees no goals, or sees them in another way.
+    """
+    card = model_card(f"told where its own rollouts led{_by(goal)}, from {base}", training.folder, len(training))
+    return gcsl_finetune(_learner(base, goal, config.seed, aim), training, out, config, card=card)
 
 
 def _by(goal: GoalSight | None) -> str:
     return "" if goal is None else f", goals by {goal}"
 
 
-def _learner(base: str | Path, goal: GoalSight | None, seed: int) -> Policy:
+def _learner(base: str | Path, goal: GoalSight | None, seed: int, aim: bool) -> Policy:
     """A policy to fine-tune."""
     policy = load_policy(str(base))
     if goal is None:
@@ -97,4 +124,4 @@ def _learner(base: str | Path, goal: GoalSight | None, seed: int) -> Policy:
     if not isinstance(policy, SmartPolicy):
         raise ConfigError(f"{base} has no weights, so it cannot learn to see goals: name a model folder.")
     torch.manual_seed(seed)
-    return policy.with_goal_sight(goal)
+    return policy.with_goal_sight(goal, aim=aim)

@@ -28,12 +28,14 @@ from rlftsim.errors import ConfigError, DataError
 from rlftsim.experiments.contestants import (
     BASE,
     CATK,
+    GCSL,
     Base,
     Baseline,
     Contestant,
     FineTuned,
     catk_config,
     finetune_config,
+    gcsl_config,
 )
 from rlftsim.experiments.evaluate import EvaluateConfig, evaluate
 from rlftsim.experiments.evaluation import SCHEMA, SCORE_COLUMNS, Evaluation, GoalsGiven
@@ -43,6 +45,7 @@ from rlftsim.experiments.stages import (
     finetune_with_reward,
     open_training,
     pretrain_smart,
+    teach_goals,
 )
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.progress import say
@@ -246,9 +249,12 @@ class Workshop:
         if contestant.method == CATK:
             finetune_with_catk(base, self.training, catk_config(contestant, self.recipe), out)
             return
+        sight = None if contestant.goals is None else contestant.goals.sight
+        if contestant.method == GCSL:
+            teach_goals(base, self.training, gcsl_config(contestant, self.recipe.gcsl), out, goal=sight)
+            return
         self._start_from_shorter(out, self._epochs(contestant))
         config = finetune_config(contestant, self.recipe.finetune)
-        sight = None if contestant.goals is None else contestant.goals.sight
         finetune_with_reward(base, self.training, config, out, goal=sight)
 
     def _start_from_shorter(self, out: Path, epochs: float) -> None:
@@ -266,7 +272,8 @@ class Workshop:
         partial.rename(out)
 
     def _epochs(self, contestant: FineTuned) -> float:
-        return self.recipe.finetune.epochs * contestant.share
+        section = self.recipe.gcsl if contestant.method == GCSL else self.recipe.finetune
+        return section.epochs * contestant.share
 
     def evaluation_name(self, contestant: Contestant, goals: GoalsGiven = "none") -> str:
         """Of a contestant's results."""

@@ -8,6 +8,7 @@ from rlftsim.policies.smart.config import SmartConfig, smart_demo, smart_mini, s
 from rlftsim.tokens.clustering import TokensConfig
 from rlftsim.training.catk import CatkConfig
 from rlftsim.training.finetune import FinetuneConfig
+from rlftsim.training.gcsl import GcslConfig
 from rlftsim.training.goals import GoalConfig, with_goals_asked
 from rlftsim.training.pretrain import PretrainConfig
 from rlftsim.training.reference import KlConfig
@@ -22,6 +23,7 @@ class SmartRecipe:
     pretrain: PretrainConfig = field(default_factory=PretrainConfig)
     finetune: FinetuneConfig = field(default_factory=FinetuneConfig)
     catk: CatkConfig = field(default_factory=CatkConfig)
+    gcsl: GcslConfig = field(default_factory=GcslConfig)
 
     def with_goals(self) -> "SmartRecipe":
         """The same, fine-tuning with goals: everybody is asked to go where the record ends. With the paper's reward; or by CAT-K, which then
@@ -62,6 +64,9 @@ def smart_demo_rlftsim() -> SmartRecipe:
         catk=CatkConfig(
             epochs=3.0, batch_size=8, learning_rate=3e-4, warmup_updates=5, gradient_clip=1.0, max_trained_agents=None,
             checkpoint_every=20,
+        ),
+        gcsl=GcslConfig(
+            epochs=1.0, batch_size=1, num_rollouts=4, warmup_updates=10, max_trained_agents=None, checkpoint_every=80,
         ),
     )  # fmt: skip
 

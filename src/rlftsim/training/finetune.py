@@ -7,7 +7,7 @@ import copy
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -294,7 +294,8 @@ def _accumulate_gradients(
 ) -> tuple[_Sums, AskedLogProb]:
     """Score the rollouts under policy and reference and leave this process's gradient of the loss in the policy's parameters.
 
-    The reference is asked nothing: with or without goals, behaviour is held to what is realistic.
+    The reference is asked what the policy is asked: one that was given eyes for this run sees nothing yet, one that followed goals before
+    is held to how it followed them.
     """
     learner.optimizer.zero_grad(set_to_none=True)
     sums = torch.zeros(2, device=fabric.device, dtype=torch.float64)
@@ -309,7 +310,7 @@ def _accumulate_gradients(
             with fabric.autocast():
                 scored = learner.policy.score(learner.policy.encode(experience.batch), rows)
                 with torch.no_grad():
-                    held = learner.reference.score(reference_context, replace(rows, goals=None))
+                    held = learner.reference.score(reference_context, rows)
             log_prob = scored.log_prob(rows.decision)
             kl, entropy = masked_sum(scored.kl(held), mask), masked_sum(scored.entropy(), mask)
             by_agent = agent_log_prob(log_prob, mask, config.log_prob_reduction)

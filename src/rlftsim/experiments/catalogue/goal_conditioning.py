@@ -5,28 +5,34 @@ from dataclasses import dataclass
 
 from rlftsim.experiments.catalogue import published
 from rlftsim.experiments.columns import GOAL_COLUMNS
-from rlftsim.experiments.contestants import GCFT, Contestant, FineTuned, GoalTraining, over_seeds
+from rlftsim.experiments.contestants import GCFT, GCSL, Contestant, FineTuned, GoalKind, GoalTraining, over_seeds
 from rlftsim.experiments.findings import Experiment, Findings, budget_note, result_table, row_numbers, verdict_line
 from rlftsim.experiments.workshop import Row, Workshop
+from rlftsim.policies.smart.config import GoalSight
 from rlftsim.viewer.figure import Interval, draw_intervals
 
 MISS = "passing_miss_rate"
 GOAL_FREE = FineTuned("mloo")
 """The realism-aligned model that learning to follow goals starts from."""
+SIGHTS: Mapping[str, GoalSight] = {"concatenation": "concat", "indication": "indication"}
+KINDS: tuple[GoalKind, ...] = ("soft", "hard")
+TOLD = {f"{name}, told": FineTuned(GCSL, base=GOAL_FREE, goals=GoalTraining(sight)) for name, sight in SIGHTS.items()}
+"""Models that know what goals are: the goal-free one, told where its own rollouts led. Nothing was rewarded yet."""
 VARIANTS = {
-    "concatenation, soft": FineTuned(GCFT, credit="agent", base=GOAL_FREE, goals=GoalTraining("concat", "soft")),
-    "concatenation, hard": FineTuned(GCFT, credit="agent", base=GOAL_FREE, goals=GoalTraining("concat", "hard")),
-    "indication, soft": FineTuned(GCFT, credit="agent", base=GOAL_FREE, goals=GoalTraining("indication", "soft")),
-    "indication, hard": FineTuned(GCFT, credit="agent", base=GOAL_FREE, goals=GoalTraining("indication", "hard")),
+    f"{name}, {kind}": FineTuned(GCFT, credit="agent", base=TOLD[f"{name}, told"], goals=GoalTraining(sight, kind))
+    for name, sight in SIGHTS.items()
+    for kind in KINDS
 }
 START = "goal-free"
 
 
 @dataclass(frozen=True)
 class Measured:
-    """Evaluations of the model without goals and of the variants, asked to go where the record ended, and asked nothing."""
+    """Evaluations of the model without goals, of those that were told, and of the variants, asked to go where the record ended; of the
+    variants asked nothing, too."""
 
     start: Row
+    told: Mapping[str, Row]
     asked: Mapping[str, Row]
     unasked: Mapping[str, Row]
 
@@ -40,13 +46,14 @@ def measure(workshop: Workshop) -> Measured:
     """Everybody's evaluations."""
     start = workshop.measure({START: (GOAL_FREE,)})[START]
     variants = rows(workshop.num_seeds)
+    told = workshop.measure({name: (one,) for name, one in TOLD.items()}, goals="recorded")
     asked = workshop.measure(variants, goals="recorded")
-    return Measured(start, asked, workshop.measure(variants))
+    return Measured(start, told, asked, workshop.measure(variants))
 
 
 def conclude(measured: Measured, workshop: Workshop) -> Findings:
     """The table, what following costs, and what is left of the goal-free model."""
-    start, asked = measured.start, list(measured.asked.values())
+    start, asked = measured.start, [*measured.told.values(), *measured.asked.values()]
     unasked = [Row(f"{name}, asked nothing", row.by_seed) for name, row in measured.unasked.items()]
     return Findings(
         title="Goal conditioning: following goals, and what it costs in realism",
@@ -62,8 +69,8 @@ def conclude(measured: Measured, workshop: Workshop) -> Findings:
         ),
         notes=(
             budget_note(workshop),
-            "The variants start from the goal-free row, so each has had its fine-tuning and as much again; what more goal-free fine-tuning does "
-            "is in finetune-curve.",
+            "Told: the goal-free row, told where its own rollouts led; whoever is asked nothing decides as there. The variants start from these "
+            "rows and have had the fine-tuning of the goal-free one again; what more goal-free fine-tuning does is in finetune-curve.",
             "A passing miss: an evaluated agent that at no simulated step is within WOMD's tolerance of where its record ends; share of agents and "
             "rollouts. In all rollouts: share of agents that miss in every one of them.",
         ),

@@ -42,6 +42,8 @@ class SmartConfig:
     motion in each class."""
     goal: GoalSight | None = None
     """How agents see their goals; None = they do not, and goals have no effect."""
+    goal_aim: bool = False
+    """Whoever sees a goal also weighs tokens by where they lead, see `goal_sight.GoalAim`."""
     public_code_quirks: bool = False
     """Repeat what the public code does where this package differs on purpose: an agent's first motion vector is its position,
     the sign of what lies exactly behind is left to rounding, and tokens are matched and placed in the order of operations of
@@ -69,6 +71,8 @@ class SmartConfig:
         require_finite(self, radii)
         if self.goal is not None and self.goal not in get_args(GoalSight):
             raise ConfigError(f"goal={self.goal!r} is no way to see goals: known are {', '.join(get_args(GoalSight))}.")
+        if self.goal_aim and self.goal is None:
+            raise ConfigError("goal_aim=True, but nobody sees goals: set goal to concat or indication.")
         if not 0 <= self.dropout < 1 or not 0 <= self.history_drop < 1:
             raise ConfigError(
                 f"dropout and history_drop are shares in [0, 1), got {self.dropout} and {self.history_drop}."

@@ -1,8 +1,11 @@
-"""How agents see their goals, in one of two ways. Both begin as nothing: with fresh weights a model decides as it did without.
+"""How agents see their goals, in one of two ways, and how they aim at them. All begin as nothing: with fresh weights a model decides as
+it did without.
 
 * `concat`: distance and bearing of the goal join the continuous state of the agent's token, at every step.
 * `indication`: the relation to the goal's polyline, the map token whose point is nearest to the goal, carries a learned mark, however
   far away it is.
+
+With either, tokens may also be weighed by where they lead (`GoalAim`), which is not in the paper.
 
 Source: RLFTSim, section 4.2 and its appendix on goal conditioning; what it leaves open is in docs/decisions.md.
 """
@@ -16,9 +19,20 @@ from torch import Tensor, nn
 from rlftsim.goals.types import Goals
 from rlftsim.policies.layers import FourierEmbedding, normalize
 from rlftsim.policies.smart.neighbors import Poses, relative_pose, within
+from rlftsim.scenario.types import FUTURE_STEPS, STEP_S
+from rlftsim.tokens.vocabulary import CLASS_NAMES, STEPS_PER_TOKEN
 
 GOAL_POLYLINE_REACH_M = 200.0
 """A goal that is farther than this from all of the map has no polyline."""
+NUM_DECISIONS = FUTURE_STEPS // STEPS_PER_TOKEN
+TOKEN_S = STEPS_PER_TOKEN * STEP_S
+ROUNDING_MPS = 0.5
+"""Misfits smaller than this differ little."""
+AIM_GAIN = 8.0
+"""Weights of an aim count so many times, so that the learning rate of other weights suits them: they are few and have far to go."""
+ROWS_PER_PIECE = {"cpu": 128}
+"""Rows whose tokens are looked at together: on a processor they fit its cache."""
+ROWS_PER_PIECE_ELSEWHERE = 1 << 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,3 +117,78 @@ class GoalMark(nn.Embedding):
         mark = self.weight.expand(len(values), -1)
         nothing = torch.zeros_like(mark)  # so that both round alike in half precision
         return normalize(embedding(values, nothing)), normalize(embedding(values, mark))
+
+
+class GoalAim(nn.Module):
+    """Tokens weighed by where they lead: three features of each, times weights that depend on the class and on how much time is left.
+
+    * how much nearer the token leads, in metres,
+    * how badly its speed would cover the rest of the way in the time that is left then, in metres a second,
+    * how far from the goal going on like this would end, by the time until then, in metres a second.
+
+    The logit of a token is raised by the first and lowered by the others, each times its weight. To be there at the end of the
+    simulation is what is aimed at, so the features are those of a walk that is to end in a place (a bridge).
+    """
+
+    def __init__(self):
+        super().__init__()
+        self.weight = nn.Parameter(torch.zeros(len(CLASS_NAMES), NUM_DECISIONS, 3))
+
+    def start_blind(self) -> None:
+        """Weights of zero weigh nothing."""
+        nn.init.zeros_(self.weight)
+
+    def forward(
+        self,
+        goal: Float[Tensor, "g 2"],
+        num_left: Int64[Tensor, "g"],
+        class_id: Int64[Tensor, "g"],
+        moves: Float[Tensor, "C V 2"],
+    ) -> Float[Tensor, "g V"]:
+        """What is added to the logits of all tokens. Differentiable in the weights.
+
+        Args:
+            goal: metres, in the frame of each agent.
+            num_left: decisions to be taken, this one included.
+            class_id: whose tokens they are.
+            moves: where tokens lead, metres.
+        """
+        weights = AIM_GAIN * self.weight[class_id, num_left - 1]
+        with torch.autocast(goal.device.type, enabled=False):  # logits are float32
+            return (weights[:, None] @ suitability(goal, num_left, class_id, moves))[:, 0]
+
+
+@torch.no_grad()
+def suitability(
+    goal: Float[Tensor, "g 2"],
+    num_left: Int64[Tensor, "g"],
+    class_id: Int64[Tensor, "g"],
+    moves: Float[Tensor, "C V 2"],
+) -> Float[Tensor, "g 3 V"]:
+    """The features of `GoalAim`: each is the larger the better a token suits."""
+    features = goal.new_empty(len(goal), 3, moves.shape[1])
+    left_s = (num_left[:, None] - 1).to(goal.dtype) * TOKEN_S
+    size = ROWS_PER_PIECE.get(goal.device.type, ROWS_PER_PIECE_ELSEWHERE)
+    for own in range(len(moves)):
+        x, y = moves[own].unbind(-1)
+        speed = moves[own].norm(dim=-1) / TOKEN_S
+        for rows in (class_id == own).nonzero()[:, 0].split(size):
+            (goal_x, goal_y), time_s = goal[rows].split(1, dim=-1), left_s[rows]
+            rest = _length(goal_x - x, goal_y - y)
+            reach = 1 + time_s / TOKEN_S
+            astray = _length(torch.addcmul(goal_x, reach, x, value=-1), torch.addcmul(goal_y, reach, y, value=-1))
+            nearer = _length(goal_x.clone(), goal_y.clone()) - rest
+            pace = torch.addcmul(rest, time_s, speed, value=-1)
+            found = nearer, _rounded(pace.div_(1 + time_s)), _rounded(astray.div_(1 + time_s))
+            features[rows] = torch.stack(found, dim=1)
+    return features
+
+
+def _length(x: Tensor, y: Tensor) -> Tensor:
+    """Of vectors, whose storage it uses up."""
+    return x.square_().addcmul_(y, y).sqrt_()
+
+
+def _rounded(misfit: Float[Tensor, "g V"]) -> Float[Tensor, "g V"]:
+    """Its negative size, without a corner at zero, in its own storage."""
+    return misfit.square_().add_(ROUNDING_MPS**2).sqrt_().neg_()

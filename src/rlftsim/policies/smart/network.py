@@ -28,7 +28,7 @@ from rlftsim.policies.layers import (
     surround,
 )
 from rlftsim.policies.smart.config import SmartConfig
-from rlftsim.policies.smart.goal_sight import GoalMark, GoalState, SeenGoals
+from rlftsim.policies.smart.goal_sight import GoalAim, GoalMark, GoalState, SeenGoals
 from rlftsim.policies.smart.heads import ClassHeads
 from rlftsim.policies.smart.neighbors import Neighbors, Poses, relative_pose, within
 from rlftsim.tokens.map_tokens import NUM_KINDS, NUM_LIGHTS, NUM_TYPES, MapTokens
@@ -184,6 +184,11 @@ class AgentDecoder(nn.Module):
         self.agent_layers = nn.ModuleList(RelationAttention(*sizes) for _ in layers)
         self.head = ClassHeads(dim, class_sizes, num_tokens) if class_sizes else MlpLayer(dim, dim, num_tokens)
         self.goal = _goal_sight(config)
+        self.aim = GoalAim() if config.goal_aim else None
+
+    def goal_parts(self) -> tuple[GoalState | GoalMark | GoalAim, ...]:
+        """What sees goals and what aims at them; nothing in a model that does not."""
+        return tuple(part for part in (self.goal, self.aim) if part is not None)
 
     def relations(self) -> Relations:
         """The relation embeddings, tabulated where that does no harm."""
@@ -377,5 +382,5 @@ class SmartNetwork(nn.Module):
         self.map_encoder = MapEncoder(config)
         self.decoder = AgentDecoder(config, num_tokens, class_sizes)
         initialize(self)
-        if self.decoder.goal is not None:
-            self.decoder.goal.start_blind()
+        for part in self.decoder.goal_parts():
+            part.start_blind()

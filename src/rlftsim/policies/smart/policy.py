@@ -17,8 +17,9 @@ from rlftsim.goals.types import Goals
 from rlftsim.policies.layers import normalize
 from rlftsim.policies.smart.config import GoalSight, SmartConfig
 from rlftsim.policies.smart.distribution import TokenDistribution
-from rlftsim.policies.smart.goal_sight import GoalState, SeenGoals, see_goals
+from rlftsim.policies.smart.goal_sight import NUM_DECISIONS, GoalState, SeenGoals, see_goals
 from rlftsim.policies.smart.heads import NEVER, ClassHeads
+from rlftsim.policies.smart.neighbors import Poses
 from rlftsim.policies.smart.network import Past, Scene, SmartNetwork, TokenSteps, nowhere_unless
 from rlftsim.rollout.types import AgentStates, Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
@@ -70,6 +71,8 @@ class SmartState:
     draws: Tensor | None = None
     goals: SeenGoals | None = None
     """None = nobody is asked anything, or the model does not see goals."""
+    num_decisions: int = 0
+    """Taken so far."""
     sight: Sight = field(default_factory=Sight)
 
 
@@ -150,7 +153,9 @@ class SmartPolicy(nn.Module):
     def decide(self, context: SmartContext, state: SmartState) -> TokenDistribution:
         """The next token of every agent."""
         mask = context.agent_mask[:, None].expand(state.heading.shape)
-        return self._distribution(context, self._look(context, state)[mask], mask)
+        said = self._distribution(context, self._look(context, state)[mask], mask)
+        num_left = torch.full_like(state.heading, NUM_DECISIONS - state.num_decisions, dtype=torch.int64)
+        return self._aimed(said, context, state.goals, Poses(state.position, state.heading), num_left)
 
     def advance(
         self,
@@ -178,7 +183,8 @@ class SmartPolicy(nn.Module):
             past, pending = state.sight.past, block
         else:
             past, pending = state.past, block if state.pending is None else state.pending.then(block)
-        return SmartState(position, heading, past, pending, poses, goals=state.goals)
+        num_decisions = state.num_decisions + 1
+        return SmartState(position, heading, past, pending, poses, goals=state.goals, num_decisions=num_decisions)
 
     def score(self, context: SmartContext, rollouts: Rollouts) -> TokenDistribution:
         """Replay the decisions without the network, then look at all steps at once."""
@@ -197,7 +203,12 @@ class SmartPolicy(nn.Module):
             parts.append(_place(rows, state.pending.valid))
         features = torch.cat(parts, 3)
         mask = context.agent_mask[:, None, :, None].expand(rollouts.decision.shape)
-        return self._distribution(context, features[mask], mask)
+        said = self._distribution(context, features[mask], mask)
+        if state.goals is None or state.pending is None:
+            return said
+        num_left = NUM_DECISIONS - torch.arange(num_decisions, device=mask.device)
+        poses = Poses(state.pending.position, state.pending.heading)
+        return self._aimed(said, context, state.goals, poses, num_left.expand(mask.shape))
 
     # ---- pre-training ---------------------------------------------------------------------------------------------
 
@@ -227,9 +238,8 @@ class SmartPolicy(nn.Module):
         return decoder.time_layers, decoder.map_layers, decoder.agent_layers, decoder.head, *self.goal_parts()
 
     def goal_parts(self) -> tuple[nn.Module, ...]:
-        """What sees goals; nothing in a model that does not."""
-        goal = self.network.decoder.goal
-        return () if goal is None else (goal,)
+        """What sees goals and aims at them; nothing in a model that does not."""
+        return self.network.decoder.goal_parts()
 
     # ---- goals ----------------------------------------------------------------------------------------------------
 
@@ -238,8 +248,12 @@ class SmartPolicy(nn.Module):
         """Whether goals have an effect."""
         return self.config.goal is not None
 
-    def with_goal_sight(self, goal: GoalSight) -> "SmartPolicy":
+    def with_goal_sight(self, goal: GoalSight, *, aim: bool = True) -> "SmartPolicy":
         """The same policy with weights to see goals by, which say nothing yet; itself if it sees them so.
+
+        Args:
+            goal: how it is to see them.
+            aim: weigh tokens by where they lead, too. Without it a model is the paper's.
 
         Raises:
             ConfigError: it sees them in another way.
@@ -250,11 +264,13 @@ class SmartPolicy(nn.Module):
             raise ConfigError(
                 f"this model sees goals by {self.config.goal}, not by {goal}: start from a model that sees none."
             )
-        policy = SmartPolicy(replace(self.config, goal=goal), self.vocabulary).to(next(self.parameters()).device)
+        policy = SmartPolicy(replace(self.config, goal=goal, goal_aim=aim), self.vocabulary).to(
+            next(self.parameters()).device
+        )
         decoder = policy.network.decoder
         if isinstance(decoder.goal, GoalState):
             decoder.goal.know(self.network.decoder.map_relation)
-        new = {k: v for k, v in policy.network.state_dict().items() if k.startswith("decoder.goal.")}
+        new = {k: v for k, v in policy.network.state_dict().items() if k.startswith(("decoder.goal.", "decoder.aim."))}
         load_strictly(policy.network, {**self.network.state_dict(), **new}, source="the model to start from")
         return policy.train(self.training)
 
@@ -339,6 +355,27 @@ class SmartPolicy(nn.Module):
         self, context: SmartContext, features: Float[Tensor, "R D"], mask: Bool[Tensor, "*batch"]
     ) -> TokenDistribution:
         return TokenDistribution(self._logits(features, context.object_type, mask), mask)
+
+    def _aimed(
+        self,
+        said: TokenDistribution,
+        context: SmartContext,
+        goals: SeenGoals | None,
+        poses: Poses,
+        num_left: Int64[Tensor, "*batch"],
+    ) -> TokenDistribution:
+        """Tokens weighed by where they lead whoever has a goal; poses and decisions left have the shape of the mask."""
+        aim = self.network.decoder.aim
+        if goals is None or aim is None:
+            return said
+        place = said.mask.nonzero(as_tuple=True)
+        carriers = goals.goal_mask[place[:3]].nonzero()[:, 0]
+        rows = tuple(index[carriers] for index in place)
+        here = poses[rows]
+        goal = rotate(goals.position[rows[:3]] - here.position, -here.heading)
+        class_id = class_of_type(context.object_type)[rows[0], rows[2]]
+        weighed = aim(goal, num_left[rows], class_id, self.vocabulary.poses()[:, :, -1, :2])
+        return TokenDistribution(said.logits.index_add(0, carriers, weighed), said.mask)
 
     def _logits(
         self, features: Float[Tensor, "R D"], object_type: Int64[Tensor, "B A"], mask: Bool[Tensor, "B N A *L"]
