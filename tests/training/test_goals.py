@@ -426,6 +426,12 @@ def test_a_policy_learns_where_its_own_rollouts_led(vocabulary, drawn_scenarios,
     assert lines[-1]["loss"] < lines[0]["loss"]
 
 
+def test_the_reference_is_asked_what_the_policy_is_asked(policy, batch, fabric):
+    """A policy that followed goals before is held to how it did: nothing pulls it away at first."""
+    learner = prepare(copy.deepcopy(policy), CONFIG, fabric.device)
+    assert update_policy(learner, batch, CONFIG, fabric)["kl"] == pytest.approx(0.0, abs=1e-6)
+
+
 def test_learning_from_own_rollouts_needs_sight_and_is_not_validated(vocabulary, drawn_scenarios, tmp_path):
     with pytest.raises(ConfigError, match="does not see goals: add --goal concat"):
         gcsl_finetune(tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path / "run", GcslConfig(device=tiny.CPU))

@@ -59,7 +59,7 @@ def smart_demo_rlftsim() -> SmartRecipe:
         ),
         finetune=FinetuneConfig(
             epochs=1.5, batch_size=4, num_rollouts=8, rollouts_per_pass=8, learning_rate=3e-4, warmup_updates=5,
-            checkpoint_every=20, kl=KlConfig(target=0.05, initial_beta=0.01), goals=GoalConfig(learning_rate_scale=20.0),
+            checkpoint_every=20, kl=KlConfig(target=0.05, initial_beta=0.01), goals=GoalConfig(learning_rate_scale=5.0),
         ),
         catk=CatkConfig(
             epochs=3.0, batch_size=8, learning_rate=3e-4, warmup_updates=5, gradient_clip=1.0, max_trained_agents=None,
