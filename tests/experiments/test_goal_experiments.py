@@ -44,7 +44,7 @@ def workshop(data, tmp_path_factory):
 def test_variants_start_from_the_realism_aligned_model(workshop):
     config = finetune_config(goal_conditioning.VARIANTS["indication, hard"], TINY.finetune)
     assert (config.reward, config.goals.share, config.goals.hindsight) == (
-        "0.9*mloo + 0.1*goal(kind='hard', partial=False)",
+        "0.98*mloo + 0.02*goal(kind='hard', partial=False)",
         1.0,
         1.0,
     )

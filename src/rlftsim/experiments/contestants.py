@@ -46,6 +46,8 @@ class GoalTraining:
     """How it sees them."""
     kind: GoalKind | None = None
     """What is rewarded: coming by, or being there in the end. None = nothing, it is told where its own rollouts led."""
+    weight: float = 0.1
+    """Of goals in the reward (lambda)."""
 
     @property
     def name(self) -> str:
@@ -100,7 +102,7 @@ def finetune_config(contestant: FineTuned, recipe: FinetuneConfig) -> FinetuneCo
     """
     reward, goals = contestant.method, GoalConfig()
     if contestant.goals is not None:
-        reward = f"{contestant.method}(kind='{contestant.goals.kind}')"
+        reward = f"{contestant.method}(goal_weight={contestant.goals.weight}, kind='{contestant.goals.kind}')"
         goals = with_goals_asked(recipe.goals)
     return replace(
         recipe, reward=reward, seed=contestant.seed, epochs=recipe.epochs * contestant.share, credit=contestant.credit, goals=goals,

@@ -16,10 +16,15 @@ GOAL_FREE = FineTuned("mloo")
 """The realism-aligned model that learning to follow goals starts from."""
 SIGHTS: Mapping[str, GoalSight] = {"concatenation": "concat", "indication": "indication"}
 KINDS: tuple[GoalKind, ...] = ("soft", "hard")
+GOAL_WEIGHT = 0.02
+"""Lambda. The paper's is 0.1, for agents that learn from the reward what a goal is. These know, and at 0.1 small models pay for passing more
+goals in collisions (docs/log.md)."""
 TOLD = {f"{name}, told": FineTuned(GCSL, base=GOAL_FREE, goals=GoalTraining(sight)) for name, sight in SIGHTS.items()}
 """Models that know what goals are: the goal-free one, told where its own rollouts led. Nothing was rewarded yet."""
 VARIANTS = {
-    f"{name}, {kind}": FineTuned(GCFT, credit="agent", base=TOLD[f"{name}, told"], goals=GoalTraining(sight, kind))
+    f"{name}, {kind}": FineTuned(
+        GCFT, credit="agent", base=TOLD[f"{name}, told"], goals=GoalTraining(sight, kind, GOAL_WEIGHT)
+    )
     for name, sight in SIGHTS.items()
     for kind in KINDS
 }
