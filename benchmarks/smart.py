@@ -245,7 +245,8 @@ def fine_tuning_step(policy: Any, num_candidates: int) -> Callable[[Any], None]:
     """One update: a CAT-K rollout, its loss, backward, clipping, AdamW; only attention and head are trained."""
     import torch
 
-    from rlftsim.training.catk import CatkConfig, predict_along, roll_out_closest
+    from rlftsim.training.catk import CatkConfig, roll_out_closest
+    from rlftsim.training.closed_loop import predict_along
     from rlftsim.training.freezing import freeze_untrained
     from rlftsim.training.imitation import summed_loss
 

@@ -229,7 +229,7 @@ def test_pretraining_and_fine_tuning_by_command(vocabulary, tmp_path, capsys):
     assert run(capsys, *words, "--out", tmp_path / "gcsl", "--set", *few)[0] == 0
     assert '"goal_aim": true' in (tmp_path / "gcsl" / "model" / "config.json").read_text()
     assert (
-        "told where its own rollouts led, goals by indication"
+        "told where its own rollouts led, goals by indication, from"
         in (tmp_path / "gcsl" / "model" / "README.md").read_text()
     )
     for run_folder in (base, tuned, tmp_path / "catk", tmp_path / "gcsl"):
@@ -289,7 +289,13 @@ def test_what_has_no_effect_on_a_method_is_refused(tmp_path, vocabulary, capsys)
         ([*catk, "--set", "catk.trained=goals"], "this model does not see goals: add --goal concat"),
         ([*catk, "--set", "catk.goal_share=1"], "this model does not see goals: add --goal concat"),
         (["--method", "gcsl"], "this model does not see goals: add --goal concat"),
-        (["--no-goal-aim"], "--no-goal-aim has no effect: name a --goal"),
+        (["--no-goal-aim"], "whether to aim has no effect without goals: name a --goal"),
+        (["--goal-aim"], "whether to aim has no effect without goals: name a --goal"),
+        (["--method", "gcsl", "--goal", "concat", "--validation-split", "validation"], "See what was learned by"),
+        (
+            ["--method", "gcsl", "--goal", "concat", "--set", "gcsl.goal_learning_rate_scale=2"],
+            "set gcsl.learning_rate",
+        ),
         (["--set", "finetune.reward=gcft"], "needs goals: set finetune.goals.share above 0"),
         (["--set", "finetune.goals.share=1"], "this model does not see goals: add --goal concat or --goal indication"),
     ]

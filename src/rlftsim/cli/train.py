@@ -11,13 +11,14 @@ from tyro.conf import Positional
 from rlftsim.cli.data import open_split, splits_of
 from rlftsim.errors import ConfigError, RlftsimError
 from rlftsim.experiments.learning_curve import write_learning_curve
-from rlftsim.experiments.stages import finetune_with_catk, finetune_with_reward, pretrain_smart, teach_goals
+from rlftsim.experiments.stages import NewSight, finetune_with_catk, finetune_with_reward, pretrain_smart, teach_goals
 from rlftsim.policies.smart.config import GoalSight
 from rlftsim.progress import say
 from rlftsim.recipes.configure import Override, configure
 from rlftsim.recipes.smart import RECIPES, RecipeName
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.tokens.vocabulary import Vocabulary
+from rlftsim.training.gcsl import NOT_VALIDATED
 from rlftsim.training.parallel import is_first_process
 
 VALIDATION = "validation"
@@ -108,13 +109,14 @@ class Finetune:
     method: Literal["rlft", "catk", "gcsl"] = "rlft"
     """rlft: policy gradient of a realism reward, fields finetune.*. catk: imitation along rollouts that keep near the record, the
     closest among the top K tokens, fields catk.*. gcsl: learn what goals are from the model's own rollouts, told where they ended, before
-    rlft with goals; trains only the weights that see goals, fields gcsl.*."""
+    rlft with goals (--model OUT); trains only the weights that see goals, fields gcsl.*."""
     goal: GoalSight | None = None
     """Fine-tune with goals: how the model is to see them, concat or indication. Every agent is asked to go where its record ends; rlft then
     takes the reward gcft (see finetune.goals for other goals), catk trains only the weights that see goals. Left out, the model keeps the
     sight it has."""
-    goal_aim: bool = True
-    """With --goal: weigh tokens by where they lead, too, which is not in the paper and is learned in minutes."""
+    goal_aim: bool | None = None
+    """With --goal: weigh tokens by where they lead, too (an aim, not in the paper). Left out, a model that is given sight of goals gets one,
+    and a model that sees goals keeps what it has."""
     split: str = "training"
     validation_split: str | None = None
     """For catk: what to validate on, see catk.validation.every, which is 0 (never). Left out, "validation" where the data set has it."""
@@ -127,20 +129,24 @@ class Finetune:
         recipe = RECIPES[self.recipe]()
         if self.goal is not None:
             recipe = recipe.with_goals()
-        elif not self.goal_aim:
-            raise ConfigError("--no-goal-aim has no effect: name a --goal.")
+        elif self.goal_aim is not None:
+            raise ConfigError("whether to aim has no effect without goals: name a --goal.")
         recipe = configure(recipe, self.set, sections=(section,))
         scenarios = open_split(self.data, self.split)
+        if self.method == "gcsl" and self.validation_split:
+            raise ConfigError(f"--validation-split {self.validation_split} has no effect: {NOT_VALIDATED}")
         every = recipe.catk.validation.every if self.method == "catk" else 0
         held_out = _held_out(self.data, self.validation_split, every)
-        start = {"base": self.model, "training": scenarios, "out": self.out, "goal": self.goal, "aim": self.goal_aim}
+        sight = None if self.goal is None else NewSight(self.goal, self.goal_aim)
         with _drawn(self.out):
             match self.method:
                 case "rlft":
-                    model = finetune_with_reward(config=recipe.finetune, **start)
+                    model = finetune_with_reward(self.model, scenarios, recipe.finetune, self.out, sight=sight)
                 case "catk":
-                    model = finetune_with_catk(config=recipe.catk, held_out=held_out, **start)
+                    model = finetune_with_catk(
+                        self.model, scenarios, recipe.catk, self.out, sight=sight, held_out=held_out
+                    )
                 case "gcsl":
-                    model = teach_goals(config=recipe.gcsl, **start)
+                    model = teach_goals(self.model, scenarios, recipe.gcsl, self.out, sight=sight)
         print(f"model: {model}")
         return 0

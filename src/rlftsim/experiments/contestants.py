@@ -48,11 +48,13 @@ class GoalTraining:
     """What is rewarded: coming by, or being there in the end. None = nothing, it is told where its own rollouts led."""
     weight: float = 0.1
     """Of goals in the reward (lambda)."""
+    aim: bool = True
+    """Tokens are weighed by where they lead, too; False = as in the paper."""
 
     @property
     def name(self) -> str:
-        """Of its files."""
-        return self.sight if self.kind is None else f"{self.sight}-{self.kind}"
+        """Of its files, without the weight."""
+        return "-".join([self.sight, *([self.kind] if self.kind else []), *([] if self.aim else ["no-aim"])])
 
 
 @dataclass(frozen=True)

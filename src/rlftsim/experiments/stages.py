@@ -1,5 +1,6 @@
 """From a data set to trained policies, stage by stage. Each does what is missing in its folder and refuses another's."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -20,6 +21,15 @@ from rlftsim.training.pretrain import PretrainConfig, pretrain
 
 CACHED_SCENARIOS = 4096
 """About a megabyte each; with them stay their tokens."""
+
+
+@dataclass(frozen=True)
+class NewSight:
+    """How a model that sees no goals is to see them; see `SmartPolicy.with_goal_sight`."""
+
+    goal: GoalSight
+    aim: bool | None = None
+    """Tokens are weighed by where they lead, too; False = as in the paper, None = yes, or as the model has it."""
 
 
 def open_training(data: Path) -> ScenarioDataset:
@@ -60,17 +70,16 @@ def finetune_with_reward(
     config: FinetuneConfig,
     out: Path,
     *,
-    goal: GoalSight | None = None,
-    aim: bool = True,
+    sight: NewSight | None = None,
 ) -> Path:
-    """Folder of a model fine-tuned closed-loop from a base model, which is given sight of goals if `goal` says how.
+    """Folder of a model fine-tuned closed-loop from a base model, which is given sight of goals if `sight` says how.
 
     Raises:
         CheckpointError: `out` holds a run with other settings or another base model.
         ConfigError: the base model has no weights, or sees goals in another way.
     """
-    card = model_card(f"fine-tuned ({config.reward}{_by(goal)}) from {base}", training.folder, len(training))
-    return finetune(_learner(base, goal, config.seed, aim), training, out, config, card=card)
+    card = model_card(f"fine-tuned ({config.reward}{_by(sight)}) from {base}", training.folder, len(training))
+    return finetune(_learner(base, sight, config.seed), training, out, config, card=card)
 
 
 def finetune_with_catk(
@@ -79,18 +88,17 @@ def finetune_with_catk(
     config: CatkConfig,
     out: Path,
     *,
-    goal: GoalSight | None = None,
-    aim: bool = True,
+    sight: NewSight | None = None,
     held_out: ScenarioDataset | None = None,
 ) -> Path:
-    """Folder of a model fine-tuned with CAT-K from a base model, which is given sight of goals if `goal` says how.
+    """Folder of a model fine-tuned with CAT-K from a base model, which is given sight of goals if `sight` says how.
 
     Raises:
         CheckpointError: `out` holds a run with other settings or another base model.
         ConfigError: the base model has no weights, or sees goals in another way.
     """
-    card = model_card(f"fine-tuned (CAT-K, {config.choice}{_by(goal)}) from {base}", training.folder, len(training))
-    return catk_finetune(_learner(base, goal, config.seed, aim), training, out, config, held_out=held_out, card=card)
+    card = model_card(f"fine-tuned (CAT-K, {config.choice}{_by(sight)}) from {base}", training.folder, len(training))
+    return catk_finetune(_learner(base, sight, config.seed), training, out, config, held_out=held_out, card=card)
 
 
 def teach_goals(
@@ -99,29 +107,30 @@ def teach_goals(
     config: GcslConfig,
     out: Path,
     *,
-    goal: GoalSight | None = None,
-    aim: bool = True,
+    sight: NewSight | None = None,
 ) -> Path:
-    """Folder of a model that knows what goals are, from a base model, which is given sight of goals if `goal` says how.
+    """Folder of a model that knows what goals are, from a base model, which is given sight of goals if `sight` says how.
 
     Raises:
         CheckpointError: `out` holds a run with other settings or another base model.
         ConfigError: the base model has no weights, sees no goals, or sees them in another way.
     """
-    card = model_card(f"told where its own rollouts led{_by(goal)}, from {base}", training.folder, len(training))
-    return gcsl_finetune(_learner(base, goal, config.seed, aim), training, out, config, card=card)
+    card = model_card(f"told where its own rollouts led{_by(sight)}, from {base}", training.folder, len(training))
+    return gcsl_finetune(_learner(base, sight, config.seed), training, out, config, card=card)
 
 
-def _by(goal: GoalSight | None) -> str:
-    return "" if goal is None else f", goals by {goal}"
+def _by(sight: NewSight | None) -> str:
+    if sight is None:
+        return ""
+    return f", goals by {sight.goal}{', without an aim' if sight.aim is False else ''}"
 
 
-def _learner(base: str | Path, goal: GoalSight | None, seed: int, aim: bool) -> Policy:
+def _learner(base: str | Path, sight: NewSight | None, seed: int) -> Policy:
     """A policy to fine-tune."""
     policy = load_policy(str(base))
-    if goal is None:
+    if sight is None:
         return policy
     if not isinstance(policy, SmartPolicy):
         raise ConfigError(f"{base} has no weights, so it cannot learn to see goals: name a model folder.")
     torch.manual_seed(seed)
-    return policy.with_goal_sight(goal, aim=aim)
+    return policy.with_goal_sight(sight.goal, aim=sight.aim)

@@ -40,6 +40,7 @@ from rlftsim.experiments.contestants import (
 from rlftsim.experiments.evaluate import EvaluateConfig, evaluate
 from rlftsim.experiments.evaluation import SCHEMA, SCORE_COLUMNS, Evaluation, GoalsGiven
 from rlftsim.experiments.stages import (
+    NewSight,
     find_vocabulary,
     finetune_with_catk,
     finetune_with_reward,
@@ -249,13 +250,14 @@ class Workshop:
         if contestant.method == CATK:
             finetune_with_catk(base, self.training, catk_config(contestant, self.recipe), out)
             return
-        sight = None if contestant.goals is None else contestant.goals.sight
+        goals = contestant.goals
+        sight = None if goals is None else NewSight(goals.sight, goals.aim)
         if contestant.method == GCSL:
-            teach_goals(base, self.training, gcsl_config(contestant, self.recipe.gcsl), out, goal=sight)
+            teach_goals(base, self.training, gcsl_config(contestant, self.recipe.gcsl), out, sight=sight)
             return
         self._start_from_shorter(out, self._epochs(contestant))
         config = finetune_config(contestant, self.recipe.finetune)
-        finetune_with_reward(base, self.training, config, out, goal=sight)
+        finetune_with_reward(base, self.training, config, out, sight=sight)
 
     def _start_from_shorter(self, out: Path, epochs: float) -> None:
         """Take over the end of a shorter run of the same contestant: a longer one passes through the same weights, because

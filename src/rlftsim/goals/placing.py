@@ -74,7 +74,9 @@ def doubts(entry: GoalEntry, scenario: Scenario) -> tuple[str, ...]:
     if away <= NEAR_M:
         found.append(f"{who} is within {NEAR_M:g} m of its goal already: the goal is passed whatever it does.")
     elif speeds[tracks.valid[track, :HISTORY_STEPS]].max() < STANDING_MPS:
-        found.append(f"{who} stands still, perhaps parked, and is asked to go {away:.0f} m: it will most likely stay.")
+        found.append(
+            f"{who} stands still, perhaps parked, and is asked to go {away:.0f} m: it may stay, or set off in a way that nothing parked does."
+        )
     top = max(speed, TOP_MPS.get(kind, speed + BRISK.acceleration_mps2 * HORIZON_S / 2))
     if away > top * HORIZON_S + NEAR_M:
         found.append(

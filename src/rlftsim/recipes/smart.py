@@ -80,6 +80,7 @@ def smart_demo_quick() -> SmartRecipe:
         pretrain=replace(recipe.pretrain, epochs=1.0),
         finetune=replace(recipe.finetune, epochs=0.25, num_rollouts=4),
         catk=replace(recipe.catk, epochs=0.25, batch_size=4),
+        gcsl=replace(recipe.gcsl, epochs=0.25),
     )
 
 

@@ -8,7 +8,7 @@ where the rollout has led.
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float, Int64
@@ -19,7 +19,6 @@ from rlftsim.goals.types import Goals
 from rlftsim.rollout.noise import derive_seed
 from rlftsim.rollout.policy import DecisionDistribution, Policy, Sampling
 from rlftsim.rollout.simulate import simulate
-from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import Scenarios
 from rlftsim.tokens import public_order
@@ -32,6 +31,7 @@ from rlftsim.tokens.agent_tokens import (
     tokens_towards,
 )
 from rlftsim.tokens.vocabulary import CLASS_BOXES_M, Vocabulary, class_of_type
+from rlftsim.training.closed_loop import TargetedRollouts, TokenLogits, TokenPolicy, predict_along
 from rlftsim.training.freezing import TrainedParts, freeze_untrained
 from rlftsim.training.goals import GoalConfig, choose_goals, refuse_goals
 from rlftsim.training.imitation import ImitationConfig, Prediction, imitate, summed_loss
@@ -42,22 +42,6 @@ Choice = Literal["closest", "top_k", "trajeglish"]
 """closest: of the K most likely tokens the one that leads nearest to the record. top_k: drawn from the K most likely ones. trajeglish:
 drawn, by the model's probabilities, from the K that lead nearest. Where nothing was recorded: the most likely token, and draws from
 the K most likely ones."""
-
-
-@runtime_checkable
-class TokenPolicy(Policy, Protocol):
-    """A policy whose decisions are tokens of a vocabulary."""
-
-    vocabulary: Vocabulary
-
-
-@runtime_checkable
-class TokenLogits(Protocol):
-    """What CAT-K needs of a distribution over tokens (a dataclass): logits of the R elements where the mask is True, in the mask's
-    order."""
-
-    logits: Float[Tensor, "R V"]
-    mask: Bool[Tensor, "B N A *L"]
 
 
 @dataclass(frozen=True)
@@ -142,19 +126,6 @@ def catk_finetune(
 # ---- rollouts -----------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class PursuingRollouts:
-    """CAT-K rollouts and what should have been decided in them."""
-
-    rollouts: Rollouts
-    target: Int64[Tensor, "B N A L"]
-    """Token that leads nearest to the record."""
-    target_mask: Bool[Tensor, "B N A L"]
-    """True = the next state was recorded, and the present one is not too far off the record."""
-    class_id: Int64[Tensor, "B A"]
-    """Whose tokens an agent takes."""
-
-
 def roll_out_closest(
     policy: TokenPolicy,
     batch: ScenarioBatch,
@@ -167,7 +138,7 @@ def roll_out_closest(
     context: Any = None,
     goals: Goals | None = None,
     public_order_of_operations: bool = False,
-) -> PursuingRollouts:
+) -> TargetedRollouts:
     """Simulate with CAT-K.
 
     Without dropout nothing in "closest" is random: more than one rollout makes sense for a policy in training mode only.
@@ -183,6 +154,10 @@ def roll_out_closest(
         context: `policy.encode(batch)`, where it is at hand.
         goals: what agents are asked, see `simulate`.
         public_order_of_operations: round where the public code rounds, see `tokens.public_order`.
+
+    Returns:
+        The rollouts. Target: the token that leads nearest to the record, where the next state was recorded and the present one is not too
+        far off the record.
 
     Raises:
         ConfigError: no candidates.
@@ -205,7 +180,7 @@ def roll_out_closest(
         policy, batch, num_rollouts=num_rollouts, seed=seed, context=context, goals=goals, choose=choose
     )
     target, mask = (torch.stack(part, -1) for part in zip(*targets))
-    return PursuingRollouts(rollouts, target, mask, class_of_type(batch.object_type))
+    return TargetedRollouts(rollouts, target, mask, class_of_type(batch.object_type))
 
 
 @dataclass(frozen=True, eq=False)
@@ -292,39 +267,11 @@ def _draw_near(distribution: Any, aim: _Aim, count: int, noise: Tensor) -> Int64
 _CHOICES = {"closest": _take_closest, "top_k": _draw_likely, "trajeglish": _draw_near}
 
 
-# ---- predictions along them ---------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class ClosedLoopPrediction:
-    """What a policy says along its own rollouts, and what it should have said."""
-
-    logits: Float[Tensor, "R V"]
-    target: Int64[Tensor, "R"]
-    target_mask: Bool[Tensor, "R"]
-    class_id: Int64[Tensor, "R"]
-
-
-def predict_along(
-    policy: TokenPolicy, context: Any, pursuing: PursuingRollouts, trained: Bool[Tensor, "B A"]
-) -> ClosedLoopPrediction:
-    """Predictions along CAT-K rollouts: differentiable, one parallel pass.
-
-    Args:
-        policy: the policy that rolled out.
-        context: its view of the same scenarios.
-        pursuing: the rollouts.
-        trained: True = the agent's decisions count.
-    """
-    scored: TokenLogits = policy.score(context, pursuing.rollouts)  # type: ignore[assignment]
-    counts = pursuing.target_mask & pursuing.rollouts.decision_mask & trained[:, None, :, None]
-    class_id = pursuing.class_id[:, None, :, None].expand(counts.shape)
-    parts = (values[scored.mask] for values in (pursuing.target, counts, class_id))
-    return ClosedLoopPrediction(scored.logits, *parts)
+# ---- the loss -----------------------------------------------------------------------------------------------------------
 
 
 def catk_loss(
-    policy: TokenPolicy, batch: ScenarioBatch, pursuing: PursuingRollouts, trained: Bool[Tensor, "B A"]
+    policy: TokenPolicy, batch: ScenarioBatch, pursuing: TargetedRollouts, trained: Bool[Tensor, "B A"]
 ) -> Float[Tensor, ""]:
     """Mean cross-entropy of the targets along CAT-K rollouts, nats; 0 where nothing counts. Differentiable.
 

@@ -7,7 +7,7 @@ import copy
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -294,8 +294,8 @@ def _accumulate_gradients(
 ) -> tuple[_Sums, AskedLogProb]:
     """Score the rollouts under policy and reference and leave this process's gradient of the loss in the policy's parameters.
 
-    The reference is asked what the policy is asked: one that was given eyes for this run sees nothing yet, one that followed goals before
-    is held to how it followed them.
+    The reference is asked what the policy is asked, see `KlConfig.reference_asked`: one that was given eyes for this run sees nothing yet, one
+    that followed goals before holds the policy to how it followed them.
     """
     learner.optimizer.zero_grad(set_to_none=True)
     sums = torch.zeros(2, device=fabric.device, dtype=torch.float64)
@@ -307,10 +307,11 @@ def _accumulate_gradients(
             reference_context = learner.reference.encode(experience.batch)
         for rows, reward in experience.slices(config.rollouts_per_pass):
             mask = rows.decision_mask
+            held_rows = rows if config.kl.reference_asked else replace(rows, goals=None)
             with fabric.autocast():
                 scored = learner.policy.score(learner.policy.encode(experience.batch), rows)
                 with torch.no_grad():
-                    held = learner.reference.score(reference_context, rows)
+                    held = learner.reference.score(reference_context, held_rows)
             log_prob = scored.log_prob(rows.decision)
             kl, entropy = masked_sum(scored.kl(held), mask), masked_sum(scored.entropy(), mask)
             by_agent = agent_log_prob(log_prob, mask, config.log_prob_reduction)

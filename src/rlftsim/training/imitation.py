@@ -95,7 +95,7 @@ class ImitationConfig:
     trained_radius_m: float = 100.0
     """Agents farther from the ego at the current step are context only."""
     max_trained_agents: int | None = 32
-    """Of a scenario; the evaluated ones first, the rest at random. None = all."""
+    """Of a scenario; the evaluated ones always, the rest at random. None = all."""
     max_skipped_in_a_row: int = 5
     """An update whose gradient is not finite is skipped; after so many in a row the run stops."""
     checkpoint_every: int = 200

@@ -19,6 +19,8 @@ class KlConfig:
     initial_beta: float = 0.1
     min_beta: float = 1e-3
     max_beta: float = 1e3
+    reference_asked: bool = True
+    """With goals: the reference is asked what the policy is asked. False = nothing, so that it stays goal-free whatever it has learned."""
     reference_every: int = 500
     """Updates between two moves of the reference; 0 = never."""
     reference_share: float = 0.005

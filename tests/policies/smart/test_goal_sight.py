@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from torch import nn
 
 import scenes
 from rlftsim.errors import CheckpointError, ConfigError, RlftsimError
@@ -25,6 +24,7 @@ SMALL = SmartConfig(
     map_radius_m=12.0, max_map_neighbors=None,
 )  # fmt: skip
 each_sight = pytest.mark.parametrize("sight", ["concat", "indication"])
+each_part = pytest.mark.parametrize("aim", [False, True], ids=["sight", "aim"])
 
 
 @pytest.fixture(scope="module")
@@ -54,12 +54,13 @@ def far_goals(batch, chosen=slice(None)):
     return Goals.of_scenarios(position, mask)
 
 
-def learned(policy, sight, size=0.5):
-    """The policy with eyes that have seen something."""
-    policy = policy.with_goal_sight(sight)
+def learned(policy, sight, size=0.5, *, aim=False):
+    """The policy with eyes that have seen something; with an aim, eyes that see nothing and an aim that was learned."""
+    policy = policy.with_goal_sight(sight, aim=aim)
     generator = torch.Generator().manual_seed(11)
+    eyes, *aims = policy.goal_parts()
     with torch.no_grad():
-        for weight in nn.ModuleList(policy.goal_parts()).parameters():
+        for weight in (aims[0] if aim else eyes).parameters():
             weight.add_(size * torch.randn(weight.shape, generator=generator))
     return policy
 
@@ -87,8 +88,9 @@ def test_a_model_that_just_got_eyes_says_what_it_said(sight, base, batch):
 
 
 @each_sight
-def test_the_first_decision_and_every_other_look_at_the_goal(sight, base, batch):
-    policy, goals = learned(base, sight), far_goals(batch).repeat(1)
+@each_part
+def test_the_first_decision_and_every_other_look_at_the_goal(sight, aim, base, batch):
+    policy, goals = learned(base, sight, aim=aim), far_goals(batch).repeat(1)
     rollouts = simulate(policy, batch, num_rollouts=1, seed=5)
     free = policy.score(policy.encode(batch), rollouts).log_prob(rollouts.decision)
     asked = policy.score(policy.encode(batch), replace(rollouts, goals=goals)).log_prob(rollouts.decision)
@@ -129,8 +131,9 @@ def test_who_has_no_goal_is_asked_nothing(sight, base):
 
 
 @each_sight
-def test_goals_may_differ_between_rollouts(sight, base, batch):
-    policy, goals = learned(base, sight), far_goals(batch).repeat(2)
+@each_part
+def test_goals_may_differ_between_rollouts(sight, aim, base, batch):
+    policy, goals = learned(base, sight, aim=aim), far_goals(batch).repeat(2)
     first_only = goals.only(torch.tensor([True, False]).view(1, 2, 1).expand_as(goals.goal_mask))
     mixed = simulate(policy, batch, num_rollouts=2, seed=5, goals=first_only)
     free = simulate(policy, batch, num_rollouts=2, seed=5)
@@ -140,9 +143,10 @@ def test_goals_may_differ_between_rollouts(sight, base, batch):
 
 
 @each_sight
-def test_a_model_that_sees_goals_keeps_the_contract(sight, base):
+@each_part
+def test_a_model_that_sees_goals_keeps_the_contract(sight, aim, base):
     small = SmartPolicy(replace(SMALL, num_decoder_layers=1), base.vocabulary)
-    report = check_policy(learned(small, sight), BENDING[1:])
+    report = check_policy(learned(small, sight, 0.1, aim=aim), BENDING[1:])
     assert report.is_passed, str(report)
 
 
@@ -197,12 +201,16 @@ def test_sight_is_given_once(base):
 @each_sight
 def test_without_aim_a_model_is_the_papers(sight, base, batch):
     plain = base.with_goal_sight(sight, aim=False)
-    assert plain.with_goal_sight(sight) is plain
+    assert plain.with_goal_sight(sight) is plain  # a model that sees goals keeps the sight it has
     assert [type(part).__name__ for part in plain.goal_parts()] == [
         {"concat": "GoalState", "indication": "GoalMark"}[sight]
     ]
     aiming = base.with_goal_sight(sight)
     assert {*aiming.network.state_dict()} - {*plain.network.state_dict()} == {"decoder.aim.weight"}
+    assert aiming.with_goal_sight(sight, aim=True) is aiming
+    for model, aim in ((aiming, False), (plain, True)):
+        with pytest.raises(ConfigError, match=f"has {'no ' if aim else 'an '}aim"):
+            model.with_goal_sight(sight, aim=aim)
 
 
 def test_models_of_before_there_was_an_aim_are_read(base, batch, tmp_path):
@@ -276,9 +284,10 @@ def test_the_goal_polyline_is_the_nearest_token_of_the_own_scenario():
 
 
 @each_sight
+@each_part
 @pytest.mark.parametrize("lies", ["beyond all of the map", "nowhere"])
-def test_a_goal_nowhere_is_none_and_one_far_from_the_map_is_aimed_at(sight, lies, base):
-    policy, batch = learned(base, sight), collate([scenes.crowd(num_agents=40)])
+def test_a_goal_nowhere_is_none_and_one_far_from_the_map_has_no_polyline(sight, aim, lies, base):
+    policy, batch = learned(base, sight, aim=aim), collate([scenes.crowd(num_agents=40)])
     goals = far_goals(batch)
     near = goals.position + (1000.0 if lies == "beyond all of the map" else torch.nan)
     first = torch.zeros_like(goals.goal_mask)
@@ -287,7 +296,8 @@ def test_a_goal_nowhere_is_none_and_one_far_from_the_map_is_aimed_at(sight, lies
     paths = [simulate(policy, batch, num_rollouts=1, seed=5, goals=g).position for g in (asked, asked.only(first))]
     assert all(path.isfinite().all() for path in paths)
     free = simulate(policy, batch, num_rollouts=1, seed=5).position
-    assert paths[1].equal(free) == (lies == "nowhere")
+    is_seen = lies == "beyond all of the map" and (aim or sight == "concat")
+    assert paths[1].equal(free) != is_seen
 
 
 def test_a_goal_beyond_a_large_map_has_no_polyline():

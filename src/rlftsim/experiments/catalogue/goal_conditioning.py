@@ -74,7 +74,7 @@ def conclude(measured: Measured, workshop: Workshop) -> Findings:
         ),
         notes=(
             budget_note(workshop),
-            "Told: the goal-free row, told where its own rollouts led; whoever is asked nothing decides as there. The variants start from these "
+            "All models that see goals also weigh tokens by where they lead, which the paper's do not. Told: the goal-free row, told where its own rollouts led; whoever is asked nothing decides as there. The variants start from these "
             "rows and have had the fine-tuning of the goal-free one again; what more goal-free fine-tuning does is in finetune-curve.",
             "A passing miss: an evaluated agent that at no simulated step is within WOMD's tolerance of where its record ends; share of agents and "
             "rollouts. In all rollouts: share of agents that miss in every one of them.",

@@ -32,7 +32,7 @@ AIM_GAIN = 8.0
 """Weights of an aim count so many times, so that the learning rate of other weights suits them: they are few and have far to go."""
 ROWS_PER_PIECE = {"cpu": 128}
 """Rows whose tokens are looked at together: on a processor they fit its cache."""
-ROWS_PER_PIECE_ELSEWHERE = 1 << 16
+ROWS_PER_PIECE_ELSEWHERE = 1 << 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,14 +120,18 @@ class GoalMark(nn.Embedding):
 
 
 class GoalAim(nn.Module):
-    """Tokens weighed by where they lead: three features of each, times weights that depend on the class and on how much time is left.
+    """Tokens weighed by where they lead: three features of each, times weights that depend on the class and on how many decisions are left.
+
+    With T the time that is left once a token has led there:
 
     * how much nearer the token leads, in metres,
-    * how badly its speed would cover the rest of the way in the time that is left then, in metres a second,
-    * how far from the goal going on like this would end, by the time until then, in metres a second.
+    * by how much going on at its speed for T would miss the rest of the way, divided by 1 s + T,
+    * how far from the goal going on straight at its speed for T would end, divided by 1 s + T; both in metres a second and rounded
+      at zero (`ROUNDING_MPS`).
 
-    The logit of a token is raised by the first and lowered by the others, each times its weight. To be there at the end of the
-    simulation is what is aimed at, so the features are those of a walk that is to end in a place (a bridge).
+    The logit of a token is raised by the first and lowered by the others, each times its weight: a product of what the model thinks likely
+    and of how well it suits, as for a walk that is to end in a place (Doob's h-transform; here with a learned, log-linear h). To be there
+    when the simulation ends is what is aimed at.
     """
 
     def __init__(self):

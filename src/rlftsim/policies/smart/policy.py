@@ -248,23 +248,28 @@ class SmartPolicy(nn.Module):
         """Whether goals have an effect."""
         return self.config.goal is not None
 
-    def with_goal_sight(self, goal: GoalSight, *, aim: bool = True) -> "SmartPolicy":
+    def with_goal_sight(self, goal: GoalSight, *, aim: bool | None = None) -> "SmartPolicy":
         """The same policy with weights to see goals by, which say nothing yet; itself if it sees them so.
 
         Args:
             goal: how it is to see them.
-            aim: weigh tokens by where they lead, too. Without it a model is the paper's.
+            aim: weigh tokens by where they lead, too; without it a model is the paper's. None = yes, or as a model does that sees goals.
 
         Raises:
             ConfigError: it sees them in another way.
         """
-        if self.config.goal == goal:
+        if self.config.goal == goal and aim in (None, self.config.goal_aim):
             return self
+        if self.config.goal == goal:
+            has = "an aim" if self.config.goal_aim else "no aim"
+            raise ConfigError(
+                f"this model sees goals and has {has}: for another one start from a model that sees none."
+            )
         if self.sees_goals:
             raise ConfigError(
                 f"this model sees goals by {self.config.goal}, not by {goal}: start from a model that sees none."
             )
-        policy = SmartPolicy(replace(self.config, goal=goal, goal_aim=aim), self.vocabulary).to(
+        policy = SmartPolicy(replace(self.config, goal=goal, goal_aim=aim is not False), self.vocabulary).to(
             next(self.parameters()).device
         )
         decoder = policy.network.decoder
@@ -375,6 +380,7 @@ class SmartPolicy(nn.Module):
         goal = rotate(goals.position[rows[:3]] - here.position, -here.heading)
         class_id = class_of_type(context.object_type)[rows[0], rows[2]]
         weighed = aim(goal, num_left[rows], class_id, self.vocabulary.poses()[:, :, -1, :2])
+        weighed = weighed.masked_fill(~self.vocabulary.token_mask[class_id], 0.0)  # these stay impossible
         return TokenDistribution(said.logits.index_add(0, carriers, weighed), said.mask)
 
     def _logits(
