@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,10 +14,11 @@ from rlftsim.experiments import attainment
 from rlftsim.experiments.attainment import Attained, measure_attainment
 from rlftsim.experiments.catalogue import goal_conditioning, kinematic_controllability, maneuver_controllability
 from rlftsim.experiments.catalogue.controllability import contestants
-from rlftsim.experiments.contestants import BASE, Baseline, FineTuned, GoalTraining, finetune_config
+from rlftsim.experiments.contestants import BASE, Baseline, FineTuned, GoalTraining, Guided, finetune_config
 from rlftsim.experiments.evaluate import EvaluateConfig, evaluate
 from rlftsim.experiments.workshop import Workshop
 from rlftsim.goals.goals_file import GoalEntry, GoalsFile, read_goals, write_goals
+from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.scenario.dataset import write_dataset
 
@@ -164,13 +166,13 @@ def test_offsets_are_compared_scenario_by_scenario(workshop):
     labels = [f"{h:+d} s" for h in offsets]
     rows = list(contestants())
     low, high = [[0.2] * 7, [0.4] * 7, [0.6] * 7], [[0.3] * 7, [0.5] * 7, [0.7] * 7]
-    shares = {name: high if name == "indication, soft" else low for name in rows}
+    shares = {name: high if name == "indication, soft, guided" else low for name in rows}
     measured = kinematic_controllability.Measured(offsets * 3, made_up_shares(labels, shares))
     found = kinematic_controllability.conclude(measured, workshop)
     assert found.tables[0].rows[0][1] == "40.0 ± 11.5"  # of 20, 40, 60: 20 over the root of 3
-    verdict = next(v for v in found.verdicts if v.startswith("indication, soft against goal-free, passed"))
+    verdict = next(v for v in found.verdicts if v.startswith("indication, soft, guided against goal-free, passed"))
     assert "difference, for the better: +10.0 points" in verdict
-    assert "no difference: +0.0" in next(v for v in found.verdicts if v.startswith("indication, hard"))
+    assert "no difference: +0.0" in next(v for v in found.verdicts if v.startswith("indication, hard, guided"))
     assert found.numbers["passed"]["base"][0]["scenarios"] == 3
     assert found.figure is not None
 
@@ -201,20 +203,20 @@ def test_conditions_are_means_over_scenarios(workshop):
     labels = ["straight (recorded)", "left", "right"]
     rows = list(contestants())
     base, better = [[1.0, 0.0, 0.2], [0.8, 0.2, 0.2]], [[1.0, 0.4, 0.6], [0.8, 0.5, 0.5]]
-    shares = {name: better if name == "concatenation, soft" else base for name in rows}
+    shares = {name: better if name == "concatenation, soft, guided" else base for name in rows}
     measured = maneuver_controllability.Measured(made_up_shares(labels, shares))
     found = maneuver_controllability.conclude(measured, workshop)
     overall = found.numbers["conditions"]["passed"]
     assert [overall["goal-free"][c]["mean"] for c in maneuver_controllability.CONDITIONS] == pytest.approx(
         [0.9, 0.525, 0.15]
     )
-    assert overall["concatenation, soft"]["alternative only"]["mean"] == pytest.approx(0.5)
+    assert overall["concatenation, soft, guided"]["alternative only"]["mean"] == pytest.approx(0.5)
     assert found.numbers["conditions"]["reached"]["base"]["mixed"]["mean"] == pytest.approx(0.2625)
     # whole goals: the first scenario's left is never passed, all the others sometimes
     assert found.numbers["conditions"]["passed_once"]["base"]["alternative only"]["mean"] == pytest.approx(0.75)
-    lefts = found.numbers["manoeuvres"]["passed"]["concatenation, soft"]["alternative only"]["left"]
+    lefts = found.numbers["manoeuvres"]["passed"]["concatenation, soft, guided"]["alternative only"]["left"]
     assert (lefts["mean"], lefts["count"]) == (pytest.approx(0.45), 2)
-    verdict = next(v for v in found.verdicts if v.startswith("concatenation, soft against goal-free, passed"))
+    verdict = next(v for v in found.verdicts if v.startswith("concatenation, soft, guided against goal-free, passed"))
     assert "alternatives only (3.33 times)" in verdict
     assert found.tables[-1].title.startswith("The paper")
 
@@ -282,7 +284,10 @@ def test_variants_are_measured_asked_and_unasked_for_every_seed(workshop, monkey
     measured = goal_conditioning.measure(replace(workshop, num_seeds=2))
     twice = dict.fromkeys(goal_conditioning.VARIANTS, 2)
     told = dict.fromkeys(goal_conditioning.TOLD, 1)
-    assert calls == [("none", {"goal-free": 1}), ("recorded", told), ("recorded", twice), ("none", twice)]
+    guided = dict.fromkeys(goal_conditioning.GUIDED, 2)
+    assert calls == [
+        ("none", {"goal-free": 1}), ("recorded", told), ("recorded", twice), ("recorded", guided), ("none", twice),
+    ]  # fmt: skip
     assert list(measured.asked) == list(measured.unasked) == list(goal_conditioning.VARIANTS)
 
 
@@ -291,7 +296,8 @@ def test_following_is_told_with_its_cost(workshop):
     asked = {name: row(name, [0.59, 0.70], passing_miss_rate=[0.1, 0.2]) for name in goal_conditioning.VARIANTS}
     unasked = {name: row(name, [0.60, 0.70], passing_miss_rate=[0.2, 0.4]) for name in goal_conditioning.VARIANTS}
     told = {name: row(name, [0.59, 0.70], passing_miss_rate=[0.2, 0.2]) for name in goal_conditioning.TOLD}
-    found = goal_conditioning.conclude(goal_conditioning.Measured(start, told, asked, unasked), workshop)
+    guided = {name: row(name, [0.60, 0.70], passing_miss_rate=[0.1, 0.1]) for name in goal_conditioning.GUIDED}
+    found = goal_conditioning.conclude(goal_conditioning.Measured(start, told, asked, guided, unasked), workshop)
     assert found.verdicts[0] == "concatenation, told: passing misses 30.00% → 20.00%, -33% relative, at -0.0050 RMM."
     assert found.verdicts[2] == "concatenation, soft: passing misses 30.00% → 15.00%, -50% relative, at -0.0050 RMM."
     assert found.tables[0].rows[0][1] == "30.00 ± 10.00"
@@ -308,5 +314,10 @@ def test_the_experiments_run_with_tiny_models(workshop):
     assert len(asked) == 3
     assert (workshop.out / "evaluations" / "gcft-indication-soft-from-gcsl-indication-from-mloo-seed0-seed0-seed0-0.5-epochs-recorded-goals.parquet").exists()  # fmt: skip
     goals = [GoalEntry("straight", 100, 1080.0, -200.0)]
-    found = measure_attainment(workshop, {"base": BASE, "soft": variant}, goals, name="tiny")
+    rows = {"base": BASE, "soft": variant, "guided": Guided(variant, 1e3)}
+    found = measure_attainment(workshop, rows, goals, name="tiny")
+    guided = SmartPolicy.from_pretrained(Path(workshop.models([rows["guided"]])[rows["guided"]]))
+    plain = SmartPolicy.from_pretrained(Path(workshop.models([variant])[variant]))
+    assert guided.network.decoder.aim.weight.equal(1e3 * plain.network.decoder.aim.weight)
+    assert workshop.evaluation_name(rows["guided"]) == f"{workshop.evaluation_name(variant)}-guided-1000"
     assert all(0 <= a.reached <= a.passed <= 1 for attained in found.values() for a in attained)

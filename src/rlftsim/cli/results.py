@@ -37,6 +37,8 @@ class Evaluate:
     """Of the row and the file; left out, the model's name."""
     device: Device = "auto"
     """Where the model runs; several processes (jobs) need cpu."""
+    goal_guidance: float = 1.0
+    """With --goals recorded: how many times the model's aim counts. Above 1 goals are followed more closely than it learned to."""
     config: Annotated[EvaluateConfig, tyro.conf.arg(name="")] = field(default_factory=EvaluateConfig)
 
     def run(self) -> int:
@@ -44,7 +46,11 @@ class Evaluate:
         path = Path(self.model)
         name = self.name or (path.parent.name if path.name == "model" else path.name)
         self._refuse_other_goals(self.out / f"{name}.parquet")
-        policy = load_policy_or_oracle(self.model, self.device)
+        if self.goal_guidance != 1.0 and self.config.goals == "none":
+            raise ConfigError(
+                f"--goal-guidance {self.goal_guidance:g} has no effect without goals: add --goals recorded."
+            )
+        policy = load_policy_or_oracle(self.model, self.device, goal_guidance=self.goal_guidance)
         result = evaluate(policy, data_folder(self.data), self.out, self.config, name=name)
         if not len(result):
             raise DataError(f"not one of {len(result.skipped)} scenarios could be scored: {result.skipped[0].reason}")

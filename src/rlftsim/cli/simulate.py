@@ -58,6 +58,8 @@ class Simulate:
     """AGENT=X,Y asks an agent of the one --scenario to go there, metres in the world frame of the record; may be given many times."""
     goals: Path | None = None
     """Goals file (docs/goals.md); without --scenario only its scenarios are simulated."""
+    goal_guidance: float = 1.0
+    """How many times the model's aim counts: above 1 goals are followed more closely than it learned to."""
     picture: bool = False
     """Draw OUT/SCENARIO.png: agents that have goals, or else the evaluated ones, and where they went."""
     device: Device = "auto"
@@ -68,9 +70,14 @@ class Simulate:
             raise ConfigError(f"--num-rollouts must be at least 1, got {self.num_rollouts}.")
         if self.scenario is not None and not self.scenario:
             raise ConfigError("--scenario names none: give ids, or leave it out for all.")
-        policy, sampling = load_policy(self.model, self.device), Sampling(self.temperature, self.top_k)
+        policy = load_policy(self.model, self.device, goal_guidance=self.goal_guidance)
+        sampling = Sampling(self.temperature, self.top_k)
         scenarios = open_split(self.data, self.split)
         asked = self._goals_asked(policy)
+        if self.goal_guidance != 1.0 and not asked.goals:
+            raise ConfigError(
+                f"--goal-guidance {self.goal_guidance:g} has no effect without goals: add --goal or --goals."
+            )
         ids = list(dict.fromkeys(self.scenario or asked.scenario_ids or scenarios.scenario_ids))
         for scenario_id in ids:
             entries = asked.of_scenario(scenario_id)

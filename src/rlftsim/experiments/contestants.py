@@ -82,12 +82,25 @@ class FineTuned:
         return f"{self.method}{goals}{credit}{base}-seed{self.seed}"
 
 
+@dataclass(frozen=True)
+class Guided:
+    """A fine-tuned model that follows goals more closely than it learned to, see `SmartPolicy.guided`."""
+
+    of: FineTuned
+    times: float
+
+    @property
+    def name(self) -> str:
+        """Of its files."""
+        return f"{self.of.name}-guided-{self.times:g}"
+
+
 CATK, GCFT, GCSL = "catk", "gcft", "gcsl"
 VARIED = (
     "finetune.reward", "finetune.credit", "finetune.seed", "catk.seed", "catk.epochs", "catk.batch_size", "gcsl.seed",
 )  # fmt: skip
 """Fields of a recipe that contestants set for themselves."""
-Contestant = Baseline | Base | FineTuned
+Contestant = Baseline | Base | FineTuned | Guided
 ORACLE, CONSTANT_VELOCITY, BASE = Baseline("oracle"), Baseline("constant_velocity"), Base()
 
 

@@ -33,6 +33,7 @@ from rlftsim.experiments.contestants import (
     Baseline,
     Contestant,
     FineTuned,
+    Guided,
     catk_config,
     finetune_config,
     gcsl_config,
@@ -183,6 +184,8 @@ class Workshop:
 
     def title(self, contestant: Contestant) -> str:
         """A contestant in words."""
+        if isinstance(contestant, Guided):
+            return f"{self.title(contestant.of)}, guided {contestant.times:g} times"
         if not isinstance(contestant, FineTuned):
             return contestant.name.replace("_", " ")
         epochs = self._epochs(contestant)
@@ -211,6 +214,8 @@ class Workshop:
 
     def _lineage(self, contestant: Contestant) -> list[Base | FineTuned]:
         """What has to be trained for a contestant, the base model first."""
+        if isinstance(contestant, Guided):
+            return self._lineage(contestant.of)
         if isinstance(contestant, Baseline) or (contestant == BASE and self.base_model):
             return []
         before = self._lineage(contestant.base) if isinstance(contestant, FineTuned) else []
@@ -226,7 +231,14 @@ class Workshop:
         for needed in self._lineage(contestant):
             with agenda.step(self._training_title(needed)):
                 self._pretrain(needed) if isinstance(needed, Base) else self._finetune(needed)
-        return str(self._result(contestant))
+        return str(self._guide(contestant) if isinstance(contestant, Guided) else self._result(contestant))
+
+    def _guide(self, contestant: Guided) -> Path:
+        """Folder of a guided model, made anew: nothing is trained."""
+        folder = self.model_folder(contestant.of) / f"guided-{contestant.times:g}"
+        policy = load_policy(str(self._result(contestant.of)), goal_guidance=contestant.times)
+        policy.save_pretrained(folder, card=f"# {self.title(contestant)}\n")  # type: ignore[attr-defined]
+        return folder
 
     def _result(self, contestant: Base | FineTuned) -> Path:
         if contestant == BASE and self.base_model:
@@ -279,6 +291,8 @@ class Workshop:
 
     def evaluation_name(self, contestant: Contestant, goals: GoalsGiven = "none") -> str:
         """Of a contestant's results."""
+        if isinstance(contestant, Guided):
+            return f"{self.evaluation_name(contestant.of, goals)}-guided-{contestant.times:g}"
         suffix = f"-{self._epochs(contestant):g}-epochs" if isinstance(contestant, FineTuned) else ""
         return f"{contestant.name}{suffix}{'' if goals == 'none' else f'-{goals}-goals'}"
 

@@ -224,6 +224,23 @@ def test_models_of_before_there_was_an_aim_are_read(base, batch, tmp_path):
     assert again.config == plain.config
 
 
+def test_guidance_counts_an_aim_several_times(base, batch):
+    policy = learned(base, "concat", 0.1)
+    rollouts = simulate(policy, batch, num_rollouts=1, seed=5, goals=far_goals(batch))
+    scored = [logits(p, batch, rollouts) for p in (policy.guided(0.0), policy, policy.guided(3.0))]
+    exists = scored[0] > -1e8
+    once, thrice = (said[exists] - scored[0][exists] for said in scored[1:])
+    torch.testing.assert_close(thrice, 3 * once, atol=2e-2, rtol=1e-3)
+    free = [simulate(p, batch, num_rollouts=1, seed=5).position for p in (policy, policy.guided(3.0))]
+    assert free[0].equal(free[1])
+    assert policy.guided(1.0) is policy
+    for times in (-1.0, float("nan"), float("inf")):
+        with pytest.raises(ConfigError, match="a number of 0 or more"):
+            policy.guided(times)
+    with pytest.raises(ConfigError, match="does not aim at goals"):
+        base.guided(2.0)
+
+
 def test_an_aim_without_sight_is_refused():
     with pytest.raises(ConfigError, match="nobody sees goals"):
         replace(SMALL, goal_aim=True)

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 
 from rlftsim.experiments.attainment import Attained
-from rlftsim.experiments.catalogue.goal_conditioning import GOAL_FREE, START, VARIANTS
+from rlftsim.experiments.catalogue.goal_conditioning import GOAL_FREE, GUIDED, START
 from rlftsim.experiments.contestants import BASE, Contestant
 from rlftsim.intervals import MeanInterval, mean_interval
 from rlftsim.viewer.figure import Band
@@ -16,8 +16,8 @@ SEED_NOTE = "Of every fine-tuned row one model is measured, that of seed 0, what
 
 
 def contestants() -> dict[str, Contestant]:
-    """The models that see no goals, and the four variants."""
-    return {"base": BASE, START: GOAL_FREE, **VARIANTS}
+    """The models that see no goals, and the four variants, guided."""
+    return {"base": BASE, START: GOAL_FREE, **GUIDED}
 
 
 def shares_by_scenario(attained: Iterable[Attained], way: str) -> dict[str, float]:
@@ -63,8 +63,8 @@ def bands_of(curves: Mapping[str, Sequence[MeanInterval]]) -> tuple[Band, ...]:
     for number, (name, curve) in enumerate(curves.items()):
         place = np.arange(len(curve)) + 0.07 * (number - (len(curves) - 1) / 2)
         mean, low, high = (100 * np.array(v) for v in ([m.mean for m in curve], *zip(*(m.interval for m in curve))))
-        sees = name in VARIANTS
-        colour = list(VARIANTS).index(name) if sees else 4 + (name == START)
+        sees = name in GUIDED
+        colour = list(GUIDED).index(name) if sees else 4 + (name == START)
         bands.append(
             Band(
                 name,

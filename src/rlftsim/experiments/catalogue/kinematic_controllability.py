@@ -20,7 +20,7 @@ from rlftsim.experiments.catalogue.controllability import (
     paired_gain,
     shares_by_scenario,
 )
-from rlftsim.experiments.catalogue.goal_conditioning import START, VARIANTS
+from rlftsim.experiments.catalogue.goal_conditioning import GUIDED, START
 from rlftsim.experiments.findings import Experiment, Findings, TextTable, budget_note
 from rlftsim.experiments.workshop import Workshop
 from rlftsim.goals.goals_file import GoalEntry
@@ -93,7 +93,7 @@ def conclude(measured: Measured, workshop: Workshop) -> Findings:
     return Findings(
         title="Kinematic controllability: the ego is asked to be there earlier or later",
         tables=tuple(_table(way, curves[way]) for way in WAYS),
-        verdicts=tuple(_verdict(measured, row, way) for way in WAYS for row in VARIANTS),
+        verdicts=tuple(_verdict(measured, row, way) for way in WAYS for row in GUIDED),
         notes=(
             budget_note(workshop),
             SEED_NOTE,

@@ -20,7 +20,7 @@ from rlftsim.experiments.catalogue.controllability import (
     paired_gain,
     shares_by_scenario,
 )
-from rlftsim.experiments.catalogue.goal_conditioning import START, VARIANTS
+from rlftsim.experiments.catalogue.goal_conditioning import GUIDED, START
 from rlftsim.experiments.findings import Experiment, Findings, TextTable, budget_note
 from rlftsim.experiments.goal_proposals import RECORDED, entry_of, propose
 from rlftsim.experiments.workshop import Workshop
@@ -103,7 +103,7 @@ def conclude(measured: Measured, workshop: Workshop) -> Findings:
             *(_manoeuvre_table(measured, condition) for condition in IS_IN),
             published.MANOEUVRES,
         ),
-        verdicts=tuple(_verdict(measured, row, way) for way in (*WAYS, "passed_once") for row in VARIANTS),
+        verdicts=tuple(_verdict(measured, row, way) for way in (*WAYS, "passed_once") for row in GUIDED),
         notes=(
             budget_note(workshop),
             SEED_NOTE,

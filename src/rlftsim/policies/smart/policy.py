@@ -1,6 +1,8 @@
 """SMART as a policy: a token of half a second for every agent, sixteen times."""
 
+import copy
 import json
+import math
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
@@ -278,6 +280,24 @@ class SmartPolicy(nn.Module):
         new = {k: v for k, v in policy.network.state_dict().items() if k.startswith(("decoder.goal.", "decoder.aim."))}
         load_strictly(policy.network, {**self.network.state_dict(), **new}, source="the model to start from")
         return policy.train(self.training)
+
+    def guided(self, times: float) -> "SmartPolicy":
+        """The same policy, its aim counting so many times: above 1 goals are followed more closely than was learned. Itself at 1.
+
+        Raises:
+            ConfigError: it has no aim, or `times` is no number of 0 or more.
+        """
+        if times == 1.0:
+            return self
+        if not (math.isfinite(times) and times >= 0):
+            raise ConfigError(f"goal_guidance is a number of 0 or more, got {times}.")
+        if self.network.decoder.aim is None:
+            raise ConfigError(f"goal_guidance={times:g} has no effect: this model does not aim at goals, leave it out.")
+        policy = copy.deepcopy(self)
+        assert policy.network.decoder.aim is not None
+        with torch.no_grad():
+            policy.network.decoder.aim.weight.mul_(times)
+        return policy
 
     # ---- files ----------------------------------------------------------------------------------------------------
 
