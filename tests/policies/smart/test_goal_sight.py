@@ -225,7 +225,7 @@ def test_models_of_before_there_was_an_aim_are_read(base, batch, tmp_path):
 
 
 def test_guidance_counts_an_aim_several_times(base, batch):
-    policy = learned(base, "concat", 0.1)
+    policy = learned(base, "concat", 0.1, aim=True)
     rollouts = simulate(policy, batch, num_rollouts=1, seed=5, goals=far_goals(batch))
     scored = [logits(p, batch, rollouts) for p in (policy.guided(0.0), policy, policy.guided(3.0))]
     exists = scored[0] > -1e8
