@@ -289,8 +289,7 @@ def test_what_has_no_effect_on_a_method_is_refused(tmp_path, vocabulary, capsys)
         ([*catk, "--set", "catk.trained=goals"], "this model does not see goals: add --goal concat"),
         ([*catk, "--set", "catk.goal_share=1"], "this model does not see goals: add --goal concat"),
         (["--method", "gcsl"], "this model does not see goals: add --goal concat"),
-        (["--no-goal-aim"], "whether to aim has no effect without goals: name a --goal"),
-        (["--goal-aim"], "whether to aim has no effect without goals: name a --goal"),
+        (["--goal-aim", "no"], "--goal-aim no has no effect: name a --goal"),
         (["--method", "gcsl", "--goal", "concat", "--validation-split", "validation"], "See what was learned by"),
         (
             ["--method", "gcsl", "--goal", "concat", "--set", "gcsl.goal_learning_rate_scale=2"],
@@ -377,7 +376,7 @@ class SeesGoals(ConstantVelocity):
 
 
 def test_a_goal_is_given_to_the_model_and_who_got_there_is_said(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("rlftsim.cli.simulate.load_policy", lambda *_: SeesGoals())
+    monkeypatch.setattr("rlftsim.cli.simulate.load_policy", lambda *_, **__: SeesGoals())
     arguments = ["simulate", "goal-seeker", "--data", "synthetic", "--scenario", SCENARIO, "--num-rollouts", "2"]
     goals = ["--goal", f"{TURNS}=-74.19,19.77", "--goal", "52=3.28,-4.49"]
     status, out, err = run(capsys, *arguments, "--out", tmp_path / "o", *goals, "--picture")
@@ -393,7 +392,7 @@ def test_a_goal_is_given_to_the_model_and_who_got_there_is_said(tmp_path, capsys
 
 
 def test_only_the_scenarios_of_a_goals_file_are_simulated(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("rlftsim.cli.simulate.load_policy", lambda *_: SeesGoals())
+    monkeypatch.setattr("rlftsim.cli.simulate.load_policy", lambda *_, **__: SeesGoals())
     run(capsys, "goals", "propose", "synthetic", "--scenario", SCENARIO, "--out", tmp_path / "g.json")
     arguments = ["simulate", "goal-seeker", "--data", "synthetic", "--out", tmp_path / "o", "--num-rollouts", "1"]
     status, out, _ = run(capsys, *arguments, "--goals", tmp_path / "g.json")
@@ -403,7 +402,7 @@ def test_only_the_scenarios_of_a_goals_file_are_simulated(tmp_path, capsys, monk
 
 
 def test_an_evaluation_with_goals_says_so_and_replaces_none_without(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("rlftsim.cli.results.load_policy_or_oracle", lambda *_: SeesGoals())
+    monkeypatch.setattr("rlftsim.cli.results.load_policy_or_oracle", lambda *_, **__: SeesGoals())
     arguments = ["evaluate", "goal-seeker", "--data", "synthetic", "--out", tmp_path, "--num-rollouts", "2", "--limit", "1"]  # fmt: skip
     status, out, _ = run(capsys, *arguments, "--goals", "recorded")
     assert (status, "goal missed" in " ".join(out.split())) == (0, True)
@@ -426,7 +425,7 @@ def goals_file(path, *goals, alternatives=()):
 @pytest.fixture
 def simulated(tmp_path, capsys, monkeypatch):
     """Runs `simulate` with a model that drives to its goals; returns status, output and errors."""
-    monkeypatch.setattr("rlftsim.cli.simulate.load_policy", lambda *_: SeesGoals())
+    monkeypatch.setattr("rlftsim.cli.simulate.load_policy", lambda *_, **__: SeesGoals())
     common = ["simulate", "goal-seeker", "--data", "synthetic", "--num-rollouts", "2", "--out", tmp_path / "o"]
     return lambda *arguments: run(capsys, *common, *arguments)
 

@@ -21,6 +21,7 @@ from rlftsim.tokens.vocabulary import Vocabulary
 from rlftsim.training.gcsl import NOT_VALIDATED
 from rlftsim.training.parallel import is_first_process
 
+AIM = {"yes": True, "no": False, None: None}
 VALIDATION = "validation"
 """Split that is validated on where none is named."""
 
@@ -114,7 +115,7 @@ class Finetune:
     """Fine-tune with goals: how the model is to see them, concat or indication. Every agent is asked to go where its record ends; rlft then
     takes the reward gcft (see finetune.goals for other goals), catk trains only the weights that see goals. Left out, the model keeps the
     sight it has."""
-    goal_aim: bool | None = None
+    goal_aim: Literal["yes", "no"] | None = None
     """With --goal: weigh tokens by where they lead, too (an aim, not in the paper). Left out, a model that is given sight of goals gets one,
     and a model that sees goals keeps what it has."""
     split: str = "training"
@@ -130,14 +131,14 @@ class Finetune:
         if self.goal is not None:
             recipe = recipe.with_goals()
         elif self.goal_aim is not None:
-            raise ConfigError("whether to aim has no effect without goals: name a --goal.")
+            raise ConfigError(f"--goal-aim {self.goal_aim} has no effect: name a --goal.")
         recipe = configure(recipe, self.set, sections=(section,))
         scenarios = open_split(self.data, self.split)
         if self.method == "gcsl" and self.validation_split:
             raise ConfigError(f"--validation-split {self.validation_split} has no effect: {NOT_VALIDATED}")
         every = recipe.catk.validation.every if self.method == "catk" else 0
         held_out = _held_out(self.data, self.validation_split, every)
-        sight = None if self.goal is None else NewSight(self.goal, self.goal_aim)
+        sight = None if self.goal is None else NewSight(self.goal, AIM[self.goal_aim])
         with _drawn(self.out):
             match self.method:
                 case "rlft":
