@@ -20,7 +20,7 @@ demo-quick: $(BIN)/.installed
 	$(BIN)/rlftsim demo --quick --out $(OUT)-quick
 
 ## lint, types and tests
-test: $(BIN)/.installed-test lint
+test: $(BIN)/.installed-test lint types
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile --jaxtyping-packages=rlftsim,beartype.beartype $(PYTEST_FLAGS)
 
 lint: $(BIN)/.installed-test
@@ -36,7 +36,7 @@ $(BIN)/.installed-test: $(BIN)/.installed
 	$(PIP) -e ".[test]"
 	touch $@
 
-## static types (pyright fetches itself through npm)
+## static types; pyright and the node that runs it come as wheels
 types: $(BIN)/.installed-test
 	$(BIN)/pyright --pythonpath $(BIN)/python src
 

@@ -1,11 +1,11 @@
-"""Are the manoeuvres that the lanes propose the legal ones, and named right? Draws a sample to be judged by eye, and counts.
+"""Are the maneuvers that the lanes propose the legal ones, and named right? Draws a sample to be judged by eye, and counts.
 
     python benchmarks/goal_proposals.py synthetic --out benchmarks/goal_proposals.png
     python benchmarks/goal_proposals.py DATA --out somewhere/outside/the/repository.png
 
-The picture shows the proposals of the first vehicles (evaluated, on a lane, with two manoeuvres or more) of 20 scenarios in random
-order. What is counted is over all evaluated agents of the split: of those whose manoeuvre is recorded, how many get it proposed without
-a look at the record; whether a goal lies off the road; whether one lies out of reach.
+The picture shows the proposals of the first vehicles (evaluated, on a lane, with two maneuvers or more) of 20 scenarios in random
+order. What is counted is over all evaluated agents of the split: of those whose maneuver is logged, how many get it proposed without
+a look at the log; whether a goal lies off the road; whether one lies out of reach.
 """
 
 import argparse
@@ -14,11 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
-from rlftsim.cli.data import open_split
 from rlftsim.experiments.goal_proposals import road_test
-from rlftsim.goals.proposals import Driver, Proposal, propose_from_lanes, why_nothing
-from rlftsim.goals.reach import BRISK, HORIZON_S
-from rlftsim.goals.recorded_manoeuvre import recorded_manoeuvre
+from rlftsim.goals.maneuvers.logged import logged_maneuver
+from rlftsim.goals.maneuvers.proposals import Driver, Proposal, no_proposal_reason, propose_from_lanes
+from rlftsim.goals.maneuvers.reach import BRISK, HORIZON_S
+from rlftsim.scenario.open import open_dataset
 from rlftsim.scenario.types import ObjectType, Scenario
 from rlftsim.viewer.goal_picture import DrawnGoal, GoalPanel, draw_goals
 
@@ -33,7 +33,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--seed", type=int, default=1)
     arguments = parser.parse_args()
-    scenarios = open_split(arguments.data, arguments.split)
+    scenarios = open_dataset(arguments.data, arguments.split)
     order = np.random.default_rng(arguments.seed).permutation(len(scenarios))
     panels: list[GoalPanel] = []
     counts: Counter[str] = Counter()
@@ -61,7 +61,7 @@ def is_vehicle(scenario: Scenario, track: int) -> bool:
 def panel(number: int, scenario: Scenario, track: int, proposals: tuple[Proposal, ...]) -> GoalPanel:
     """The proposals of one agent."""
     speed = Driver.of(scenario, track).speed_mps
-    marks = tuple(DrawnGoal(p.object_id, p.position, p.manoeuvre.value, p.way[:, :2]) for p in proposals)
+    marks = tuple(DrawnGoal(p.object_id, p.position, p.maneuver.value, p.way[:, :2]) for p in proposals)
     title = f"{number}: {scenario.scenario_id}, agent {scenario.tracks.object_id[track]}, {speed:.1f} m/s"
     return GoalPanel(title, scenario, marks)
 
@@ -71,16 +71,16 @@ def count(counts: Counter[str], scenario: Scenario, by_track: dict[int, tuple[Pr
     test = road_test(scenario)
     for track, proposals in by_track.items():
         counts["agents"] += 1
-        reason = why_nothing(scenario, track)
-        recorded = recorded_manoeuvre(scenario, track)
+        reason = no_proposal_reason(scenario, track)
+        logged = logged_maneuver(scenario, track)
         if reason is not None:
             counts[f"without proposals: {reason}"] += 1
-        elif recorded is not None:
-            counts[f"recorded {recorded.manoeuvre}, in all"] += 1
-            counts[f"recorded {recorded.manoeuvre}, proposed"] += recorded.manoeuvre in {p.manoeuvre for p in proposals}
+        elif logged is not None:
+            counts[f"logged {logged.maneuver}, in all"] += 1
+            counts[f"logged {logged.maneuver}, proposed"] += logged.maneuver in {p.maneuver for p in proposals}
         driver = Driver.of(scenario, track)
         for proposal in proposals:
-            counts[f"proposed {proposal.manoeuvre}"] += 1
+            counts[f"proposed {proposal.maneuver}"] += 1
             counts["proposed, out of reach"] += is_out_of_reach(proposal, driver)
             if test is not None:
                 last = proposal.way[-2:]

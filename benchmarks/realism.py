@@ -6,7 +6,7 @@
 Prints Markdown tables. Every measurement is a process of its own with one thread, because the peak of resident memory never
 goes down. Times are CPU time: what a process used, whatever else the machine was doing. `--official` runs the evaluator
 on the same scenarios and rollouts (8 to 10 minutes) through `tools/official_rmm/evaluate.py` of the shared folder, in an environment
-made by `make_venv.sh` beside it; `--keep` stores what it said and reads it the next time.
+made by `make_venv.sh` beside it; `--keep` stores what it printed and reads it the next time.
 """
 
 import argparse
@@ -85,7 +85,7 @@ def measure(shared: Path, prefix: str, recipe: str, num_rollouts: int, num_agent
     """CPU seconds and peak memory of one scenario; runs in a process of its own."""
     import torch
 
-    from rlftsim.realism import build_scenario_log, score
+    from rlftsim.realism import scenario_log, score
 
     scenario, states = read_case(shared, prefix, recipe, num_rollouts)
     if num_agents is not None:
@@ -93,7 +93,7 @@ def measure(shared: Path, prefix: str, recipe: str, num_rollouts: int, num_agent
     torch.ones(1) + 1
     before = peak_mib()
     start = time.process_time()
-    log = build_scenario_log(scenario)
+    log = scenario_log(scenario)
     prepared = time.process_time()
     meta_metric = float(score(log, states).meta_metric)
     first_s = time.process_time() - start
@@ -104,7 +104,7 @@ def measure(shared: Path, prefix: str, recipe: str, num_rollouts: int, num_agent
         "points": len(scenario.map_features.points),
         "first_s": first_s,
         "first_prepare_s": prepared - start,
-        "prepare_s": median_cpu_s(lambda: build_scenario_log(scenario)),
+        "prepare_s": median_cpu_s(lambda: scenario_log(replace(scenario))),
         "score_s": median_cpu_s(lambda: score(log, states)),
         "added_mib": peak - before,
         "peak_mib": peak,
@@ -116,7 +116,7 @@ def measure_leave_one_out(shared: Path, prefix: str, recipe: str) -> dict[str, f
     """CPU seconds of a scoring and of turning counts into the values of 1 set of rollouts and of 1 + 32 sets."""
     import torch
 
-    from rlftsim.realism import METRIC_2025, build_scenario_log, score
+    from rlftsim.realism import METRIC_2025, scenario_log, score
     from rlftsim.realism.features import compute_features
     from rlftsim.realism.likelihood import (
         RolloutCounts,
@@ -127,7 +127,7 @@ def measure_leave_one_out(shared: Path, prefix: str, recipe: str) -> dict[str, f
     )
 
     scenario, states = read_case(shared, prefix, recipe, NUM_ROLLOUTS)
-    log = build_scenario_log(scenario)
+    log = scenario_log(scenario)
     counts = count_rollouts(compute_features(log, states), log, METRIC_2025)
     target, table = log_target(log, METRIC_2025), histogram_table(METRIC_2025, torch.device("cpu"))
 
@@ -151,12 +151,12 @@ def measure_leave_one_out(shared: Path, prefix: str, recipe: str) -> dict[str, f
 
 def measure_scenarios(shared: Path, recipe: str, prefixes: tuple[str, ...]) -> dict[str, float]:
     """CPU seconds and peak of several scenarios scored one after the other in one process."""
-    from rlftsim.realism import build_scenario_log, score
+    from rlftsim.realism import scenario_log, score
 
     cases = [read_case(shared, prefix, recipe, NUM_ROLLOUTS) for prefix in prefixes]
     before, start = peak_mib(), time.process_time()
     for scenario, states in cases:
-        score(build_scenario_log(scenario), states)
+        score(scenario_log(scenario), states)
     return {"cpu_s": time.process_time() - start, "added_mib": peak_mib() - before}
 
 
@@ -166,9 +166,9 @@ def measure_update(
     """Seconds of the parts of a fine-tuning update (median), on the vocabulary of a model folder."""
     import torch
 
+    from rlftsim.policies.registry import load_policy
     from rlftsim.policies.smart.config import smart_tiny
     from rlftsim.policies.smart.policy import SmartPolicy
-    from rlftsim.recipes.models import load_policy
     from rlftsim.scenario.batch import collate
     from rlftsim.scenario.womd import read_scenarios
     from rlftsim.training.finetune import FinetuneConfig, prepare, update_policy
@@ -285,20 +285,20 @@ def print_leave_one_out(options: argparse.Namespace) -> None:
 
 
 def print_update_share(options: argparse.Namespace) -> None:
-    print("\n## The reward's share of a fine-tuning update: 4 rollouts, wall time of one thread\n")
+    print("\n## The reward's part of a fine-tuning update: 4 rollouts, wall time of one thread\n")
     print(
-        "| model | scenarios | rollouts s | reward s | gradients s | share | share in the first update, scenario part included |"
+        "| model | scenarios | rollouts s | reward s | gradients s | part | part in the first update, scenario part included |"
     )
     print("|---|--:|--:|--:|--:|--:|--:|")
     for size, prefixes, num_updates in (("the given one", COMPARED, 3), ("smart-tiny", ("bada",), 2)):
         row = alone(measure_update, options.shared, options.model, size, prefixes, num_updates)
         parts = ("rollout", "reward", "backward", "step")
-        share, first = (
+        fraction, first = (
             row[f"{at}seconds_reward"] / sum(row[f"{at}seconds_{p}"] for p in parts) for at in ("", "first_")
         )
         print(
             f"| {size} | {len(prefixes)} | {row['seconds_rollout']:.2f} | {row['seconds_reward']:.2f} | "
-            f"{row['seconds_backward']:.2f} | {share:.1%} | {first:.1%} |",
+            f"{row['seconds_backward']:.2f} | {fraction:.1%} | {first:.1%} |",
             flush=True,
         )
 
@@ -308,7 +308,7 @@ def main() -> None:
     parser.add_argument("shared", type=Path, help="folder with data/womd, golden/rmm and tools/official_rmm")
     parser.add_argument("--official", type=Path, help="Python of an environment with the official evaluator")
     parser.add_argument("--keep", type=Path, help="JSON file with the official evaluator's part, written once")
-    parser.add_argument("--model", help="a fine-tunable model's folder: also measure the reward's share of an update")
+    parser.add_argument("--model", help="a fine-tunable model's folder: also measure the reward's part of an update")
     parser.add_argument("--recipe", default="messy")
     options = parser.parse_args()
     os.environ["OMP_NUM_THREADS"] = "1"

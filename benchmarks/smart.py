@@ -32,7 +32,7 @@ NUM_ROLLOUTS = 32
 TOP_K = 48
 NUM_CANDIDATES = 32
 CONTEXT_RADIUS_M = 150.0
-"""In updates a step of an agent farther from the ego than this is taken as not recorded, by both sides."""
+"""In updates a step of an agent farther from the ego than this is taken as not logged, by both sides."""
 LARGEST_BATCH_TRIED = 1024
 
 
@@ -180,7 +180,7 @@ def started_clock(recipe: Recipe, threads: int = 1) -> Any:
     import rlftsim.rollout.simulate
     import rlftsim.training.catk
     import rlftsim.training.pretrain  # noqa: F401
-    from rlftsim.processor import keep_freed_memory
+    from rlftsim.threads import keep_freed_memory
 
     keep_freed_memory()  # as the command line does
     torch.set_num_threads(threads)
@@ -232,8 +232,8 @@ def pretraining_step(policy: Any) -> Callable[[Any], None]:
 
     def step(batch: Any) -> None:
         optimizer.zero_grad(set_to_none=True)
-        said = policy.teacher_forced(batch, trained(batch))
-        logits, target = said.logits[said.target_mask], said.target[said.target_mask]
+        prediction = policy.teacher_forced(batch, trained(batch))
+        logits, target = prediction.logits[prediction.target_mask], prediction.target[prediction.target_mask]
         cross_entropy(logits, target, label_smoothing=config.label_smoothing).backward()
         torch.nn.utils.clip_grad_norm_(policy.parameters(), config.gradient_clip)
         optimizer.step()
@@ -259,8 +259,8 @@ def fine_tuning_step(policy: Any, num_candidates: int) -> Callable[[Any], None]:
     def step(batch: Any) -> None:
         optimizer.zero_grad(set_to_none=True)
         context = policy.encode(batch)
-        pursuing = roll_out_closest(policy, batch, num_candidates=num_candidates, context=context)
-        loss, counts = summed_loss(predict_along(policy, context, pursuing, trained(batch)), config.label_smoothing)
+        targeted = roll_out_closest(policy, batch, num_candidates=num_candidates, context=context)
+        loss, counts = summed_loss(predict_along(policy, context, targeted, trained(batch)), config.label_smoothing)
         (loss / counts[2]).backward()
         torch.nn.utils.clip_grad_norm_(weights, config.gradient_clip)
         optimizer.step()
@@ -337,13 +337,13 @@ def run_public(options: Options, inputs: Inputs, case: Case) -> dict[str, Any]:
         "golden": str(options.shared / "golden" / "smart"),
         "max_batch": LARGEST_BATCH_TRIED,
     }
-    asked, answered = inputs.folder / "request.json", inputs.folder / "answer.json"
-    asked.write_text(json.dumps(request))
+    request_path, answer_path = inputs.folder / "request.json", inputs.folder / "answer.json"
+    request_path.write_text(json.dumps(request))
     here = Path(__file__).resolve().parent
     environment = os.environ | {"PYTHONPATH": str(here.parent / "src")}
     script = here / "smart_public.py"
-    subprocess.run([options.catk_python, script, asked, answered], check=True, env=environment)
-    return json.loads(answered.read_text())
+    subprocess.run([options.catk_python, script, request_path, answer_path], check=True, env=environment)
+    return json.loads(answer_path.read_text())
 
 
 class PublicResults:
@@ -355,7 +355,7 @@ class PublicResults:
         if options.keep and options.keep.exists():
             found = json.loads(options.keep.read_text())
             if found["recipe"] != self.kept["recipe"]:
-                sys.exit(f"{options.keep}: recipe {found['recipe']} is not the one asked for, {self.kept['recipe']}.")
+                sys.exit(f"{options.keep}: recipe {found['recipe']} is not the requested one, {self.kept['recipe']}.")
             self.kept = found
 
     def of(self, case: Case) -> dict[str, Any] | None:
@@ -396,7 +396,7 @@ def print_check(public: PublicResults) -> None:
         found = public.of(Case("check", size, "A"))
         if found:
             print(
-                f"- The public code ({found['commit']}, torch {found['torch']}, neighbour search: {found['searches']}) as it is timed, "
+                f"- The public code ({found['commit']}, torch {found['torch']}, neighbor search: {found['searches']}) as it is timed, "
                 f"against its golden numbers, {size}, A: preprocessing {'equal' if found['inputs_equal'] else 'DIFFERENT'}, "
                 f"logits within {found['logits']:.1e}, greedy tokens {'equal' if found['greedy_tokens_equal'] else 'DIFFERENT'}, "
                 f"positions within {found['greedy_m']:.1e} m."
@@ -405,7 +405,7 @@ def print_check(public: PublicResults) -> None:
 
 def print_cases(options: Options, inputs: Inputs, public: PublicResults) -> None:
     print(
-        "\n| measurement | public s | ours s | ratio | public added MiB | ours added MiB | ratio | in neighbour search |"
+        "\n| measurement | public s | ours s | ratio | public added MiB | ours added MiB | ratio | in neighbor search |"
     )
     print("|---|--:|--:|--:|--:|--:|--:|--:|", flush=True)
     for case in CPU_CASES if options.device == "cpu" else GPU_CASES:
@@ -418,18 +418,18 @@ def print_cases(options: Options, inputs: Inputs, public: PublicResults) -> None
         our_s, columns = seconds_of(case, ours), [""] * 5
         if theirs:
             their_s = seconds_of(case, theirs)
-            share = theirs["search_s"] / sum(theirs.get("rollout_s") or [theirs["first_s"], *theirs["step_s"]])
+            search = theirs["search_s"] / sum(theirs.get("rollout_s") or [theirs["first_s"], *theirs["step_s"]])
             memory = f"{theirs['added_mib'] / ours['added_mib']:.1f}×"
             columns = [
                 f"{their_s:.1f}",
                 f"**{their_s / our_s:.1f}×**",
                 f"{theirs['added_mib']:.0f}",
                 memory,
-                f"{share:.1%}",
+                f"{search:.1%}",
             ]
-        their_column, ratio, their_mib, memory, share = columns
+        their_column, ratio, their_mib, memory, search = columns
         print(
-            f"| {case.name} | {their_column} | {our_s:.2f} | {ratio} | {their_mib} | {ours['added_mib']:.0f} | {memory} | {share} |",
+            f"| {case.name} | {their_column} | {our_s:.2f} | {ratio} | {their_mib} | {ours['added_mib']:.0f} | {memory} | {search} |",
             flush=True,
         )
 
@@ -452,7 +452,7 @@ def print_threads(inputs: Inputs) -> None:
 
 
 def default_rollouts_per_pass() -> int:
-    from rlftsim.experiments.evaluation import EvaluateConfig
+    from rlftsim.evaluation.results import EvaluateConfig
 
     return EvaluateConfig().rollouts_per_pass
 

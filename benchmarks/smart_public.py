@@ -42,7 +42,7 @@ class Data(dict):
 def radius(
     x: Tensor, y: Tensor, r: float, batch_x: Tensor | None = None, batch_y: Tensor | None = None, **_: Any
 ) -> Tensor:
-    """Pairs (row of y, row of x) of the same group that are nearer than r, exactly. Groups are sorted. No cap on neighbours:
+    """Pairs (row of y, row of x) of the same group that are nearer than r, exactly. Groups are sorted. No cap on neighbors:
     those of the public code bind in no scenario that is measured."""
     global search_s
     start = time.process_time()
@@ -62,10 +62,10 @@ def radius(
 
 
 def radius_graph(x: Tensor, r: float, batch: Tensor | None = None, **_: Any) -> Tensor:
-    """Edges (neighbour, centre) without self-loops."""
-    centre, neighbour = radius(x, x, r, batch, batch)
-    other = centre != neighbour
-    return torch.stack([neighbour[other], centre[other]])
+    """Edges (neighbor, center) without self-loops."""
+    center, neighbor = radius(x, x, r, batch, batch)
+    other = center != neighbor
+    return torch.stack([neighbor[other], center[other]])
 
 
 def stand_in(name: str, **content: Any) -> ModuleType:
@@ -80,7 +80,7 @@ def stand_in(name: str, **content: Any) -> ModuleType:
 
 
 def prepare_imports(checkout: Path) -> str:
-    """Make the public code importable; how its neighbour searches are done."""
+    """Make the public code importable; how its neighbor searches are done."""
     import torch_geometric  # noqa: F401  # pyright: ignore[reportMissingImports]  # looks for others before they are stood in for
 
     from rlftsim.scenario import womd_pb2
@@ -214,11 +214,11 @@ def training_step(request: dict[str, Any]) -> Callable[[Data], Any]:
     def step(data: Data) -> None:
         optimizer.zero_grad(set_to_none=True)
         of_map, of_agents = processor(data)
-        said = (
+        outputs = (
             network.inference(of_map, of_agents, sampling_scheme=scheme) if closed_loop else network(of_map, of_agents)
         )
         loss = loss_of(
-            **said,
+            **outputs,
             token_agent_shape=of_agents["token_agent_shape"],
             token_traj=of_agents["token_traj"],
             train_mask=data["agent"]["train_mask"],

@@ -1,6 +1,7 @@
 """Scenarios drawn by hand, for tests of everything that takes a scenario.
 
-World frame, metres: the ego is near (1000, -200) at the current step. Nothing is symmetrical, so that no two distances tie.
+World frame, meters: the ego is near (1000, -200) at the current step. Nothing is symmetrical, so that no two distances
+tie.
 """
 
 from collections.abc import Sequence
@@ -62,11 +63,11 @@ TRAFFIC = (
     Mover(ObjectType.CYCLIST, x_m=-14.9, y_m=-2.3, speed_mps=4.7, turn_rate_radps=-0.03),
     Mover(x_m=-9.2, y_m=4.6, heading_rad=1.2, speed_mps=0.0),
 )
-"""Two cars in a lane, one that comes towards them, a pedestrian, a cyclist and a parked car. The first is the ego."""
+"""Two cars in a lane, one that comes toward them, a pedestrian, a cyclist and a parked car. The first is the ego."""
 
 
 def tracks_of(movers: Sequence[Mover]) -> Tracks:
-    """Recorded tracks of some agents, ids from 100 on; zeros where an agent is not seen."""
+    """Logged tracks of some agents, ids from 100 on; zeros where an agent is not seen."""
     states = [mover.states() for mover in movers]
     valid = np.ones((len(movers), TOTAL_STEPS), bool)
     for row, mover in zip(valid, movers):
@@ -142,7 +143,7 @@ def junction_map() -> MapFeatures:
 
 
 def bend_map(radius_m: float = 90.0) -> MapFeatures:
-    """A road that winds to the left about (0, radius): no piece lies straight ahead of another, no two are equally far."""
+    """A road that winds to the left about (0, radius): no piece straight ahead of another, no two equally far."""
     angles = np.linspace(-0.71, 1.63, 263)
 
     def arc(offset_m: float, backwards: bool = False) -> list[tuple[float, float]]:
@@ -212,7 +213,7 @@ def junction_with_light(scenario_id: str = "junction") -> Scenario:
 
 
 def bend(scenario_id: str = "bend", num_agents: int = 6) -> Scenario:
-    """A bending road with a light, on which nobody goes straight: no bearing is exactly 0 or 180 degrees.
+    """A bending road with a light, on which no agent goes straight: no bearing is exactly 0 or 180 degrees.
 
     One agent has gaps, one is first seen at step 7.
     """
@@ -228,12 +229,12 @@ def bend(scenario_id: str = "bend", num_agents: int = 6) -> Scenario:
 
 
 def lone_agent(scenario_id: str = "lone") -> Scenario:
-    """The ego and nobody else."""
+    """The ego alone."""
     return build_scenario(scenario_id, TRAFFIC[:1])
 
 
 def without_map(scenario_id: str = "no-map") -> Scenario:
-    """`TRAFFIC` on nothing."""
+    """`TRAFFIC` without a map."""
     return build_scenario(scenario_id, map_features=NO_MAP)
 
 
@@ -250,7 +251,7 @@ def crowd(scenario_id: str = "crowd", num_agents: int = 128) -> Scenario:
 
 
 def with_gaps(scenario_id: str = "gaps") -> Scenario:
-    """One agent with holes in its record, one first seen at step 7, one first seen at the current step, one gone before it."""
+    """Agents with gaps: some steps missing, first seen at step 7 or at the current step, gone before it."""
     second, third, fourth = (
         replace(TRAFFIC[1], missing=(3, 4, 25, 26, 27, 88, 89, 90)),
         replace(TRAFFIC[2], missing=tuple(range(7))),
@@ -261,7 +262,7 @@ def with_gaps(scenario_id: str = "gaps") -> Scenario:
 
 
 def without_future(scenario_id: str = "test-split") -> Scenario:
-    """The straight road as a test split has it: 11 steps."""
+    """The straight road as in a test split: 11 steps."""
     whole = straight_road(scenario_id)
     tracks = whole.tracks
     cut = {
@@ -272,7 +273,7 @@ def without_future(scenario_id: str = "test-split") -> Scenario:
 
 
 def without_road_edges(scenario_id: str = "no-edges") -> Scenario:
-    """The straight road as a record without road edges has it."""
+    """The straight road as in a log without road edges."""
     whole = straight_road(scenario_id)
     lanes = polylines([(MapFeatureType.LANE_SURFACE_STREET, [(-60.3, 0.1), (140.6, 0.3)])])
     return replace(whole, map_features=lanes)

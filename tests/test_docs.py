@@ -9,9 +9,15 @@ from pathlib import Path
 
 import pytest
 
+from rlftsim.policies.registry import POLICIES
+from rlftsim.recipes.registry import RECIPES
+from rlftsim.rewards.base import REWARDS
+from rlftsim.scenario.sources import SOURCES
+
 ROOT = Path(__file__).parents[1]
 DOCS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
 BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
+TEST_NAME = re.compile(r"`(test_\w+)`")
 LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 
 
@@ -37,6 +43,18 @@ def run_page(page: Path) -> dict[str, object]:
     return namespace
 
 
+@pytest.fixture
+def names_as_before():
+    """What a page registers is forgotten, so that other tests of the process see the shipped names alone."""
+    tables = (POLICIES, RECIPES, REWARDS, SOURCES)
+    before = [set(table.names()) for table in tables]
+    yield
+    for table, known in zip(tables, before):
+        for name in set(table.names()) - known:
+            table.remove(name)
+
+
+@pytest.mark.usefixtures("names_as_before")
 @pytest.mark.parametrize("page", promised(), ids=lambda p: p.name)
 def test_the_page_runs(page, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
@@ -66,6 +84,13 @@ def test_a_page_that_lies_would_be_seen(tmp_path):
     with pytest.raises(AssertionError) as caught:
         run_page(page)
     assert caught.traceback[-1].lineno == 9  # counted from 0: the tenth line of the page
+
+
+@pytest.mark.parametrize("page", [p for p in DOCS if TEST_NAME.search(p.read_text())], ids=lambda p: p.name)
+def test_tests_named_in_the_documents_exist(page):
+    source = "".join(path.read_text() for path in (ROOT / "tests").rglob("*.py"))
+    tests = set(re.findall(r"^def (test_\w+)", source, re.MULTILINE))
+    assert [name for name in TEST_NAME.findall(page.read_text()) if name not in tests] == []
 
 
 @pytest.mark.parametrize("page", DOCS, ids=lambda p: p.name)

@@ -1,3 +1,86 @@
-"""Closed-loop reinforcement-learning fine-tuning of traffic simulation models against the official realism meta-metric."""
+"""Closed-loop reinforcement-learning fine-tuning of traffic simulation models against the realism meta-metric.
 
-__version__ = "0.1.0"
+    import rlftsim as rs
+
+    data = rs.load_dataset("synthetic", "validation")
+    policy = rs.load_policy("runs/base")
+    rollouts = rs.simulate(policy, data[0], num_rollouts=32, seed=0)
+    print(rs.score(data[0], rollouts))
+    rs.show(data[0], rollouts)
+
+Names are loaded on first use, so that the import itself takes no time and needs no torch (PEP 562). Editors and type
+checkers read them in `__init__.pyi`.
+"""
+
+# pyright: reportUnsupportedDunderAll=false
+
+import importlib
+from typing import Any
+
+__version__ = "0.2.0.dev0"
+
+__all__ = [
+    "ConstantVelocity",
+    "Evaluation",
+    "FinetuneConfig",
+    "Goals",
+    "Policy",
+    "RealismResult",
+    "RlftsimError",
+    "Rollouts",
+    "Sampling",
+    "Scenario",
+    "SmartPolicy",
+    "check_policy",
+    "compare",
+    "evaluate",
+    "finetune",
+    "leave_one_out",
+    "load_dataset",
+    "load_policy",
+    "pretrain",
+    "recipe",
+    "register_reward",
+    "score",
+    "show",
+    "simulate",
+    "write_dataset",
+]
+
+_MODULES = {
+    "rlftsim._api.evaluation": ("compare", "evaluate"),
+    "rlftsim._api.look": ("check_policy", "score"),
+    "rlftsim._api.loop": ("simulate",),
+    "rlftsim._api.sources": ("load_dataset", "load_policy"),
+    "rlftsim._api.train": ("finetune", "pretrain", "recipe"),
+    "rlftsim.errors": ("RlftsimError",),
+    "rlftsim.evaluation.results": ("Evaluation",),
+    "rlftsim.goals.types": ("Goals",),
+    "rlftsim.policies.smart.policy": ("SmartPolicy",),
+    "rlftsim.realism": ("RealismResult",),
+    "rlftsim.rewards": ("leave_one_out", "register_reward"),
+    "rlftsim.rollout.baselines": ("ConstantVelocity",),
+    "rlftsim.rollout.policy": ("Policy", "Sampling"),
+    "rlftsim.rollout.types": ("Rollouts",),
+    "rlftsim.scenario.dataset": ("write_dataset",),
+    "rlftsim.scenario.types": ("Scenario",),
+    "rlftsim.training.finetune": ("FinetuneConfig",),
+    "rlftsim.viewer.notebook": ("show",),
+}
+_MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULE_OF:
+        import difflib  # seldom needed
+
+        near = difflib.get_close_matches(name, __all__, n=1, cutoff=0.8)
+        hint = f": did you mean {near[0]!r}?" if near else ""
+        raise AttributeError(f"module 'rlftsim' has no attribute {name!r}{hint}")
+    value = getattr(importlib.import_module(_MODULE_OF[name]), name)
+    globals()[name] = value  # from now on found without this function
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted([*__all__, "__version__"])

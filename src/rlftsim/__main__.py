@@ -1,4 +1,4 @@
-"""`python -m rlftsim` is the command line."""
+"""Command line: `python -m rlftsim` is the same as `rlftsim`."""
 
 import sys
 

@@ -1,29 +1,82 @@
-"""Errors that are a user's to mend: each message names the value, the cause and the way out."""
+"""User errors, from bad input or configuration: each message names the value, the cause and the way out."""
 
 import math
+import operator
+from dataclasses import fields, is_dataclass
+from types import UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 
 class RlftsimError(Exception):
-    """Base of every error this package raises on purpose; the command line prints it as one line without a traceback."""
+    """Base of every error that this package raises on purpose; the command line prints it as one line without a
+    traceback."""
 
 
 class DataError(RlftsimError):
-    """A file, record or scenario cannot be used: says which file, which record and why."""
+    """A file, record or scenario that cannot be used; the message names the file, the record and the reason."""
 
 
 class ConfigError(RlftsimError, ValueError):
-    """A setting contradicts another one or lies outside its range: says which and what to set instead."""
+    """A setting that contradicts another one or lies outside its range; the message says what to set instead."""
 
 
 class CheckpointError(RlftsimError):
-    """A checkpoint or run folder is damaged or does not fit: says which key or file and what to do."""
+    """A checkpoint or run folder that is damaged or does not fit; the message names the key or file and what to do."""
+
+
+def in_short(value: object) -> str:
+    """A value as a message shows it: numbers and text as they are, anything else by its type."""
+    return repr(value) if isinstance(value, str | int | float | None) else type(value).__name__
+
+
+def whole_number(name: str, value: object, least: int | None = None) -> int:
+    """A whole number as a plain int; numpy's integers are whole numbers, True and 2.0 are not.
+
+    Args:
+        name: of the argument, for the message.
+        value: anything.
+        least: lowest number that is taken; None takes all.
+
+    Raises:
+        ConfigError: something else, or a lower number; the message has both names and value.
+    """
+    number = _fitted(value, int)
+    if number is _MISFIT or (least is not None and number < least):
+        limit = "" if least is None else f" of at least {least}"
+        raise ConfigError(f"{name} must be a whole number{limit}, got {value!r}.")
+    return number
+
+
+def require_types(config: Any) -> None:
+    """Require that each field of a configuration has a value of its type, and a choice one of its words.
+
+    Numbers of numpy become plain ones, so that every configuration can be stored as JSON.
+
+    Args:
+        config: a dataclass; fields of other types than numbers, text, choices and dataclasses are not checked.
+
+    Raises:
+        ConfigError: a field has another value; the message names it and what it takes.
+    """
+    hints = get_type_hints(type(config))
+    for one in fields(config):
+        value, hint = getattr(config, one.name), hints[one.name]
+        fitted = _fitted(value, hint)
+        if fitted is _MISFIT:
+            raise ConfigError(f"{one.name} must be {_in_words(hint)}, got {value!r}.")
+        if fitted is not value:
+            object.__setattr__(config, one.name, fitted)  # the dataclasses are frozen
 
 
 def require_positive(config: object, names: tuple[str, ...]) -> None:
-    """Check fields of a configuration.
+    """Require that fields of a configuration are above zero.
+
+    Args:
+        config: a dataclass.
+        names: its fields to check.
 
     Raises:
-        ConfigError: one of them is not above zero; names it and its value.
+        ConfigError: one of them is not above zero; the message names it and its value.
     """
     for name in names:
         if not getattr(config, name) > 0:
@@ -31,10 +84,14 @@ def require_positive(config: object, names: tuple[str, ...]) -> None:
 
 
 def require_not_negative(config: object, names: tuple[str, ...]) -> None:
-    """Check fields of a configuration.
+    """Require that fields of a configuration are zero or more.
+
+    Args:
+        config: a dataclass.
+        names: its fields to check.
 
     Raises:
-        ConfigError: one of them is below zero or no number; names it and its value.
+        ConfigError: one of them is negative or not a number; the message names it and its value.
     """
     for name in names:
         if not getattr(config, name) >= 0:
@@ -42,10 +99,14 @@ def require_not_negative(config: object, names: tuple[str, ...]) -> None:
 
 
 def require_finite(config: object, names: tuple[str, ...]) -> None:
-    """Check fields of a configuration.
+    """Require that fields of a configuration are finite numbers.
+
+    Args:
+        config: a dataclass.
+        names: its fields to check.
 
     Raises:
-        ConfigError: one of them is infinite or no number; names it and its value.
+        ConfigError: one of them is infinite or not a number; the message names it and its value.
     """
     for name in names:
         if not math.isfinite(getattr(config, name)):
@@ -53,5 +114,63 @@ def require_finite(config: object, names: tuple[str, ...]) -> None:
 
 
 def given(config: object, names: tuple[str, ...]) -> tuple[str, ...]:
-    """Those of some optional fields that are not None."""
+    """Names of optional fields that are not None.
+
+    Args:
+        config: a dataclass.
+        names: fields that may be None.
+    """
     return tuple(name for name in names if getattr(config, name) is not None)
+
+
+_MISFIT: Any = object()
+_WORDS = {int: "a whole number", float: "a number", bool: "True or False", str: "text", type(None): "None"}
+
+
+def _fitted(value: Any, hint: Any) -> Any:
+    """A value as a type has it, or `_MISFIT`; the value itself for types that are not checked."""
+    if get_origin(hint) in (Union, UnionType):
+        options = (_fitted(value, option) for option in get_args(hint))
+        return next((option for option in options if option is not _MISFIT), _MISFIT)
+    if get_origin(hint) is Literal:
+        return value if isinstance(value, str) and value in get_args(hint) else _MISFIT
+    if get_origin(hint) is tuple:
+        parts, kinds = (tuple(value), get_args(hint)) if isinstance(value, tuple | list) else ((), (None,))
+        is_fit = len(parts) == len(kinds) and all(_fitted(p, k) is not _MISFIT for p, k in zip(parts, kinds))
+        return value if is_fit or ... in kinds else _MISFIT
+    if hint is int:
+        return _MISFIT if isinstance(value, bool) else _converted(value, operator.index)
+    if hint is float:
+        # An int stays an int: settings are stored as they were written.
+        if isinstance(value, int | float):
+            return _MISFIT if isinstance(value, bool) else value
+        return _MISFIT if isinstance(value, str) else _converted(value, float)
+    if hint is str:
+        # A year is text: metric=2025 is "2025".
+        return str(value) if isinstance(value, int) and not isinstance(value, bool) else _if_kind(value, str)
+    if hint in (bool, type(None)) or (isinstance(hint, type) and is_dataclass(hint)):
+        return _if_kind(value, hint)
+    return value
+
+
+def _if_kind(value: Any, kind: type) -> Any:
+    return value if isinstance(value, kind) else _MISFIT
+
+
+def _converted(value: Any, convert: Any) -> Any:
+    """A number as a plain one; truth values of numpy and arrays of several numbers do not fit."""
+    try:
+        return convert(value)
+    except (TypeError, ValueError):
+        return _MISFIT
+
+
+def _in_words(hint: Any) -> str:
+    """The values of a type, for a message."""
+    if get_origin(hint) in (Union, UnionType):
+        return " or ".join(_in_words(option) for option in get_args(hint))
+    if get_origin(hint) is Literal:
+        return f"one of {', '.join(get_args(hint))}"
+    if get_origin(hint) is tuple:
+        return f"{len(get_args(hint))} numbers"
+    return _WORDS.get(hint) or f"a {hint.__name__}"

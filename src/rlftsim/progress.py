@@ -1,5 +1,8 @@
-"""What a person sees of long work: a bar with an ETA on a terminal, a line now and then elsewhere; and tables at its end."""
+"""Progress of long work (a bar with an ETA on a terminal, occasional lines elsewhere), the package's log, and
+tables."""
 
+import logging
+import math
 import sys
 import time
 from collections.abc import Iterator
@@ -19,28 +22,45 @@ from rich.progress import (
 
 SECONDS_BETWEEN_LINES = 30.0
 FILE_WIDTH = 200
-"""Columns of a table that is not printed on a terminal."""
+"""Width of a table that is not printed on a terminal, in characters."""
+
+
+class _StandardError(logging.StreamHandler):  # type: ignore[type-arg]
+    """Handler that looks up standard error at each message, because tests and notebooks replace it."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        # The stream of the moment: the one at import may be closed by now.
+        self.stream = sys.stderr
+        super().emit(record)
+
+
+log = logging.getLogger("rlftsim")
+"""Messages of the package, printed plainly on standard error; `logging.getLogger("rlftsim")` changes that."""
+if not log.handlers:
+    log.addHandler(_StandardError())
+    log.setLevel(logging.INFO)
+    log.propagate = False
 
 
 def print_wide(*tables: object) -> None:
-    """Print tables, their texts as they are: brackets are no markup. In a file or a pipe they are as wide as they need to be."""
+    """Print tables as wide as they need to be, or as the terminal. Brackets in their texts are not markup."""
     width = None if Console().is_terminal else FILE_WIDTH
     console = Console(width=width, markup=False, emoji=False)
     for table in tables:
         console.print(table)
 
 
-def say(line: str) -> None:
-    """A line that a person should see at once, beside the bar."""
-    print(line, file=sys.stderr, flush=True)
-
-
 @runtime_checkable
 class Advance(Protocol):
-    """Told whenever work is done."""
+    """Callback of long work."""
 
     def __call__(self, count: int = 1, note: str = "") -> None:
-        """`count` more units are done; `note` is shown beside the bar."""
+        """Report progress.
+
+        Args:
+            count: units that were finished since the last call.
+            note: text to show next to the bar.
+        """
         ...
 
 
@@ -48,18 +68,19 @@ class Advance(Protocol):
 def progress_bar(
     title: str, total: int, done: int = 0, *, unit: Literal["things", "bytes"] = "things", show: bool = True
 ) -> Iterator[Advance]:
-    """Show how far a piece of work is; yields the function to call after each piece.
+    """Show the progress of a piece of work; yields the function to call after each unit.
 
     Args:
-        title: what is being done.
+        title: name of the work.
         total: units in all.
-        done: units an earlier run has done.
+        done: units that an earlier run has finished.
         unit: bytes are shown as kB, MB or GB.
-        show: False = say nothing.
+        show: False = print nothing.
     """
     if not (show and sys.stderr.isatty()):
         yield _lines(title, total, done, show)
         return
+    # Without markup: titles hold names of files with brackets.
     amount = DownloadColumn() if unit == "bytes" else MofNCompleteColumn()
     columns = (
         TextColumn("{task.description}", markup=False), BarColumn(), amount, TimeElapsedColumn(),
@@ -75,7 +96,7 @@ def progress_bar(
 
 
 def _lines(title: str, total: int, done: int, show: bool) -> Advance:
-    """Where there is no terminal: a line every half minute and at the end."""
+    """Progress without a terminal: a line every half minute and at the end."""
     start = last = time.monotonic()
     so_far = done
 
@@ -85,8 +106,13 @@ def _lines(title: str, total: int, done: int, show: bool) -> Advance:
         now = time.monotonic()
         if show and (now - last >= SECONDS_BETWEEN_LINES or so_far == total):
             last = now
-            left = (now - start) / (so_far - done) * (total - so_far)
-            eta = f", about {left:.0f} s to go" if so_far < total else f" in {now - start:.0f} s"
-            print(f"{title}: {so_far / total:.0%}{eta}  {note}".rstrip(), file=sys.stderr, flush=True)
+            # Units of earlier runs took no time in this one, so they do not count for the estimate.
+            # Before the first unit of this run there is no estimate; work of no units, such as an empty file, is done.
+            eta = f" in {now - start:.0f} s"
+            if so_far < total:
+                left = (now - start) / (so_far - done) * (total - so_far) if so_far > done else math.inf
+                eta = f", about {left:.0f} s to go" if math.isfinite(left) else ""
+            fraction = so_far / total if total else 1.0
+            print(f"{title}: {fraction:.0%}{eta}  {note}".rstrip(), file=sys.stderr, flush=True)
 
     return advance

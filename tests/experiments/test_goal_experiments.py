@@ -1,4 +1,4 @@
-"""Controllability: goals of the ego, who attains them, and what is concluded from made-up shares."""
+"""Controllability: goals of the ego, their attainment, and summaries of made-up rates."""
 
 import json
 from dataclasses import replace
@@ -6,23 +6,30 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from made_up import TINY, row
 
 import scenes
+from made_up import TINY, row
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.experiments import attainment
-from rlftsim.experiments.attainment import Attained, measure_attainment
-from rlftsim.experiments.catalogue import goal_conditioning, kinematic_controllability, maneuver_controllability
-from rlftsim.experiments.catalogue.controllability import contestants
-from rlftsim.experiments.contestants import BASE, Baseline, FineTuned, GoalTraining, Guided, finetune_config
-from rlftsim.experiments.evaluate import EvaluateConfig, evaluate
-from rlftsim.experiments.workshop import Workshop
+from rlftsim.evaluation.evaluate import EvaluateConfig, evaluate
+from rlftsim.evaluation.goal_attainment import Attained
+from rlftsim.experiments import suite_goals
+from rlftsim.experiments.model_specs import BASE, Baseline, FineTuned, GoalTraining, Guided, finetune_config
+from rlftsim.experiments.paper import (
+    controllability,
+    goal_conditioning,
+    kinematic_controllability,
+    maneuver_controllability,
+    maneuver_goals,
+)
+from rlftsim.experiments.suite import ExperimentSuite
+from rlftsim.experiments.suite_goals import measure_attainment
 from rlftsim.goals.goals_file import GoalEntry, GoalsFile, read_goals, write_goals
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.scenario.dataset import write_dataset
 
 QUICK = EvaluateConfig(num_rollouts=2)
+ROWS = ("base", goal_conditioning.START, *goal_conditioning.GUIDED)
 
 
 @pytest.fixture(scope="module")
@@ -31,21 +38,25 @@ def data(tmp_path_factory):
     folder = tmp_path_factory.mktemp("goals") / "data"
     standing = replace(scenes.straight_road("standing"), ego_index=5)
     held_out = [scenes.straight_road("straight"), scenes.bend("bend"), standing]
-    write_dataset([scenes.straight_road("a"), *held_out], folder, split=lambda s: "training" if s.scenario_id == "a" else "validation")  # fmt: skip
+    write_dataset(
+        [scenes.straight_road("a"), *held_out],
+        folder,
+        split=lambda s: "training" if s.scenario_id == "a" else "validation",
+    )
     return folder
 
 
 @pytest.fixture(scope="module")
-def workshop(data, tmp_path_factory):
-    return Workshop(TINY, data, tmp_path_factory.mktemp("workshop"), QUICK)
+def suite(data, tmp_path_factory):
+    return ExperimentSuite(TINY, data, tmp_path_factory.mktemp("suite"), QUICK)
 
 
-# ---- contestants --------------------------------------------------------------------------------------------------------
+# ---- specs --------------------------------------------------------------------------------------------------------
 
 
-def test_variants_start_from_the_realism_aligned_model(workshop):
+def test_variants_start_from_the_realism_aligned_model(suite):
     config = finetune_config(goal_conditioning.VARIANTS["indication, hard"], TINY.finetune)
-    assert (config.reward, config.goals.share, config.goals.hindsight) == (
+    assert (config.reward, config.goals.probability, config.goals.hindsight) == (
         "0.98*mloo + 0.02*goal(kind='hard', partial=False)",
         1.0,
         1.0,
@@ -54,31 +65,31 @@ def test_variants_start_from_the_realism_aligned_model(workshop):
     assert (
         finetune_config(
             FineTuned("mloo"), replace(TINY.finetune, goals=replace(config.goals, hindsight=0.0))
-        ).goals.share
+        ).goals.probability
         == 0.0
     )
     variant = goal_conditioning.VARIANTS["concatenation, soft"]
-    told = "gcsl-concat-from-mloo-seed0-seed0"
-    assert variant.name == f"gcft-concat-soft-agent-from-{told}-seed0"
-    lineage = [one.name for one in workshop._lineage(variant)]
-    assert lineage == ["base", "mloo-seed0", told, variant.name]
+    relabelled = "gcsl-concat-from-mloo-seed0-seed0"
+    assert variant.name == f"gcft-concat-soft-agent-from-{relabelled}-seed0"
+    lineage = [one.name for one in suite._lineage(variant)]
+    assert lineage == ["base", "mloo-seed0", relabelled, variant.name]
 
 
 def test_goals_are_refused_for_models_that_see_none(data, tmp_path):
-    config = EvaluateConfig(num_rollouts=1, goals="recorded")
-    with pytest.raises(ConfigError, match="goals=recorded has no effect: cv does not see goals"):
+    config = EvaluateConfig(num_rollouts=1, goals="logged")
+    with pytest.raises(ConfigError, match="goals=logged has no effect: cv is not goal-conditioned"):
         evaluate(ConstantVelocity(), data, tmp_path, config, name="cv")
     assert "goals" not in QUICK.what_counts()  # evaluations of before are still what they were
-    assert config.what_counts()["goals"] == "recorded"
+    assert config.what_counts()["goals"] == "logged"
 
 
-# ---- attainment ---------------------------------------------------------------------------------------------------------
+# ---- attainment -----------------------------------------------------------------------------------------------------
 
 
 class Seeker(ConstantVelocity):
     """Drives the straight line to its goal."""
 
-    sees_goals = True
+    is_goal_conditioned = True
 
     def begin(self, context, num_rollouts, goals, noise):
         state = super().begin(context, num_rollouts, goals, noise)
@@ -88,9 +99,9 @@ class Seeker(ConstantVelocity):
         return replace(state, velocity=way.where(goals.goal_mask[..., None], state.velocity))
 
 
-def test_every_goal_is_given_alone_and_measured_once(workshop, monkeypatch):
+def test_every_goal_is_given_alone_and_measured_once(suite, monkeypatch):
     policies = {"constant_velocity": ConstantVelocity(), "oracle": Seeker()}
-    monkeypatch.setattr(attainment, "load_policy", lambda name, device: policies[name])
+    monkeypatch.setattr(suite_goals, "load_policy", lambda name, device: policies[name])
     straight_on = 1000.0 + 9.3 * 8
     goals = [
         GoalEntry("straight", 100, straight_on, -200.0),
@@ -98,41 +109,41 @@ def test_every_goal_is_given_alone_and_measured_once(workshop, monkeypatch):
         GoalEntry("straight", 100, 1040.0, -180.0),
         GoalEntry("bend", 100, 1030.0, -190.0),
     ]
-    rows = {"blind": Baseline("constant_velocity"), "seeker": Baseline("oracle")}
-    found = measure_attainment(workshop, rows, goals, name="test")
-    assert [(a.reached, a.passed) for a in found["blind"]] == [(1, 1), (0, 1), (0, 0), (0, 0)]
+    rows = {"straight on": Baseline("constant_velocity"), "seeker": Baseline("oracle")}
+    found = measure_attainment(suite, rows, goals, name="test")
+    assert [(a.reached, a.passed) for a in found["straight on"]] == [(1, 1), (0, 1), (0, 0), (0, 0)]
     assert [(a.reached, a.passed) for a in found["seeker"]] == [(1, 1)] * 4
     assert [a.entry for a in found["seeker"]] == goals
-    files = {p: p.stat().st_mtime_ns for p in (workshop.out / "attainment").rglob("*.json")}
+    files = {p: p.stat().st_mtime_ns for p in (suite.out / "attainment").rglob("*.json")}
     assert len(files) == 4
     # an edited goal is measured anew, the other scenario is not
     edited = [*goals[:3], replace(goals[3], x=1031.0)]
-    measure_attainment(workshop, rows, edited, name="test")
+    measure_attainment(suite, rows, edited, name="test")
     changed = {p.stem for p, stamp in files.items() if p.stat().st_mtime_ns != stamp}
     assert changed == {"bend"}
 
 
-def test_another_model_of_the_same_name_is_measured_anew(workshop, monkeypatch):
+def test_another_model_of_the_same_name_is_measured_anew(suite, monkeypatch):
     goal = GoalEntry("straight", 100, 1020.0, -200.0)
     rows = {"one": Baseline("constant_velocity")}
     for policy, reached in ((ConstantVelocity(), 0.0), (Seeker(), 1.0), (ConstantVelocity(), 0.0)):
-        monkeypatch.setattr(attainment, "load_policy", lambda name, device, policy=policy: policy)
-        assert measure_attainment(workshop, rows, [goal], name="again")["one"][0].reached == reached
+        monkeypatch.setattr(suite_goals, "load_policy", lambda name, device, policy=policy: policy)
+        assert measure_attainment(suite, rows, [goal], name="again")["one"][0].reached == reached
 
 
-def test_two_processes_measure_what_one_does(data, tmp_path, workshop):
+def test_two_processes_measure_what_one_does(data, tmp_path, suite):
     goals = [GoalEntry("straight", 100, 1020.0, -200.0), GoalEntry("bend", 100, 1030.0, -190.0)]
-    rows = {"blind": Baseline("constant_velocity")}
-    spread = Workshop(TINY, data, tmp_path, replace(QUICK, jobs=2))
-    found = [measure_attainment(one, rows, goals, name="spread") for one in (workshop, spread)]
+    rows = {"straight on": Baseline("constant_velocity")}
+    spread = ExperimentSuite(TINY, data, tmp_path, replace(QUICK, jobs=2))
+    found = [measure_attainment(one, rows, goals, name="spread") for one in (suite, spread)]
     assert found[0] == found[1]
     assert len(list(tmp_path.rglob("attainment/spread/**/*.json"))) == 2
 
 
-# ---- kinematic ----------------------------------------------------------------------------------------------------------
+# ---- kinematic ------------------------------------------------------------------------------------------------------
 
 
-def test_goals_lie_on_the_recorded_way_and_its_continuation():
+def test_goals_lie_on_the_logged_way_and_its_continuation():
     straight = scenes.straight_road()  # 9.3 m/s along x from (1000, -200)
     for offset in (-3, 0, 2):
         goal = kinematic_controllability.goal_of(straight, offset)
@@ -149,7 +160,7 @@ def test_goals_lie_on_the_recorded_way_and_its_continuation():
     assert kinematic_controllability.goal_of(scenes.without_future(), 0) is None
 
 
-def made_up_shares(labels, shares):
+def made_up_rates(labels, rates):
     """Attained goals of rows: scenario k has the labels in turn."""
     return {
         row: tuple(
@@ -157,18 +168,18 @@ def made_up_shares(labels, shares):
             for k in range(len(values))
             for n, label in enumerate(labels)
         )
-        for row, values in shares.items()
+        for row, values in rates.items()
     }
 
 
-def test_offsets_are_compared_scenario_by_scenario(workshop):
+def test_offsets_are_compared_scenario_by_scenario(suite):
     offsets = kinematic_controllability.OFFSETS_S
     labels = [f"{h:+d} s" for h in offsets]
-    rows = list(contestants())
+    rows = list(ROWS)
     low, high = [[0.2] * 7, [0.4] * 7, [0.6] * 7], [[0.3] * 7, [0.5] * 7, [0.7] * 7]
-    shares = {name: high if name == "indication, soft, guided" else low for name in rows}
-    measured = kinematic_controllability.Measured(offsets * 3, made_up_shares(labels, shares))
-    found = kinematic_controllability.conclude(measured, workshop)
+    rates = {name: high if name == "indication, soft, guided" else low for name in rows}
+    measured = made_up_rates(labels, rates)
+    found = kinematic_controllability.summarize(measured, suite)
     assert found.tables[0].rows[0][1] == "40.0 ± 11.5"  # of 20, 40, 60: 20 over the root of 3
     verdict = next(v for v in found.verdicts if v.startswith("indication, soft, guided against goal-free, passed"))
     assert "difference, for the better: +10.0 points" in verdict
@@ -177,35 +188,32 @@ def test_offsets_are_compared_scenario_by_scenario(workshop):
     assert found.figure is not None
 
 
-def test_the_ego_is_asked_for_every_offset(workshop, monkeypatch):
-    asked = {}
-    monkeypatch.setattr(
-        kinematic_controllability, "measure_attainment", lambda w, rows, goals, name: asked.update({name: goals}) or {}
-    )
-    measured = kinematic_controllability.measure(workshop)
-    goals = asked[kinematic_controllability.NAME]
-    assert measured.offsets_s == kinematic_controllability.OFFSETS_S * 3
-    assert [goal.label for goal in goals[:7]] == ["-3 s", "-2 s", "-1 s", "+0 s", "+1 s", "+2 s", "+3 s"]
+def test_the_ego_has_a_goal_for_every_offset(suite, monkeypatch):
+    given = {}
+    monkeypatch.setattr(controllability, "measure_attainment", lambda *_, name: given.update({name: _[-1]}) or {})
+    kinematic_controllability.run(suite)
+    goals = given[kinematic_controllability.NAME]
+    assert [goal.label for goal in goals] == ["-3 s", "-2 s", "-1 s", "+0 s", "+1 s", "+2 s", "+3 s"] * 3
     assert [(goal.scenario_id, goal.agent_id) for goal in goals[::7]] == [
         ("straight", 100),
         ("bend", 100),
         ("standing", 105),
     ]
     monkeypatch.setattr(kinematic_controllability, "goal_of", lambda scenario, offset_s: None)
-    with pytest.raises(DataError, match="not one of 3 scenarios is recorded to the end"):
-        kinematic_controllability.measure(workshop)
+    with pytest.raises(DataError, match="not one of 3 scenarios is logged to the end"):
+        kinematic_controllability.run(suite)
 
 
-# ---- manoeuvres ---------------------------------------------------------------------------------------------------------
+# ---- maneuvers ------------------------------------------------------------------------------------------------------
 
 
-def test_conditions_are_means_over_scenarios(workshop):
-    labels = ["straight (recorded)", "left", "right"]
-    rows = list(contestants())
+def test_conditions_are_means_over_scenarios(suite):
+    labels = ["straight (logged)", "left", "right"]
+    rows = list(ROWS)
     base, better = [[1.0, 0.0, 0.2], [0.8, 0.2, 0.2]], [[1.0, 0.4, 0.6], [0.8, 0.5, 0.5]]
-    shares = {name: better if name == "concatenation, soft, guided" else base for name in rows}
-    measured = maneuver_controllability.Measured(made_up_shares(labels, shares))
-    found = maneuver_controllability.conclude(measured, workshop)
+    rates = {name: better if name == "concatenation, soft, guided" else base for name in rows}
+    measured = made_up_rates(labels, rates)
+    found = maneuver_controllability.summarize(measured, suite)
     overall = found.numbers["conditions"]["passed"]
     assert [overall["goal-free"][c]["mean"] for c in maneuver_controllability.CONDITIONS] == pytest.approx(
         [0.9, 0.525, 0.15]
@@ -214,110 +222,117 @@ def test_conditions_are_means_over_scenarios(workshop):
     assert found.numbers["conditions"]["reached"]["base"]["mixed"]["mean"] == pytest.approx(0.2625)
     # whole goals: the first scenario's left is never passed, all the others sometimes
     assert found.numbers["conditions"]["passed_once"]["base"]["alternative only"]["mean"] == pytest.approx(0.75)
-    lefts = found.numbers["manoeuvres"]["passed"]["concatenation, soft, guided"]["alternative only"]["left"]
+    lefts = found.numbers["maneuvers"]["passed"]["concatenation, soft, guided"]["alternative only"]["left"]
     assert (lefts["mean"], lefts["count"]) == (pytest.approx(0.45), 2)
     verdict = next(v for v in found.verdicts if v.startswith("concatenation, soft, guided against goal-free, passed"))
     assert "alternatives only (3.33 times)" in verdict
     assert found.tables[-1].title.startswith("The paper")
 
 
-def test_the_goals_are_written_for_a_person_to_edit(workshop, monkeypatch):
-    asked = []
-    monkeypatch.setattr(
-        maneuver_controllability, "measure_attainment", lambda w, rows, goals, name: asked.append(goals) or {}
-    )
-    monkeypatch.setattr(maneuver_controllability, "propose", made_up_proposals)
-    maneuver_controllability.measure(workshop)
-    path = maneuver_controllability.goals_path(workshop)
+def test_the_goals_are_written_for_a_person_to_edit(suite, monkeypatch):
+    given = []
+    monkeypatch.setattr(controllability, "measure_attainment", lambda *_, name: given.append(_[-1]) or {})
+    monkeypatch.setattr(maneuver_goals, "propose", made_up_proposals)
+    maneuver_controllability.run(suite)
+    path = maneuver_goals.goals_path(suite)
     file = read_goals(path)
-    assert [goal.label for goal in file.goals] == ["straight (recorded)"]  # only where there is a choice
+    assert [goal.label for goal in file.goals] == ["straight (logged)"]  # only where there is a choice
     assert [goal.label for goal in file.alternatives] == ["left"]
     path.write_text(path.read_text().replace('"left"', '"right"'))
-    maneuver_controllability.measure(workshop)
-    assert [goal.label for goal in asked[1]] == ["straight (recorded)", "right"]
+    maneuver_controllability.run(suite)
+    assert [goal.label for goal in given[1]] == ["straight (logged)", "right"]
     path.write_text(path.read_text().replace('"right"', '"somewhere"'))
-    with pytest.raises(DataError, match=r"alternatives\[0\]: label 'somewhere' names no manoeuvre: known are straight"):
-        maneuver_controllability.measure(workshop)
+    with pytest.raises(DataError, match=r"alternatives\[0\]: label 'somewhere' names no maneuver: known are straight"):
+        maneuver_controllability.run(suite)
     path.unlink()
 
 
 @pytest.mark.parametrize(
     ("goals", "message"),
     [
-        ([("straight", 105, "left")], r"agent 105 is not the ego of scenario straight, only the ego is asked here: write agent 100"),
+        ([("straight", 105, "left")], "agent 105 is not the ego of scenario straight, .*: write agent 100"),
         ([("straight", 999, "left")], "has no agent 999"),
-        ([("straight", 100, "straight (recorded)"), ("elsewhere", 7, "left")], "may do anything but what it did: take more"),
+        ([("straight", 100, "straight (logged)"), ("elsewhere", 7, "left")], "has an alternative maneuver: take more"),
     ],
 )  # fmt: skip
-def test_an_edited_goal_is_refused_before_anything_is_trained(goals, message, workshop):
-    path = maneuver_controllability.goals_path(workshop)
+def test_an_edited_goal_is_refused_before_anything_is_trained(goals, message, suite):
+    path = maneuver_goals.goals_path(suite)
     entries = [GoalEntry(scenario_id, agent, 1040.0, -200.0, label) for scenario_id, agent, label in goals]
     write_goals(path, GoalsFile(tuple(entries[:1]), tuple(entries[1:])))
     with pytest.raises(DataError, match=message):
-        maneuver_controllability.measure(workshop)
-    assert not (workshop.out / "runs").exists()
+        maneuver_controllability.run(suite)
+    assert not (suite.out / "runs").exists()
     path.unlink()
 
 
 def made_up_proposals(scenario, track):
-    from rlftsim.goals.manoeuvre import Manoeuvre
-    from rlftsim.goals.proposals import Proposal
+    from rlftsim.goals.maneuvers.proposals import Proposal
+    from rlftsim.scenario.maneuver import Maneuver
 
     way = scenario.tracks.position[track, 10:, :].astype(np.float64)
     agent = int(scenario.tracks.object_id[track])
-    found = {"straight": [Manoeuvre.STRAIGHT, Manoeuvre.LEFT], "bend": [Manoeuvre.LEFT], "standing": []}
+    found = {"straight": [Maneuver.STRAIGHT, Maneuver.LEFT], "bend": [Maneuver.LEFT], "standing": []}
     kinds = found[scenario.scenario_id]
-    return tuple(Proposal(agent, kind, way[-1, :2], way, is_recorded=n == 0) for n, kind in enumerate(kinds))
+    return tuple(Proposal(agent, kind, way[-1, :2], way, is_logged=n == 0) for n, kind in enumerate(kinds))
 
 
-# ---- goal conditioning --------------------------------------------------------------------------------------------------
+# ---- goal conditioning ----------------------------------------------------------------------------------------------
 
 
-def test_variants_are_measured_asked_and_unasked_for_every_seed(workshop, monkeypatch):
+def test_variants_are_evaluated_with_and_without_goals_for_every_seed(suite, monkeypatch):
     calls = []
 
-    def measure(self, rows, goals="none"):
+    def evaluate_rows(self, rows, goals="none"):
         calls.append((goals, {name: len(seeds) for name, seeds in rows.items()}))
         return {name: row(name, [0.5]) for name in rows}
 
-    monkeypatch.setattr(Workshop, "measure", measure)
-    measured = goal_conditioning.measure(replace(workshop, num_seeds=2))
+    monkeypatch.setattr(ExperimentSuite, "evaluate", evaluate_rows)
+    rows = goal_conditioning.run(replace(suite, num_seeds=2))
     twice = dict.fromkeys(goal_conditioning.VARIANTS, 2)
-    told = dict.fromkeys(goal_conditioning.TOLD, 1)
+    relabelled = dict.fromkeys(goal_conditioning.RELABELLED, 1)
     guided = dict.fromkeys(goal_conditioning.GUIDED, 2)
     assert calls == [
-        ("none", {"goal-free": 1}), ("recorded", told), ("recorded", twice), ("recorded", guided), ("none", twice),
+        ("none", {"goal-free": 1}), ("logged", relabelled), ("logged", twice), ("logged", guided), ("none", twice),
     ]  # fmt: skip
-    assert list(measured.asked) == list(measured.unasked) == list(goal_conditioning.VARIANTS)
+    assert list(rows.variants) == list(rows.without_goals) == list(goal_conditioning.VARIANTS)
 
 
-def test_following_is_told_with_its_cost(workshop):
-    start = row("goal-free", [0.60, 0.70], passing_miss_rate=[0.2, 0.4])
-    asked = {name: row(name, [0.59, 0.70], passing_miss_rate=[0.1, 0.2]) for name in goal_conditioning.VARIANTS}
-    unasked = {name: row(name, [0.60, 0.70], passing_miss_rate=[0.2, 0.4]) for name in goal_conditioning.VARIANTS}
-    told = {name: row(name, [0.59, 0.70], passing_miss_rate=[0.2, 0.2]) for name in goal_conditioning.TOLD}
-    guided = {name: row(name, [0.60, 0.70], passing_miss_rate=[0.1, 0.1]) for name in goal_conditioning.GUIDED}
-    found = goal_conditioning.conclude(goal_conditioning.Measured(start, told, asked, guided, unasked), workshop)
-    assert found.verdicts[0] == "concatenation, told: passing misses 30.00% → 20.00%, -33% relative, at -0.0050 RMM."
-    assert found.verdicts[2] == "concatenation, soft: passing misses 30.00% → 15.00%, -50% relative, at -0.0050 RMM."
+def test_fewer_missed_goals_are_listed_with_their_cost(suite):
+    def rows_of(names, meta_metric, misses):
+        return {name: row(name, meta_metric, passing_miss_rate=misses) for name in names}
+
+    rows = goal_conditioning.GoalRows(
+        start=row("goal-free", [0.60, 0.70], passing_miss_rate=[0.2, 0.4]),
+        relabelled=rows_of(goal_conditioning.RELABELLED, [0.59, 0.70], [0.2, 0.2]),
+        variants=rows_of(goal_conditioning.VARIANTS, [0.59, 0.70], [0.1, 0.2]),
+        guided=rows_of(goal_conditioning.GUIDED, [0.60, 0.70], [0.1, 0.1]),
+        without_goals=rows_of(goal_conditioning.VARIANTS, [0.60, 0.70], [0.2, 0.4]),
+    )
+    found = goal_conditioning.summarize(rows, suite)
+    relabelled, _, soft, *_ = found.verdicts
+    assert relabelled == "concatenation, relabelled: passing misses 30.00% → 20.00%, -33% relative, at -0.0050 RMM."
+    assert soft == "concatenation, soft: passing misses 30.00% → 15.00%, -50% relative, at -0.0050 RMM."
     assert found.tables[0].rows[0][1] == "30.00 ± 10.00"
-    assert found.tables[1].rows[1][0] == "concatenation, soft, asked nothing"
+    assert found.tables[1].rows[1][0] == "concatenation, soft, without goals"
     assert "Tab. 3" in found.tables[2].title
     assert json.dumps(found.numbers)
 
 
 @pytest.mark.slow
-def test_the_experiments_run_with_tiny_models(workshop):
-    told = FineTuned("gcsl", base=FineTuned("mloo"), goals=GoalTraining("indication"))
-    variant = FineTuned("gcft", base=told, goals=GoalTraining("indication", "soft"))
-    asked = workshop.measure({"soft": (variant,)}, goals="recorded")["soft"].mean
-    assert len(asked) == 3
-    assert (workshop.out / "evaluations" / "gcft-indication-soft-from-gcsl-indication-from-mloo-seed0-seed0-seed0-0.5-epochs-recorded-goals.parquet").exists()  # fmt: skip
+def test_the_experiments_run_with_tiny_models(suite):
+    relabelled = FineTuned("gcsl", base=FineTuned("mloo"), goals=GoalTraining("indication"))
+    variant = FineTuned("gcft", base=relabelled, goals=GoalTraining("indication", "soft"))
+    evaluated = suite.evaluate({"soft": (variant,)}, goals="logged")["soft"].mean
+    assert len(evaluated) == 3
+    assert suite.evaluation_name(variant, "logged") == (
+        "gcft-indication-soft-from-gcsl-indication-from-mloo-seed0-seed0-seed0-0.5-epochs-recorded-goals"
+    )
+    assert (suite.out / "evaluations" / f"{suite.evaluation_name(variant, 'logged')}.parquet").exists()
     goals = [GoalEntry("straight", 100, 1080.0, -200.0)]
     rows = {"base": BASE, "soft": variant, "guided": Guided(variant, 1e3)}
-    found = measure_attainment(workshop, rows, goals, name="tiny")
-    guided = SmartPolicy.from_pretrained(Path(workshop.models([rows["guided"]])[rows["guided"]]))
-    plain = SmartPolicy.from_pretrained(Path(workshop.models([variant])[variant]))
+    found = measure_attainment(suite, rows, goals, name="tiny")
+    guided = SmartPolicy.from_pretrained(Path(suite.models([rows["guided"]])[rows["guided"]]))
+    plain = SmartPolicy.from_pretrained(Path(suite.models([variant])[variant]))
     assert guided.network.decoder.aim.weight.equal(1e3 * plain.network.decoder.aim.weight)
-    assert workshop.evaluation_name(rows["guided"]) == f"{workshop.evaluation_name(variant)}-guided-1000"
+    assert suite.evaluation_name(rows["guided"]) == f"{suite.evaluation_name(variant)}-guided-1000"
     assert all(0 <= a.reached <= a.passed <= 1 for attained in found.values() for a in attained)

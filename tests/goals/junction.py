@@ -1,4 +1,4 @@
-"""A junction with every manoeuvre, drawn by hand. Coordinates relative to the ego, which comes along +x."""
+"""A junction with every maneuver, drawn by hand. Coordinates relative to the ego, which comes along +x."""
 
 import numpy as np
 
@@ -36,7 +36,8 @@ def junction(*more: tuple[MapFeatureType, list[tuple[float, float]]]) -> MapFeat
 def driving(*more: tuple[MapFeatureType, list[tuple[float, float]]], **mover: object) -> Scenario:
     """The ego before the junction."""
     settings = {"speed_mps": 8.0, **mover}
-    return build_scenario("junction", (Mover(**settings), Mover(ObjectType.PEDESTRIAN, x_m=9.0, y_m=-6.0)), junction(*more))  # type: ignore[arg-type]  # fmt: skip
+    movers = (Mover(**settings), Mover(ObjectType.PEDESTRIAN, x_m=9.0, y_m=-6.0))  # type: ignore[arg-type]
+    return build_scenario("junction", movers, junction(*more))
 
 
 def relative(position: np.ndarray) -> np.ndarray:

@@ -7,14 +7,14 @@ import torch
 import scenes
 from rlftsim.goals.attainment import (
     closest_m,
-    is_missed_in_passing,
     is_passed,
     is_reached,
+    is_within,
     outcome_of,
     rate,
     tolerance_m,
 )
-from rlftsim.goals.recorded import recorded_ends, recorded_goals
+from rlftsim.goals.logged import logged_endpoints, logged_goals
 from rlftsim.goals.types import Goals
 from rlftsim.realism.from_rollouts import logged_states
 from rlftsim.realism.miss import compute_miss_rates
@@ -33,7 +33,7 @@ def goals_at(*points):
     return Goals.of_scenarios(position, torch.ones(position.shape[:2], dtype=torch.bool))
 
 
-def test_reaching_is_ending_near_and_passing_is_having_been_near():
+def test_reached_means_near_at_the_end_and_passed_near_at_any_step():
     # ends at 10, 12.1 and 40 m; goals at 10 m: the second ends 2.1 m beyond and was at 10 m before, the third too
     position, goals = along_x(10.0, 12.1, 40.0), goals_at((10.0, 0.0), (10.0, 0.0), (10.0, 2.1))
     assert is_reached(position, goals).tolist() == [[[True, False, False]]]
@@ -42,7 +42,7 @@ def test_reaching_is_ending_near_and_passing_is_having_been_near():
 
 
 def test_the_outcome_of_a_goal_is_counted_over_its_rollouts_even_far_from_the_origin():
-    # at most half a metre apart are numbers of float32 near 8 000 km: x = 10, 40 and 7 m; goal at 10 m, 1 m to the side
+    # at most 0.5 m apart are numbers of float32 near 8 000 km: x = 10, 40 and 7 m; goal at 10 m, 1 m to the side
     way = torch.stack([along_x(end)[0, 0, 0].double() for end in (10.0, 40.0, 7.0)])
     far = torch.tensor([8.0e6, -8.0e6], dtype=torch.float64)
     outcome = outcome_of(way + far, (8.0e6 + 10.0, -8.0e6 + 1.0))
@@ -52,14 +52,14 @@ def test_the_outcome_of_a_goal_is_counted_over_its_rollouts_even_far_from_the_or
     assert few.median_m == pytest.approx((1 + math.hypot(3, 1)) / 2)
 
 
-def test_who_has_no_goal_meets_none_and_counts_nowhere():
+def test_agents_without_a_goal_meet_none_and_count_nowhere():
     position = along_x(10.0, 10.0)
     goals = goals_at((10.0, 0.0), (10.0, 0.0)).only(torch.tensor([[[True, False]]]))
     assert is_passed(position, goals).tolist() == [[[True, False]]]
     assert rate(is_passed(position, goals), goals.goal_mask).tolist() == [[1.0]]
-    nobody = goals.only(torch.zeros(1, 1, 2, dtype=torch.bool))
-    assert not nobody.any
-    assert rate(is_passed(position, nobody), nobody.goal_mask).isnan().all()
+    none = goals.only(torch.zeros(1, 1, 2, dtype=torch.bool))
+    assert not none.any
+    assert rate(is_passed(position, none), none.goal_mask).isnan().all()
 
 
 def test_tolerances_are_those_of_the_challenge():
@@ -70,13 +70,11 @@ def test_tolerances_are_those_of_the_challenge():
     torch.testing.assert_close(tolerance_m(speed, horizon), torch.tensor(expected))
 
 
-@pytest.mark.parametrize(("heading", "missed"), [(0.0, False), (math.pi / 2, True)])
-def test_the_box_lies_along_the_heading(heading, missed):
-    """Stops 5 m short: inside 6 m along, outside 3 m sideways."""
-    fast, long = torch.tensor([[15.0]]), torch.tensor([[8.0]])
-    heading = torch.tensor(heading).expand(1, 1, 1, 1)
-    result = is_missed_in_passing(along_x(10.0), goals_at((15.0, 0.0)), heading, fast, long)
-    assert result.tolist() == [[[missed]]]
+@pytest.mark.parametrize(("heading", "inside"), [(0.0, True), (math.pi / 2, False)])
+def test_the_box_lies_along_the_heading(heading, inside):
+    """5 m short of the goal: inside 6 m along, outside 3 m sideways."""
+    offset = torch.tensor([-5.0, 0.0])
+    assert bool(is_within(offset, torch.tensor(heading), torch.tensor([6.0, 3.0]))) == inside
 
 
 def test_passing_misses_are_those_of_the_evaluation():
@@ -85,35 +83,35 @@ def test_passing_misses_are_those_of_the_evaluation():
     batch, states = collate([scenario]), logged_states(scenario, num_rollouts=2)
     pushed = states.x.clone()
     pushed[:, :3] += 30.0
-    ends = recorded_ends(batch)
-    goals = recorded_goals(batch, batch.evaluated_mask)
+    ends = logged_endpoints(batch)
+    goals = logged_goals(batch, batch.evaluated_mask)
     position = torch.stack([pushed, states.y], -1)[None] - batch.origin.float()
-    missed = is_missed_in_passing(
-        position, goals, ends.heading[:, None, :, None], batch.velocity[:, :, 10].norm(dim=-1), ends.horizon_s
-    )
+    tolerance = tolerance_m(batch.velocity[:, :, 10].norm(dim=-1), ends.horizon_s)[:, None, :, None]
+    offset = position - goals.position[..., None, :]
+    missed = goals.goal_mask & ~is_within(offset, ends.heading[:, None, :, None], tolerance).any(-1)
     expected = compute_miss_rates(scenario, type(states)(states.object_id, pushed, states.y, states.z, states.heading))
     assert 0 < expected.passing < 1
     assert float(rate(missed, goals.goal_mask).mean()) == pytest.approx(expected.passing)
 
 
-def test_the_recorded_goal_is_where_an_agent_was_last_seen():
+def test_the_logged_goal_is_where_an_agent_was_last_seen():
     scenario = scenes.with_gaps()
     batch = collate([scenario])
-    ends = recorded_ends(batch)
-    row = scenario.simulated_indices.tolist().index(1)  # not recorded at the last three steps, 88 to 90
+    ends = logged_endpoints(batch)
+    row = scenario.simulated_indices.tolist().index(1)  # not logged at the last three steps, 88 to 90
     expected = scenario.tracks.position[1, 87, :2] - scenario.origin
     np.testing.assert_allclose(ends.position[0, row].numpy(), expected, atol=1e-3)
     assert ends.horizon_s[0, row] == pytest.approx(7.7)
-    assert is_passed(batch.position[:, None, :, 11:], recorded_goals(batch)).equal(ends.mask[:, None])
+    assert is_passed(batch.position[:, None, :, 11:], logged_goals(batch)).equal(ends.mask[:, None])
 
 
-def test_without_a_future_nobody_has_a_goal():
-    assert not recorded_goals(collate([scenes.without_future()])).any
+def test_without_a_future_no_agent_has_a_goal():
+    assert not logged_goals(collate([scenes.without_future()])).any
 
 
-def test_only_the_chosen_have_goals():
+def test_only_chosen_agents_have_goals():
     batch = collate([scenes.straight_road()])
     chosen = torch.zeros_like(batch.agent_mask)
     chosen[:, 2] = True
-    assert recorded_goals(batch, chosen).goal_mask.nonzero().tolist() == [[0, 0, 2]]
-    assert recorded_goals(batch).goal_mask[:, 0].equal(batch.agent_mask)
+    assert logged_goals(batch, chosen).goal_mask.nonzero().tolist() == [[0, 0, 2]]
+    assert logged_goals(batch).goal_mask[:, 0].equal(batch.agent_mask)

@@ -1,8 +1,10 @@
-"""Goals as a person writes them: read, mended, refused with the file, the entry and the field."""
+"""Goals written by hand: read, edited, refused with the file, the entry and the field."""
 
 import json
 import re
+import tarfile
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -10,7 +12,7 @@ import torch
 import scenes
 from rlftsim.errors import DataError
 from rlftsim.goals.goals_file import FORMAT, GoalEntry, GoalsFile, parse_goal, read_goals, write_goals
-from rlftsim.goals.placing import doubts, goals_of_batch
+from rlftsim.goals.placement import goal_warnings, goals_of_batch
 from rlftsim.scenario.batch import collate
 
 GOOD = {"scenario": "straight", "agent": 100, "x": 1040.0, "y": -200.0, "label": "straight"}
@@ -39,12 +41,12 @@ def test_what_is_written_is_read(tmp_path):
     [
         ({"x": float("nan")}, r"goals\[1\]: x is nan: a goal needs a finite point"),
         ({"y": float("inf")}, r"goals\[1\]: y is inf"),
-        ({"x": "12"}, r"goals\[1\]: x must be a number of metres, is text"),
-        ({"y": True}, r"goals\[1\]: y must be a number of metres, is true or false"),
+        ({"x": "12"}, r"goals\[1\]: x must be a number of meters, is text"),
+        ({"y": True}, r"goals\[1\]: y must be a number of meters, is true or false"),
         ({"agent": "100"}, r"goals\[1\]: agent must be a whole number"),
         ({"agent": 1.5}, r"goals\[1\]: agent must be a whole number"),
         ({"agent": True}, r"goals\[1\]: agent must be a whole number"),
-        ({"agent": None}, r"goals\[1\]: agent must be a whole number, an object id of the record, is null"),
+        ({"agent": None}, r"goals\[1\]: agent must be a whole number, an object id of the log, is null"),
         ({"scenario": 5}, r"goals\[1\]: scenario must be text in quotes, is a number"),
         ({"label": 5}, r"goals\[1\]: label must be text"),
         ({"lable": "x"}, r"goals\[1\]: no field 'lable' here: did you mean 'label'"),
@@ -71,9 +73,18 @@ def test_a_wrong_entry_is_named(change, message, tmp_path):
         (f'{{"format": "{FORMAT}", "goals": {{}}}}', "goals: must be a list of goals, is an object"),
         (f'{{"format": "{FORMAT}", "goals": [5]}}', r"goals\[0\]: must be an object such as"),
         (f'{{"format": "{FORMAT}", "goals": [{{"x": 1}}]}}', r"goals\[0\]: scenario, agent, y missing"),
-        (f'{{"format": "{FORMAT}", "goals": [{{"scenario": "s", "agent": 1, "x": {"1" * 5000}, "y": 1}}]}}', r"goals\[0\]: x is inf"),
-        (f'{{"format": "{FORMAT}", "goals": [{{"scenario": "s", "agent": 1, "x": 1, "x": 2, "y": 1}}]}}', r"goals\[0\]: x is written more than once"),
-        (f'{{"format": "{FORMAT}", "goals": [], "goals": []}}', r"json: goals is written more than once: keep one of them"),
+        (
+            f'{{"format": "{FORMAT}", "goals": [{{"scenario": "s", "agent": 1, "x": {"1" * 5000}, "y": 1}}]}}',
+            r"goals\[0\]: x is inf",
+        ),
+        (
+            f'{{"format": "{FORMAT}", "goals": [{{"scenario": "s", "agent": 1, "x": 1, "x": 2, "y": 1}}]}}',
+            r"goals\[0\]: x is written more than once",
+        ),
+        (
+            f'{{"format": "{FORMAT}", "goals": [], "goals": []}}',
+            r"json: goals is written more than once: keep one of them",
+        ),
         (f'{{"format": "{FORMAT}", "goals": {"[" * 200_000}', "brackets nested too deeply"),
         (f'{{"format": "{FORMAT}", "goal": []}}', "no field 'goal' here: did you mean 'goals'"),
     ],
@@ -98,6 +109,18 @@ def test_a_file_that_is_not_there_says_how_to_make_one(tmp_path):
         read_goals(tmp_path / "goals.json")
 
 
+@pytest.mark.parametrize("name", ["proposed", "by_hand"])
+def test_goals_files_of_0_1_are_read(name, tmp_path):
+    stored = Path(__file__).parent.parent / "data" / "stored_0_1"
+    with tarfile.open(stored / "stored.tar.xz") as archive:
+        archive.extract(f"goals/{name}.json", tmp_path, filter="data")
+    file = read_goals(tmp_path / "goals" / f"{name}.json")
+    expected = json.loads((stored / "expected.json").read_text())["goals_files"][name]
+    for section in ("goals", "alternatives"):
+        entries = [[e.scenario_id, e.agent_id, e.x, e.y, e.label] for e in getattr(file, section)]
+        assert entries == expected[section]
+
+
 def test_a_goal_of_the_command_line():
     assert parse_goal("12=1034.5,-188", "s") == GoalEntry("s", 12, 1034.5, -188.0)
     for wrong in ("12", "12=5", "a=1,2", "12=1;2", "=1,2", ""):
@@ -107,16 +130,16 @@ def test_a_goal_of_the_command_line():
         parse_goal("12=nan,2", "s")
 
 
-# ---- in a scenario ------------------------------------------------------------------------------------------------------
+# ---- in a scenario -------------------------------------------------------------------------------
 
 
 def test_goals_are_placed_in_the_frame_of_the_batch():
     batch = collate([scenes.straight_road(), scenes.straight_road("other")])
-    goals = goals_of_batch([GoalEntry("other", 101, 1017.0, -190.0), GoalEntry("nobody", 1, 0.0, 0.0)], batch)
+    goals = goals_of_batch([GoalEntry("other", 101, 1017.0, -190.0), GoalEntry("elsewhere", 1, 0.0, 0.0)], batch)
     assert goals.goal_mask.nonzero().tolist() == [[1, 0, 1]]
     torch.testing.assert_close(
         goals.position[1, 0, 1], torch.tensor([17.0, 10.0])
-    )  # the map frame is centred on the ego
+    )  # the map frame is centered on the ego
 
 
 def entry(agent=100, x=1040.0, y=-200.0):
@@ -128,31 +151,32 @@ def test_impossible_goals_are_refused():
     with pytest.raises(
         DataError, match=r"goals\[3\]: scenario straight has no agent 7: it simulates 6 agents: 100, 101"
     ):
-        doubts(entry(7), scenario)
+        goal_warnings(entry(7), scenario)
     with pytest.raises(
-        DataError, match=r"goals\[3\]: \(6000.0, -200.0\) is 5000 m from agent 100 at \(1000.0, -200.0\), nobody"
+        DataError,
+        match=r"goals\[3\]: \(6000.0, -200.0\) is 5000 m from agent 100 at \(1000.0, -200.0\), out of reach in 8 s",
     ):
-        doubts(entry(x=6000.0), scenario)
+        goal_warnings(entry(x=6000.0), scenario)
     with pytest.raises(DataError, match="agent 105 is not there at the current step"):
-        doubts(entry(105), scenes.with_gaps())
+        goal_warnings(entry(105), scenes.with_gaps())
 
 
 @pytest.mark.parametrize(
     ("agent", "x", "message"),
     [
         (103, 1060.0, r"pedestrian, 1.3 m/s\) would need 6.\d m/s on average"),
-        (105, 1020.0, r"stands still, perhaps parked, and is asked to go 30 m"),
+        (105, 1020.0, r"stands still, perhaps parked, and its goal is 30 m away"),
         (100, 1001.0, "is within 2 m of its goal already"),
-        (100, 1250.0, "will most likely stay short of it"),
+        (100, 1250.0, "will most likely stop short of it"),
     ],
 )
-def test_doubtful_goals_are_said_to_be(agent, x, message):
-    (line,) = doubts(entry(agent, x), scenes.straight_road())
+def test_doubtful_goals_get_a_warning(agent, x, message):
+    (line,) = goal_warnings(entry(agent, x), scenes.straight_road())
     assert line.startswith("goals.json: goals[3]: ")
     assert re.search(message, line)
 
 
-def test_a_goal_within_reach_raises_no_doubt():
-    assert doubts(entry(), scenes.straight_road()) == ()
+def test_a_goal_within_reach_gets_no_warning():
+    assert goal_warnings(entry(), scenes.straight_road()) == ()
     parked = replace(entry(105), x=1300.0)
-    assert len(doubts(parked, scenes.straight_road())) == 2  # stands still, and would have to race
+    assert len(goal_warnings(parked, scenes.straight_road())) == 2  # stands still, and would have to race

@@ -1,4 +1,4 @@
-"""Manoeuvres that the lanes allow: found, named, reachable, on the road."""
+"""Maneuvers that the lanes allow: found, named, reachable, on the road."""
 
 from dataclasses import replace
 
@@ -7,22 +7,22 @@ import pytest
 from junction import BACK, BESIDE, DOUBLE_LINE, LANE, driving, relative
 
 import scenes
-from rlftsim.goals import lane_paths
-from rlftsim.goals.lane_paths import Pose, lanes_for, neighbor_lanes, path_through, paths_from
-from rlftsim.goals.manoeuvre import Manoeuvre, manoeuvre_of_turn
-from rlftsim.goals.proposals import Driver, propose_from_lanes, why_nothing
-from rlftsim.goals.reach import reach_along
-from rlftsim.goals.recorded_manoeuvre import recorded_manoeuvre
+from rlftsim.goals.maneuvers import lane_paths
+from rlftsim.goals.maneuvers.lane_paths import Pose, lanes_for, neighbor_lanes, path_through, paths_from
+from rlftsim.goals.maneuvers.logged import logged_maneuver
+from rlftsim.goals.maneuvers.proposals import Driver, no_proposal_reason, propose_from_lanes
+from rlftsim.goals.maneuvers.reach import reach_along
 from rlftsim.scenario.lane_graph import lane_graph
+from rlftsim.scenario.maneuver import Maneuver, maneuver_of_turn
 from rlftsim.scenario.types import MapFeatures, ObjectType
 
 
 def proposed(scenario, track=0, road_test=None):
-    """Goals relative to the ego, by manoeuvre."""
-    return {p.manoeuvre: relative(p.position) for p in propose_from_lanes(scenario, track, road_test)}
+    """Goals relative to the ego, by maneuver."""
+    return {p.maneuver: relative(p.position) for p in propose_from_lanes(scenario, track, road_test)}
 
 
-# ---- the lane graph -----------------------------------------------------------------------------------------------------
+# ---- the lane graph ------------------------------------------------------------------------------
 
 
 def test_lanes_go_on_where_others_begin():
@@ -40,7 +40,7 @@ def test_a_lane_with_many_ways_onward_leaves_room_for_the_others(monkeypatch):
     assert len(paths_from(lanes, pose, starts, length_m=120.0, ease_m=15.0)) == 3
 
 
-def test_geometry_finds_the_successors_that_the_synthetic_records_list(pack):
+def test_geometry_finds_the_successors_that_the_synthetic_logs_list(pack):
     listed = found = 0
     for scenario in pack:
         graph = lane_graph(scenario)
@@ -52,7 +52,7 @@ def test_geometry_finds_the_successors_that_the_synthetic_records_list(pack):
     assert found >= 0.99 * listed
 
 
-def test_geometry_finds_the_neighbours_that_the_synthetic_records_list(pack):
+def test_geometry_finds_the_neighbors_that_the_synthetic_logs_list(pack):
     listed = found = 0
     for scenario in pack:
         graph, features = lane_graph(scenario), scenario.map_features
@@ -72,82 +72,82 @@ def test_geometry_finds_the_neighbours_that_the_synthetic_records_list(pack):
     assert found >= 0.97 * listed
 
 
-# ---- manoeuvres ---------------------------------------------------------------------------------------------------------
+# ---- maneuvers -----------------------------------------------------------------------------------
 
 
-def test_every_manoeuvre_of_the_junction_is_found_where_a_usual_driver_is_in_time():
+def test_every_maneuver_of_the_junction_is_found_where_a_usual_driver_is_in_time():
     goals = proposed(driving(BESIDE))
-    assert set(goals) == {Manoeuvre.STRAIGHT, Manoeuvre.LEFT, Manoeuvre.RIGHT, Manoeuvre.LANE_CHANGE_LEFT}
+    assert set(goals) == {Maneuver.STRAIGHT, Maneuver.LEFT, Maneuver.RIGHT, Maneuver.LANE_CHANGE_LEFT}
     # from 8 m/s with 1.2 m/s2 to the usual 13 m/s of a street: 4.17 s and 43.75 m, then 3.83 s at 13 m/s: 93.6 m
-    assert goals[Manoeuvre.STRAIGHT] == pytest.approx([93, 0], abs=1.0)
-    assert goals[Manoeuvre.LEFT][0] == pytest.approx(32, abs=0.3)
-    assert goals[Manoeuvre.LEFT][1] > 12
-    assert goals[Manoeuvre.RIGHT][0] == pytest.approx(28, abs=0.3)
-    assert goals[Manoeuvre.RIGHT][1] < -8
-    assert goals[Manoeuvre.LANE_CHANGE_LEFT][1] == pytest.approx(3.5, abs=0.2)
+    assert goals[Maneuver.STRAIGHT] == pytest.approx([93, 0], abs=1.0)
+    assert goals[Maneuver.LEFT][0] == pytest.approx(32, abs=0.3)
+    assert goals[Maneuver.LEFT][1] > 12
+    assert goals[Maneuver.RIGHT][0] == pytest.approx(28, abs=0.3)
+    assert goals[Maneuver.RIGHT][1] < -8
+    assert goals[Maneuver.LANE_CHANGE_LEFT][1] == pytest.approx(3.5, abs=0.2)
 
 
-def test_turning_round_needs_a_lane_that_leads_back_and_no_lane_to_the_left():
+def test_u_turns_need_an_opposite_lane_and_no_lane_to_the_left():
     goals = proposed(driving(BACK))
-    assert goals[Manoeuvre.LEFT_UTURN][1] == pytest.approx(14, abs=0.3)
-    assert goals[Manoeuvre.LEFT_UTURN][0] < 20
-    assert Manoeuvre.LEFT_UTURN not in proposed(driving(BACK, BESIDE))
+    assert goals[Maneuver.LEFT_UTURN][1] == pytest.approx(14, abs=0.3)
+    assert goals[Maneuver.LEFT_UTURN][0] < 20
+    assert Maneuver.LEFT_UTURN not in proposed(driving(BACK, BESIDE))
     narrow = (LANE, [(140, 4), (-60, 4)])  # a half circle of 2 m radius
-    assert Manoeuvre.LEFT_UTURN not in proposed(driving(narrow))
+    assert Maneuver.LEFT_UTURN not in proposed(driving(narrow))
 
 
 def test_a_turn_that_cannot_be_completed_is_not_proposed():
-    """At 19 m/s nobody takes a corner of 8 m radius that is 20 m away."""
+    """At 19 m/s a corner of 8 m radius that is 20 m away cannot be taken."""
     fast = proposed(driving(BESIDE, speed_mps=19.0))
-    assert Manoeuvre.RIGHT not in fast
-    assert Manoeuvre.LEFT not in fast
-    assert fast[Manoeuvre.STRAIGHT][0] > 19 * 8 * 0.8
+    assert Maneuver.RIGHT not in fast
+    assert Maneuver.LEFT not in fast
+    assert fast[Maneuver.STRAIGHT][0] > 19 * 8 * 0.8
 
 
 def test_a_goal_that_ends_in_a_turn_is_pushed_to_its_end():
     """A usual driver from a standstill is 38 m on, the arc of the left turn from 20 m to 38.8 m."""
     goals = proposed(driving(speed_mps=0.0))
-    assert goals[Manoeuvre.LEFT][1] >= 12
-    assert goals[Manoeuvre.STRAIGHT] == pytest.approx([38, 0], abs=1.0)
+    assert goals[Maneuver.LEFT][1] >= 12
+    assert goals[Maneuver.STRAIGHT] == pytest.approx([38, 0], abs=1.0)
 
 
 def test_a_solid_double_line_is_not_crossed():
-    assert Manoeuvre.LANE_CHANGE_LEFT in proposed(driving(BESIDE))
-    assert Manoeuvre.LANE_CHANGE_LEFT not in proposed(driving(BESIDE, DOUBLE_LINE))
+    assert Maneuver.LANE_CHANGE_LEFT in proposed(driving(BESIDE))
+    assert Maneuver.LANE_CHANGE_LEFT not in proposed(driving(BESIDE, DOUBLE_LINE))
 
 
 def test_what_leaves_the_road_is_not_proposed():
     def only_the_street(way, heading, size):
         return np.abs(relative(way[:, :2])[:, 1]) - 6.0
 
-    assert set(proposed(driving(BESIDE), road_test=only_the_street)) == {Manoeuvre.STRAIGHT, Manoeuvre.LANE_CHANGE_LEFT}
+    assert set(proposed(driving(BESIDE), road_test=only_the_street)) == {Maneuver.STRAIGHT, Maneuver.LANE_CHANGE_LEFT}
 
 
 def test_a_cyclist_turns_but_does_not_change_lanes():
     goals = proposed(driving(BESIDE, BACK, kind=ObjectType.CYCLIST, speed_mps=4.0))
-    assert set(goals) == {Manoeuvre.STRAIGHT, Manoeuvre.LEFT, Manoeuvre.RIGHT}
+    assert set(goals) == {Maneuver.STRAIGHT, Maneuver.LEFT, Maneuver.RIGHT}
 
 
 def test_lanes_in_short_pieces_and_in_circles_end_the_search():
     pieces = [(LANE, [(x, 0), (x + 2, 0)]) for x in range(-10, 200, 2)]
     circle = [(LANE, [(200, 0), (203, 3), (200, 6), (197, 3), (199.5, 0.2)])]
     scenario = scenes.build_scenario("pieces", scenes.TRAFFIC[:1], scenes.polylines([*pieces, *circle, *pieces]))
-    assert set(proposed(scenario)) == {Manoeuvre.STRAIGHT}
+    assert set(proposed(scenario)) == {Maneuver.STRAIGHT}
 
 
 @pytest.mark.parametrize(
     ("scenario", "reason"),
     [
-        (scenes.without_map(), "on no lane"),
-        (driving(y_m=9.0), "on no lane"),
-        (driving(heading_rad=3.0), "on no lane that leads its way"),
+        (scenes.without_map(), "no lane within 2.5 m"),
+        (driving(y_m=9.0), "no lane within 2.5 m"),
+        (driving(heading_rad=3.0), "no lane within 2.5 m runs in its direction of travel"),
         (driving(y_m=-1.9, speed_mps=0.0), "probably parked"),
         (driving(kind=ObjectType.PEDESTRIAN), "a pedestrian does not follow lanes"),
     ],
 )
-def test_who_gets_nothing_is_told_why(scenario, reason):
+def test_agents_without_proposals_get_the_reason(scenario, reason):
     assert propose_from_lanes(scenario, 0) == ()
-    assert reason in (why_nothing(scenario, 0) or "")
+    assert reason in (no_proposal_reason(scenario, 0) or "")
 
 
 def test_broken_lanes_are_survived():
@@ -161,10 +161,10 @@ def test_broken_lanes_are_survived():
         points=np.concatenate([features.points, odd]),
         offsets=np.append(features.offsets, features.offsets[-1] + np.array([1, 3, 6])),
     )
-    assert Manoeuvre.STRAIGHT in proposed(replace(whole, map_features=broken))
+    assert Maneuver.STRAIGHT in proposed(replace(whole, map_features=broken))
 
 
-# ---- how far ------------------------------------------------------------------------------------------------------------
+# ---- how far -------------------------------------------------------------------------------------
 
 
 def line(length_m, limit_mps=13.0):
@@ -194,33 +194,33 @@ def test_a_curve_that_is_taken_too_fast_is_the_end():
     ("degrees", "name"),
     [(0, "straight"), (29, "straight"), (31, "left"), (-31, "right"), (134, "left"), (136, "left_uturn"), (-150, None)],
 )
-def test_ways_are_named_by_their_turn(degrees, name):
-    assert manoeuvre_of_turn(np.radians(degrees)) == name
+def test_paths_are_named_by_their_turn(degrees, name):
+    assert maneuver_of_turn(np.radians(degrees)) == name
 
 
-# ---- the record ---------------------------------------------------------------------------------------------------------
+# ---- the log -------------------------------------------------------------------------------------
 
 
-def test_the_record_is_named_as_the_proposals_are():
+def test_logged_maneuvers_are_named_as_the_proposals_are():
     def name(**mover):
-        found = recorded_manoeuvre(driving(BESIDE, **mover), 0)
-        return found and found.manoeuvre.value
+        found = logged_maneuver(driving(BESIDE, **mover), 0)
+        return found and found.maneuver.value
 
     assert name() == "straight"
     assert name(turn_rate_radps=0.2) == "left"  # 1.6 rad in 8 s
     assert name(turn_rate_radps=-0.2) == "right"
     assert name(turn_rate_radps=0.35) == "left_uturn"
     assert name(speed_mps=0.2) is None
-    assert recorded_manoeuvre(driving(), 1) is None  # a pedestrian
+    assert logged_maneuver(driving(), 1) is None  # a pedestrian
     # 8 m/s at 3.1 degrees: 3.5 m to the left after 64 m
     assert name(heading_rad=0.0547) == "lane_change_left"
 
 
-def test_without_a_future_nothing_is_recorded():
-    assert recorded_manoeuvre(scenes.without_future(), 0) is None
+def test_without_a_future_nothing_is_logged():
+    assert logged_maneuver(scenes.without_future(), 0) is None
 
 
-def test_who_drives_stands_on_the_ground():
+def test_drivers_stand_on_the_ground():
     driver = Driver.of(driving(), 0)
-    assert driver.pose.position[2] == pytest.approx(3.0 - 0.8)  # half of 1.6 m below the box's centre
+    assert driver.pose.position[2] == pytest.approx(3.0 - 0.8)  # half of 1.6 m below the box's center
     assert driver.speed_mps == pytest.approx(8.0)

@@ -23,7 +23,7 @@ def draw_map(polylines, *, first_id=100):
 
 
 def draw_street():
-    """A street along x, 12 m wide: driving lane at y = -2, oncoming lane at y = 2, edges with the road on their left."""
+    """A street along x, 12 m wide: driving lane at y = -2, oncoming lane at y = 2, the road left of its edges."""
     x = np.arange(-200.0, 201.0, 4.0)
     return draw_map(
         [
@@ -49,7 +49,8 @@ def draw_red_light(*, lane_id=100, state=4, at_x=20.0, steps=range(91)):
 def draw_traffic(seed, *, num_agents=6, num_evaluated=3, lights=NO_LIGHTS, map_features=None):
     """Agents on the street at nearly constant speed, wobbling sideways; coordinates are multiples of 1/64 m.
 
-    Ids are shuffled; the last agent is not valid at the current step, so it is not simulated. A few log steps are invalid.
+    Ids are shuffled; the last agent is not valid at the current step, so it is not simulated. A few log steps are
+    invalid.
     """
     random = np.random.default_rng(seed)
     time = (np.arange(91) - 10) * 0.1

@@ -11,9 +11,9 @@ from rlftsim.realism import (
     METRIC_2023,
     METRIC_2024,
     METRIC_2025,
-    build_scenario_log,
     compute_credit,
     compute_features,
+    scenario_log,
     score_features,
 )
 from rlftsim.realism.credit import log_mean_of_exp
@@ -23,13 +23,13 @@ SLOW = settings(deadline=None, max_examples=15)
 
 def draw(seed, num_rollouts=4):
     scenario = draw_traffic(seed, lights=draw_red_light())
-    log = build_scenario_log(scenario)
+    log = scenario_log(scenario)
     return log, draw_rollouts(scenario, num_rollouts, seed=seed, spread=4.0)
 
 
 @SLOW
 @given(st.integers(0, 10_000), st.sampled_from([METRIC_2025, METRIC_2024, METRIC_2023]))
-def test_shares_add_up_to_what_the_rollout_adds(seed, config):
+def test_parts_add_up_to_the_contribution_of_the_rollout(seed, config):
     log, states = draw(seed)
     features = compute_features(log, states)
     result, credit = score_features(log, features, config), compute_credit(log, features, config)
@@ -39,7 +39,7 @@ def test_shares_add_up_to_what_the_rollout_adds(seed, config):
 
 @SLOW
 @given(st.integers(0, 10_000))
-def test_shares_of_features_are_weight_times_change_of_likelihood(seed):
+def test_parts_of_features_are_weight_times_change_of_likelihood(seed):
     log, states = draw(seed)
     weights = torch.tensor(METRIC_2025.weights)
     credit = compute_credit(log, compute_features(log, states))
@@ -71,7 +71,7 @@ def test_an_agent_that_moves_like_the_log_in_all_rollouts_but_one_loses_there():
     assert credit.mloo.sum(-1)[2, 1] < 0
 
 
-def test_repeated_rollouts_are_owed_what_their_copies_are():
+def test_repeated_rollouts_get_the_credit_of_their_copies():
     log, states = draw(1, num_rollouts=2)
     repeated = compute_credit(log, compute_features(log, dataclasses.replace(states, repeat=3)))
     copied = compute_credit(log, compute_features(log, select_rollouts(states, [0, 0, 0, 1, 1, 1])))

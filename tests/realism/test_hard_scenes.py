@@ -49,7 +49,7 @@ def test_128_agents(num_rollouts):
     assert result.meta_metric.isfinite()
 
 
-def test_one_agent_has_nobody_to_run_into():
+def test_one_agent_alone_collides_with_nothing():
     scenario = scenes.lone_agent()
     result = score(scenario, logged_states(scenario, num_rollouts=32))
     assert result.collision_rate == 0

@@ -25,7 +25,7 @@ def draw_boxes(rows, *, valid=None):
 
 
 def draw_crowd(seed, num_agents, num_evaluated, *, with_validity=False):
-    """Boxes thrown on a small square at 5 steps of 2 rollouts, far from the origin as in the record."""
+    """Boxes thrown on a small square at 5 steps of 2 rollouts, far from the origin as in a log."""
     generator = torch.Generator().manual_seed(seed)
     position = 3000 + 40 * torch.rand(2, 2, num_agents, 5, generator=generator)
     heading = 2 * math.pi * torch.rand(2, num_agents, 5, generator=generator) - math.pi
@@ -65,14 +65,14 @@ def test_distance_between_two_boxes(other, expected):
     assert compute_distance_to_nearest_object(agents).item() == pytest.approx(expected, abs=1e-5)
 
 
-def test_a_truck_passing_closely_counts_although_its_centre_is_farther():
-    # Truck 20 m long beside the ego: sides 1 m apart; the car ahead is 2 m away with a nearer centre.
+def test_a_truck_passing_closely_counts_although_its_center_is_farther():
+    # Truck 20 m long beside the ego: sides 1 m apart; the car ahead is 2 m away with a nearer center.
     truck, car = (8.0, 3.0, 0.0, 20.0, 2.0), (6.0, 0.0, 0.0, 4.0, 2.0)
     agents = draw_boxes([(0.0, 0.0, 0.0, 4.0, 2.0), car, truck])
     assert compute_distance_to_nearest_object(agents).item() == pytest.approx(1.0, abs=1e-5)
 
 
-def test_nobody_else_valid_gives_the_far_distance():
+def test_no_other_valid_agent_gives_the_far_distance():
     ego, other = (0.0, 0.0, 0.0, 4.0, 2.0), (6.0, 0.0, 0.0, 4.0, 2.0)
     for agents in (
         draw_boxes([ego]),
@@ -116,7 +116,7 @@ def test_time_to_collision_with_one_agent_ahead(leader, leader_speed, expected):
     assert compute_time_to_collision(agents, speed).item() == pytest.approx(expected, abs=1e-4)
 
 
-def test_an_oblique_leader_needs_half_a_metre_of_overlap():
+def test_an_oblique_leader_needs_half_a_meter_of_overlap():
     # 45 degrees, 4 x 2: half extent across (2 + 1)/sqrt(2) = 2.1213, with the ego's half width 3.1213; along the same.
     speed = torch.tensor([10.0, 0.0]).view(1, 2, 1)
     for offset, expected in ((2.6, (24 - 2 - 2.1213) / 10), (2.7, 5.0)):

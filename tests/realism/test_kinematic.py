@@ -38,6 +38,6 @@ def test_more_than_a_quarter_turn_a_step_is_taken_for_a_turn_back():
     assert angular_speed[1].item() == pytest.approx((2 - math.pi) / 0.1, abs=1e-4)
 
 
-def test_validity_shrinks_by_the_neighbours_and_does_not_ask_the_step_itself():
+def test_validity_shrinks_by_the_neighbors_and_ignores_the_step_itself():
     valid = torch.tensor([True, True, False, True, True, True])
     assert shrink_validity(valid).tolist() == [False, False, True, False, True, False]

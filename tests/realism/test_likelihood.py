@@ -67,9 +67,10 @@ def test_every_edge_opens_its_bin():
 
 
 def test_likelihoods_of_two_rollouts_counted_by_hand():
-    # One agent, two steps, two rollouts. Speeds: 1 and 3 | 1 and 1, so three of four values in bin 0 and one in bin 1; the
-    # log has one scored step in bin 0 and one in bin 1. P(0) = 3.1 / 5, P(1) = 1.1 / 5 with ten bins of pseudocount 0.1.
-    # Collisions agree in one of two rollouts: 1.001 / 2.002; the other outcomes in both: 2.001 / 2.002.
+    # One agent, two steps, two rollouts. Speeds: 1 and 3 | 1 and 1, so three of four values in bin 0 and one in bin
+    # 1; the log has one scored step in bin 0 and one in bin 1. P(0) = 3.1 / 5, P(1) = 1.1 / 5 with ten bins of
+    # pseudocount 0.1. Collisions agree in one of two rollouts: 1.001 / 2.002; the other outcomes in both: 2.001 /
+    # 2.002.
     table = histogram_table(METRIC_2025, CPU)
     values = torch.zeros(7, 2, 1, 2)
     values[SPEED] = torch.tensor([[[1.0, 3.0]], [[1.0, 1.0]]])

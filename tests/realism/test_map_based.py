@@ -32,8 +32,9 @@ def test_left_of_an_edge_is_on_the_road_and_negative():
 
 
 def test_beyond_a_corner_both_segments_decide_the_side():
-    # A sharp left turn at (10, 0). (11, 0.5) lies beyond both segments, left of the first one's line, right of the second
-    # one's (cross of (1, 0.5) and (-10, 3) is 8 > 0). The road is inside the turn: off the road, distance to the corner.
+    # A sharp left turn at (10, 0). (11, 0.5) lies beyond both segments, left of the first one's line, right of the
+    # second one's (cross of (1, 0.5) and (-10, 3) is 8 > 0). The road is inside the turn: off the road, distance to
+    # the corner.
     left_turn = [[0.0, 0, 0], [10, 0, 0], [0, 3, 0]]
     assert measure([left_turn], [11.0, 0.5, 0]) == pytest.approx(1.25**0.5)
     # Mirrored, right of the first and left of the second: the road is outside the turn.
@@ -62,7 +63,8 @@ def test_polylines_of_one_point_are_no_edges():
 
 
 def test_the_corner_farthest_off_the_road_counts():
-    # Street edges at y = -6 and 6; a box 4 x 2 at y = -4 turned by 90 degrees reaches y = -6: distance 0, then off by 0.5.
+    # Street edges at y = -6 and 6; a box 4 x 2 at y = -4 turned by 90 degrees reaches y = -6: distance 0, then off by
+    # 0.5.
     edges = build_road_edges(draw_street(), CPU)
     y = torch.tensor([[[-4.0, -4.5, 0.0]]])
     zero = torch.zeros_like(y)

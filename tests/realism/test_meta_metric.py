@@ -1,4 +1,7 @@
 import dataclasses
+import gc
+import weakref
+from collections import deque
 
 import jaxtyping
 import numpy as np
@@ -17,6 +20,7 @@ from rlftsim.realism import (
     score_batch,
     score_features,
 )
+from rlftsim.realism import features as realism_features
 
 
 @pytest.fixture(scope="module")
@@ -24,8 +28,24 @@ def scenario():
     return draw_traffic(0, lights=draw_red_light())
 
 
-def test_the_scenario_part_is_built_once(scenario):
+def test_the_log_of_a_scenario_is_computed_once(scenario):
     assert scenario_log(scenario) is scenario_log(scenario, "cpu")
+
+
+def test_cached_logs_are_bounded_and_keep_no_scenario_in_memory(monkeypatch):
+    monkeypatch.setattr(realism_features, "_recent_logs", deque(maxlen=2))
+    scenarios = [draw_traffic(seed) for seed in range(3)]
+    logs = [weakref.ref(scenario_log(scenario)) for scenario in scenarios]
+    gc.collect()
+    assert [log() is None for log in logs] == [True, False, False]
+    scenario_log(scenarios[1])  # used again: now the last one to go
+    scenario_log(scenarios[0])
+    gc.collect()
+    assert [log() is None for log in logs[1:]] == [False, True]
+    alive = weakref.ref(scenarios[0])
+    del scenarios
+    gc.collect()
+    assert alive() is None
 
 
 def test_rollouts_that_repeat_the_log_score_high_but_not_one(scenario):
@@ -152,7 +172,7 @@ def test_a_scenario_without_future_is_refused(scenario):
         tracks,
         **{name: getattr(tracks, name)[:, :11] for name in ("position", "heading", "velocity", "size", "valid")},
     )
-    with pytest.raises(DataError, match="drawn_0 records 11 steps"):
+    with pytest.raises(DataError, match="drawn_0 has 11 logged steps"):
         score(dataclasses.replace(scenario, tracks=cut), draw_rollouts(scenario, 2, seed=1))
 
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from realism_drawing import draw_red_light, draw_rollouts, draw_traffic, select_rollouts
 from torch.nn import functional
 
-from rlftsim.realism import SimulatedStates, build_scenario_log, compute_features, score
+from rlftsim.realism import SimulatedStates, compute_features, scenario_log, score
 from rlftsim.realism.config import HISTOGRAM_FEATURES
 from rlftsim.realism.from_rollouts import states_of_rollouts
 from rlftsim.rollout.types import Rollouts
@@ -46,7 +46,7 @@ def test_the_order_of_agents_does_not_matter(seed):
 
 @SLOW
 @given(SEEDS)
-def test_the_order_of_tracks_in_the_record_does_not_matter(seed):
+def test_the_order_of_tracks_in_the_log_does_not_matter(seed):
     scenario, states = draw(seed)
     order = np.random.default_rng(seed).permutation(len(scenario.tracks.object_id))
     rank = np.argsort(order)
@@ -88,7 +88,7 @@ def test_repeated_rollouts_equal_copied_ones(seed, repeat):
 
 @SLOW
 @given(SEEDS)
-def test_rewards_centred_on_the_leave_one_out_mean_sum_to_zero(seed):
+def test_rewards_centered_on_the_leave_one_out_mean_sum_to_zero(seed):
     scenario, states = draw(seed)
     without_each = score(scenario, states).leave_one_out_meta_metric
     assert (without_each.mean() - without_each).sum().item() == pytest.approx(0.0, abs=1e-6)
@@ -96,7 +96,7 @@ def test_rewards_centred_on_the_leave_one_out_mean_sum_to_zero(seed):
 
 @SLOW
 @given(SEEDS)
-def test_who_is_not_valid_at_the_current_step_does_not_exist(seed):
+def test_agents_not_valid_at_the_current_step_do_not_exist(seed):
     scenario, states = draw(seed)
     changed = dataclasses.replace(scenario.tracks, position=scenario.tracks.position.copy())
     changed.position[-1] = changed.position[0]  # the last track, put on the ego
@@ -146,13 +146,13 @@ def move(scenario, states, angle, shift):
 
 @SLOW
 @given(SEEDS, st.integers(-4000, 4000), st.integers(-4000, 4000))
-def test_a_shift_by_whole_metres_changes_features_by_rounding_only(seed, x, y):
+def test_a_shift_by_whole_meters_changes_features_by_rounding_only(seed, x, y):
     # Coordinates are multiples of 1/64 m below 8192 m: the shift itself is exact, box corners are rounded to 5e-4 m.
     scenario = draw_traffic(seed)
     states = draw_rollouts(scenario, 3, seed=seed)
     moved, moved_states = move(scenario, states, 0.0, [float(x), float(y)])
-    before = compute_features(build_scenario_log(scenario), states)
-    after = compute_features(build_scenario_log(moved), moved_states)
+    before = compute_features(scenario_log(scenario), states)
+    after = compute_features(scenario_log(moved), moved_states)
     assert_same_features(before, after, kinematic=1e-6, distance=4e-3, seconds=1e-4)
 
 
@@ -163,8 +163,8 @@ def test_a_rotation_changes_features_by_rounding_only(seed, angle):
     scenario = draw_traffic(seed)
     states = draw_rollouts(scenario, 3, seed=seed)
     moved, moved_states = move(scenario, states, angle, [0.0, 0.0])
-    before = compute_features(build_scenario_log(scenario), states)
-    after = compute_features(build_scenario_log(moved), moved_states)
+    before = compute_features(scenario_log(scenario), states)
+    after = compute_features(scenario_log(moved), moved_states)
     for name in ("distance_to_nearest_object", "distance_to_road_edge", "linear_speed", "angular_speed"):
         difference = (getattr(before, name) - getattr(after, name)).abs().nan_to_num()
         assert difference.max() < 1e-3, name

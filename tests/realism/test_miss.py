@@ -13,7 +13,7 @@ from rlftsim.realism.miss import compute_miss_rates
 
 
 def moved(states, shift_xy, steps=slice(None)):
-    """The same rollouts, everybody put elsewhere at some steps."""
+    """The same rollouts, all agents moved at some steps."""
     x, y = states.x.clone(), states.y.clone()
     x[..., steps] += shift_xy[0]
     y[..., steps] += shift_xy[1]
@@ -30,7 +30,7 @@ def speed_of_ego(scenario):
     return np.linalg.norm(scenario.tracks.velocity[scenario.ego_index, 10])
 
 
-def test_the_record_itself_misses_nothing():
+def test_the_log_itself_misses_nothing():
     scenario = scenes.straight_road()
     assert compute_miss_rates(scenario, logged_states(scenario, num_rollouts=3)) == (0.0, 0.0, 0.0)
 
@@ -40,7 +40,8 @@ def test_a_box_not_a_disc(lone):
     along, sideways = tolerance_m(torch.tensor([speed_of_ego(lone)]), torch.tensor([8.0]))[0].tolist()
     heading = float(lone.tracks.heading[lone.ego_index, 90])
     ahead, left = np.array([math.cos(heading), math.sin(heading)]), np.array([-math.sin(heading), math.cos(heading)])
-    for shift, missed in ((0.97 * along * ahead, 0.0), (1.03 * along * ahead, 1.0), (-0.97 * sideways * left, 0.0), (1.03 * sideways * left, 1.0)):  # fmt: skip
+    shifts = (0.97 * along * ahead, 1.03 * along * ahead, -0.97 * sideways * left, 1.03 * sideways * left)
+    for shift, missed in zip(shifts, (0.0, 1.0, 0.0, 1.0)):
         assert compute_miss_rates(lone, moved(states, shift)).at_goal == missed
 
 
@@ -54,8 +55,8 @@ def test_passing_is_enough_for_the_passing_rate(lone):
     assert rates == (1.0, 0.0, 0.0)
 
 
-def test_shares_are_over_rollouts_and_agents(lone):
-    """Three of four rollouts meet; in all taken together nobody misses."""
+def test_fractions_are_over_rollouts_and_agents(lone):
+    """Three of four rollouts meet; in all taken together none misses."""
     once = logged_states(lone, num_rollouts=1)
     off = moved(once, (0.0, 50.0))
     join = [torch.cat([getattr(once, f)] * 3 + [getattr(off, f)]) for f in ("x", "y", "z", "heading")]
@@ -85,8 +86,8 @@ def test_agents_may_come_in_any_order():
     assert compute_miss_rates(scenario, shuffled).at_goal == pytest.approx(expected)
 
 
-def test_nobody_with_a_future_gives_no_number(lone):
+def test_without_any_logged_future_the_rates_are_nan(lone):
     valid = lone.tracks.valid.copy()
     valid[:, 11:] = False
-    nobody = replace(lone, tracks=replace(lone.tracks, valid=valid))
-    assert all(math.isnan(rate) for rate in compute_miss_rates(nobody, logged_states(lone, num_rollouts=1)))
+    none = replace(lone, tracks=replace(lone.tracks, valid=valid))
+    assert all(math.isnan(rate) for rate in compute_miss_rates(none, logged_states(lone, num_rollouts=1)))

@@ -1,4 +1,4 @@
-"""Agreement with the official evaluator on real scenarios: every field, every feature, small sets, each left out, each alone."""
+"""Agreement with the official evaluator on real scenarios: fields, features, small sets, leave-one-out, alone."""
 
 import json
 from functools import lru_cache
@@ -11,8 +11,8 @@ import torch
 from rlftsim.realism import (
     METRICS,
     SimulatedStates,
-    build_scenario_log,
     compute_features,
+    scenario_log,
     score,
     score_batch,
     score_features,
@@ -55,7 +55,7 @@ def read_all_scenarios(shared: Path):
 
 @lru_cache
 def build_log(shared: Path, prefix: str):
-    return build_scenario_log(read_all_scenarios(shared)[prefix])
+    return scenario_log(read_all_scenarios(shared)[prefix])
 
 
 @lru_cache(maxsize=2)

@@ -1,21 +1,22 @@
-"""Every recipe that ships can be built, and `field=value` changes it or is refused in words."""
+"""Every recipe that ships can be built, and values out of range are refused in words."""
 
-import contextlib
 import inspect
-from dataclasses import fields, is_dataclass
-from typing import get_args
+import math
+from dataclasses import dataclass, field, replace
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+import torch
 
-from rlftsim.cli.train import RecipeName
 from rlftsim.errors import CheckpointError, ConfigError
-from rlftsim.recipes import models, smart
-from rlftsim.recipes.configure import configure
-from rlftsim.recipes.models import load_policy, load_policy_or_oracle
-from rlftsim.recipes.smart import RECIPES, SmartRecipe, smart_demo_rlftsim, smart_tiny_rlftsim
+from rlftsim.policies import registry
+from rlftsim.policies.registry import load_policy, load_policy_or_oracle
+from rlftsim.recipes import smart
+from rlftsim.recipes.registry import RECIPES, Recipe, recipe_by_name
+from rlftsim.recipes.settings import sections_of
+from rlftsim.recipes.smart import SmartRecipe, smart_demo_rlftsim, smart_tiny_rlftsim
 from rlftsim.rollout.baselines import ConstantVelocity
+from rlftsim.scenario.open import open_dataset
+from rlftsim.tokens.clustering import build_vocabulary
 
 SHIPPED = [
     f for _, f in inspect.getmembers(smart, inspect.isfunction)
@@ -31,8 +32,8 @@ def test_every_recipe_can_be_built(recipe):
     assert recipe.__doc__
 
 
-def test_the_command_lines_recipes_are_shipped_ones():
-    assert set(RECIPES.values()) <= set(SHIPPED)
+def test_the_recipes_with_names_are_shipped_ones():
+    assert {RECIPES.get(name) for name in RECIPES.names()} <= set(SHIPPED)
     assert len(SHIPPED) >= 5
 
 
@@ -43,134 +44,115 @@ def test_the_papers_recipe_has_the_papers_numbers():
     assert (finetune.betas[0], finetune.weight_decay, finetune.gradient_clip) == (0.9, 0.01, 1.0)
     assert (finetune.kl.target, finetune.kl.horizon, finetune.entropy_bonus) == (0.01, 5.0, 0.0)
     assert (finetune.kl.min_beta, finetune.kl.max_beta) == (1e-3, 1e3)
-    assert (finetune.kl.reference_every, finetune.kl.reference_share) == (500, 0.005)
+    assert (finetune.kl.reference_sync_every, finetune.kl.reference_ema) == (500, 0.005)
     assert smart_tiny_rlftsim().pretrain.epochs == 32.0
 
 
+class TinyRecipe(Recipe):
+    """A recipe of another package: no vocabulary, no sizes."""
+
+
+def test_a_recipe_may_have_no_vocabulary_and_no_sizes():
+    recipe = TinyRecipe()
+    assert list(sections_of(recipe)) == ["pretrain", "finetune", "catk", "gcsl"]
+    with pytest.raises(ConfigError, match="TinyRecipe describes no new policy"):
+        recipe.new_policy(None)
+    assert recipe.with_goals().finetune.goals.probability == 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Prior:
+    """A section of another package."""
+
+    width: int = 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class ContinuousRecipe(Recipe):
+    """A recipe for policies without tokens, with a section of its own."""
+
+    catk: None = None
+    gcsl: None = None
+    prior: Prior = field(default_factory=Prior)
+    note: str = ""
+
+
+def test_a_recipe_may_leave_methods_out_and_bring_sections():
+    recipe = ContinuousRecipe()
+    assert list(sections_of(recipe)) == ["pretrain", "finetune", "prior"]
+    with_goals = recipe.with_goals()
+    assert with_goals.catk is None
+    assert "goal(" in with_goals.finetune.reward
+
+
+def test_a_recipe_follows_the_sizes_of_its_own_kind_of_policy_only():
+    with pytest.raises(ConfigError, match="makes SMART policies, none like a ConstantVelocity"):
+        smart_demo_rlftsim().like(ConstantVelocity())
+    with pytest.raises(ConfigError, match="ContinuousRecipe describes no policy like a ConstantVelocity"):
+        ContinuousRecipe().like(ConstantVelocity())
+
+
+def test_goals_of_a_smart_recipe_keep_its_other_sections():
+    recipe = replace(smart_demo_rlftsim(), catk=None).with_goals()
+    assert isinstance(recipe, SmartRecipe)
+    assert recipe.catk is None
+
+
+def test_recipes_have_names():
+    assert set(RECIPES.names()) >= {"smart-tiny", "smart-mini", "smart-nano", "smart-demo", "synthetic"}
+    assert recipe_by_name("smart-tiny") == smart_tiny_rlftsim()
+    with pytest.raises(ConfigError, match="unknown recipe 'smart-tinny': did you mean 'smart-tiny'"):
+        recipe_by_name("smart-tinny")
+
+
+def test_a_function_that_returns_no_recipe_is_refused(monkeypatch):
+    monkeypatch.setitem(RECIPES._registered, "no-recipe", dict)
+    with pytest.raises(ConfigError, match="recipe 'no-recipe' is a dict: make it extend"):
+        recipe_by_name("no-recipe")
+
+
+def test_fresh_weights_depend_on_the_recipes_seed_alone():
+    recipe = smart_demo_rlftsim()
+    small = replace(recipe, model=replace(recipe.model, dim=16, num_heads=2, head_dim=8, num_decoder_layers=1))
+    scenarios = open_dataset("synthetic", "validation")
+    few = replace(small.tokens, num_tokens=16, num_map_prototypes=4, max_scenarios=4)
+    vocabulary = build_vocabulary(scenarios, few)[0]
+    torch.manual_seed(1)
+    first = small.new_policy(vocabulary).state_dict()
+    torch.manual_seed(2)
+    again = small.new_policy(vocabulary).state_dict()
+    other = replace(small, pretrain=replace(small.pretrain, seed=5)).new_policy(vocabulary).state_dict()
+    assert all(torch.equal(first[key], again[key]) for key in first)
+    assert any(not torch.equal(first[key], other[key]) for key in first)
+
+
 @pytest.mark.parametrize(
-    ("override", "value"),
+    ("section", "change", "words"),
     [
-        ("pretrain.epochs=2", 2.0),
-        ("pretrain.epochs=0.5", 0.5),
-        ("pretrain.trained_radius_m=50", 50.0),
-        ("pretrain.max-trained-agents=16", 16),
-        ("finetune.kl.target=0.02", 0.02),
-        ("finetune.learning-rate=1e-5", 1e-5),
-        ("finetune.reward=rloo", "rloo"),
-        ("finetune.trained=all", "all"),
-        ("finetune.betas=(0.8, 0.95)", (0.8, 0.95)),
-        ("finetune.device.accelerator=cpu", "cpu"),
-        ("tokens.mirror=false", False),
-        ("model.public_code_quirks=True", True),
+        ("finetune", {"num_rollouts": 1}, "at least 2 rollouts"),
+        ("finetune", {"reward": "joy"}, "unknown reward 'joy': known are collision_offroad"),
+        ("finetune", {"betas": (0.9, 2.0)}, r"in \[0, 1\)"),
+        ("finetune", {"entropy_bonus": math.inf}, "entropy_bonus must be a finite number"),
+        ("model", {"dropout": 1.5}, r"in \[0, 1\)"),
+        ("model", {"map_radius_m": math.nan}, "map_radius_m must be positive, got nan"),
+        ("model", {"agent_radius_m": math.inf}, "agent_radius_m must be a finite number"),
+        ("model", {"max_map_neighbors": -1}, "max_map_neighbors must be positive"),
+        ("pretrain", {"epochs": math.inf}, "epochs must be a finite number, got inf"),
+        ("pretrain", {"weight_decay": -1.0}, "weight_decay must not be negative, got -1"),
+        ("pretrain", {"label_smoothing_kind": "spatial"}, "has no effect: set label_smoothing"),
+        ("pretrain", {"max_skipped_in_a_row": 0}, "max_skipped_in_a_row must be positive"),
+        ("catk", {"gradient_clip": -1.0}, "gradient_clip must be positive, got -1"),
+        ("catk", {"final_lr_ratio": math.nan}, r"final_lr_ratio .* \[0, 1\], got nan"),
+        ("tokens", {"straight_up_to_mps": math.inf}, "straight_up_to_mps must be a finite number"),
+        ("tokens", {"seed": -1}, "seed must not be negative"),
     ],
 )
-def test_a_good_override_changes_one_field(override, value):
-    before = smart_demo_rlftsim()
-    after = configure(before, [override])
-    path = override.split("=")[0].replace("-", "_").split(".")
-    found = after
-    for name in path:
-        found = getattr(found, name)
-    assert found == value
-    assert type(found) is type(value)
-    assert len(differences(before, after)) == 1
-
-
-def differences(a, b, path=""):
-    """Names of the leaves in which two configurations differ."""
-    if is_dataclass(a):
-        return [d for f in fields(a) for d in differences(getattr(a, f.name), getattr(b, f.name), f"{path}.{f.name}")]
-    return [] if a == b else [path]
-
-
-def leaves(config, path=""):
-    """Names of all leaves of a configuration."""
-    if is_dataclass(config):
-        return [name for f in fields(config) for name in leaves(getattr(config, f.name), f"{path}.{f.name}")]
-    return [path]
-
-
-def test_later_overrides_win():
-    config = configure(smart_demo_rlftsim(), ["pretrain.seed=1", "model.dim=64", "pretrain.seed=2"])
-    assert (config.pretrain.seed, config.model.dim) == (2, 64)
-
-
-def test_fields_that_depend_on_each_other_may_come_in_any_order():
-    overrides = ["finetune.kl.min_beta=0.5", "finetune.kl.initial_beta=1"]
-    kl = configure(smart_demo_rlftsim(), overrides).finetune.kl
-    assert (kl.min_beta, kl.initial_beta) == (0.5, 1.0)
-
-
-def test_none_is_a_value_where_a_field_allows_it():
-    config = configure(smart_tiny_rlftsim(), ["pretrain.max_trained_agents=none"])
-    assert config.pretrain.max_trained_agents is None
-
-
-@pytest.mark.parametrize(
-    ("override", "words"),
-    [
-        ("pretrain.epoch=2", "no field 'epoch' here, known are epochs, batch_size, .*seed"),
-        ("training.epochs=2", "no field 'training' here, known are tokens, model, pretrain, finetune"),
-        ("finetune.kl.goal=1", "no field 'goal' here, known are target, horizon"),
-        ("finetune.kl=1", "name one of its fields: target, horizon"),
-        ("finetune.seed.x=1", "'seed' has no fields of its own"),
-        ("pretrain.epochs", "is not field=value"),
-        ("pretrain.epochs=many", "expected float"),
-        ("pretrain.batch_size=2.5", "expected int"),
-        ("pretrain.batch_size=true", "expected int"),
-        ("pretrain.batch_size=none", "expected int"),
-        ("tokens.mirror=1", "expected bool"),
-        ("finetune.trained=some", "expected one of decoder, goals, all"),
-        ("finetune.reward=joy", "unknown reward 'joy': known are collision_offroad"),
-        ("finetune.num_rollouts=1", "at least 2 rollouts"),
-        ("model.dropout=1.5", r"shares in \[0, 1\)"),
-        ("finetune.kl.target=0", "must be positive"),
-        ("pretrain.epochs=inf", "epochs must be a finite number, got inf"),
-        ("pretrain.weight_decay=-1", "weight_decay must not be negative, got -1"),
-        ("catk.gradient_clip=-1", "gradient_clip must be positive, got -1"),
-        ("catk.final_learning_rate_share=nan", r"final_learning_rate_share is a share in \[0, 1\], got nan"),
-        ("pretrain.label_smoothing_kind=spatial", "has no effect: set label_smoothing"),
-        ("pretrain.max_skipped_in_a_row=0", "max_skipped_in_a_row must be positive"),
-        ("pretrain.validation.seed=-1", "seed must not be negative"),
-        ("pretrain.device.devices=0", "devices must be positive"),
-        ("finetune.device.threads=-1", "threads must not be negative"),
-        ("finetune.betas=0.9,2", r"betas are shares in \[0, 1\)"),
-        ("finetune.entropy_bonus=inf", "entropy_bonus must be a finite number"),
-        ("model.num_frequencies=0", "num_frequencies must be positive"),
-        ("model.map_radius_m=nan", "map_radius_m must be positive, got nan"),
-        ("model.agent_radius_m=inf", "agent_radius_m must be a finite number"),
-        ("model.max_map_neighbors=-1", "max_map_neighbors must be positive"),
-        ("tokens.straight_up_to_mps=inf", "straight_up_to_mps must be a finite number"),
-        ("tokens.seed=-1", "seed must not be negative"),
-        ("tokens.trajtok.vehicle.x_max_m=inf", "x_max_m must be a finite number"),
-        ("tokens.trajtok.num_neighbors=-1", "num_neighbors must not be negative"),
-    ],
-)
-def test_a_bad_override_is_refused_in_words(override, words):
+def test_a_value_out_of_range_is_refused_in_words(section, change, words):
     with pytest.raises(ConfigError, match=words):
-        configure(smart_demo_rlftsim(), [override])
+        replace(getattr(smart_demo_rlftsim(), section), **change)
 
 
-LEAVES = [path[1:] for path in leaves(smart_demo_rlftsim()) if not path.endswith("betas")]
-
-
-@given(st.one_of(st.sampled_from(LEAVES), st.text(max_size=12)), st.one_of(st.text(max_size=8), st.floats().map(str), st.integers().map(str)))  # fmt: skip
-def test_any_override_is_taken_or_refused_in_words(name, value):
-    with contextlib.suppress(ConfigError):
-        configure(smart_demo_rlftsim(), [f"{name}={value}"])
-
-
-def test_a_metrics_year_is_a_name():
-    assert configure(smart_demo_rlftsim(), ["finetune.metric=2024"]).finetune.metric == "2024"
-
-
-@pytest.mark.parametrize("override", ["finetune.betas=0.9", "finetune.betas=(0.9,)", "finetune.betas=('a', 'b')"])
-def test_a_tuple_needs_all_its_values(override):
-    with pytest.raises(ConfigError):
-        configure(smart_demo_rlftsim(), [override])
-
-
-# ---- models by name ---------------------------------------------------------------------------------------------------
+# ---- models by name ------------------------------------------------------------------------------------------------
 
 
 def test_baselines_have_names():
@@ -194,12 +176,8 @@ def test_an_empty_folder_is_no_model(tmp_path):
         load_policy(str(tmp_path))
 
 
-def test_the_command_line_knows_every_recipe():
-    assert set(get_args(RecipeName)) == set(RECIPES)
-
-
 def test_a_gpu_that_is_not_there_is_refused_and_auto_does_without(monkeypatch):
-    monkeypatch.setattr(models.torch.cuda, "is_available", lambda: False)
-    assert models.find_device("auto").type == "cpu"
-    with pytest.raises(ConfigError, match="--device cuda, but torch sees no CUDA device"):
-        models.find_device("cuda")
+    monkeypatch.setattr(registry.torch.cuda, "is_available", lambda: False)
+    assert registry.find_device("auto").type == "cpu"
+    with pytest.raises(ConfigError, match="device=cuda, but torch sees no CUDA device"):
+        registry.find_device("cuda")

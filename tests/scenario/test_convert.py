@@ -1,4 +1,6 @@
+import errno
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -9,9 +11,10 @@ from pathlib import Path
 import pytest
 
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.scenario.convert import convert, infer_split
+from rlftsim.scenario.convert import convert
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.inspect import verify_dataset
+from rlftsim.scenario.sources import infer_split
 from rlftsim.scenario.womd import read_scenarios
 
 
@@ -129,6 +132,40 @@ def test_stop_raises_at_a_bad_record_and_skip_goes_on_later(source, tmp_path, ma
         run(source, tmp_path / "data", on_error="stop")
 
 
+@pytest.mark.parametrize("number", range(8))
+def test_a_full_disk_is_named_in_one_line_and_the_same_command_goes_on(source, tmp_path, monkeypatch, number):
+    """Three shards and a receipt each, an index, a manifest: every one of them is synced to disk once."""
+    synced, sync = [], os.fsync
+
+    def full_at(descriptor):
+        synced.append(descriptor)
+        if len(synced) == number + 1:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        sync(descriptor)
+
+    with monkeypatch.context() as disk:
+        disk.setattr(os, "fsync", full_at)
+        with pytest.raises(DataError) as caught:
+            run(source, tmp_path / "data")
+    assert "\n" not in str(caught.value)
+    kinds = (r"shards/.*\.arrow", r"shards/.*\.arrow\.json")
+    path = kinds[number % 2] if number < 6 else ("index.parquet", "manifest.json")[number - 6]
+    way_out = "make room or choose another place, then run the same command again"
+    assert re.fullmatch(rf"cannot write .*/data/{path} \(No space left on device\): {way_out}\.", str(caught.value))
+    assert not list((tmp_path / "data").rglob("*.tmp"))
+    report = run(source, tmp_path / "data")
+    assert report.shards_reused == min((number) // 2, 3)
+    run(source, tmp_path / "uninterrupted")
+    assert contents(tmp_path / "data") == contents(tmp_path / "uninterrupted")
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write anywhere")
+def test_a_destination_that_may_not_be_written_to_is_named(source, tmp_path):
+    (tmp_path / "closed").mkdir(mode=0o500)
+    with pytest.raises(DataError, match=r"cannot write .*/closed/data/INCOMPLETE \(Permission denied\)"):
+        run(source, tmp_path / "closed" / "data")
+
+
 def test_of_duplicates_the_first_is_kept_and_the_others_are_reported(source, tmp_path, make_message, make_tfrecord):
     make_tfrecord(source / "training" / "z.tfrecord", make_message("training01", num_tracks=1), make_message("new"))
     report = run(source, tmp_path / "data")
@@ -174,7 +211,7 @@ def test_two_conversions_to_one_folder_do_not_mix(source, tmp_path):
         ("/testing/x/a.tfrecord", "unknown"),
     ],
 )
-def test_the_split_is_told_by_the_name_of_file_or_folder(path, split):
+def test_the_split_follows_from_the_name_of_file_or_folder(path, split):
     assert infer_split(Path(path)) == split
 
 
@@ -258,3 +295,10 @@ def test_no_official_scenario_is_lost(shared, tmp_path):
     assert (report.converted, report.skipped, report.duplicates) == (7, (), ())
     damage = [finding for finding in verify_dataset(tmp_path / "data") if finding.problem.is_damage]
     assert damage == []
+
+
+def test_an_empty_file_is_named(tmp_path, capsys):
+    (tmp_path / "empty.tfrecord").touch()
+    with pytest.raises(DataError, match=r"not one scenario could be converted; .*empty\.tfrecord.*the file is empty"):
+        run(tmp_path / "empty.tfrecord", tmp_path / "data", show_progress=True)
+    assert "converting: 100%" in capsys.readouterr().err

@@ -1,6 +1,9 @@
+import errno
 import json
 import pickle
+import tarfile
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -8,9 +11,12 @@ import pytest
 
 from rlftsim.errors import DataError
 from rlftsim.scenario import shards
-from rlftsim.scenario.dataset import DatasetWriter, ScenarioDataset, write_dataset
+from rlftsim.scenario.dataset import DatasetWriter, ScenarioDataset, read_manifest, write_dataset
+from rlftsim.scenario.inspect import dataset_stats, verify_dataset
 from rlftsim.scenario.types import LaneTopology
 from rlftsim.scenario.womd import read_scenarios, scenario_from_bytes
+
+STORED = Path(__file__).parents[1] / "data" / "stored_0_1" / "stored.tar.xz"
 
 
 @pytest.fixture
@@ -62,13 +68,32 @@ def test_scenarios_are_found_by_position_and_id(folder):
     dataset = ScenarioDataset(folder)
     assert len(dataset) == 5
     assert dataset.scenario_ids == ["id0", "id1", "id2", "id3", "id4"]
-    assert dataset[-1] is dataset[4] is dataset.by_id("id4")
+    assert dataset[-1] is dataset[4] is dataset["id4"] is dataset.by_id("id4")
     assert "id3" in dataset
     assert "id9" not in dataset
     with pytest.raises(DataError, match="no scenario 'id9'"):
-        dataset.by_id("id9")
+        dataset["id9"]
     with pytest.raises(IndexError):
         dataset[5]
+
+
+def test_a_folder_may_be_a_text_and_the_embedded_data_set_has_a_name(folder):
+    assert ScenarioDataset(str(folder)).scenario_ids == ScenarioDataset(folder).scenario_ids
+    assert len(ScenarioDataset("synthetic")) == 200
+    assert read_manifest("synthetic").counts == {"training": 160, "validation": 40}
+
+
+def test_a_data_set_of_release_0_1_opens_under_the_names_of_today(tmp_path):
+    """Its index has a column `ego_manoeuvre`, its manifest a `licence_note`."""
+    with tarfile.open(STORED) as stored:
+        stored.extractall(tmp_path, [m for m in stored if m.name.startswith("data/")], filter="data")
+    assert "licence_note" in (tmp_path / "data" / "manifest.json").read_text()
+    dataset = ScenarioDataset(tmp_path / "data")
+    assert len(dataset) == len({scenario.scenario_id for scenario in dataset}) == 9
+    assert dataset.manifest.license_note.startswith("CC0-1.0")
+    assert "straight" in dataset.index["ego_maneuver"].to_pylist()
+    assert sum(dataset_stats(tmp_path / "data").by_ego_maneuver.values()) == 9
+    assert verify_dataset(tmp_path / "data") == []
 
 
 def test_a_split_shows_only_its_scenarios(folder):
@@ -98,9 +123,9 @@ def test_many_scenarios_are_spread_over_shards(tmp_path, scenarios):
 
 
 def test_the_manifest_says_where_the_data_comes_from(tmp_path, scenarios):
-    write_dataset(scenarios, tmp_path / "data", licence_note="CC0", provenance={"seed": 3})
+    write_dataset(scenarios, tmp_path / "data", license_note="CC0", provenance={"seed": 3})
     manifest = json.loads((tmp_path / "data" / "manifest.json").read_text())
-    assert manifest["licence_note"] == "CC0"
+    assert manifest["license_note"] == "CC0"
     assert manifest["provenance"] == {"seed": 3}
     assert manifest["counts"] == {"unknown": 5}
 
@@ -126,6 +151,29 @@ def test_an_error_while_writing_leaves_nothing(tmp_path, scenarios):
 def test_a_folder_with_something_in_it_is_not_overwritten(folder, scenarios):
     with pytest.raises(DataError, match="not an empty folder"):
         write_dataset(scenarios, folder)
+
+
+def test_a_full_disk_leaves_no_half_a_data_set(tmp_path, scenarios, monkeypatch):
+    def full(self, batch):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("pyarrow.ipc.RecordBatchFileWriter.write_batch", full)
+    with pytest.raises(DataError, match=r"cannot write .*00000\.arrow \(No space left on device\): make room"):
+        write_dataset(scenarios, tmp_path / "data")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("field", ["position", "heading", "velocity", "size"])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_valid_state_that_is_no_number_is_refused_by_name(tmp_path, scenarios, field, value):
+    getattr(scenarios[1].tracks, field)[1, 30] = value
+    way_out = "correct the value or mark the state as not valid"
+    with pytest.raises(
+        DataError, match=rf"scenario id1: track 101 has a NaN or infinite {field} at step 30, .*{way_out}"
+    ):
+        write_dataset(scenarios, tmp_path / "data")
+    scenarios[1].tracks.valid[1, 30] = False
+    write_dataset(scenarios, tmp_path / "data")
 
 
 def test_a_wrong_dtype_is_refused_before_it_is_written(tmp_path, scenarios):
@@ -174,17 +222,31 @@ def test_a_missing_shard_is_named(folder):
         ("INCOMPLETE", b"", "was not finished"),
     ],
 )
-def test_damage_around_the_shards_is_refused_in_words(folder, file, content, cause):
+def test_damage_around_the_shards_is_refused(folder, file, content, cause):
     (folder / file).write_bytes(content)
     with pytest.raises(DataError, match=cause):
         ScenarioDataset(folder)
 
 
 def test_a_folder_without_a_data_set_is_refused(tmp_path):
-    with pytest.raises(DataError, match="have to be converted first"):
+    with pytest.raises(DataError, match=r"is no data set: it has no manifest\.json; name a folder"):
         ScenarioDataset(tmp_path)
-    with pytest.raises(DataError, match="no such folder"):
+    (tmp_path / "training").mkdir()
+    source = tmp_path / "training" / "a.tfrecord-00000-of-00001"
+    source.write_bytes(b"x")
+    with pytest.raises(DataError, match="its tfrecord files have to be converted first"):
+        ScenarioDataset(tmp_path)
+    with pytest.raises(DataError, match=r"of-00001 is a file: convert it with `rlftsim convert`"):
+        ScenarioDataset(source)
+    with pytest.raises(DataError, match=r"no such folder$"):
         ScenarioDataset(tmp_path / "none")
+    with pytest.raises(DataError, match="did you mean 'synthetic'"):
+        ScenarioDataset("syntetic")
+
+
+def test_the_home_folder_may_be_written_as_a_tilde(folder, monkeypatch):
+    monkeypatch.setenv("HOME", str(folder.parent))
+    assert len(ScenarioDataset(f"~/{folder.name}")) == len(ScenarioDataset(folder))
 
 
 @pytest.mark.official

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from rlftsim.scenario.index_row import classify_ego_manoeuvre, compute_index_row
+from rlftsim.scenario.index_row import classify_ego_maneuver, compute_index_row
 from rlftsim.scenario.womd import scenario_from_bytes
 
 
@@ -29,12 +29,12 @@ def drive(message, turn_rad, speed_mps=8.0):
         (0.0, 0.1, "stationary"),
     ],
 )
-def test_the_manoeuvre_of_the_ego_is_told_by_its_turn(make_message, turn_rad, speed_mps, expected):
-    assert classify_ego_manoeuvre(drive(make_message(), turn_rad, speed_mps)) == expected
+def test_the_maneuver_of_the_ego_follows_from_its_turn(make_message, turn_rad, speed_mps, expected):
+    assert classify_ego_maneuver(drive(make_message(), turn_rad, speed_mps)) == expected
 
 
-def test_without_a_future_the_manoeuvre_is_unknown(make_message):
-    assert classify_ego_manoeuvre(drive(make_message(num_steps=11), 0.0)) == "unknown"
+def test_without_a_future_the_maneuver_is_unknown(make_message):
+    assert classify_ego_maneuver(drive(make_message(num_steps=11), 0.0)) == "unknown"
 
 
 def test_the_index_row_counts_what_is_there_at_the_current_step(make_message):

@@ -164,8 +164,18 @@ def spoil_heading(m):
     m.tracks[1].states[17].heading = float("inf")
 
 
+def spoil_size(m):
+    m.tracks[1].states[17].length = float("nan")
+
+
 def spoil_map(m):
     m.map_features[1].road_edge.polyline[1].z = float("nan")
+
+
+def spoil_polygon(m):
+    polygon = m.map_features.add(id=9).crosswalk.polygon
+    for x in (1.0, 2.0, 1e300, float("inf")):
+        polygon.add(x=x, y=0.0, z=0.0)
 
 
 def spoil_ego(m):
@@ -207,8 +217,10 @@ def spoil_tracks(m):
 BAD = [
     (spoil_nan, "track 101 has a NaN or infinite position at step 17"),
     (spoil_infinite, "track 101 has a NaN or infinite position at step 17"),
-    (spoil_heading, "track 101 has a NaN or infinite size, heading or velocity at step 17"),
+    (spoil_heading, "track 101 has a NaN or infinite heading at step 17"),
+    (spoil_size, "track 101 has a NaN or infinite size at step 17"),
     (spoil_map, r"map feature 8 has a NaN or infinite point \(its point 1\)"),
+    (spoil_polygon, r"map feature 9 has a NaN or infinite point \(its point 2\)"),
     (spoil_ego, "no ego: sdc_track_index is 3, but there are 3 tracks"),
     (spoil_negative_ego, "no ego: sdc_track_index is -1"),
     (spoil_no_ego, "no ego: sdc_track_index is not set"),
@@ -222,6 +234,7 @@ BAD = [
 
 
 @pytest.mark.parametrize(("spoil", "cause"), BAD, ids=[spoil.__name__[6:] for spoil, _ in BAD])
+@pytest.mark.filterwarnings("error")
 def test_a_bad_scenario_is_named_and_the_others_survive(tmp_path, make_message, make_tfrecord, spoil, cause):
     bad = make_message("bad")
     spoil(bad)
@@ -251,7 +264,7 @@ def test_twenty_second_scenarios_are_refused_with_the_way_out(make_message):
         parse(make_message(num_steps=201))
 
 
-def test_skipped_records_are_logged_where_nobody_collects_them(tmp_path, make_message, make_tfrecord, caplog):
+def test_skipped_records_go_to_the_log_unless_they_are_collected(tmp_path, make_message, make_tfrecord, caplog):
     make_tfrecord(tmp_path / "x.tfrecord", b"nonsense", make_message())
     assert len(list(read_scenarios(tmp_path / "x.tfrecord", "skip"))) == 1
     assert "x.tfrecord: record 0: not a WOMD Scenario message" in caplog.text

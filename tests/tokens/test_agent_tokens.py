@@ -39,7 +39,7 @@ def track(positions, headings=None, valid=None) -> CleanTracks:
 @given(
     st.sampled_from(KINDS), st.floats(-math.pi, math.pi), st.floats(-80, 80), st.floats(-80, 80)
 )  # fmt: skip
-def test_who_stands_still_takes_token_0(vocabulary, kind, heading, x, y):
+def test_standing_agents_take_token_0(vocabulary, kind, heading, x, y):
     still = track(np.tile([x, y], (91, 1)), np.full(91, heading))
     tokens = tokenize_tracks(still, torch.tensor([[int(kind)]]), vocabulary)
     assert tokens.token_id.unique().tolist() == [0]
@@ -48,7 +48,7 @@ def test_who_stands_still_takes_token_0(vocabulary, kind, heading, x, y):
 
 @settings(max_examples=40, deadline=None)
 @given(st.data(), st.sampled_from(KINDS), st.floats(-math.pi, math.pi), st.floats(-50, 50), st.floats(-50, 50))
-def test_a_track_made_of_tokens_is_tokenised_back(vocabulary, data, kind, heading, x, y):
+def test_a_track_made_of_tokens_is_tokenized_back(vocabulary, data, kind, heading, x, y):
     object_type = torch.tensor([[int(kind)]])
     class_id = class_of_type(object_type)
     known = int(vocabulary.token_mask[class_id[0, 0]].sum())
@@ -101,11 +101,11 @@ def test_the_nearest_token_is_nearest_by_corners(vocabulary):
     assert int(tokens.token_id[0, 0, 0]) == int(distance.argmin())
 
 
-# ---- cleaning ---------------------------------------------------------------------------------------------------------
+# ---- cleaning ------------------------------------------------------------------------------------
 
 
 def with_missing(missing, mover=None):
-    """Batch of one agent with holes in its record."""
+    """Batch of one agent with holes in its log."""
     mover = scenes.Mover(speed_mps=7.0, turn_rate_radps=0.1) if mover is None else mover
     return collate([scenes.build_scenario("gaps", (replace(mover, missing=tuple(missing)),), num_predicted=0)])
 
@@ -147,7 +147,9 @@ def test_headings_are_interpolated_the_short_way_round():
     torch.testing.assert_close(wrap_angle(tracks.heading - whole.heading), torch.zeros(1, 1, 91), atol=1e-4, rtol=0)
 
 
-@pytest.mark.parametrize(("jump", "is_held"), [(1.4, False), (1.6, True), (3.1, True), (-1.6, True), (2 * math.pi - 0.1, False)])  # fmt: skip
+@pytest.mark.parametrize(
+    ("jump", "is_held"), [(1.4, False), (1.6, True), (3.1, True), (-1.6, True), (2 * math.pi - 0.1, False)]
+)
 def test_a_heading_that_jumps_is_held(jump, is_held):
     scenario = scenes.build_scenario("jump", (scenes.Mover(speed_mps=5.0),), num_predicted=0)
     heading = scenario.tracks.heading.copy()
@@ -172,7 +174,7 @@ def test_tracks_begin_early_enough_for_their_first_token(first, extra):
     )
 
 
-def test_a_record_without_future_has_two_tokens(vocabulary):
+def test_a_log_without_future_has_two_tokens(vocabulary):
     tokens = tokenize_agents(collate([scenes.without_future()]), vocabulary)
     assert tokens.token_id.shape[-1] == 2
     both = tokenize_agents(collate([scenes.without_future(), scenes.straight_road()]), vocabulary)

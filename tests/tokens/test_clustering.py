@@ -32,7 +32,7 @@ def test_every_token_is_nearest_to_a_motion_or_to_its_mirror_image(pack_scenario
         assert not coverage.is_implausible.any()
 
 
-def test_vehicles_of_every_speed_up_to_45_metres_per_second_have_a_token(pack_scenarios):
+def test_vehicles_of_every_speed_up_to_45_meters_per_second_have_a_token(pack_scenarios):
     config = replace(SMALL, num_tokens=512)
     for limit_mps, fastest_mps in ((45.0, 44.0), (0.0, 30.0)):
         vocabulary, _ = build_vocabulary(pack_scenarios, replace(config, straight_up_to_mps=limit_mps))
@@ -43,7 +43,7 @@ def test_vehicles_of_every_speed_up_to_45_metres_per_second_have_a_token(pack_sc
             assert ahead[ahead > -0.5].diff().max() < 1.5  # half of it is the farthest that any speed is from a token
 
 
-def test_the_wanted_share_of_motions_lies_within_a_disk(pack_scenarios, built):
+def test_the_wanted_fraction_of_motions_lies_within_a_disk(pack_scenarios, built):
     vocabulary, radii = built
     for coverage, radius in zip(measure_coverage(pack_scenarios, vocabulary), radii):
         assert coverage.single_m.count > 50
@@ -55,7 +55,7 @@ def test_the_wanted_share_of_motions_lies_within_a_disk(pack_scenarios, built):
 def test_more_tokens_mean_finer_disks(pack_scenarios, built):
     finer = build_vocabulary(pack_scenarios, replace(SMALL, num_tokens=256))[1]
     for coarse, fine in zip(built[1], finer):
-        at_finest = coarse < 0.022  # disks are never smaller than the jitter of recorded labels
+        at_finest = coarse < 0.022  # disks are never smaller than the jitter of logged labels
         assert fine < coarse or at_finest
 
 
@@ -67,7 +67,7 @@ def test_the_same_data_and_seed_give_the_same_vocabulary(pack_scenarios, vocabul
     assert not torch.equal(other.corners, vocabulary.corners)
 
 
-def test_only_the_drawn_scenarios_are_read(pack_scenarios):
+def test_only_the_sampled_scenarios_are_read(pack_scenarios):
     class Counted(list):
         read: typing.ClassVar = []
 
@@ -147,13 +147,19 @@ def test_no_scenario_gives_no_vocabulary():
         build_vocabulary([], SMALL)
 
 
-@pytest.mark.parametrize("changes", [{"num_tokens": 1}, {"num_map_prototypes": 0}, {"coverage": 0.0}, {"coverage": 1.1}, {"max_segments": 0}, {"max_scenarios": 0}])  # fmt: skip
+@pytest.mark.parametrize(
+    "changes",
+    [
+        *({"num_tokens": 1}, {"num_map_prototypes": 0}, {"coverage": 0.0}, {"coverage": 1.1}),
+        *({"max_segments": 0}, {"max_scenarios": 0}),
+    ],
+)
 def test_impossible_settings_are_refused(changes):
     with pytest.raises(ConfigError):
         TokensConfig(**changes)
 
 
-# ---- the file ---------------------------------------------------------------------------------------------------------
+# ---- the file ------------------------------------------------------------------------------------
 
 
 def test_a_vocabulary_comes_back_from_its_file(vocabulary, tmp_path):
@@ -166,8 +172,11 @@ def test_a_vocabulary_comes_back_from_its_file(vocabulary, tmp_path):
     assert [p.name for p in (tmp_path / "new").iterdir()] == ["v.safetensors"]
 
 
-@pytest.mark.parametrize(("content", "words"), [(None, "no such vocabulary"), (b"garbage", "damaged vocabulary"), (b"", "damaged vocabulary")])  # fmt: skip
-def test_a_file_that_is_no_vocabulary_is_refused(tmp_path, content, words):
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [(None, "no such vocabulary"), (b"garbage", "damaged vocabulary"), (b"", "damaged vocabulary")],
+)
+def test_a_file_that_is_not_a_vocabulary_is_refused(tmp_path, content, words):
     path = tmp_path / "v.safetensors"
     if content is not None:
         path.write_bytes(content)

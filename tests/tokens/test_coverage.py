@@ -1,4 +1,4 @@
-"""What is said about a vocabulary is true."""
+"""Coverage of a vocabulary: counts, errors and flags of made-up and real tokens."""
 
 import numpy as np
 import pytest
@@ -53,24 +53,24 @@ def test_one_sided_and_impossible_tokens_are_seen():
     assert cyclist.is_implausible.tolist() == [False, False, True]
     assert vehicle.asymmetry_m == pytest.approx(
         2 * 2.6 * np.sin(0.6), rel=0.01
-    )  # corners 2.6 m from the centre, 1.2 rad apart
+    )  # corners 2.6 m from the center, 1.2 rad apart
 
 
 @settings(max_examples=30, deadline=None)
 @given(st.lists(st.floats(1e-4, 100), min_size=1, max_size=300), st.floats(0.01, 1.0))
-def test_quantiles_of_a_stream_are_within_half_a_percent(values, share):
+def test_quantiles_of_a_stream_are_within_half_a_percent(values, fraction):
     spread = Spread()
     for part in torch.tensor(values).split(7):
         spread.add(part)
-    exact = np.quantile(np.array(values, np.float32), share, method="inverted_cdf")
-    assert spread.quantile(share) == pytest.approx(exact, rel=0.006)
+    exact = np.quantile(np.array(values, np.float32), fraction, method="inverted_cdf")
+    assert spread.quantile(fraction) == pytest.approx(exact, rel=0.006)
     assert spread.mean == pytest.approx(np.mean(values), rel=1e-5)
     assert spread.max == pytest.approx(max(values), rel=1e-6)
 
 
 @settings(max_examples=15, deadline=None)
 @given(st.integers(0, 2**31), st.sampled_from([1, 130, 700]))
-def test_the_nearest_token_is_found_without_looking_at_all(seed, num_tokens):
+def test_the_nearest_token_is_found_without_comparing_all(seed, num_tokens):
     generator = torch.Generator().manual_seed(seed)
 
     def drawn(count: int) -> torch.Tensor:

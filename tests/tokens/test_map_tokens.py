@@ -14,7 +14,7 @@ def pieces_of(*features):
     return split_map(scenes.build_scenario("map", scenes.TRAFFIC[:1], scenes.polylines(features)))
 
 
-def test_a_straight_lane_is_cut_every_five_metres():
+def test_a_straight_lane_is_cut_every_five_meters():
     pieces = pieces_of((LANE, [(0.0, 0.0), (21.0, 0.0)]))  # the last of the 22 points is dropped: 20 m
     begin = pieces.points[:, 0] - scenes.EGO_POSITION_M
     np.testing.assert_allclose(begin, [[0, 0], [5, 0], [10, 0], [15, 0]], atol=1e-3)

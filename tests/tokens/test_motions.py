@@ -10,11 +10,11 @@ import scenes
 from rlftsim.scenario.types import ObjectType
 from rlftsim.tokens.motions import (
     DistinctSample,
-    drawn_scenarios,
     is_plausible,
     mirrored,
     motion_keys,
     motions_of,
+    sample_scenarios,
 )
 
 MOTION = arrays.arrays(np.float32, (5, 6, 3), elements=st.floats(-1, 1, width=32))
@@ -40,7 +40,7 @@ def test_a_sample_does_not_depend_on_the_order_or_on_repetitions(order, cut, cap
     assert len(whole) == capacity
 
 
-def test_a_sample_is_even_over_a_stream_and_follows_its_seed():
+def test_a_sample_is_uniform_over_a_stream_and_follows_its_seed():
     parts = [rows(100_000)[start : start + 500] for start in range(0, 100_000, 500)]
     drawn = np.array(sampled(parts, 2000))
     quarters = np.histogram(drawn, 4, (0, 100_000))[0]
@@ -62,20 +62,23 @@ def test_a_motion_and_its_mirror_image_are_one(motions):
     assert (motion_keys(motions) == motion_keys(mirrored(motions))).all()
 
 
-def test_drawn_scenarios_are_spread_over_the_whole_data_set():
-    drawn = drawn_scenarios(10_000, 500, seed=1)
+def test_sampled_scenarios_are_spread_over_the_whole_data_set():
+    drawn = sample_scenarios(10_000, 500, seed=1)
     assert len(set(drawn)) == 500
     assert drawn == sorted(drawn)
     assert np.histogram(drawn, 4, (0, 10_000))[0].min() > 80
-    assert drawn_scenarios(3, 500, seed=1) == drawn_scenarios(3, None, seed=1) == [0, 1, 2]
+    assert sample_scenarios(3, 500, seed=1) == sample_scenarios(3, None, seed=1) == [0, 1, 2]
 
 
 @pytest.mark.parametrize(
     ("speed", "turn", "class_id", "plausible"),
-    [(4.4, 0.0, 0, True), (4.6, 0.0, 0, False), (1.3, 0.0, 1, False), (0.1, 0.2, 1, True), (0.1, 0.53, 1, False), (2.4, 0.1, 2, True)],
-)  # fmt: skip
-def test_what_nobody_can_do_is_a_glitch(speed, turn, class_id, plausible):
-    """A way of `speed` metres, and once a turn, within 0.1 s."""
+    [
+        *((4.4, 0.0, 0, True), (4.6, 0.0, 0, False), (1.3, 0.0, 1, False)),
+        *((0.1, 0.2, 1, True), (0.1, 0.53, 1, False), (2.4, 0.1, 2, True)),
+    ],
+)
+def test_impossible_motions_are_glitches(speed, turn, class_id, plausible):
+    """A way of `speed` meters, and once a turn, within 0.1 s."""
     motion = np.zeros((1, 6, 3), np.float32)
     motion[0, :, 0] = speed * np.arange(6)
     motion[0, 3:, 2] = turn

@@ -1,4 +1,4 @@
-"""Label smoothing over near tokens: known shares, sums to one, a gradient that is the weights."""
+"""Label smoothing over near tokens: known probabilities, sums to one, a gradient that is the weights."""
 
 import numpy as np
 import pytest

@@ -67,7 +67,7 @@ def test_map_pieces_lie_where_the_public_code_puts_them(batch, preprocessed):
     assert len(pieces.heading) == 2121
     np.testing.assert_allclose(pieces.points, preprocessed["map_traj_pos"], atol=5e-4, rtol=0)
     turn = np.remainder(pieces.heading - preprocessed["map_traj_theta"] + np.pi, 2 * np.pi) - np.pi
-    assert np.quantile(np.abs(turn), 0.99) < 1e-3  # headings of half a metre of float32 world coordinates
+    assert np.quantile(np.abs(turn), 0.99) < 1e-3  # headings of 0.5 m of float32 world coordinates
 
 
 def test_kinds_types_and_lights_of_map_pieces_are_exactly_the_same(batch, preprocessed):

@@ -63,7 +63,7 @@ def test_lonely_cells_go_and_holes_are_filled():
 
 
 @pytest.mark.parametrize(("around", "stays"), [(19, False), (20, True)])
-def test_twenty_neighbours_keep_a_cell(around, stays):
+def test_twenty_neighbors_keep_a_cell(around, stays):
     used = np.zeros((9, 9), bool)
     used.flat[:around] = True
     used[4, 4] = True
@@ -71,13 +71,13 @@ def test_twenty_neighbours_keep_a_cell(around, stays):
 
 
 @pytest.mark.parametrize(("around", "added"), [(20, False), (21, True)])
-def test_more_than_twenty_neighbours_add_a_cell(around, added):
+def test_more_than_twenty_neighbors_add_a_cell(around, added):
     used = np.zeros((9, 9), bool)
     used.flat[:around] = True
     assert smoothed(used, CONFIG)[4, 4] == added
 
 
-def test_an_added_cell_ends_with_its_neighbours_heading_and_is_under_way_at_both_ends():
+def test_an_added_cell_ends_with_its_neighbors_heading_and_is_under_way_at_both_ends():
     tokens = tokens_of(all_around(0.3, leave_out=(5, 3)))
     [made] = tokens[np.abs(tokens[:, -1, :2] - (1.5, 0.3)).max(1) < 1e-4]
     assert made[-1, 2] == pytest.approx(0.3, abs=1e-5)

@@ -1,4 +1,4 @@
-"""A toy: one agent, a road that forks, two recorded futures of the same history, one for each branch."""
+"""A toy: one agent, a road that forks, two logged futures of the same history, one for each branch."""
 
 from dataclasses import replace
 from functools import cache
@@ -57,8 +57,8 @@ def fork():
     policy, batch = SmartPolicy(MODEL, vocabulary), collate(both)
     optimizer = torch.optim.AdamW(policy.parameters(), lr=3e-3)
     for _ in range(120):
-        said = policy.teacher_forced(batch, batch.agent_mask)
-        loss = cross_entropy(said.logits[said.target_mask], said.target[said.target_mask])
+        dist = policy.teacher_forced(batch, batch.agent_mask)
+        loss = cross_entropy(dist.logits[dist.target_mask], dist.target[dist.target_mask])
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()

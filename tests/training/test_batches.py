@@ -1,35 +1,35 @@
-"""Shares of processes and pieces that fit into memory."""
+"""Parts for processes, and pieces that fit into memory."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-import tiny
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+import tiny
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.synthetic import pack_path
-from rlftsim.training.batches import micro_batches, scenario_costs, share_out
+from rlftsim.training.batches import balance_by_cost, micro_batches, scenario_costs
 
 COSTS = st.lists(st.floats(0.1, 100.0), min_size=1, max_size=24)
 
 
-@given(costs=COSTS, num_shares=st.integers(1, 6))
-def test_shares_hold_everything_once_and_cost_about_the_same(costs, num_shares):
-    shares = share_out(costs, num_shares)
-    assert sorted(i for share in shares for i in share) == list(range(len(costs)))
-    spent = [sum(costs[i] for i in share) for share in shares]
-    assert max(spent) - min(spent) <= max(costs) + 1e-6  # nobody waits longer than the dearest scenario takes
+@given(costs=COSTS, num_parts=st.integers(1, 6))
+def test_parts_hold_everything_once_and_cost_about_the_same(costs, num_parts):
+    parts = balance_by_cost(costs, num_parts)
+    assert sorted(i for share in parts for i in share) == list(range(len(costs)))
+    spent = [sum(costs[i] for i in share) for share in parts]
+    assert max(spent) - min(spent) <= max(costs) + 1e-6  # less than the most expensive scenario
 
 
 def test_equal_costs_are_dealt_out_in_turn():
-    assert share_out([1.0] * 5, 2) == [[0, 2, 4], [1, 3]]
+    assert balance_by_cost([1.0] * 5, 2) == [[0, 2, 4], [1, 3]]
 
 
 def test_a_crowded_scenario_is_set_off_by_several_small_ones():
-    assert share_out([1.0, 6.0, 2.0, 2.0, 1.0], 2) == [[1], [0, 2, 3, 4]]
+    assert balance_by_cost([1.0, 6.0, 2.0, 2.0, 1.0], 2) == [[1], [0, 2, 3, 4]]
 
 
 @given(costs=COSTS, max_count=st.integers(1, 8), max_cost=st.none() | st.floats(0.1, 300.0))

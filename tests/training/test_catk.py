@@ -4,16 +4,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import tiny
 import torch
 
+import tiny
+from catk_loss import catk_loss
 from rlftsim.errors import ConfigError
 from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.rollout.policy import Sampling
 from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.types import CURRENT_STEP
-from rlftsim.training.catk import CatkConfig, catk_finetune, catk_loss, roll_out_closest
+from rlftsim.training.catk import CatkConfig, catk_finetune, roll_out_closest
 from rlftsim.training.run_folder import read_metrics
 
 ENDS = slice(4, None, 5)
@@ -30,8 +31,8 @@ def batch(drawn_scenarios):
     return collate(drawn_scenarios)
 
 
-def distance_from_record(batch, rollouts):
-    """Mean distance at the ends of decisions, metres, where recorded."""
+def distance_from_log(batch, rollouts):
+    """Mean distance at the ends of decisions, meters, where logged."""
     future = slice(CURRENT_STEP + 1, None)
     off = (rollouts.position[:, 0] - batch.position[:, :, future])[:, :, ENDS].norm(dim=-1)
     return off[batch.valid[:, :, future][:, :, ENDS]].mean()
@@ -40,49 +41,49 @@ def distance_from_record(batch, rollouts):
 def test_with_one_candidate_it_is_a_greedy_rollout(policy, batch):
     greedy = simulate(policy, batch, num_rollouts=1, seed=0, sampling=Sampling(temperature=0.0))
     for choice in ("closest", "top_k"):
-        pursuing = roll_out_closest(policy, batch, num_candidates=1, choice=choice)
-        assert torch.equal(pursuing.rollouts.decision, greedy.decision)
+        targeted = roll_out_closest(policy, batch, num_candidates=1, choice=choice)
+        assert torch.equal(targeted.rollouts.decision, greedy.decision)
 
 
 def test_with_all_candidates_it_decides_as_it_should(policy, batch, vocabulary):
-    pursuing = roll_out_closest(policy, batch, num_candidates=vocabulary.num_tokens)
-    recorded = pursuing.target_mask
-    assert torch.equal(pursuing.rollouts.decision[recorded], pursuing.target[recorded])
+    targeted = roll_out_closest(policy, batch, num_candidates=vocabulary.num_tokens)
+    logged = targeted.target_mask
+    assert torch.equal(targeted.rollouts.decision[logged], targeted.target[logged])
 
 
 def test_the_nearest_token_drawn_alone_is_the_target(policy, batch):
-    pursuing = roll_out_closest(policy, batch, num_candidates=1, choice="trajeglish")
-    recorded = pursuing.target_mask
-    assert torch.equal(pursuing.rollouts.decision[recorded], pursuing.target[recorded])
+    targeted = roll_out_closest(policy, batch, num_candidates=1, choice="trajeglish")
+    logged = targeted.target_mask
+    assert torch.equal(targeted.rollouts.decision[logged], targeted.target[logged])
 
 
-def test_more_candidates_keep_nearer_to_the_record_than_chance(policy, batch):
+def test_more_candidates_keep_nearer_to_the_log_than_chance(policy, batch):
     by_chance = roll_out_closest(policy, batch, num_candidates=24, choice="top_k", seed=1)
     again = roll_out_closest(policy, batch, num_candidates=24, choice="top_k", seed=2)
     assert not torch.equal(by_chance.rollouts.decision, again.rollouts.decision)
     few, many = (roll_out_closest(policy, batch, num_candidates=k) for k in (4, 24))
     drawn_near = roll_out_closest(policy, batch, num_candidates=4, choice="trajeglish", seed=1)
-    off = [float(distance_from_record(batch, p.rollouts)) for p in (many, few, by_chance, drawn_near)]
+    off = [float(distance_from_log(batch, p.rollouts)) for p in (many, few, by_chance, drawn_near)]
     assert off[0] < off[1] < off[2]
     assert off[3] < off[2]
 
 
-def test_what_has_strayed_does_not_count_if_so_wished(policy, batch):
-    pursuing = roll_out_closest(policy, batch, num_candidates=4, choice="top_k", seed=3)
+def test_what_has_strayed_does_not_count_with_max_distance_lengths(policy, batch):
+    targeted = roll_out_closest(policy, batch, num_candidates=4, choice="top_k", seed=3)
     strict = roll_out_closest(policy, batch, num_candidates=4, choice="top_k", seed=3, max_distance_lengths=1.0)
-    assert torch.equal(strict.rollouts.decision, pursuing.rollouts.decision)
+    assert torch.equal(strict.rollouts.decision, targeted.rollouts.decision)
     # by hand: cars of 4.8 m, pedestrians and cyclists of 1 and 2 m, from where they stand before each decision
     length = torch.tensor([0.0, 4.8, 1.0, 2.0, 4.8])[batch.object_type]
     before = torch.cat(
-        [batch.position[:, :, None, CURRENT_STEP], pursuing.rollouts.position[:, 0, :, ENDS][:, :, :-1]], 2
+        [batch.position[:, :, None, CURRENT_STEP], targeted.rollouts.position[:, 0, :, ENDS][:, :, :-1]], 2
     )
     steps = range(CURRENT_STEP, 86, 5)
     off = (before - batch.position[:, :, steps]).norm(dim=-1)
     plain = batch.valid[:, :, CURRENT_STEP:].all(-1) & batch.agent_mask  # no gap that would be filled
-    near = (off <= length[..., None]) & pursuing.target_mask[:, 0]
-    clear = plain[..., None] & ((off - length[..., None]).abs() > 0.5)  # history tokens lead beside the record a little
+    near = (off <= length[..., None]) & targeted.target_mask[:, 0]
+    clear = plain[..., None] & ((off - length[..., None]).abs() > 0.5)  # history tokens lead beside the log a little
     assert bool((strict.target_mask[:, 0] == near)[clear].all())
-    assert 0 < int(strict.target_mask.sum()) < int(pursuing.target_mask.sum())
+    assert 0 < int(strict.target_mask.sum()) < int(targeted.target_mask.sum())
 
 
 def test_a_few_updates_lower_the_closed_loop_loss(vocabulary, drawn_scenarios, batch, tmp_path):
@@ -108,7 +109,7 @@ def test_a_few_updates_lower_the_closed_loop_loss(vocabulary, drawn_scenarios, b
 def test_where_nothing_counts_the_loss_is_zero(stage, vocabulary, drawn_scenarios, tmp_path):
     [scenario] = drawn_scenarios[:1]
     valid = scenario.tracks.valid.copy()
-    valid[:, CURRENT_STEP + 1 :] = False  # recorded until now, and never again
+    valid[:, CURRENT_STEP + 1 :] = False  # logged until now, and never again
     alone = replace(scenario, tracks=replace(scenario.tracks, valid=valid))
     policy = tiny.tiny_policy(vocabulary)
     tiny.train(stage, policy, [alone], tmp_path, epochs=1.0)
@@ -143,6 +144,6 @@ def test_what_cannot_be_fine_tuned_is_refused(vocabulary, drawn_scenarios, tmp_p
 
 def test_published_numbers_are_the_defaults():
     config = CatkConfig()
-    assert (config.learning_rate, config.final_learning_rate_share, config.label_smoothing) == (5e-5, 0.05, 0.0)
+    assert (config.learning_rate, config.final_lr_ratio, config.label_smoothing) == (5e-5, 0.05, 0.0)
     assert (config.batch_size, config.num_candidates, config.gradient_clip) == (80, 32, 0.5)
     assert np.isclose(config.weight_decay, 0.01)

@@ -1,16 +1,17 @@
 import copy
+import resource
 import shutil
 
 import pytest
 import torch
 from torch import nn
 
-from rlftsim.errors import CheckpointError
+from rlftsim.errors import CheckpointError, DataError
 from rlftsim.training.checkpoint import Progress, newest_checkpoint, read_checkpoint, write_checkpoint
 
 
 def small_run(seed=0, steps=3):
-    """A module and an optimiser that has moments."""
+    """A module and an optimizer that has moments."""
     torch.manual_seed(seed)
     module = nn.Sequential(nn.Linear(3, 4), nn.LayerNorm(4), nn.Linear(4, 2))
     optimizer = torch.optim.AdamW(module.parameters(), lr=1e-2)
@@ -40,7 +41,7 @@ def test_a_checkpoint_gives_back_weights_and_moments_bit_for_bit(tmp_path):
     assert all(torch.equal(a, b) for a, b in zip(module.parameters(), other.parameters()))
 
 
-def test_the_learning_rate_in_force_is_the_optimisers_own(tmp_path):
+def test_the_learning_rate_in_force_is_the_optimizers_own(tmp_path):
     module, optimizer = small_run()
     path = write_checkpoint(tmp_path, Progress(1), {"policy": module}, optimizer)
     other, other_optimizer = small_run(seed=1)
@@ -75,6 +76,20 @@ def test_writing_goes_on_over_what_a_killed_run_left(tmp_path):
     path = write_checkpoint(tmp_path, Progress(4), {"policy": module}, optimizer)
     assert not leftover.exists()
     assert read_checkpoint(path, {"policy": copy.deepcopy(module)}, optimizer).update == 4
+
+
+def test_a_checkpoint_that_does_not_fit_on_the_disk_is_named_and_the_older_one_stays(tmp_path):
+    module, optimizer = small_run()
+    good = write_checkpoint(tmp_path, Progress(2), {"policy": module}, optimizer)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (64, before[1]))  # no file may grow larger, as on a full disk
+    try:
+        with pytest.raises(DataError, match=r"cannot write .*update-00000004/policy\.safetensors .*make room"):
+            write_checkpoint(tmp_path, Progress(4), {"policy": module}, optimizer)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert newest_checkpoint(tmp_path) == good
+    assert read_checkpoint(good, {"policy": module}, optimizer).update == 2
 
 
 @pytest.mark.parametrize("name", ["policy.safetensors", "optimizer.safetensors", "progress.json"])

@@ -6,21 +6,22 @@ import math
 from dataclasses import replace
 
 import pytest
-import tiny
 import torch
 
 import scenes
+import tiny
 from rlftsim.errors import CheckpointError, ConfigError
+from rlftsim.rewards import REWARDS, register_reward
 from rlftsim.rollout.baselines import ConstantVelocity
+from rlftsim.rollout.noise import derive_seed
 from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import collate
+from rlftsim.training import experience
 from rlftsim.training import finetune as module
 from rlftsim.training.finetune import FinetuneConfig, compute_reward, finetune, prepare, update_policy
 from rlftsim.training.parallel import start_fabric
 from rlftsim.training.policy_gradient import masked_sum
 from rlftsim.training.reference import KlConfig
-from rlftsim.training.rewards import register_reward
-from rlftsim.training.rewards.base import _REWARDS
 from rlftsim.training.run_folder import read_metrics
 
 CONFIG = replace(tiny.FINETUNE, num_rollouts=4, gradient_clip=1e9)
@@ -53,11 +54,11 @@ def reward_of():
 
     yield register
     for name in names:
-        del _REWARDS[name]
+        REWARDS.remove(name)
 
 
-def nothing(scores, rollouts, batch):
-    return torch.zeros_like(scores.single_meta_metric)
+def nothing(realism, rollouts, batch):
+    return torch.zeros_like(realism.single_meta_metric)
 
 
 def move_weights(policy, size=0.05):
@@ -77,13 +78,13 @@ def moved(module, before):
 
 
 def test_an_update_moves_the_decoder_and_nothing_else(learner, batch, fabric):
-    before, held = snapshot(learner.policy), snapshot(learner.reference)
+    before, reference = snapshot(learner.policy), snapshot(learner.reference)
     update_policy(learner, batch, CONFIG, fabric)
     changed = moved(learner.policy, before)
     assert changed
     parts = ("time_layers", "map_layers", "agent_layers", "head")
     assert all(name.startswith(tuple(f"network.decoder.{part}" for part in parts)) for name in changed)
-    assert moved(learner.reference, held) == []
+    assert moved(learner.reference, reference) == []
 
 
 def test_training_everything_reaches_the_map_encoder(vocabulary, batch, fabric):
@@ -100,21 +101,21 @@ def test_scored_log_probs_equal_the_sampled_ones_and_the_gap_is_logged(learner, 
 
 
 def test_the_logged_gap_would_show_a_policy_that_is_scored_otherwise_than_sampled(learner, batch, fabric, monkeypatch):
-    original = module.simulate
+    original = experience.simulate
 
     def sampled_with_other_weights(policy, *args, **options):
         other = copy.deepcopy(policy)
         move_weights(other, 0.02)
         return original(other, *args, **options)
 
-    monkeypatch.setattr(module, "simulate", sampled_with_other_weights)
+    monkeypatch.setattr(experience, "simulate", sampled_with_other_weights)
     assert update_policy(learner, batch, CONFIG, fabric)["score_gap"] > 1e-3
 
 
 def test_credit_by_agent_weighs_each_agents_decisions_by_what_it_earned(learner, batch, fabric):
-    config = replace(CONFIG, credit="agent", shared_credit=0.25)
+    config = replace(CONFIG, credit="agent", credit_mixing=0.25)
     found = gradients_with(learner, batch, fabric, config, beta=0.0)
-    seed = module.derive_seed(config.seed, "rollouts", learner.update)
+    seed = derive_seed(config.seed, "rollouts", learner.update)
     rollouts = simulate(learner.policy, batch, num_rollouts=4, seed=seed)
     earned = compute_reward(batch, rollouts, config)[1].by_agent  # [B, N, A]
     learner.policy.zero_grad()
@@ -142,7 +143,7 @@ def test_every_term_of_the_reward_is_logged_for_itself(learner, batch, fabric):
         "reward_mloo_mean", "reward_mloo_std", "reward_minade_rloo_mean", "reward_minade_rloo_std",
     }  # fmt: skip
     assert alone["mloo"]["reward_mloo_std"] == alone["mloo"]["reward_std"]
-    assert values["reward_minade_rloo_std"] > values["reward_mloo_std"] > 0  # metres against shares of the metric
+    assert values["reward_minade_rloo_std"] > values["reward_mloo_std"] > 0  # metres against fractions of the metric
     assert values["reward_mloo_mean"] == pytest.approx(0.0, abs=1e-6)
 
 
@@ -176,7 +177,7 @@ def test_gradients_do_not_depend_on_how_many_rollouts_are_scored_at_once(vocabul
 
 
 def test_gradients_do_not_depend_on_how_many_scenarios_are_in_memory_at_once(vocabulary, drawn_scenarios, fabric):
-    batch, found = collate(drawn_scenarios), []  # of different sizes, one with gaps in its record
+    batch, found = collate(drawn_scenarios), []  # of different sizes, one with gaps in its log
     base = replace(CONFIG, num_rollouts=2, reward="mloo + 0.1*collision_offroad_ade", credit="agent")
     for micro_batch_size in (8, 3, 1):
         config = replace(base, micro_batch_size=micro_batch_size)
@@ -205,13 +206,13 @@ def test_with_a_reward_of_zero_the_gradient_is_beta_times_that_of_the_kl(learner
     move_weights(learner.reference)
     found = gradients_with(learner, batch, fabric, config, beta=0.3)
     rollouts = simulate(
-        learner.policy, batch, num_rollouts=4, seed=module.derive_seed(config.seed, "rollouts", learner.update)
+        learner.policy, batch, num_rollouts=4, seed=derive_seed(config.seed, "rollouts", learner.update)
     )
     learner.policy.zero_grad()
-    scored = learner.policy.score(learner.policy.encode(batch), rollouts)
+    dist = learner.policy.score(learner.policy.encode(batch), rollouts)
     with torch.no_grad():
-        held = learner.reference.score(learner.reference.encode(batch), rollouts)
-    kl = masked_sum(scored.kl(held), rollouts.decision_mask) / rollouts.decision_mask.sum()
+        ref_dist = learner.reference.score(learner.reference.encode(batch), rollouts)
+    kl = masked_sum(dist.kl(ref_dist), rollouts.decision_mask) / rollouts.decision_mask.sum()
     kl.backward()
     for name, gradient in tiny.gradients_of(learner.policy).items():
         torch.testing.assert_close(found[name], 0.3 * gradient, atol=1e-6, rtol=1e-4, msg=name)
@@ -231,8 +232,8 @@ def test_the_sum_over_decisions_pulls_harder_than_their_mean(learner, batch, fab
 
 
 def test_a_reward_that_is_no_number_counts_as_none(batch, learner, reward_of):
-    def broken(scores, rollouts, batch):
-        values = scores.single_meta_metric.clone()
+    def broken(realism, rollouts, batch):
+        values = realism.single_meta_metric.clone()
         values[0, 1] = torch.nan
         return values
 
@@ -257,9 +258,9 @@ def poison_from(monkeypatch, update):
 
     def poisoned(*args):
         calls.append(1)
-        scores, rewards = original(*args)
+        realism, rewards = original(*args)
         poison = torch.nan if len(calls) >= update else 1.0
-        return scores, replace(rewards, by_agent=rewards.by_agent * poison)
+        return realism, replace(rewards, by_agent=rewards.by_agent * poison)
 
     monkeypatch.setattr(module, "compute_reward", poisoned)
 
@@ -297,8 +298,8 @@ def test_a_run_that_diverges_stops_and_names_its_last_good_checkpoint(
     with pytest.raises(CheckpointError, match=r"3 updates in a row .*update-00000002.*learning_rate"):
         finetune(tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path, config)
     assert [line["skipped"] for line in read_metrics(tmp_path)] == [0, 0, 0, 1, 2, 3]
-    said = [line for line in capsys.readouterr().err.splitlines() if "skipped" in line]
-    assert said == [
+    warnings = [line for line in capsys.readouterr().err.splitlines() if "skipped" in line]
+    assert warnings == [
         f"update {3 + n} skipped: its gradient is not finite ({n} in a row, the run stops at 3)" for n in (1, 2, 3)
     ]
     assert not (tmp_path / "model").exists()
@@ -311,12 +312,12 @@ def test_a_run_whose_kl_exploded_says_so_and_stops(vocabulary, drawn_scenarios, 
     config = replace(tiny.FINETUNE, epochs=5.0, max_kl=1e-9, max_skipped_in_a_row=2)
     with pytest.raises(CheckpointError, match=r"2 updates in a row .*KL above max_kl"):
         finetune(tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path, config)
-    said = [line for line in capsys.readouterr().err.splitlines() if "skipped" in line]
-    assert "nats per decision is above max_kl=1e-09 (1 in a row, the run stops at 2)" in said[0]
+    warnings = [line for line in capsys.readouterr().err.splitlines() if "skipped" in line]
+    assert "nats per decision is above max_kl=1e-09 (1 in a row, the run stops at 2)" in warnings[0]
 
 
 def test_the_reference_moves_every_so_many_updates(learner, batch, fabric):
-    config = replace(CONFIG, kl=KlConfig(reference_every=2, reference_share=0.25))
+    config = replace(CONFIG, kl=KlConfig(reference_sync_every=2, reference_ema=0.25))
     first = snapshot(learner.reference)
     update_policy(learner, batch, config, fabric)
     assert moved(learner.reference, first) == []

@@ -1,4 +1,4 @@
-"""The estimator on toys small enough to enumerate: expectations are sums over everything that can happen, so nothing is left to luck.
+"""The estimator on toys small enough to enumerate: expectations are sums over everything that can happen.
 
 The parts are those of the package: its distribution, its baselines, its loss and, for proposition 1, its metric.
 """
@@ -12,16 +12,16 @@ import torch
 from torch import Tensor
 
 import scenes
-from rlftsim.policies.smart.distribution import TokenDistribution
+from rlftsim.policies.distributions import TokenDistribution
 from rlftsim.realism import SimulatedStates, score
 from rlftsim.realism.from_rollouts import states_of_rollouts
+from rlftsim.rewards import leave_one_out
+from rlftsim.rewards.mloo import compute_mloo
 from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.rollout.policy import Sampling
 from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import collate
 from rlftsim.training.policy_gradient import agent_log_prob, policy_gradient_loss
-from rlftsim.training.rewards import leave_one_out
-from rlftsim.training.rewards.mloo import compute_mloo
 
 NUM_TOKENS = 3
 
@@ -67,7 +67,7 @@ def groups(num_outcomes, num_rollouts):
 
 
 def expected_estimate(reward, log_prob, probability, parameters):
-    """Expectation over groups of what the loss pulls along: its gradient, each group weighted by how often it happens."""
+    """Expected gradient of the loss: over all groups, each weighted by its probability."""
     weight = probability.detach().view(-1, *[1] * (reward.dim() - 1))
     return -gradient(policy_gradient_loss(weight * reward, log_prob, 1), parameters)
 
@@ -126,7 +126,7 @@ def test_the_leave_one_out_baseline_makes_the_estimate_steadier():
     assert spread[1] < 0.1 * spread[0]
 
 
-# ---- proposition 1, with the metric itself -------------------------------------------------------------------------------
+# ---- proposition 1, with the metric itself -------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -190,17 +190,17 @@ def test_climbing_along_mloo_raises_the_metric_of_a_group(metric):
     assert all(later > earlier for earlier, later in pairwise(values))
 
 
-# ---- credit by agent ----------------------------------------------------------------------------------------------------
+# ---- credit by agent -----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Company:
-    """Two agents decide once each, independently; what agent a earns for itself is worth[a][its token][the other's token]."""
+    """Two agents decide once each, independently; agent a earns worth[a][its token][the other's token]."""
 
     worth: Tensor
 
     def estimate_and_truth(self, shared, num_rollouts=2):
-        """Mean of the estimate with credit by agent over all groups, N times the gradient of the expected reward, and the
+        """Mean of the estimate with credit by agent over all groups, N times the gradient of the expected reward, the
         estimate's variance summed over weights."""
         logits = random_logits(2, NUM_TOKENS, seed=2)
         log_probs = torch.log_softmax(logits, -1)
@@ -249,22 +249,22 @@ def test_what_agents_do_to_each_other_counts_as_far_as_it_is_shared(shared):
         assert truth[1 - b, b].abs().max() > 1e-3
 
 
-# ---- KL -----------------------------------------------------------------------------------------------------------------
+# ---- KL ------------------------------------------------------------------------------------------------------------
 
 
 def test_the_kl_of_a_decision_is_the_sum_over_the_vocabulary():
     logits, other = random_logits(1, 5, seed=1), random_logits(1, 5, seed=2)
-    everybody = torch.ones(1, dtype=torch.bool)
+    present = torch.ones(1, dtype=torch.bool)
     p, q = ([math.exp(x) for x in values[0].tolist()] for values in (logits, other))
     p, q = [x / sum(p) for x in p], [x / sum(q) for x in q]
     expected = sum(a * math.log(a / b) for a, b in zip(p, q))
-    found = TokenDistribution(logits, everybody).kl(TokenDistribution(other, everybody))
+    found = TokenDistribution(logits, present).kl(TokenDistribution(other, present))
     assert found.item() == pytest.approx(expected, rel=1e-12)
     assert expected > 0.1
 
 
 def test_the_kl_per_decision_adds_up_to_that_of_whole_rollouts():
-    """sum_tau p ln(p / q) = sum_tau p sum_l KL_l(tau): what is averaged over decisions is the KL of what is simulated."""
+    """sum_tau p ln(p / q) = sum_tau p sum_l KL_l(tau): the mean over decisions is the KL of simulations."""
     toy, other = TwoDecisions(seed=0), TwoDecisions(seed=1)
     probability = toy.probability()
     by_decision = toy.distribution(toy.rollouts).kl(other.distribution(toy.rollouts))  # [9, 2]

@@ -3,10 +3,10 @@ from dataclasses import replace
 from itertools import pairwise
 
 import pytest
-import tiny
 import torch
 
 import scenes
+import tiny
 from rlftsim.errors import ConfigError
 from rlftsim.scenario.batch import collate
 from rlftsim.tokens.smoothing import neighbor_weights
@@ -60,14 +60,14 @@ def test_evaluated_agents_come_first_and_the_limit_holds():
     assert not torch.equal(chosen, other)
 
 
-def test_without_a_limit_everybody_near_with_a_future_is_trained_on():
+def test_without_a_limit_all_agents_near_with_a_future_are_trained_on():
     batch = collate([scenes.with_gaps()])
     assert torch.equal(trained_agents(batch, 0, **NEAR), batch.agent_mask)
     assert torch.equal(trained_agents(batch, 0, **{**NEAR, "radius_m": 0.1}), batch.evaluated_mask)
 
 
 def test_the_learning_rate_warms_up_and_falls_along_a_cosine():
-    config = PretrainConfig(learning_rate=1.0, warmup_updates=4, final_learning_rate_share=0.1)
+    config = PretrainConfig(learning_rate=1.0, warmup_updates=4, final_lr_ratio=0.1)
     rates = [learning_rate(u, 24, config) for u in range(24)]
     assert rates[:4] == pytest.approx([0.25, 0.5, 0.75, 1.0])
     assert rates[4] == pytest.approx(1.0)
@@ -87,7 +87,7 @@ class Weightless:
 
 
 def test_what_cannot_be_pre_trained_is_refused(drawn_scenarios, vocabulary, tmp_path):
-    with pytest.raises(ConfigError, match="Weightless cannot be pre-trained"):
+    with pytest.raises(ConfigError, match="Weightless has no weights: there is nothing for pre-training to train"):
         pretrain(Weightless(), drawn_scenarios, tmp_path, tiny.PRETRAIN)  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="no scenario to train on"):
         pretrain(tiny.tiny_policy(vocabulary), [], tmp_path, tiny.PRETRAIN)
@@ -110,23 +110,24 @@ def test_smoothing_may_go_to_the_tokens_near_the_target(vocabulary, drawn_scenar
         pretrain(policy, drawn_scenarios, tmp_path / kind, replace(config, label_smoothing_kind=kind))
         losses[kind] = read_metrics(tmp_path / kind)[0]["loss"]
     batch = collate(drawn_scenarios)
-    said = tiny.tiny_policy(vocabulary, tiny.WITHOUT_CHANCE).teacher_forced(batch, batch.agent_mask)
-    rows = said.target_mask
-    targets, classes = said.target[rows], said.class_id[rows]
-    log_probs = said.logits[rows].log_softmax(-1)
+    dist = tiny.tiny_policy(vocabulary, tiny.WITHOUT_CHANCE).teacher_forced(batch, batch.agent_mask)
+    rows = dist.target_mask
+    targets, classes = dist.target[rows], dist.class_id[rows]
+    log_probs = dist.logits[rows].log_softmax(-1)
     weights = neighbor_weights(vocabulary, classes, targets)
     near = (weights * log_probs.clamp(min=-100)).sum(-1)
     expected = -(0.7 * log_probs.gather(-1, targets[:, None])[:, 0] + 0.3 * near).sum()
-    assert float(summed_loss(said, 0.3, vocabulary)[0].detach()) == pytest.approx(float(expected.detach()), rel=1e-4)
+    assert float(summed_loss(dist, 0.3, vocabulary).loss.detach()) == pytest.approx(float(expected.detach()), rel=1e-4)
     assert losses["spatial"] != pytest.approx(losses["uniform"], rel=1e-3)
 
 
 def test_the_entropy_of_predictions_is_logged(vocabulary, drawn_scenarios, tmp_path):
     policy = tiny.tiny_policy(vocabulary, tiny.WITHOUT_CHANCE)
     batch = collate(drawn_scenarios)
-    said = policy.teacher_forced(batch, batch.agent_mask)
-    entropies = torch.distributions.Categorical(logits=said.logits[said.target_mask]).entropy()
-    _, (_, _, entropy, count) = summed_loss(said, 0.0)
+    dist = policy.teacher_forced(batch, batch.agent_mask)
+    entropies = torch.distributions.Categorical(logits=dist.logits[dist.target_mask]).entropy()
+    summed = summed_loss(dist, 0.0)
+    entropy, count = summed.sums["entropy"], summed.count
     assert float(entropy / count) == pytest.approx(float(entropies.mean()), rel=1e-5)
     config = replace(tiny.PRETRAIN, epochs=1.0, batch_size=len(drawn_scenarios))
     pretrain(policy, drawn_scenarios, tmp_path, config)

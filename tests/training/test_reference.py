@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from torch import nn
 
 from rlftsim.errors import ConfigError
-from rlftsim.training.reference import KlConfig, adapt_beta, move_reference
+from rlftsim.training.reference import KlConfig, adapt_beta, sync_reference
 
 CONFIG = KlConfig()  # target 0.01, horizon 5
 
@@ -58,7 +58,7 @@ def test_the_reference_moves_a_share_of_the_way():
         policy.weight.fill_(3.0)
         reference.weight.fill_(1.0)
     reference.requires_grad_(False)
-    move_reference(reference, policy, 0.25)  # 0.25 * 3 + 0.75 * 1
+    sync_reference(reference, policy, 0.25)  # 0.25 * 3 + 0.75 * 1
     assert reference.weight.item() == pytest.approx(1.5)
     assert policy.weight.item() == 3.0
 
@@ -66,7 +66,7 @@ def test_the_reference_moves_a_share_of_the_way():
 def test_a_share_of_zero_or_one_keeps_or_copies():
     policy, reference = nn.Linear(2, 2), nn.Linear(2, 2).requires_grad_(False)
     before = reference.weight.clone()
-    move_reference(reference, policy, 0.0)
+    sync_reference(reference, policy, 0.0)
     assert torch.equal(reference.weight, before)
-    move_reference(reference, policy, 1.0)
+    sync_reference(reference, policy, 1.0)
     torch.testing.assert_close(reference.weight, policy.weight.detach())

@@ -9,11 +9,11 @@ import time
 from pathlib import Path
 
 import pytest
-import tiny
 import torch
 from safetensors.torch import load_file
 
 import rlftsim
+import tiny
 from rlftsim.training import finetune as finetune_module
 from rlftsim.training import imitation as imitation_module
 from rlftsim.training.batches import scenario_costs

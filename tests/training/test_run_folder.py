@@ -2,9 +2,9 @@ import json
 from dataclasses import replace
 
 import pytest
-import tiny
 
-from rlftsim.errors import CheckpointError
+import tiny
+from rlftsim.errors import CheckpointError, DataError
 from rlftsim.training.finetune import FinetuneConfig
 from rlftsim.training.reference import KlConfig
 from rlftsim.training.run_folder import RunFolder, board_tag, describe_inputs, read_metrics, to_plain
@@ -28,7 +28,11 @@ def test_other_settings_are_refused_by_name(tmp_path):
     RunFolder(tmp_path, FinetuneConfig())
     with pytest.raises(CheckpointError, match=r"other settings or inputs \(kl.target, seed\): name another --out"):
         RunFolder(tmp_path, FinetuneConfig(kl=KlConfig(target=0.02), seed=1))
+    stored = json.loads((tmp_path / "config.json").read_text())
+    others = {name: value for name, value in stored.items() if not isinstance(value, str | int | float)}
     with pytest.raises(CheckpointError, match=r"other settings or inputs \((\w+(\.\w+)*, ){7}\S+ and \d+ more\)"):
+        RunFolder(tmp_path, others)
+    with pytest.raises(CheckpointError, match=r"belongs to a run of another kind: name another --out"):
         RunFolder(tmp_path, tiny.PRETRAIN)
 
 
@@ -50,6 +54,14 @@ def test_metrics_of_updates_that_are_done_again_are_dropped(tmp_path):
         (3, 0.3),
         (4, 9.0),
     ]
+
+
+def test_a_full_disk_is_named_with_the_file_that_does_not_fit(tmp_path):
+    run = RunFolder(tmp_path, FinetuneConfig())
+    run.continue_from(0)
+    (tmp_path / "metrics.jsonl").symlink_to("/dev/full")
+    with pytest.raises(DataError, match=r"cannot write .*metrics\.jsonl \(No space left on device\): make room"):
+        run.log(1, {"rmm": 0.5})
 
 
 def test_a_process_that_does_not_write_leaves_nothing(tmp_path):

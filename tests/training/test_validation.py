@@ -5,12 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import tiny
 import torch
 from safetensors.torch import load_file
 
+import tiny
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.experiments.evaluate import EvaluateConfig, evaluate
+from rlftsim.evaluation.evaluate import EvaluateConfig, evaluate
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
 from rlftsim.scenario.synthetic import pack_path
@@ -42,7 +42,7 @@ def test_validation_changes_nothing_of_the_training(stage, vocabulary, drawn_sce
 
 def test_the_last_validation_is_what_an_evaluation_of_the_model_finds(vocabulary, drawn_scenarios, held_out, tmp_path):
     fewest = sorted(range(len(held_out)), key=lambda i: held_out.index["num_map_points"][i].as_py())[:5]
-    write_dataset([held_out[i] for i in fewest], tmp_path / "data", split="validation", licence_note="CC0-1.0")
+    write_dataset([held_out[i] for i in fewest], tmp_path / "data", split="validation", license_note="CC0-1.0")
     held_out = ScenarioDataset(tmp_path / "data", "validation")
     policy = tiny.tiny_policy(vocabulary)
     everything = replace(OFTEN, every=100, num_scenarios=4, top_k=3)
@@ -104,5 +104,6 @@ def test_scenarios_without_a_future_cannot_be_validated_on(vocabulary, drawn_sce
     short = replace(scenario, tracks=replace(scenario.tracks, **arrays), timestamps_s=scenario.timestamps_s[:11])
     with pytest.raises(DataError, match="its future is withheld"):
         tiny.train(
-            "pretrain", tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path, held_out=[short], validation=OFTEN, epochs=0.5
+            "pretrain", tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path, held_out=[short], validation=OFTEN,
+            epochs=0.5
         )  # fmt: skip

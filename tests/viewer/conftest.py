@@ -3,7 +3,7 @@ import pytest
 
 from rlftsim.scenario.types import LightStates, MapFeatures, MapFeatureType, Scenario, Tracks
 from rlftsim.viewer.page import Animation, Panel
-from rlftsim.viewer.scene import Trajectories, build_scene, logged_trajectories
+from rlftsim.viewer.scene import SceneMotion, build_scene, logged_trajectories
 
 STEPS = 91
 CHROMIUM = "/usr/bin/chromium"
@@ -36,7 +36,7 @@ def draw_tracks() -> Tracks:
 
 
 def draw_map() -> MapFeatures:
-    """A straight lane along y = 500 with a point every metre, a road edge with a right angle, a crosswalk, a stop sign."""
+    """A straight lane along y = 500 with a point every meter, a right-angled road edge, a crosswalk, a stop sign."""
     lane = [(x, 500) for x in range(980, 1041)]
     edge = [(980, 496), (1005, 496), (1030, 496), (1030, 480)]
     crosswalk = [(1000, 495), (1003, 495), (1003, 505), (1000, 505)]
@@ -93,7 +93,7 @@ def animation(scenario) -> Animation:
     """The log beside two rollouts in which everybody stands 1 m and 2 m further along x."""
     scene = build_scene(scenario)
     log = logged_trajectories(scenario).with_overlaps(scene.agents)
-    moved = Trajectories(
+    moved = SceneMotion(
         np.concatenate([log.position + np.array([1, 0]), log.position + np.array([2, 0])]),
         np.repeat(log.heading, 2, 0),
         np.ones((2, *log.valid.shape[1:]), bool),

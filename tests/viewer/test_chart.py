@@ -13,8 +13,8 @@ def test_smoothing_keeps_a_straight_line():
 
 
 def test_smoothing_averages_over_the_window():
-    # 0 0 3 0 0 with a window of 3: inside the mean of three; at the ends the line through 0 0 3 (slope 1.5, mean 1 in the
-    # middle) is read off one place further out
+    # 0 0 3 0 0 with a window of 3: inside the mean of three; at the ends the line through 0 0 3 (slope 1.5, mean 1 in
+    # the middle) is read off one place further out
     np.testing.assert_allclose(smooth(np.array([0.0, 0, 3, 0, 0]), 3), [-0.5, 1, 1, 1, -0.5])
 
 

@@ -8,7 +8,7 @@ from matplotlib.patches import Rectangle
 from rlftsim.errors import DataError
 from rlftsim.viewer.figure import (  # fmt: skip
     BETTER,
-    COLOURS,
+    COLORS,
     NEITHER,
     WORSE,
     Band,
@@ -23,9 +23,9 @@ from rlftsim.viewer.page import read_asset
 X = np.array([2.0, 4.0, 8.0])
 
 
-def test_curves_have_the_colours_of_the_page():
+def test_curves_have_the_colors_of_the_page():
     light = read_asset("page.css").split("@media")[0]
-    assert re.findall(r"--series-\d: (#\w+)", light) == list(COLOURS[:4])
+    assert re.findall(r"--series-\d: (#\w+)", light) == list(COLORS[:4])
 
 
 def test_both_kinds_of_files_are_written_whole(tmp_path):
@@ -69,9 +69,9 @@ def test_the_first_interval_is_on_top_and_zero_is_marked_for_differences():
     assert len(draw_intervals(items, title="t", x_label="score", zero=False).axes[0].lines) == 4
 
 
-def test_verdicts_are_signs_and_colours_and_the_diagonal_is_empty():
+def test_verdicts_are_signs_and_colors_and_the_diagonal_is_empty():
     verdicts = np.array([[0, 1, 0], [-1, 0, 1], [0, -1, 0]])
     axis = draw_verdicts(["a", "b", "c"], verdicts, title="t", note="n").axes[0]
     assert [text.get_text() for text in axis.texts] == ["", "+", "~", "−", "", "+", "~", "−", ""]
-    colours = [to_hex(p.get_facecolor()) for p in axis.patches if isinstance(p, Rectangle)]
-    assert [colours[i] for i in (1, 2, 3)] == [BETTER, NEITHER, WORSE]
+    colors = [to_hex(p.get_facecolor()) for p in axis.patches if isinstance(p, Rectangle)]
+    assert [colors[i] for i in (1, 2, 3)] == [BETTER, NEITHER, WORSE]

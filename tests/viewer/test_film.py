@@ -17,7 +17,7 @@ def read_mp4(path):
 
 
 def blue_columns(frame):
-    """Where the ego is in each half of a picture, left to right: its colour is nobody else's."""
+    """Where the ego is in each half of a picture, left to right: its color is nobody else's."""
     frame = frame[: int(len(frame) * 0.85)].astype(int)  # above the legend
     is_blue = (frame[..., 2] > 150) & (frame[..., 0] < 90)
     return [float(np.nonzero(half)[1].mean()) for half in np.split(is_blue, [frame.shape[1] // 2], axis=1)]

@@ -1,4 +1,4 @@
-"""Pictures of goals: who is asked, how near is near, and colours that mean nothing else."""
+"""Pictures of goals: who is asked, how near is near, and colors that mean nothing else."""
 
 import numpy as np
 import pytest
@@ -6,8 +6,8 @@ from matplotlib.patches import Circle
 
 import scenes
 from rlftsim.viewer import goal_picture
-from rlftsim.viewer.goal_picture import GOAL_COLOURS, LONGEST_LABEL, DrawnGoal, GoalPanel, draw_goals
-from rlftsim.viewer.picture import COLOURS
+from rlftsim.viewer.goal_picture import GOAL_COLORS, LONGEST_LABEL, DrawnGoal, GoalPanel, draw_goals
+from rlftsim.viewer.picture import COLORS
 
 ROAD = scenes.straight_road()
 
@@ -25,7 +25,7 @@ def drawn(monkeypatch, tmp_path):
     return draw
 
 
-def test_a_goal_is_a_circle_of_two_metres_with_its_agent_beside_it(drawn):
+def test_a_goal_is_a_circle_of_two_meters_with_its_agent_beside_it(drawn):
     goal = np.array([1040.0, -200.0])
     axis = drawn(DrawnGoal(100, goal, r"a $\foo$ b" + "x" * 300))
     circles = [patch for patch in axis.patches if isinstance(patch, Circle)]
@@ -43,5 +43,5 @@ def test_who_has_no_goal_is_in_the_middle(drawn):
     np.testing.assert_allclose(middle, place, atol=1e-3)
 
 
-def test_goals_have_no_colour_of_agents():
-    assert not set(GOAL_COLOURS) & {COLOURS[role] for role in ("ego", "evaluated", "other")}
+def test_goals_have_no_color_of_agents():
+    assert not set(GOAL_COLORS) & {COLORS[role] for role in ("ego", "evaluated", "other")}

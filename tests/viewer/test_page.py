@@ -7,7 +7,7 @@ import pytest
 from rlftsim.errors import DataError
 from rlftsim.viewer.page import Animation, Panel, animation_html, write_page
 from rlftsim.viewer.picture import to_png
-from rlftsim.viewer.scene import Trajectories
+from rlftsim.viewer.scene import SceneMotion
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
@@ -62,7 +62,7 @@ def test_three_scenes_of_64_agents_and_four_rollouts_stay_under_3_mb(animation):
         speed = np.cumsum(rng.normal(0, 0.1, (num_rollouts, 64, 91, 2)), 2)
         position = np.cumsum(speed, 2) * 0.1 + rng.uniform(-80, 80, (1, 64, 1, 2))
         turning = np.cumsum(rng.normal(0, 0.05, position.shape[:3]), 2)
-        return Trajectories(position, turning, np.ones(turning.shape, bool))
+        return SceneMotion(position, turning, np.ones(turning.shape, bool))
 
     sizes = [len(json.dumps(restless(n).to_payload(), separators=(",", ":"))) for n in (1, 4, 4)]
     assert 3 * sum(sizes) < 3e6
@@ -70,7 +70,7 @@ def test_three_scenes_of_64_agents_and_four_rollouts_stay_under_3_mb(animation):
 
 def test_panel_of_another_scene_is_refused(animation):
     log = animation.panels[0].trajectories
-    fewer = Trajectories(log.position[:, :2], log.heading[:, :2], log.valid[:, :2])
+    fewer = SceneMotion(log.position[:, :2], log.heading[:, :2], log.valid[:, :2])
     with pytest.raises(DataError, match="2 agents, but scene drawn has 3"):
         Animation("Scene", animation.scene, [Panel("Logged", fewer)])
 

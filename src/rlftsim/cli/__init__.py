@@ -1,4 +1,4 @@
-"""A person's verbs. `rlftsim VERB --help` explains each."""
+"""The command line: one file for each verb or two. `rlftsim VERB --help` explains a verb."""
 
 import os
 

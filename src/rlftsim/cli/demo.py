@@ -1,30 +1,31 @@
-"""The verb that shows everything: demo."""
+"""The verb that runs the whole pipeline: demo."""
 
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from rlftsim.evaluation.evaluate import EvaluateConfig
 from rlftsim.experiments.demo import DemoConfig, run_demo
-from rlftsim.experiments.evaluate import EvaluateConfig
 from rlftsim.recipes.smart import smart_demo_quick, smart_demo_rlftsim
 from rlftsim.scenario.synthetic import pack_path
 
 
 @dataclass(frozen=True)
 class Demo:
-    """See the whole pipeline work on synthetic scenarios, in minutes, on a CPU.
+    """Run the whole pipeline on synthetic scenarios, in minutes, on a CPU.
 
-    Vocabulary, pre-training, closed-loop fine-tuning with the MLOO reward, evaluation on held-out scenarios, and a report with
-    pictures. Interrupted in any way, the same command goes on where it was.
+    Vocabulary, pre-training, closed-loop fine-tuning with the MLOO reward, evaluation on held-out scenarios,
+    and a report with pictures. An interrupted demo continues when the same command is repeated.
     """
 
     out: Path | None = None
-    """Folder for everything; the report is OUT/report.html. Left out, runs/demo or runs/demo-quick."""
+    """Folder for everything; the report is OUT/report.html. Left out: runs/demo or runs/demo-quick."""
     quick: bool = False
-    """Every stage at its smallest: shows that all of them run, not that fine-tuning helps."""
+    """Run every stage at its smallest size. This shows that all stages work, not that fine-tuning helps."""
 
     def run(self) -> int:
-        """Run the stages, print the table and where the report is."""
+        """Run the stages; print the table and the path of the report."""
+        # More processes than this only compete for memory bandwidth on the machines that the demo is made for.
         jobs = min(os.cpu_count() or 1, 4)
         evaluation = EvaluateConfig(jobs=jobs)
         config = DemoConfig(smart_demo_rlftsim(), pack_path(), evaluation)

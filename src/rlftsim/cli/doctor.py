@@ -1,12 +1,11 @@
-"""The verb that looks at the machine: doctor."""
+"""The verb that checks the machine: doctor."""
 
 import os
 import platform
 import shutil
-import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -25,7 +24,7 @@ MIN_FREE_GB = 2.0
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """One thing that was looked at."""
+    """Result of one check."""
 
     what: str
     state: str
@@ -34,34 +33,36 @@ class Diagnosis:
 
 @dataclass(frozen=True)
 class Doctor:
-    """Look at this machine: versions, threads, GPU, disk, the embedded scenarios. Says what to do about what is wrong."""
+    """Check this machine: versions, threads, GPU, disk, the embedded scenarios. Prints what to do about each
+    problem."""
 
     def run(self) -> int:
-        """Print the diagnoses; exit status 1 if something is bad."""
-        checks: tuple[Callable[[], Diagnosis], ...] = (_python, _torch, _threads, _gpu, _sumo, _disk, _pack)
-        diagnoses = [check() for check in checks]
+        """Print the results; exit status 1 if a check failed."""
+        diagnoses = [*_versions(), _threads(), _gpu(), _sumo(), _disk(), _pack()]
         table = Table(show_header=False)
-        colour = {GOOD: "green", WARNING: "yellow", BAD: "red"}
+        color = {GOOD: "green", WARNING: "yellow", BAD: "red"}
         for d in diagnoses:
-            table.add_row(d.what, Text(d.state, style=colour[d.state]), d.found)
+            table.add_row(d.what, Text(d.state, style=color[d.state]), d.found)
         print_wide(table)
         return int(any(d.state == BAD for d in diagnoses))
 
 
-def _python() -> Diagnosis:
-    good = sys.version_info[:2] >= (3, 11)
-    found = platform.python_version() + ("" if good else ": needs 3.11 or newer")
-    return Diagnosis("Python", GOOD if good else BAD, found)
-
-
-def _torch() -> Diagnosis:
-    number = tuple(int(part) for part in torch.__version__.split("+")[0].split(".")[:2])
-    good = number >= (2, 10)
-    return Diagnosis("torch", GOOD if good else BAD, torch.__version__ + ("" if good else ": needs 2.10 or newer"))
+def _versions() -> Iterator[Diagnosis]:
+    """Python and torch, each with the oldest version that will do."""
+    for what, version_text, oldest in (
+        ("Python", platform.python_version(), (3, 11)),
+        ("torch", torch.__version__, (2, 10)),
+    ):
+        number = tuple(int(part) for part in version_text.split("+")[0].split(".")[:2])
+        if number >= oldest:
+            yield Diagnosis(what, GOOD, version_text)
+        else:
+            yield Diagnosis(what, BAD, f"{version_text}: needs {oldest[0]}.{oldest[1]} or newer")
 
 
 def _threads() -> Diagnosis:
-    """Two threads must not be slower than one; where they are, cores are shared and waiting threads spin."""
+    """Compare two threads with one. Where two are slower, cores are shared and waiting threads spin."""
+    # torch keeps the number of threads for the process, so it is put back.
     before = torch.get_num_threads()
     seconds = []
     for threads in (1, 2):
@@ -76,6 +77,7 @@ def _threads() -> Diagnosis:
 
 
 def _seconds_of_work() -> float:
+    # The first product is not timed: it starts the threads.
     x, w = torch.rand(4096, 64), torch.rand(64, 64)
     torch.relu(x @ w)
     start = time.perf_counter()

@@ -1,4 +1,4 @@
-"""Who got where it was asked to go, read off the rollouts that `rlftsim simulate` wrote."""
+"""Agents that reached their goals, read off the rollouts that `rlftsim simulate` wrote."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -7,20 +7,53 @@ import numpy as np
 from rich.table import Table
 
 from rlftsim.errors import DataError
-from rlftsim.experiments.rollout_files import RolloutEntry, read_states
+from rlftsim.evaluation.rollout_files import RolloutEntry, read_states
 from rlftsim.goals.attainment import Outcome, outcome_of
-from rlftsim.goals.goals_file import GoalEntry
+from rlftsim.goals.goals_file import GoalEntry, GoalsFile
+from rlftsim.progress import print_wide
 from rlftsim.realism import SimulatedStates
 from rlftsim.scenario.types import Scenario
-from rlftsim.viewer.goal_picture import DrawnGoal, GoalPanel
+from rlftsim.viewer.goal_picture import DrawnGoal, GoalPanel, draw_goals
+
+PICTURE_INCHES = 7.0
+
+
+def report_outcomes(folder: Path, scenarios: Sequence[Scenario], goals: GoalsFile, *, picture: bool) -> None:
+    """Print a table of goals and their outcomes, and draw scenarios.
+
+    Args:
+        folder: rollouts of `rlftsim simulate`.
+        scenarios: scenarios to report on.
+        goals: goals of their agents; may be empty.
+        picture: True = draw FOLDER/SCENARIO.png, too.
+
+    Raises:
+        DataError: damaged rollouts.
+    """
+    outcomes, pictures = [], []
+    for scenario in scenarios:
+        states, entries = read_rollouts(folder, scenario), goals.of_scenario(scenario.scenario_id)
+        outcomes += [(entry, outcome_of(states.way_of(entry.agent_id), (entry.x, entry.y))) for entry in entries]
+        if picture:
+            pictures.append(folder / f"{scenario.scenario_id}.png")
+            draw_goals(pictures[-1], [picture_of(states, scenario, entries)], panel_inches=PICTURE_INCHES)
+    if outcomes:
+        print_wide(outcome_table(outcomes))
+    for path in pictures:
+        print(path)
 
 
 def read_rollouts(folder: Path, scenario: Scenario) -> SimulatedStates:
-    """What a folder of `rlftsim simulate` holds of a scenario.
+    """Rollouts of a scenario in a folder that `rlftsim simulate` wrote.
+
+    Args:
+        folder: has a file SCENARIO.npz.
+        scenario: the simulated scenario.
 
     Raises:
         DataError: a damaged file, or one without the agents of the scenario.
     """
+    # Files of an earlier call may be damaged or of an older data set.
     entry = RolloutEntry(scenario.scenario_id, folder / f"{scenario.scenario_id}.npz", "npz")
     way_out = "remove it, then run the same command again."
     try:
@@ -28,20 +61,15 @@ def read_rollouts(folder: Path, scenario: Scenario) -> SimulatedStates:
     except DataError as error:
         raise DataError(f"{str(error).rstrip('.')}: {way_out}") from None
     if not np.isin(scenario.tracks.object_id[scenario.simulated_indices], states.object_id).all():
-        raise DataError(f"{entry}: has not all agents of the scenario: {way_out}")
+        raise DataError(f"{entry}: lacks agents of the scenario: {way_out}")
     return states
 
 
-def outcomes_of(states: SimulatedStates, entries: Sequence[GoalEntry]) -> list[tuple[GoalEntry, Outcome]]:
-    """What became of a scenario's goals."""
-    return [(entry, outcome_of(states.way_of(entry.agent_id), (entry.x, entry.y))) for entry in entries]
-
-
 def outcome_table(outcomes: Sequence[tuple[GoalEntry, Outcome]]) -> Table:
-    """For `print_wide`."""
+    """Table of goals and outcomes, for `print_wide`."""
     table = Table(
         title="goals: within 2 m in the end (reached), at any time (passed)",
-        caption="closest: least distance to the goal, in the best rollout and in the median one",
+        caption="closest: smallest distance to the goal, in the best rollout and in the median one",
         title_justify="left",
         caption_justify="left",
     )
@@ -54,8 +82,15 @@ def outcome_table(outcomes: Sequence[tuple[GoalEntry, Outcome]]) -> Table:
 
 
 def picture_of(states: SimulatedStates, scenario: Scenario, entries: Sequence[GoalEntry]) -> GoalPanel:
-    """Goals and where their agents went; without goals where the evaluated agents went."""
-    asked = [(e.agent_id, np.array([e.x, e.y]), e.label) for e in entries]
+    """Goals and the simulated paths of their agents; without goals the paths of the evaluated agents.
+
+    Args:
+        states: rollouts of the scenario.
+        scenario: map and log.
+        entries: goals of its agents; may be empty.
+    """
+    targeted = [(e.agent_id, np.array([e.x, e.y]), e.label) for e in entries]
+    # Without goals the picture shows the agents that the metric evaluates.
     free = [(agent, None, "") for agent in scenario.tracks.object_id[scenario.evaluated_indices].tolist()]
-    marks = tuple(DrawnGoal(*one, driven=states.way_of(one[0]).numpy().astype(np.float64)) for one in asked or free)
+    marks = tuple(DrawnGoal(*one, driven=states.way_of(one[0]).numpy().astype(np.float64)) for one in targeted or free)
     return GoalPanel(scenario.scenario_id, scenario, marks)

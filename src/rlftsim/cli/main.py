@@ -1,17 +1,18 @@
-"""Reads the command line, runs the verb, and turns a user's mistakes into one line.
+"""Entry point: reads the command line, runs the verb, and turns user errors into one line.
 
-Only the verb that is asked for is imported: nobody waits for torch to read a help text.
+Only the module of the verb is imported, and help texts do not import torch.
 """
 
 import difflib
-import importlib
+import errno
+import os
 import sys
 from collections.abc import Sequence
 from typing import Any
 
 from rlftsim import __version__
 from rlftsim.errors import RlftsimError
-from rlftsim.processor import keep_freed_memory
+from rlftsim.threads import keep_freed_memory
 
 VERBS = {
     "demo": ("rlftsim.cli.demo", "Demo"),
@@ -19,47 +20,49 @@ VERBS = {
     "convert": ("rlftsim.cli.data", "Convert"),
     "data": ("rlftsim.cli.data", "Data"),
     "synthesize": ("rlftsim.cli.data", "Synthesize"),
+    "recipe": ("rlftsim.cli.recipe", "PrintRecipe"),
     "tokens": ("rlftsim.cli.tokens", "Tokens"),
     "pretrain": ("rlftsim.cli.train", "Pretrain"),
     "finetune": ("rlftsim.cli.train", "Finetune"),
     "augment": ("rlftsim.cli.augment", "Augment"),
     "model": ("rlftsim.cli.model", "Model"),
-    "goals": ("rlftsim.cli.goals", "Goals"),
+    "goals": ("rlftsim.cli.goals", "GoalsVerb"),
     "simulate": ("rlftsim.cli.simulate", "Simulate"),
     "score": ("rlftsim.cli.results", "Score"),
     "evaluate": ("rlftsim.cli.results", "Evaluate"),
     "compare": ("rlftsim.cli.results", "Compare"),
     "experiment": ("rlftsim.cli.experiment", "RunExperiment"),
 }
-"""Module and class of each verb, in the order a newcomer meets them."""
+"""Module and class of each verb, in the order in which a newcomer needs them."""
 
 OVERVIEW = f"""rlftsim {__version__}: traffic agents that behave like real road users.
 
 usage: rlftsim VERB ...      rlftsim VERB --help explains a verb
 
-  demo         see the whole pipeline work on synthetic scenarios, in minutes, on a CPU
-  doctor       look at this machine and say what to do about what is wrong
+  demo         run the whole pipeline on synthetic scenarios, in minutes, on a CPU
+  doctor       check this machine and print what to do about each problem
 
-  convert      WOMD tfrecords to a portable data set
-  data         check a data set, or say what is in it
+  convert      convert logged scenarios, such as WOMD tfrecords, to a portable data set
+  data         check a data set, or print its statistics
   synthesize   make synthetic scenarios with SUMO
 
-  tokens       build a vocabulary of motion and map tokens, or look at one
+  recipe       list the recipes (models and training settings), or print one
+  tokens       build a vocabulary of motion and map tokens, or measure its coverage
   pretrain     train a model to predict the next motion token
-  finetune     fine-tune a model closed-loop with a realism reward, with goals if asked
-  augment      draw further goals for fine-tuning with goals
-  model        take a checkpoint from the public CAT-K code, or hand one back
-  goals        say what agents may be asked to do, and write it to a file
-  simulate     roll scenarios out with a model
+  finetune     fine-tune a model in closed loop with a realism reward, also with goals
+  augment      sample further goals for goal-conditioned fine-tuning
+  model        import a checkpoint of the public CAT-K code, or export one
+  goals        propose goals for agents and write a goals file, or check one
+  simulate     roll out scenarios with a model
 
-  score        score anybody's rollouts with the official realism meta-metric
-  evaluate     measure a model with the official realism meta-metric
+  score        score rollouts of any simulator with the official realism meta-metric
+  evaluate     evaluate a model with the official realism meta-metric
   compare      compare two evaluations scenario by scenario
-  experiment   answer a question of the paper with a table and a figure
+  experiment   repeat an experiment of the paper: a table, verdicts and a figure
 """
 
-STARTS_ANEW = ("doctor", "data", "tokens", "model", "goals", "compare")
-"""Verbs that keep nothing of what they were stopped in."""
+STARTS_ANEW = ("doctor", "data", "recipe", "tokens", "model", "goals", "compare")
+"""Verbs that keep nothing of an interrupted run."""
 INTERRUPTED = 130
 USER_MISTAKE = 2
 
@@ -79,50 +82,51 @@ def main(arguments: Sequence[str] | None = None) -> int:
         hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(VERBS)}."
         print(f"rlftsim: no verb {words[0]!r}: {hint}", file=sys.stderr)
         return USER_MISTAKE
-    return _run(words)
-
-
-def parse(words: Sequence[str]) -> Any:
-    """The verb of a command line with its settings; has a method `run`.
-
-    Raises:
-        SystemExit: the words make no sense, or ask for help; what was wrong has been printed.
-    """
-    import tyro
-
-    words = join_settings(words)
-
-    module, name = VERBS[words[0]]
-    verb = getattr(importlib.import_module(module), name)
-    config = (tyro.conf.OmitSubcommandPrefixes,)
-    return tyro.cli(verb, args=list(words[1:]), prog=f"rlftsim {words[0]}", config=config)
-
-
-def join_settings(words: Sequence[str]) -> list[str]:
-    """The same words with the values of all `--set` after the last one: it may be given once or many times."""
-    rest: list[str] = []
-    values: list[str] = []
-    is_value = False
-    for word in words:
-        is_value = word == "--set" or (is_value and not word.startswith("-"))
-        (values if is_value else rest).append(word)
-    settings = [value for value in values if value != "--set"]
-    return [*rest, "--set", *settings] if "--set" in values else rest
-
-
-def _run(words: list[str]) -> int:
     try:
         return parse(words).run()
     except RlftsimError as error:
         print(f"rlftsim: {error}", file=sys.stderr)
         return USER_MISTAKE
     except KeyboardInterrupt:
-        what_next = "starts anew" if words[0] in STARTS_ANEW else "goes on where it was"
+        what_next = "starts anew" if words[0] in STARTS_ANEW else "continues where this one stopped"
         print(f"\nrlftsim: stopped. The same command {what_next}.", file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:
+        # `rlftsim ... | head` has read enough
         return 0
-    except OSError as error:
-        where = f": {error.filename}" if error.filename else ""
-        print(f"rlftsim: {error.strerror or error}{where}", file=sys.stderr)
+    except Exception as error:
+        line = _in_words(error)
+        if line is None:
+            # A bug of this package: its traceback is what a report needs.
+            raise
+        print(f"rlftsim: {line}", file=sys.stderr)
         return 1
+
+
+def parse(words: Sequence[str]) -> Any:
+    """The verb of a command line with its settings; has a method `run`.
+
+    Raises:
+        ConfigError: the words make no sense.
+        SystemExit: they ask for help, which has been printed.
+    """
+    # Imported late: the overview is printed without it.
+    from rlftsim.cli.parse import parse as parse_words
+
+    return parse_words(words, VERBS)
+
+
+def _in_words(error: Exception) -> str | None:
+    """One line about what the machine lacks; None for any other error."""
+    # Libraries wrap a full disk in errors of their own, so the text decides, not the class.
+    if getattr(error, "errno", None) == errno.ENOSPC or os.strerror(errno.ENOSPC) in str(error):
+        where = getattr(error, "filename", None)
+        return f"the disk is full{f', writing {where}' if where else ''}: free some space and repeat the command."
+    # By name: torch is not imported for this.
+    if type(error).__name__ == "OutOfMemoryError":
+        return (
+            "the GPU has too little memory: lower the number of scenarios or rollouts in memory at once (see --help)."
+        )
+    if isinstance(error, OSError):
+        return f"{error.strerror or error}{f': {error.filename}' if error.filename else ''}"
+    return None

@@ -1,4 +1,4 @@
-"""The verb that takes models from elsewhere and hands them back: model."""
+"""The verb that imports and exports checkpoints of the public CAT-K code: model."""
 
 import sys
 from dataclasses import dataclass
@@ -19,25 +19,25 @@ Format = Literal["catk"]
 
 @dataclass(frozen=True)
 class Import:
-    """Make a model folder of a checkpoint of the public CAT-K code.
+    """Convert a checkpoint of the public CAT-K code to a model folder.
 
-    Nothing in the checkpoint is run. Every weight must be there with the right shape, and no other; otherwise all differences
-    are listed and nothing is written.
+    No code in the checkpoint is executed. It must have exactly the expected weights with the right shapes;
+    otherwise all differences are listed and nothing is written.
     """
 
     checkpoint: Positional[Path]
     """Lightning .ckpt, or .safetensors with the keys of its state dict."""
     vocabulary: list[Path]
-    """Token tables that it was trained with: npz with veh, ped, cyc and traj_src (may be two files), or a vocabulary file."""
+    """Token tables of its training: npz with veh, ped, cyc and traj_src (may be two files), or a vocabulary file."""
     out: Path
     """Folder for the model."""
     format: Annotated[Format, tyro.conf.arg(name="from")] = "catk"
-    """Whose checkpoint it is."""
+    """Code that the checkpoint comes from."""
 
     def run(self) -> int:
-        """Read strictly, write the folder, say what was found."""
+        """Read strictly, write the folder, print a summary."""
         if (self.out / "config.json").exists():
-            raise ConfigError(f"{self.out}: holds a model already: name another folder.")
+            raise ConfigError(f"{self.out} holds a model already: name another folder.")
         imported = import_catk(self.checkpoint, self.vocabulary)
         imported.policy.save_pretrained(self.out, card=_card(self.checkpoint, imported))
         weights = sum(p.numel() for p in imported.policy.parameters())
@@ -49,35 +49,36 @@ class Import:
 
 @dataclass(frozen=True)
 class Export:
-    """Write a model's weights with the keys of the public CAT-K code, and its token tables beside them.
+    """Write a model's weights with the keys of the public CAT-K code, and its token tables.
 
     Importing them again gives the same bits.
     """
 
     model: Positional[Path]
-    """Model folder."""
+    """Folder of a SMART model."""
     out: Positional[Path]
     """File for the weights, .safetensors; the tables go to the same name with .vocabulary.npz."""
     format: Annotated[Format, tyro.conf.arg(name="to")] = "catk"
-    """Whose keys to use."""
+    """Code that the keys are for."""
 
     def run(self) -> int:
         """Read the model folder, write both files."""
         if self.out.suffix != ".safetensors":
             raise ConfigError(f"{self.out}: weights are written as .safetensors: name the file so.")
+        # The keys are SMART's, so no other architecture can be exported.
         policy = SmartPolicy.from_pretrained(self.model)
         tables = self.out.with_suffix(".vocabulary.npz")
         write_catk(policy, self.out)
         write_catk_vocabulary(policy.vocabulary, tables)
         print(f"{self.out}: weights\n{tables}: token tables")
-        if not policy.config.public_code_quirks:
+        if not policy.config.catk_compat:
             print("  trained here: the public code treats an agent's first motion differently (docs/catk.md)")
         return 0
 
 
 @dataclass(frozen=True)
 class Model:
-    """Take a model from the public CAT-K code, or hand one back."""
+    """Import a checkpoint of the public CAT-K code, or export a model to it."""
 
     action: Annotated[Import, tyro.conf.subcommand("import")] | Annotated[Export, tyro.conf.subcommand("export")]
 
@@ -92,9 +93,9 @@ def _card(checkpoint: Path, imported: CatkImport) -> str:
 
 * from {checkpoint.name}, a checkpoint of the public CAT-K code
 {notes}
-* computes what the public code computes (`public_code_quirks`)
-* terms: those of the checkpoint, of its token tables (CAT-K's own: NVIDIA, non-commercial research) and of the data that it was
-  trained on (Waymo Open Motion Dataset: non-commercial)
+* computes what the public code computes (`catk_compat`)
+* terms: those of the checkpoint, of its token tables (CAT-K's own: NVIDIA, non-commercial research) and of the data
+  that it was trained on (Waymo Open Motion Dataset: non-commercial)
 * command: rlftsim {" ".join(sys.argv[1:])}
 * rlftsim {__version__}
 """

@@ -1,4 +1,4 @@
-"""Verbs that measure: score, evaluate, compare."""
+"""Verbs that measure realism: score, evaluate, compare."""
 
 import json
 import sys
@@ -9,103 +9,106 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional
 
-from rlftsim.cli.data import data_folder
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.experiments.compare import columns_of, compare, format_comparison, format_table
-from rlftsim.experiments.evaluate import EvaluateConfig, evaluate
-from rlftsim.experiments.evaluation import Evaluation
-from rlftsim.experiments.explain import explain_rollouts
-from rlftsim.experiments.score import ScoreConfig, format_scores, score_rollouts, to_json
+from rlftsim.evaluation.compare import columns_of, compare, format_comparison, format_table
+from rlftsim.evaluation.evaluate import EvaluateConfig, evaluate, evaluation_name
+from rlftsim.evaluation.explain_page import explain_rollouts
+from rlftsim.evaluation.results import Evaluation
+from rlftsim.evaluation.score_files import ScoreConfig, format_scores, score_rollouts, to_json
+from rlftsim.policies.registry import Device, load_policy_or_oracle, with_guidance
 from rlftsim.progress import print_wide
-from rlftsim.recipes.models import Device, load_policy_or_oracle
+from rlftsim.scenario.open import dataset_folder
 
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Measure a model with the official realism meta-metric: 32 rollouts of every held-out scenario.
+    """Evaluate a model with the official realism meta-metric, by 32 rollouts of every held-out scenario.
 
-    Results are kept for each scenario in OUT/NAME.parquet. An interrupted run goes on where it was.
+    Writes the results of each scenario to OUT/NAME.parquet. An interrupted evaluation continues when the same
+    command is repeated.
     """
 
-    model: Positional[str]
-    """Model folder, "constant_velocity", or "oracle" (the record itself: the ceiling)."""
+    model: Annotated[Positional[str], tyro.conf.arg(metavar="MODEL")]
+    """A run, a model folder, a registered name such as "constant_velocity", or "oracle" (the log itself: the
+    ceiling)."""
     data: str
-    """Folder of a data set, or "synthetic"."""
+    """Folder of a data set, or "synthetic" for the scenarios that ship with the package."""
     out: Path
     """Folder for the results."""
     name: str | None = None
-    """Of the row and the file; left out, the model's name."""
+    """Name of the table row and of the file. Left out: the model's name."""
     device: Device = "auto"
-    """Where the model runs; several processes (jobs) need cpu."""
-    goal_guidance: float = 1.0
-    """With --goals recorded: how many times the model's aim counts. Above 1 goals are followed more closely than it learned to."""
+    """Device of the model; several processes (--jobs) need cpu."""
+    guidance_scale: float = 1.0
+    """With --goals logged: factor on the goal-progress bias of the model's logits. Above 1 it follows goals
+    more closely than it learned to."""
     config: Annotated[EvaluateConfig, tyro.conf.arg(name="")] = field(default_factory=EvaluateConfig)
 
     def run(self) -> int:
         """Evaluate and print the table."""
-        path = Path(self.model)
-        name = self.name or (path.parent.name if path.name == "model" else path.name)
-        self._refuse_other_goals(self.out / f"{name}.parquet")
-        if self.goal_guidance != 1.0 and self.config.goals == "none":
+        name = self.name or evaluation_name(self.model)
+        self._refuse_to_replace(self.out / f"{name}.parquet")
+        if self.guidance_scale != 1.0 and self.config.goals == "none":
             raise ConfigError(
-                f"--goal-guidance {self.goal_guidance:g} has no effect without goals: add --goals recorded."
+                f"--guidance-scale {self.guidance_scale:g} has no effect without goals: add --goals logged."
             )
-        policy = load_policy_or_oracle(self.model, self.device, goal_guidance=self.goal_guidance)
-        result = evaluate(policy, data_folder(self.data), self.out, self.config, name=name)
+        policy = with_guidance(load_policy_or_oracle(self.model, self.device), self.guidance_scale)
+        result = evaluate(policy, dataset_folder(self.data), self.out, self.config, name=name)
         if not len(result):
-            raise DataError(f"not one of {len(result.skipped)} scenarios could be scored: {result.skipped[0].reason}")
+            raise DataError(f"none of {len(result.skipped)} scenarios could be scored: {result.skipped[0].reason}")
         print_wide(format_table(result))
         for skipped in result.skipped:
             print(f"  skipped {skipped.scenario_id}: {skipped.reason}")
         print(f"{self.out / name}.parquet")
         return 0
 
-    def _refuse_other_goals(self, path: Path) -> None:
-        """Refuse to replace what the model does with goals by what it does without, or the other way round.
+    def _refuse_to_replace(self, path: Path) -> None:
+        """Protect an evaluation that was made with other goals; `evaluate` protects one of more scenarios.
 
         Raises:
-            ConfigError: an evaluation of that name asked otherwise.
+            ConfigError: there is such an evaluation of the same name.
         """
         try:
-            old = Evaluation.read(path).config.goals
-        except DataError:  # none, or one that cannot be read and is replaced
+            old = Evaluation.read(path)
+        except DataError:
+            # There is none, or one that cannot be read and is replaced.
             return
-        if old != self.config.goals:
-            raise ConfigError(
-                f"{path} was measured with goals={old}, not {self.config.goals}: name this one apart with --name, or remove the file."
-            )
+        way_out = "give this one another --name, or remove the file."
+        if old.config.goals != self.config.goals:
+            raise ConfigError(f"{path} was measured with goals={old.config.goals}, not {self.config.goals}: {way_out}")
 
 
 @dataclass(frozen=True)
 class Score:
-    """Score anybody's rollouts with the official realism meta-metric.
+    """Score rollouts of any simulator with the official realism meta-metric.
 
     Reads npz files (scenario_id, object_ids [A], x y z heading [N, A, 80]) and official submission files; see
-    docs/rollout_formats.md. With OUT an interrupted run goes on where it was.
+    docs/rollout_formats.md. With --out an interrupted run continues when the same command is repeated.
     """
 
     rollouts: Positional[Path]
     """A file of rollouts, or a folder of them."""
     scenarios: str
-    """What was simulated: a converted data set, tfrecords (file, folder, quoted glob), or "synthetic"."""
+    """The simulated scenarios: a converted data set, tfrecords (file, folder, quoted glob), or "synthetic"."""
     out: Path | None = None
     """Folder for the per-scenario results (Parquet)."""
     name: str | None = None
-    """Of the row and the file; left out, the name of the rollouts."""
+    """Name of the table row and of the file. Left out: the name of the rollouts."""
     json: bool = False
-    """Print JSON under the official messages' names instead of a table."""
+    """Print JSON with the field names of the official messages instead of a table."""
     explain: Path | None = None
-    """Folder for a page a scenario: which feature, agent and steps cost how much."""
+    """Folder for one page per scenario that attributes the lost score to features, agents and steps."""
     config: Annotated[ScoreConfig, tyro.conf.arg(name="")] = field(default_factory=ScoreConfig)
 
     def run(self) -> int:
         """Score, print, explain."""
-        scenarios = data_folder(self.scenarios)
+        scenarios = dataset_folder(self.scenarios)
         result = score_rollouts(self.rollouts, scenarios, self.out, self.config, name=self.name)
         if self.json:
             print(json.dumps(to_json(result), allow_nan=False))
         else:
             print_wide(format_scores(result))
+        # On standard error, so that --json prints nothing but JSON.
         for skipped in result.skipped:
             print(f"  skipped {skipped.scenario_id}: {skipped.reason}", file=sys.stderr)
         if self.explain is not None:

@@ -1,66 +1,175 @@
-"""Verbs that make and change models: pretrain, finetune."""
+"""Verbs that train models: pretrain, finetune."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, ClassVar, Literal
 
+import tyro
 from tyro.conf import Positional
 
-from rlftsim.cli.data import open_split, splits_of
+from rlftsim.cli.recipe_verb import RecipeVerb, refuse_settings, value_of
 from rlftsim.errors import ConfigError, RlftsimError
-from rlftsim.experiments.learning_curve import write_learning_curve
-from rlftsim.experiments.stages import NewSight, finetune_with_catk, finetune_with_reward, pretrain_smart, teach_goals
-from rlftsim.policies.smart.config import GoalSight
-from rlftsim.progress import say
-from rlftsim.recipes.configure import Override, configure
-from rlftsim.recipes.smart import RECIPES, RecipeName
+from rlftsim.evaluation.learning_curve import write_learning_curve
+from rlftsim.experiments.stages import GoalConditioning, finetune_model, pretrain_policy
+from rlftsim.progress import log
+from rlftsim.recipes.registry import Recipe
 from rlftsim.scenario.dataset import ScenarioDataset
+from rlftsim.scenario.open import open_dataset, splits_of
 from rlftsim.tokens.vocabulary import Vocabulary
-from rlftsim.training.gcsl import NOT_VALIDATED
+from rlftsim.training.goal_relabeling import NOT_VALIDATED
 from rlftsim.training.parallel import is_first_process
 
-AIM = {"yes": True, "no": False, None: None}
 VALIDATION = "validation"
 """Split that is validated on where none is named."""
+SECTION_OF_METHOD = {"rlft": "finetune", "catk": "catk", "gcsl": "gcsl"}
+RecipeArgument = Annotated[Positional[str], tyro.conf.arg(metavar="RECIPE")]
 
 
 @dataclass(frozen=True)
-class Pretrain:
-    """Train a model to predict the next motion token of every agent.
+class Pretrain(RecipeVerb):
+    """Train a model from fresh weights to predict the next motion token of every agent along the logged tracks.
 
-    Interrupted in any way, the same command goes on where it was. The result is in OUT/model.
+    Writes checkpoints, metrics and the finished model, OUT/model. An interrupted run continues when the same
+    command is repeated.
     """
 
-    recipe: Positional[RecipeName]
+    sections: ClassVar[tuple[str, ...]] = ("model", "pretrain")
+
+    recipe: RecipeArgument
+    """Model and training settings; `rlftsim recipe` lists all recipes. The flags below change single fields."""
     data: str
-    """Folder of a data set, or "synthetic"."""
+    """Folder of a data set, or "synthetic" for the scenarios that ship with the package."""
     out: Path
     """Folder of the run: configuration, metrics, checkpoints, model."""
-    vocabulary: Path
-    """File that `rlftsim tokens` wrote."""
+    vocabulary: Path | None = None
+    """File that `rlftsim tokens` wrote; needed by models with a vocabulary, such as SMART."""
     split: str = "training"
+    """Split of the data set to train on."""
     validation_split: str | None = None
-    """What to validate on in closed loop, every so many updates: see pretrain.validation.every, which is 0 (never). Left out,
-    "validation" where the data set has it."""
-    set: list[Override] = field(default_factory=list)
-    """Other values for fields of the recipe, e.g. pretrain.epochs=2 model.dim=64."""
+    """Split to validate on in closed loop, see --pretrain.validation.every. Left out: "validation", if the data
+    set has it."""
+    config: Path | None = None
+    """JSON file of settings: the output of `rlftsim recipe NAME --json`, or the config.json of an earlier run. The
+    latter holds only the section pretrain: sizes of the model are those of RECIPE and the flags --model.*. A run
+    repeated from its own config.json, with the same recipe, flags of the model, vocabulary and data, gives the same
+    weights bit for bit. Flags override the file."""
 
     def run(self) -> int:
         """Build the model and train it."""
-        recipe = configure(RECIPES[self.recipe](), self.set, sections=("model", "pretrain"))
-        scenarios = open_split(self.data, self.split)
-        vocabulary = Vocabulary.load(self.vocabulary)
+        recipe = self.settings
+        if self.vocabulary is None and recipe.tokens is not None:
+            raise ConfigError(
+                f"recipe {self.recipe} needs a vocabulary: build one with `rlftsim tokens`, then name it with "
+                "--vocabulary."
+            )
+        scenarios = open_dataset(self.data, self.split)
+        vocabulary = Vocabulary.load(self.vocabulary) if self.vocabulary else None
         held_out = _held_out(self.data, self.validation_split, recipe.pretrain.validation.every)
-        with _drawn(self.out):
-            model = pretrain_smart(vocabulary, scenarios, recipe.model, recipe.pretrain, self.out, held_out=held_out)
+        # The curve is drawn of interrupted runs, too.
+        with _learning_curve(self.out):
+            policy = recipe.new_policy(vocabulary)
+            model = pretrain_policy(policy, scenarios, recipe.pretrain, self.out, held_out=held_out)
+        print(f"model: {model}")
+        return 0
+
+
+@dataclass(frozen=True)
+class Finetune(RecipeVerb):
+    """Fine-tune a model in closed loop: by policy gradient on a realism reward (RLFTSim), or with the baseline CAT-K.
+
+    Example: rlftsim finetune smart-tiny --model runs/base --data data/womd --out runs/tuned --finetune.epochs 0.5
+
+    Writes checkpoints, metrics and the finished model, OUT/model. An interrupted run continues when the same
+    command is repeated.
+    """
+
+    sections: ClassVar[tuple[str, ...]] = ("finetune", "catk", "gcsl")
+
+    recipe: RecipeArgument
+    """Settings to start from; `rlftsim recipe` lists all recipes. The flags below change single fields. The
+    model brings its own architecture, so any recipe fits any model."""
+    model: str
+    """Model to start from: a run, a model folder or a registered name. rlft also uses it as the frozen KL reference."""
+    data: str
+    """Folder of a data set, or "synthetic" for the scenarios that ship with the package."""
+    out: Path
+    """Folder of the run: configuration, metrics, checkpoints, model."""
+    method: Literal["rlft", "catk", "gcsl"] = "rlft"
+    """rlft: policy gradient on a realism reward, fields finetune.*. catk: supervised fine-tuning along rollouts
+    that choose the token closest to the log among the top K, fields catk.*. gcsl: train the goal-conditioned
+    weights on the model's own rollouts, relabelled with their endpoints, as a start for rlft with goals
+    (--model OUT), fields gcsl.*."""
+    goal: Literal["concat", "indication"] | None = None
+    """Fine-tune with goals, and how the model encodes them. Every agent's goal is its logged endpoint (see
+    --finetune.goals.augmented for others). rlft then uses the reward gcft, catk trains the goal-conditioned
+    weights alone. Left out, the model keeps the goal conditioning it has."""
+    goal_logit_bias: Annotated[bool | None, tyro.conf.arg(metavar="/ --no-goal-logit-bias")] = None
+    """With --goal: add a goal-progress bias to the token logits (ours, not the paper's). Left out: yes where
+    goal conditioning is added, unchanged where the model has it."""
+    split: str = "training"
+    """Split of the data set to train on."""
+    validation_split: str | None = None
+    """With catk: split to validate on in closed loop, see --catk.validation.every. Left out: "validation", if
+    the data set has it."""
+    config: Path | None = None
+    """JSON file of settings: the output of `rlftsim recipe NAME --json`, or the config.json of an earlier run
+    by the same method. A run repeated from its own config.json, with the same model and data, gives the same
+    weights bit for bit. Flags override the file."""
+
+    @classmethod
+    def recipe_for(cls, name: str, words: Sequence[str]) -> Recipe:
+        """The recipe of a command line, with goals if `--goal` is given.
+
+        Args:
+            name: of the recipe.
+            words: the words behind the verb.
+        """
+        recipe = super().recipe_for(name, words)
+        return recipe.with_goals() if value_of("--goal", words) else recipe
+
+    @classmethod
+    def run_section(cls, words: Sequence[str]) -> str:
+        """Section of the method."""
+        return SECTION_OF_METHOD.get(value_of("--method", words) or "rlft", "finetune")
+
+    def refuse_useless(self, flags: Sequence[str]) -> None:
+        """Refuse settings of other methods, and flags that need another flag.
+
+        Raises:
+            ConfigError: one of them would have no effect.
+        """
+        # 1. settings of other methods
+        used = SECTION_OF_METHOD[self.method]
+        others = [section for section in self.sections if section != used]
+        refuse_settings(flags, others, f"with --method {self.method}: its settings are --{used}.*")
+        # 2. flags that need another flag
+        if self.goal is None and self.goal_logit_bias is not None:
+            flag = "--goal-logit-bias" if self.goal_logit_bias else "--no-goal-logit-bias"
+            raise ConfigError(f"{flag} has no effect without goals: add --goal concat or --goal indication.")
+        if self.method == "gcsl" and self.validation_split:
+            raise ConfigError(f"--validation-split {self.validation_split} has no effect: {NOT_VALIDATED}")
+
+    def run(self) -> int:
+        """Load the model and fine-tune it."""
+        config = getattr(self.settings, SECTION_OF_METHOD[self.method])
+        if config is None:
+            raise ConfigError(f"recipe {self.recipe} has no section {self.method}: its models cannot be trained so.")
+        scenarios = open_dataset(self.data, self.split)
+        # Of the methods of fine-tuning only CAT-K validates.
+        every = config.validation.every if self.method == "catk" else 0
+        held_out = _held_out(self.data, self.validation_split, every)
+        goals = None if self.goal is None else GoalConditioning(self.goal, self.goal_logit_bias)
+        with _learning_curve(self.out):
+            model = finetune_model(self.model, scenarios, config, self.out, conditioning=goals, held_out=held_out)
         print(f"model: {model}")
         return 0
 
 
 def _held_out(data: str, split: str | None, every: int) -> ScenarioDataset | None:
-    """Scenarios to validate on; None = none are asked for, or the data set has no such split and none was named.
+    """Scenarios to validate on; None = no validation was requested, or the data set has no such split and none
+    was named.
 
     Raises:
         ConfigError: a split is named, but there is no validation.
@@ -71,18 +180,19 @@ def _held_out(data: str, split: str | None, every: int) -> ScenarioDataset | Non
     if not every:
         return None
     if split is None and VALIDATION not in splits_of(data):
-        say(f"no validation: {data} has no split {VALIDATION!r}, name another with --validation-split.")
+        log.info(f"no validation: {data} has no split {VALIDATION!r}, name another with --validation-split.")
         return None
-    return open_split(data, split or VALIDATION)
+    return open_dataset(data, split or VALIDATION)
 
 
 @contextmanager
-def _drawn(out: Path) -> Iterator[None]:
-    """A run whose learning curve is drawn however it ends."""
+def _learning_curve(out: Path) -> Iterator[None]:
+    """Draw the learning curve of a run when it ends, for whatever reason."""
     try:
         yield
     except BaseException:
-        with suppress(RlftsimError, OSError):  # why the run ended matters more than why nothing could be drawn
+        # The reason why the run ended matters more than a picture that could not be drawn.
+        with suppress(RlftsimError, OSError):
             _draw(out)
         raise
     _draw(out)
@@ -91,63 +201,3 @@ def _drawn(out: Path) -> Iterator[None]:
 def _draw(out: Path) -> None:
     if is_first_process():
         write_learning_curve(out)
-
-
-@dataclass(frozen=True)
-class Finetune:
-    """Fine-tune a model closed-loop: with a realism reward (RLFTSim), as a baseline with CAT-K, or on where its own rollouts led.
-
-    Interrupted in any way, the same command goes on where it was. The result is in OUT/model.
-    """
-
-    recipe: Positional[RecipeName]
-    model: str
-    """Model folder to start from; rlft holds on to it as its reference, too."""
-    data: str
-    """Folder of a data set, or "synthetic"."""
-    out: Path
-    """Folder of the run: configuration, metrics, checkpoints, model."""
-    method: Literal["rlft", "catk", "gcsl"] = "rlft"
-    """rlft: policy gradient of a realism reward, fields finetune.*. catk: imitation along rollouts that keep near the record, the
-    closest among the top K tokens, fields catk.*. gcsl: learn what goals are from the model's own rollouts, told where they ended, before
-    rlft with goals (--model OUT); trains only the weights that see goals, fields gcsl.*."""
-    goal: GoalSight | None = None
-    """Fine-tune with goals: how the model is to see them, concat or indication. Every agent is asked to go where its record ends; rlft then
-    takes the reward gcft (see finetune.goals for other goals), catk trains only the weights that see goals. Left out, the model keeps the
-    sight it has."""
-    goal_aim: Literal["yes", "no"] | None = None
-    """With --goal: weigh tokens by where they lead, too (an aim, not in the paper). Left out, a model that is given sight of goals gets one,
-    and a model that sees goals keeps what it has."""
-    split: str = "training"
-    validation_split: str | None = None
-    """For catk: what to validate on, see catk.validation.every, which is 0 (never). Left out, "validation" where the data set has it."""
-    set: list[Override] = field(default_factory=list)
-    """Other values for fields of the recipe, e.g. finetune.learning-rate=1e-5 finetune.reward=rloo, or catk.num-candidates=16."""
-
-    def run(self) -> int:
-        """Load the model and fine-tune it."""
-        section = "finetune" if self.method == "rlft" else self.method
-        recipe = RECIPES[self.recipe]()
-        if self.goal is not None:
-            recipe = recipe.with_goals()
-        elif self.goal_aim is not None:
-            raise ConfigError(f"--goal-aim {self.goal_aim} has no effect: name a --goal.")
-        recipe = configure(recipe, self.set, sections=(section,))
-        scenarios = open_split(self.data, self.split)
-        if self.method == "gcsl" and self.validation_split:
-            raise ConfigError(f"--validation-split {self.validation_split} has no effect: {NOT_VALIDATED}")
-        every = recipe.catk.validation.every if self.method == "catk" else 0
-        held_out = _held_out(self.data, self.validation_split, every)
-        sight = None if self.goal is None else NewSight(self.goal, AIM[self.goal_aim])
-        with _drawn(self.out):
-            match self.method:
-                case "rlft":
-                    model = finetune_with_reward(self.model, scenarios, recipe.finetune, self.out, sight=sight)
-                case "catk":
-                    model = finetune_with_catk(
-                        self.model, scenarios, recipe.catk, self.out, sight=sight, held_out=held_out
-                    )
-                case "gcsl":
-                    model = teach_goals(self.model, scenarios, recipe.gcsl, self.out, sight=sight)
-        print(f"model: {model}")
-        return 0

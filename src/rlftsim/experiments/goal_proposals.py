@@ -1,4 +1,4 @@
-"""Goals that a map and the record propose; those of a map that has road edges are never off the road."""
+"""Goals proposed from the map and the log. On a map with road edges none is off the road."""
 
 from functools import partial
 
@@ -7,26 +7,28 @@ import torch
 from jaxtyping import Float
 
 from rlftsim.goals.goals_file import GoalEntry
-from rlftsim.goals.manoeuvre import Manoeuvre
-from rlftsim.goals.proposals import Proposal, RoadTest, propose_from_lanes
-from rlftsim.goals.recorded_manoeuvre import recorded_manoeuvre
+from rlftsim.goals.maneuvers.logged import logged_maneuver
+from rlftsim.goals.maneuvers.proposals import Proposal, RoadTest, propose_from_lanes
 from rlftsim.realism.agents import Trajectories
 from rlftsim.realism.map_based import RoadEdges, build_road_edges, compute_distance_to_road_edge
-from rlftsim.scenario.derived import derived
+from rlftsim.scenario.derived import cached_on_scenario
+from rlftsim.scenario.maneuver import BENCHMARK_MANEUVERS
 from rlftsim.scenario.types import Scenario
 
 MAX_PAIRS = 1 << 17
-RECORDED = " (recorded)"
-"""Said behind the label of what the record shows."""
+LOGGED = " (logged)"
+"""Ending of the label of the logged maneuver."""
+_LOGGED_ENDINGS = (LOGGED, " (recorded)")
+"""The second is that of goals files of 0.1."""
 
 
-@derived
+@cached_on_scenario
 def _road_edges(scenario: Scenario) -> RoadEdges | None:
     return build_road_edges(scenario.map_features, torch.device("cpu"))
 
 
 def road_test(scenario: Scenario) -> RoadTest | None:
-    """The metric's own test of being on the road; None for a map without road edges."""
+    """The metric's own distance to the road edge as a test of goals; None for a map without road edges."""
     edges = _road_edges(scenario)
     return None if edges is None else partial(_outside_m, edges)
 
@@ -34,31 +36,50 @@ def road_test(scenario: Scenario) -> RoadTest | None:
 def _outside_m(
     edges: RoadEdges, way: Float[np.ndarray, "S 3"], heading: Float[np.ndarray, "S"], size: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "S"]:
-    x, y, z = torch.from_numpy(way).float().T
+    x, y, z = torch.from_numpy(way).float().T  # each [S]
+    # the metric takes the center of the box, lanes lie on the ground
     z = z + float(size[2]) / 2
     angle = torch.from_numpy(heading).float()
-    states = Trajectories(*(v[None, None] for v in (x, y, z, angle)))
+    states = Trajectories(*(v[None, None] for v in (x, y, z, angle)))  # one rollout, one agent: [1, 1, S]
     box = torch.from_numpy(size).float()[None]
     return compute_distance_to_road_edge(states, box, edges, max_pairs=MAX_PAIRS)[0, 0].numpy()
 
 
 def propose(scenario: Scenario, track: int) -> tuple[Proposal, ...]:
-    """What an agent may do, in the order of the manoeuvres: the recorded one with its recorded end, the others read off the lanes."""
-    recorded = recorded_manoeuvre(scenario, track)
+    """Proposals for an agent in the order of the maneuvers: the logged one with its logged end, others along the lanes.
+
+    Args:
+        scenario: with its logged future, where the logged maneuver is wanted.
+        track: row of the agent in `scenario.tracks`.
+    """
+    logged = logged_maneuver(scenario, track)
     others = propose_from_lanes(scenario, track, road_test(scenario))
-    if recorded is None:
+    if logged is None:
         return others
-    order = tuple(Manoeuvre)
-    kept = [proposal for proposal in others if proposal.manoeuvre != recorded.manoeuvre]
-    return tuple(sorted([*kept, recorded], key=lambda proposal: order.index(proposal.manoeuvre)))
+    order = BENCHMARK_MANEUVERS
+    kept = [proposal for proposal in others if proposal.maneuver != logged.maneuver]
+    return tuple(sorted([*kept, logged], key=lambda proposal: order.index(proposal.maneuver)))
 
 
 def entry_of(scenario: Scenario, proposal: Proposal) -> GoalEntry:
-    """A proposal as a line of a goals file."""
+    """A proposal as an entry of a goals file.
+
+    Args:
+        scenario: of the agent.
+        proposal: for the agent.
+    """
     x, y = proposal.position
     return GoalEntry(scenario.scenario_id, proposal.object_id, float(x), float(y), label_of(proposal))
 
 
 def label_of(proposal: Proposal) -> str:
-    """Its manoeuvre, and whether it is the recorded one."""
-    return f"{proposal.manoeuvre.value}{RECORDED if proposal.is_recorded else ''}"
+    """Label of a proposal: its maneuver, with an ending for the logged one."""
+    return f"{proposal.maneuver.value}{LOGGED if proposal.is_logged else ''}"
+
+
+def split_label(label: str) -> tuple[str, bool]:
+    """The maneuver of a label, and True for the logged one."""
+    for ending in _LOGGED_ENDINGS:
+        if label.endswith(ending):
+            return label.removesuffix(ending), True
+    return label, False

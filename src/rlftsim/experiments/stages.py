@@ -1,35 +1,43 @@
-"""From a data set to trained policies, stage by stage. Each does what is missing in its folder and refuses another's."""
+"""Stages from a data set to trained policies: vocabulary, pre-training, fine-tuning by any method.
 
+Each does what is missing in its folder, and refuses the folder of another run.
+"""
+
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
+from torch import nn
 
 from rlftsim.errors import ConfigError
-from rlftsim.policies.smart.config import GoalSight, SmartConfig
-from rlftsim.policies.smart.policy import SmartPolicy
+from rlftsim.policies.registry import load_policy
 from rlftsim.recipes.card import model_card
-from rlftsim.recipes.models import load_policy
-from rlftsim.rollout.policy import Policy
+from rlftsim.rollout.policy import ConditionablePolicy
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
 from rlftsim.tokens.vocabulary import Vocabulary
-from rlftsim.training.catk import CatkConfig, catk_finetune
-from rlftsim.training.finetune import FinetuneConfig, finetune
-from rlftsim.training.gcsl import GcslConfig, gcsl_finetune
+from rlftsim.training.methods import FinetuningConfig, describe_method, finetune_policy
 from rlftsim.training.pretrain import PretrainConfig, pretrain
 
 CACHED_SCENARIOS = 4096
-"""About a megabyte each; with them stay their tokens."""
+"""About a megabyte each; their tokens are cached with them."""
 
 
 @dataclass(frozen=True)
-class NewSight:
-    """How a model that sees no goals is to see them; see `SmartPolicy.with_goal_sight`."""
+class GoalConditioning:
+    """Goal conditioning that is added to a goal-free model before fine-tuning, see
+    `SmartPolicy.with_goal_conditioning`."""
 
-    goal: GoalSight
-    aim: bool | None = None
-    """Tokens are weighed by where they lead, too; False = as in the paper, None = yes, or as the model has it."""
+    encoding: str
+    """SMART has "concat" and "indication"."""
+    logit_bias: bool | None = None
+    """Goals also bias the logits of tokens by their endpoints. False = no, as in the paper; None = yes, or as
+    the model has it."""
+
+    def __str__(self) -> str:
+        return f", goals by {self.encoding}{', without a logit bias' if self.logit_bias is False else ''}"
 
 
 def open_training(data: Path) -> ScenarioDataset:
@@ -38,99 +46,101 @@ def open_training(data: Path) -> ScenarioDataset:
 
 
 def find_vocabulary(training: ScenarioDataset, config: TokensConfig, path: Path, *, origin: str) -> Vocabulary:
-    """The vocabulary in a file; built from the training scenarios where there is none of this origin."""
+    """The vocabulary in a file; built from the training scenarios where the file is missing or of another origin.
+
+    Args:
+        training: scenarios to build it from.
+        config: settings of the clustering.
+        path: file to read, or to write.
+        origin: text that says what it was built from; stored with it.
+    """
     if not path.exists() or Vocabulary.load(path).origin != origin:
         build_vocabulary(training, config, origin=origin)[0].save(path)
+    # Always from the file: the first run and a resumed one get the very same tokens.
     return Vocabulary.load(path)
 
 
-def pretrain_smart(
-    vocabulary: Vocabulary,
+def pretrain_policy(
+    policy: nn.Module,
     training: ScenarioDataset,
-    model: SmartConfig,
     config: PretrainConfig,
     out: Path,
     *,
     held_out: ScenarioDataset | None = None,
 ) -> Path:
-    """Folder of a model pre-trained from fresh weights.
+    """Folder of the model that pre-training makes of a policy.
+
+    Args:
+        policy: with fresh weights, such as `recipe.new_policy(vocabulary)`; trained in place.
+        training: training scenarios.
+        config: settings.
+        out: folder of the run. A run that was stopped there is resumed, a finished one is not repeated.
+        held_out: scenarios for validation, see `config.validation`.
 
     Raises:
         CheckpointError: `out` holds a run with other settings.
     """
-    torch.manual_seed(config.seed)
-    policy = SmartPolicy(model, vocabulary)
     card = model_card("pre-trained", training.folder, len(training))
-    return pretrain(policy, training, out, config, held_out=held_out, card=card)
+    # Refuses a module that is not a `PretrainablePolicy`.
+    return pretrain(policy, training, out, config, held_out=held_out, card=card)  # type: ignore[arg-type]
 
 
-def finetune_with_reward(
+def finetune_model(
     base: str | Path,
     training: ScenarioDataset,
-    config: FinetuneConfig,
+    config: FinetuningConfig,
     out: Path,
     *,
-    sight: NewSight | None = None,
-) -> Path:
-    """Folder of a model fine-tuned closed-loop from a base model, which is given sight of goals if `sight` says how.
-
-    Raises:
-        CheckpointError: `out` holds a run with other settings or another base model.
-        ConfigError: the base model has no weights, or sees goals in another way.
-    """
-    card = model_card(f"fine-tuned ({config.reward}{_by(sight)}) from {base}", training.folder, len(training))
-    return finetune(_learner(base, sight, config.seed), training, out, config, card=card)
-
-
-def finetune_with_catk(
-    base: str | Path,
-    training: ScenarioDataset,
-    config: CatkConfig,
-    out: Path,
-    *,
-    sight: NewSight | None = None,
+    conditioning: GoalConditioning | None = None,
     held_out: ScenarioDataset | None = None,
 ) -> Path:
-    """Folder of a model fine-tuned with CAT-K from a base model, which is given sight of goals if `sight` says how.
+    """Folder of the model that fine-tuning makes of a base model. The type of `config` chooses the method.
+
+    Args:
+        base: model folder, or the folder of a run.
+        training: training scenarios.
+        config: settings: `FinetuneConfig` for a reward, `CatkConfig` for CAT-K, `GcslConfig` for imitation of the
+            model's own rollouts, relabelled with their endpoints as goals.
+        out: folder of the run. A run that was stopped there is resumed, a finished one is not repeated.
+        conditioning: goal conditioning to add to the base model first; None = as the base model is.
+        held_out: scenarios for validation; CAT-K only, see `config.validation`.
 
     Raises:
         CheckpointError: `out` holds a run with other settings or another base model.
-        ConfigError: the base model has no weights, or sees goals in another way.
+        ConfigError: the base model has no weights or other goal conditioning, or the method has no validation.
     """
-    card = model_card(f"fine-tuned (CAT-K, {config.choice}{_by(sight)}) from {base}", training.folder, len(training))
-    return catk_finetune(_learner(base, sight, config.seed), training, out, config, held_out=held_out, card=card)
+    policy: Any = load_policy(str(base))
+    if conditioning is not None:
+        if not isinstance(policy, ConditionablePolicy):
+            raise ConfigError(f"{base} cannot be goal-conditioned: its policy has no with_goal_conditioning.")
+        torch.manual_seed(config.seed)  # of the weights that encode goals; the base model brings the others
+        policy = policy.with_goal_conditioning(conditioning.encoding, logit_bias=conditioning.logit_bias)
+
+    what = f"fine-tuned ({describe_method(config)}{conditioning or ''}) from {base}"
+    card = model_card(what, training.folder, len(training))
+    return finetune_policy(policy, training, out, config, held_out=held_out, card=card)
 
 
-def teach_goals(
-    base: str | Path,
-    training: ScenarioDataset,
-    config: GcslConfig,
-    out: Path,
-    *,
-    sight: NewSight | None = None,
-) -> Path:
-    """Folder of a model that knows what goals are, from a base model, which is given sight of goals if `sight` says how.
+def start_from_shorter_run(out: Path, epochs: float) -> None:
+    """Copy the end of the longest shorter run with a reward into a run that has not begun; nothing if there is none.
 
-    Raises:
-        CheckpointError: `out` holds a run with other settings or another base model.
-        ConfigError: the base model has no weights, sees no goals, or sees them in another way.
+    The longer run passes through the same weights, because nothing in it depends on the update at which it ends.
+
+    Args:
+        out: folder of the run to begin, beside the shorter ones; they are called "3-epochs".
+        epochs: length of the run to begin.
     """
-    card = model_card(f"told where its own rollouts led{_by(sight)}, from {base}", training.folder, len(training))
-    return gcsl_finetune(_learner(base, sight, config.seed), training, out, config, card=card)
 
+    def epochs_of(path: Path) -> float:
+        return float(path.name.removesuffix("-epochs"))
 
-def _by(sight: NewSight | None) -> str:
-    if sight is None:
-        return ""
-    return f", goals by {sight.goal}{', without an aim' if sight.aim is False else ''}"
-
-
-def _learner(base: str | Path, sight: NewSight | None, seed: int) -> Policy:
-    """A policy to fine-tune."""
-    policy = load_policy(str(base))
-    if sight is None:
-        return policy
-    if not isinstance(policy, SmartPolicy):
-        raise ConfigError(f"{base} has no weights, so it cannot learn to see goals: name a model folder.")
-    torch.manual_seed(seed)
-    return policy.with_goal_sight(sight.goal, aim=sight.aim)
+    finished = [path for path in out.parent.glob("*-epochs") if (path / "model").exists()]
+    shorter = [path for path in finished if epochs_of(path) < epochs]
+    if out.exists() or not shorter:
+        return
+    # Copied under another name first: a copy that is interrupted must not look like a run.
+    found, copied = max(shorter, key=epochs_of), out.with_name(f".partial-{out.name}")
+    shutil.rmtree(copied, ignore_errors=True)
+    shutil.copytree(found / "checkpoints", copied / "checkpoints")
+    shutil.copy(found / "metrics.jsonl", copied / "metrics.jsonl")
+    copied.rename(out)

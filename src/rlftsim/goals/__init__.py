@@ -1,1 +1,1 @@
-"""What is asked: goals of agents."""
+"""Goals of agents: points that they are conditioned on, and the maneuvers behind them."""

@@ -1,4 +1,4 @@
-"""Goals as a JSON file that a person can write and mend. Frame: world, metres, as in the scenario's record.
+"""Goals as a JSON file, to be read and edited by hand. Frame: world, m, as in the scenario's log.
 
     {
      "format": "rlftsim-goals-1",
@@ -6,8 +6,8 @@
      "alternatives": []
     }
 
-`label` is free text and may be missing, `alternatives` too: entries that are kept at hand and not asked for. An agent has at most one
-goal; to ask for an alternative, swap the two entries.
+`label` is free text and optional. `alternatives` is optional, too: entries that are stored but not used. An agent has
+at most one goal; to use an alternative instead, swap the two entries.
 """
 
 import difflib
@@ -19,21 +19,21 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from rlftsim.atomic_io import write_text
 from rlftsim.errors import DataError
-from rlftsim.files import write_text
 
 FORMAT = "rlftsim-goals-1"
 FIELDS = ("scenario", "agent", "x", "y", "label")
 SECTIONS = ("goals", "alternatives")
 LONGEST_WHOLE = 20
-"""Digits of a whole number that may be an object id; longer ones are coordinates, written oddly."""
+"""Digits that an int64 object id may have; longer whole numbers are read as coordinates."""
 UNSHOWABLE = {"Cc": "a control character", "Cs": "half a character"}
-"""By Unicode category."""
+"""Unicode categories that no terminal or picture can show: control characters and lone surrogates."""
 
 
 @dataclass(frozen=True)
 class GoalEntry:
-    """A point that an agent of a scenario is asked to go to."""
+    """The goal of one agent of one scenario."""
 
     scenario_id: str
     agent_id: int
@@ -41,7 +41,7 @@ class GoalEntry:
     y: float
     label: str = ""
     place: str = field(default="", compare=False)
-    """Where it was written, for messages."""
+    """File and position it was read from, for messages."""
 
     def __str__(self) -> str:
         return self.place or f"goal of agent {self.agent_id} in scenario {self.scenario_id}"
@@ -49,11 +49,11 @@ class GoalEntry:
 
 @dataclass(frozen=True)
 class GoalsFile:
-    """What a goals file says."""
+    """Content of a goals file."""
 
     goals: tuple[GoalEntry, ...]
     alternatives: tuple[GoalEntry, ...] = ()
-    """Not asked for."""
+    """Stored, not used."""
 
     @property
     def scenario_ids(self) -> tuple[str, ...]:
@@ -66,14 +66,19 @@ class GoalsFile:
 
 
 def read_goals(path: Path) -> GoalsFile:
-    """Read and check a goals file; whether scenarios have these agents is for `goals.placing` to say.
+    """Read and check a goals file. `goals.placement` checks it against the scenarios.
 
     Raises:
-        DataError: it is not there, no JSON, or an entry is wrong: names file, entry and field.
+        DataError: the file is missing or not JSON, or an entry is wrong: names file, entry and field.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")
-        about = json.loads(text, object_pairs_hook=_Object, parse_int=_whole)
+        # Python refuses to parse whole numbers of more than 4300 digits: floats report them as infinite instead.
+        about = json.loads(
+            text,
+            object_pairs_hook=_Object,
+            parse_int=lambda digits: int(digits) if len(digits) <= LONGEST_WHOLE else float(digits),
+        )
     except FileNotFoundError:
         raise DataError(f"{path}: no such goals file: make one with `rlftsim goals propose`.") from None
     except UnicodeDecodeError:
@@ -87,13 +92,22 @@ def read_goals(path: Path) -> GoalsFile:
     if not isinstance(about, dict) or about.get("format") != FORMAT:
         raise DataError(f'{path}: not a goals file of this version: it must be an object with "format": "{FORMAT}".')
     _refuse_unknown(about, ("format", *SECTIONS), f"{path}")
-    goals, alternatives = (_entries(about.get(section, []), f"{path}: {section}") for section in SECTIONS)
-    refuse_twice(goals)
-    return GoalsFile(goals, alternatives)
+    sections: list[tuple[GoalEntry, ...]] = []
+    for section in SECTIONS:
+        found, place = about.get(section, []), f"{path}: {section}"
+        if not isinstance(found, list):
+            raise DataError(f"{place}: must be a list of goals, is {_kind(found)}.")
+        sections.append(tuple(_entry(one, f"{place}[{number}]") for number, one in enumerate(found)))
+    refuse_twice(sections[0])
+    return GoalsFile(*sections)
 
 
 def write_goals(path: Path, file: GoalsFile) -> None:
-    """Write a goals file, one entry a line, whole or not at all.
+    """Write a goals file, one entry a line, atomically.
+
+    Args:
+        path: the file; replaced if it exists.
+        file: goals and alternatives; coordinates are rounded to 1 mm.
 
     Raises:
         DataError: it cannot be written.
@@ -101,13 +115,22 @@ def write_goals(path: Path, file: GoalsFile) -> None:
     sections = {"goals": file.goals, "alternatives": file.alternatives}
     lines = [f' "format": "{FORMAT}"']
     for name, entries in sections.items():
-        body = ",\n".join(f"  {json.dumps(_to_plain(entry))}" for entry in entries)
+        plain = (
+            {"scenario": entry.scenario_id, "agent": entry.agent_id, "x": round(entry.x, 3), "y": round(entry.y, 3)}
+            | ({"label": entry.label} if entry.label else {})
+            for entry in entries
+        )
+        body = ",\n".join(f"  {json.dumps(entry)}" for entry in plain)
         lines.append(f' "{name}": [{f"{chr(10)}{body}{chr(10)} " if body else ""}]')
     write_text(path, "{\n" + ",\n".join(lines) + "\n}\n")
 
 
 def parse_goal(text: str, scenario_id: str) -> GoalEntry:
-    """A goal as written on a command line: AGENT=X,Y.
+    """Goal of a command line, written AGENT=X,Y.
+
+    Args:
+        text: such as "12=1034.5,-188.0": object id, then x and y in m, world frame.
+        scenario_id: the scenario that it is meant for.
 
     Raises:
         DataError: it is written otherwise, or a number is not finite.
@@ -125,38 +148,28 @@ def parse_goal(text: str, scenario_id: str) -> GoalEntry:
 
 
 def refuse_twice(entries: Sequence[GoalEntry]) -> None:
-    """Refuse two goals of one agent.
+    """Check that no agent has two goals.
 
     Raises:
-        DataError: there are: names both entries.
+        DataError: one has: names both entries.
     """
     first: dict[tuple[str, int], GoalEntry] = {}
     for entry in entries:
         other = first.setdefault((entry.scenario_id, entry.agent_id), entry)
         if other is not entry:
             raise DataError(
-                f"{entry}: agent {entry.agent_id} of scenario {entry.scenario_id} has a goal already ({other}): keep one "
-                'of them; in a file the other may go to "alternatives".'
+                f"{entry}: agent {entry.agent_id} of scenario {entry.scenario_id} has a goal already ({other}): keep "
+                'one of them; in a file the other may go to "alternatives".'
             )
 
 
 class _Object(dict[str, Any]):
-    """A JSON object that remembers the keys it was written with more than once."""
+    """A JSON object that remembers repeated keys, of which `json` would silently keep the last value."""
 
     def __init__(self, pairs: Sequence[tuple[str, Any]]):
         super().__init__(pairs)
         names = [name for name, _ in pairs]
         self.repeated = [name for name in self if names.count(name) > 1]
-
-
-def _whole(digits: str) -> int | float:
-    return int(digits) if len(digits) <= LONGEST_WHOLE else float(digits)
-
-
-def _entries(found: object, place: str) -> tuple[GoalEntry, ...]:
-    if not isinstance(found, list):
-        raise DataError(f"{place}: must be a list of goals, is {_kind(found)}.")
-    return tuple(_entry(one, f"{place}[{number}]") for number, one in enumerate(found))
 
 
 def _entry(found: object, place: str) -> GoalEntry:
@@ -168,20 +181,26 @@ def _entry(found: object, place: str) -> GoalEntry:
         raise DataError(f"{place}: {', '.join(missing)} missing: a goal needs scenario, agent, x and y.")
     for name in ("scenario", "label"):
         if not isinstance(found.get(name, ""), str):
-            raise DataError(f'{place}: {name} must be text in quotes, is {_kind(found[name])}.')  # fmt: skip
-        _refuse_unshowable(found.get(name, ""), f"{place}: {name}")
+            raise DataError(f"{place}: {name} must be text in quotes, is {_kind(found[name])}.")
+        for character in found.get(name, ""):
+            unshowable = UNSHOWABLE.get(unicodedata.category(character))
+            if unshowable:
+                raise DataError(
+                    f"{place}: {name} has {unshowable}, U+{ord(character):04X}, that cannot be shown: write it without."
+                )
+    # bool is a subclass of int: `true` is refused first.
     if isinstance(found["agent"], bool) or not isinstance(found["agent"], int):
         shown = found["agent"] if isinstance(found["agent"], float) else _kind(found["agent"])
-        raise DataError(f"{place}: agent must be a whole number, an object id of the record, is {shown}.")
+        raise DataError(f"{place}: agent must be a whole number, an object id of the log, is {shown}.")
     x, y = (_coordinate(found[name], f"{place}: {name}") for name in ("x", "y"))
     return GoalEntry(found["scenario"], found["agent"], x, y, found.get("label", ""), place)
 
 
 def _coordinate(value: object, place: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise DataError(f"{place} must be a number of metres, is {_kind(value)}.")
+        raise DataError(f"{place} must be a number of meters, is {_kind(value)}.")
     if not math.isfinite(value):
-        raise DataError(f"{place} is {value}: a goal needs a finite point, metres in the world frame of the record.")
+        raise DataError(f"{place} is {value}: a goal needs a finite point, meters in the world frame of the log.")
     return float(value)
 
 
@@ -195,20 +214,7 @@ def _refuse_unknown(found: Mapping[str, Any], known: Sequence[str], place: str) 
         raise DataError(f"{place}: {', '.join(found.repeated)} is written more than once: keep one of them.")
 
 
-def _refuse_unshowable(text: str, place: str) -> None:
-    for character in text:
-        kind = UNSHOWABLE.get(unicodedata.category(character))
-        if kind:
-            raise DataError(f"{place} has {kind}, U+{ord(character):04X}, that cannot be shown: write it without.")
-
-
 def _kind(value: object) -> str:
-    """A JSON value in words."""
+    """Kind of a JSON value in words, for messages."""
     names = {str: "text", list: "a list", _Object: "an object", bool: "true or false", type(None): "null"}
     return names.get(type(value), "a number")
-
-
-def _to_plain(entry: GoalEntry) -> dict[str, object]:
-    point = {"x": round(entry.x, 3), "y": round(entry.y, 3)}
-    label = {"label": entry.label} if entry.label else {}
-    return {"scenario": entry.scenario_id, "agent": entry.agent_id, **point, **label}

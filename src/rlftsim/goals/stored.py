@@ -1,6 +1,7 @@
-"""Goals of many scenarios in a folder of Parquet files beside a data set: scenario_id, object_id, x, y. Frame: world, metres.
+"""Goals of many scenarios in a folder of Parquet files: scenario_id, object_id, x, y. Frame: world, m.
 
-For what programs make, such as the augmented goals of a whole data set. A person's goals are JSON (`goals.goals_file`).
+For goals that programs write, such as the augmented goals of a whole data set. Goals written by hand are JSON
+(`goals.goals_file`).
 """
 
 import hashlib
@@ -12,8 +13,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from rlftsim.atomic_io import write_whole
 from rlftsim.errors import DataError
-from rlftsim.files import write_whole
 from rlftsim.goals.types import Goals, Points, goals_at
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.shards import hash_file
@@ -22,11 +23,11 @@ SCHEMA = pa.schema([("scenario_id", pa.string()), ("object_id", pa.int64()), ("x
 
 
 def write_goal_part(path: Path, goals: Mapping[str, Points]) -> None:
-    """Write one file of such a folder, whole or not at all.
+    """Write one file of such a folder, atomically.
 
     Args:
-        path: of the file; a folder's files are read in the order of their names.
-        goals: by scenario id.
+        path: the file; a folder's files are read in the order of their names.
+        goals: object ids and points by scenario id.
     """
     columns = {
         "scenario_id": np.repeat(list(goals), [len(ids) for ids, _ in goals.values()]),
@@ -39,10 +40,10 @@ def write_goal_part(path: Path, goals: Mapping[str, Points]) -> None:
 
 
 class StoredGoals:
-    """The goals of a folder.
+    """The goals of a folder, by scenario id.
 
     Raises:
-        DataError: it holds no goals, a file is damaged, or a row is no goal.
+        DataError: it has no goals, a file is damaged, or a row is not a goal.
     """
 
     def __init__(self, folder: Path):
@@ -58,13 +59,15 @@ class StoredGoals:
         points = np.stack([self._table[name].to_numpy().astype(float) for name in ("x", "y")])
         if any(column.null_count for column in self._table.columns) or not np.isfinite(points).all():
             raise DataError(
-                f"{folder}: holds rows that are no goals (a value is missing or not finite): write them by `rlftsim augment`."
+                f"{folder}: holds rows that are not goals (a value is missing or not finite): write them by "
+                "`rlftsim augment`."
             )
 
     @cached_property
     def _rows(self) -> dict[str, slice]:
-        """Rows of each scenario: they stand together."""
+        """Rows of each scenario."""
         ids = self._table["scenario_id"].to_numpy()
+        # A scenario's rows are contiguous, so it begins wherever the id changes.
         starts = np.flatnonzero(np.append(True, ids[1:] != ids[:-1])) if len(ids) else np.zeros(0, np.int64)
         return {ids[a]: slice(a, b) for a, b in zip(starts.tolist(), [*starts[1:].tolist(), len(ids)])}
 
@@ -72,7 +75,7 @@ class StoredGoals:
         return scenario_id in self._rows
 
     def __len__(self) -> int:
-        """Scenarios."""
+        """Number of scenarios that have goals."""
         return len(self._rows)
 
     @cached_property
@@ -81,7 +84,7 @@ class StoredGoals:
         return hashlib.sha256("".join(map(hash_file, self._files)).encode()).hexdigest()
 
     def count_among(self, scenario_ids: Iterable[str]) -> int:
-        """How many of some scenarios have goals here; 0 for those of another data set."""
+        """Number of the given scenarios that have goals here; 0 if they are of another data set."""
         return sum(scenario_id in self for scenario_id in scenario_ids)
 
     def of_scenario(self, scenario_id: str) -> Points:
@@ -92,6 +95,6 @@ class StoredGoals:
         return ids, np.stack([x, y], -1)
 
     def of_batch(self, batch: ScenarioBatch) -> Goals:
-        """The goals of a batch, for a single rollout, in its frame; agents and scenarios that have none have no goal."""
+        """Goals of a batch, for a single rollout, in its frame; scenarios that are not in the folder have none."""
         ids = [scenario.scenario_id for scenario in batch.scenarios if scenario.scenario_id in self]
         return goals_at({scenario_id: self.of_scenario(scenario_id) for scenario_id in ids}, batch)

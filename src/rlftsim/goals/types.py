@@ -1,31 +1,85 @@
-"""What an agent is asked to do."""
+"""Goals: points that agents are conditioned on."""
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from rlftsim.errors import ConfigError
+from rlftsim.errors import ConfigError, DataError
 from rlftsim.scenario.batch import ScenarioBatch, origin_of
+from rlftsim.scenario.types import Scenario
 
 Points = tuple[Int64[np.ndarray, "n"], Float[np.ndarray, "n 2"]]
-"""Object ids, each once, and a point of each. Frame: world, metres, float64."""
+"""Object ids, each once, and a point of each. Frame: world, m, float64."""
+
+PointById = Mapping[int | np.integer, Sequence[float | int] | np.ndarray]
+"""Object id -> (x, y). Frame: world, m."""
+
+LISTED = 12
+"""Object ids that an error message lists at most."""
 
 
 @dataclass(frozen=True, eq=False)
 class Goals:
-    """A point for some of the agents of each rollout. Frame: map (centred). `goal_mask` is True where an agent has a goal; elsewhere `position` means nothing."""
+    """A point for some of the agents of each rollout. Frame: map (centered on each scenario).
+
+    `goal_mask` is True where an agent has a goal. Elsewhere `position` is undefined and must not be read.
+    """
 
     position: Float[Tensor, "B N A 2"]
     goal_mask: Bool[Tensor, "B N A"]
 
     @classmethod
     def of_scenarios(cls, position: Float[Tensor, "B A 2"], goal_mask: Bool[Tensor, "B A"]) -> "Goals":
-        """The goals of a single rollout; `repeat` makes them those of N."""
+        """Goals of a single rollout (N = 1); `repeat` expands them to N.
+
+        Args:
+            position: goal of each agent, map frame, m.
+            goal_mask: True = the agent has a goal.
+        """
         return cls(position[:, None], goal_mask[:, None])
+
+    @classmethod
+    def from_points(cls, batch: ScenarioBatch, points: Mapping[str, PointById] | PointById) -> "Goals":
+        """Goals of agents addressed by object id, for a single rollout.
+
+        Args:
+            batch: the scenarios; agents that are not named have no goal.
+            points: `{scenario_id: {object_id: (x, y)}}`, or `{object_id: (x, y)}` for a batch of one scenario. World
+                frame, m.
+
+        Raises:
+            ConfigError: object ids without a scenario id for several scenarios, or a scenario that is not in the batch.
+            DataError: an agent that the scenario lacks or does not simulate, or a point that is not two finite numbers.
+        """
+        ids = [scenario.scenario_id for scenario in batch.scenarios]
+        by_scenario: dict[str, PointById] = {
+            str(key): value for key, value in points.items() if isinstance(value, Mapping)
+        }
+        if len(by_scenario) != len(points):
+            if len(ids) != 1 or by_scenario:
+                raise ConfigError(
+                    f"goals by object id alone need a batch of one scenario, this one has {len(ids)}: write "
+                    "{scenario_id: {object_id: (x, y)}}."
+                )
+            by_scenario = {ids[0]: cast(PointById, points)}
+        missing = [key for key in by_scenario if key not in ids]
+        if missing:
+            raise ConfigError(f"goals name scenario {missing[0]!r}, which is not in the batch: it has {_listed(ids)}.")
+        found: dict[str, Points] = {}
+        for scenario in batch.scenarios:
+            named = by_scenario.get(scenario.scenario_id, {})
+            for object_id, point in named.items():
+                simulated_track(scenario, object_id, "goals")
+                _refuse_no_point(point, f"goal of agent {object_id} in scenario {scenario.scenario_id}")
+            positions = np.array([tuple(point) for point in named.values()], np.float64).reshape(-1, 2)
+            found[scenario.scenario_id] = np.array(list(named), np.int64), positions
+        return goals_at(found, batch)
 
     @property
     def num_rollouts(self) -> int:
@@ -34,7 +88,7 @@ class Goals:
 
     @property
     def any(self) -> bool:
-        """Whether anybody has a goal."""
+        """True if at least one agent has a goal."""
         return bool(self.goal_mask.any())
 
     def rollouts(self, selected: slice) -> "Goals":
@@ -42,23 +96,29 @@ class Goals:
         return Goals(self.position[:, selected], self.goal_mask[:, selected])
 
     def repeat(self, num_rollouts: int) -> "Goals":
-        """The goals of a single rollout, asked in N of them, without copies; goals of N rollouts as they are.
+        """The goals of a single rollout expanded to N, without copies; goals of N rollouts as they are.
 
         Raises:
             ConfigError: they are of another number of rollouts.
         """
         if self.num_rollouts not in (1, num_rollouts):
             raise ConfigError(
-                f"goals of {self.num_rollouts} rollouts cannot be those of {num_rollouts}: give as many, or those of one."
+                f"goals of {self.num_rollouts} rollouts do not fit {num_rollouts} rollouts: give goals of one rollout "
+                "or of as many."
             )
         return Goals(self.position.expand(-1, num_rollouts, -1, -1), self.goal_mask.expand(-1, num_rollouts, -1))
 
     def only(self, chosen: Bool[Tensor, "B #N A"]) -> "Goals":
-        """The same, without the goals of agents that are not chosen."""
+        """The same goals, masked to the chosen agents."""
         return replace(self, goal_mask=self.goal_mask & chosen)
 
     def where(self, condition: Bool[Tensor, "B N A"], other: "Goals") -> "Goals":
-        """These goals where a condition is True, other ones elsewhere."""
+        """These goals where a condition is True, other ones elsewhere, like `torch.where`.
+
+        Args:
+            condition: True = keep this goal (or none, if there is none here).
+            other: goals of the same shape.
+        """
         return Goals(
             torch.where(condition[..., None], self.position, other.position),
             torch.where(condition, self.goal_mask, other.goal_mask),
@@ -68,21 +128,79 @@ class Goals:
         """The same goals on another device."""
         return Goals(self.position.to(device), self.goal_mask.to(device))
 
+    def __repr__(self) -> str:
+        num_scenarios, num_rollouts, num_agents = self.goal_mask.shape
+        count = int(self.goal_mask.any(1).sum())
+        agents, scenarios, rollouts = (
+            f"{number} {word}{'' if number == 1 else 's'}"
+            for number, word in ((count, "agent"), (num_scenarios, "scenario"), (num_rollouts, "rollout"))
+        )
+        return f"Goals({agents} of {scenarios} × {num_agents}, in {rollouts})"
+
 
 def goals_at(points: Mapping[str, Points], batch: ScenarioBatch) -> Goals:
-    """Points of the world as goals of a batch, for a single rollout, in its frame.
+    """World-frame points as goals of a batch, for a single rollout, in the batch's frame.
 
     Args:
-        points: by scenario id; those of agents that nobody simulates are left out.
+        points: by scenario id; those of agents that are not simulated are left out silently (`Goals.from_points`
+            refuses them).
         batch: scenarios and agents that have no point have no goal.
     """
-    mask = np.zeros(batch.agent_mask.shape, bool)
-    position = np.zeros((*mask.shape, 2), np.float32)
+    mask = np.zeros(batch.agent_mask.shape, bool)  # [B, A]
+    position = np.zeros((*mask.shape, 2), np.float32)  # [B, A, 2]
     for row, scenario in enumerate(batch.scenarios):
         if scenario.scenario_id in points:
             ids, places = points[scenario.scenario_id]
             simulated = scenario.tracks.object_id[scenario.simulated_indices]
-            _, agents, asked = np.intersect1d(simulated, ids, return_indices=True)
+            _, agents, given = np.intersect1d(simulated, ids, return_indices=True)
             mask[row, agents] = True
-            position[row, agents] = places[asked] - origin_of(scenario, batch.frame)
+            # The origin is subtracted in float64: world coordinates may be kilometers, where float32 has steps of 0.5
+            # mm.
+            position[row, agents] = places[given] - origin_of(scenario, batch.frame)
     return Goals.of_scenarios(torch.from_numpy(position), torch.from_numpy(mask)).to(batch.device)
+
+
+def shown_id(object_id: object) -> str:
+    """An object id for an error message; one that is not a whole number, such as the text "9", is marked."""
+    return str(object_id) if isinstance(object_id, int | np.integer) else f"{object_id!r} (ids are whole numbers)"
+
+
+def simulated_track(scenario: Scenario, object_id: object, place: str) -> int:
+    """Index of the track of a simulated agent.
+
+    Args:
+        scenario: the agent's scenario.
+        object_id: the id it has in the log.
+        place: start of the error message, such as a file and an entry.
+
+    Raises:
+        DataError: there is no such agent, or it is not simulated.
+    """
+    tracks, simulated = scenario.tracks, scenario.simulated_indices
+    found = np.flatnonzero(tracks.object_id == object_id)
+    if not len(found):
+        ids = sorted(tracks.object_id[simulated].tolist())
+        raise DataError(
+            f"{place}: scenario {scenario.scenario_id} has no agent {shown_id(object_id)}: it simulates {len(ids)} "
+            f"agents: {_listed(ids)}."
+        )
+    if found[0] not in simulated:
+        raise DataError(
+            f"{place}: agent {object_id} is not there at the current step of scenario {scenario.scenario_id}, so it is "
+            "not simulated: choose another one."
+        )
+    return int(found[0])
+
+
+def _refuse_no_point(point: object, place: str) -> None:
+    try:
+        x, y = point  # type: ignore[misc]
+        finite = math.isfinite(x) and math.isfinite(y)
+    except (TypeError, ValueError):
+        finite = False
+    if not finite:
+        raise DataError(f"{place}: {point!r} is not a point: give (x, y), finite, in m, in the world frame of the log.")
+
+
+def _listed(ids: list[str] | list[int]) -> str:
+    return ", ".join(str(i) for i in ids[:LISTED]) + (", ..." if len(ids) > LISTED else "")

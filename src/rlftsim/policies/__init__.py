@@ -1,1 +1,1 @@
-"""Who decides: models that implement `rollout.policy`."""
+"""Traffic models: policies that implement `rollout.policy`, and their registry."""

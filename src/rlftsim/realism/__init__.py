@@ -1,12 +1,12 @@
-"""How real it is: the realism meta-metric of the Waymo Open Sim Agents Challenge, equal to the official evaluator.
+"""Realism meta-metric (RMM) of the Waymo Open Sim Agents Challenge, equal to the official evaluator to 1e-6.
 
-`score` for one scenario, `score_batch` for several; `measure_batch` (or `compute_features`) and `score_measured`, `AgentScores` where
-several readers share the features. Nothing here knows models or rewards.
+`score` for one scenario, `score_batch` for several. `compute_batch_features` (or `compute_features`), then
+`score_batch_features` and `AgentScores`, where several readers share the features. Independent of models and rewards.
 """
 
 from rlftsim.realism.agent_scores import AgentScores
 from rlftsim.realism.agents import SimulatedStates
-from rlftsim.realism.batch import Measured, measure_batch, score_batch, score_measured
+from rlftsim.realism.batch import ScenarioFeatures, compute_batch_features, score_batch, score_batch_features
 from rlftsim.realism.config import (
     FEATURE_NAMES,
     METRIC_2023,
@@ -22,7 +22,6 @@ from rlftsim.realism.features import (
     ComputeConfig,
     Features,
     ScenarioLog,
-    build_scenario_log,
     compute_features,
     scenario_log,
 )
@@ -39,20 +38,19 @@ __all__ = [
     "ComputeConfig",
     "Credit",
     "Features",
-    "Measured",
     "MetricConfig",
     "RealismResult",
+    "ScenarioFeatures",
     "ScenarioLog",
     "SimulatedStates",
-    "build_scenario_log",
+    "compute_batch_features",
     "compute_credit",
     "compute_features",
     "compute_single_credit",
-    "measure_batch",
     "metric_by_name",
     "scenario_log",
     "score",
     "score_batch",
+    "score_batch_features",
     "score_features",
-    "score_measured",
 ]

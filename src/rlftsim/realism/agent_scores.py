@@ -1,6 +1,6 @@
-"""What each agent has to do with the scores of its rollouts, in a batch's order of agents: for rewards that are owed by agent.
+"""Scores of rollouts split over agents, in a batch's order of agents: for rewards with credit per agent.
 
-Everybody who is not evaluated, and padding, has 0. Each property is computed when it is first asked for, from features that are there.
+Agents that are not evaluated, and padding, have 0. Each property is computed on first use, from features that exist.
 """
 
 from collections.abc import Callable
@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from rlftsim.realism.batch import Measured
+from rlftsim.realism.batch import ScenarioFeatures
 from rlftsim.realism.config import MetricConfig
 from rlftsim.realism.credit import compute_credit, compute_single_credit
 from rlftsim.realism.likelihood import compute_outcomes
@@ -19,40 +19,40 @@ from rlftsim.realism.likelihood import compute_outcomes
 
 @dataclass(frozen=True, eq=False)
 class AgentScores:
-    """Shares of A agents in scores of N distinct rollouts of B scenarios. Summed over agents they are the rollout's score."""
+    """Parts of A agents in the scores of N distinct rollouts of B scenarios; their sum is the rollout's score."""
 
-    measured: tuple[Measured, ...]
+    measured: tuple[ScenarioFeatures, ...]
     config: MetricConfig
     num_agents: int
     """A, padding included."""
 
     @cached_property
     def leave_one_out(self) -> Float64[Tensor, "B N A"]:
-        """Of mean_j RMM(-j) - RMM(-i), the reward `mloo`, see `Credit.mloo`. Sums to zero over rollouts, too."""
+        """Parts of mean_j RMM(-j) - RMM(-i), the reward `mloo`; see `Credit.mloo`. Their sum over rollouts is zero."""
         return self._place(lambda item: compute_credit(item.log, item.features, self.config).mloo.sum(-1))
 
     @cached_property
     def single(self) -> Float64[Tensor, "B N A"]:
-        """Of RMM_i - mean_{j != i} RMM_j, the reward `rloo`, see `compute_single_credit`."""
+        """Parts of RMM_i - mean_{j != i} RMM_j, the reward `rloo`; see `compute_single_credit`."""
         return self._place(lambda item: compute_single_credit(item.log, item.features, self.config).sum(-1))
 
     @cached_property
     def displacement_error(self) -> Float[Tensor, "B N A"]:
-        """Of `RealismResult.rollout_displacement_error`, m: the agent's own error over the number of evaluated agents."""
+        """Parts of `RealismResult.rollout_displacement_error`, m: an agent's own error over the number of agents E."""
         return self._place(lambda item: item.features.displacement_error / item.features.displacement_error.shape[-1])
 
     @cached_property
     def collision(self) -> Float[Tensor, "B N A"]:
-        """Of `RealismResult.rollout_collision_rate`: one over the number of evaluated agents for whoever collides."""
-        return self._place(lambda item: _share_of_outcome(item, 0))
+        """Parts of `RealismResult.rollout_collision_rate`: 1 / E for each evaluated agent that collides."""
+        return self._place(lambda item: _part_of_rate(item, 0))
 
     @cached_property
     def offroad(self) -> Float[Tensor, "B N A"]:
-        """Of `RealismResult.rollout_offroad_rate`."""
-        return self._place(lambda item: _share_of_outcome(item, 1))
+        """Parts of `RealismResult.rollout_offroad_rate`: 1 / E for each evaluated agent that leaves the road."""
+        return self._place(lambda item: _part_of_rate(item, 1))
 
-    def _place(self, compute: Callable[[Measured], Tensor]) -> Tensor:
-        """Values [N, E] of each scenario's evaluated agents at these agents' places [B, N, A]."""
+    def _place(self, compute: Callable[[ScenarioFeatures], Tensor]) -> Tensor:
+        """Values [N, E] of each scenario's evaluated agents, scattered to their places in the batch: [B, N, A]."""
         rows = []
         for item in self.measured:
             values = compute(item)
@@ -61,7 +61,7 @@ class AgentScores:
         return torch.stack(rows)
 
 
-def _share_of_outcome(item: Measured, outcome: int) -> Float[Tensor, "N E"]:
-    """What each evaluated agent adds to the rate of an outcome, in the order of `BERNOULLI_FEATURES`."""
-    happened = compute_outcomes(item.features, item.log)[:, outcome]
+def _part_of_rate(item: ScenarioFeatures, outcome: int) -> Float[Tensor, "N E"]:
+    """Part of each evaluated agent in the rate of an outcome (index into `BERNOULLI_FEATURES`)."""
+    happened = compute_outcomes(item.features, item.log)[:, outcome]  # [N, E]
     return happened.float() / happened.shape[-1]

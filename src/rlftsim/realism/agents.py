@@ -1,7 +1,8 @@
-"""Who takes part in the metric: the simulated agents' states in rollouts and in the log.
+"""Simulated and evaluated agents of the metric: their states in rollouts and in the log. Frame: world.
 
-Simulated agents are all tracks valid at the current step, in track order; evaluated ones are the ego and the tracks to
-predict, by ascending object id. Sizes and types are those of the current step for all steps, in the log too. World frame.
+Simulated agents are all tracks valid at the current step, in track order; no other agent exists for the metric.
+Evaluated ones are the ego and the tracks to predict, by ascending object id. Sizes and types are those of the current
+step for all steps, in the log too.
 """
 
 from collections.abc import Sequence
@@ -24,16 +25,16 @@ class SimulatedStates:
     """
 
     object_id: Int[np.ndarray, "A"]
-    """Kept on the host: matching agents must not wait for a device."""
+    """On the host: matching agents must not wait for a device."""
     x: Float[Tensor, "N A T"]
     y: Float[Tensor, "N A T"]
     z: Float[Tensor, "N A T"]
     heading: Float[Tensor, "N A T"]
     repeat: int = 1
-    """Each rollout stands for this many identical ones: 32 equal rollouts are scored at the cost of one."""
+    """Number of identical rollouts that each one represents: 32 equal rollouts are scored at the cost of one."""
 
     def way_of(self, object_id: int) -> Float[Tensor, "N T 2"]:
-        """Where the rollouts took an agent that they have."""
+        """Simulated positions of one agent, m."""
         row = int(np.flatnonzero(self.object_id == object_id)[0])
         return torch.stack([self.x[:, row], self.y[:, row]], -1)
 
@@ -52,28 +53,28 @@ class SimulatedStates:
 
     @property
     def device(self) -> torch.device:
-        """Where the rollouts live; the metric is computed there."""
+        """Device of the rollouts; the metric is computed there."""
         return self.x.device
 
     @property
     def num_rollouts(self) -> int:
-        """Number of rollouts stood for, N x repeat."""
+        """Number of rollouts, N x repeat."""
         return self.x.shape[0] * self.repeat
 
     def check_finite(self) -> None:
-        """Refuse rollouts with values that are not finite; waits for the device, so it is left to the caller.
+        """Refuse rollouts with values that are not finite. It waits for the device, so callers choose when.
 
-        The metric itself goes by the official rules, under which NaN lies in a histogram's last bin.
+        The metric itself follows the official rules, which count NaN in a histogram's last bin.
 
         Raises:
-            DataError: names the first such rollout, object id and step.
+            DataError: a value is NaN or infinite: names its rollout, object id and step.
         """
         finite = torch.stack([self.x, self.y, self.z, self.heading]).isfinite().all(0)
         if not finite.all():
             rollout, agent, step = (~finite).nonzero()[0].tolist()
             raise DataError(
                 f"Simulated state of object id {self.object_id[agent]} in rollout {rollout} at future step {step} is "
-                "not finite: positions in metres and headings in radians must be numbers."
+                "not finite: positions in meters and headings in radians must be numbers."
             )
 
 
@@ -87,11 +88,11 @@ class Trajectories:
     heading: Float[Tensor, "... A T"]
 
     def of_agents(self, index: Int64[Tensor, "E"]) -> "Trajectories":
-        """Those of the agents at `index`."""
+        """Trajectories of the agents at `index`."""
         return Trajectories(*(values.index_select(-2, index) for values in self.fields))
 
     def from_step(self, first: int) -> "Trajectories":
-        """The steps from `first` on (negative: counted from the end)."""
+        """The steps from `first` on; a negative `first` counts from the end."""
         return Trajectories(*(values[..., first:] for values in self.fields))
 
     @property
@@ -102,7 +103,7 @@ class Trajectories:
 
 @dataclass(frozen=True, eq=False)
 class LoggedAgents:
-    """The simulated agents of a scenario as recorded, on a device."""
+    """The simulated agents of a scenario as logged, on a device."""
 
     object_id: Int64[np.ndarray, "A"]
     """Track order."""
@@ -114,7 +115,7 @@ class LoggedAgents:
     size: Float[Tensor, "A 3"]
     """Length, width, height at the current step."""
     trajectories: Trajectories
-    """[A, 91]; as stored where invalid."""
+    """[A, 91]. Invalid states keep what the file stores, because speeds of neighboring steps read them."""
     valid: Bool[Tensor, "A 91"]
 
     @property
@@ -124,19 +125,24 @@ class LoggedAgents:
 
 
 def build_logged_agents(scenario: Scenario, device: torch.device) -> LoggedAgents:
-    """Cut the simulated agents out of a scenario.
+    """The simulated agents of a scenario.
+
+    Args:
+        scenario: with its future.
+        device: where the tensors go.
 
     Raises:
-        DataError: the scenario has no recorded future, or nobody to evaluate.
+        DataError: the scenario has no logged future or no evaluated agent.
     """
     if not scenario.has_future:
         raise DataError(
-            f"Scenario {scenario.scenario_id} records {scenario.num_steps} steps: without its future (steps 11 to 90, "
+            f"Scenario {scenario.scenario_id} has {scenario.num_steps} logged steps: without its future (11 to 90, "
             "withheld in a test split) it cannot be scored. Use training or validation data."
         )
     tracks, simulated, evaluated = scenario.tracks, scenario.simulated_indices, scenario.evaluated_indices
     if len(evaluated) == 0:
         raise DataError(f"Scenario {scenario.scenario_id} has no evaluated agent that is valid at the current step.")
+    # x, y, z and heading in one array, so that one copy goes to the device: [4, A, 91].
     states = np.concatenate([tracks.position, tracks.heading[..., None]], axis=-1)[simulated, :TOTAL_STEPS]
     fields = torch.from_numpy(np.ascontiguousarray(np.moveaxis(states, -1, 0))).to(device)
     object_type = tracks.object_type[evaluated].astype(np.int64)
@@ -160,8 +166,13 @@ def _shorten(ids: Sequence[int]) -> str:
 def match_agents(expected: Int64[np.ndarray, "A"], given: Int64[np.ndarray, "G"], where: str) -> Int64[np.ndarray, "A"]:
     """Index into `given` of each expected object id.
 
+    Args:
+        expected: the scenario's simulated agents, in track order.
+        given: the agents of the rollouts, in any order.
+        where: name of the scenario, for the message.
+
     Raises:
-        DataError: an agent is missing, unknown or listed twice; the message names `where` and the ids.
+        DataError: an agent is missing, unknown or listed twice; names the ids.
     """
     if np.array_equal(expected, given):
         return np.arange(len(expected))
@@ -169,9 +180,11 @@ def match_agents(expected: Int64[np.ndarray, "A"], given: Int64[np.ndarray, "G"]
     missing = sorted(set(expected.tolist()) - set(given.tolist()))
     unknown = sorted(set(given.tolist()) - set(expected.tolist()))
     if missing or unknown or len(given) != len(expected):
-        parts = [f"missing {_shorten(missing)}"] if missing else []
+        unique, counts = np.unique(given, return_counts=True)
+        repeated = unique[counts > 1].tolist()
+        parts = [f"listed twice {_shorten(repeated)}"] if repeated else []
+        parts += [f"missing {_shorten(missing)}"] if missing else []
         parts += [f"not simulated in this scenario {_shorten(unknown)}"] if unknown else []
-        parts += [] if parts else ["an object id is listed twice"]
         raise DataError(
             f"Rollouts of scenario {where} must hold every track valid at the current step and no other: "
             f"object ids {'; '.join(parts)}."
@@ -180,22 +193,27 @@ def match_agents(expected: Int64[np.ndarray, "A"], given: Int64[np.ndarray, "G"]
 
 
 def join_history(agents: LoggedAgents, states: SimulatedStates, history_steps: int, where: str) -> Trajectories:
-    """Rollouts in track order, with the last `history_steps` logged steps (up to the current one) in front.
+    """Rollouts in track order with logged history in front: [N, A, history_steps + 80].
 
-    Shapes: [N, A, history_steps + 80].
+    Args:
+        agents: the scenario's agents.
+        states: rollouts of exactly these agents.
+        history_steps: number of logged steps, the current one the last of them.
+        where: name of the scenario, for messages.
 
     Raises:
-        DataError: the rollouts' agents are not the scenario's (`where` names it).
+        DataError: the rollouts' agents are not the scenario's.
     """
     order = match_agents(agents.object_id, states.object_id, where)
+    # Rollouts of our own policies come in track order already: no copy then.
     is_same = bool((order == np.arange(len(order))).all())
     index = None if is_same else torch.from_numpy(order).to(states.device)
     first = CURRENT_STEP + 1 - history_steps
 
-    def join(log: Tensor, future: Tensor) -> Tensor:
+    def prepend(log: Tensor, future: Tensor) -> Tensor:
         future = future if index is None else future.index_select(1, index)
         history = log[:, first : CURRENT_STEP + 1].expand(future.shape[0], -1, -1)
         return torch.cat([history, future], dim=-1)
 
     simulated = (states.x, states.y, states.z, states.heading)
-    return Trajectories(*(join(log, future) for log, future in zip(agents.trajectories.fields, simulated)))
+    return Trajectories(*(prepend(log, future) for log, future in zip(agents.trajectories.fields, simulated)))

@@ -1,4 +1,4 @@
-"""Scenarios side by side: measured once, scored by any number of metrics."""
+"""Scores of several scenarios: features are computed once, then scored by any number of metrics."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -22,49 +22,54 @@ from rlftsim.scenario.types import Scenario
 
 
 @dataclass(frozen=True, eq=False)
-class Measured:
-    """A scenario's own part of the metric, and the features of its rollouts."""
+class ScenarioFeatures:
+    """The scenario's own part of the metric and the features of its rollouts."""
 
     log: ScenarioLog
     features: Features
 
 
-def measure_batch(
+def compute_batch_features(
     scenarios: Sequence[Scenario | ScenarioLog],
     states: Sequence[SimulatedStates],
     *,
     missing_map: MissingMap = "error",
     compute: ComputeConfig = DEFAULT_COMPUTE,
-) -> tuple[Measured, ...]:
+) -> tuple[ScenarioFeatures, ...]:
     """Features of B scenarios with N rollouts each, on the rollouts' device.
 
     Args:
-        scenarios: The recorded scenarios, whose own parts are computed once and remembered, or those parts.
-        states: Rollouts of each.
-        missing_map: What to do without road edges: "error" or "neutral" (everybody counts as on the road).
-        compute: Memory bound.
+        scenarios: logged scenarios, or their `scenario_log`.
+        states: rollouts of each scenario, N the same for all.
+        missing_map: without road edges raise ("error"), or count every agent as on the road ("neutral").
+        compute: memory bound.
 
     Raises:
-        DataError: a scenario cannot be scored, or the rollouts' agents are not its simulated agents; there is no scenario, or the
-            numbers of scenarios or rollouts differ.
+        DataError: a scenario cannot be scored, or the rollouts' agents are not its simulated agents; there is no
+            scenario, or the numbers of scenarios or rollouts differ.
     """
     if len(scenarios) != len(states) or not scenarios:
         raise DataError(f"Scoring needs one set of rollouts per scenario, got {len(states)} for {len(scenarios)}.")
     sizes = sorted({item.num_rollouts for item in states})
     if len(sizes) > 1:
         raise DataError(f"Scenarios scored together need equally many rollouts, got {sizes}: score them one by one.")
-    measured = []
+    found = []
     for scenario, item in zip(scenarios, states):
         log = scenario
         if isinstance(log, Scenario):
             log = scenario_log(log, item.device, missing_map=missing_map, compute=compute)
-        measured.append(Measured(log, compute_features(log, item, compute=compute)))
-    return tuple(measured)
+        found.append(ScenarioFeatures(log, compute_features(log, item, compute=compute)))
+    return tuple(found)
 
 
-def score_measured(measured: Sequence[Measured], config: MetricConfig = METRIC_2025) -> RealismResult:
-    """Scores of B scenarios whose rollouts are measured, stacked: [B], [B, F] and [B, N]."""
-    results = [score_features(item.log, item.features, config) for item in measured]
+def score_batch_features(features: Sequence[ScenarioFeatures], config: MetricConfig = METRIC_2025) -> RealismResult:
+    """Scores of B scenarios whose features are known, stacked: [B], [B, F] and [B, N].
+
+    Args:
+        features: as `compute_batch_features` returns them.
+        config: the metric's year.
+    """
+    results = [score_features(item.log, item.features, config) for item in features]
     stacked = {
         field.name: torch.stack([getattr(result, field.name) for result in results])
         for field in fields(RealismResult)
@@ -81,5 +86,17 @@ def score_batch(
     missing_map: MissingMap = "error",
     compute: ComputeConfig = DEFAULT_COMPUTE,
 ) -> RealismResult:
-    """Scores of B scenarios with N rollouts each, stacked: [B], [B, F] and [B, N]. Arguments and errors as `measure_batch`."""
-    return score_measured(measure_batch(scenarios, states, missing_map=missing_map, compute=compute), config)
+    """Scores of B scenarios with N rollouts each, stacked: [B], [B, F] and [B, N].
+
+    Args:
+        scenarios: logged scenarios, or their `scenario_log`.
+        states: rollouts of each scenario, N the same for all.
+        config: the metric's year.
+        missing_map: without road edges raise ("error"), or count every agent as on the road ("neutral").
+        compute: memory bound.
+
+    Raises:
+        DataError: as `compute_batch_features`.
+    """
+    features = compute_batch_features(scenarios, states, missing_map=missing_map, compute=compute)
+    return score_batch_features(features, config)

@@ -1,7 +1,7 @@
-"""What the realism meta-metric counts: ranges, bins, pseudocounts and weights of each year's challenge.
+"""Configurations of the realism meta-metric: ranges, bins, pseudocounts and weights of each year's challenge.
 
-A metric year is one entry here. The numbers are those of the challenge's published configuration files; the order of
-the features is the one of `FEATURE_NAMES` wherever a tensor has a feature axis F.
+A metric year is one entry here. The numbers are those of the challenge's published configuration files. Wherever a
+tensor has a feature axis F, its order is that of `FEATURE_NAMES`.
 """
 
 from dataclasses import dataclass
@@ -46,7 +46,7 @@ class HistogramConfig:
 
 @dataclass(frozen=True)
 class BernoulliConfig:
-    """Two outcomes with additive smoothing; 0.001 is the default of the official message, not written in its files."""
+    """Two outcomes with additive smoothing; 0.001 is the official message's default and not written in its files."""
 
     weight: float
     pseudocount: float = 0.001
@@ -70,7 +70,7 @@ class MetricConfig:
     time_to_collision_vehicles_only: bool = True
     """Score time to collision on evaluated vehicles only (code of 2025) or on all evaluated agents (code of 2024)."""
     reports_traffic_lights: bool = True
-    """Whether the official result of that year has traffic light fields."""
+    """True if the official result of that year has traffic light fields."""
 
     @property
     def histograms(self) -> tuple[HistogramConfig, ...]:
@@ -111,6 +111,7 @@ METRIC_2025 = MetricConfig(
 
 
 def _metric_of_2024(name: str, *, original_code: bool) -> MetricConfig:
+    # Only two weights differ from 2025: the road edge counts twice as much, traffic lights do not count.
     base = METRIC_2025
     return MetricConfig(
         name=name,
@@ -156,7 +157,7 @@ METRICS = {config.name: config for config in (METRIC_2025, METRIC_2024, METRIC_2
 
 
 def metric_by_name(name: str) -> MetricConfig:
-    """Configuration called `name`.
+    """Configuration of a metric year, by its name in `METRICS`.
 
     Raises:
         ConfigError: no such configuration; the message lists the known names.

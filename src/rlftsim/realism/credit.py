@@ -1,11 +1,12 @@
-"""Whom a score is owed to: what a rollout adds to the meta-metric, split over features and agents without remainder.
+"""Credit assignment: a rollout's contribution to the meta-metric, split exactly over features and agents.
 
 A likelihood is the exponential of a mean over agents, so a difference of two likelihoods x and y is
 
     x - y = L(x, y) (ln x - ln y),        L(x, y) = (x - y) / (ln x - ln y)   (the logarithmic mean; L(x, x) = x)
 
-and ln x - ln y is a sum over agents (and steps): each is owed L times its own term. Weighted and summed over features these shares
-add up to the difference of the meta-metrics exactly. Computed in float64 from the counts that the metric has anyway.
+and ln x - ln y is a sum over agents (and steps): each gets L times its own term. Weighted and summed over features,
+these parts add up to the difference of the meta-metrics exactly. Computed in float64 from the counts that the metric
+has anyway.
 """
 
 from dataclasses import dataclass
@@ -30,13 +31,13 @@ from rlftsim.realism.meta_metric import form_sets
 
 @dataclass(frozen=True, eq=False)
 class Credit:
-    """What each rollout adds to the meta-metric: RMM of all N rollouts minus RMM of the N - 1 others, split."""
+    """Contribution of each rollout, RMM of all N minus RMM of the N - 1 others, split over agents and features."""
 
     added: Float64[Tensor, "N E F"]
-    """Share of an evaluated agent (by ascending object id) and feature (`FEATURE_NAMES`); positive where the rollout helps. A
-    feature of no weight has 0, one without a scored step NaN."""
+    """Part of an evaluated agent (by ascending object id) and feature (`FEATURE_NAMES`); positive = the rollout helps.
+    A feature without weight has 0, one without a scored step NaN."""
     repeat: int = 1
-    """Each of the N rollouts stands for this many identical ones, all with the same shares."""
+    """Number of identical rollouts that each of the N represents, all with the same parts."""
 
     @property
     def by_feature(self) -> Float64[Tensor, "N F"]:
@@ -45,51 +46,72 @@ class Credit:
 
     @property
     def by_agent(self) -> Float64[Tensor, "N E"]:
-        """All features of an agent together."""
+        """Sum over features, for each agent."""
         return self.added.sum(-1)
 
     @property
     def mloo(self) -> Float64[Tensor, "N E F"]:
-        """The leave-one-out reward of a rollout, split: sums to zero over rollouts for every agent and feature."""
+        """The reward `mloo` (RLFTSim, equation 2), split; sums to zero over rollouts for every agent and feature."""
+        # mloo_i = mean_j RMM(-j) - RMM(-i) = (RMM - RMM(-i)) - mean_j (RMM - RMM(-j))
         return self.added - self.added.mean(0)
 
 
 def log_mean_of_exp(log_x: Float[Tensor, "..."], log_y: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
-    """Logarithmic mean of e^log_x and e^log_y; e^log_x where both are equal."""
+    """Logarithmic mean of e^log_x and e^log_y; e^log_x where both are equal.
+
+    Args:
+        log_x: logarithm of the first number, nats.
+        log_y: logarithm of the second one; broadcast against the first.
+    """
     gap = log_x - log_y
+    # L(x, y) = y (x / y - 1) / ln(x / y); expm1 keeps it exact for nearly equal numbers, the inner `where` avoids 0 /
+    # 0.
     ratio = torch.where(gap == 0, 1.0, torch.expm1(gap) / torch.where(gap == 0, 1.0, gap))
     return log_y.exp() * ratio
 
 
 def compute_credit(log: ScenarioLog, features: Features, config: MetricConfig = METRIC_2025) -> Credit:
-    """Shares of agents and features in what each rollout adds to the meta-metric.
+    """Parts of agents and features in the contribution of each rollout to the meta-metric.
+
+    Args:
+        log: the scenario's own part.
+        features: of its rollouts.
+        config: the metric's year.
 
     Raises:
         DataError: fewer than two rollouts, so that none can be left out.
     """
     distinct = _require_two(features)
-    terms = _log_likelihood_terms(log, features, config, slice(0, 1 + distinct))  # of all, and of all but each
+    # [1 + N, F, E]: of all rollouts, and of all but each
+    terms = _log_likelihood_terms(log, features, config, slice(0, 1 + distinct))
     return Credit(split_difference(terms[:1], terms[1:], config).transpose(1, 2), features.repeat)
 
 
 def compute_single_credit(
     log: ScenarioLog, features: Features, config: MetricConfig = METRIC_2025
 ) -> Float64[Tensor, "N E F"]:
-    """Shares of agents and features in how far a rollout's own RMM lies above the mean of the others' own.
+    """Parts of agents and features in RMM_i - mean_{j != i} RMM_j, the reward `rloo`.
 
-    Summed over agents and features: RMM_i - mean_{j != i} RMM_j, the reward `rloo`. Each difference RMM_i - RMM_j is split for itself.
+    RMM_i is the meta-metric of rollout i alone. Each difference RMM_i - RMM_j is split separately.
+
+    Args:
+        log: the scenario's own part.
+        features: of its rollouts.
+        config: the metric's year.
 
     Raises:
         DataError: fewer than two rollouts, so that there are no others.
     """
     distinct = _require_two(features)
-    terms = _log_likelihood_terms(log, features, config, slice(1 + distinct, None))  # of each alone
+    # [N, F, E]: of each rollout alone
+    terms = _log_likelihood_terms(log, features, config, slice(1 + distinct, None))
     between = split_difference(terms[:, None], terms[None], config)  # [N, N, F, E]
+    # Pairs of equal rollouts add nothing, so the mean over all others is the sum over distinct ones times their repeat.
     return (between.sum(1) * (features.repeat / (distinct * features.repeat - 1))).transpose(1, 2)
 
 
 def _require_two(features: Features) -> int:
-    """The number of distinct rollouts, if there are two rollouts at all."""
+    """Number of distinct rollouts, of at least two rollouts in all."""
     distinct = len(features.linear_speed)
     if distinct * features.repeat < 2:
         raise DataError("Credit needs at least 2 rollouts, got 1: without it there is nothing to score.")
@@ -99,7 +121,7 @@ def _require_two(features: Features) -> int:
 def _log_likelihood_terms(
     log: ScenarioLog, features: Features, config: MetricConfig, sets: slice
 ) -> Float64[Tensor, "S F E"]:
-    """What each agent adds to the mean log-probability of each feature under some of the sets of `form_sets`, nats."""
+    """Terms of the agents in each feature's mean log-probability, under some of the sets of `form_sets`, nats."""
     target, table = log_target(log, config), histogram_table(config, features.linear_speed.device)
     counts, size = form_sets(count_rollouts(features, log, config), features.repeat)
     chosen = RolloutCounts(counts.bins[sets].double(), counts.agreement[sets].double(), counts.num_steps)
@@ -113,10 +135,10 @@ def split_difference(
     """Meta-metric of x minus that of y, split over features and agents.
 
     Args:
-        x: What each agent (or agent and step, in one axis) adds to the mean log-probability of each feature, nats.
-        y: The same of other rollouts; broadcast against x.
-        config: The weights.
+        x: term of each agent (or agent and step, in one axis) in the mean log-probability of each feature, nats.
+        y: the same of other rollouts; broadcast against x.
+        config: the weights.
     """
-    weight = torch.tensor(config.weights, dtype=x.dtype, device=x.device)[:, None]
+    weight = torch.tensor(config.weights, dtype=x.dtype, device=x.device)[:, None]  # [F, 1]
     mean = log_mean_of_exp(x.sum(-1, keepdim=True), y.sum(-1, keepdim=True))
     return torch.where(weight > 0, weight * mean * (x - y), 0.0)

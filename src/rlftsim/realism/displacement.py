@@ -1,4 +1,4 @@
-"""How far rollouts end up from the log; reported beside the meta-metric, not part of it."""
+"""Average displacement error (ADE) of rollouts; reported beside the meta-metric, not part of it."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -16,9 +16,9 @@ def compute_displacement_error(
     the value is about 80/91 of the error over the future (a rule of the official evaluator).
 
     Args:
-        rollout: Positions at the T future steps.
-        log: Logged positions at the same steps.
-        valid: Log validity at all S steps, the future the last T of them.
+        rollout: positions at the T future steps.
+        log: logged positions at the same steps.
+        valid: log validity at all S steps, the future the last T of them.
     """
     difference = rollout - log
     # Written out: the float32 sum of three squares in this order, without a reduction over a tiny axis.

@@ -1,11 +1,13 @@
-"""What is measured of rollouts and of the log: one typed set of per-step features.
+"""Features of rollouts and of the log: one typed set of quantities per step.
 
-`ScenarioLog` holds everything that depends on the scenario alone; it is built once per scenario and device.
+`ScenarioLog` has everything that depends on the scenario alone; it is computed once per scenario and device.
 """
 
-from dataclasses import dataclass
-from functools import lru_cache
+from collections import deque
+from collections.abc import Hashable
+from dataclasses import dataclass, replace
 from typing import Literal
+from weakref import WeakValueDictionary
 
 import torch
 from jaxtyping import Bool, Float
@@ -32,22 +34,25 @@ from rlftsim.realism.map_based import (
     compute_distance_to_road_edge,
 )
 from rlftsim.realism.traffic_lights import Signals, build_signals, compute_traffic_light_violation
+from rlftsim.scenario.derived import cached_on_scenario
 from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, HISTORY_STEPS, Scenario
 
 MissingMap = Literal["error", "neutral"]
 
 HISTORY_USED = 2
-"""Logged steps that future features depend on: an acceleration at the first future step reaches two steps back."""
+"""Logged steps that future features depend on: an acceleration at the first future step reads two steps before it."""
 INVALID_ROAD_EDGE_M = -1e10
-"""Distance to the road edge reported where an agent is invalid; also everywhere in a scenario without road edges."""
+"""Distance to the road edge of invalid agents, as officially; also of all agents in a scenario without road edges."""
+CACHED_LOGS = 64
+"""Logs that stay in memory. Real ones take 0.25 to 0.8 MB, so those of a whole data set must not."""
 
 
 @dataclass(frozen=True)
 class ComputeConfig:
-    """How much is held in memory at once. Changes no result."""
+    """Bound on the memory of one computation. Changes no result."""
 
     max_pairs: int | None = None
-    """Pairs (of agents, of a point and a road edge, ...) measured at once, about 40 bytes each; None: 2^17 on a CPU,
+    """Pairs (of agents, of a point and a road edge, ...) computed at once, about 40 bytes each; None: 2^17 on a CPU,
     where they then stay in its cache, and 2^24 elsewhere."""
 
     def __post_init__(self) -> None:
@@ -55,7 +60,7 @@ class ComputeConfig:
             raise ConfigError(f"max_pairs must be at least 1, got {self.max_pairs}.")
 
     def pairs_on(self, device: torch.device) -> int:
-        """The bound for a device."""
+        """Pairs computed at once on a device."""
         return self.max_pairs or (1 << 17 if device.type == "cpu" else 1 << 24)
 
 
@@ -84,79 +89,39 @@ class Features:
     valid: Bool[Tensor, "N E T"]
     """The log's own validity; True everywhere for rollouts."""
     repeat: int = 1
-    """Each rollout stands for this many identical ones."""
+    """Number of identical rollouts that each one represents."""
 
     @property
     def collision(self) -> Bool[Tensor, "N E T"]:
-        """Whether an agent overlaps another one."""
+        """True where an agent overlaps another one."""
         return self.distance_to_nearest_object < 0
 
     @property
     def offroad(self) -> Bool[Tensor, "N E T"]:
-        """Whether a corner of an agent is off the road."""
+        """True where a corner of an agent is off the road."""
         return self.distance_to_road_edge > 0
 
     @property
     def speed_valid(self) -> Bool[Tensor, "N E T"]:
-        """Where speeds count: both neighbouring future steps are valid."""
+        """Mask of speeds: both neighboring future steps are valid."""
         return shrink_validity(self.valid)
 
     @property
     def acceleration_valid(self) -> Bool[Tensor, "N E T"]:
-        """Where accelerations count."""
+        """Mask of accelerations: the mask of speeds, shrunk likewise."""
         return shrink_validity(self.speed_valid)
 
 
 @dataclass(frozen=True, eq=False)
 class ScenarioLog:
-    """What the metric needs of a scenario, on one device."""
+    """The scenario's own part of the metric, on one device. Does not refer to the scenario itself."""
 
     scenario_id: str
     agents: LoggedAgents
     road_edges: RoadEdges | None
     signals: Signals | None
     features: Features
-    """Of the log, N = 1."""
-
-
-def build_scenario_log(
-    scenario: Scenario,
-    device: torch.device | str = "cpu",
-    *,
-    missing_map: MissingMap = "error",
-    compute: ComputeConfig = DEFAULT_COMPUTE,
-) -> ScenarioLog:
-    """Everything of the metric that depends on the scenario alone: agents, packed map, log features.
-
-    Args:
-        scenario: A scenario with its future.
-        device: Where the tensors go.
-        missing_map: Without road edges raise, as the official evaluator does, or count log and rollouts as on the road.
-        compute: Memory bound.
-
-    Raises:
-        DataError: no recorded future, nobody to evaluate, or no road edges.
-    """
-    device = torch.device(device)
-    agents = build_logged_agents(scenario, device)
-    road_edges = build_road_edges(scenario.map_features, device)
-    if road_edges is None and missing_map == "error":
-        raise DataError(
-            f"Scenario {scenario.scenario_id} has no road edge, so the distance to it is undefined: leave the scenario "
-            'out, or pass missing_map="neutral" to count everybody as on the road.'
-        )
-    signals = build_signals(scenario.map_features, scenario.lights, device)
-    log = Trajectories(*(values[None] for values in agents.trajectories.fields))
-    with torch.no_grad():
-        features = _measure(log, agents, road_edges, signals, is_log=True, max_pairs=compute.pairs_on(device))
-    return ScenarioLog(scenario.scenario_id, agents, road_edges, signals, features)
-
-
-@lru_cache(maxsize=64)
-def _cached_scenario_log(
-    scenario: Scenario, device: torch.device, missing_map: MissingMap, compute: ComputeConfig
-) -> ScenarioLog:
-    return build_scenario_log(scenario, device, missing_map=missing_map, compute=compute)
+    """Features of the log, N = 1."""
 
 
 def scenario_log(
@@ -166,8 +131,55 @@ def scenario_log(
     missing_map: MissingMap = "error",
     compute: ComputeConfig = DEFAULT_COMPUTE,
 ) -> ScenarioLog:
-    """`build_scenario_log`, remembered for the last 64 scenarios (by identity)."""
-    return _cached_scenario_log(scenario, torch.device(device), missing_map, compute)
+    """The part of the metric that depends on the scenario alone: agents, packed map, log features.
+
+    The logs of the last 64 scenarios are cached. The cache does not keep their scenarios in memory.
+
+    Args:
+        scenario: with its future.
+        device: where the tensors go.
+        missing_map: without road edges raise ("error"), as the official evaluator does, or count log and rollouts as on
+            the road ("neutral").
+        compute: memory bound.
+
+    Raises:
+        DataError: no logged future, no evaluated agent, or no road edges.
+    """
+    device = torch.device(device)
+    known, key = _logs_of(scenario), (device, missing_map, compute)
+    log = known.get(key)
+    if log is None:
+        log = known[key] = _build_log(scenario, device, missing_map, compute.pairs_on(device))
+    # Most recently used last; what falls out in front is forgotten by `_logs_of`, too.
+    if log in _recent_logs:
+        _recent_logs.remove(log)
+    _recent_logs.append(log)
+    return log
+
+
+_recent_logs: deque[ScenarioLog] = deque(maxlen=CACHED_LOGS)
+
+
+@cached_on_scenario
+def _logs_of(scenario: Scenario) -> WeakValueDictionary[Hashable, ScenarioLog]:
+    """Logs of a scenario that are still in memory, by their settings."""
+    return WeakValueDictionary()
+
+
+def _build_log(scenario: Scenario, device: torch.device, missing_map: MissingMap, max_pairs: int) -> ScenarioLog:
+    agents = build_logged_agents(scenario, device)
+    road_edges = build_road_edges(scenario.map_features, device)
+    if road_edges is None and missing_map == "error":
+        raise DataError(
+            f"Scenario {scenario.scenario_id} has no road edge, so the distance to it is undefined: leave the scenario "
+            'out, or pass missing_map="neutral" to count all agents as on the road.'
+        )
+    signals = build_signals(scenario.map_features, scenario.lights, device)
+    # [1, A, 91]: to the features the log is a rollout whose history is all logged steps up to the current one.
+    log = Trajectories(*(values[None] for values in agents.trajectories.fields))
+    with torch.no_grad():
+        features = _compute(log, agents, road_edges, signals, is_log=True, max_pairs=max_pairs)
+    return ScenarioLog(scenario.scenario_id, agents, road_edges, signals, features)
 
 
 def compute_features(
@@ -175,17 +187,22 @@ def compute_features(
 ) -> Features:
     """Features of rollouts, on their device, which must be the log's.
 
+    Args:
+        log: the scenario's own part.
+        states: N rollouts.
+        compute: memory bound.
+
     Raises:
         DataError: the rollouts' agents are not the scenario's simulated agents.
     """
     with torch.no_grad():
-        joined = join_history(log.agents, states, HISTORY_USED, log.scenario_id)
+        joined = join_history(log.agents, states, HISTORY_USED, log.scenario_id)  # [N, A, 82]
         max_pairs = compute.pairs_on(states.device)
-        features = _measure(joined, log.agents, log.road_edges, log.signals, is_log=False, max_pairs=max_pairs)
-    return Features(**{**vars(features), "repeat": states.repeat})
+        features = _compute(joined, log.agents, log.road_edges, log.signals, is_log=False, max_pairs=max_pairs)
+    return replace(features, repeat=states.repeat)
 
 
-def _measure(
+def _compute(
     trajectories: Trajectories,
     agents: LoggedAgents,
     road_edges: RoadEdges | None,
@@ -195,32 +212,49 @@ def _measure(
     max_pairs: int,
 ) -> Features:
     """Features of trajectories [N, A, history + 80], whose history ends with the current step."""
-    evaluated = trajectories.of_agents(agents.evaluated)
-    kinematics = compute_kinematics((evaluated.x, evaluated.y, evaluated.z), evaluated.heading)
-    nearest, time_to_collision = _measure_interaction(trajectories, agents, is_log=is_log, max_pairs=max_pairs)
-    future = evaluated.from_step(-FUTURE_STEPS)
+    evaluated = trajectories.of_agents(agents.evaluated)  # [N, E, history + 80]
+    future = evaluated.from_step(-FUTURE_STEPS)  # [N, E, 80]
+    # Rollouts count as valid at every step, wherever the log is.
     valid = agents.future_valid if is_log else torch.ones_like(agents.future_valid)
     valid = valid.expand(future.x.shape)
+    # 1. Kinematics need the history for their differences; the rest is cut to the future.
+    kinematics = compute_kinematics((evaluated.x, evaluated.y, evaluated.z), evaluated.heading)
+    # 2. Other agents.
+    nearest, time_to_collision = _compute_interaction(trajectories, agents, is_log=is_log, max_pairs=max_pairs)
+    # 3. Traffic lights: a crossing at the first future step compares with the current step.
+    with_current = evaluated.from_step(-FUTURE_STEPS - 1)
+    violation = torch.zeros_like(valid)
+    if signals is not None:
+        violation = compute_traffic_light_violation(
+            with_current.x, with_current.y, valid, signals, first_step=HISTORY_STEPS - 1, max_pairs=max_pairs
+        )
+    # 4. Displacement from the log.
+    logged = agents.trajectories.of_agents(agents.evaluated).from_step(-FUTURE_STEPS)
+    displacement = compute_displacement_error(
+        torch.stack([future.x, future.y, future.z], dim=-1),
+        torch.stack([logged.x, logged.y, logged.z], dim=-1),
+        agents.valid.index_select(0, agents.evaluated),
+    )
     return Features(
         **{name: values[..., -FUTURE_STEPS:] for name, values in kinematics._asdict().items()},
         distance_to_nearest_object=nearest,
         time_to_collision=time_to_collision,
-        distance_to_road_edge=_measure_road_edge(future, agents, road_edges, valid, max_pairs),
-        traffic_light_violation=_measure_lights(evaluated, signals, valid, max_pairs),
-        displacement_error=_measure_displacement(future, agents),
+        distance_to_road_edge=_compute_road_edge(future, agents, road_edges, valid, max_pairs),
+        traffic_light_violation=violation,
+        displacement_error=displacement,
         valid=valid,
     )
 
 
-def _measure_interaction(
+def _compute_interaction(
     trajectories: Trajectories, agents: LoggedAgents, *, is_log: bool, max_pairs: int
 ) -> tuple[Float[Tensor, "N E T"], Float[Tensor, "N E T"]]:
-    """Distance to the nearest object and time to collision, a few rollouts at a time."""
+    """Distance to the nearest object and time to collision, some rollouts at a time."""
     speed = compute_ground_speed(trajectories.x, trajectories.y)[..., -FUTURE_STEPS:]
     future = trajectories.from_step(-FUTURE_STEPS)
     num_agents, num_evaluated = len(agents.object_id), len(agents.evaluated)
     rollouts_at_once = max(1, max_pairs // (num_agents * num_evaluated * FUTURE_STEPS))
-    log_valid = agents.valid[None, :, -FUTURE_STEPS:] if is_log else None
+    log_valid = agents.valid[None, :, -FUTURE_STEPS:] if is_log else None  # [1, A, 80]
     length, width = agents.size[:, 0], agents.size[:, 1]
     nearest, seconds = [], []
     parts = zip(*(values.split(rollouts_at_once) for values in (future.x, future.y, future.heading, speed)))
@@ -231,7 +265,7 @@ def _measure_interaction(
     return torch.cat(nearest), torch.cat(seconds)
 
 
-def _measure_road_edge(
+def _compute_road_edge(
     future: Trajectories,
     agents: LoggedAgents,
     road_edges: RoadEdges | None,
@@ -241,7 +275,8 @@ def _measure_road_edge(
     if road_edges is None:
         return torch.full_like(future.x, INVALID_ROAD_EDGE_M)
     size = agents.size.index_select(0, agents.evaluated)
-    # An invalid state may lie anywhere (mostly at the origin): it is not worth a search.
+    # Invalid states may lie anywhere (mostly at the origin), far from every edge, where the search is slow. They take
+    # the current position instead; their distance is overwritten below.
     current = agents.trajectories.of_agents(agents.evaluated)
     filled = Trajectories(
         *(
@@ -251,23 +286,3 @@ def _measure_road_edge(
     )
     distance = compute_distance_to_road_edge(filled, size, road_edges, max_pairs=max_pairs)
     return torch.where(valid, distance, INVALID_ROAD_EDGE_M)
-
-
-def _measure_lights(
-    evaluated: Trajectories, signals: Signals | None, valid: Bool[Tensor, "N E T"], max_pairs: int
-) -> Bool[Tensor, "N E T"]:
-    if signals is None:
-        return torch.zeros_like(valid)
-    with_current = evaluated.from_step(-FUTURE_STEPS - 1)
-    return compute_traffic_light_violation(
-        with_current.x, with_current.y, valid, signals, first_step=HISTORY_STEPS - 1, max_pairs=max_pairs
-    )
-
-
-def _measure_displacement(future: Trajectories, agents: LoggedAgents) -> Float[Tensor, "N E"]:
-    logged = agents.trajectories.of_agents(agents.evaluated).from_step(-FUTURE_STEPS)
-    return compute_displacement_error(
-        torch.stack([future.x, future.y, future.z], dim=-1),
-        torch.stack([logged.x, logged.y, logged.z], dim=-1),
-        agents.valid.index_select(0, agents.evaluated),
-    )

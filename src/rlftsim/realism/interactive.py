@@ -1,7 +1,7 @@
 """Distance to the nearest object and time to collision, as the official evaluator defines them.
 
-Both need a minimum over all other agents at every step of every rollout. A cheap bound on centre distances leaves the
-few pairs that can decide it; only these are measured exactly, so the result does not depend on the bound. Coordinates
+Both are a minimum over all other agents at every step of every rollout. A cheap bound on center distances leaves the
+few pairs that can decide it. Only these are computed exactly, so the result does not depend on the bound. Coordinates
 stay in the world frame in float32: box corners are rounded there by about 5e-4 m, and a local frame would flip a
 borderline collision now and then.
 """
@@ -18,9 +18,9 @@ from rlftsim.realism.rounding import compute_sqrt
 FAR_M = 1e10
 """Distance reported where no other object is valid."""
 CORNER_ROUNDING = 0.7
-"""Share of a box's smaller half side that its corners are rounded by."""
+"""Radius of the rounded corners over half the smaller side of the box."""
 TIME_HORIZON_S = 5.0
-"""Time to collision where nobody is followed or approached."""
+"""Largest time to collision, also where no agent is followed or approached."""
 MAX_HEADING_DIFFERENCE = math.radians(75.0)
 SMALL_HEADING_DIFFERENCE = math.radians(10.0)
 SMALL_OVERLAP_M = 0.5
@@ -29,7 +29,7 @@ BOUND_SLACK_M = 0.05
 
 
 class PlanarAgents(NamedTuple):
-    """Boxes of all simulated agents in the plane over time, and who of them is evaluated."""
+    """Boxes of all simulated agents in the plane over time, and the indices of the evaluated ones."""
 
     x: Float[Tensor, "N A T"]
     y: Float[Tensor, "N A T"]
@@ -38,31 +38,24 @@ class PlanarAgents(NamedTuple):
     width: Float[Tensor, "A"]
     evaluated: Int64[Tensor, "E"]
     valid: Bool[Tensor, "N A T"] | None = None
-    """None: everybody is valid at every step."""
+    """None: all agents are valid at every step."""
 
 
 class _Pairs(NamedTuple):
-    """Pairs of an evaluated and another agent at one step of one rollout, P of them."""
+    """P pairs of an evaluated agent (ego) and another one, each at one step of one rollout."""
 
     row: Int64[Tensor, "P"]
     """Flat index of (rollout, evaluated agent, step)."""
     ego: Int64[Tensor, "P"]
-    """Flat index of (rollout, agent, step) of the evaluated agent, and of the other below."""
+    """Flat index of (rollout, agent, step) of the evaluated agent."""
     other: Int64[Tensor, "P"]
+    """The same of the other agent."""
     ego_agent: Int64[Tensor, "P"]
     other_agent: Int64[Tensor, "P"]
 
 
-def _exclude(far: Float[Tensor, "N E A T"], agents: PlanarAgents) -> Float[Tensor, "N E A T"]:
-    """Set what cannot be a pair to infinity, in place: an agent with itself, and invalid others."""
-    rank = torch.arange(len(agents.evaluated), device=far.device)
-    far[:, rank, agents.evaluated] = torch.inf
-    if agents.valid is not None:
-        far.masked_fill_(~agents.valid[:, None], torch.inf)
-    return far
-
-
 def _list_pairs(mask: Bool[Tensor, "N E A T"], evaluated: Int64[Tensor, "E"]) -> _Pairs:
+    # Flat indices, so that later gathers need one index instead of three.
     num_evaluated, num_agents, num_steps = mask.shape[1:]
     rollout, rank, other, step = mask.nonzero().unbind(-1)
     ego = evaluated[rank]
@@ -76,21 +69,28 @@ def _list_pairs(mask: Bool[Tensor, "N E A T"], evaluated: Int64[Tensor, "E"]) ->
 
 
 def _find_nearest_candidates(agents: PlanarAgents) -> _Pairs:
-    """Pairs that may hold the smallest distance of their row.
+    """Pairs that may have the smallest distance of their row (rollout, evaluated agent, step).
 
-    A rounded box contains the disc of half its smaller side and lies in the disc of half its diagonal, so with centre
+    A rounded box contains the disc of half its smaller side and lies in the disc of half its diagonal, so with center
     distance c the distance of i and j lies between c - outer_i - outer_j and c - inner_i - inner_j.
     """
+    # 1. Distances of centers; in place, because [N, E, A, T] is the largest tensor of the metric.
     inner = torch.minimum(agents.length, agents.width) / 2
     outer = torch.hypot(agents.length, agents.width) / 2
     dx = agents.x[:, None] - agents.x[:, agents.evaluated, None]  # [N, E, A, T]
     dy = agents.y[:, None] - agents.y[:, agents.evaluated, None]
-    centre_distance = _exclude(dx.square_().add_(dy.square_()).sqrt_(), agents)
+    center_distance = dx.square_().add_(dy.square_()).sqrt_()
+    # 2. An agent with itself, and with invalid others, is no pair.
+    rank = torch.arange(len(agents.evaluated), device=dx.device)
+    center_distance[:, rank, agents.evaluated] = torch.inf
+    if agents.valid is not None:
+        center_distance.masked_fill_(~agents.valid[:, None], torch.inf)
+    # 3. Candidates: their lower bound does not exceed the smallest upper bound of the row.
     slack = (outer - inner)[agents.evaluated] + BOUND_SLACK_M
-    # With one agent alone the row is empty of pairs: everything is infinite and inf <= inf must not pass.
-    enough = (centre_distance - inner[:, None]).amin(2) + slack[:, None]  # [N, E, T]
+    # A row without any pair is all infinite, and inf <= inf must not pass: its bound becomes the largest finite number.
+    enough = (center_distance - inner[:, None]).amin(2) + slack[:, None]  # [N, E, T]
     enough.clamp_(max=torch.finfo(enough.dtype).max)
-    mask = (centre_distance - outer[:, None]) <= enough[:, :, None]
+    mask = (center_distance - outer[:, None]) <= enough[:, :, None]
     if agents.valid is not None:
         mask &= agents.valid[:, agents.evaluated, None]
     return _list_pairs(mask, agents.evaluated)
@@ -105,6 +105,7 @@ def _compute_core_corners(
     half_length, half_width = (length - 2 * rounding) / 2, (width - 2 * rounding) / 2
     heading = agents.heading.reshape(-1)[state]
     cos, sin = heading.cos(), heading.sin()
+    # The order of operations and of corners is that of the official code, for equal rounding.
     along = torch.stack([half_length, -half_length, -half_length, half_length])  # [4, P]
     across = torch.stack([half_width, half_width, -half_width, -half_width])
     x = cos * along - sin * across + agents.x.reshape(-1)[state]
@@ -115,6 +116,7 @@ def _compute_core_corners(
 def _start_at_lowest(
     x: Float[Tensor, "4 P"], y: Float[Tensor, "4 P"]
 ) -> tuple[Float[Tensor, "4 P"], Float[Tensor, "4 P"]]:
+    """The corners, rotated until the lowest one comes first."""
     first = y.argmin(0, keepdim=True)
     order = (first + torch.arange(4, device=x.device)[:, None]) % 4
     return x.gather(0, order), y.gather(0, order)
@@ -125,14 +127,14 @@ def _add_rectangles(
 ) -> tuple[Float[Tensor, "8 P"], Float[Tensor, "8 P"]]:
     """Vertices of the Minkowski sum of two rectangles, counter-clockwise.
 
-    Which rectangle's edge comes first is settled once, at the lowest corners, as in the official evaluator. Between
-    nearly parallel boxes, whose corners are rounded, the other edges may disagree, which moves a vertex by millimetres:
-    an exact sum would differ from the official distance by as much.
+    The rectangle whose edge comes first is chosen once, at the lowest corners, as in the official evaluator. Between
+    nearly parallel boxes, whose corners are rounded, the other edges may disagree, which moves a vertex by
+    millimeters: an exact sum would differ from the official distance by as much.
     """
     (ax, ay), (bx, by) = _start_at_lowest(*a), _start_at_lowest(*b)
     a_edge_x, a_edge_y, b_edge_x, b_edge_y = ax[1] - ax[0], ay[1] - ay[0], bx[1] - bx[0], by[1] - by[0]
     a_leads = a_edge_x * b_edge_y - a_edge_y * b_edge_x >= 0
-    # From vertex to vertex one of the two moves on by a corner, in turns.
+    # From vertex to vertex the two rectangles advance by a corner in turns.
     turn = torch.arange(8, device=ax.device)
     leading, trailing = (turn + 1) // 2 % 4, turn // 2
     x = torch.where(a_leads, ax[leading] + bx[trailing], ax[trailing] + bx[leading])
@@ -141,20 +143,22 @@ def _add_rectangles(
 
 
 def _compute_origin_distance(x: Float[Tensor, "8 P"], y: Float[Tensor, "8 P"]) -> Float[Tensor, "P"]:
-    """Signed distance of the origin to a convex polygon given counter-clockwise, negative inside."""
+    """Signed distance of the origin to a convex polygon with counter-clockwise vertices, negative inside."""
     edge_x, edge_y = x.roll(-1, 0) - x, y.roll(-1, 0) - y
     squared_length = edge_x * edge_x + edge_y * edge_y
     squared_length = torch.where(squared_length > 0, squared_length, 1.0)
     along = (-(x * edge_x + y * edge_y) / squared_length).clamp_(0.0, 1.0)
     off_x, off_y = x + along * edge_x, y + along * edge_y
     distance = compute_sqrt((off_x * off_x + off_y * off_y).amin(0))
-    outward = y * edge_x - x * edge_y  # positive where the origin is beyond an edge's line
-    # Inside, too, the distance is to edges, not to their lines: between parallel boxes an edge may be a millimetre of noise.
+    outward = y * edge_x - x * edge_y  # [8, P], positive where the origin is beyond an edge's line
+    # Inside, too, the distance is to edges and not to their lines: between parallel boxes an edge may be 1 mm of noise.
     return torch.where((outward <= 0).all(0), -distance, distance)
 
 
 def _compute_box_distance(agents: PlanarAgents, pairs: _Pairs) -> Float[Tensor, "P"]:
-    """Signed distance between rounded boxes, negative for overlap: of the origin to the difference of their cores."""
+    """Signed distance between rounded boxes, m, negative for overlap."""
+    # Two rounded boxes are as far apart as their cores, less both roundings. The distance of two convex shapes is that
+    # of the origin to their Minkowski difference.
     ego_x, ego_y, ego_rounding = _compute_core_corners(agents, pairs.ego, pairs.ego_agent)
     other_x, other_y, other_rounding = _compute_core_corners(agents, pairs.other, pairs.other_agent)
     core_distance = _compute_origin_distance(*_add_rectangles((ego_x, ego_y), (-other_x, -other_y)))
@@ -164,8 +168,8 @@ def _compute_box_distance(agents: PlanarAgents, pairs: _Pairs) -> Float[Tensor, 
 def compute_distance_to_nearest_object(agents: PlanarAgents) -> Float[Tensor, "N E T"]:
     """Signed distance of each evaluated agent to the nearest other valid agent, m; negative for overlap.
 
-    Boxes have corners rounded by 0.35 of their smaller side; height plays no role. `FAR_M` where the agent itself or
-    everybody else is invalid.
+    Boxes have corners rounded by 0.35 of their smaller side; height is ignored. `FAR_M` where the agent itself or all
+    others are invalid.
     """
     num_rollouts, _, num_steps = agents.x.shape
     pairs = _find_nearest_candidates(agents)
@@ -175,10 +179,10 @@ def compute_distance_to_nearest_object(agents: PlanarAgents) -> Float[Tensor, "N
 
 
 def _find_follow_candidates(agents: PlanarAgents, speed: Float[Tensor, "N A T"]) -> _Pairs:
-    """Pairs whose other agent may be the one followed and be reached within the horizon.
+    """Pairs whose other agent may be followed and reached within the horizon.
 
-    Whoever is further ahead than the ego drives within the horizon gives 5 s whether chosen or not, and never hides a
-    nearer one: leaving it out changes nothing.
+    An agent farther ahead than the ego drives within the horizon gives 5 s anyway, and never hides a nearer one:
+    leaving it out changes nothing.
     """
     outer = torch.hypot(agents.length, agents.width) / 2
     heading = agents.heading[:, agents.evaluated, None]
@@ -189,7 +193,7 @@ def _find_follow_candidates(agents: PlanarAgents, speed: Float[Tensor, "N A T"])
     aside = dy.mul_(cos).sub_(dx.mul_(sin)).abs_()
     reach = TIME_HORIZON_S * speed[:, agents.evaluated] * 1.001 + (outer[agents.evaluated] + BOUND_SLACK_M)[:, None]
     half_width = (agents.width[agents.evaluated] / 2 + BOUND_SLACK_M)[:, None]  # [E, 1]
-    # A speed of NaN (first and last step of a record) fails the comparison, as it does in the official rule.
+    # A speed of NaN (first and last step of a log) fails the comparison, as it does in the official rule.
     mask = (ahead - outer[:, None] <= reach[:, :, None]) & (ahead > 0)
     mask &= aside < half_width[:, :, None] + outer[:, None]
     rank = torch.arange(len(agents.evaluated), device=mask.device)
@@ -200,7 +204,7 @@ def _find_follow_candidates(agents: PlanarAgents, speed: Float[Tensor, "N A T"])
 
 
 def _compute_gaps(agents: PlanarAgents, pairs: _Pairs) -> tuple[Float[Tensor, "P"], Bool[Tensor, "P"]]:
-    """Free space between ego and other along the ego's heading, m, and whether the other is followed."""
+    """Free space between ego and other along the ego's heading, m, and True where the other is followed."""
     x, y, heading = (values.reshape(-1) for values in (agents.x, agents.y, agents.heading))
     ego_heading = heading[pairs.ego]
     # Not wrapped: headings near 2 pi apart are "not following" in the official rule too.
@@ -208,6 +212,7 @@ def _compute_gaps(agents: PlanarAgents, pairs: _Pairs) -> tuple[Float[Tensor, "P
     cos, sin = ego_heading.cos(), ego_heading.sin()
     dx, dy = x[pairs.other] - x[pairs.ego], y[pairs.other] - y[pairs.ego]
     half_length, half_width = agents.length / 2, agents.width / 2
+    # Half extent of the other box along and across the ego's heading.
     turn_cos, turn_sin = turn.cos().abs(), turn.sin().abs()
     reach_along = half_length[pairs.other_agent] * turn_cos + half_width[pairs.other_agent] * turn_sin
     reach_across = half_length[pairs.other_agent] * turn_sin + half_width[pairs.other_agent] * turn_cos
@@ -219,14 +224,14 @@ def _compute_gaps(agents: PlanarAgents, pairs: _Pairs) -> tuple[Float[Tensor, "P
 
 
 def compute_time_to_collision(agents: PlanarAgents, speed: Float[Tensor, "N A T"]) -> Float[Tensor, "N E T"]:
-    """Seconds until each evaluated agent reaches the one it follows at their present speeds, at most 5.
+    """Time until each evaluated agent reaches the one it follows at their current speeds, s, at most 5.
 
-    Followed is the nearest of those ahead that overlap laterally and point roughly the same way (whether the evaluated
-    agent itself is valid is not asked). Full boxes, no rounding.
+    An agent follows the nearest of those ahead that overlap laterally and have about the same heading. Its own validity
+    is ignored, as officially. Full boxes, without rounding.
 
     Args:
-        agents: Boxes.
-        speed: Speed in the plane, m/s; NaN counts as not approaching.
+        agents: boxes.
+        speed: speed in the plane, m/s; NaN counts as not approaching.
     """
     num_rollouts, num_agents, num_steps = agents.x.shape
     shape = (num_rollouts, len(agents.evaluated), num_steps)
@@ -235,11 +240,11 @@ def compute_time_to_collision(agents: PlanarAgents, speed: Float[Tensor, "N A T"
     gap = torch.where(is_followed, gap, torch.inf)
     nearest = gap.new_full((math.prod(shape),), torch.inf)
     nearest.scatter_reduce_(0, pairs.row, gap, "amin")
-    # Ties go to the first agent in track order.
+    # The followed agent (leader) is the one with the smallest gap; ties go to the first agent in track order.
     leader = torch.where(is_followed & (gap == nearest[pairs.row]), pairs.other_agent, num_agents)
     first = leader.new_full((math.prod(shape),), num_agents)
     first.scatter_reduce_(0, pairs.row, leader, "amin")
-    first = first.view(shape)
+    first = first.view(shape)  # [N, E, T], the leader's index, or A where there is none
     leader_speed = speed.gather(1, first.clamp(max=num_agents - 1))
     approach = speed[:, agents.evaluated] - leader_speed
     seconds = (nearest.view(shape) / approach).clamp_(max=TIME_HORIZON_S)

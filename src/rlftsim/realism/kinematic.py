@@ -1,7 +1,8 @@
-"""Speeds and accelerations as the official evaluator takes them: central differences that ignore validity.
+"""Speeds and accelerations as the official evaluator computes them: central differences that ignore validity.
 
 Source: Waymo Open Sim Agents Challenge, evaluator of 2025. Everything is float32; the step is 0.1 s. A difference at
-step t needs t - 1 and t + 1 and is NaN where one of them is missing: speeds lose one step at each end, accelerations two.
+    step t needs t - 1 and t + 1 and is NaN where one of them is missing: speeds lose one step at each end,
+    accelerations two.
 """
 
 from typing import NamedTuple
@@ -32,7 +33,7 @@ def compute_central_difference(values: Float[Tensor, "... T"]) -> Float[Tensor, 
 
 
 def _compute_turn(angle: Float[Tensor, "... T"]) -> Float[Tensor, "... T"]:
-    # The two-step difference is wrapped, not the one-step one: at most pi/2 per step can be told apart.
+    # The two-step difference is wrapped, not the one-step one, as officially: at most pi/2 per step is representable.
     return wrap_angle(2 * compute_central_difference(angle)) / 2
 
 
@@ -43,12 +44,13 @@ def compute_kinematics(
     """Linear and angular speed and acceleration of trajectories.
 
     Args:
-        position: x, y and z of the box centre; the height counts.
-        heading: Radians; the second wrapped difference, not the difference of wrapped speeds, gives the acceleration.
+        position: x, y and z of the box center, m; the height counts, as officially.
+        heading: rad.
     """
     dx, dy, dz = (compute_central_difference(axis) for axis in position)
     linear_speed = compute_sqrt(dx * dx + dy * dy + dz * dz) / STEP_S
     turn = _compute_turn(heading)
+    # Angular acceleration wraps the difference of the turns once more; it is not the difference of the angular speeds.
     return KinematicFeatures(
         linear_speed=linear_speed,
         linear_acceleration=compute_central_difference(linear_speed) / STEP_S,
@@ -58,15 +60,20 @@ def compute_kinematics(
 
 
 def compute_ground_speed(x: Float[Tensor, "... T"], y: Float[Tensor, "... T"]) -> Float[Tensor, "... T"]:
-    """Speed in the plane, m/s, NaN at both ends: for time to collision, which leaves height out."""
+    """Speed in the plane, m/s, NaN at both ends. Time to collision uses it, which ignores height.
+
+    Args:
+        x: m.
+        y: m.
+    """
     dx, dy = compute_central_difference(x), compute_central_difference(y)
     return compute_sqrt(dx * dx + dy * dy) / STEP_S
 
 
 def shrink_validity(valid: Bool[Tensor, "... T"]) -> Bool[Tensor, "... T"]:
-    """Where both neighbouring steps are valid (the step itself is not asked); False at both ends.
+    """True where both neighboring steps are valid, whatever the step itself; False at both ends.
 
-    Applied once to the future's validity it says where speeds count, twice where accelerations count.
+    Applied to the future's validity once, it is the mask of speeds, applied twice that of accelerations.
     """
     shrunk = torch.zeros_like(valid)
     shrunk[..., 1:-1] = valid[..., 2:] & valid[..., :-2]

@@ -1,8 +1,8 @@
-"""From features to likelihoods: how probable the log is under the rollouts' histograms.
+"""Likelihoods of the log under the rollouts' histograms, as the official evaluator computes them.
 
-Rollouts enter a score only through counts, so the counts of each rollout are kept apart: any set of rollouts (all, all
-but one, one alone) is a sum of them, and scoring every leave-one-out set costs one reduction. Features axis: H = 7
-histogram features in the order of `HISTOGRAM_FEATURES`, J = 3 Bernoulli features in that of `BERNOULLI_FEATURES`.
+Rollouts enter a score only through counts, so counts are stored per rollout: any set of rollouts (all, all but one, one
+alone) is a sum of them, and scoring every leave-one-out set costs one reduction. Feature axes: H = 7 histogram features
+in the order of `HISTOGRAM_FEATURES`, J = 3 Bernoulli features in that of `BERNOULLI_FEATURES`, F = H + J. K bins.
 """
 
 from dataclasses import dataclass
@@ -44,11 +44,17 @@ class HistogramTable:
 
 @lru_cache(maxsize=32)
 def histogram_table(config: MetricConfig, device: torch.device) -> HistogramTable:
-    """The metric's bins on a device."""
+    """Bins of a metric on a device; cached.
+
+    Args:
+        config: the metric's year.
+        device: where the tensors go.
+    """
     histograms = config.histograms
     edges = np.full((len(histograms), max(h.num_bins for h in histograms) + 1), np.inf, np.float32)
     for row, histogram in enumerate(histograms):
         edges[row, : histogram.num_bins + 1] = compute_bin_edges(histogram)
+    # [H, 4]
     columns = [[h.low, h.high, h.pseudocount, h.num_bins] for h in histograms]
     low, high, pseudocount, num_bins = torch.tensor(columns, device=device).unbind(1)
     return HistogramTable(
@@ -67,6 +73,10 @@ def find_bins(values: Float[Tensor, "H m"], table: HistogramTable) -> Int64[Tens
 
     NaN falls into the last bin, as in the official evaluator: the last steps of a rollout, where no difference exists,
     are counted there.
+
+    Args:
+        values: of each histogram feature.
+        table: the metric's bins.
     """
     clipped = values.clamp(table.low[:, None], table.high[:, None])
     bins = torch.searchsorted(table.edges, clipped, right=True) - 1
@@ -75,12 +85,17 @@ def find_bins(values: Float[Tensor, "H m"], table: HistogramTable) -> Int64[Tens
 
 
 def stack_histogram_features(features: Features) -> Float[Tensor, "H N E T"]:
-    """The histogram features of a set side by side."""
+    """The histogram features, stacked."""
     return torch.stack([getattr(features, name) for name in HISTOGRAM_FEATURES])
 
 
 def count_bins(values: Float[Tensor, "H N E T"], table: HistogramTable) -> Float[Tensor, "N H E K"]:
-    """Histogram of each rollout and agent over all T steps, valid or not."""
+    """Histogram of each rollout and agent over all T steps, valid or not.
+
+    Args:
+        values: of each histogram feature.
+        table: the metric's bins.
+    """
     num_features, num_rollouts, num_agents, _ = values.shape
     bins = find_bins(values.flatten(1), table).view(values.shape).permute(1, 0, 2, 3)
     counts = values.new_zeros(num_rollouts, num_features, num_agents, table.edges.shape[1] - 1)
@@ -89,27 +104,37 @@ def count_bins(values: Float[Tensor, "H N E T"], table: HistogramTable) -> Float
 
 @dataclass(frozen=True, eq=False)
 class LogTarget:
-    """What the rollouts' histograms are asked about: the log's bins, counted, and its outcomes."""
+    """The log's side of the likelihoods: its bins, counted, and its outcomes."""
 
     steps_in_bin: Float[Tensor, "H E K"]
     """Number of scored steps whose logged value lies in the bin."""
     num_scored_steps: Float[Tensor, "H"]
     outcome: Bool[Tensor, "J E"]
-    """Whether the agent ever collides, leaves the road, passes a red light in the log."""
+    """True if the agent ever collides, leaves the road or runs a red light in the log."""
 
 
 def compute_outcomes(features: Features, log: ScenarioLog) -> Bool[Tensor, "N J E"]:
-    """Whether an agent ever collides, leaves the road, passes a red light at a step where the log is valid.
+    """True for agents that ever collide, leave the road or run a red light at a step where the log is valid.
 
-    A light violation counts for vehicles only.
+    Light violations of agents other than vehicles do not count.
+
+    Args:
+        features: of rollouts or of the log.
+        log: the scenario's own part.
     """
+    # The log's validity masks the rollouts, too, as officially.
     log_valid = log.agents.future_valid
     lights = features.traffic_light_violation & log.agents.is_vehicle[:, None]
     return torch.stack([features.collision, features.offroad, lights], dim=1).logical_and_(log_valid).any(-1)
 
 
 def stack_scored_steps(log: ScenarioLog, config: MetricConfig) -> Bool[Tensor, "H E T"]:
-    """At which steps of the log each histogram feature counts."""
+    """Mask of the logged steps at which each histogram feature counts.
+
+    Args:
+        log: the scenario's own part.
+        config: the metric's year.
+    """
     features = log.features
     valid, speed, acceleration = features.valid[0], features.speed_valid[0], features.acceleration_valid[0]
     collision_time = valid & log.agents.is_vehicle[:, None] if config.time_to_collision_vehicles_only else valid
@@ -117,9 +142,14 @@ def stack_scored_steps(log: ScenarioLog, config: MetricConfig) -> Bool[Tensor, "
 
 
 def build_log_target(log: ScenarioLog, config: MetricConfig) -> LogTarget:
-    """Bins and outcomes of the log under a configuration."""
+    """Bins and outcomes of the log.
+
+    Args:
+        log: the scenario's own part.
+        config: the metric's year.
+    """
     table = histogram_table(config, log.agents.valid.device)
-    values = stack_histogram_features(log.features)[:, 0]
+    values = stack_histogram_features(log.features)[:, 0]  # [H, E, T]
     scored = stack_scored_steps(log, config).to(values.dtype)
     bins = find_bins(values.flatten(1), table).view(values.shape)
     steps = values.new_zeros(*values.shape[:2], table.edges.shape[1] - 1).scatter_add_(-1, bins, scored)
@@ -127,22 +157,28 @@ def build_log_target(log: ScenarioLog, config: MetricConfig) -> LogTarget:
 
 
 log_target = lru_cache(maxsize=8)(build_log_target)
-"""`build_log_target`, remembered (logs are compared by identity)."""
+"""`build_log_target`, cached (logs are compared by identity)."""
 
 
 @dataclass(frozen=True, eq=False)
 class RolloutCounts:
-    """What rollouts contribute to scores, each for itself; a set of rollouts is the sum over its members."""
+    """Counts of each rollout; the counts of a set of rollouts are the sum over its members."""
 
     bins: Float[Tensor, "N H E K"]
     agreement: Float[Tensor, "N J E"]
-    """1 where the rollout's outcome is the log's."""
+    """1 where the rollout has the log's outcome."""
     num_steps: int
     """Values per rollout and agent, T."""
 
 
 def count_rollouts(features: Features, log: ScenarioLog, config: MetricConfig) -> RolloutCounts:
-    """Counts of each rollout, a rollout that stands for several counted once."""
+    """Counts of each distinct rollout.
+
+    Args:
+        features: of N distinct rollouts.
+        log: the scenario's own part.
+        config: the metric's year.
+    """
     values = stack_histogram_features(features)
     table = histogram_table(config, values.device)
     agreement = compute_outcomes(features, log) == log_target(log, config).outcome
@@ -152,7 +188,15 @@ def count_rollouts(features: Features, log: ScenarioLog, config: MetricConfig) -
 def compute_log_probabilities(
     counts: Float[Tensor, "S H E K"], num_values: Float[Tensor, "S"], table: HistogramTable
 ) -> Float[Tensor, "S H E K"]:
-    """Log-probability of each bin for S sets of rollouts with additive smoothing, nats."""
+    """Log-probability of each bin for S sets of rollouts with additive smoothing, nats.
+
+    ln P(k) = ln (count(k) + c) - ln (total + c K), with c the pseudocount and K the feature's own number of bins.
+
+    Args:
+        counts: of each set.
+        num_values: values in each histogram: rollouts times steps.
+        table: the metric's bins.
+    """
     pseudocount = table.pseudocount[:, None, None]
     total = num_values[:, None] + table.pseudocount * table.num_bins  # [S, H]
     return (counts + pseudocount).log_() - total.log()[..., None, None]
@@ -161,25 +205,26 @@ def compute_log_probabilities(
 def compute_agent_log_likelihoods(
     counts: RolloutCounts, num_rollouts: Float[Tensor, "S"], target: LogTarget, table: HistogramTable
 ) -> Float[Tensor, "S F E"]:
-    """What each agent adds to the log-likelihood of the log under S sets of rollouts, nats.
+    """Log-likelihood of each agent's log under S sets of rollouts, nats.
 
-    The log-probabilities of an agent's scored steps, summed; for a Bernoulli feature that of its one outcome.
+    For histogram features the sum over the agent's scored steps, for Bernoulli features that of its one outcome.
 
     Args:
-        counts: Summed over each set: `bins` [S, H, E, K], `agreement` [S, J, E].
-        num_rollouts: Size of each set.
-        target: The log's side.
-        table: The metric's bins.
+        counts: summed over each set: `bins` [S, H, E, K], `agreement` [S, J, E].
+        num_rollouts: size of each set.
+        target: the log's side.
+        table: the metric's bins.
     """
     log_probability = compute_log_probabilities(counts.bins, num_rollouts * counts.num_steps, table)
     histogram = (log_probability * target.steps_in_bin).sum(-1)  # [S, H, E]
     pseudocount = table.bernoulli_pseudocount
+    # Two outcomes: (number that agree + c) / (number of rollouts + 2 c).
     agreement = (counts.agreement + pseudocount[:, None]) / (num_rollouts[:, None] + 2 * pseudocount)[..., None]
     return torch.cat([histogram, agreement.log_()], dim=1)
 
 
 def count_terms(target: LogTarget) -> Float[Tensor, "F"]:
-    """Number of log-probabilities a feature's mean is taken over: scored (agent, step) pairs, or agents."""
+    """Number of terms in a feature's mean log-probability: scored (agent, step) pairs, or agents."""
     num_bernoulli, num_agents = target.outcome.shape
     return torch.cat([target.num_scored_steps, target.num_scored_steps.new_full((num_bernoulli,), num_agents)])
 
@@ -189,8 +234,14 @@ def compute_likelihoods(
 ) -> Float[Tensor, "S F"]:
     """Likelihood of the log under S sets of rollouts, one per feature: the exponential of the mean log-probability.
 
-    Histogram features average over all scored (agent, step) pairs together, Bernoulli ones over all agents. A feature
-    without a scored step is NaN, as in the official evaluator. Arguments as in `compute_agent_log_likelihoods`.
+    Histogram features average over all scored (agent, step) pairs together (not over means of agents), Bernoulli ones
+    over all agents. A feature without a scored step is NaN, as in the official evaluator.
+
+    Args:
+        counts: summed over each set: `bins` [S, H, E, K], `agreement` [S, J, E].
+        num_rollouts: size of each set.
+        target: the log's side.
+        table: the metric's bins.
     """
     by_agent = compute_agent_log_likelihoods(counts, num_rollouts, target, table)
     return (by_agent.sum(-1) / count_terms(target)).exp_()

@@ -1,6 +1,8 @@
-"""Distance to the road edge, as the official evaluator defines it.
+"""Signed distance to the road edge, as the official evaluator defines it.
 
-Road edges are packed once per scenario; the search over them is exact. Frame: world, float32.
+For each bottom corner of a box the segment nearest in space (heights stretched) is chosen, and the distance to it in
+the plane is signed by the side of the edge that the corner lies on. Road edges are packed once per scenario, the
+search over them is exact. Frame: world, float32.
 """
 
 import math
@@ -17,18 +19,19 @@ from rlftsim.realism.segment_search import ChunkedSegments, chunk_segments, find
 from rlftsim.scenario.types import ROAD_EDGE_TYPES, MapFeatures
 
 HEIGHT_STRETCH = 3.0
-"""Heights count this much more when the nearest road edge is chosen, so that a bridge's edge is not taken below it."""
+"""Factor on heights when the nearest road edge is chosen, so that agents below a bridge do not get its edge."""
 CLOSED_SQUARED_M2 = 1.0
+"""Polylines whose ends are nearer than this (squared, in space) are closed."""
 GROUP_STEPS = 8
-"""Steps of one agent whose corners share a list of nearby road edges."""
+"""Steps of one agent whose corners share a list of nearby road edges in the search."""
 
 
 @dataclass(frozen=True, eq=False)
 class Polylines:
-    """Polylines with two or more points, in file order; s segments in all."""
+    """L polylines with two or more points, in file order; p points and s segments in all."""
 
     feature: Int64[np.ndarray, "L"]
-    """Index among the map features."""
+    """Index of its map feature."""
     points: Float[np.ndarray, "p 3"]
     first: Int64[np.ndarray, "L"]
     """Index of a polyline's first point."""
@@ -37,7 +40,12 @@ class Polylines:
 
 
 def select_polylines(features: MapFeatures, types: tuple[int, ...]) -> Polylines:
-    """The polylines of the given types that have a segment at all."""
+    """Polylines of the given types that have at least one segment.
+
+    Args:
+        features: of the map.
+        types: `MapFeatureType` values.
+    """
     chosen = features.indices_of(types)
     count = np.diff(features.offsets)[chosen]
     chosen, count = chosen[count >= 2], count[count >= 2]
@@ -49,7 +57,8 @@ def select_polylines(features: MapFeatures, types: tuple[int, ...]) -> Polylines
 def _cut_segments(
     polylines: Polylines,
 ) -> tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3"], Int64[np.ndarray, "s"]]:
-    """First and last point of every segment and its polyline's index."""
+    """Both ends of every segment, and its polyline."""
+    # Every point but the last one of each polyline begins a segment.
     starts = np.delete(np.arange(len(polylines.points)), polylines.first + polylines.count - 1)
     owner = np.repeat(np.arange(len(polylines.count)), polylines.count - 1)
     return polylines.points[starts], polylines.points[starts + 1], owner
@@ -57,26 +66,27 @@ def _cut_segments(
 
 @dataclass(frozen=True, eq=False)
 class RoadEdges:
-    """Road edges of a scenario, ready to be searched."""
+    """Road edges of a scenario, packed for the search; s segments."""
 
     segments: ChunkedSegments
     start: Float[Tensor, "s 2"]
-    """Segment starts and directions once more by plain index: what the sign rule needs of the winner's neighbours."""
+    """Starts of the segments by plain index, for the sign rule, which looks at the nearest segment's neighbors."""
     delta: Float[Tensor, "s 2"]
+    """End minus start."""
     previous: Int64[Tensor, "s"]
-    """Segment before, or the segment itself where there is none."""
+    """Index of the segment before, or of the segment itself at an end."""
     next: Int64[Tensor, "s"]
-    """Segment after, likewise."""
+    """Index of the segment after, likewise."""
 
 
 def _link_neighbors(polylines: Polylines) -> tuple[Int64[np.ndarray, "s"], Int64[np.ndarray, "s"]]:
     """Index of the segment before and after each segment.
 
-    At the ends a segment is its own neighbour, which leaves its sign as it is. A closed polyline wraps around only if
+    At the ends a segment is its own neighbor, which leaves its sign as it is. A closed polyline wraps around only if
     it has as many points as the longest one: the official code wraps in an array padded to that length, where the
-    neighbour of any shorter polyline is padding, and padding does not count.
+    neighbor in any shorter polyline is padding, which it ignores.
     """
-    num_segments = polylines.count - 1
+    num_segments = polylines.count - 1  # [L]
     head = np.cumsum(num_segments) - num_segments
     tail = head + num_segments - 1
     index = np.arange(num_segments.sum())
@@ -89,7 +99,12 @@ def _link_neighbors(polylines: Polylines) -> tuple[Int64[np.ndarray, "s"], Int64
 
 
 def build_road_edges(features: MapFeatures, device: torch.device) -> RoadEdges | None:
-    """Pack the road edges of every kind; None if the map has none with at least two points."""
+    """Road edges of every kind, packed; None if the map has none with at least two points.
+
+    Args:
+        features: of the map.
+        device: where the tensors go.
+    """
     polylines = select_polylines(features, ROAD_EDGE_TYPES)
     if len(polylines.count) == 0:
         return None
@@ -108,8 +123,8 @@ def build_road_edges(features: MapFeatures, device: torch.device) -> RoadEdges |
 def _measure_road_edge(
     points: Float[Tensor, "P 3"], segments: ChunkedSegments, chunk: Int64[Tensor, "P"]
 ) -> Float[Tensor, "P U"]:
-    """Squared distance in space with heights stretched, to the point of the segment nearest in the plane."""
-    dx, dy, dz = (axis[chunk] for axis in segments.delta)
+    """Squared distance, heights stretched, to the point of each segment that is nearest in the plane."""
+    dx, dy, dz = (axis[chunk] for axis in segments.delta)  # [P, U]
     to_x, to_y, to_z = (points[:, axis, None] - segments.start[axis][chunk] for axis in range(3))
     along = to_x * dx + to_y * dy
     along.div_(segments.squared_length[chunk]).clamp_(0.0, 1.0)
@@ -122,16 +137,11 @@ def _cross(ax: Tensor, ay: Tensor, bx: Tensor, by: Tensor) -> Tensor:
     return ax * by - ay * bx
 
 
-def _compute_side(x: Tensor, y: Tensor, edges: RoadEdges, segment: Int64[Tensor, "..."]) -> Float[Tensor, "..."]:
-    """-1 left of the segment's line (on the road), +1 right of it, 0 on it."""
-    start, delta = edges.start[segment], edges.delta[segment]
-    return _cross(x - start[..., 0], y - start[..., 1], delta[..., 0], delta[..., 1]).sign()
-
-
 def _compute_signed_distance(
     x: Float[Tensor, "..."], y: Float[Tensor, "..."], edges: RoadEdges, segment: Int64[Tensor, "..."]
 ) -> Float[Tensor, "..."]:
-    """Distance in the plane to the chosen segment, signed by the side of it or, beyond an end, of the corner there."""
+    """Distance in the plane to the nearest segment, negative to its left (on the road)."""
+    # 1. Distance to the segment. `along` < 0 or > 1: the nearest point is one of its ends.
     start, delta = edges.start[segment], edges.delta[segment]
     to_x, to_y, dx, dy = x - start[..., 0], y - start[..., 1], delta[..., 0], delta[..., 1]
     squared_length = dx * dx + dy * dy
@@ -139,10 +149,14 @@ def _compute_signed_distance(
     clipped = along.clamp(0.0, 1.0)
     off_x, off_y = to_x - clipped * dx, to_y - clipped * dy
     distance = compute_sqrt(off_x * off_x + off_y * off_y)
+    # 2. Sides of the segment and of its neighbor at that end: -1 left, +1 right, 0 on the line.
     is_before = along < 0
     neighbor = torch.where(is_before, edges.previous[segment], torch.where(along > 1, edges.next[segment], segment))
-    side, other_side = _cross(to_x, to_y, dx, dy).sign(), _compute_side(x, y, edges, neighbor)
-    bend = _cross(dx, dy, edges.delta[neighbor][..., 0], edges.delta[neighbor][..., 1])
+    next_start, (next_dx, next_dy) = edges.start[neighbor], edges.delta[neighbor].unbind(-1)
+    side = _cross(to_x, to_y, dx, dy).sign()
+    other_side = _cross(x - next_start[..., 0], y - next_start[..., 1], next_dx, next_dy).sign()
+    # 3. Beyond an end the corner of both segments decides: at a convex one the right side wins, else the left one.
+    bend = _cross(dx, dy, next_dx, next_dy)
     bend = torch.where(is_before, -bend, bend)  # from the earlier to the later segment
     corner = torch.where(bend > 0, torch.maximum(side, other_side), torch.minimum(side, other_side))
     return torch.where(neighbor == segment, side, corner) * distance
@@ -154,9 +168,9 @@ def compute_point_distance_to_road_edge(
     """Signed distance of points to the nearest road edge, m, negative on the road (left of the edge).
 
     Args:
-        groups: x, y, z of points in groups of neighbours.
-        edges: Packed road edges.
-        max_pairs: Bound on the pairs held at once, see `find_nearest_segment`.
+        groups: x, y, z of points, G groups of Q nearby ones.
+        edges: packed road edges.
+        max_pairs: memory bound, see `find_nearest_segment`.
     """
     segment = find_nearest_segment(groups, edges.segments, _measure_road_edge, max_pairs=max_pairs)
     return _compute_signed_distance(groups[..., 0], groups[..., 1], edges, segment)
@@ -168,10 +182,10 @@ def compute_distance_to_road_edge(
     """Signed distance of agents to the road edge, m: that of the bottom corner farthest off (or least on) the road.
 
     Args:
-        agents: Evaluated agents' states, [N, E, T].
-        size: Length, width, height.
-        edges: Packed road edges.
-        max_pairs: Bound on the pairs held at once.
+        agents: states of the evaluated agents, [N, E, T].
+        size: length, width, height.
+        edges: packed road edges.
+        max_pairs: memory bound, see `find_nearest_segment`.
     """
     half = (size / 2)[:, :, None]  # [E, 3, 1]
     along = half[:, :1] * half.new_tensor([1.0, -1.0, -1.0, 1.0])  # [E, 1, 4]
@@ -180,7 +194,8 @@ def compute_distance_to_road_edge(
     x = cos * along - sin * across + agents.x[..., None]  # [N, E, T, 4]
     y = sin * along + cos * across + agents.y[..., None]
     z = (agents.z - half[:, 2])[..., None].expand_as(x)
-    corners = torch.stack([x, y, z], dim=-1)
+    corners = torch.stack([x, y, z], dim=-1)  # [N, E, T, 4, 3]
+    # The corners of a few steps lie close together: they make a group.
     steps = math.gcd(corners.shape[2], GROUP_STEPS)
     distance = compute_point_distance_to_road_edge(corners.view(-1, 4 * steps, 3), edges, max_pairs=max_pairs)
     return distance.view(x.shape).amax(-1)

@@ -1,7 +1,7 @@
 """The realism meta-metric of rollouts, of all but one of them, and of each alone.
 
-Source: Waymo Open Sim Agents Challenge. The leave-one-out and single-rollout values are what the rewards of RLFTSim
-(equation 2) are made of; they cost one reduction over per-rollout counts.
+Source: Waymo Open Sim Agents Challenge; RLFTSim, equation 1. The rewards of RLFTSim (equation 2) are made of the
+leave-one-out and single-rollout values, which cost one reduction over per-rollout counts.
 """
 
 from dataclasses import dataclass
@@ -45,12 +45,12 @@ class RealismResult:
     average_displacement_error: Float[Tensor, "*B"]
     """Mean over rollouts and evaluated agents, m."""
     min_average_displacement_error: Float[Tensor, "*B"]
-    """Of the best rollout: the mean over agents is taken before the minimum, m."""
+    """minADE, m: of the best rollout as a whole; the mean over agents is taken before the minimum."""
     collision_rate: Float[Tensor, "*B"]
-    """Share of (rollout, evaluated agent) pairs that ever collide in simulation while the log is valid."""
+    """Fraction of (rollout, evaluated agent) pairs that ever collide in simulation while the log is valid."""
     offroad_rate: Float[Tensor, "*B"]
     traffic_light_violation_rate: Float[Tensor, "*B"]
-    """Of all agents; the likelihood looks at vehicles only."""
+    """Over all evaluated agents, while the likelihood counts vehicles only (as officially)."""
     leave_one_out_meta_metric: Float[Tensor, "*B N"]
     """Meta-metric of the other N - 1 rollouts; NaN for N = 1."""
     single_meta_metric: Float[Tensor, "*B N"]
@@ -66,12 +66,12 @@ class RealismResult:
         return self.likelihoods[..., FEATURE_NAMES.index(feature)]
 
     def score_of(self, name: str) -> Float[Tensor, "*B"]:
-        """A field, or `FEATURE_likelihood`."""
+        """A field by its name, or a feature's likelihood by `FEATURE_likelihood`."""
         feature = name.removesuffix("_likelihood")
         return self.likelihood(feature) if feature in FEATURE_NAMES else getattr(self, name)
 
     def to_official_fields(self) -> list[dict[str, object]]:
-        """Plain numbers under the official messages' names, one entry per scenario; sub-scores under `buckets`."""
+        """Plain numbers under the official messages' names, an entry per scenario; sub-scores under `buckets`."""
         fields, buckets = (
             {official: self.score_of(ours).reshape(-1).tolist() for ours, official in names.items()}
             for names in (official_fields(self.config), official_buckets(self.config))
@@ -85,21 +85,32 @@ class RealismResult:
             for row, scenario_id in enumerate(self.scenario_ids)
         ]
 
+    def __repr__(self) -> str:
+        names = {"RMM": "meta_metric", "kinematic": "kinematic", "interactive": "interactive", "map-based": "map_based"}
+        means = " | ".join(f"{shown} {float(getattr(self, name).mean()):.3f}" for shown, name in names.items())
+        count = len(self.scenario_ids)
+        return means if count == 1 else f"{means} (mean of {count} scenarios)"
+
 
 @lru_cache(maxsize=32)
 def _score_weights(config: MetricConfig, device: torch.device) -> Float[Tensor, "4 F"]:
-    """Weights of the meta-metric and of the three sub-scores."""
+    """Weights of the meta-metric and of the three sub-scores. Cached, because a copy to a device takes time."""
     rows = [config.weights, *(config.sub_score_weights(name) for name in SUB_SCORES)]
     return torch.tensor(rows, dtype=torch.float32, device=device)
 
 
 def _weigh(likelihoods: Float[Tensor, "... F"], weights: Float[Tensor, "... F"]) -> Float[Tensor, "..."]:
-    # A feature of no weight stays out even where it is NaN (nobody's time to collision is scored).
+    # A feature without weight stays out even where it is NaN (time to collision without any evaluated vehicle).
     return torch.where(weights > 0, likelihoods * weights, 0.0).sum(-1)
 
 
 def form_sets(counts: RolloutCounts, repeat: int) -> tuple[RolloutCounts, Float[Tensor, "S"]]:
-    """Counts and sizes of S = 1 + N + N sets: all rollouts, all but each, each alone. N are the distinct ones."""
+    """Counts and sizes of S = 1 + N + N sets of rollouts: all, all but each one, each one alone.
+
+    Args:
+        counts: of N distinct rollouts.
+        repeat: number of identical rollouts that each represents.
+    """
     num_rollouts = len(counts.bins) * repeat
     # Counts are whole numbers below 2^24: sums and differences are exact in float32.
     all_bins = counts.bins.sum(0, keepdim=True) * repeat
@@ -116,23 +127,32 @@ def form_sets(counts: RolloutCounts, repeat: int) -> tuple[RolloutCounts, Float[
 
 
 def _any_rate(event: Bool[Tensor, "N E T"], log: ScenarioLog, repeat: int) -> Float[Tensor, "N_repeat"]:
-    """Share of evaluated agents of a rollout with an event at any step where the log is valid."""
+    """Fraction of a rollout's evaluated agents with an event at any step where the log is valid."""
     occurred = (event & log.agents.future_valid).any(-1).to(torch.float32)
     return occurred.mean(-1).repeat_interleave(repeat)
 
 
 def score_features(log: ScenarioLog, features: Features, config: MetricConfig = METRIC_2025) -> RealismResult:
-    """Scores of rollouts whose features are known (several metrics of the same rollouts share them)."""
+    """Scores of rollouts from their features, which several metrics of the same rollouts share.
+
+    Args:
+        log: the scenario's own part.
+        features: of its rollouts.
+        config: the metric's year.
+    """
     distinct, repeat = len(features.linear_speed), features.repeat
+    # 1. Likelihoods of all sets of rollouts at once.
     sets, size = form_sets(count_rollouts(features, log, config), repeat)
     table = histogram_table(config, features.linear_speed.device)
     likelihoods = compute_likelihoods(sets, size, log_target(log, config), table)  # [S, F]
+    # 2. Meta-metric of each set; without a rollout there is no score, so leave-one-out values need two.
     weights = _score_weights(config, likelihoods.device)
-    rmm = _weigh(likelihoods, weights[0])
+    rmm = _weigh(likelihoods, weights[0])  # [S]
     without_each, alone = rmm[1:].view(2, distinct).repeat_interleave(repeat, dim=1)
     if distinct * repeat == 1:
         without_each = torch.full_like(without_each, torch.nan)
-    scores = _weigh(likelihoods[:1], weights)
+    meta_metric, kinematic, interactive, map_based = _weigh(likelihoods[:1], weights)
+    # 3. Reported beside the metric, for each rollout [N].
     displacement = features.displacement_error.mean(-1).repeat_interleave(repeat)
     collision = _any_rate(features.collision, log, repeat)
     offroad = _any_rate(features.offroad, log, repeat)
@@ -141,10 +161,10 @@ def score_features(log: ScenarioLog, features: Features, config: MetricConfig = 
         scenario_ids=(log.scenario_id,),
         config=config,
         likelihoods=likelihoods[0],
-        meta_metric=scores[0],
-        kinematic=scores[1],
-        interactive=scores[2],
-        map_based=scores[3],
+        meta_metric=meta_metric,
+        kinematic=kinematic,
+        interactive=interactive,
+        map_based=map_based,
         average_displacement_error=displacement.mean(),
         min_average_displacement_error=displacement.min(),
         collision_rate=collision.mean(),
@@ -170,11 +190,11 @@ def score(
     """Scores of one scenario's rollouts, on the rollouts' device.
 
     Args:
-        scenario: The recorded scenario, whose own part is computed once and remembered, or that part.
-        states: Its rollouts.
-        config: The metric's year.
-        missing_map: What to do without road edges: "error" or "neutral" (everybody counts as on the road).
-        compute: Memory bound.
+        scenario: the logged scenario, or its `scenario_log`.
+        states: its rollouts.
+        config: the metric's year.
+        missing_map: without road edges raise ("error"), or count every agent as on the road ("neutral").
+        compute: memory bound.
 
     Raises:
         DataError: the scenario cannot be scored, or the rollouts' agents are not its simulated agents.

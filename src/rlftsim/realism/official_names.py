@@ -1,4 +1,4 @@
-"""What the official messages call a scenario's scores: the one table of their names."""
+"""Names of a scenario's scores in the official messages."""
 
 from rlftsim.realism.config import FEATURE_NAMES, MetricConfig
 
@@ -26,15 +26,20 @@ _BUCKETS = {
 
 
 def is_reported(score: str, config: MetricConfig) -> bool:
-    """Whether the official result of that year has a score."""
+    """True if the official result of a year has a score.
+
+    Args:
+        score: our name.
+        config: the metric's year.
+    """
     return config.reports_traffic_lights or LIGHT not in score
 
 
 def official_fields(config: MetricConfig) -> dict[str, str]:
-    """Official names of a scenario's scores in that year, by ours."""
+    """Official names of a scenario's scores in a year, by our names."""
     return {ours: official for ours, official in _FIELDS.items() if is_reported(ours, config)}
 
 
 def official_buckets(config: MetricConfig) -> dict[str, str]:
-    """Official names of its sub-scores and what stands beside them, by ours."""
+    """Official names of the sub-scores and the figures beside them in a year, by our names."""
     return {ours: official for ours, official in _BUCKETS.items() if is_reported(ours, config)}

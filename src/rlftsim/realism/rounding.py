@@ -1,4 +1,4 @@
-"""Square roots rounded as IEEE 754 asks, which a CPU's vector library does not always do."""
+"""Square roots rounded as IEEE 754 requires, which a CPU's vector library does not always do."""
 
 import torch
 from jaxtyping import Float
@@ -8,8 +8,8 @@ from torch import Tensor
 def compute_sqrt(values: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
     """Square root of float32 values, correctly rounded.
 
-    `Tensor.sqrt` may be off by the last bit in one value of two hundred. Next to a state that jumps by kilometres, which
-    the official metric does read, that bit is a millimetre per second of speed and a centimetre of acceleration.
+    `Tensor.sqrt` may be off by the last bit in one value of two hundred. Next to a state that jumps by kilometers,
+    which the official metric does read, that bit is 1 mm/s of speed and 1 cm/s² of acceleration.
     """
     # The root of a float32 number is never near enough to the middle of two float32 numbers to be rounded twice.
     return values.double().sqrt_().to(values.dtype)
@@ -17,6 +17,7 @@ def compute_sqrt(values: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
 
 def compute_largest_square(root: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
     """The largest float32 number whose correctly rounded square root is still `root`."""
+    # Roots up to the midpoint of `root` and the next float32 number round to `root`; its square is exact in float64.
     above = torch.nextafter(root, torch.full_like(root, torch.inf))
     bound = ((root.double() + above.double()) / 2).square_()
     square = bound.to(root.dtype)

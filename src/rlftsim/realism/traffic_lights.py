@@ -1,7 +1,8 @@
 """Traffic light violations, as the official evaluator of 2025 defines them.
 
-Lanes and lights are packed once per scenario; which lane an agent is on is looked up only where it passes a red light's
-stop point. Frame: world, float32; z plays no role.
+An agent violates a light if its center passes the stop point of a red light on the light's lane. Lanes and lights are
+packed once per scenario; an agent's lane is looked up only where it passes a stop point. Frame: world, float32,
+without z. Quirks of the official code that change results are reproduced and marked.
 """
 
 from dataclasses import dataclass
@@ -16,14 +17,14 @@ from rlftsim.realism.segment_search import ChunkedSegments, chunk_segments, find
 from rlftsim.scenario.types import TOTAL_STEPS, LightState, LightStates, MapFeatures, MapFeatureType
 
 RED_STATES = (LightState.ARROW_STOP, LightState.STOP)
-"""Flashing stop is not red."""
+"""A flashing stop is not red."""
 
 
 @dataclass(frozen=True, eq=False)
 class Signals:
-    """Traffic lights of surface-street lanes over the steps of a record, and the lanes to find agents on.
+    """Traffic lights of surface-street lanes over the steps of a log, and the lanes that agents may be on.
 
-    S steps (91), J signals.
+    S steps (91), J signals, s segments.
     """
 
     lanes: ChunkedSegments
@@ -32,21 +33,23 @@ class Signals:
     """Index of a signal's lane among the surface-street lanes, as in `lane_of_segment`."""
     is_red: Bool[Tensor, "S J"]
     stop_start: Float[Tensor, "S J 2"]
-    """The segment of the signal's lane nearest to its stop point: start and direction over squared length."""
+    """Start of the segment of the signal's lane that is nearest to its stop point."""
     stop_direction: Float[Tensor, "S J 2"]
+    """End minus start of that segment."""
     stop_squared_length: Float[Tensor, "S J"]
     stop_progress: Float[Tensor, "S J"]
-    """Where the stop point projects on that segment, in segment lengths."""
+    """Projection of the stop point on that segment, in segment lengths."""
 
 
-def _measure_lane(
+def _lane_rule(
     points: Float[Tensor, "P 2"], segments: ChunkedSegments, chunk: Int64[Tensor, "P"]
 ) -> Float[Tensor, "P U"]:
-    """Square of what the official rule compares, which is not a distance: it steps from the segment's start away from the projection.
+    """Square of the quantity that the official rule minimizes, which is not the distance to the segment.
 
     It amounts to the nearest segment start, with starts ahead of or abreast of the point preferred. It is never below
     the distance to the segment's start.
     """
+    # A quirk of the official code: the projection is added to the offset where a distance would subtract it.
     dx, dy = (axis[chunk] for axis in segments.delta)
     to_x, to_y = (points[:, axis, None] - segments.start[axis][chunk] for axis in range(2))
     along = ((to_x * dx + to_y * dy) / segments.squared_length[chunk]).clamp_(0.0, 1.0)
@@ -57,10 +60,10 @@ def _measure_lane(
 def _cut_lane_segments(
     lanes: Polylines,
 ) -> tuple[Float[np.ndarray, "s 2"], Float[np.ndarray, "s 2"], Int64[np.ndarray, "s"]]:
-    """Segments of lanes in the plane, with the one the official code adds to every lane but the longest.
+    """Segments of lanes in the plane, with the one that the official code adds to every lane but the longest.
 
-    Lanes are padded with zeros to the longest one there and a segment counts if its start is real: a shorter lane gets
-    a segment from its last point to the world's origin.
+    The official code pads lanes with zeros to the longest one and counts a segment if its start is real, so a shorter
+    lane gets a segment from its last point to the world's origin. It can be the nearest one, so it is reproduced.
     """
     ends = np.append(lanes.points[1:, :2], np.zeros((1, 2), np.float32), axis=0)
     last = lanes.first + lanes.count - 1
@@ -69,19 +72,6 @@ def _cut_lane_segments(
     keep[last] = lanes.count < lanes.count.max()
     owner = np.repeat(np.arange(len(lanes.count)), lanes.count)
     return lanes.points[keep, :2], ends[keep], owner[keep]
-
-
-def _tabulate_lights(
-    lights: LightStates,
-) -> tuple[Int64[np.ndarray, "J"], Int64[np.ndarray, "S J"], Float[np.ndarray, "S J 2"]]:
-    """Lane ids, states and stop points per step; where a light is not observed state 0 (unknown) and point (0, 0)."""
-    lane_ids, column = np.unique(lights.lane_id, return_inverse=True)
-    state = np.zeros((TOTAL_STEPS, len(lane_ids)), np.int64)
-    stop = np.zeros((TOTAL_STEPS, len(lane_ids), 2), np.float32)
-    within = lights.step < TOTAL_STEPS
-    state[lights.step[within], column[within]] = lights.state[within]
-    stop[lights.step[within], column[within]] = lights.stop_point[within, :2]
-    return lane_ids, state, stop
 
 
 def _project_stop_points(
@@ -94,6 +84,7 @@ def _project_stop_points(
     for signal, lane_index in enumerate(lane):
         first, last = np.searchsorted(lanes[2], [lane_index, lane_index + 1])
         own_start, own_direction = lanes[0][first:last], lanes[1][first:last] - lanes[0][first:last]
+        # Most signals have the same stop point at all steps: project each distinct one once.
         points, which = np.unique(stop[:, signal], axis=0, return_inverse=True)
         to_point = points[:, None] - own_start  # [u, n, 2]
         squared_length = (own_direction * own_direction).sum(-1)
@@ -105,35 +96,38 @@ def _project_stop_points(
 
 
 def build_signals(features: MapFeatures, lights: LightStates, device: torch.device) -> Signals | None:
-    """Pack traffic lights and surface-street lanes; None where nothing can be violated."""
+    """Traffic lights and surface-street lanes, packed; None where nothing can be violated.
+
+    Args:
+        features: of the map.
+        lights: all observations.
+        device: where the tensors go.
+    """
+    # 1. States [S, J] and stop points [S, J, 2]. A light that is not observed at a step has state 0 (unknown) and stop
+    #    point (0, 0), as officially; of two observations the last one counts.
+    lane_ids, column = np.unique(lights.lane_id, return_inverse=True)
+    state = np.zeros((TOTAL_STEPS, len(lane_ids)), np.int64)
+    stop = np.zeros((TOTAL_STEPS, len(lane_ids), 2), np.float32)
+    within = lights.step < TOTAL_STEPS
+    state[lights.step[within], column[within]] = lights.state[within]
+    stop[lights.step[within], column[within]] = lights.stop_point[within, :2]
+    # 2. Only lights of surface-street lanes can be violated.
     lanes = select_polylines(features, (MapFeatureType.LANE_SURFACE_STREET,))
-    lane_ids, state, stop = _tabulate_lights(lights)
     row_of_id = {int(features.feature_id[feature]): row for row, feature in enumerate(lanes.feature)}
     known = np.array([int(lane_id) in row_of_id for lane_id in lane_ids], bool)
     if not known.any():
         return None
     lane = np.array([row_of_id[int(lane_id)] for lane_id in lane_ids[known]], np.int64)
+    # 3. Stop points as progress along the nearest segment of their own lane.
     segments = _cut_lane_segments(lanes)
     start, direction = _project_stop_points(segments, lane, stop[:, known])
     squared_length = (direction * direction).sum(-1)
     squared_length = np.where(squared_length > 0, squared_length, np.float32(1))
     progress = ((stop[:, known] - start) * direction).sum(-1) / squared_length
+    # 4. The lane rule is bounded by the distance to a segment's start, so boxes are those of the starts.
     chunks = chunk_segments(*segments, (segments[0], segments[0]), axis_scale=(1.0, 1.0), device=device)
     arrays = (segments[2], lane, np.isin(state[:, known], RED_STATES), start, direction, squared_length, progress)
     return Signals(chunks, *(torch.from_numpy(array).to(device) for array in arrays))
-
-
-def _find_crossings(
-    x: Float[Tensor, "N E T1"], y: Float[Tensor, "N E T1"], signals: Signals, first_step: int
-) -> Bool[Tensor, "N E T J"]:
-    """Whether an agent passes a red light's stop point along its lane, however far aside, since the step before."""
-    steps = slice(first_step, first_step + x.shape[-1])
-    start, direction = signals.stop_start[steps], signals.stop_direction[steps]
-    along = (x[..., None] - start[..., 0]) * direction[..., 0] + (y[..., None] - start[..., 1]) * direction[..., 1]
-    progress = along / signals.stop_squared_length[steps]
-    stop = signals.stop_progress[steps]
-    crossed = (progress[..., :-1, :] < stop[:-1]) & (progress[..., 1:, :] > stop[1:])
-    return crossed & signals.is_red[steps][1:]
 
 
 def compute_traffic_light_violation(
@@ -145,24 +139,31 @@ def compute_traffic_light_violation(
     first_step: int,
     max_pairs: int,
 ) -> Bool[Tensor, "N E T"]:
-    """Whether an agent's centre crosses the stop point of a red light while on that light's lane.
+    """True where an agent's center crosses the stop point of a red light on that light's lane.
 
     Args:
-        x: Centres at T + 1 steps, the first of which is only the step before.
-        y: Likewise.
-        valid: Validity at the last T steps.
-        signals: Packed lights and lanes.
-        first_step: Step of the record that x and y begin with.
-        max_pairs: Bound on the pairs held at once.
+        x: centers at T + 1 steps, m; the first is the step before the first result.
+        y: likewise.
+        valid: validity at the last T steps.
+        signals: packed lights and lanes.
+        first_step: step of the log that x and y begin with.
+        max_pairs: memory bound, see `find_nearest_segment`.
     """
-    crossings = _find_crossings(x, y, signals, first_step) & valid[..., None]
+    # 1. Crossings of red lights since the step before, along the light's lane and at any distance to its side.
+    steps = slice(first_step, first_step + x.shape[-1])
+    start, direction = signals.stop_start[steps], signals.stop_direction[steps]  # [T + 1, J, 2]
+    along = (x[..., None] - start[..., 0]) * direction[..., 0] + (y[..., None] - start[..., 1]) * direction[..., 1]
+    progress = along / signals.stop_squared_length[steps]  # [N, E, T + 1, J]
+    stop = signals.stop_progress[steps]
+    crossed = (progress[..., :-1, :] < stop[:-1]) & (progress[..., 1:, :] > stop[1:])
+    crossings = crossed & signals.is_red[steps][1:] & valid[..., None]  # [N, E, T, J]
     violation = crossings.new_zeros(crossings.shape[:-1])
-    # The lane matters for the few crossings only.
+    # 2. The agent's lane, which is expensive to find, only for these few crossings.
     rollout, agent, step = crossings.any(-1).nonzero().unbind(-1)
     if len(rollout) == 0:
         return violation
     points = torch.stack([x[rollout, agent, step + 1], y[rollout, agent, step + 1]], dim=-1)
-    segment = find_nearest_segment(points[:, None], signals.lanes, _measure_lane, max_pairs=max_pairs)
+    segment = find_nearest_segment(points[:, None], signals.lanes, _lane_rule, max_pairs=max_pairs)
     on_lane = signals.lane_of_segment[segment] == signals.lane
     violation[rollout, agent, step] = (crossings[rollout, agent, step] & on_lane).any(-1)
     return violation

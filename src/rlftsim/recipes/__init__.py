@@ -1,1 +1,1 @@
-"""Named full configurations: functions that return dataclasses, no logic."""
+"""Named full configurations: functions that return dataclasses, no logic. The contract is `registry.Recipe`."""

@@ -1,36 +1,63 @@
-"""SMART's sizes with the numbers they are trained by. A variant calls one of these and changes fields."""
+"""SMART models of several sizes, each with the numbers it is trained by. A variant calls one of these and
+changes fields."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Literal
 
+import torch
+
+from rlftsim.errors import ConfigError
 from rlftsim.policies.smart.config import SmartConfig, smart_demo, smart_mini, smart_nano, smart_tiny
+from rlftsim.policies.smart.policy import SmartPolicy
+from rlftsim.recipes.registry import Recipe
+from rlftsim.rollout.policy import Policy
 from rlftsim.tokens.clustering import TokensConfig
+from rlftsim.tokens.vocabulary import Vocabulary
 from rlftsim.training.catk import CatkConfig
 from rlftsim.training.finetune import FinetuneConfig
-from rlftsim.training.gcsl import GcslConfig
-from rlftsim.training.goals import GoalConfig, with_goals_asked
+from rlftsim.training.goal_relabeling import GcslConfig
+from rlftsim.training.goals import GoalConfig
 from rlftsim.training.pretrain import PretrainConfig
 from rlftsim.training.reference import KlConfig
 
 
-@dataclass(frozen=True)
-class SmartRecipe:
-    """Everything from the vocabulary to the fine-tuned policy."""
+@dataclass(frozen=True, kw_only=True)
+class SmartRecipe(Recipe):
+    """Everything from the vocabulary to the fine-tuned SMART policy."""
 
     tokens: TokensConfig = field(default_factory=TokensConfig)
     model: SmartConfig = field(default_factory=SmartConfig)
-    pretrain: PretrainConfig = field(default_factory=PretrainConfig)
-    finetune: FinetuneConfig = field(default_factory=FinetuneConfig)
-    catk: CatkConfig = field(default_factory=CatkConfig)
-    gcsl: GcslConfig = field(default_factory=GcslConfig)
+
+    def new_policy(self, vocabulary: Vocabulary | None) -> SmartPolicy:
+        """A SMART policy with fresh weights, drawn with the seed of pre-training.
+
+        Raises:
+            ConfigError: there is no vocabulary.
+        """
+        if vocabulary is None:
+            raise ConfigError(
+                "a SMART model needs a vocabulary: build one with `rlftsim tokens`, then name it with --vocabulary."
+            )
+        # Directly before the weights are drawn: anything random in between would change every stored result.
+        torch.manual_seed(self.pretrain.seed)
+        return SmartPolicy(self.model, vocabulary)
+
+    def like(self, policy: Policy) -> "SmartRecipe":
+        """The same recipe for SMART policies of the sizes of an existing one.
+
+        Raises:
+            ConfigError: the policy is no SMART policy.
+        """
+        if not isinstance(policy, SmartPolicy):
+            raise ConfigError(f"this recipe makes SMART policies, none like a {type(policy).__name__}.")
+        return replace(self, model=policy.config)
 
     def with_goals(self) -> "SmartRecipe":
-        """The same, fine-tuning with goals: everybody is asked to go where the record ends. With the paper's reward; or by CAT-K, which then
-        trains the weights that see goals and no others, on all tokens as candidates."""
-        goals = with_goals_asked(self.finetune.goals)
-        catk = replace(self.catk, goal_share=1.0, trained="goals", num_candidates=self.tokens.num_tokens)
-        return replace(self, finetune=replace(self.finetune, goals=goals, reward="gcft"), catk=catk)
+        """The same recipe for goal-conditioned fine-tuning; CAT-K then chooses among all tokens, not among the
+        most likely ones."""
+        # The goal-conditioned weights start at zero: among the most likely tokens none may lead towards the goal.
+        goals = super().with_goals()
+        assert isinstance(goals, SmartRecipe)
+        return replace(goals, catk=goals.catk and replace(goals.catk, num_candidates=goals.tokens.num_tokens))
 
 
 def smart_tiny_rlftsim() -> SmartRecipe:
@@ -49,7 +76,9 @@ def smart_nano_rlftsim() -> SmartRecipe:
 
 
 def smart_demo_rlftsim() -> SmartRecipe:
-    """Minutes on two CPU cores, for a few hundred scenarios: a small model, a pre-training of many small updates, large fine-tuning steps."""
+    """Minutes on two CPU cores, for a few hundred scenarios: a small model, many small pre-training updates,
+    large fine-tuning steps."""
+    # Few scenarios mean few updates, so steps are larger than the paper's; all agents are trained on.
     return SmartRecipe(
         tokens=TokensConfig(num_tokens=1024, num_map_prototypes=256),
         model=smart_demo(),
@@ -72,29 +101,19 @@ def smart_demo_rlftsim() -> SmartRecipe:
 
 
 def smart_demo_quick() -> SmartRecipe:
-    """The demo's stages at the smallest size that still exercises all of them."""
+    """The demo's stages, each at the smallest size that still exercises it."""
     recipe = smart_demo_rlftsim()
     return replace(
         recipe,
         tokens=replace(recipe.tokens, num_tokens=256, num_map_prototypes=64),
         pretrain=replace(recipe.pretrain, epochs=1.0),
         finetune=replace(recipe.finetune, epochs=0.25, num_rollouts=4),
-        catk=replace(recipe.catk, epochs=0.25, batch_size=4),
-        gcsl=replace(recipe.gcsl, epochs=0.25),
+        catk=recipe.catk and replace(recipe.catk, epochs=0.25, batch_size=4),
+        gcsl=recipe.gcsl and replace(recipe.gcsl, epochs=0.25),
     )
 
 
 def smart_synthetic() -> SmartRecipe:
-    """For experiments on the synthetic scenarios: the demo with shorter fine-tuning, because it is run many times."""
+    """Experiments on the synthetic scenarios: the demo with shorter fine-tuning, because it is run many times."""
     recipe = smart_demo_rlftsim()
     return replace(recipe, finetune=replace(recipe.finetune, epochs=1.0))
-
-
-RecipeName = Literal["smart-tiny", "smart-mini", "smart-nano", "smart-demo"]
-RECIPES: dict[RecipeName, Callable[[], SmartRecipe]] = {
-    "smart-tiny": smart_tiny_rlftsim,
-    "smart-mini": smart_mini_rlftsim,
-    "smart-nano": smart_nano_rlftsim,
-    "smart-demo": smart_demo_rlftsim,
-}
-"""By the names the command line takes."""

@@ -1,1 +1,1 @@
-"""What may happen: the closed loop, the policy interface and policies without weights."""
+"""The closed loop: the policy interface, simulation, and policies without weights."""

@@ -1,4 +1,4 @@
-"""Policies without weights: the floor every model has to beat, and the smallest example of the interface."""
+"""Policies without weights: a lower bound for every model, and the smallest example of the interface."""
 
 from dataclasses import dataclass
 
@@ -21,12 +21,25 @@ class PointMass:
     decision: Float[Tensor, "*batch event"]
 
     def sample(self, sampling: Sampling, noise: Tensor) -> Tensor:
-        """The decision. Raises ConfigError where `sampling.top_k` is asked for: there are no categories."""
+        """The decision itself.
+
+        Args:
+            sampling: any temperature; `top_k` is refused, as there are no categories.
+            noise: not used.
+
+        Raises:
+            ConfigError: `sampling.top_k` is set.
+        """
         _refuse_top_k(sampling)
         return self.decision
 
     def log_prob(self, decision: Tensor, sampling: Sampling = Sampling()) -> Float[Tensor, "*batch"]:  # noqa: B008
-        """Zeros."""
+        """Zeros: the only possible decision has probability 1.
+
+        Args:
+            decision: any; its last axis is the event.
+            sampling: as in `sample`.
+        """
         _refuse_top_k(sampling)
         return torch.zeros_like(decision[..., 0])
 
@@ -55,7 +68,7 @@ class ConstantVelocityContext:
 
 @dataclass(frozen=True, eq=False)
 class ConstantVelocityState:
-    """Where everybody is."""
+    """Poses and velocities of running simulations, map frame."""
 
     position: Float[Tensor, "B N A 2"]
     heading: Float[Tensor, "B N A"]
@@ -65,14 +78,22 @@ class ConstantVelocityState:
 
 
 class ConstantVelocity:
-    """Every agent keeps the velocity and heading it has at the current step. A decision is a velocity, kept for 0.1 s."""
+    """Every agent keeps the velocity and heading it has at the current step.
 
+    A decision is a velocity, kept for 0.1 s.
+    """
+
+    architecture = "constant_velocity"
+    fingerprint_name = "rlftsim.rollout.baselines.ConstantVelocity"
     steps_per_decision = 1
     noise_size = 0
     initial_noise_size = 0
 
+    def __repr__(self) -> str:
+        return "ConstantVelocity()"
+
     def encode(self, scenarios: ScenarioBatch) -> ConstantVelocityContext:
-        """The current states."""
+        """States at the current step."""
         now = CURRENT_STEP
         return ConstantVelocityContext(
             scenarios.position[:, :, now], scenarios.heading[:, :, now], scenarios.velocity[:, :, now]
@@ -81,7 +102,14 @@ class ConstantVelocity:
     def begin(
         self, context: ConstantVelocityContext, num_rollouts: int, goals: Goals | None, noise: Tensor
     ) -> ConstantVelocityState:
-        """The current state, N times. Goals are ignored: this policy cannot be asked for anything."""
+        """The current state, N times.
+
+        Args:
+            context: of `encode`.
+            num_rollouts: N.
+            goals: ignored, this policy cannot follow any.
+            noise: empty.
+        """
         repeated = (
             v[:, None].expand(-1, num_rollouts, *v.shape[1:])
             for v in (context.position, context.heading, context.velocity)
@@ -89,7 +117,12 @@ class ConstantVelocity:
         return ConstantVelocityState(*repeated)
 
     def decide(self, context: ConstantVelocityContext, state: ConstantVelocityState) -> PointMass:
-        """The velocity it has."""
+        """Distributions [B, N, A] with all mass on the present velocity.
+
+        Args:
+            context: of `encode`, not used.
+            state: its velocity is the decision.
+        """
         return PointMass(state.velocity)
 
     def advance(
@@ -99,15 +132,27 @@ class ConstantVelocity:
         decision: Float[Tensor, "B N A 2"],
         forced: AgentStates | None = None,
     ) -> ConstantVelocityState:
-        """Move on by 0.1 s."""
+        """State after 0.1 s at the chosen velocity; the heading stays.
+
+        Args:
+            context: of `encode`, not used.
+            state: before the decision.
+            decision: velocities, m/s, map frame.
+            forced: states imposed from outside, of a single step.
+        """
         position, heading = state.position + decision * STEP_S, state.heading
         if forced is not None:
-            imposed = forced.valid[..., 0]
+            imposed = forced.valid[..., 0]  # [B, N, A]; a decision lasts a single step
             position = torch.where(imposed[..., None], forced.position[..., 0, :], position)
             heading = torch.where(imposed, forced.heading[..., 0], heading)
         poses = torch.cat([position, heading[..., None]], -1)[..., None, :]
         return ConstantVelocityState(position, heading, state.velocity, poses, state.draws)
 
     def score(self, context: ConstantVelocityContext, rollouts: Rollouts) -> PointMass:
-        """The same velocity at every decision."""
+        """Distributions [B, N, A, L]: the same velocity at every decision.
+
+        Args:
+            context: of `encode`.
+            rollouts: supply the shape.
+        """
         return PointMass(context.velocity[:, None, :, None].expand_as(rollouts.decision))

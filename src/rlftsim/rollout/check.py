@@ -1,9 +1,10 @@
-"""Does a policy keep the contract of `rollout.policy`? For our policies and for yours.
+"""A test of any policy against the contract of `rollout.policy`.
 
     report = check_policy(my_policy, scenarios)
     print(report)
 
-Hand over scenes with several kinds of agents, a map and, if you have them, lights: a rule can only be seen broken where it applies.
+Hand over scenarios with several kinds of agents, a map and, if possible, traffic lights: a violated rule shows only
+where it applies.
 """
 
 import copy
@@ -21,15 +22,17 @@ from rlftsim.errors import RlftsimError
 from rlftsim.geometry import rotate, wrap_angle
 from rlftsim.goals.types import Goals
 from rlftsim.rollout.edge_scenes import EXACT_TURN_RAD, edge_scenes, move_scenario, place_on_grid
-from rlftsim.rollout.policy import DecisionDistribution, Policy, Sampling
+from rlftsim.rollout.noise import draw_noise
+from rlftsim.rollout.policy import DecisionDistribution, Policy, Sampling, device_of
 from rlftsim.rollout.simulate import simulate
 from rlftsim.rollout.types import AgentStates, Rollouts
 from rlftsim.scenario.batch import ScenarioBatch, collate
 from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, STEP_S, Scenario
 
 NUM_ROLLOUTS = 3
+SEED = 0
 SCORE_TOLERANCE = 1e-4
-"""Nats, between what was sampled and what is scored."""
+"""Nats, between sampled and scored log-probabilities."""
 PADDING_TOLERANCE = 1e-5
 POSE_TOLERANCE_M = 1e-3
 MONTE_CARLO_DRAWS = 4096
@@ -43,12 +46,13 @@ Outcome = Literal["passed", "failed", "not applicable"]
 
 @dataclass(frozen=True)
 class CheckResult:
-    """One rule of the contract."""
+    """Outcome of one rule of the contract."""
 
     rule: str
+    """Name of the rule's function in this file, with spaces."""
     outcome: Outcome
     detail: str
-    """What was measured, or why the rule does not apply."""
+    """The measurement, or the reason for which the rule does not apply."""
 
     def __str__(self) -> str:
         return f"{self.outcome:>14}  {self.rule}: {self.detail}"
@@ -56,33 +60,33 @@ class CheckResult:
 
 @dataclass(frozen=True)
 class CheckReport:
-    """All rules of the contract."""
+    """Outcomes of all rules of the contract."""
 
     policy: str
     results: tuple[CheckResult, ...]
 
     @property
     def failures(self) -> tuple[CheckResult, ...]:
-        """What is broken."""
+        """Results of the violated rules."""
         return tuple(r for r in self.results if r.outcome == "failed")
 
     @property
     def is_passed(self) -> bool:
-        """Whether nothing is broken."""
+        """True if no rule is violated."""
         return not self.failures
 
     def __str__(self) -> str:
         count = sum(r.outcome == "passed" for r in self.results)
-        summary = f"{self.policy}: {count} rules kept, {len(self.failures)} broken."
+        summary = f"{self.policy}: {count} rules passed, {len(self.failures)} failed."
         return "\n".join([summary, *(str(r) for r in self.results)])
 
 
 class _NotApplicable(Exception):
-    """The rule says nothing about this policy."""
+    """The rule does not apply to this policy; the message has the reason."""
 
 
 class _Broken(Exception):
-    """The rule is broken; says by how much."""
+    """The rule is violated; the message has the measurement."""
 
 
 def check_policy(policy: Policy, scenarios: Sequence[Scenario], *, reference: Policy | None = None) -> CheckReport:
@@ -91,27 +95,27 @@ def check_policy(policy: Policy, scenarios: Sequence[Scenario], *, reference: Po
     Nothing is changed in the policy: a module is copied and put into evaluation mode. Takes seconds for a small policy.
 
     Args:
-        policy: the policy.
+        policy: of any architecture, with or without weights.
         scenarios: at least one, on which everything is tried; best of different sizes and with all kinds of agents.
         reference: another policy of the same kind for KL divergences; None = a copy with perturbed weights.
 
     Returns:
-        One result per rule. A rule whose check raised an error counts as broken, the error is its detail.
+        One result per rule. A rule whose check raised an error counts as failed, the error is its detail.
     """
     subject = _Subject(_evaluation_copy(policy), tuple(scenarios), reference)
-    return CheckReport(type(policy).__name__, tuple(_run(check, subject) for check in CHECKS))
-
-
-def _run(check: "Check", subject: "_Subject") -> CheckResult:
-    rule = str(check.__doc__).splitlines()[0].rstrip(".")
-    try:
-        return CheckResult(rule, "passed", check(subject))
-    except _NotApplicable as reason:
-        return CheckResult(rule, "not applicable", str(reason))
-    except _Broken as measured:
-        return CheckResult(rule, "failed", str(measured))
-    except Exception as error:
-        return CheckResult(rule, "failed", f"raised {type(error).__name__}: {error}")
+    results = []
+    for check in CHECKS:
+        outcome: Outcome = "passed"
+        try:
+            detail = check(subject)
+        except _NotApplicable as reason:
+            outcome, detail = "not applicable", str(reason)
+        except _Broken as measured:
+            outcome, detail = "failed", str(measured)
+        except Exception as error:  # whatever a policy raises is an outcome of the test
+            outcome, detail = "failed", f"raised {type(error).__name__}: {error}"
+        results.append(CheckResult(check.__name__.replace("_", " "), outcome, detail))
+    return CheckReport(type(policy).__name__, tuple(results))
 
 
 def _evaluation_copy(policy: Policy) -> Policy:
@@ -120,7 +124,7 @@ def _evaluation_copy(policy: Policy) -> Policy:
 
 @dataclass(frozen=True, eq=False)
 class _Subject:
-    """A policy and the scenes it is tried on."""
+    """A policy, the scenarios it is tested on, and rollouts that several rules share."""
 
     policy: Policy
     scenarios: tuple[Scenario, ...]
@@ -135,12 +139,12 @@ class _Subject:
         return self.simulate(self.batch)
 
     @cached_property
-    def steered(self) -> Rollouts:
-        """Rollouts in which some agents are led for a while."""
+    def with_forced(self) -> Rollouts:
+        """Rollouts in which some agents are forced along arcs for a while."""
         return self.simulate(self.batch, force=_lead_some(self.batch, self.policy.steps_per_decision))
 
     @cached_property
-    def asked(self) -> Rollouts:
+    def with_goals(self) -> Rollouts:
         """Rollouts in which some agents have goals."""
         batch = self.batch
         index = torch.arange(batch.agent_mask.shape[1], device=batch.device)
@@ -158,11 +162,6 @@ class _Subject:
     def is_random(self) -> bool:
         return self.policy.noise_size > 0
 
-    @property
-    def device(self) -> torch.device:
-        weights = self.policy.parameters() if isinstance(self.policy, nn.Module) else ()
-        return next((w.device for w in weights), torch.device("cpu"))
-
     @cached_property
     def reference(self) -> Policy:
         """Another policy of the same kind."""
@@ -173,15 +172,16 @@ class _Subject:
         with torch.no_grad():
             for weight in other.parameters():
                 noise = torch.randn(weight.shape, generator=generator).to(weight)
+                # relative to the weights' size, so that a policy of any scale changes visibly but stays finite
                 weight.add_(0.1 * noise * (weight.abs().mean() + 0.01))
         assert isinstance(other, Policy)
         return other
 
     def collate(self, scenarios: Sequence[Scenario], max_agents: int | None = None) -> ScenarioBatch:
-        return collate(scenarios, max_agents=max_agents).to(self.device)
+        return collate(scenarios, max_agents=max_agents).to(device_of(self.policy))
 
     def simulate(self, batch: ScenarioBatch, num_rollouts: int | range = NUM_ROLLOUTS, **options) -> Rollouts:
-        return simulate(self.policy, batch, num_rollouts=num_rollouts, seed=0, **options)
+        return simulate(self.policy, batch, num_rollouts=num_rollouts, seed=SEED, **options)
 
     def score(self, batch: ScenarioBatch, rollouts: Rollouts, policy: Policy | None = None) -> DecisionDistribution:
         policy = self.policy if policy is None else policy
@@ -189,12 +189,19 @@ class _Subject:
             return policy.score(policy.encode(batch), rollouts)
 
     def log_prob(self, batch: ScenarioBatch, rollouts: Rollouts, policy: Policy | None = None) -> Tensor:
-        """Scored log-probabilities [B, N, A, L], 0 where the policy did not decide."""
+        """Scored log-probabilities [B, N, A, L], 0 where the policy did not decide.
+
+        Args:
+            batch: the scenarios.
+            rollouts: of these.
+            policy: that scores; None = the policy under test.
+        """
         scored = self.score(batch, rollouts, policy).log_prob(rollouts.decision)
         return torch.where(rollouts.decision_mask, scored, 0.0)
 
 
 Check = Callable[[_Subject], str]
+"""A rule: a function that returns its measurement as a text, or raises `_Broken` or `_NotApplicable`."""
 
 
 def _within(measured: float, allowed: float, what: str) -> str:
@@ -213,7 +220,7 @@ def _gap(a: Tensor, b: Tensor) -> float:
 
 
 def _lead_some(batch: ScenarioBatch, stride: int) -> Callable[[object, int], AgentStates]:
-    """A `force`: the first agent is led throughout, every third from the second on for two seconds; along arcs."""
+    """A `force` along arcs: of the first agent throughout, of every third from the second on for two seconds."""
     now = CURRENT_STEP
     position, velocity, heading = batch.position[:, :, now], batch.velocity[:, :, now], batch.heading[:, :, now]
     index = torch.arange(batch.agent_mask.shape[1], device=batch.device)
@@ -221,6 +228,7 @@ def _lead_some(batch: ScenarioBatch, stride: int) -> Callable[[object, int], Age
     def force(state: object, step: int) -> AgentStates:
         time = torch.arange(step + 1, step + stride + 1, device=batch.device) * STEP_S
         turn = LEAD_TURN_RATE_RADPS * time
+        # constant speed along a chord of the arc
         way = rotate(velocity[:, :, None] * time[:, None], (turn / 2).expand(*heading.shape, stride))
         path, towards = position[:, :, None] + way, wrap_angle(heading[:, :, None] + turn)
         led = batch.agent_mask & ((index == 0) | ((index % 3 == 1) & (step < 20)))
@@ -234,59 +242,61 @@ def _lead_some(batch: ScenarioBatch, stride: int) -> Callable[[object, int], Age
     return force
 
 
-# ---- 1, 2: scores ------------------------------------------------------------------------------------------------------
+# ---- rules: scores
+# ------------------------------------------------------------------------------------------------------
 
 
-def scores_equal_what_was_sampled(subject: _Subject) -> str:
+def scored_log_probs_equal_sampled_ones(subject: _Subject) -> str:
     """Scored log-probabilities equal the sampled ones."""
     scored = subject.log_prob(subject.batch, subject.rollouts)
     return _within(_gap(scored, subject.rollouts.log_prob), SCORE_TOLERANCE, "largest gap")
 
 
-def scores_hold_with_forced_agents(subject: _Subject) -> str:
+def scored_log_probs_equal_sampled_ones_with_forced_agents(subject: _Subject) -> str:
     """Scored log-probabilities equal the sampled ones where agents are forced for a while."""
-    rollouts = subject.steered
-    led = rollouts.forced.valid if rollouts.forced is not None else torch.zeros(0)
-    off = (rollouts.position - rollouts.forced.position)[led] if rollouts.forced is not None else led
-    _within(float(off.abs().max()), 0.0, "distance of forced agents from where they were put (m)")
+    rollouts = subject.with_forced
+    assert rollouts.forced is not None
+    off = (rollouts.position - rollouts.forced.position)[rollouts.forced.valid]
+    _within(float(off.abs().max()), 0.0, "distance of forced agents from their imposed positions (m)")
     return _within(_gap(subject.log_prob(subject.batch, rollouts), rollouts.log_prob), SCORE_TOLERANCE, "largest gap")
 
 
-def scores_hold_with_goals(subject: _Subject) -> str:
+def scored_log_probs_equal_sampled_ones_with_goals(subject: _Subject) -> str:
     """Scored log-probabilities equal the sampled ones where agents have goals."""
-    scored = subject.log_prob(subject.batch, subject.asked)
-    return _within(_gap(scored, subject.asked.log_prob), SCORE_TOLERANCE, "largest gap")
+    scored = subject.log_prob(subject.batch, subject.with_goals)
+    return _within(_gap(scored, subject.with_goals.log_prob), SCORE_TOLERANCE, "largest gap")
 
 
-def goals_of_nobody_change_nothing(subject: _Subject) -> str:
-    """Rollouts and scores with goals that no agent has are those without goals."""
+def empty_goals_equal_no_goals(subject: _Subject) -> str:
+    """Goals that no agent has (mask False, position NaN) change neither rollouts nor scores."""
     position = torch.full_like(subject.batch.position[:, :, CURRENT_STEP], math.nan)
-    nobody = Goals.of_scenarios(position, torch.zeros_like(subject.batch.agent_mask))
-    rollouts = subject.simulate(subject.batch, goals=nobody)
+    empty = Goals.of_scenarios(position, torch.zeros_like(subject.batch.agent_mask))
+    rollouts = subject.simulate(subject.batch, goals=empty)
     _within(_gap(rollouts.position, subject.rollouts.position), 0.0, "rollouts apart (m)")
     return _within(_gap(subject.log_prob(subject.batch, rollouts), rollouts.log_prob), SCORE_TOLERANCE, "largest gap")
 
 
-def slices_of_scores_are_scores_of_slices(subject: _Subject) -> str:
-    """The score of some of the rollouts is that part of the score of all."""
+def scores_of_some_rollouts_equal_slices_of_all(subject: _Subject) -> str:
+    """Scores do not depend on which rollouts are scored together."""
     gaps = []
-    for rollouts in (subject.rollouts, subject.steered, subject.asked):
+    for rollouts in (subject.rollouts, subject.with_forced, subject.with_goals):
         whole = subject.log_prob(subject.batch, rollouts)
         for part in (slice(0, 1), slice(1, NUM_ROLLOUTS)):
             gaps.append(_gap(subject.log_prob(subject.batch, rollouts.select(part)), whole[:, part]))
     return _within(max(gaps), SCORE_TOLERANCE, "largest gap")
 
 
-# ---- 3: the distribution -----------------------------------------------------------------------------------------------
+# ---- rules: the distribution
+# -----------------------------------------------------------------------------------------------
 
 
-def divergence_from_itself_is_zero(subject: _Subject) -> str:
+def kl_from_itself_is_zero(subject: _Subject) -> str:
     """The KL divergence of a policy from itself is 0."""
     scored = subject.score(subject.batch, subject.rollouts)
     return _within(float(scored.kl(scored).abs().max()), 1e-6, "largest KL")
 
 
-def divergence_is_never_negative(subject: _Subject) -> str:
+def kl_from_another_policy_is_positive(subject: _Subject) -> str:
     """The KL divergence from another policy is not negative, and somewhere positive."""
     reference = subject.reference
     scored = subject.score(subject.batch, subject.rollouts)
@@ -296,35 +306,38 @@ def divergence_is_never_negative(subject: _Subject) -> str:
     return _within(-float(kl.min()), 1e-6, "most negative KL: minus")
 
 
-def padding_decides_nothing(subject: _Subject) -> str:
+def padding_has_zero_log_prob_kl_and_entropy(subject: _Subject) -> str:
     """Padding has log-probability, KL and entropy of exactly 0."""
     width = subject.batch.agent_mask.shape[1] + 2
     batch = subject.collate(subject.scenarios, max_agents=width)
     rollouts = subject.simulate(batch)
     scored = subject.score(batch, rollouts)
+    # two more agents than there are: even the largest scenario has padding
     padding = ~batch.agent_mask[:, None, :, None].expand(rollouts.log_prob.shape)
     values = (scored.log_prob(rollouts.decision), scored.kl(scored), scored.entropy())
     return _within(max(float(v[padding].abs().max()) for v in values), 0.0, "largest value")
 
 
-def entropy_agrees_with_monte_carlo(subject: _Subject) -> str:
+def entropy_matches_monte_carlo(subject: _Subject) -> str:
     """The entropy is the mean of minus the log-probability of draws."""
     drawn = _draw_many(subject)
     return _agree(-drawn.log_prob, drawn.distribution.entropy()[0], drawn.mask)
 
 
-def divergence_agrees_with_monte_carlo(subject: _Subject) -> str:
+def kl_matches_monte_carlo(subject: _Subject) -> str:
     """The KL divergence from another policy is the mean log-ratio of draws."""
     drawn = _draw_many(subject)
     other = _first_distribution(subject, subject.reference)
+    # KL(p || q) is the mean of log p - log q over draws from p
     ratio = torch.stack([own - other.log_prob(d)[0] for own, d in zip(drawn.log_prob, drawn.decisions)])
     return _agree(ratio, drawn.distribution.kl(other)[0], drawn.mask)
 
 
-def probabilities_add_up_to_one(subject: _Subject) -> str:
+def probabilities_sum_to_one(subject: _Subject) -> str:
     """Probabilities add up to 1 (as importance weights of draws at temperature 1.5)."""
     warm = Sampling(temperature=1.5)
     drawn = _draw_many(subject, warm)
+    # the mean of p / p_warm over draws from p_warm is the sum of p over all decisions that p_warm can draw
     weight = torch.stack(
         [(drawn.distribution.log_prob(d)[0] - p).exp() for d, p in zip(drawn.decisions, drawn.log_prob)]
     )
@@ -349,7 +362,7 @@ def _smallest(subject: _Subject) -> ScenarioBatch:
 
 
 def _first_distribution(subject: _Subject, policy: Policy, num_rollouts: int = 64) -> DecisionDistribution:
-    """What the policy says first in the smallest scenario, for N equal rollouts [1, N, A]."""
+    """Distributions of the first decision in the smallest scenario, for N equal rollouts [1, N, A]."""
     batch = _smallest(subject)
     shape = (1, num_rollouts, batch.agent_mask.shape[1], policy.initial_noise_size)
     noise = torch.full(shape, 0.5, device=batch.device)
@@ -375,16 +388,18 @@ def _draw_many(subject: _Subject, sampling: Sampling = Sampling()) -> _Drawn:  #
 
 def _agree(draws: Tensor, expected: Tensor, mask: Tensor) -> str:
     """Compare Monte Carlo means of draws [K, N, A] with values [N, A]."""
+    # agents differ, rollouts are equal: draws and rollouts together are one sample per agent
     flat = draws.double().flatten(0, 1)[:, mask]  # [K N, agents]
     error = flat.std(0) / math.sqrt(len(flat)) + 1e-6
     gap = (flat.mean(0) - expected.double().mean(0)[mask]).abs() / error
     return _within(float(gap.max()), MONTE_CARLO_ERRORS, f"standard errors off, over {len(flat)} draws:")
 
 
-# ---- 4, 5: sampling and kinematics -------------------------------------------------------------------------------------
+# ---- rules: sampling and kinematics
+# -------------------------------------------------------------------------------------
 
 
-def temperature_zero_repeats_itself(subject: _Subject) -> str:
+def temperature_zero_is_deterministic(subject: _Subject) -> str:
     """At temperature 0 every rollout is the same, twice, up to what is drawn once per rollout."""
     first, second = (subject.simulate(subject.batch, sampling=Sampling(temperature=0.0)) for _ in range(2))
     if not subject.policy.initial_noise_size:
@@ -396,7 +411,7 @@ def temperature_zero_repeats_itself(subject: _Subject) -> str:
     return _within(_gap(first.position, second.position), 0.0, "runs apart (m)")
 
 
-def same_seed_gives_the_same_rollouts(subject: _Subject) -> str:
+def same_seed_gives_same_rollouts(subject: _Subject) -> str:
     """The same seed gives the same rollouts, whole or in slices."""
     again = subject.simulate(subject.batch)
     _within(_gap(again.position, subject.rollouts.position), 0.0, "runs apart (m)")
@@ -411,7 +426,8 @@ def top_k_truncates_or_is_refused(subject: _Subject) -> str:
             subject.simulate(subject.batch, sampling=Sampling(top_k=3))
         except RlftsimError as error:
             return f"refused: {error}"
-        raise _Broken("decisions are no categories, and yet top_k=3 is accepted")
+        raise _Broken("decisions are not categorical, and yet top_k=3 is accepted")
+    # top-1 is the mode; and log-probabilities are those of the truncated, renormalized distribution
     greedy = subject.simulate(subject.batch, sampling=Sampling(temperature=0.0))
     first = subject.simulate(subject.batch, sampling=Sampling(top_k=1))
     _within(_gap(first.position, greedy.position), POSE_TOLERANCE_M, "top-1 apart from the mode (m)")
@@ -422,18 +438,19 @@ def top_k_truncates_or_is_refused(subject: _Subject) -> str:
     return _within(_gap(scored, few.log_prob), SCORE_TOLERANCE, "largest gap of truncated log-probabilities")
 
 
-def decisions_replay_to_the_same_poses(subject: _Subject) -> str:
+def replayed_decisions_give_same_poses(subject: _Subject) -> str:
     """Replaying decisions through `advance` gives the same poses, bit for bit."""
     return _within(
-        max(_replay_gap(subject, r) for r in (subject.rollouts, subject.steered)), 0.0, "largest gap (m, rad)"
+        max(_replay_gap(subject, r) for r in (subject.rollouts, subject.with_forced)), 0.0, "largest gap (m, rad)"
     )
 
 
 def _replay_gap(subject: _Subject, rollouts: Rollouts) -> float:
     policy, stride = subject.policy, subject.policy.steps_per_decision
-    if policy.initial_noise_size:
-        raise _NotApplicable("the policy draws once per rollout; only it can repeat these draws")
-    noise = rollouts.log_prob.new_zeros(*rollouts.log_prob.shape[:3], 0)
+    # The numbers that `simulate` gave to `begin`. Those of the decisions are not needed: the decisions are known.
+    ids = range(rollouts.num_rollouts)
+    size = policy.initial_noise_size
+    noise = draw_noise(subject.batch, ids, seed=SEED, purpose="begin", per_agent=size)  # [B, N, A, size]
     poses = []
     with torch.no_grad():
         context = policy.encode(subject.batch)
@@ -446,16 +463,18 @@ def _replay_gap(subject: _Subject, rollouts: Rollouts) -> float:
     return max(_gap(path[..., :2], rollouts.position), _gap(path[..., 2], rollouts.heading))
 
 
-# ---- 6: gradients ------------------------------------------------------------------------------------------------------
+# ---- rules: gradients
+# ------------------------------------------------------------------------------------------------------
 
 
-def gradients_reach_what_is_trained(subject: _Subject) -> str:
+def gradients_reach_all_trained_weights(subject: _Subject) -> str:
     """Gradients of the score reach every weight that is trained and no other, and are finite."""
     module = copy.deepcopy(subject.module)
     trained = [p for p in module.parameters() if p.requires_grad]
     if not trained:
         raise _NotApplicable("no weight is trained")
     _back_propagate(module, subject, scale=1.0)
+    # a weight may have a zero gradient (no light in these scenarios), but it must have one
     named = dict(module.named_parameters())
     missed = [name for name, p in named.items() if p.requires_grad and p.grad is None]
     strays = [name for name, p in named.items() if not p.requires_grad and p.grad is not None]
@@ -466,7 +485,7 @@ def gradients_reach_what_is_trained(subject: _Subject) -> str:
     return f"{len(trained)} weights reached" + (f", zero on these scenarios: {', '.join(flat)}" if flat else "")
 
 
-def zero_reward_moves_nothing(subject: _Subject) -> str:
+def zero_reward_gives_zero_gradient(subject: _Subject) -> str:
     """With a reward of 0 the policy gradient is exactly 0."""
     module = copy.deepcopy(subject.module)
     if not any(p.requires_grad for p in module.parameters()):
@@ -477,16 +496,16 @@ def zero_reward_moves_nothing(subject: _Subject) -> str:
 
 
 def _back_propagate(module: nn.Module, subject: _Subject, *, scale: float) -> None:
-    """Gradients of a policy-gradient loss whose rewards are `scale` times 1, 2, ..."""
+    """Back-propagate a policy-gradient loss whose rewards are `scale` times 1, 2, ... by rollout."""
     assert isinstance(module, Policy)
     module.zero_grad(set_to_none=True)
-    rollouts = subject.asked  # so that what looks at goals takes part
+    rollouts = subject.with_goals  # so that weights for goals take part
     scored = module.score(module.encode(subject.batch), rollouts).log_prob(rollouts.decision)
     reward = scale * torch.arange(1.0, NUM_ROLLOUTS + 1, device=scored.device)[None, :, None, None]
     (-reward * torch.where(rollouts.decision_mask, scored, 0.0)).sum().backward()
 
 
-def frozen_weights_say_the_same(subject: _Subject) -> str:
+def freezing_weights_changes_no_score(subject: _Subject) -> str:
     """Freezing the weights changes no score."""
     frozen = copy.deepcopy(subject.module).requires_grad_(False)
     assert isinstance(frozen, Policy)
@@ -496,30 +515,35 @@ def frozen_weights_say_the_same(subject: _Subject) -> str:
     return _within(_gap(*scores), SCORE_TOLERANCE, "largest gap")
 
 
-# ---- 7, 8, 9: scenes ---------------------------------------------------------------------------------------------------
+# ---- rules: scenarios
+# ---------------------------------------------------------------------------------------------------
 
 
-def turned_and_shifted_scenes_score_alike(subject: _Subject) -> str:
+def scores_are_invariant_to_rotation_and_translation(subject: _Subject) -> str:
     """Scenarios and rollouts turned and shifted together have the same scores."""
     gaps = {}
+    # on a grid that stays exact under the turns below: gaps are then the policy's own rounding
     still = replace(subject, scenarios=tuple(place_on_grid(s) for s in subject.scenarios))
     turns = (("shifted", 0.0), ("turned by 90 degrees", math.pi / 2), ("turned by 53.13 degrees", EXACT_TURN_RAD))
     for what, turn in turns:
         moved = [move_scenario(s, turn, SHIFT_M) for s in still.scenarios]
         batch = subject.collate(moved)
-        offset = torch.from_numpy(_offsets(still.scenarios, moved)).to(subject.device)
-        for rollouts in (still.rollouts, still.steered, still.asked):
+        # map frames have their origin on whole meters, so it does not follow a scenario exactly
+        origins = [a.origin + np.array(SHIFT_M) - b.origin for a, b in zip(still.scenarios, moved)]
+        offset = torch.from_numpy(np.stack(origins).astype(np.float32)).to(device_of(subject.policy))  # [B, 2]
+        for rollouts in (still.rollouts, still.with_forced, still.with_goals):
             scored = subject.log_prob(batch, _move_rollouts(rollouts, turn, offset))
             gaps[what] = max(gaps.get(what, 0.0), _gap(scored, subject.log_prob(still.batch, rollouts)))
     worst = max(gaps, key=lambda name: gaps[name])
     return _within(gaps[worst], SCORE_TOLERANCE, f"largest gap ({worst})")
 
 
-def company_in_a_batch_changes_nothing(subject: _Subject) -> str:
+def rollouts_are_independent_of_batch_composition(subject: _Subject) -> str:
     """A scenario alone has the same scores as in a batch with a larger one, and the same rollouts."""
     batch, gaps, apart = subject.batch, [], []
     if len(subject.scenarios) < 2:
         raise _NotApplicable("a single scenario was handed over")
+    # a policy that draws once per rollout gets as many agents as in the batch: its draws have that shape
     whole = subject.log_prob(batch, subject.rollouts)
     for b, scenario in enumerate(subject.scenarios):
         count = batch.agent_mask.shape[1] if subject.rollouts.draws is not None else len(scenario.simulated_indices)
@@ -531,7 +555,7 @@ def company_in_a_batch_changes_nothing(subject: _Subject) -> str:
     return _within(max(gaps), PADDING_TOLERANCE, "largest gap")
 
 
-def edge_scenes_run(subject: _Subject) -> str:
+def edge_cases_can_be_simulated_and_scored(subject: _Subject) -> str:
     """One agent, no map, no lights, 128 agents, agents first seen now or never: all are simulated and scored."""
     gaps = {}
     for name, scenario in edge_scenes(subject.scenarios[0]).items():
@@ -542,11 +566,6 @@ def edge_scenes_run(subject: _Subject) -> str:
         gaps[name] = _gap(subject.log_prob(batch, rollouts), rollouts.log_prob)
     worst = max(gaps, key=lambda name: gaps[name])
     return _within(gaps[worst], SCORE_TOLERANCE, f"{len(gaps)} scenes, largest gap ({worst})")
-
-
-def _offsets(before: Sequence[Scenario], after: Sequence[Scenario]) -> np.ndarray:
-    """Where the origin of each scenario's map frame went, in the moved map frame [B, 2]."""
-    return np.stack([a.origin + np.array(SHIFT_M) - b.origin for a, b in zip(before, after)]).astype(np.float32)
 
 
 def _move_rollouts(rollouts: Rollouts, turn: float, offset: Tensor) -> Rollouts:
@@ -574,25 +593,25 @@ def _of_scenario(rollouts: Rollouts, b: int, num_agents: int) -> Rollouts:
 
 
 CHECKS: tuple[Check, ...] = (
-    scores_equal_what_was_sampled,
-    scores_hold_with_forced_agents,
-    scores_hold_with_goals,
-    goals_of_nobody_change_nothing,
-    slices_of_scores_are_scores_of_slices,
-    divergence_from_itself_is_zero,
-    divergence_is_never_negative,
-    padding_decides_nothing,
-    entropy_agrees_with_monte_carlo,
-    divergence_agrees_with_monte_carlo,
-    probabilities_add_up_to_one,
-    temperature_zero_repeats_itself,
-    same_seed_gives_the_same_rollouts,
+    scored_log_probs_equal_sampled_ones,
+    scored_log_probs_equal_sampled_ones_with_forced_agents,
+    scored_log_probs_equal_sampled_ones_with_goals,
+    empty_goals_equal_no_goals,
+    scores_of_some_rollouts_equal_slices_of_all,
+    kl_from_itself_is_zero,
+    kl_from_another_policy_is_positive,
+    padding_has_zero_log_prob_kl_and_entropy,
+    entropy_matches_monte_carlo,
+    kl_matches_monte_carlo,
+    probabilities_sum_to_one,
+    temperature_zero_is_deterministic,
+    same_seed_gives_same_rollouts,
     top_k_truncates_or_is_refused,
-    decisions_replay_to_the_same_poses,
-    gradients_reach_what_is_trained,
-    zero_reward_moves_nothing,
-    frozen_weights_say_the_same,
-    turned_and_shifted_scenes_score_alike,
-    company_in_a_batch_changes_nothing,
-    edge_scenes_run,
+    replayed_decisions_give_same_poses,
+    gradients_reach_all_trained_weights,
+    zero_reward_gives_zero_gradient,
+    freezing_weights_changes_no_score,
+    scores_are_invariant_to_rotation_and_translation,
+    rollouts_are_independent_of_batch_composition,
+    edge_cases_can_be_simulated_and_scored,
 )

@@ -1,4 +1,4 @@
-"""Variants of a scenario that policies must cope with: moved elsewhere, emptied, crowded, seen late."""
+"""Variants of a scenario that policies must handle: moved, emptied, crowded, with agents that appear late."""
 
 from dataclasses import replace
 
@@ -8,7 +8,7 @@ from rlftsim.geometry import wrapped
 from rlftsim.scenario.types import CURRENT_STEP, LaneTopology, LightStates, MapFeatures, Scenario, Tracks
 
 EXACT_TURN_RAD = float(np.arctan2(4.0, 3.0))
-"""Sine 4/5, cosine 3/5."""
+"""53.13 degrees: sine 4/5 and cosine 3/5 are short fractions, so rotated grid points stay exact in float32."""
 _GRID_M = 5 / 4096
 _NO_LIGHTS = LightStates(
     np.zeros(0, np.int32), np.zeros(0, np.int64), np.zeros(0, np.int8), np.zeros((0, 3), np.float32)
@@ -24,15 +24,16 @@ def move_scenario(scenario: Scenario, turn_rad: float, shift_m: tuple[float, flo
     Args:
         scenario: any.
         turn_rad: angle.
-        shift_m: x and y, world frame; whole metres keep float32 coordinates as exact as they were.
+        shift_m: x and y, world frame; whole meters keep float32 coordinates as exact as they were.
     """
-    centre = np.append(scenario.origin, 0.0)
+    # in float64, rounded once at the end
+    center = np.append(scenario.origin, 0.0)
     cos, sin = np.cos(turn_rad), np.sin(turn_rad)
     matrix = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
     shift = np.append(np.asarray(shift_m, np.float64), 0.0)
 
     def moved(points: np.ndarray) -> np.ndarray:
-        return ((points.astype(np.float64) - centre) @ matrix.T + centre + shift).astype(np.float32)
+        return ((points.astype(np.float64) - center) @ matrix.T + center + shift).astype(np.float32)
 
     tracks, features, lights = scenario.tracks, scenario.map_features, scenario.lights
     heading = wrapped(tracks.heading.astype(np.float64) + turn_rad)
@@ -49,10 +50,11 @@ def place_on_grid(scenario: Scenario) -> Scenario:
     """The same scenario at the world's origin, coordinates rounded to 5/4096 m (1.2 mm).
 
     Such coordinates stay exact in float32 when they are turned by 90 degrees or by `EXACT_TURN_RAD` and shifted by some
-    hundreds of whole metres, so that what a policy makes of them differs by the policy's own rounding alone.
+    hundreds of whole meters, so that what a policy makes of them differs by the policy's own rounding alone.
     """
     central = move_scenario(scenario, 0.0, (-float(scenario.origin[0]), -float(scenario.origin[1])))
 
+    # multiples of 5/4096 times 3/5 or 4/5 are multiples of 1/4096, which float32 has exactly below 4 km
     def rounded(points: np.ndarray) -> np.ndarray:
         return (np.round(points / _GRID_M) * _GRID_M).astype(np.float32)
 
@@ -65,7 +67,7 @@ def place_on_grid(scenario: Scenario) -> Scenario:
 
 
 def edge_scenes(scenario: Scenario) -> dict[str, Scenario]:
-    """A scenario's awkward variants, by name. All keep the ego."""
+    """Edge cases made of a scenario, by name. All keep the ego."""
     ego_alone = _with_tracks(scenario, np.array([scenario.ego_index]))
     return {
         "one agent": ego_alone,
@@ -93,10 +95,11 @@ def _with_tracks(scenario: Scenario, chosen: np.ndarray) -> Scenario:
 
 
 def _crowded(scenario: Scenario, num_agents: int) -> Scenario:
-    """The agents over and over again, 3.1 m apart, until there are so many."""
+    """The ego and copies of all agents, shifted on a grid of 3.1 m x 3.3 m, `num_agents` in all."""
     own = scenario.simulated_indices
     chosen = np.append(scenario.ego_index, np.resize(own, num_agents - 1))
     many = _with_tracks(scenario, chosen)
+    # 11 columns; copies of different agents may overlap, which policies have to accept
     rows = np.arange(len(chosen), dtype=np.float32)
     shift = np.stack([rows % 11 * 3.1, rows // 11 * 3.3, 0 * rows], -1)[:, None]
     ids = np.arange(len(chosen), dtype=np.int64) + 1
@@ -104,7 +107,7 @@ def _crowded(scenario: Scenario, num_agents: int) -> Scenario:
 
 
 def _seen_from(scenario: Scenario, step: int) -> Scenario:
-    """Nobody but the ego is seen before a step."""
+    """The scenario with all agents but the ego invalid before a step."""
     valid = scenario.tracks.valid.copy()
     others = np.arange(len(valid)) != scenario.ego_index
     valid[others, :step] = False
@@ -112,9 +115,10 @@ def _seen_from(scenario: Scenario, step: int) -> Scenario:
 
 
 def _with_absent_agent(scenario: Scenario) -> Scenario:
-    """One more track, which has not a single valid step."""
+    """The scenario with one more track, without a single valid step."""
     rows = np.append(np.arange(len(scenario.tracks.valid)), scenario.ego_index)
     tracks = _with_tracks(scenario, rows).tracks
+    # a copy of the ego's track, with an id of its own
     valid, ids = tracks.valid.copy(), tracks.object_id.copy()
     valid[-1], ids[-1] = False, ids.max() + 1
     return replace(scenario, tracks=replace(tracks, valid=valid, object_id=ids))

@@ -8,20 +8,30 @@ from pathlib import Path
 
 import numpy as np
 
-from rlftsim.files import write_whole
+from rlftsim.atomic_io import write_whole
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import CURRENT_STEP
 
 
 def write_rollouts(folder: Path, batch: ScenarioBatch, rollouts: Rollouts) -> list[Path]:
-    """Write each scenario's rollouts to `folder/<scenario id>.npz`, whole or not at all. Returns the files."""
+    """Write each scenario's rollouts to `folder/<scenario id>.npz`, each file whole or not at all.
+
+    Args:
+        folder: created where it is missing.
+        batch: the scenarios.
+        rollouts: of these, map frame. The height of an agent stays that of the current step.
+
+    Returns:
+        The files, in the order of the batch.
+    """
     world = batch.to_world(rollouts.position).cpu().numpy()
+    # rollouts are two-dimensional: heights stay those of the current step
     heading, z = rollouts.heading.float().cpu().numpy(), batch.z[:, :, CURRENT_STEP].cpu().numpy()
     files = []
     for b, scenario in enumerate(batch.scenarios):
         chosen = scenario.simulated_indices
-        own = heading[b, :, : len(chosen)]
+        own = heading[b, :, : len(chosen)]  # [N, A, 80] without padding
         path = folder / f"{scenario.scenario_id}.npz"
         save = partial(
             _write_npz,

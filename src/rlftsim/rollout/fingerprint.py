@@ -1,4 +1,4 @@
-"""Which policy it was: a hash of weights and settings, equal for equal policies on any device."""
+"""Fingerprints of policies: hashes of weights and settings, equal for equal policies on any device."""
 
 import hashlib
 from collections.abc import Mapping, Sequence
@@ -10,10 +10,15 @@ from torch import Tensor, nn
 
 
 def fingerprint_policy(policy: object) -> str:
-    """Hash of a policy's class, weights and public settings (numbers, texts, tensors, dataclasses of these).
+    """Hash of a policy's architecture, weights and public settings (numbers, texts, tensors, dataclasses of these).
+
+    Moving or renaming code must leave the fingerprints of stored models valid. So a class is hashed under the name
+    that it declares itself, `fingerprint_name` or else `architecture`, and only without either under its module and
+    name. A dataclass whose fields were renamed declares in `first_names` the names they had at first. Classes of
+    nested settings count too. What a base class declares does not stand for a subclass, which is other code.
 
     Returns:
-        32 hexadecimal digits; for a policy without weights and settings they stand for its class alone.
+        32 hexadecimal digits; for a policy without weights and settings they stand for its architecture alone.
     """
     digest = hashlib.blake2b(digest_size=16)
     _feed(digest, policy)
@@ -22,12 +27,14 @@ def fingerprint_policy(policy: object) -> str:
 
 def _feed(digest: "hashlib.blake2b", value: object) -> None:
     if isinstance(value, Tensor):
+        # bytes, not values: NaN and -0.0 count, and nothing is rounded
         array = value.detach().cpu().contiguous()
         digest.update(f"tensor {array.dtype} {tuple(array.shape)}".encode())
         digest.update(array.reshape(-1).view(torch.uint8).numpy().tobytes())
     elif isinstance(value, np.ndarray):
         digest.update(f"array {value.dtype} {value.shape}".encode() + np.ascontiguousarray(value).tobytes())
     elif isinstance(value, Mapping):
+        # order of insertion does not count
         for key in sorted(value, key=str):
             digest.update(f"key {key}".encode())
             _feed(digest, value[key])
@@ -42,15 +49,21 @@ def _feed(digest: "hashlib.blake2b", value: object) -> None:
 
 
 def _feed_object(digest: "hashlib.blake2b", value: object) -> None:
-    """Class, weights and what is kept in public attributes."""
-    digest.update(f"object {type(value).__module__}.{type(value).__qualname__}".encode())
+    """Feed a class's name, weights and public attributes."""
+    kind = type(value)
+    declared = (vars(kind).get(name) for name in ("fingerprint_name", "architecture"))
+    names = [name for name in declared if isinstance(name, str)]
+    name = names[0] if names else f"{kind.__module__}.{kind.__qualname__}"
+    digest.update(f"object {name}".encode())
     if is_dataclass(value) and not isinstance(value, type):
-        _feed(digest, {field.name: getattr(value, field.name) for field in fields(value)})
+        first_names = getattr(kind, "first_names", {})
+        _feed(digest, {first_names.get(field.name, field.name): getattr(value, field.name) for field in fields(value)})
         return
     own = (
         {name: item for name, item in vars(value).items() if not name.startswith("_")} if _keeps_settings(value) else {}
     )
     if isinstance(value, nn.Module):
+        # mode is no setting; submodules are private attributes, so weights come in through the state dict alone
         own.pop("training", None)
         _feed(digest, value.state_dict())
     _feed(digest, own)

@@ -1,29 +1,56 @@
-"""What the closed loop needs from a model. A policy implements this page and imports nothing else of ours.
+"""The interface between a traffic model and everything else. To add a model, read this page and write a class.
+
+`Policy` is all that simulation, the metric and evaluation need: five methods and three numbers. Each protocol below
+it is optional and opens one more door:
+
+| a policy that implements | can be |
+|---|---|
+| `Policy` | simulated, scored, evaluated |
+| `TrainablePolicy` (an nn.Module) | fine-tuned with rewards, saved, loaded by folder |
+| `PartlyTrainedPolicy` | fine-tuned in chosen parts, with the rest frozen |
+| `PretrainablePolicy` | pre-trained on logged tracks, token by token |
+| `ImitatedPolicy` | pre-trained on logged tracks with a loss of its own |
+| `TokenPolicy` | fine-tuned in closed loop on tokens (CAT-K, goal relabelling) |
+| `GoalConditionedPolicy` | given goals, and trained on them |
+| `ConditionablePolicy` | made goal-conditioned, where a run with goals starts from a goal-free model |
+
+`policies.registry` makes it known by name, and `rollout.check.check_policy` tests whether it keeps the contract.
 
 Differences from a classical policy API, each for a reason:
 
-* A policy holds weights only; its states are values. Policy and reference can run side by side, rollouts can interleave.
-* Randomness is handed in as uniform noise, one value or a few for every (scenario, rollout, agent, decision), drawn from
-  the seed and the scenario's id (`rollout.noise`). So the same seed gives the same rollouts however a batch is composed, sliced or
-  moved between devices, and nothing random has to be stored to resume a run.
+* A policy holds weights only. Its states are values, so policy and reference can run side by side and rollouts can
+  interleave.
+* Randomness is handed in as uniform noise, a few values for every (scenario, rollout, agent, decision), drawn from
+  the seed and the scenario's id (`rollout.noise`). So the same seed gives the same rollouts however a batch is
+  composed, sliced or moved between devices, and nothing random has to be stored to resume a run.
+
+A policy that is an nn.Module is used in these modes. `policies.registry.load_policy` returns it in evaluation mode with
+`requires_grad` False everywhere. Imitation of the log (pre-training, CAT-K) trains it in `.train()`, so dropout is
+active. Fine-tuning with rewards and goal relabeling train it in `.eval()`: dropout would change the probabilities of
+decisions between the rollout and its score.
+
+Shapes: B scenarios, N rollouts, A agents, L decisions, t steps of 0.1 s per decision, V tokens, R selected elements.
 """
 
-from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 
 from rlftsim.errors import ConfigError
 from rlftsim.goals.types import Goals
 from rlftsim.rollout.types import AgentStates, Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
+from rlftsim.tokens.vocabulary import Vocabulary
 
 
 @dataclass(frozen=True)
 class Sampling:
-    """How decisions are drawn. RL samples with the defaults, so that the estimator is unbiased."""
+    """Temperature and truncation of the draws. RL samples with the defaults, so that its estimator is unbiased."""
 
     temperature: float = 1.0
     """The density is raised to 1 / temperature; 0 takes the mode."""
@@ -40,24 +67,41 @@ class Sampling:
 
     @property
     def is_full(self) -> bool:
-        """Whether the whole, untempered distribution is sampled."""
+        """True if the whole, untempered distribution is sampled."""
         return self.temperature == 1.0 and self.top_k is None
 
 
 @runtime_checkable
 class DecisionDistribution(Protocol):
-    """One independent distribution per leading element: [B, N, A] while simulating, [B, N, A, L] when scored. float32, nats."""
+    """One independent distribution per leading element, float32, nats.
+
+    Leading axes are [B, N, A] while simulating and [B, N, A, L] when scored.
+    `policies.distributions.TokenDistribution` is one for decisions that are token ids.
+    """
 
     def sample(self, sampling: Sampling, noise: Float[Tensor, "... noise"]) -> Tensor:
-        """Decisions [..., *event] from uniform noise in [0, 1); never a gradient."""
+        """Draw decisions; no gradient flows through them.
+
+        Args:
+            sampling: temperature and truncation.
+            noise: uniform in [0, 1), `Policy.noise_size` numbers per element.
+
+        Returns:
+            Decisions [..., *event].
+        """
         ...
 
     def log_prob(self, decision: Tensor, sampling: Sampling = Sampling()) -> Float[Tensor, "..."]:
-        """Log-probability under the distribution that `sampling` draws from, event axes summed."""
+        """Log-probability under the distribution that `sampling` draws from.
+
+        Args:
+            decision: [..., *event]; the event axes are summed over.
+            sampling: temperature and truncation it was drawn with.
+        """
         ...
 
     def kl(self, other: Any) -> Float[Tensor, "..."]:
-        """KL(self || other) to a distribution of the same kind, between the full ones, closed form."""
+        """KL(self || other) in closed form, between full distributions of the same kind."""
         ...
 
     def entropy(self) -> Float[Tensor, "..."]:
@@ -66,53 +110,285 @@ class DecisionDistribution(Protocol):
 
 
 @runtime_checkable
-class PolicyState(Protocol):
-    """A policy's own state of B x N running simulations."""
-
-    poses: Float[Tensor, "B N A t 3"] | None
-    """x, y, heading of the steps of the last decision, map frame; None before the first."""
-    draws: Tensor | None
-    """[B, N, ...] drawn once per rollout."""
-
-
-@runtime_checkable
 class Policy(Protocol):
-    """A model that decides for all agents of a scenario."""
+    """A model that decides for all agents of a scenario.
+
+    Contexts and states are opaque values of the policy's own classes, except that a state has two attributes:
+
+    * `poses` [B, N, A, t, 3]: x, y, heading of the steps of the last decision in the map frame; None before the first.
+    * `draws` [B, N, ...]: what `begin` drew from its noise, once per rollout; None for most policies. It is a single
+      tensor that all other code slices along B and N and hands back to `score` as `Rollouts.draws`. Several values
+      are packed along the last axis: 16 latent numbers and the index of a destination per agent are float32
+      [B, N, A, 17], where integers are exact up to 2^24. Log-probabilities are conditional on the draws, and the
+      draws themselves are not rewarded: training changes what is decided given a latent, not how latents are drawn.
+    """
 
     steps_per_decision: int
-    """Steps of 0.1 s a decision lasts; divides 80."""
+    """Steps of 0.1 s that a decision lasts; divides 80."""
     noise_size: int
-    """Uniform numbers a decision consumes (0 = deterministic)."""
+    """Uniform numbers per agent that a decision consumes (0 = deterministic)."""
     initial_noise_size: int
-    """Uniform numbers `begin` consumes per agent."""
+    """Uniform numbers per agent that `begin` consumes."""
 
     def encode(self, scenarios: ScenarioBatch) -> Any:
-        """Everything that does not depend on what agents will do: map, lights, history. Once per scenario, never per rollout."""
+        """Context of a batch: map, lights, history. Computed once per scenario and shared by its rollouts."""
         ...
 
     def begin(self, context: Any, num_rollouts: int, goals: Goals | None, noise: Float[Tensor, "B N A k"]) -> Any:
-        """State of N simulations at the current step."""
+        """State of N simulations at the current step.
+
+        Args:
+            context: of `encode`.
+            num_rollouts: N.
+            goals: of all agents in each rollout; None = goal-free. A policy that cannot follow goals ignores them.
+            noise: uniform in [0, 1), `initial_noise_size` numbers per agent.
+        """
         ...
 
     def decide(self, context: Any, state: Any) -> DecisionDistribution:
-        """Distributions [B, N, A] of the next decision."""
+        """Distributions [B, N, A] of the next decision.
+
+        Log-probability, KL and entropy of padding are exactly 0.
+
+        Args:
+            context: of `encode`.
+            state: before the decision.
+        """
         ...
 
     def advance(self, context: Any, state: Any, decision: Tensor, forced: AgentStates | None = None) -> Any:
-        """State after the decision: kinematics only. Agents whose forced states are all valid are put there instead."""
+        """State after a decision: kinematics only, no network.
+
+        Args:
+            context: of `encode`.
+            state: before the decision.
+            decision: [B, N, A, *event].
+            forced: states [B, N, A, t] imposed from outside. An agent whose forced states are all valid is put
+                there, whatever was decided for it.
+        """
         ...
 
     def score(self, context: Any, rollouts: Rollouts) -> DecisionDistribution:
-        """What `decide` would have said at each decision of these rollouts [B, N, A, L]; differentiable, one parallel pass."""
+        """Distributions [B, N, A, L] that `decide` gives along rollouts; differentiable, in one parallel pass.
+
+        Args:
+            context: of `encode`, for the same scenarios.
+            rollouts: decisions, forced states, goals and draws of the simulation; of this policy or another one.
+        """
         ...
 
 
+# ---- optional: weights
+# ---------------------------------------------------------------------------------------------------
+
+
+@runtime_checkable
+class SavedPolicy(Protocol):
+    """A model that can be written into a folder; `policies.checkpoint` does it in a line."""
+
+    def save_pretrained(self, folder: Path, *, card: str = "") -> None:
+        """Write the model into a folder.
+
+        Args:
+            folder: created where it is missing.
+            card: text of its README.md; training says there what the model was trained with.
+        """
+        ...
+
+
+@runtime_checkable
+class TrainablePolicy(Policy, SavedPolicy, Protocol):
+    """A policy with weights, an nn.Module. Needed by every training method.
+
+    A class that is to be loaded by folder is a `LoadablePolicy`, too.
+    """
+
+
+@runtime_checkable
+class LoadablePolicy(Protocol):
+    """Class of policies that are found by the architecture name in a model folder's config.json.
+
+    Stored evaluations and runs know a policy by its fingerprint (`rollout.fingerprint`), a hash of its weights, its
+    public settings and the name of its class. That name is `architecture` of the class itself, so the class may be
+    moved or renamed. Two more class attributes, both optional, keep stored fingerprints valid through other changes:
+
+    * `fingerprint_name: ClassVar[str]`, to be declared by every class of nested settings, such as a dataclass in
+      `self.config`; without it that class is known by its module and name, and cannot be moved. A policy needs it
+      only where its `architecture` is to change.
+    * `first_names: ClassVar[dict[str, str]]`, in a dataclass: present name -> first name of each renamed field.
+    """
+
+    architecture: ClassVar[str]
+    """Name in `policies.registry.POLICIES`."""
+
+    @classmethod
+    def from_pretrained(cls, folder: Any) -> Policy:
+        """Policy of a model folder, as `save_pretrained` wrote it."""
+        ...
+
+
+@runtime_checkable
+class PartlyTrainedPolicy(Protocol):
+    """A policy with parts that fine-tuning leaves alone. Without this, all of its weights are trained."""
+
+    def fine_tuned_parts(self) -> tuple[nn.Module, ...]:
+        """Submodules to be trained by default; the others are frozen unless `trained="all"`."""
+        ...
+
+
+# ---- optional: tokens
+# ----------------------------------------------------------------------------------------------------
+
+
+@runtime_checkable
+class TokenPolicy(Policy, Protocol):
+    """A policy whose decisions are token ids of a vocabulary.
+
+    Its distributions are dataclasses with `logits` [R, V] of the R elements where their `mask` is True, in the
+    mask's order.
+    """
+
+    vocabulary: Vocabulary
+
+
+@runtime_checkable
+class Prediction(Protocol):
+    """Predicted next tokens of R elements and the tokens that should come next: input of a cross-entropy."""
+
+    @property
+    def logits(self) -> Float[Tensor, "R V"]:
+        """Logits over the vocabulary."""
+        ...
+
+    @property
+    def target(self) -> Int64[Tensor, "R"]:
+        """Token that should come next."""
+        ...
+
+    @property
+    def target_mask(self) -> Bool[Tensor, "R"]:
+        """True = the prediction counts."""
+        ...
+
+    @property
+    def class_id(self) -> Int64[Tensor, "R"]:
+        """Agent class that each row's token ids refer to."""
+        ...
+
+
+@runtime_checkable
+class PretrainablePolicy(SavedPolicy, Protocol):
+    """A model that learns to predict the next token along logged tracks."""
+
+    def teacher_forced(self, scenarios: ScenarioBatch, trained: Bool[Tensor, "B A"]) -> Prediction:
+        """Predictions of the next token of every agent at every step of its logged track.
+
+        Args:
+            scenarios: with their futures.
+            trained: True = the agent's predictions count; other agents are context.
+        """
+        ...
+
+
+# ---- optional: goals
+# -----------------------------------------------------------------------------------------------------
+
+
+@runtime_checkable
+class GoalConditionedPolicy(Policy, Protocol):
+    """A policy that can be given goals. An agent without a goal must decide exactly as in a goal-free policy."""
+
+    is_goal_conditioned: bool
+    """True if goals have an effect. False lets a class implement this protocol and some of its models not follow
+    goals."""
+
+    def goal_parts(self) -> tuple[nn.Module, ...]:
+        """Submodules that only goals use: `trained="goals"` trains these alone, and their learning rate can be scaled.
+
+        Empty in a model that is not goal-conditioned.
+        """
+        ...
+
+    def with_guidance(self, scale: float) -> "GoalConditionedPolicy":
+        """Copy that follows goals more closely (scale > 1) or less (< 1) than was learned; itself at 1.
+
+        Raises:
+            ConfigError: this model has nothing that could be scaled.
+        """
+        ...
+
+
+@runtime_checkable
+class ConditionablePolicy(Protocol):
+    """A policy that goal conditioning can be added to, before it is trained with goals."""
+
+    def with_goal_conditioning(self, encoding: Any, *, logit_bias: bool | None = None) -> GoalConditionedPolicy:
+        """Copy with fresh weights for goals that have no effect yet; itself if it is conditioned in this way.
+
+        Args:
+            encoding: name of an encoding of goals, of the policy's own choice; SMART has "concat" and "indication".
+            logit_bias: add a goal-progress bias to the logits of decisions; None = the policy's default.
+
+        Raises:
+            ConfigError: no such encoding, or it is conditioned in another way.
+        """
+        ...
+
+
+# ---- questions about any policy
+# ------------------------------------------------------------------------------------------
+
+
 def device_of(policy: object) -> torch.device:
-    """Where a policy computes: with its weights; the CPU if it has none."""
+    """Device of a policy's weights; the CPU for a policy without any."""
     weights = policy.parameters() if isinstance(policy, nn.Module) else ()
     return next((w.device for w in weights), torch.device("cpu"))
 
 
-def sees_goals(policy: object) -> bool:
-    """Whether goals have an effect on a policy: it says so by an attribute of this name."""
-    return bool(getattr(policy, "sees_goals", False))
+def is_goal_conditioned(policy: object) -> bool:
+    """True if goals have an effect on a policy: its attribute of this name, False where it has none."""
+    return bool(getattr(policy, "is_goal_conditioned", False))
+
+
+# ---- optional: an imitation objective of its own
+# -----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class ImitationLoss:
+    """Loss of imitation and its metrics, summed over predictions: `training.imitation` divides by their number."""
+
+    loss: Float[Tensor, ""]
+    """Sum, differentiable."""
+    count: Tensor
+    """Number of predictions that count, a scalar."""
+    sums: Mapping[str, Tensor] = field(default_factory=dict)
+    """Sums of further metrics, scalars, by their names in metrics.jsonl. Always the same names."""
+
+
+@runtime_checkable
+class ImitatedPolicy(Protocol):
+    """A model that is pre-trained with an objective of its own, such as a likelihood of continuous actions.
+
+    Takes the place of `PretrainablePolicy` for a policy without tokens.
+    """
+
+    def imitation_loss(self, scenarios: ScenarioBatch, trained: Bool[Tensor, "B A"], update: int) -> ImitationLoss:
+        """Loss of the logged futures.
+
+        Args:
+            scenarios: with their futures.
+            trained: True = the agent counts; other agents are context.
+            update: counted from 0, for schedules. torch's generator was seeded for this update, so a resumed run
+                draws the same.
+        """
+        ...
+
+    def save_pretrained(self, folder: Path, *, card: str = "") -> None:
+        """Write the model into a folder, as in `TrainablePolicy`.
+
+        Args:
+            folder: created where it is missing.
+            card: text of its README.md.
+        """
+        ...

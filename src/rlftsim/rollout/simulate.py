@@ -1,4 +1,4 @@
-"""The closed loop."""
+"""The closed loop: a policy decides, all agents move, and so on for eight seconds."""
 
 from collections.abc import Callable
 from typing import Any
@@ -9,12 +9,12 @@ from torch import Tensor
 
 from rlftsim.errors import ConfigError
 from rlftsim.goals.types import Goals
-from rlftsim.processor import one_thread
 from rlftsim.rollout.noise import draw_noise
 from rlftsim.rollout.policy import DecisionDistribution, Policy, Sampling
 from rlftsim.rollout.types import AgentStates, Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import FUTURE_STEPS
+from rlftsim.threads import one_thread
 
 Choose = Callable[[DecisionDistribution, Any, Sampling, Tensor], Tensor]
 Force = Callable[[Any, int], AgentStates | None]
@@ -23,7 +23,14 @@ Force = Callable[[Any, int], AgentStates | None]
 def sample_decision(
     distribution: DecisionDistribution, state: Any, sampling: Sampling, noise: Float[Tensor, "B N A k"]
 ) -> Tensor:
-    """The ordinary choice: a draw from the policy's distribution."""
+    """Draw a decision from the policy's distribution: the default of `simulate`.
+
+    Args:
+        distribution: of the decisions.
+        state: of the policy, not used here.
+        sampling: temperature and truncation.
+        noise: uniform in [0, 1).
+    """
     return distribution.sample(sampling, noise)
 
 
@@ -46,14 +53,17 @@ def simulate(
     Args:
         policy: decides for every agent, the ego included.
         batch: scenarios; only their history, map and lights are used.
-        num_rollouts: N, or a range of rollout ids: ids 8..15 of a seed are the same rollouts whether drawn alone or among 32.
+        num_rollouts: N, or a range of rollout ids: ids 8..15 of a seed are the same rollouts whether drawn alone or
+            among 32.
         seed: of the noise; see `rollout.noise`.
-        context: `policy.encode(batch)`, where it is at hand.
-        goals: what agents are asked to do, in each of the N rollouts or, where they are of a single one, in all of them; None =
-            goal-free.
+        context: `policy.encode(batch)`, if it has been computed already.
+        goals: of agents in each of the N rollouts, or in a single one, which is repeated; None = goal-free.
         sampling: temperature and truncation.
-        choose: picks decisions from a distribution; CAT-K is another one.
+        choose: picks decisions from a distribution, such as CAT-K's closest among the top K.
         force: called before every advance with the state and the step it starts at; may impose states on agents.
+
+    Returns:
+        Poses, decisions and log-probabilities, under the distribution that was sampled from.
 
     Raises:
         ConfigError: no rollouts, or a decision length that does not divide the 80 steps.
@@ -62,20 +72,23 @@ def simulate(
     stride = policy.steps_per_decision
     if len(rollout_ids) < 1 or FUTURE_STEPS % stride:
         raise ConfigError(
-            f"cannot simulate {len(rollout_ids)} rollouts with {stride} steps per decision: need >= 1 and a divisor of 80."
+            f"cannot simulate {len(rollout_ids)} rollouts with {stride} steps per decision: "
+            "need >= 1 and a divisor of 80."
         )
     num_decisions = FUTURE_STEPS // stride
     goals = goals and goals.repeat(len(rollout_ids))
-    context = policy.encode(batch) if context is None else context
+
+    # 1. all noise at once: it depends on seed, scenario and rollout id alone
     initial = draw_noise(batch, rollout_ids, seed=seed, purpose="begin", per_agent=policy.initial_noise_size)
     noise = draw_noise(batch, rollout_ids, seed=seed, purpose="decide", per_agent=num_decisions * policy.noise_size)
+    noise = noise.unflatten(-1, (num_decisions, -1))  # [B, N, A, L, noise]
+
+    # 2. the loop
+    context = policy.encode(batch) if context is None else context
     state = policy.begin(context, len(rollout_ids), goals, initial)
     draws = state.draws
-
     poses, decisions, log_probs, forces = [], [], [], []
-    for step, decision_noise in zip(
-        range(0, FUTURE_STEPS, stride), noise.unflatten(-1, (num_decisions, -1)).unbind(-2)
-    ):
+    for step, decision_noise in zip(range(0, FUTURE_STEPS, stride), noise.unbind(-2)):
         distribution = policy.decide(context, state)
         decision = choose(distribution, state, sampling, decision_noise)
         forced = force(state, step) if force else None
@@ -84,24 +97,13 @@ def simulate(
         decisions.append(decision)
         log_probs.append(distribution.log_prob(decision, sampling))
         forces.append(forced)
-    return _assemble(batch, poses, decisions, log_probs, forces, draws, goals)
 
-
-def _assemble(
-    batch: ScenarioBatch,
-    poses: list[Tensor],
-    decisions: list[Tensor],
-    log_probs: list[Tensor],
-    forces: list[AgentStates | None],
-    draws: Tensor | None,
-    goals: Goals | None,
-) -> Rollouts:
-    """What the loop collected, as one value."""
-    path = torch.cat(poses, dim=3)  # [B, N, A, T, 3]
-    forced = _join(forces, path)
-    mask = batch.agent_mask[:, None, :, None].expand(*path.shape[:3], len(decisions))
-    if forced is not None:
-        mask = mask & ~forced.valid.unflatten(-1, (len(decisions), -1)).all(-1)
+    # 3. one value. A decision counts unless the agent is padding or was forced through all of its steps
+    path = torch.cat(poses, dim=3)  # [B, N, A, 80, 3]
+    all_forced = _join(forces, path)
+    mask = batch.agent_mask[:, None, :, None].expand(*path.shape[:3], num_decisions)
+    if all_forced is not None:
+        mask = mask & ~all_forced.valid.unflatten(-1, (num_decisions, -1)).all(-1)
     return Rollouts(
         position=path[..., :2],
         heading=path[..., 2],
@@ -110,7 +112,7 @@ def _assemble(
         log_prob=torch.where(mask, torch.stack(log_probs, dim=3), 0.0),
         draws=draws,
         goals=goals,
-        forced=forced,
+        forced=all_forced,
     )
 
 
@@ -118,13 +120,13 @@ def _join(forces: list[AgentStates | None], path: Float[Tensor, "B N A T 3"]) ->
     """Imposed states of all steps; None where nothing was imposed at all."""
     if all(f is None for f in forces):
         return None
-    pieces = []
+    parts = []
     for part, f in zip(path.chunk(len(forces), dim=3), forces):
-        if f is None:
+        if f is None:  # the states that the policy chose, marked as not imposed
             f = AgentStates(part[..., :2], part[..., 2], torch.zeros_like(part[..., 0], dtype=torch.bool))
-        pieces.append(f)
+        parts.append(f)
     return AgentStates(
-        torch.cat([p.position for p in pieces], 3),
-        torch.cat([p.heading for p in pieces], 3),
-        torch.cat([p.valid for p in pieces], 3),
+        torch.cat([p.position for p in parts], 3),
+        torch.cat([p.heading for p in parts], 3),
+        torch.cat([p.valid for p in parts], 3),
     )

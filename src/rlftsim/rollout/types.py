@@ -1,27 +1,42 @@
-"""What may happen: simulated futures of a batch of scenarios.
+"""Simulated futures (rollouts) of a batch of scenarios.
 
-Frame: map (centred, metres). N rollouts, L decisions, T simulated steps of 0.1 s. A policy's decisions have event axes `*event`
-(none for SMART's token ids, one of size 2 for two-dimensional actions).
+Frame: map (centered, meters). N rollouts, L decisions, T simulated steps of 0.1 s. A policy's decisions have event
+axes `*event` (none for SMART's token ids, one of size 2 for two-dimensional actions).
 """
 
+import importlib
 from dataclasses import dataclass, replace
 
-from jaxtyping import Bool, Float
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from rlftsim.goals.types import Goals
+import rlftsim
+from rlftsim.errors import ConfigError
+from rlftsim.goals.types import Goals, shown_id
+from rlftsim.scenario.batch import Frame, origin_of
+from rlftsim.scenario.types import Scenario
 
 
 @dataclass(frozen=True, eq=False)
 class AgentStates:
-    """States imposed from outside. Where `valid` is False the policy moves the agent and the other fields mean nothing."""
+    """States imposed on agents from outside.
+
+    Where `valid` is False the policy moves the agent and the other fields are not used.
+    """
 
     position: Float[Tensor, "B N A t 2"]
     heading: Float[Tensor, "B N A t"]
     valid: Bool[Tensor, "B N A t"]
 
     def steps(self, start: int, stop: int) -> "AgentStates":
-        """The states of steps [start, stop)."""
+        """The states of steps [start, stop).
+
+        Args:
+            start: first step of 0.1 s, counted from 0 at the first simulated one.
+            stop: step after the last.
+        """
         return AgentStates(
             self.position[..., start:stop, :], self.heading[..., start:stop], self.valid[..., start:stop]
         )
@@ -32,25 +47,49 @@ class AgentStates:
 
 
 @dataclass(frozen=True, eq=False)
+class RolloutProvenance:
+    """Origin of rollouts: the scenarios they continue, and what it takes to simulate them again."""
+
+    scenarios: tuple[Scenario, ...]
+    frame: Frame
+    """Frame of the rollouts' positions."""
+    policy: str
+    """Class of the policy."""
+    policy_fingerprint: str
+    """Hash of its weights and settings."""
+    seed: int
+    temperature: float = 1.0
+    top_k: int | None = None
+    rlftsim_version: str = rlftsim.__version__
+
+    @property
+    def scenario_ids(self) -> tuple[str, ...]:
+        """Ids of the scenarios, in the order of the rollouts' axis B."""
+        return tuple(scenario.scenario_id for scenario in self.scenarios)
+
+
+@dataclass(frozen=True, eq=False)
 class Rollouts:
-    """N simulated futures of each of B scenarios, with what was decided and how likely it was."""
+    """N simulated futures of each of B scenarios, with the decisions and their log-probabilities."""
 
     position: Float[Tensor, "B N A T 2"]
     heading: Float[Tensor, "B N A T"]
     decision: Tensor
-    """[B, N, A, L, *event]; what was sampled, never recovered from poses."""
+    """[B, N, A, L, *event]; as sampled, never recovered from poses."""
     decision_mask: Bool[Tensor, "B N A L"]
-    """True = the policy chose it and it counts."""
+    """True = the policy chose it. False for padding, and where all steps of the decision were forced."""
     log_prob: Float[Tensor, "B N A L"]
     """Under the distribution that was sampled from, nats; 0 where the mask is False."""
     draws: Tensor | None = None
-    """[B, N, ...] what the policy drew once per rollout; opaque to everybody else."""
+    """[B, N, ...] drawn once per rollout by the policy, opaque to all other code."""
     goals: Goals | None = None
     forced: AgentStates | None = None
+    provenance: RolloutProvenance | None = None
+    """Set by `rlftsim.simulate`; None for rollouts of the closed loop itself, as in training."""
 
     @property
     def num_rollouts(self) -> int:
-        """N."""
+        """Number of rollouts per scenario, N."""
         return self.position.shape[1]
 
     def select(self, selected: slice) -> "Rollouts":
@@ -66,3 +105,71 @@ class Rollouts:
             draws=None if self.draws is None else self.draws[:, selected],
             forced=None if self.forced is None else self.forced.rollouts(selected),
         )
+
+    # ---- agents by object id: rollouts that `rlftsim.simulate` returned ------------------------------------------
+
+    def row_of(self, scenario_id: str | None = None) -> int:
+        """Index of a scenario on axis B.
+
+        Args:
+            scenario_id: None stands for the only scenario.
+
+        Raises:
+            ConfigError: no such scenario, several to choose from, or rollouts without provenance.
+        """
+        if self.provenance is None:
+            raise ConfigError("these rollouts do not know their scenarios: simulate them with rlftsim.simulate.")
+        ids = self.provenance.scenario_ids
+        if scenario_id not in ids and not (scenario_id is None and len(ids) == 1):
+            listed = ", ".join(ids[:12]) + (", ..." if len(ids) > 12 else "")
+            wanted = "a scenario_id is needed" if scenario_id is None else f"no scenario {scenario_id!r}"
+            raise ConfigError(f"{wanted}: these are rollouts of {listed}.")
+        return 0 if scenario_id is None else ids.index(scenario_id)
+
+    def object_ids(self, scenario_id: str | None = None) -> Int64[np.ndarray, "A"]:
+        """Object ids of a scenario's simulated agents, in the order of axis A; a scenario's padding has none.
+
+        Raises:
+            ConfigError: see `row_of`.
+        """
+        row = self.row_of(scenario_id)
+        assert self.provenance is not None
+        scenario = self.provenance.scenarios[row]
+        return scenario.tracks.object_id[scenario.simulated_indices]
+
+    def trajectory(self, object_id: int, scenario_id: str | None = None) -> Float[Tensor, "N T 3"]:
+        """Poses of one agent in all rollouts: x, y in meters and heading in radians, world frame, float32.
+
+        Args:
+            object_id: of a simulated agent.
+            scenario_id: None stands for the only scenario.
+
+        Raises:
+            ConfigError: no such agent (the message lists those that are simulated), or see `row_of`.
+        """
+        row, ids = self.row_of(scenario_id), self.object_ids(scenario_id)
+        assert self.provenance is not None
+        scenario = self.provenance.scenarios[row]
+        if object_id not in ids:
+            listed = ", ".join(map(str, sorted(ids.tolist())))
+            raise ConfigError(
+                f"scenario {scenario.scenario_id} simulates no agent {shown_id(object_id)}: there are {listed}."
+            )
+        agent = int(np.flatnonzero(ids == object_id)[0])
+        # Added in float64, as `ScenarioBatch.to_world` does, so that only the result is rounded.
+        origin = torch.from_numpy(origin_of(scenario, self.provenance.frame)).to(self.position.device)
+        position = (self.position[row, :, agent].double() + origin).float()  # [N, T, 2]
+        return torch.cat([position, self.heading[row, :, agent, :, None].float()], -1)
+
+    def __repr__(self) -> str:
+        num_scenarios, num_rollouts, num_agents, num_steps, _ = self.position.shape
+        several = "s" if num_scenarios != 1 else ""
+        seed = "" if self.provenance is None else f", seed {self.provenance.seed}"
+        counts = (
+            f"{num_scenarios} scenario{several} × {num_rollouts} rollouts × {num_agents} agents × {num_steps} steps"
+        )
+        return f"Rollouts({counts}{seed})"
+
+    def _repr_html_(self) -> str | None:
+        # The viewer is on a higher floor, so it is looked up by name and only where a notebook shows the value.
+        return importlib.import_module("rlftsim.viewer.notebook").rollouts_html(self)

@@ -1,1 +1,1 @@
-"""What happened: recorded scenarios, however they were stored."""
+"""Logged scenarios: types, data sources, data sets and the synthetic generator."""

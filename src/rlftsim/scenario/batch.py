@@ -1,4 +1,4 @@
-"""Scenarios side by side: padded tensors of the simulated agents, in the map frame unless asked otherwise."""
+"""Batches of scenarios: padded tensors of the simulated agents, in the map frame by default."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -19,13 +19,13 @@ Frame = Literal["map", "world"]
 class ScenarioBatch:
     """B scenarios, their simulated agents (valid at the current step, track order) padded to A.
 
-    Frame: map, i.e. world minus the scenario's own origin (whole metres, exact in float32). Padding has `agent_mask` False and zeros elsewhere.
-    S is the largest number of recorded steps; a shorter record is invalid beyond its end.
+    Frame: map, i.e. world minus the scenario's own origin (whole meters, exact in float32). Padding has `agent_mask`
+    False and zeros elsewhere. S is the largest number of logged steps; a shorter log is invalid beyond its end.
     """
 
     scenarios: tuple[Scenario, ...]
     origin: Float[Tensor, "B 2"]
-    """float64, metres, world frame: where (0, 0) of the batch's frame is. Zeros in the world frame."""
+    """World coordinates of the batch frame's (0, 0), float64, meters. Zeros in the world frame."""
     object_id: Int64[Tensor, "B A"]
     object_type: Int64[Tensor, "B A"]
     agent_mask: Bool[Tensor, "B A"]
@@ -42,16 +42,21 @@ class ScenarioBatch:
 
     @property
     def num_scenarios(self) -> int:
-        """B."""
+        """Number of scenarios B."""
         return len(self.scenarios)
 
     @property
     def device(self) -> torch.device:
-        """Where the tensors live."""
+        """Device of the tensors."""
         return self.position.device
 
     def to_world(self, position: Float[Tensor, "B N A T 2"]) -> Float[Tensor, "B N A T 2"]:
-        """Positions of the map frame in the world frame, float32; added in float64, so that only the result is rounded."""
+        """Positions of the map frame in the world frame, float32.
+
+        Args:
+            position: of the N rollouts of each scenario over T steps, map frame.
+        """
+        # added in float64, so that only the result is rounded
         return (position.double() + self.origin[:, None, None, None].to(position.device)).float()
 
     def to(self, device: torch.device | str) -> "ScenarioBatch":
@@ -61,11 +66,18 @@ class ScenarioBatch:
 
     def split(self, size: int) -> tuple["ScenarioBatch", ...]:
         """Batches of at most `size` of the scenarios each, in their order, padded as this one is."""
+        # every tensor has the scenarios along its first axis
         tensors = {f.name: v.split(size) for f in fields(self) if isinstance(v := getattr(self, f.name), Tensor)}
         return tuple(
             replace(self, scenarios=self.scenarios[i * size : (i + 1) * size], **dict(zip(tensors, parts)))
             for i, parts in enumerate(zip(*tensors.values()))
         )
+
+    def __repr__(self) -> str:
+        num_scenarios, num_agents, num_steps = self.valid.shape
+        several = "s" if num_scenarios != 1 else ""
+        size = f"{num_scenarios} scenario{several} × {num_agents} agents × {num_steps} steps"
+        return f"ScenarioBatch({size}, {self.frame} frame, {self.device})"
 
 
 def collate(scenarios: Sequence[Scenario], *, max_agents: int | None = None, frame: Frame = "map") -> ScenarioBatch:
@@ -74,19 +86,20 @@ def collate(scenarios: Sequence[Scenario], *, max_agents: int | None = None, fra
     Args:
         scenarios: at least one.
         max_agents: pad to this many agents; None = as many as the fullest scenario has.
-        frame: "map" = centred on each scenario. "world" = as recorded, kilometres from the origin, where float32 rounds to half a
-            millimetre: for comparison with code that works there.
+        frame: "map" = centered on each scenario. "world" = as logged, kilometers from the origin, where float32 rounds
+            to half a millimeter: for comparison with code that works there.
 
     Raises:
         DataError: no scenario, or a scenario with more agents than `max_agents`.
     """
     if not scenarios:
-        raise DataError("cannot batch 0 scenarios: hand over at least one.")
+        raise DataError("cannot batch 0 scenarios: pass at least one.")
     counts = [len(s.simulated_indices) for s in scenarios]
     num_agents = max(counts) if max_agents is None else max_agents
     if max(counts) > num_agents:
         fullest = scenarios[counts.index(max(counts))]
         raise DataError(f"{fullest.scenario_id}: {max(counts)} agents do not fit max_agents={num_agents}: raise it.")
+    # as long as the longest log; the 80 future steps of a test split are invalid
     num_steps = max(s.num_steps for s in scenarios)
     rows = [_agent_rows(s, num_agents, num_steps, origin_of(s, frame)) for s in scenarios]
     stacked = {name: torch.from_numpy(np.stack([row[name] for row in rows])) for name in rows[0]}
@@ -94,7 +107,12 @@ def collate(scenarios: Sequence[Scenario], *, max_agents: int | None = None, fra
 
 
 def origin_of(scenario: Scenario, frame: Frame) -> Float[np.ndarray, "2"]:
-    """World coordinates of a frame's (0, 0), float64."""
+    """World coordinates of a frame's (0, 0), float64, meters.
+
+    Args:
+        scenario: its own origin is that of its map frame.
+        frame: "map" or "world".
+    """
     return scenario.origin if frame == "map" else np.zeros(2)
 
 
@@ -104,17 +122,18 @@ def _agent_rows(
     """One scenario's agents as padded arrays, by field name of `ScenarioBatch`."""
     tracks, chosen = scenario.tracks, scenario.simulated_indices
     valid = _pad(tracks.valid[chosen], num_agents, num_steps)
-    centred = tracks.position[chosen].copy()
-    centred[..., :2] -= origin
-    centred[~tracks.valid[chosen]] = 0
+    centered = tracks.position[chosen].copy()  # [A, S, 3] world
+    centered[..., :2] -= origin
+    # zeros in place of the log's values, which mean nothing where a state is not valid
+    centered[~tracks.valid[chosen]] = 0
     return {
         "origin": origin,
         "object_id": _pad(tracks.object_id[chosen], num_agents),
         "object_type": _pad(tracks.object_type[chosen].astype(np.int64), num_agents),
         "agent_mask": _pad(np.ones(len(chosen), bool), num_agents),
         "evaluated_mask": _pad(np.isin(chosen, scenario.evaluated_indices), num_agents),
-        "position": _pad(centred[..., :2], num_agents, num_steps),
-        "z": _pad(centred[..., 2], num_agents, num_steps),
+        "position": _pad(centered[..., :2], num_agents, num_steps),
+        "z": _pad(centered[..., 2], num_agents, num_steps),
         "heading": _pad(tracks.heading[chosen], num_agents, num_steps) * valid,
         "velocity": _pad(tracks.velocity[chosen], num_agents, num_steps) * valid[..., None],
         "size": _pad(tracks.size[chosen, CURRENT_STEP], num_agents),

@@ -1,19 +1,22 @@
-"""Tfrecord files to a data set: one shard per file, in parallel, resumable.
+"""Files of a data source to a data set: one shard per unit of work, in parallel, resumable.
 
-A shard that is done has a receipt beside it, written after it, that says what it was made from. A later run takes over
-a shard whose receipt, source and checksum agree and makes the others anew, so it does not matter when a run was
-interrupted or how.
+A finished shard has a receipt beside it, written after it, that holds what it was made from. A later run takes over a
+shard whose receipt, source and checksum agree, and makes the others again. So it does not matter when or how a run was
+interrupted.
 """
 
+import hashlib
 import json
 import os
-import re
 import shutil
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 
+from rlftsim.atomic_io import cannot_write
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.progress import progress_bar
 from rlftsim.scenario.dataset import (
@@ -29,21 +32,17 @@ from rlftsim.scenario.dataset import (
     write_json,
 )
 from rlftsim.scenario.shards import SCHEMA_VERSION, ShardWriter, hash_file
-from rlftsim.scenario.tfrecord import RECORD_OVERHEAD_BYTES, OnError, SkippedRecord, read_records
-from rlftsim.scenario.womd import find_tfrecords, scenario_or_report
+from rlftsim.scenario.sources import AUTO, DataSource, Unit, find_source, read_unit
+from rlftsim.scenario.tfrecord import OnError, SkippedRecord
 from rlftsim.workers import run_tasks, usable_cores
 
-WOMD_LICENCE_NOTE = (
-    "Waymo Open Dataset material: Waymo Dataset License Agreement for Non-Commercial Use (waymo.com/open/terms). "
-    "This work was made using the Waymo Open Dataset, provided by Waymo LLC."
-)
-_SPLIT = re.compile(r"training|validation|testing")
 _INCOMPLETE_TEXT = "A conversion runs here or was interrupted: run the same command again, it goes on.\n"
+_RECEIPTS = "*.arrow.json"
 
 
 @dataclass(frozen=True)
 class ConvertReport:
-    """What a conversion did."""
+    """Outcome of a conversion."""
 
     destination: Path
     converted: int
@@ -60,17 +59,15 @@ class ConvertReport:
 
 @dataclass(frozen=True)
 class _Task:
-    """One source file to one shard."""
+    """One unit of a source and the shard it becomes."""
 
-    source: Path
-    name: str
-    """Path of the source below the common folder of all sources."""
+    unit: Unit
     shard: str
     """Path of the shard inside the data set."""
     split: str
     folder: Path
     on_error: OnError
-    known: ShardEntry | None
+    known: ShardEntry | None = None
 
 
 @dataclass(frozen=True)
@@ -87,76 +84,73 @@ def convert(
     source: str | os.PathLike[str],
     destination: str | os.PathLike[str],
     *,
+    reader: str = AUTO,
     split: str | None = None,
     on_error: OnError = "skip",
     jobs: int | None = None,
-    licence_note: str = WOMD_LICENCE_NOTE,
+    license_note: str | None = None,
     show_progress: bool = True,
 ) -> ConvertReport:
-    """Convert WOMD tfrecord files to a data set that needs them no more.
+    """Convert files of a data source to a data set that does not need them any more.
 
     Interrupted in any way, the same call goes on where it was. A data set may be added to by converting other files to
     it; a source that changed is converted again. The same sources give the same bytes.
 
     Args:
-        source: tfrecord file, folder or glob, as in `find_tfrecords`.
+        source: file, folder or glob that the data source finds its files by.
         destination: folder of the data set: new, empty, or a data set or unfinished conversion of ours.
-        split: name of the split; None = training, validation or testing by the name of the file or its folder, else
-            "unknown".
+        reader: name of the data source, such as "womd" (see `sources.SOURCES`); "auto" = the one that recognizes the
+            files.
+        split: name of the split; None = as the data source has it, for WOMD training, validation or testing by the name
+            of the file or its folder, else "unknown".
         on_error: "skip" leaves bad files and records out and reports them, "stop" raises at the first.
         jobs: processes that work at the same time; None = one per usable core.
-        licence_note: what the manifest of a new data set says about the licence.
-        show_progress: whether to draw a progress bar with the time left on stderr.
+        license_note: license of the data, for the manifest; None = that of the data source.
+        show_progress: False shows no progress bar on stderr.
 
     Raises:
-        DataError: nothing to read, nothing readable in it, or a destination with something else in it; under "stop"
-            also the first bad file or record.
-        ConfigError: fewer than one process, or a split without a name.
+        DataError: nothing to read, nothing readable in it, a destination with something else in it, or one that cannot
+            be written to; under "stop" also the first bad file or record.
+        ConfigError: an unknown data source, fewer than one process, or a split without a name.
     """
     if jobs is not None and jobs < 1:
         raise ConfigError(f"jobs must be at least 1, got {jobs}: leave it out for one per core.")
     if split is not None and not split.strip():
         raise ConfigError("the split has no name: leave it out to read it off the folder or file.")
+    # 1. Refuse a destination that holds anything but a data set or an unfinished conversion.
     folder = Path(destination)
-    _check_destination(folder)
-    tasks = _plan(find_tfrecords(source), folder, split, on_error)
-    with _claim(folder):
-        tasks = _prepare(folder, tasks)
-        outcomes = _run(tasks, jobs or usable_cores(), show_progress)
-        manifest = _finish(folder, [outcome.entry for outcome in outcomes], licence_note)
-    return _report(folder, outcomes, manifest)
+    if folder.exists() and not (folder / INCOMPLETE).exists():
+        if not folder.is_dir():
+            raise DataError(f"{folder} is a file, not a folder: choose another destination")
+        if (folder / MANIFEST).exists():
+            read_manifest(folder)  # raises where it cannot be added to
+        elif any(folder.iterdir()):
+            raise DataError(f"{folder} is not empty and not a data set: choose another destination")
 
-
-def infer_split(path: Path) -> str:
-    """Split that a file's name or else its folder's name tells: training, validation, testing or unknown."""
-    for name in (path.name, path.absolute().parent.name):
-        match = _SPLIT.search(name)
-        if match:
-            return match.group()
-    return "unknown"
-
-
-def _check_destination(folder: Path) -> None:
-    if not folder.exists() or (folder / INCOMPLETE).exists():
-        return
-    if not folder.is_dir():
-        raise DataError(f"{folder} is a file, not a folder: choose another destination")
-    if (folder / MANIFEST).exists():
-        read_manifest(folder)
-    elif any(folder.iterdir()):
-        raise DataError(f"{folder} is not empty and not a data set: choose another destination")
-
-
-def _plan(sources: list[Path], folder: Path, split: str | None, on_error: OnError) -> list[_Task]:
-    common = os.path.commonpath([source.absolute().parent for source in sources])
+    # 2. One task per unit of the source.
+    data_source = find_source(reader, source)
     tasks = []
-    for source in sources:
-        name = source.absolute().relative_to(common).as_posix()
-        label = split or infer_split(source)
+    for unit in data_source.find(source):
+        label = split or unit.split
         # files of two splits may have the same name: a split's shards have a folder of their own
-        place = name if name.startswith(f"{label}/") else f"{label}/{name}"
-        tasks.append(_Task(source, name, f"{SHARDS}/{place}.arrow", label, folder, on_error, None))
-    return tasks
+        place = unit.name if unit.name.startswith(f"{label}/") else f"{label}/{unit.name}"
+        tasks.append(_Task(unit, f"{SHARDS}/{place}.arrow", label, folder, on_error))
+    repeated = [shard for shard, count in Counter(task.shard for task in tasks).items() if count > 1]
+    if repeated:
+        raise DataError(f"{source}: its data source has two units of one name for {repeated[0]}: names must differ.")
+
+    # 3. Make the shards that earlier runs have not finished, then index and manifest.
+    with _claim(folder):
+        for leftover in folder.rglob("*.tmp"):  # of an interrupted run
+            leftover.unlink()
+        known = _known_entries(folder)
+        tasks = [replace(task, known=known.get(task.shard)) for task in tasks]
+        total = sum(file.stat().st_size for task in tasks for file in task.unit.files if file.exists())
+        with progress_bar("converting", total, unit="bytes", show=show_progress) as advance:
+            convert_one = partial(_convert_unit, source=data_source)
+            outcomes = run_tasks(convert_one, tasks, jobs=jobs or usable_cores(), advance=advance)
+        manifest = _finish(folder, [outcome.entry for outcome in outcomes], data_source, license_note)
+    return _report(folder, outcomes, manifest)
 
 
 @contextmanager
@@ -164,43 +158,39 @@ def _claim(folder: Path) -> Iterator[None]:
     """Mark the folder as unfinished for the time of the block, and after it if it fails. One process at a time.
 
     Raises:
-        DataError: another process converts to this folder.
+        DataError: another process converts to this folder, or it cannot be written to.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    with open(folder / INCOMPLETE, "w", encoding="utf-8") as marker:
-        _lock(marker.fileno(), folder)
-        marker.write(_INCOMPLETE_TEXT)
-        marker.flush()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        marker = open(folder / INCOMPLETE, "w", encoding="utf-8")  # noqa: SIM115 (the with follows)
+    except OSError as error:
+        raise cannot_write(folder / INCOMPLETE, error) from error
+    with marker:
+        try:
+            import fcntl
+
+            fcntl.flock(marker.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except ImportError:  # no such locks on this platform: two conversions at a time are not noticed
+            pass
+        except OSError as error:
+            raise DataError(
+                f"another process is converting to {folder}: wait for it or choose another destination"
+            ) from error
+        try:
+            marker.write(_INCOMPLETE_TEXT)
+            marker.flush()
+        except OSError as error:
+            raise cannot_write(folder / INCOMPLETE, error) from error
         yield
         (folder / INCOMPLETE).unlink()
-
-
-def _lock(descriptor: int, folder: Path) -> None:
-    try:
-        import fcntl
-    except ImportError:  # no such locks on this platform: then nobody may convert twice at the same time
-        return
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        raise DataError(
-            f"another process is converting to {folder}: wait for it or choose another destination"
-        ) from error
-
-
-def _prepare(folder: Path, tasks: list[_Task]) -> list[_Task]:
-    """Remove what an interrupted run left half-written and tell each task what is known of its shard."""
-    for leftover in folder.rglob("*.tmp"):
-        leftover.unlink()
-    known = _known_entries(folder)
-    return [replace(task, known=known.get(task.shard)) for task in tasks]
 
 
 def _known_entries(folder: Path) -> dict[str, ShardEntry]:
     """Shards that earlier runs finished, by path: from the manifest and the receipts of runs that got no further."""
     earlier = _earlier_manifest(folder)
     entries = {entry.file: entry for entry in earlier.shards} if earlier else {}
-    for path in sorted((folder / SHARDS).rglob("*.arrow.json")):
+    for path in sorted((folder / SHARDS).rglob(_RECEIPTS)):
+        # receipts are written whole or not at all, so one that is there can be read
         receipt = json.loads(path.read_text(encoding="utf-8"))
         if receipt.pop("schema_version") == SCHEMA_VERSION:
             entry = shard_entry_from_json(receipt)
@@ -216,113 +206,116 @@ def _earlier_manifest(folder: Path) -> Manifest | None:
         return None
 
 
-def _receipt_path(folder: Path, shard: str) -> Path:
-    return folder / f"{shard}.json"
-
-
-def _convert_file(task: _Task, advance: Callable[[int], None], is_stopped: Callable[[], bool]) -> _Outcome:
+def _convert_unit(
+    task: _Task, advance: Callable[[int], None], is_stopped: Callable[[], bool], *, source: DataSource
+) -> _Outcome:
     """Make the shard of a task, or take over a finished one.
 
     Args:
-        task: what to convert.
+        task: unit and shard.
         advance: called with the number of bytes dealt with.
-        is_stopped: asked after each record.
+        is_stopped: asked after each scenario.
+        source: reader of the unit.
 
     Raises:
         DataError: under "stop", a bad file or record; always: the shard cannot be written.
-        _Stopped: as asked for.
+        _Stopped: `is_stopped` was true.
     """
-    size, digest = task.source.stat().st_size, hash_file(task.source)
-    finished = _finished_entry(task, size, digest)
-    if finished is not None:
+    # 1. Take over the shard of an earlier run if it is whole and made from these very files.
+    size, digest = _fingerprint(task.unit.files)
+    known = task.known
+    if (
+        known is not None
+        and (known.source_bytes, known.source_sha256, known.split) == (size, digest, task.split)
+        and not (known.skipped and task.on_error == "stop")
+        and hash_file(task.folder / task.shard) == known.sha256
+    ):
         advance(size)
-        return _Outcome(finished, reused=True)
+        return _Outcome(known, reused=True)
+
+    # 2. Read and write record by record, so that memory does not grow with the file.
     skipped: list[SkippedRecord] = []
-    try:
-        num_rows = _write_shard(task, skipped, advance, is_stopped)
-    except OSError as error:
-        raise DataError(f"cannot write {task.folder / task.shard}: {error.strerror or error}") from error
-    entry = ShardEntry(
-        file=task.shard,
-        sha256=hash_file(task.folder / task.shard),
-        num_rows=num_rows,
-        split=task.split,
-        source=task.name,
-        source_bytes=size,
-        source_sha256=digest,
-        skipped=tuple(replace(record, file=task.name) for record in skipped),
-    )
-    write_json(_receipt_path(task.folder, task.shard), {**asdict(entry), "schema_version": SCHEMA_VERSION})
-    return _Outcome(entry, reused=False)
+    bytes_left = size
 
+    def count(num_bytes: int) -> None:
+        nonlocal bytes_left
+        bytes_left -= num_bytes
+        advance(num_bytes)
 
-def _finished_entry(task: _Task, size: int, digest: str) -> ShardEntry | None:
-    """Entry of the task's shard if it is there, whole, and made from this very source."""
-    entry = task.known
-    if entry is None or (entry.source_bytes, entry.source_sha256, entry.split) != (size, digest, task.split):
-        return None
-    if entry.skipped and task.on_error == "stop":
-        return None
-    return entry if hash_file(task.folder / task.shard) == entry.sha256 else None
-
-
-def _write_shard(
-    task: _Task, skipped: list[SkippedRecord], advance: Callable[[int], None], is_stopped: Callable[[], bool]
-) -> int:
-    """Convert record by record; returns the number of scenarios written."""
     writer = ShardWriter(task.folder / task.shard)
-    how = {"on_error": task.on_error, "report": skipped.append}
     try:
-        for record, data in read_records(task.source, **how):
-            scenario = scenario_or_report(task.source, record, data, **how)
-            if scenario is not None:
-                writer.add(scenario, task.split, record)
-            advance(len(data) + RECORD_OVERHEAD_BYTES)
+        scenarios = read_unit(source, task.unit, on_error=task.on_error, report=skipped.append, advance=count)
+        for record, scenario in scenarios:
+            writer.add(scenario, task.split, record)
             if is_stopped():
                 raise _Stopped
         writer.close()
     except BaseException:
         writer.discard()
         raise
-    return writer.num_rows
+    # bytes between records, and all of them for a source that does not count
+    advance(bytes_left)
+
+    # 3. Leave a receipt: from now on the shard counts as finished.
+    if len(task.unit.files) == 1:  # the same bytes wherever the sources lie
+        skipped = [replace(record, file=task.unit.name) for record in skipped]
+    entry = ShardEntry(
+        file=task.shard,
+        sha256=hash_file(task.folder / task.shard),
+        num_rows=writer.num_rows,
+        split=task.split,
+        source=task.unit.name,
+        source_bytes=size,
+        source_sha256=digest,
+        skipped=tuple(skipped),
+    )
+    write_json(task.folder / f"{task.shard}.json", {**asdict(entry), "schema_version": SCHEMA_VERSION})
+    return _Outcome(entry, reused=False)
 
 
-def _run(tasks: list[_Task], jobs: int, show_progress: bool) -> list[_Outcome]:
-    """Convert all files; returns their outcomes in the order of `tasks`. Stopped, files in progress are given up, finished ones stay."""
-    total = sum(task.source.stat().st_size for task in tasks)
-    with progress_bar("converting", total, unit="bytes", show=show_progress) as advance:
-        return run_tasks(_convert_file, tasks, jobs=jobs, advance=advance)
+def _fingerprint(files: tuple[Path, ...]) -> tuple[int, str]:
+    """Bytes of some files and their SHA-256; of several files that of their checksums."""
+    try:
+        size = sum(file.stat().st_size for file in files)
+        digests = [hash_file(file) for file in files]
+    except OSError as error:
+        raise DataError(f"{error.filename}: cannot be read: {error.strerror}") from error
+    return size, digests[0] if len(digests) == 1 else hashlib.sha256("".join(digests).encode()).hexdigest()
 
 
-def _finish(folder: Path, new: list[ShardEntry], licence_note: str) -> Manifest:
-    """Index and manifest of the new shards and those that were there; the receipts go."""
+def _finish(folder: Path, new: list[ShardEntry], source: DataSource, license_note: str | None) -> Manifest:
+    """Write index and manifest of the new shards and those that were there, and remove the receipts."""
+    # shards of earlier runs that this call does not touch stay in the data set
     entries = {**_known_entries(folder), **{entry.file: entry for entry in new}}
     if not any(entry.num_rows for entry in entries.values()):
-        _clear(folder)
+        # leave nothing behind, as if the command had not been given
+        shutil.rmtree(folder / SHARDS, ignore_errors=True)
+        (folder / INCOMPLETE).unlink()
+        if not any(folder.iterdir()):
+            folder.rmdir()
         causes = [record for entry in new for record in entry.skipped]
         first = f"; first of {len(causes)} causes: {causes[0]}" if causes else ""
         raise DataError(f"not one scenario could be converted{first}")
     earlier = _earlier_manifest(folder)
+    note = license_note or source.license_note
+    if earlier is not None and note not in earlier.license_note:
+        note = f"{earlier.license_note} {note}"  # of several sources every license applies
+    elif earlier is not None:
+        note = earlier.license_note
     manifest = write_index_and_manifest(
         folder,
         entries.values(),
-        licence_note=earlier.licence_note if earlier else licence_note,
-        provenance=earlier.provenance if earlier else None,
+        license_note=note,
+        provenance={**(earlier.provenance if earlier else {}), **source.describe()},
     )
-    for receipt in (folder / SHARDS).rglob("*.arrow.json"):
+    # only now: until the manifest is there the receipts are the only memory of finished shards
+    for receipt in (folder / SHARDS).rglob(_RECEIPTS):
         receipt.unlink()
     return manifest
 
 
-def _clear(folder: Path) -> None:
-    """Leave nothing of a conversion without a single scenario."""
-    shutil.rmtree(folder / SHARDS, ignore_errors=True)
-    (folder / INCOMPLETE).unlink()
-    if not any(folder.iterdir()):
-        folder.rmdir()
-
-
 def _report(folder: Path, outcomes: list[_Outcome], manifest: Manifest) -> ConvertReport:
+    """Report on the units of this call; a data set may hold more."""
     entries = [outcome.entry for outcome in outcomes]
     sources = {entry.source for entry in entries}
     duplicates = tuple(record for record in manifest.duplicates if record.file in sources)

@@ -2,47 +2,52 @@
 
 Everything is in it; what it was made from is never opened again.
 
-    manifest.json       schema version, shards with checksums and sources, counts, licence note; written last
-    index.parquet       one row per scenario: where it is and what is in it
+    manifest.json       schema version, shards with checksums and sources, counts, license note; written last
+    index.parquet       one row per scenario: its shard and row, counts of its contents
     shards/*.arrow      the scenarios
     INCOMPLETE          only while a conversion runs or after it was interrupted
 
 Files are written under temporary names and renamed, so a file under its own name is whole.
 """
 
+import difflib
 import json
 import os
 import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from threading import Lock
 from types import TracebackType
-from typing import Any
+from typing import Any, overload
 
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 import rlftsim
-from rlftsim.errors import DataError
-from rlftsim.files import write_text, write_whole
+from rlftsim.aliases import current_name, current_names
+from rlftsim.atomic_io import cannot_write, write_text, write_whole
+from rlftsim.errors import ConfigError, DataError, whole_number
 from rlftsim.scenario.shards import INDEX_FIELDS, SCHEMA_VERSION, ShardReader, ShardWriter, hash_file
+from rlftsim.scenario.synthetic.pack import pack_path
 from rlftsim.scenario.tfrecord import SkippedRecord
 from rlftsim.scenario.types import Scenario
 
 FORMAT = "rlftsim scenarios"
 MANIFEST, INDEX, INCOMPLETE, SHARDS = "manifest.json", "index.parquet", "INCOMPLETE", "shards"
-DEFAULT_LICENCE_NOTE = "The licence of the source data applies to this data set."
+DEFAULT_LICENSE_NOTE = "The license of the source data applies to this data set."
+SYNTHETIC = "synthetic"
+"""Name of the data set that ships with the package."""
 _MAX_OPEN_SHARDS = 128  # each holds a file descriptor; systems allow 256 to 1024
 INDEX_SCHEMA = pa.schema([*INDEX_FIELDS, pa.field("shard", pa.string()), pa.field("row", pa.int32())])
 
 
 @dataclass(frozen=True)
 class ShardEntry:
-    """What the manifest says about a shard."""
+    """One shard in the manifest."""
 
     file: str
     """Path inside the data set's folder."""
@@ -68,9 +73,9 @@ class Manifest:
     index_sha256: str
     duplicates: tuple[SkippedRecord, ...] = ()
     """Scenarios that are in a shard but not in the index, because an earlier one has the same id."""
-    licence_note: str = DEFAULT_LICENCE_NOTE
+    license_note: str = DEFAULT_LICENSE_NOTE
     provenance: Mapping[str, object] = field(default_factory=dict)
-    """How the data was made, in plain JSON values, e.g. the seed of a generator."""
+    """Origin of the data in plain JSON values, e.g. the seed of a generator or the values a source had to guess."""
     format: str = FORMAT
     schema_version: int = SCHEMA_VERSION
     rlftsim_version: str = rlftsim.__version__
@@ -79,11 +84,11 @@ class Manifest:
 class ScenarioDataset:
     """Scenarios of a data set's folder, by position or by id.
 
-    As long as a scenario is in the cache the same object comes back, so what is derived from it can be cached by
+    As long as a scenario is in the cache the same object comes back, so values derived from it can be cached by
     identity. Can be handed to other processes: each opens the files itself.
 
     Args:
-        folder: the data set.
+        folder: the data set; "synthetic" = the one that ships with the package.
         split: only scenarios of this split, e.g. "training"; None = all.
         cache_size: decoded scenarios kept in memory, the least recently used go first (about 1 MB each).
 
@@ -92,43 +97,73 @@ class ScenarioDataset:
     """
 
     def __init__(self, folder: str | os.PathLike[str], split: str | None = None, *, cache_size: int = 256) -> None:
-        self.folder = Path(folder)
+        self.folder = dataset_folder(folder)
         self.split = split
         self.cache_size = cache_size
         self.manifest = read_manifest(self.folder)
-        self.index = _read_index(self.folder, self.manifest, split)
+        index = load_index(self.folder)
+        if index.schema.names != INDEX_SCHEMA.names or len(index) != self.manifest.num_scenarios:
+            raise DataError(f"{self.folder / INDEX} does not belong to {MANIFEST}: convert again")
+        if split is not None and split not in self.manifest.counts:
+            known = ", ".join(self.manifest.counts) or "none"
+            raise DataError(f"{self.folder} has no split {split!r}, only {known}: name one of these as the split")
+        self.index = index if split is None else index.filter(pc.field("split") == split)
         """Table with the columns of `INDEX_SCHEMA`, one row per scenario, in the order of positions."""
         self.scenario_ids: list[str] = self.index["scenario_id"].to_pylist()
         self._shard_names: list[str] = self.index["shard"].to_pylist()
         self._rows: list[int] = self.index["row"].to_pylist()
         self._position = {scenario_id: i for i, scenario_id in enumerate(self.scenario_ids)}
         self._lock = Lock()
+        # shards are opened on first use and stay open, least recently used ones go
         self._reader = lru_cache(_MAX_OPEN_SHARDS)(lambda name: ShardReader(self.folder / name))
-        self._decoded = lru_cache(cache_size)(self._decode)
+        self._decoded = lru_cache(cache_size)(
+            lambda position: self._reader(self._shard_names[position]).read(self._rows[position])
+        )
 
     def __len__(self) -> int:
         return len(self.scenario_ids)
 
-    def __getitem__(self, position: int) -> Scenario:
-        """Scenario at a position of the index; negative positions count from the end.
+    @overload
+    def __getitem__(self, position: int | str, /) -> Scenario: ...
+    @overload
+    def __getitem__(self, position: slice | Iterable[int], /) -> list[Scenario]: ...
+    def __getitem__(self, position: Any, /) -> Scenario | list[Scenario]:
+        """Scenario at a position of the index, or with a scenario id; a list of them for a slice or several positions.
+
+        Negative positions count from the end.
 
         Raises:
+            ConfigError: neither a whole number nor an id, a slice or several of these.
             IndexError: there is no such position.
-            DataError: its shard is missing or damaged.
+            DataError: there is no such id, or the scenario's shard is missing or damaged.
         """
+        if isinstance(position, str):
+            return self.by_id(position)
+        if isinstance(position, slice):
+            return [self[one] for one in range(len(self))[position]]
+        if isinstance(position, list | tuple) or getattr(position, "ndim", 0) == 1:
+            return [self[one] for one in position]
+        position = whole_number("position of a scenario", position)
         if not -len(self) <= position < len(self):
             raise IndexError(f"position {position} in a data set of {len(self)} scenarios")
-        with self._lock:  # or two threads would get two objects for one scenario
+        # without the lock two threads would get two objects for one scenario
+        with self._lock:
             return self._decoded(position % len(self))
 
     def __iter__(self) -> Iterator[Scenario]:
         return (self[position] for position in range(len(self)))
 
-    def __contains__(self, scenario_id: object) -> bool:
-        return scenario_id in self._position
+    def __contains__(self, scenario: object) -> bool:
+        """True for a scenario of the data set, or its id."""
+        return (scenario.scenario_id if isinstance(scenario, Scenario) else scenario) in self._position
 
     def __reduce__(self) -> tuple[Callable[..., "ScenarioDataset"], tuple[object, ...]]:
-        return _reopen, (self.folder, self.split, self.cache_size)
+        # memory maps, locks and caches stay in their process
+        return partial(ScenarioDataset, cache_size=self.cache_size), (self.folder, self.split)
+
+    def __repr__(self) -> str:
+        split = "" if self.split is None else f", split {self.split!r}"
+        return f"ScenarioDataset({str(self.folder)!r}{split}, {len(self)} scenarios)"
 
     def by_id(self, scenario_id: str) -> Scenario:
         """Scenario with the given id.
@@ -141,9 +176,6 @@ class ScenarioDataset:
             raise DataError(f"{self.folder}{of_split} has no scenario {scenario_id!r}")
         return self[self._position[scenario_id]]
 
-    def _decode(self, position: int) -> Scenario:
-        return self._reader(self._shard_names[position]).read(self._rows[position])
-
 
 class DatasetWriter:
     """Writes a new data set; use it as a context manager.
@@ -153,11 +185,11 @@ class DatasetWriter:
     Args:
         folder: must not exist or be empty.
         scenarios_per_shard: a new shard is begun after so many.
-        licence_note: what the manifest says about the licence of the data.
-        provenance: how the data was made, in plain JSON values.
+        license_note: license of the data, for the manifest.
+        provenance: origin of the data in plain JSON values, for the manifest.
 
     Raises:
-        DataError: the folder is not empty.
+        DataError: the folder is not empty, or cannot be written to.
     """
 
     def __init__(
@@ -165,21 +197,25 @@ class DatasetWriter:
         folder: str | os.PathLike[str],
         *,
         scenarios_per_shard: int = 256,
-        licence_note: str = DEFAULT_LICENCE_NOTE,
+        license_note: str = DEFAULT_LICENSE_NOTE,
         provenance: Mapping[str, object] | None = None,
     ) -> None:
         self.folder = Path(folder)
         if self.folder.exists() and (not self.folder.is_dir() or any(self.folder.iterdir())):
             raise DataError(f"{self.folder} is not an empty folder: choose another one or delete it")
+        # beside the folder, so that renaming it never crosses file systems
         self._temporary = self.folder.absolute().with_name(f".{self.folder.name}.{os.getpid()}.tmp")
         self._scenarios_per_shard = scenarios_per_shard
-        self._licence_note = licence_note
+        self._license_note = license_note
         self._provenance = dict(provenance or {})
         self._entries: list[ShardEntry] = []
         self._ids: set[str] = set()
         self._shard: ShardWriter | None = None
         shutil.rmtree(self._temporary, ignore_errors=True)
-        (self._temporary / SHARDS).mkdir(parents=True)
+        try:
+            (self._temporary / SHARDS).mkdir(parents=True)
+        except OSError as error:
+            raise cannot_write(self.folder, error) from error
 
     def __enter__(self) -> "DatasetWriter":
         return self
@@ -187,16 +223,21 @@ class DatasetWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        if kind is None:
-            self.close()
-        else:
-            self.discard()
+        try:
+            if kind is None:
+                self.close()
+        finally:
+            self.discard()  # after `close` there is nothing left to discard
 
     def add(self, scenario: Scenario, split: str = "unknown") -> None:
         """Append a scenario.
 
+        Args:
+            scenario: one with an id of its own, whose valid states and map points are finite.
+            split: name of its split.
+
         Raises:
-            DataError: there is one with this id already, or it is not as `ShardWriter.add` wants it.
+            DataError: there is one with this id already, or `ShardWriter.add` refuses it.
         """
         if scenario.scenario_id in self._ids:
             raise DataError(f"scenario {scenario.scenario_id} is in the data set already: ids must differ")
@@ -211,15 +252,16 @@ class DatasetWriter:
         """Write index and manifest and give the folder its name."""
         self._finish_shard()
         manifest = write_index_and_manifest(
-            self._temporary, self._entries, licence_note=self._licence_note, provenance=self._provenance
+            self._temporary, self._entries, license_note=self._license_note, provenance=self._provenance
         )
+        # the folder is renamed whole, so nothing ever sees half a data set
         if self.folder.exists():
             self.folder.rmdir()
         os.replace(self._temporary, self.folder)
         return manifest
 
     def discard(self) -> None:
-        """Throw away what was written."""
+        """Throw away everything written so far."""
         if self._shard is not None:
             self._shard.discard()
         shutil.rmtree(self._temporary, ignore_errors=True)
@@ -232,37 +274,55 @@ class DatasetWriter:
 
 
 def write_dataset(
-    scenarios: Iterable[Scenario],
+    scenarios: Scenario | Iterable[Scenario],
     folder: str | os.PathLike[str],
     *,
     split: str | Callable[[Scenario], str] = "unknown",
-    licence_note: str = DEFAULT_LICENCE_NOTE,
+    license_note: str = DEFAULT_LICENSE_NOTE,
     provenance: Mapping[str, object] | None = None,
 ) -> Manifest:
     """Write `scenarios` as a new data set.
 
     Args:
-        scenarios: with different ids; read one at a time.
+        scenarios: one, or several with different ids, which are read one at a time.
         folder: must not exist or be empty; appears when all is written.
-        split: name of the split of all of them, or a function that says it of each.
-        licence_note: what the manifest says about the licence of the data.
-        provenance: how the data was made, in plain JSON values.
+        split: name of the split of all of them, or a function from scenario to split.
+        license_note: license of the data, for the manifest.
+        provenance: origin of the data in plain JSON values, for the manifest.
 
     Returns:
         The manifest written.
 
     Raises:
-        DataError: the folder is not empty, an id occurs twice, an array has another dtype than `types.py` says, or a valid state
-            or map point is not finite.
+        ConfigError: there is no scenario, or something else is among them.
+        DataError: the folder is not empty or cannot be written to, an id occurs twice, an array has another dtype than
+            `types.py` says, or a valid state or map point is not finite (names scenario, agent and step).
     """
-    with DatasetWriter(folder, licence_note=licence_note, provenance=provenance) as writer:
-        for scenario in scenarios:
+    with DatasetWriter(folder, license_note=license_note, provenance=provenance) as writer:
+        is_empty = True
+        for scenario in [scenarios] if isinstance(scenarios, Scenario) else scenarios:
+            is_empty = False
+            if not isinstance(scenario, Scenario):
+                raise ConfigError(f"{type(scenario).__name__}: not a scenario: hand over scenarios to write.")
             writer.add(scenario, split(scenario) if callable(split) else split)
+        if is_empty:
+            raise ConfigError(f"no scenario to write to {folder}: hand over at least one.")
     return read_manifest(folder)
 
 
+def dataset_folder(name: str | os.PathLike[str]) -> Path:
+    """Folder of a data set, "~" expanded; "synthetic" names the one that ships with the package."""
+    return pack_path() if name == SYNTHETIC else Path(name).expanduser()
+
+
 def describe_shard(folder: Path, path: Path, num_rows: int) -> ShardEntry:
-    """Entry of the manifest for a shard of scenarios that were not converted from a file."""
+    """Entry of the manifest for a shard of scenarios that were not converted from a file.
+
+    Args:
+        folder: the data set.
+        path: the shard, inside the folder.
+        num_rows: scenarios in it.
+    """
     return ShardEntry(file=path.relative_to(folder).as_posix(), sha256=hash_file(path), num_rows=num_rows)
 
 
@@ -270,13 +330,26 @@ def write_index_and_manifest(
     folder: Path,
     entries: Iterable[ShardEntry],
     *,
-    licence_note: str = DEFAULT_LICENCE_NOTE,
+    license_note: str = DEFAULT_LICENSE_NOTE,
     provenance: Mapping[str, object] | None = None,
 ) -> Manifest:
     """Write the index of the given shards, then the manifest.
 
     Of scenarios with the same id only the first is in the index.
+
+    Args:
+        folder: the data set.
+        entries: its shards, in any order.
+        license_note: license of the data.
+        provenance: origin of the data in plain JSON values.
+
+    Returns:
+        The manifest written.
+
+    Raises:
+        DataError: a shard is damaged, or the folder cannot be written to.
     """
+    # sorted: the index must not depend on the order in which processes finished
     entries = sorted(entries, key=lambda entry: entry.file)
     table, duplicates = build_index(folder, entries)
     write_whole(folder / INDEX, lambda path: pq.write_table(table, path, compression="zstd"))
@@ -286,7 +359,7 @@ def write_index_and_manifest(
         counts=dict(sorted(Counter(table["split"].to_pylist()).items())),
         index_sha256=hash_file(folder / INDEX),
         duplicates=tuple(duplicates),
-        licence_note=licence_note,
+        license_note=license_note,
         provenance=dict(provenance or {}),
     )
     write_json(folder / MANIFEST, asdict(manifest))
@@ -299,7 +372,7 @@ def read_manifest(folder: str | os.PathLike[str]) -> Manifest:
     Raises:
         DataError: no data set there, an unfinished or damaged one, or one of another schema version.
     """
-    folder = Path(folder)
+    folder = dataset_folder(folder)
     if (folder / INCOMPLETE).exists():
         raise DataError(f"the conversion to {folder} was not finished: run the same convert command again, it goes on")
     return parse_manifest(folder)
@@ -309,11 +382,15 @@ def parse_manifest(folder: Path) -> Manifest:
     """Manifest of a data set as `read_manifest` gives it, even where a conversion is unfinished."""
     try:
         values = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
+        # earlier versions wrote other names, e.g. of the license
+        values = current_names(values) if isinstance(values, dict) else values
     except FileNotFoundError:
-        hint = "tfrecord files have to be converted first" if folder.exists() else "there is no such folder"
-        raise DataError(f"{folder} is no data set, it has no {MANIFEST}: {hint}") from None
+        raise DataError(f"{folder} is no data set: {_missing_manifest_hint(folder)}") from None
+    except NotADirectoryError:
+        raise DataError(f"{folder} is a file: convert it with `rlftsim convert`, then name the new folder") from None
     except (OSError, ValueError) as error:
-        raise DataError(f"{folder / MANIFEST} cannot be read ({error}): convert again") from error
+        cause = error.strerror if isinstance(error, OSError) else "it is not JSON text"
+        raise DataError(f"{folder / MANIFEST} cannot be read ({cause}): convert again") from error
     if not isinstance(values, dict) or values.get("format") != FORMAT:
         raise DataError(f"{folder / MANIFEST} is not the manifest of a data set of scenarios")
     if values.get("schema_version") != SCHEMA_VERSION:
@@ -327,6 +404,19 @@ def parse_manifest(folder: Path) -> Manifest:
         raise DataError(f"{folder / MANIFEST} is damaged ({error}): convert again") from error
 
 
+def _missing_manifest_hint(folder: Path) -> str:
+    """Cause and remedy where a folder has no manifest."""
+    if not folder.exists():
+        near = difflib.get_close_matches(str(folder), [SYNTHETIC], n=1)
+        return "there is no such folder" + (f", did you mean {SYNTHETIC!r}?" if near else "")
+    # also one level down: WOMD has a folder per split
+    has_source = any(next(folder.glob(pattern), None) for pattern in ("*.tfrecord*", "*/*.tfrecord*"))
+    remedy = (
+        "its tfrecord files have to be converted first" if has_source else "name a folder that `rlftsim convert` wrote"
+    )
+    return f"it has no {MANIFEST}; {remedy}, or {SYNTHETIC!r}"
+
+
 def shard_entry_from_json(values: Mapping[str, Any]) -> ShardEntry:
     """Inverse of `asdict` for a shard's entry."""
     skipped = tuple(SkippedRecord(**record) for record in values["skipped"])
@@ -334,19 +424,43 @@ def shard_entry_from_json(values: Mapping[str, Any]) -> ShardEntry:
 
 
 def write_json(path: Path, values: Mapping[str, object]) -> None:
-    """Write plain values as JSON, whole or not at all."""
+    """Write plain values as JSON, whole or not at all.
+
+    Args:
+        path: the file.
+        values: anything that JSON has.
+    """
     write_text(path, json.dumps(values, indent=1, sort_keys=True) + "\n")
 
 
+def load_index(folder: Path) -> pa.Table:
+    """Index file of a data set with the column names of today.
+
+    Raises:
+        DataError: the file is missing or damaged.
+    """
+    try:
+        index = pq.read_table(folder / INDEX)
+    except (OSError, pa.ArrowException) as error:
+        cause = getattr(error, "strerror", None) or "it is not a whole Parquet file"
+        raise DataError(f"{folder / INDEX} cannot be read ({cause}): convert again") from error
+    return index.rename_columns([current_name(name) for name in index.schema.names])
+
+
 def build_index(folder: Path, entries: Iterable[ShardEntry]) -> tuple[pa.Table, list[SkippedRecord]]:
-    """Index of the given shards, read from them, and the scenarios left out because an earlier one has the same id."""
+    """Index of the given shards, read from them, and the scenarios left out because an earlier one has the same id.
+
+    Args:
+        folder: the data set.
+        entries: its shards in the order of the index.
+    """
     tables, duplicates, first_place = [], [], {}
     for entry in entries:
         rows = ShardReader(folder / entry.file).index_rows()
         keep = []
-        for row, (scenario_id, record) in enumerate(
-            zip(*(rows[c].to_pylist() for c in ("scenario_id", "source_record")))
-        ):
+        ids, records = (rows[column].to_pylist() for column in ("scenario_id", "source_record"))
+        for row, (scenario_id, record) in enumerate(zip(ids, records)):
+            # the first of equal ids is indexed; the others stay in their shards, reported as duplicates
             place = f"{entry.source or entry.file} record {row if record is None else record}"
             keep.append(first_place.setdefault(scenario_id, place) == place)
             if not keep[-1]:
@@ -357,21 +471,3 @@ def build_index(folder: Path, entries: Iterable[ShardEntry]) -> tuple[pa.Table, 
         table = table.append_column("row", pa.array(range(len(table)), pa.int32()))
         tables.append(table.filter(pa.array(keep, pa.bool_())))
     return pa.concat_tables([INDEX_SCHEMA.empty_table(), *tables]).combine_chunks(), duplicates
-
-
-def _read_index(folder: Path, manifest: Manifest, split: str | None) -> pa.Table:
-    try:
-        index = pq.read_table(folder / INDEX)
-    except (OSError, pa.ArrowException) as error:
-        raise DataError(f"{folder / INDEX} cannot be read ({error}): convert again") from error
-    if index.schema.names != INDEX_SCHEMA.names or len(index) != manifest.num_scenarios:
-        raise DataError(f"{folder / INDEX} does not belong to {MANIFEST}: convert again")
-    if split is None:
-        return index
-    if split not in manifest.counts:
-        raise DataError(f"{folder} has no split {split!r}, only {', '.join(manifest.counts) or 'none'}")
-    return index.filter(pc.field("split") == split)
-
-
-def _reopen(folder: Path, split: str | None, cache_size: int) -> ScenarioDataset:
-    return ScenarioDataset(folder, split, cache_size=cache_size)

@@ -1,4 +1,4 @@
-"""What is computed from a scenario, remembered for as long as the scenario itself is in memory."""
+"""Values computed from a scenario, cached for as long as the scenario itself is in memory."""
 
 from collections.abc import Callable, Hashable
 from functools import wraps
@@ -11,8 +11,14 @@ Value = TypeVar("Value")
 More = ParamSpec("More")
 
 
-def derived(compute: Callable[Concatenate[Scenario, More], Value]) -> Callable[Concatenate[Scenario, More], Value]:
-    """Decorator: compute once for each scenario (and further, hashable arguments); forget it together with the scenario."""
+def cached_on_scenario(
+    compute: Callable[Concatenate[Scenario, More], Value],
+) -> Callable[Concatenate[Scenario, More], Value]:
+    """Decorator that caches a function of a scenario, and of further hashable arguments, with the scenario.
+
+    The values go when the scenario goes.
+    """
+    # weak keys: the cache must not keep a scenario in memory that its data set has dropped
     known: WeakKeyDictionary[Scenario, dict[Hashable, Value]] = WeakKeyDictionary()
 
     @wraps(compute)

@@ -1,28 +1,14 @@
-"""What the index of a data set says about a scenario: counts and the manoeuvre of the ego."""
+"""A scenario's row in the index of a data set: counts and the maneuver of the ego."""
 
 from dataclasses import dataclass
-from enum import StrEnum
 
 import numpy as np
 
+from rlftsim.scenario.maneuver import Maneuver, maneuver_of_turn
 from rlftsim.scenario.types import CURRENT_STEP, ObjectType, Scenario
 
 _STATIONARY_SPEED_MPS = 2.0
 _STATIONARY_DISTANCE_M = 5.0
-_STRAIGHT_RAD = np.radians(30.0)
-_UTURN_RAD = np.radians(135.0)
-
-
-class Manoeuvre(StrEnum):
-    """What the ego does from the current step to the end of its record."""
-
-    STRAIGHT = "straight"
-    LEFT = "left"
-    RIGHT = "right"
-    UTURN = "uturn"
-    STATIONARY = "stationary"
-    UNKNOWN = "unknown"
-    """The future is withheld, or the ego is not valid in it."""
 
 
 @dataclass(frozen=True)
@@ -40,11 +26,16 @@ class IndexRow:
     num_map_features: int
     num_map_points: int
     num_light_states: int
-    ego_manoeuvre: str
+    ego_maneuver: str
 
 
 def compute_index_row(scenario: Scenario, split: str) -> IndexRow:
-    """Row of `scenario` in the index of a data set."""
+    """Row of a scenario in the index of a data set.
+
+    Args:
+        scenario: its agents are counted at the current step.
+        split: name of its split.
+    """
     agent_types = scenario.tracks.object_type[scenario.simulated_indices]
     count = {kind: int((agent_types == kind).sum()) for kind in ObjectType}
     return IndexRow(
@@ -59,12 +50,12 @@ def compute_index_row(scenario: Scenario, split: str) -> IndexRow:
         num_map_features=len(scenario.map_features),
         num_map_points=len(scenario.map_features.points),
         num_light_states=len(scenario.lights.step),
-        ego_manoeuvre=classify_ego_manoeuvre(scenario).value,
+        ego_maneuver=classify_ego_maneuver(scenario).value,
     )
 
 
-def classify_ego_manoeuvre(scenario: Scenario) -> Manoeuvre:
-    """What the ego's logged track does from the current step to its last valid one.
+def classify_ego_maneuver(scenario: Scenario) -> Maneuver:
+    """Maneuver of the ego's logged track from the current step to its last valid step.
 
     Stationary: never faster than 2 m/s and it ends within 5 m. Else by the change of heading, turned continuously:
     below 30 degrees straight (lane changes too), from 135 degrees a U-turn, in between left (counter-clockwise) or
@@ -73,15 +64,13 @@ def classify_ego_manoeuvre(scenario: Scenario) -> Manoeuvre:
     tracks, ego = scenario.tracks, scenario.ego_index
     steps = CURRENT_STEP + np.flatnonzero(tracks.valid[ego, CURRENT_STEP:])
     if not scenario.has_future or len(steps) < 2:
-        return Manoeuvre.UNKNOWN
+        return Maneuver.UNKNOWN
     distance_m = np.linalg.norm(tracks.position[ego, steps[-1], :2] - tracks.position[ego, steps[0], :2])
+    # both conditions: a slow car in a queue gets away, and a fast one may come back to its start
     top_speed_mps = np.linalg.norm(tracks.velocity[ego, steps], axis=-1).max()
     if top_speed_mps < _STATIONARY_SPEED_MPS and distance_m < _STATIONARY_DISTANCE_M:
-        return Manoeuvre.STATIONARY
+        return Maneuver.STATIONARY
+    # unwrapped, so that a turn through pi counts as the small turn it is
     heading = np.unwrap(tracks.heading[ego, steps].astype(np.float64))
-    turn = heading[-1] - heading[0]
-    if abs(turn) < _STRAIGHT_RAD:
-        return Manoeuvre.STRAIGHT
-    if abs(turn) >= _UTURN_RAD:
-        return Manoeuvre.UTURN
-    return Manoeuvre.LEFT if turn > 0 else Manoeuvre.RIGHT
+    maneuver = maneuver_of_turn(float(heading[-1] - heading[0]))
+    return Maneuver.UTURN if maneuver in (Maneuver.LEFT_UTURN, None) else maneuver

@@ -1,4 +1,4 @@
-"""Is a data set whole and plausible, and what is in it?"""
+"""Checks of a data set (is it whole, is its content plausible) and statistics of its content."""
 
 import os
 from collections import Counter
@@ -8,10 +8,17 @@ from enum import StrEnum
 from pathlib import Path
 
 import numpy as np
-import pyarrow.parquet as pq
 
 from rlftsim.errors import DataError
-from rlftsim.scenario.dataset import INDEX, Manifest, ScenarioDataset, build_index, read_manifest
+from rlftsim.scenario.dataset import (
+    INDEX,
+    Manifest,
+    ScenarioDataset,
+    build_index,
+    dataset_folder,
+    load_index,
+    read_manifest,
+)
 from rlftsim.scenario.shards import ShardReader, hash_file
 from rlftsim.scenario.types import (
     LANE_TYPES,
@@ -38,7 +45,7 @@ class Problem(StrEnum):
 
     @property
     def is_damage(self) -> bool:
-        """True: files are not what was written. False: they are, but the recorded content is doubtful."""
+        """True: files are not as they were written. False: they are, but the logged content is doubtful."""
         return self in (Problem.MISSING_SHARD, Problem.DAMAGED_SHARD, Problem.INDEX_MISMATCH)
 
 
@@ -57,7 +64,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class SpeedStats:
-    """Speeds of valid states of agents of one type, in metres per second."""
+    """Speeds of valid states of agents of one type, in meters per second."""
 
     mean_mps: float
     p95_mps: float
@@ -66,12 +73,12 @@ class SpeedStats:
 
 @dataclass(frozen=True)
 class DatasetStats:
-    """What is in a data set."""
+    """Counts and means over a data set."""
 
     num_scenarios: int
     by_split: Mapping[str, int]
     by_num_steps: Mapping[int, int]
-    by_ego_manoeuvre: Mapping[str, int]
+    by_ego_maneuver: Mapping[str, int]
     agents_by_type: Mapping[str, int]
     """Tracks that are valid at the current step, over all scenarios."""
     mean_agents: float
@@ -88,17 +95,20 @@ class DatasetStats:
 def verify_dataset(folder: str | os.PathLike[str]) -> list[Finding]:
     """Check every shard and every scenario of a data set.
 
-    Damage: shards missing or not as the manifest says, index and manifest that do not belong together. Doubtful
-    content: NaN or infinite states or map points, a lane with two states at a step, consecutive valid positions that imply
-    more than 60 m/s, no lanes or no road edges, nobody to evaluate beside the ego.
+    Damage: shards missing or not as the manifest has them, index and manifest that do not belong together. Doubtful
+    content: NaN or infinite states or map points, a lane with two states at a step, consecutive valid positions that
+    imply more than 60 m/s, no lanes or no road edges, no agent to evaluate beside the ego.
+
+    Args:
+        folder: the data set, or "synthetic".
 
     Returns:
-        What was found, empty if all is well; damage first.
+        The findings, damage first; empty if all is well.
 
     Raises:
         DataError: there is no finished data set in the folder.
     """
-    folder = Path(folder)
+    folder = dataset_folder(folder)
     manifest = read_manifest(folder)
     damage, content, seen = [], [], set()
     for entry in manifest.shards:
@@ -109,7 +119,7 @@ def verify_dataset(folder: str | os.PathLike[str]) -> list[Finding]:
             damage.append(Finding(Problem.DAMAGED_SHARD, entry.file, "its checksum does not match: convert again"))
         else:
             content.extend(_check_shard(path, entry.file, seen))
-    if not damage:
+    if not damage:  # the index is rebuilt from the shards, which takes whole ones
         damage.extend(_check_index(folder, manifest))
     return damage + [f for f in content if f.problem.is_damage] + [f for f in content if not f.problem.is_damage]
 
@@ -120,7 +130,7 @@ def dataset_stats(
     """Summary of a data set or one split of it.
 
     Args:
-        folder: the data set.
+        folder: the data set, or "synthetic".
         split: only this split; None = all.
         max_speed_scenarios: speeds are taken from at most so many scenarios, spread evenly over the index.
 
@@ -134,13 +144,14 @@ def dataset_stats(
         kind: int(sum(index[f"num_{kind}"].to_pylist())) for kind in ("vehicles", "pedestrians", "cyclists", "others")
     }
     positions = np.unique(np.linspace(0, len(dataset) - 1, min(max_speed_scenarios, len(dataset))).astype(int))
+    # a shard holds scenarios of all splits, so the size is that of the whole data set
     total_bytes = sum((dataset.folder / entry.file).stat().st_size for entry in dataset.manifest.shards)
     total_rows = max(sum(entry.num_rows for entry in dataset.manifest.shards), 1)
     return DatasetStats(
         num_scenarios=len(dataset),
         by_split=_count(index["split"].to_pylist()),
         by_num_steps=_count(index["num_steps"].to_pylist()),
-        by_ego_manoeuvre=_count(index["ego_manoeuvre"].to_pylist()),
+        by_ego_maneuver=_count(index["ego_maneuver"].to_pylist()),
         agents_by_type=agents,
         mean_agents=sum(agents.values()) / num_scenarios,
         mean_evaluated=sum(index["num_evaluated"].to_pylist()) / num_scenarios,
@@ -153,15 +164,46 @@ def dataset_stats(
 
 
 def check_scenario(scenario: Scenario) -> Iterator[Finding]:
-    """Doubtful content of one scenario."""
-    for problem, check in _CHECKS.items():
-        detail = check(scenario)
-        if detail is not None:
-            yield Finding(problem, scenario.scenario_id, detail)
+    """Doubtful content of one scenario, at most one finding of each kind."""
+    where, tracks, lights = scenario.scenario_id, scenario.tracks, scenario.lights
+    try:
+        scenario.refuse_not_finite()
+    except DataError as error:
+        yield Finding(Problem.NOT_FINITE, where, str(error))
+
+    # Different states of one lane at one step. Repeated equal observations are no contradiction.
+    observed = np.unique(np.stack([lights.step, lights.lane_id, lights.state], axis=1), axis=0)
+    places, count = np.unique(observed[:, :2], axis=0, return_counts=True)
+    bad = np.flatnonzero(count > 1)
+    if len(bad):
+        step, lane = places[bad[0]]
+        detail = f"lane {lane} has {count[bad[0]]} different states at step {step}{_and_more(len(bad))}"
+        yield Finding(Problem.CONTRADICTORY_LIGHTS, where, detail)
+
+    # Jumps between two valid states that no road user makes.
+    with np.errstate(invalid="ignore"):  # states that are not valid may hold infinities
+        moved = np.diff(tracks.position[..., :2].astype(np.float64), axis=1)  # [O, S-1, 2]
+    both_valid = tracks.valid[:, 1:] & tracks.valid[:, :-1]
+    speed = np.where(both_valid, np.hypot(moved[..., 0], moved[..., 1]), 0.0) / STEP_S  # [O, S-1]
+    bad = np.argwhere(speed > TELEPORT_SPEED_MPS)
+    if len(bad):
+        track, step = bad[0]
+        moves = f"track {tracks.object_id[track]} moves {speed[track, step] * STEP_S:.1f} m"
+        yield Finding(Problem.TELEPORT, where, f"{moves} from step {step} to {step + 1}{_and_more(len(bad))}")
+
+    features = scenario.map_features
+    kinds = (("lanes", LANE_TYPES), ("road edges", ROAD_EDGE_TYPES))
+    missing = [name for name, types in kinds if not len(features.indices_of(types))]
+    if missing:
+        detail = f"no {' and no '.join(missing)}" if len(features.points) else "no map features"
+        yield Finding(Problem.MISSING_MAP, where, detail)
+    if not (scenario.evaluated_indices != scenario.ego_index).any():
+        detail = "no track to predict is valid at the current step, only the ego is evaluated"
+        yield Finding(Problem.NO_EVALUATED_AGENTS, where, detail)
 
 
 def _check_shard(path: Path, name: str, seen: set[str]) -> Iterator[Finding]:
-    """Findings in one shard; scenarios whose id was seen before are in no index and not looked at again."""
+    """Findings in one shard. Scenarios whose id was seen before are in no index and not checked again."""
     try:
         reader = ShardReader(path)
     except DataError as error:
@@ -179,74 +221,16 @@ def _check_shard(path: Path, name: str, seen: set[str]) -> Iterator[Finding]:
 
 
 def _check_index(folder: Path, manifest: Manifest) -> Iterator[Finding]:
+    """Findings in the index: it must be the manifest's, and its rows those of the shards."""
     path = folder / INDEX
     if not path.exists() or hash_file(path) != manifest.index_sha256:
         yield Finding(Problem.INDEX_MISMATCH, INDEX, "it is not the one the manifest was written for: convert again")
         return
     expected, duplicates = build_index(folder, manifest.shards)
-    if not pq.read_table(path).equals(expected):
+    if not load_index(folder).equals(expected):
         yield Finding(Problem.INDEX_MISMATCH, INDEX, "its rows are not those of the shards: convert again")
     if expected.num_rows != manifest.num_scenarios or tuple(duplicates) != manifest.duplicates:
         yield Finding(Problem.INDEX_MISMATCH, INDEX, "the manifest's counts are not those of the shards: convert again")
-
-
-def _describe_contradictory_lights(scenario: Scenario) -> str | None:
-    lights = scenario.lights
-    observed = np.unique(np.stack([lights.step, lights.lane_id, lights.state], axis=1), axis=0)
-    places, count = np.unique(observed[:, :2], axis=0, return_counts=True)
-    bad = np.flatnonzero(count > 1)
-    if not len(bad):
-        return None
-    step, lane = places[bad[0]]
-    return f"lane {lane} has {count[bad[0]]} different states at step {step}{_and_more(len(bad))}"
-
-
-def _describe_teleport(scenario: Scenario) -> str | None:
-    tracks = scenario.tracks
-    moved = np.diff(tracks.position[..., :2].astype(np.float64), axis=1)
-    speed = np.where(tracks.valid[:, 1:] & tracks.valid[:, :-1], np.hypot(moved[..., 0], moved[..., 1]), 0.0) / STEP_S
-    bad = np.argwhere(speed > TELEPORT_SPEED_MPS)
-    if not len(bad):
-        return None
-    track, step = bad[0]
-    distance_m = speed[track, step] * STEP_S
-    return (
-        f"track {tracks.object_id[track]} moves {distance_m:.1f} m from step {step} to {step + 1}{_and_more(len(bad))}"
-    )
-
-
-def _describe_missing_map(scenario: Scenario) -> str | None:
-    features = scenario.map_features
-    if not len(features.points):
-        return "no map features"
-    missing = [
-        name
-        for name, types in (("lanes", LANE_TYPES), ("road edges", ROAD_EDGE_TYPES))
-        if not len(features.indices_of(types))
-    ]
-    return f"no {' and no '.join(missing)}" if missing else None
-
-
-def _describe_not_finite(scenario: Scenario) -> str | None:
-    try:
-        scenario.refuse_not_finite()
-    except DataError as error:
-        return str(error)
-    return None
-
-
-def _describe_nobody_to_evaluate(scenario: Scenario) -> str | None:
-    others = scenario.evaluated_indices[scenario.evaluated_indices != scenario.ego_index]
-    return None if len(others) else "no track to predict is valid at the current step, only the ego is evaluated"
-
-
-_CHECKS = {
-    Problem.NOT_FINITE: _describe_not_finite,
-    Problem.CONTRADICTORY_LIGHTS: _describe_contradictory_lights,
-    Problem.TELEPORT: _describe_teleport,
-    Problem.MISSING_MAP: _describe_missing_map,
-    Problem.NO_EVALUATED_AGENTS: _describe_nobody_to_evaluate,
-}
 
 
 def _and_more(count: int) -> str:
@@ -258,6 +242,7 @@ def _count(values: list) -> dict:
 
 
 def _compute_speeds(dataset: ScenarioDataset, positions: np.ndarray) -> dict[str, SpeedStats]:
+    """Speeds by type of agent, over the scenarios at some positions of a data set."""
     by_type: dict[ObjectType, list[np.ndarray]] = {kind: [] for kind in ObjectType}
     for position in positions:
         scenario = dataset[int(position)]

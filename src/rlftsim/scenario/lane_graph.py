@@ -1,7 +1,8 @@
-"""Lanes of a map as a graph that one can drive on: centre lines, what follows what, what lies where. Frame: world, metres.
+"""Lanes of a map as a graph to drive on: center lines and the links between them. Frame: world, meters.
 
-What follows what is read off the geometry: a lane goes on where another begins. Records list it, too, but many sources lose the lists;
-where a record has them, this finds 99.7 % of their entries (25 000 of real maps), and what it finds beyond is joined without a gap.
+Successors follow from the geometry: a lane goes on where another begins. Logs list successors, too, but many sources
+lose the lists. Where a log has them, the geometry gives 99.7 % of their entries (of 25 000 on real maps), and the links
+it gives beyond them are joined without a gap.
 """
 
 from dataclasses import dataclass
@@ -10,15 +11,17 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from rlftsim.geometry import wrapped
-from rlftsim.scenario.derived import derived
+from rlftsim.scenario.derived import cached_on_scenario
 from rlftsim.scenario.types import LANE_TYPES, Scenario
 
 JOINT_M = 1.2
-"""At most this far lies the start of a lane from the end of the one before it."""
+"""Largest gap between the end of a lane and the start of the next."""
 JOINT_RAD = np.radians(40.0)
+"""Largest bend between the end of a lane and the start of the next."""
 REPEATED_M = 0.01
+"""Points at most this far from the one before count as repeated."""
 TANGENT_POINTS = 4
-"""Directions at the ends of a lane are taken over so many points."""
+"""Number of segments over which the direction at the end of a lane is taken."""
 MPS_PER_MPH = 0.44704
 
 
@@ -33,7 +36,7 @@ class LaneGraph:
     speed_limit_mps: Float[np.ndarray, "n"]
     """0 = unknown."""
     lines: tuple[Float[np.ndarray, "_ 3"], ...]
-    """Centre lines without repeated points."""
+    """Center lines without repeated points."""
     successors: tuple[tuple[int, ...], ...]
     """Indices of the lanes that a lane goes on into."""
     points: Float[np.ndarray, "P 3"]
@@ -49,19 +52,28 @@ class LaneGraph:
         return len(self.lane_id)
 
 
-@derived
+@cached_on_scenario
 def lane_graph(scenario: Scenario) -> LaneGraph:
     """The lanes of a scenario's map; without lanes an empty graph."""
     features = scenario.map_features
     limits = features.topology.speed_limit_mph
-    kept, lines = [], []
+    kept, lines, headings = [], [], []
     for index in features.indices_of(LANE_TYPES):
-        line = _without_repeats(features.polyline(index).astype(np.float64))
+        line = features.polyline(index).astype(np.float64)
+        line = line[np.isfinite(line).all(1)]
         if len(line) >= 2:
-            kept.append(int(index))
-            lines.append(line)
+            # repeated points have no direction between them
+            step = np.linalg.norm(np.diff(line[:, :2], axis=0), axis=1)
+            line = line[np.append(True, step > REPEATED_M)]
+        if len(line) < 2:
+            continue
+        # direction at each point: from the point before to the point after
+        ahead, behind = np.append(line[1:], line[-1:], 0), np.append(line[:1], line[:-1], 0)
+        x, y = (ahead - behind)[:, :2].T
+        kept.append(int(index))
+        lines.append(line)
+        headings.append(np.arctan2(y, x))
     counts = np.array([len(line) for line in lines], np.int64)
-    headings = [_headings(line) for line in lines]
     return LaneGraph(
         lane_id=features.feature_id[kept],
         lane_type=features.feature_type[kept].astype(np.int64),
@@ -75,37 +87,23 @@ def lane_graph(scenario: Scenario) -> LaneGraph:
     )
 
 
-def _without_repeats(line: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
-    """The finite points that lie apart from the one before them."""
-    line = line[np.isfinite(line).all(1)]
-    if len(line) < 2:
-        return line
-    step = np.linalg.norm(np.diff(line[:, :2], axis=0), axis=1)
-    return line[np.append(True, step > REPEATED_M)]
-
-
-def _headings(line: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-    """Direction at each point: from the point before to the point after."""
-    ahead, behind = np.append(line[1:], line[-1:], 0), np.append(line[:1], line[:-1], 0)
-    x, y = (ahead - behind)[:, :2].T
-    return np.arctan2(y, x)
-
-
 def _successors(lines: list[Float[np.ndarray, "_ 3"]]) -> tuple[tuple[int, ...], ...]:
-    """For each line those that begin where it ends, in nearly the same direction."""
+    """Indices of the lines that begin where a line ends, in nearly the same direction, for each line."""
     if not lines:
         return ()
+    # [n, 3] each
     starts, ends = np.stack([line[0] for line in lines]), np.stack([line[-1] for line in lines])
     into = _directions([line[: TANGENT_POINTS + 1] for line in lines])
     out_of = _directions([line[-TANGENT_POINTS - 1 :] for line in lines])
+    # [n, n]: row = the lane that ends, column = the one that begins
     gap = np.linalg.norm(ends[:, None] - starts[None], axis=-1)
     bend = np.abs(wrapped(into[None] - out_of[:, None]))
     joined = (gap <= JOINT_M) & (bend <= JOINT_RAD)
-    np.fill_diagonal(joined, False)
+    np.fill_diagonal(joined, False)  # a closed loop does not follow itself
     return tuple(tuple(np.flatnonzero(row).tolist()) for row in joined)
 
 
 def _directions(pieces: list[Float[np.ndarray, "_ 3"]]) -> Float[np.ndarray, "n"]:
-    """From the first to the last point of each piece."""
+    """Direction from the first to the last point of each piece, rad."""
     ways = np.stack([piece[-1] - piece[0] for piece in pieces])
     return np.arctan2(ways[:, 1], ways[:, 0])

@@ -7,6 +7,7 @@ over its encoded arrays that is checked whenever the row is read.
 import hashlib
 import os
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,8 @@ import google_crc32c
 import numpy as np
 import pyarrow as pa
 
+from rlftsim.aliases import current_name
+from rlftsim.atomic_io import cannot_write
 from rlftsim.errors import DataError
 from rlftsim.scenario.codec import decode_array, encode_array
 from rlftsim.scenario.index_row import IndexRow, compute_index_row
@@ -86,48 +89,89 @@ class ShardWriter:
 
     Args:
         path: the shard. An existing one is replaced on `close`.
+
+    Raises:
+        DataError: the file cannot be written.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
         self.num_rows = 0
-        self.path.parent.mkdir(parents=True, exist_ok=True)
         self._temporary = self.path.with_name(f"{self.path.name}.{os.getpid()}.tmp")
-        self._file = open(self._temporary, "wb")  # noqa: SIM115 (closed by close and discard)
-        self._writer = pa.ipc.new_file(self._file, _SCHEMA)
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = open(self._temporary, "wb")  # noqa: SIM115 (closed by close and discard)
+            self._writer = pa.ipc.new_file(self._file, _SCHEMA)
+        except OSError as error:
+            raise cannot_write(self.path, error) from error
         self._pending: list[dict[str, object]] = []
 
     def add(self, scenario: Scenario, split: str, source_record: int | None = None) -> None:
         """Append a scenario.
 
+        Args:
+            scenario: one whose valid states and map points are finite.
+            split: name of its split.
+            source_record: number of its record in the file it was converted from; None if there is none.
+
         Raises:
-            DataError: an array of the scenario has another dtype than `types.py` says, or a valid state or map point is not
-                finite.
+            DataError: an array of the scenario has another dtype than `types.py` declares, a valid state or map point
+                is not finite, or the file cannot be written (a full disk, say).
         """
-        row = _row_of(scenario, split, source_record)
+        arrays = _to_arrays(scenario)
+        for name, dtype in _ARRAY_DTYPES.items():
+            array = arrays[name]
+            if array is not None and array.dtype != dtype:
+                raise DataError(f"scenario {scenario.scenario_id}: {name} is {array.dtype}, it must be {dtype}")
+        try:
+            scenario.refuse_not_finite()
+        except DataError as error:
+            raise DataError(f"scenario {scenario.scenario_id}: {error}") from None
+        # every array by itself: each gets the encoding that suits its values
+        encoded = {name: None if array is None else encode_array(array) for name, array in arrays.items()}
+        row = {
+            **asdict(compute_index_row(scenario, split)),
+            "source_record": source_record,
+            "ego_index": scenario.ego_index,
+            "checksum": _checksum(encoded),
+            **encoded,
+        }
         self._pending.append(row)
         self.num_rows += 1
         if len(self._pending) == _ROWS_PER_BATCH:
             self._flush()
 
     def close(self) -> None:
-        """Finish the shard: only now does it appear under its name."""
+        """Finish the shard: only now does it appear under its name.
+
+        Raises:
+            DataError: the file cannot be written.
+        """
         self._flush()
-        self._writer.close()
-        self._file.flush()
-        os.fsync(self._file.fileno())
-        self._file.close()
-        os.replace(self._temporary, self.path)
+        try:
+            self._writer.close()
+            self._file.flush()
+            # on disk before the name is: after a power cut a file under its own name is still whole
+            os.fsync(self._file.fileno())
+            self._file.close()
+            os.replace(self._temporary, self.path)
+        except OSError as error:
+            raise cannot_write(self.path, error) from error
 
     def discard(self) -> None:
-        """Throw away what was written."""
-        self._file.close()
+        """Throw away everything written so far."""
+        with suppress(OSError):  # on a full disk closing fails too, because it flushes
+            self._file.close()
         self._temporary.unlink(missing_ok=True)
 
     def _flush(self) -> None:
-        if self._pending:
+        if not self._pending:
+            return
+        try:
             self._writer.write_batch(pa.RecordBatch.from_pylist(self._pending, schema=_SCHEMA))
-            self._pending = []
+        except OSError as error:
+            raise cannot_write(self.path, error) from error
+        self._pending = []
 
 
 class ShardReader:
@@ -143,9 +187,11 @@ class ShardReader:
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
         try:
-            self._table = pa.ipc.open_file(pa.memory_map(str(path))).read_all()
+            # memory-mapped: "reading all" touches no page of the columns yet
+            table = pa.ipc.open_file(pa.memory_map(str(path))).read_all()
+            self._table = table.rename_columns([current_name(name) for name in table.schema.names])
         except (OSError, pa.ArrowException) as error:
-            cause = "is missing" if not self.path.exists() else f"is damaged ({error})"
+            cause = "is damaged" if self.path.exists() else "is missing"
             raise DataError(f"shard {self.path} {cause}: {_WAY_OUT}") from error
         earlier = [name for name in _SCHEMA.names if name not in _ADDED_LATER]
         if self._table.schema.names not in (_SCHEMA.names, earlier):
@@ -160,7 +206,7 @@ class ShardReader:
         try:
             columns = {name: self._table[name].to_pylist() for name in [*names, "source_record"]}
         except (OSError, UnicodeDecodeError, pa.ArrowException) as error:
-            raise DataError(f"shard {self.path} is damaged ({error}): {_WAY_OUT}") from error
+            raise DataError(f"shard {self.path} is damaged: {_WAY_OUT}") from error
         return pa.table(columns, schema=pa.schema([*INDEX_FIELDS, pa.field("source_record", pa.int32())]))
 
     def read(self, row: int) -> Scenario:
@@ -169,22 +215,21 @@ class ShardReader:
         Raises:
             DataError: the row is damaged.
         """
+        known = self._table.schema.names
         try:
-            encoded = self._encoded(row)
+            encoded = {name: self._table[name][row].as_buffer() if name in known else None for name in _ARRAY_DTYPES}
+            # the checksum first: nothing of a damaged row is decoded
             if _checksum(encoded) != self._table["checksum"][row].as_py():
                 raise ValueError("its checksum does not match")
-            # None only where `types.py` allows it: the checksum has just been found right
+            # None only where `types.py` allows it, which the checksum has just confirmed
             arrays: dict[str, Any] = {
                 name: None if data is None else decode_array(data) for name, data in encoded.items()
             }
             scenario_id = self._table["scenario_id"][row].as_py()
             return _from_arrays(scenario_id, self._table["ego_index"][row].as_py(), arrays)
         except (ValueError, OSError, pa.ArrowException) as error:
-            raise DataError(f"shard {self.path}: row {row} is damaged ({error}): {_WAY_OUT}") from error
-
-    def _encoded(self, row: int) -> dict[str, pa.Buffer | None]:
-        known = self._table.schema.names
-        return {name: self._table[name][row].as_buffer() if name in known else None for name in _ARRAY_DTYPES}
+            cause = "it cannot be read" if isinstance(error, OSError | pa.ArrowException) else error
+            raise DataError(f"shard {self.path}: row {row} is damaged ({cause}): {_WAY_OUT}") from error
 
 
 _WAY_OUT = "delete the file and run the conversion or generation that made it again"
@@ -196,27 +241,8 @@ def hash_file(path: str | os.PathLike[str]) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _row_of(scenario: Scenario, split: str, source_record: int | None) -> dict[str, object]:
-    arrays = _to_arrays(scenario)
-    for name, dtype in _ARRAY_DTYPES.items():
-        array = arrays[name]
-        if array is not None and array.dtype != dtype:
-            raise DataError(f"scenario {scenario.scenario_id}: {name} is {array.dtype}, it must be {dtype}")
-    try:
-        scenario.refuse_not_finite()
-    except DataError as error:
-        raise DataError(f"scenario {scenario.scenario_id}: {error}") from None
-    encoded = {name: None if array is None else encode_array(array) for name, array in arrays.items()}
-    return {
-        **asdict(compute_index_row(scenario, split)),
-        "source_record": source_record,
-        "ego_index": scenario.ego_index,
-        "checksum": _checksum(encoded),
-        **encoded,
-    }
-
-
 def _checksum(encoded: Mapping[str, bytes | pa.Buffer | None]) -> int:
+    """CRC-32C of all encoded arrays one after another, without those that a scenario lacks."""
     crc = 0
     for data in encoded.values():
         if data is not None:
@@ -225,7 +251,11 @@ def _checksum(encoded: Mapping[str, bytes | pa.Buffer | None]) -> int:
 
 
 def _to_arrays(scenario: Scenario) -> dict[str, np.ndarray | None]:
-    """Arrays in the order of the columns, alike along their last axis; tables are transposed."""
+    """Arrays of a scenario in the order of the columns.
+
+    The codec uses that neighbors along the last axis are alike. So components of vectors are columns of their own, and
+    tables [rows, columns] are transposed, because a column's entries resemble each other.
+    """
     tracks, features, lights = scenario.tracks, scenario.map_features, scenario.lights
     topology, rest = features.topology, features.polygon_rest
     return {
@@ -269,10 +299,12 @@ def _to_arrays(scenario: Scenario) -> dict[str, np.ndarray | None]:
 
 
 def _from_arrays(scenario_id: str, ego_index: int, arrays: Mapping[str, np.ndarray]) -> Scenario:
-    def vector(name: str, components: str) -> np.ndarray:
+    """Inverse of `_to_arrays`."""
+
+    def _vector(name: str, components: str) -> np.ndarray:
         return np.stack([arrays[f"{name}.{component}"] for component in components.split()], axis=-1)
 
-    def table(name: str) -> np.ndarray:
+    def _table(name: str) -> np.ndarray:
         return np.ascontiguousarray(arrays[f"topology.{name}"].T)
 
     return Scenario(
@@ -281,24 +313,24 @@ def _from_arrays(scenario_id: str, ego_index: int, arrays: Mapping[str, np.ndarr
         tracks=Tracks(
             object_id=arrays["tracks.object_id"],
             object_type=arrays["tracks.object_type"],
-            position=vector("tracks.position", "x y z"),
+            position=_vector("tracks.position", "x y z"),
             heading=arrays["tracks.heading"],
-            velocity=vector("tracks.velocity", "x y"),
-            size=vector("tracks.size", "length width height"),
+            velocity=_vector("tracks.velocity", "x y"),
+            size=_vector("tracks.size", "length width height"),
             valid=arrays["tracks.valid"],
         ),
         map_features=MapFeatures(
             feature_id=arrays["map.feature_id"],
             feature_type=arrays["map.feature_type"],
-            points=vector("map.points", "x y z"),
+            points=_vector("map.points", "x y z"),
             offsets=arrays["map.offsets"],
-            polygon_rest=None if arrays["map.polygon_rest.x"] is None else vector("map.polygon_rest", "x y z"),
+            polygon_rest=None if arrays["map.polygon_rest.x"] is None else _vector("map.polygon_rest", "x y z"),
             topology=LaneTopology(
-                entry_lanes=table("entry_lanes"),
-                exit_lanes=table("exit_lanes"),
-                neighbors=table("neighbors"),
-                boundaries=table("boundaries"),
-                stop_sign_lanes=table("stop_sign_lanes"),
+                entry_lanes=_table("entry_lanes"),
+                exit_lanes=_table("exit_lanes"),
+                neighbors=_table("neighbors"),
+                boundaries=_table("boundaries"),
+                stop_sign_lanes=_table("stop_sign_lanes"),
                 speed_limit_mph=arrays["topology.speed_limit_mph"],
                 interpolating=arrays["topology.interpolating"],
             ),
@@ -307,7 +339,7 @@ def _from_arrays(scenario_id: str, ego_index: int, arrays: Mapping[str, np.ndarr
             step=arrays["lights.step"],
             lane_id=arrays["lights.lane_id"],
             state=arrays["lights.state"],
-            stop_point=vector("lights.stop_point", "x y z"),
+            stop_point=_vector("lights.stop_point", "x y z"),
         ),
         ego_index=ego_index,
         tracks_to_predict=arrays["tracks_to_predict"],

@@ -2,8 +2,8 @@
 
     uint64 length | uint32 crc(length) | length bytes | uint32 crc(bytes)        little-endian, crc = masked crc32c
 
-A damaged checksum of the bytes costs one record. A damaged length costs the rest of the file, because only the length
-says where the next record starts.
+A damaged checksum of the bytes costs one record. A damaged length costs the rest of the file, because the start of the
+next record follows from it alone.
 """
 
 import logging
@@ -23,7 +23,7 @@ OnError = Literal["stop", "skip"]
 _HEADER = struct.Struct("<QI")
 _FOOTER = struct.Struct("<I")
 RECORD_OVERHEAD_BYTES = _HEADER.size + _FOOTER.size
-"""What a record takes in the file beside its own bytes."""
+"""Bytes of a record in the file beside its own."""
 _MASK_DELTA = 0xA282EAD8
 _GZIP_MAGIC = b"\x1f\x8b"
 
@@ -42,18 +42,23 @@ class SkippedRecord:
 
 
 def log_skipped(skipped: SkippedRecord) -> None:
-    """Say what was skipped as a warning of the logger `rlftsim`."""
+    """Log a skipped record as a warning of the logger `rlftsim`."""
     logging.getLogger("rlftsim").warning("skipped %s", skipped)
 
 
 def masked_crc32c(data: bytes) -> int:
     """Checksum of `data` as TFRecord files store it, in [0, 2**32)."""
+    # rotated and shifted, so that the checksum of data that holds its own checksum is not degenerate
     crc = google_crc32c.value(data)
     return (((crc >> 15) | (crc << 17)) + _MASK_DELTA) & 0xFFFFFFFF
 
 
 def write_records(path: str | os.PathLike[str], records: Iterable[bytes]) -> int:
-    """Write `records` as a TFRecord file, replacing what was there.
+    """Write a TFRecord file, replacing an existing one.
+
+    Args:
+        path: the file.
+        records: bytes of each record.
 
     Returns:
         Number of records written.
@@ -91,6 +96,7 @@ def read_records(
     except OSError as error:
         raise DataError(f"{path}: cannot be opened: {error.strerror}") from error
     with file:
+        # an empty file enters the loop once, to be reported
         size = os.fstat(file.fileno()).st_size
         record = 0
         while file.tell() < size or size == 0:
@@ -108,35 +114,27 @@ def read_records(
 
 
 def _read_one(file: BinaryIO, size: int, record: int) -> tuple[bytes | None, str | None]:
-    """Next record and what is wrong with it; no bytes = the rest of the file cannot be read."""
-    start = file.tell()
+    """Next record and its damage, None where it is sound; no bytes = the rest of the file cannot be read."""
+    bytes_left = size - file.tell()
     header = file.read(_HEADER.size)
-    damage = _header_damage(header, size - start, record)
-    if damage is not None:
-        return None, damage
-    length = _HEADER.unpack(header)[0]
+    if bytes_left == 0:
+        return None, "the file is empty"
+    if record == 0 and header.startswith(_GZIP_MAGIC):
+        return None, "not a TFRecord file but a gzip-compressed one: unpack it with gunzip first"
+    if len(header) < _HEADER.size:
+        too_short = "not a TFRecord file: too short"
+        return None, too_short if record == 0 else "truncated: the file ends inside the record's header"
+    # the length is trusted only with its own checksum: a wrong one would be read as gigabytes
+    length, crc = _HEADER.unpack(header)
+    if crc != masked_crc32c(header[:8]):
+        if record == 0:
+            return None, "not a TFRecord file, or damaged at its start: the checksum of the first length does not match"
+        return None, "damaged: the checksum of its length does not match; the rest of the file is lost"
+    needed = _HEADER.size + length + _FOOTER.size
+    if needed > bytes_left:
+        return None, f"truncated: the record needs {needed} bytes, the file has {bytes_left} left"
     data = file.read(length)
     (crc,) = _FOOTER.unpack(file.read(_FOOTER.size))
     if crc != masked_crc32c(data):
         return data, f"damaged: the checksum of its {length} bytes does not match"
     return data, None
-
-
-def _header_damage(header: bytes, bytes_left: int, record: int) -> str | None:
-    if bytes_left == 0:
-        return "the file is empty"
-    if record == 0 and header.startswith(_GZIP_MAGIC):
-        return "not a TFRecord file but a gzip-compressed one: unpack it with gunzip first"
-    if len(header) < _HEADER.size:
-        return (
-            "not a TFRecord file: too short" if record == 0 else "truncated: the file ends inside the record's header"
-        )
-    length, crc = _HEADER.unpack(header)
-    if crc != masked_crc32c(header[:8]):
-        if record == 0:
-            return "not a TFRecord file, or damaged at its start: the checksum of the first length does not match"
-        return "damaged: the checksum of its length does not match; the rest of the file is lost"
-    needed = _HEADER.size + length + _FOOTER.size
-    if needed > bytes_left:
-        return f"truncated: the record needs {needed} bytes, the file has {bytes_left} left"
-    return None

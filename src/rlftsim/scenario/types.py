@@ -1,12 +1,15 @@
-"""One recorded traffic scenario: tracks, map, lights.
+"""One logged traffic scenario: tracks, map, lights.
 
-Units: metres, seconds, radians, metres per second. Headings are counter-clockwise from +x. Frame: the *world* frame of the
-record. Coordinates are float32 from reading on, because the official evaluator and the public SMART code round them so before
-they do anything else (but for one thing: `MapFeatures.polygon_rest`); `Scenario.origin` is in whole metres, so that subtracting it is exact.
+Units: meters, seconds, radians, meters per second. Headings are counter-clockwise from +x. Frame: the *world* frame of
+the log. Coordinates are float32 from reading on, because the official evaluator and the public SMART code round them
+before they do anything else. The one exception is `MapFeatures.polygon_rest`. `Scenario.origin` is in whole meters, so
+that subtracting it is exact.
 
-Shapes: O objects, S steps at 10 Hz (91; 11 in a test split), F map features, P map points, K light states. Nothing here needs torch.
+Shapes: O objects, S steps at 10 Hz (91; 11 in a test split), F map features, P map points, K light states. Nothing here
+needs torch.
 """
 
+import importlib
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from enum import IntEnum
@@ -80,12 +83,15 @@ class LightState(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """Recorded objects in file order. Where `valid` is False the other fields hold what the record stored (the metric reads some of it)."""
+    """Logged objects in file order.
+
+    Where `valid` is False the other fields hold the values of the log, because the metric reads some of them.
+    """
 
     object_id: Int64[np.ndarray, "O"]
     object_type: Int8[np.ndarray, "O"]
     position: Float32[np.ndarray, "O S 3"]
-    """Centre of the box, world frame."""
+    """Center of the box, world frame."""
     heading: Float32[np.ndarray, "O S"]
     velocity: Float32[np.ndarray, "O S 2"]
     size: Float32[np.ndarray, "O S 3"]
@@ -99,14 +105,14 @@ def _no_rows(columns: int) -> Int64[np.ndarray, "0 columns"]:
 
 @dataclass(frozen=True, eq=False)
 class LaneTopology:
-    """How lanes hang together; every row starts with a lane's feature id, rows are in file order. Empty where a source lacks it."""
+    """Links between lanes; rows start with a lane's feature id and are in file order. Empty where a source has none."""
 
     entry_lanes: Int64[np.ndarray, "n_entry 2"] = field(default_factory=lambda: _no_rows(2))
     """lane, lane before it."""
     exit_lanes: Int64[np.ndarray, "n_exit 2"] = field(default_factory=lambda: _no_rows(2))
     """lane, lane after it."""
     neighbors: Int64[np.ndarray, "n_neighbor 7"] = field(default_factory=lambda: _no_rows(7))
-    """lane, side (0 left, 1 right), neighbour's feature id, own start and end index, neighbour's start and end index."""
+    """lane, side (0 left, 1 right), neighbor's feature id, own start and end index, neighbor's start and end index."""
     boundaries: Int64[np.ndarray, "n_boundary 6"] = field(default_factory=lambda: _no_rows(6))
     """lane, side (0 left, 1 right), boundary's feature id, own start and end index, road line type as in WOMD."""
     stop_sign_lanes: Int64[np.ndarray, "n_stop 2"] = field(default_factory=lambda: _no_rows(2))
@@ -127,8 +133,11 @@ class MapFeatures:
     offsets: Int64[np.ndarray, "F+1"]
     topology: LaneTopology = field(default_factory=LaneTopology)
     polygon_rest: Float32[np.ndarray, "P 3"] | None = None
-    """What float32 took from the points of crosswalks, bumps and driveways, zero elsewhere: the public SMART code cuts these in double
-    precision. None where a source has float32 alone, or the points have been moved."""
+    """Rounding error of the points of crosswalks, bumps and driveways, zero elsewhere: double precision minus float32.
+
+    The public SMART code cuts these polygons in double precision. None where a source has float32 alone, or the points
+    have been moved.
+    """
 
     def __len__(self) -> int:
         return len(self.feature_id)
@@ -138,7 +147,7 @@ class MapFeatures:
         return self.points[self.offsets[index] : self.offsets[index + 1]]
 
     def polygon(self, index: int | np.integer) -> Float64[np.ndarray, "n 3"]:
-        """Points of a crosswalk, bump or driveway, world frame, as precise as they are known."""
+        """Points of a crosswalk, bump or driveway, world frame, in the precision of the source."""
         polygon = self.polyline(index).astype(np.float64)
         own = slice(self.offsets[index], self.offsets[index + 1])
         return polygon if self.polygon_rest is None else polygon + self.polygon_rest[own]
@@ -150,7 +159,7 @@ class MapFeatures:
 
 @dataclass(frozen=True, eq=False)
 class LightStates:
-    """Traffic light observations, one row each, ordered by step and as listed in the record (a lane may be listed twice)."""
+    """Traffic light observations, one row each, by step, then in the log's order (a lane may occur twice)."""
 
     step: Int32[np.ndarray, "K"]
     lane_id: Int64[np.ndarray, "K"]
@@ -160,7 +169,7 @@ class LightStates:
 
 @dataclass(frozen=True, eq=False)
 class Scenario:
-    """One recorded scenario. Compared and hashed by identity, so that what is derived from it can be cached."""
+    """One logged scenario. Compared and hashed by identity, so that values derived from it can be cached."""
 
     scenario_id: str
     timestamps_s: Float[np.ndarray, "S"]
@@ -168,7 +177,7 @@ class Scenario:
     map_features: MapFeatures
     lights: LightStates
     ego_index: int
-    """Index of the recording vehicle in `tracks`."""
+    """Index of the logging vehicle in `tracks`."""
     tracks_to_predict: Int32[np.ndarray, "n"]
     """Track indices, in file order."""
     difficulty: Int8[np.ndarray, "n"]
@@ -176,29 +185,35 @@ class Scenario:
     """Object ids."""
 
     def refuse_not_finite(self) -> None:
-        """Look at every valid state and every map point.
+        """Check every valid state and every map point.
 
         Raises:
-            DataError: one holds a NaN or an infinite number: says which.
+            DataError: one holds a NaN or an infinite number. Names track, step and field, or map feature and point.
         """
         tracks = self.tracks
-        kinds = {
+        fields = {
             "position": tracks.position,
-            "size, heading or velocity": np.concatenate([tracks.size, tracks.heading[..., None], tracks.velocity], -1),
+            "heading": tracks.heading[..., None],
+            "velocity": tracks.velocity,
+            "size": tracks.size,
         }
-        for kind, values in kinds.items():
-            bad = np.argwhere(tracks.valid & ~np.isfinite(values).all(-1))
+        for name, values in fields.items():
+            bad = np.argwhere(tracks.valid & ~np.isfinite(values).all(-1))  # [n, 2] rows of (track, step)
             if len(bad):
                 track, step = bad[0]
                 raise DataError(
-                    f"track {tracks.object_id[track]} has a NaN or infinite {kind} at step {step}, where it is marked valid"
+                    f"track {tracks.object_id[track]} has a NaN or infinite {name} at step {step}, where it is marked "
+                    "valid: correct the value or mark the state as not valid"
                 )
         lines = self.map_features
         bad_points = np.flatnonzero(~np.isfinite(lines.points).all(1))
         if len(bad_points):
             owner = np.searchsorted(lines.offsets, bad_points[0], side="right") - 1
             place = bad_points[0] - lines.offsets[owner]
-            raise DataError(f"map feature {lines.feature_id[owner]} has a NaN or infinite point (its point {place})")
+            raise DataError(
+                f"map feature {lines.feature_id[owner]} has a NaN or infinite point (its point {place}): "
+                "correct it or leave the feature out"
+            )
 
     @property
     def num_steps(self) -> int:
@@ -207,44 +222,59 @@ class Scenario:
 
     @property
     def has_future(self) -> bool:
-        """Whether the 80 future steps are recorded."""
+        """True where the log has the 80 future steps."""
         return self.num_steps >= TOTAL_STEPS
 
     @cached_property
     def simulated_indices(self) -> Int64[np.ndarray, "A"]:
-        """Tracks that are simulated: those valid at the current step, in track order."""
+        """Simulated tracks: those valid at the current step, in track order."""
         return np.flatnonzero(self.tracks.valid[:, CURRENT_STEP])
 
     @cached_property
     def evaluated_indices(self) -> Int64[np.ndarray, "E"]:
-        """Tracks that are evaluated: the ego and the tracks to predict, by ascending object id as in the official evaluator.
+        """Evaluated tracks: the ego and the tracks to predict, by ascending object id as in the official evaluator.
 
-        A track to predict that is not valid at the current step is left out: nobody simulates it.
+        A track to predict that is not valid at the current step is left out, because it is not simulated.
         """
+        # each track once, even where the ego is among the tracks to predict
         chosen = np.unique(np.append(self.tracks_to_predict, self.ego_index).astype(np.int64))
         chosen = chosen[self.tracks.valid[chosen, CURRENT_STEP]]
         return chosen[np.argsort(self.tracks.object_id[chosen], kind="stable")]
 
     @cached_property
     def origin(self) -> Float[np.ndarray, "2"]:
-        """Ego position at the current step rounded to whole metres, float64: the centre of the scenario's *map* frame."""
+        """Center of the *map* frame: ego position at the current step in whole meters, float64, world frame."""
         return np.round(self.tracks.position[self.ego_index, CURRENT_STEP, :2].astype(np.float64))
+
+    def __repr__(self) -> str:
+        types = self.tracks.object_type[self.simulated_indices]
+        counts = [(int((types == t).sum()), t.name.lower()) for t in ObjectType]
+        kinds = ", ".join(f"{count} {kind}{'s' if count != 1 else ''}" for count, kind in counts if count)
+        return (
+            f"Scenario({self.scenario_id!r}, {len(types)} agents ({kinds or 'none'}), {self.num_steps} steps, "
+            f"{len(self.map_features)} map features)"
+        )
+
+    def _repr_html_(self) -> str:
+        # The viewer is on a higher floor, so it is looked up by name and only where a notebook shows the value.
+        return importlib.import_module("rlftsim.viewer.notebook").scenario_html(self)
 
 
 @runtime_checkable
 class Scenarios(Protocol):
-    """Scenarios that are looked up by position: a list of them, or a data set."""
+    """Scenarios by position: a list of them, or a data set."""
 
     def __len__(self) -> int:
-        """How many there are."""
+        """Number of scenarios."""
         ...
 
     def __getitem__(self, position: int, /) -> Scenario:
-        """One of them."""
+        """Scenario at a position."""
         ...
 
 
 def scenario_ids_of(scenarios: Scenarios) -> Iterable[str]:
-    """Their ids in order; a data set knows them without reading its scenarios."""
+    """Scenario ids in order."""
+    # a data set has them in its index: its scenarios need not be read
     known = getattr(scenarios, "scenario_ids", None)
     return known if known is not None else (scenarios[i].scenario_id for i in range(len(scenarios)))

@@ -1,13 +1,14 @@
 """Waymo Open Motion Dataset: TFRecord files of `Scenario` messages to `Scenario` objects, without TensorFlow.
 
-World coordinates become float32 here and nowhere else: the official evaluator rounds them so before it does anything.
-What a record stores where a state is not valid is kept as it is.
+World coordinates become float32 here and nowhere else, because the official evaluator rounds them before it does
+anything. Values of states that are not valid are kept.
 """
 
 import glob
 import os
 import re
 from collections.abc import Callable, Iterator, Sequence
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,8 @@ from google.protobuf.message import DecodeError
 
 from rlftsim.errors import DataError
 from rlftsim.scenario import womd_pb2
-from rlftsim.scenario.tfrecord import OnError, SkippedRecord, log_skipped, read_records
+from rlftsim.scenario.sources import BytesRead, Item, Unit, read_unit, units_of_files
+from rlftsim.scenario.tfrecord import RECORD_OVERHEAD_BYTES, OnError, SkippedRecord, log_skipped, read_records
 from rlftsim.scenario.types import (
     CURRENT_STEP,
     HISTORY_STEPS,
@@ -30,11 +32,15 @@ from rlftsim.scenario.types import (
 
 _TFRECORD_NAME = re.compile(r"\.tfrecords?(-\d+-of-\d+)?$")
 _LEFT, _RIGHT = 0, 1
+_STATE_FIELDS = (
+    *("center_x", "center_y", "center_z", "length", "width", "height"),
+    *("heading", "velocity_x", "velocity_y", "valid"),
+)
 _POLYGONS = ("crosswalk", "speed_bump", "driveway")
 
 
 def find_tfrecords(source: str | os.PathLike[str]) -> list[Path]:
-    """Files that `source` means, sorted by path.
+    """Files of a source, sorted by path.
 
     Args:
         source: a file of any name, a folder (searched with its subfolders for names like `x.tfrecord` and
@@ -83,34 +89,56 @@ def read_scenarios(
 def read_scenario_file(
     path: str | os.PathLike[str], *, on_error: OnError = "stop", report: Callable[[SkippedRecord], None] = log_skipped
 ) -> Iterator[tuple[int, Scenario]]:
-    """Read one tfrecord file as `read_scenarios` does; yields the number of the record, from 0, with its scenario."""
-    for record, data in read_records(path, on_error=on_error, report=report):
-        scenario = scenario_or_report(path, record, data, on_error=on_error, report=report)
-        if scenario is not None:
-            yield record, scenario
+    """Read one tfrecord file; yields the number of the record, from 0, with its scenario.
 
-
-def scenario_or_report(
-    path: str | os.PathLike[str],
-    record: int,
-    data: bytes,
-    *,
-    on_error: OnError,
-    report: Callable[[SkippedRecord], None],
-) -> Scenario | None:
-    """Scenario of record number `record` of a file; None if it is bad, which is reported.
+    Args:
+        path: the file.
+        on_error: "stop" raises at the first bad record, "skip" reports it and goes on.
+        report: called with each skipped record, only under "skip".
 
     Raises:
-        DataError: under "stop", the record is bad: names file, record and cause.
+        DataError: no such file; under "stop" also any bad record: names file, record and cause.
     """
-    try:
-        return scenario_from_bytes(data)
-    except DataError as error:
-        skipped = SkippedRecord(str(path), record, str(error))
-        if on_error == "stop":
-            raise DataError(str(skipped)) from error
-        report(skipped)
-        return None
+    return read_unit(WomdSource(), Unit(str(path), (Path(path),)), on_error=on_error, report=report)
+
+
+class WomdSource:
+    """The data source "womd": tfrecord files of `Scenario` messages."""
+
+    license_note = (
+        "Waymo Open Dataset material: Waymo Dataset License Agreement for Non-Commercial Use (waymo.com/open/terms). "
+        "This work was made using the Waymo Open Dataset, provided by Waymo LLC."
+    )
+
+    def detects(self, path: str | os.PathLike[str]) -> bool:
+        """True where at least one file has the name of a tfrecord."""
+        try:
+            return any(_TFRECORD_NAME.search(file.name) for file in find_tfrecords(path))
+        except DataError:
+            return False
+
+    def find(self, path: str | os.PathLike[str]) -> list[Unit]:
+        """One unit per tfrecord file, as in `find_tfrecords`."""
+        return units_of_files(find_tfrecords(path))
+
+    def read(self, unit: Unit) -> Iterator[Item]:
+        """The records of a tfrecord file in order, those that are damaged or no scenarios with their cause."""
+        (path,) = unit.files
+        damaged: list[SkippedRecord] = []
+        for record, data in read_records(path, on_error="skip", report=damaged.append):
+            # the framing reports damage before it yields the next whole record
+            yield from damaged
+            damaged.clear()
+            try:
+                yield scenario_from_bytes(data)
+            except DataError as error:
+                yield SkippedRecord(str(path), record, str(error))
+            yield BytesRead(len(data) + RECORD_OVERHEAD_BYTES)
+        yield from damaged
+
+    def describe(self) -> dict[str, object]:
+        """Nothing: no value of a record is guessed."""
+        return {}
 
 
 def scenario_from_bytes(record: bytes) -> Scenario:
@@ -136,15 +164,29 @@ def scenario_from_bytes(record: bytes) -> Scenario:
         raise DataError(f"not a WOMD Scenario message, or a damaged one: its scenario_id is {message.scenario_id!r}")
     tracks = _read_tracks(message)
     num_steps = tracks.valid.shape[1]
-    ego_index = _read_ego_index(message, tracks)
+    # the ego must be there now: it is always evaluated, and the map frame is centered on it
+    ego = message.sdc_track_index
+    if not message.HasField("sdc_track_index"):
+        raise DataError("no ego: sdc_track_index is not set")
+    if not 0 <= ego < len(tracks.valid):
+        raise DataError(f"no ego: sdc_track_index is {ego}, but there are {len(tracks.valid)} tracks")
+    if message.HasField("current_time_index") and message.current_time_index != CURRENT_STEP:
+        raise DataError(f"current_time_index is {message.current_time_index} instead of {CURRENT_STEP}")
+    if not tracks.valid[ego, CURRENT_STEP]:
+        raise DataError(f"the ego (track {tracks.object_id[ego]}) is not valid at the current step ({CURRENT_STEP})")
+    if len(message.timestamps_seconds) < num_steps:
+        raise DataError(f"{len(message.timestamps_seconds)} timestamps for {num_steps} steps")
+    predicted = np.array([item.track_index for item in message.tracks_to_predict], np.int32)
+    for index in predicted[(predicted < 0) | (predicted >= len(message.tracks))]:
+        raise DataError(f"tracks_to_predict names track index {index}, but there are {len(message.tracks)} tracks")
     scenario = Scenario(
         scenario_id=message.scenario_id,
-        timestamps_s=_read_timestamps(message, num_steps),
+        timestamps_s=np.array(message.timestamps_seconds[:num_steps], np.float64),
         tracks=tracks,
         map_features=_read_map(message.map_features),
         lights=_read_lights(message.dynamic_map_states[:num_steps]),
-        ego_index=ego_index,
-        tracks_to_predict=_read_tracks_to_predict(message),
+        ego_index=ego,
+        tracks_to_predict=predicted,
         difficulty=np.array([item.difficulty for item in message.tracks_to_predict], np.int8),
         objects_of_interest=np.array(message.objects_of_interest, np.int64),
     )
@@ -153,82 +195,43 @@ def scenario_from_bytes(record: bytes) -> Scenario:
 
 
 def _read_tracks(message: womd_pb2.Scenario) -> Tracks:
-    num_steps = len(message.tracks[0].states)
+    """All tracks, with the values of states that are not valid, too."""
+    first = message.tracks[0]
+    num_steps = len(first.states)
     for track in message.tracks:
         if len(track.states) != num_steps:
-            raise DataError(
-                f"track {track.id} has {len(track.states)} states, track {message.tracks[0].id} has {num_steps}"
-            )
+            raise DataError(f"track {track.id} has {len(track.states)} states, track {first.id} has {num_steps}")
     if num_steps not in (HISTORY_STEPS, TOTAL_STEPS):
         raise DataError(
             f"{num_steps} steps instead of {TOTAL_STEPS} (or {HISTORY_STEPS} in a test split): "
             "take WOMD's 9-second files, not the 20-second ones"
         )
-    states = np.array(
-        [
-            (
-                s.center_x,
-                s.center_y,
-                s.center_z,
-                s.length,
-                s.width,
-                s.height,
-                s.heading,
-                s.velocity_x,
-                s.velocity_y,
-                s.valid,
-            )
-            for track in message.tracks
-            for s in track.states
-        ]
-    ).reshape(len(message.tracks), num_steps, 10)
+    # one tuple per state, made in C: filling arrays field by field costs several times as much
+    numbers_of = attrgetter(*_STATE_FIELDS)
+    rows = [numbers_of(state) for track in message.tracks for state in track.states]
+    # float64 holds all fields exactly, `valid` as 0 or 1
+    states = np.array(rows).reshape(len(message.tracks), num_steps, -1)  # [O, S, 10] float64
     values = _to_float32(states)
-    valid = states[..., 9] != 0
-    object_id = np.array([track.id for track in message.tracks], np.int64)
     return Tracks(
-        object_id=object_id,
+        object_id=np.array([track.id for track in message.tracks], np.int64),
         object_type=np.array([track.object_type for track in message.tracks], np.int8),
         position=np.ascontiguousarray(values[..., 0:3]),
         heading=np.ascontiguousarray(values[..., 6]),
         velocity=np.ascontiguousarray(values[..., 7:9]),
         size=np.ascontiguousarray(values[..., 3:6]),
-        valid=valid,
+        valid=states[..., 9] != 0,
     )
 
 
 def _to_float32(values: np.ndarray) -> np.ndarray:
-    """Nearest float32; what lies outside its range becomes infinite without a warning and is refused later."""
+    """Nearest float32. Values outside its range become infinite without a warning and are refused later."""
     with np.errstate(over="ignore"):
         return values.astype(np.float32)
 
 
-def _read_ego_index(message: womd_pb2.Scenario, tracks: Tracks) -> int:
-    index = message.sdc_track_index
-    if not message.HasField("sdc_track_index"):
-        raise DataError("no ego: sdc_track_index is not set")
-    if not 0 <= index < len(tracks.valid):
-        raise DataError(f"no ego: sdc_track_index is {index}, but there are {len(tracks.valid)} tracks")
-    if message.HasField("current_time_index") and message.current_time_index != CURRENT_STEP:
-        raise DataError(f"current_time_index is {message.current_time_index} instead of {CURRENT_STEP}")
-    if not tracks.valid[index, CURRENT_STEP]:
-        raise DataError(f"the ego (track {tracks.object_id[index]}) is not valid at the current step ({CURRENT_STEP})")
-    return index
-
-
-def _read_timestamps(message: womd_pb2.Scenario, num_steps: int) -> np.ndarray:
-    if len(message.timestamps_seconds) < num_steps:
-        raise DataError(f"{len(message.timestamps_seconds)} timestamps for {num_steps} steps")
-    return np.array(message.timestamps_seconds[:num_steps], np.float64)
-
-
-def _read_tracks_to_predict(message: womd_pb2.Scenario) -> np.ndarray:
-    indices = np.array([item.track_index for item in message.tracks_to_predict], np.int32)
-    for index in indices[(indices < 0) | (indices >= len(message.tracks))]:
-        raise DataError(f"tracks_to_predict names track index {index}, but there are {len(message.tracks)} tracks")
-    return indices
-
-
 def _read_lights(dynamic_states: Sequence[womd_pb2.DynamicMapState]) -> LightStates:
+    """All light states; the number of a `DynamicMapState` is its step."""
+    # a few thousand rows at most, so a list is fast enough
     rows = [
         (step, light.lane, light.state, light.stop_point.x, light.stop_point.y, light.stop_point.z)
         for step, states in enumerate(dynamic_states)
@@ -240,6 +243,32 @@ def _read_lights(dynamic_states: Sequence[womd_pb2.DynamicMapState]) -> LightSta
         lane_id=np.array(lane, np.int64),
         state=np.array(state, np.int8),
         stop_point=_to_float32(np.array(point, np.float64).T.reshape(-1, 3)),
+    )
+
+
+def _read_map(features: Sequence[womd_pb2.MapFeature]) -> MapFeatures:
+    """Map features in the order of the message, those of unknown kinds left out."""
+    # a kind that womd.proto does not have yet reads as a feature without data
+    features = [feature for feature in features if feature.WhichOneof("feature_data")]
+    kinds = [feature.WhichOneof("feature_data") for feature in features]
+    typed_points = [_points_of(feature, kind) for feature, kind in zip(features, kinds)]
+    flat = [value for _, points in typed_points for p in points for value in (p.x, p.y, p.z)]
+    offsets = np.zeros(len(features) + 1, np.int64)
+    np.cumsum([len(points) for _, points in typed_points], out=offsets[1:])
+    doubles = np.array(flat, np.float64).reshape(-1, 3)  # [P, 3]
+    points = _to_float32(doubles)
+    # The rounding error of polygons. Only of finite points: infinity minus infinity would warn before the point is
+    # refused by name.
+    is_polygon = np.repeat(np.array([kind in _POLYGONS for kind in kinds], bool), np.diff(offsets))  # [P]
+    rest = np.zeros_like(doubles)
+    np.subtract(doubles, points, out=rest, where=is_polygon[:, None] & np.isfinite(points))
+    return MapFeatures(
+        feature_id=np.array([feature.id for feature in features], np.int64),
+        feature_type=np.array([kind for kind, _ in typed_points], np.int8),
+        points=points,
+        offsets=offsets,
+        topology=_read_topology(features, kinds),
+        polygon_rest=_to_float32(rest),
     )
 
 
@@ -263,58 +292,35 @@ def _points_of(feature: womd_pb2.MapFeature, kind: str) -> tuple[int, Sequence[w
     raise AssertionError(f"womd.proto has a kind of map feature that is not read: {kind}")
 
 
-def _read_map(features: Sequence[womd_pb2.MapFeature]) -> MapFeatures:
-    features = [feature for feature in features if feature.WhichOneof("feature_data")]
-    kinds = [feature.WhichOneof("feature_data") for feature in features]
-    typed_points = [_points_of(feature, kind) for feature, kind in zip(features, kinds)]
-    flat = [value for _, points in typed_points for p in points for value in (p.x, p.y, p.z)]
-    offsets = np.zeros(len(features) + 1, np.int64)
-    np.cumsum([len(points) for _, points in typed_points], out=offsets[1:])
-    feature_id = np.array([feature.id for feature in features], np.int64)
-    doubles = np.array(flat, np.float64).reshape(-1, 3)
-    points = _to_float32(doubles)
-    is_polygon = np.repeat(np.array([kind in _POLYGONS for kind in kinds], bool), np.diff(offsets))
-    return MapFeatures(
-        feature_id=feature_id,
-        feature_type=np.array([kind for kind, _ in typed_points], np.int8),
-        points=points,
-        offsets=offsets,
-        topology=_read_topology(features, kinds),
-        polygon_rest=_to_float32(np.where(is_polygon[:, None], doubles - points, 0.0)),
-    )
-
-
 def _read_topology(features: Sequence[womd_pb2.MapFeature], kinds: Sequence[str]) -> LaneTopology:
+    """Links of all lanes as tables, the first column the lane's feature id."""
     lanes = [(feature.id, feature.lane) for feature, kind in zip(features, kinds) if kind == "lane"]
     is_lane = np.array([kind == "lane" for kind in kinds], bool)
     speed_limit = np.zeros(len(features), np.float32)
     interpolating = np.zeros(len(features), bool)
     speed_limit[is_lane] = _to_float32(np.array([lane.speed_limit_mph for _, lane in lanes], np.float64))
     interpolating[is_lane] = [lane.interpolating for _, lane in lanes]
+    neighbors, boundaries = [], []
+    for lane_id, lane in lanes:
+        for side, found in ((_LEFT, lane.left_neighbors), (_RIGHT, lane.right_neighbors)):
+            for n in found:
+                own, other = (n.self_start_index, n.self_end_index), (n.neighbor_start_index, n.neighbor_end_index)
+                neighbors.append((lane_id, side, n.feature_id, *own, *other))
+        for side, found in ((_LEFT, lane.left_boundaries), (_RIGHT, lane.right_boundaries)):
+            for b in found:
+                span = (b.lane_start_index, b.lane_end_index)
+                boundaries.append((lane_id, side, b.boundary_feature_id, *span, b.boundary_type))
     return LaneTopology(
         entry_lanes=_rows(2, [(lane_id, other) for lane_id, lane in lanes for other in lane.entry_lanes]),
         exit_lanes=_rows(2, [(lane_id, other) for lane_id, lane in lanes for other in lane.exit_lanes]),
-        neighbors=_rows(7, [row for lane_id, lane in lanes for row in _neighbor_rows(lane_id, lane)]),
-        boundaries=_rows(6, [row for lane_id, lane in lanes for row in _boundary_rows(lane_id, lane)]),
+        neighbors=_rows(7, neighbors),
+        boundaries=_rows(6, boundaries),
         stop_sign_lanes=_rows(
             2, [(f.id, lane) for f, kind in zip(features, kinds) if kind == "stop_sign" for lane in f.stop_sign.lane]
         ),
         speed_limit_mph=speed_limit,
         interpolating=interpolating,
     )
-
-
-def _neighbor_rows(lane_id: int, lane: womd_pb2.LaneCenter) -> Iterator[tuple[int, ...]]:
-    for side, neighbors in ((_LEFT, lane.left_neighbors), (_RIGHT, lane.right_neighbors)):
-        for n in neighbors:
-            own, other = (n.self_start_index, n.self_end_index), (n.neighbor_start_index, n.neighbor_end_index)
-            yield lane_id, side, n.feature_id, *own, *other
-
-
-def _boundary_rows(lane_id: int, lane: womd_pb2.LaneCenter) -> Iterator[tuple[int, ...]]:
-    for side, boundaries in ((_LEFT, lane.left_boundaries), (_RIGHT, lane.right_boundaries)):
-        for b in boundaries:
-            yield lane_id, side, b.boundary_feature_id, b.lane_start_index, b.lane_end_index, b.boundary_type
 
 
 def _rows(columns: int, rows: list[tuple[int, ...]]) -> np.ndarray:

@@ -1,1 +1,1 @@
-"""Motion as words: vocabularies and the tokens of agents and maps."""
+"""Motion and map tokens: vocabularies, and the tokens of agents and maps."""

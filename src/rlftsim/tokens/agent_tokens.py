@@ -1,7 +1,7 @@
-"""Tracks → motion tokens.
+"""Tokenization of agents: tracks to motion tokens, by the rules of the public SMART code.
 
-A agents, K token steps: token step k is the motion from 10 Hz step 5k to 5k + 5, its state is the one at 5k + 5.
-K is 18 for a whole scenario, 2 where only the history is recorded. The rules are those of the public SMART code.
+A agents, S steps at 10 Hz, K token steps. Token step k is the motion from step 5k to 5k + 5, its state is the one at
+5k + 5. K is 18 for a whole scenario, 2 where only the history is logged.
 """
 
 from dataclasses import dataclass
@@ -12,21 +12,22 @@ from torch import Tensor
 
 from rlftsim.geometry import box_corners, pose_of_corners, rotate, wrap_angle
 from rlftsim.scenario.batch import Frame, ScenarioBatch, collate
-from rlftsim.scenario.derived import derived
+from rlftsim.scenario.derived import cached_on_scenario
 from rlftsim.scenario.types import CURRENT_STEP, STEP_S, Scenario
-from rlftsim.tokens import public_order
+from rlftsim.tokens import catk_compat as catk_ops
 from rlftsim.tokens.vocabulary import CLASS_BOXES_M, STEPS_PER_TOKEN, Vocabulary, class_of_type
 
 HISTORY_TOKENS = 2
+"""Token steps up to the current step."""
 MAX_HEADING_STEP_RAD = 1.5
 _ROWS_PER_CHUNK = 512
 _CANDIDATES = 64
-"""Tokens whose corners are compared; if that may not be enough, all are."""
+"""Tokens whose corners are compared first; all tokens are, where these may not contain the nearest one."""
 
 
 @dataclass(frozen=True, eq=False)
 class CleanTracks:
-    """Recorded tracks with gaps filled, headings cleaned and begun early enough for the first token. In the batch's frame."""
+    """Tracks with gaps filled, headings cleaned, and extended back to the first token's start. Frame: the batch's."""
 
     position: Float[Tensor, "*batch A S 2"]
     heading: Float[Tensor, "*batch A S"]
@@ -36,32 +37,33 @@ class CleanTracks:
 
 @dataclass(frozen=True, eq=False)
 class AgentTokens:
-    """The rolling tokenisation of recorded tracks. In the batch's frame; zeros where `valid` is False."""
+    """Rolling tokenization of logged tracks. Frame: the batch's. Zeros where `valid` is False."""
 
     token_id: Int64[Tensor, "B A K"]
     position: Float[Tensor, "B A K 2"]
-    """Where the chosen tokens lead, not where the record was: each token corrects the error of the last."""
+    """End points of the chosen tokens, not of the log: each token corrects the error of the one before."""
     heading: Float[Tensor, "B A K"]
     valid: Bool[Tensor, "B A K"]
     logged_position: Float[Tensor, "B A K 2"]
     logged_heading: Float[Tensor, "B A K"]
     logged_valid: Bool[Tensor, "B A K"]
     next_token_id: Int64[Tensor, "B A K"]
-    """Token that should come next: `token_id` of the next step. The last column means nothing, nor does what `valid` there denies."""
+    """Target of next-token prediction: `token_id` of the next step. Undefined in the last column and where the next
+    step is not `valid`."""
 
 
-def clean_tracks(batch: ScenarioBatch, *, public_order_of_operations: bool = False) -> CleanTracks:
-    """Tracks as SMART sees them: gaps interpolated, jumps of heading removed, up to five made-up steps before the first.
+def clean_tracks(batch: ScenarioBatch, *, catk_compat: bool = False) -> CleanTracks:
+    """Tracks as SMART reads them: gaps interpolated, jumps of heading removed, up to five steps added before the first.
 
     Args:
-        batch: recorded tracks.
-        public_order_of_operations: round where the public code rounds, see `tokens.public_order`.
+        batch: logged tracks.
+        catk_compat: round where the public code rounds, see `tokens.catk_compat`.
     """
     position, heading, velocity, valid = _fill_gaps(batch.position, batch.heading, batch.velocity, batch.valid)
-    if public_order_of_operations:
-        position, velocity, valid = public_order.fill_gaps_in_world(batch)
+    if catk_compat:
+        position, velocity, valid = catk_ops.fill_gaps_in_world(batch)
     heading = _hold_jumping_headings(heading, valid)
-    return _begin_earlier(CleanTracks(position, heading, velocity, valid), stepwise=public_order_of_operations)
+    return _begin_earlier(CleanTracks(position, heading, velocity, valid), stepwise=catk_compat)
 
 
 def _fill_gaps(
@@ -70,20 +72,23 @@ def _fill_gaps(
     velocity: Float[Tensor, "B A S 2"],
     valid: Bool[Tensor, "B A S"],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Linear interpolation between the first and the last valid step, which all become valid."""
+    """Linear interpolation between the first and the last valid step; all steps between them become valid."""
+    # 1. Last valid step at or before each step, and first one at or after it [B, A, S].
     steps = torch.arange(valid.shape[-1], device=valid.device).expand_as(valid)
     before = torch.where(valid, steps, -1).cummax(-1).values
     after = torch.where(valid, steps, valid.shape[-1]).flip(-1).cummin(-1).values.flip(-1)
     inside = (before >= 0) & (after < valid.shape[-1])
     before, after = torch.where(inside, before, 0), torch.where(inside, after, 0)
-    share = (steps - before) / (after - before).clamp(min=1)
+    # 2. Interpolation; `weight` is 0 at valid steps, where both neighbors are the step itself.
+    weight = (steps - before) / (after - before).clamp(min=1)
 
     def blend(values: Tensor) -> Tensor:
         first, last = _take_steps(values, before), _take_steps(values, after)
-        return torch.where(inside[..., None], first + share[..., None] * (last - first), 0.0)
+        return torch.where(inside[..., None], first + weight[..., None] * (last - first), 0.0)
 
+    # 3. Headings turn the short way round.
     turn = wrap_angle(heading.gather(-1, after) - heading.gather(-1, before))
-    filled = torch.where(valid, heading, wrap_angle(heading.gather(-1, before) + share * turn))
+    filled = torch.where(valid, heading, wrap_angle(heading.gather(-1, before) + weight * turn))
     filled = torch.where(inside, filled, 0.0)
     return (
         torch.where(valid[..., None], position, blend(position)),
@@ -98,7 +103,8 @@ def _take_steps(values: Float[Tensor, "B A S c"], steps: Int64[Tensor, "B A S"])
 
 
 def _hold_jumping_headings(heading: Float[Tensor, "B A S"], valid: Bool[Tensor, "B A S"]) -> Float[Tensor, "B A S"]:
-    """A heading that jumps by more than 1.5 rad from a valid step to the next takes the value before."""
+    """Headings with jumps removed: after a jump of more than 1.5 rad between valid steps the earlier value stays."""
+    # Sequential, because a value that was kept is compared with the next one.
     columns = list(heading.unbind(-1))
     for step in range(1, len(columns)):
         jumps = wrap_angle(columns[step] - columns[step - 1]).abs() > MAX_HEADING_STEP_RAD
@@ -108,22 +114,23 @@ def _hold_jumping_headings(heading: Float[Tensor, "B A S"], valid: Bool[Tensor, 
 
 
 def _begin_earlier(tracks: CleanTracks, *, stepwise: bool) -> CleanTracks:
-    """Extend each track backwards, at constant velocity, to the last multiple of five steps (and to step 5 at the least).
+    """Each track extended backwards, at constant velocity, to a multiple of five steps, and at least to step 5.
 
-    `stepwise`: subtract a step after the other instead of their product, for the sake of rounding.
+    So every agent has the token that ends at the current step. `stepwise` subtracts one step after the other instead of
+    their product, which rounds differently.
     """
     num_steps = tracks.valid.shape[-1]
     steps = torch.arange(num_steps, device=tracks.valid.device)
     first = torch.where(tracks.valid, steps, num_steps).amin(-1)  # [B, A]
     extra = torch.where(first == CURRENT_STEP, STEPS_PER_TOKEN, first % STEPS_PER_TOKEN)
-    lead = first[..., None] - steps  # steps before the first one
+    lead = first[..., None] - steps  # [B, A, S], number of steps before the first one
     made_up = (lead > 0) & (lead <= extra[..., None]) & (first < num_steps)[..., None]
     at = first.clamp(max=num_steps - 1)[..., None].expand_as(made_up)
     velocity = _take_steps(tracks.velocity, at)
     start = _take_steps(tracks.position, at)
     back = start - lead[..., None] * STEP_S * velocity
     if stepwise:
-        back = public_order.step_back(start[..., 0, :], velocity[..., 0, :], lead)
+        back = catk_ops.step_back(start[..., 0, :], velocity[..., 0, :], lead)
     return CleanTracks(
         position=torch.where(made_up[..., None], back, tracks.position),
         heading=torch.where(made_up, tracks.heading.gather(-1, at), tracks.heading),
@@ -133,7 +140,7 @@ def _begin_earlier(tracks: CleanTracks, *, stepwise: bool) -> CleanTracks:
 
 
 def class_boxes(object_type: Int64[Tensor, "..."]) -> tuple[Float[Tensor, "..."], Float[Tensor, "..."]]:
-    """Length and width of the box that an agent's class is matched with."""
+    """Length and width of the box of an agent's class, which tokens are matched with, m."""
     table = torch.tensor(CLASS_BOXES_M, device=object_type.device)[class_of_type(object_type)]
     return table[..., 0], table[..., 1]
 
@@ -143,17 +150,18 @@ def tokenize_tracks(
     object_type: Int64[Tensor, "B A"],
     vocabulary: Vocabulary,
     *,
-    public_order_of_operations: bool = False,
+    catk_compat: bool = False,
 ) -> AgentTokens:
-    """Rolling matching: at each token step the token that leads nearest to the record from where the last one led.
+    """Rolling matching: at each step the token that ends nearest to the log, from the end of the token before.
 
     Args:
-        tracks: what `clean_tracks` returned.
+        tracks: from `clean_tracks`.
         object_type: WOMD's object types.
         vocabulary: the tokens.
-        public_order_of_operations: round where the public code rounds, see `tokens.public_order`.
+        catk_compat: round where the public code rounds, see `tokens.catk_compat`.
     """
-    match = _match_placed if public_order_of_operations else _match_in_local_frame
+    # 1. The pose rolls along with the matched tokens; where there is no token it restarts from the log.
+    match = _match_placed if catk_compat else _match_in_local_frame
     class_id = class_of_type(object_type)
     position, heading = tracks.position[..., 0, :], tracks.heading[..., 0]
     columns: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
@@ -166,11 +174,13 @@ def tokenize_tracks(
         position = torch.where(valid[..., None], led_position, logged_position)
         heading = torch.where(valid, led_heading, logged_heading)
         columns.append((token_id, position * valid[..., None], heading * valid, valid))
+    # 2. Columns to tensors [B, A, K].
     token_id, led_positions, led_headings, valid = (torch.stack([c[i] for c in columns], 2) for i in range(4))
     logged = slice(STEPS_PER_TOKEN, None, STEPS_PER_TOKEN)
     logged_position, logged_heading = tracks.position[..., logged, :], tracks.heading[..., logged]
+    # 3. Targets. The public code matches them separately, from the end of each token to the next logged pose.
     next_token_id = token_id.roll(-1, -1)
-    if public_order_of_operations:
+    if catk_compat:
         following = (logged_position.roll(-1, -2), logged_heading.roll(-1, -1))
         next_token_id = tokens_towards(
             following, (led_positions, led_headings), class_id[..., None].expand_as(valid), valid, vocabulary
@@ -191,12 +201,26 @@ def tokens_towards(
     valid: Bool[Tensor, "*batch"],
     vocabulary: Vocabulary,
 ) -> Int64[Tensor, "*batch"]:
-    """Token that leads nearest from a pose to a goal pose: smallest sum of corner distances in the frame of the pose, 0 where not `valid`."""
+    """Token that ends nearest to a target pose: smallest sum of corner distances in the frame of the start pose.
+
+    Args:
+        goal: target position (m) and heading (rad).
+        pose: start position and heading, same frame.
+        class_id: index into `CLASS_NAMES`.
+        valid: the result is 0 elsewhere.
+        vocabulary: the tokens.
+    """
     return nearest_tokens(local_boxes(goal, pose, class_id), class_id, valid, vocabulary)
 
 
 def local_boxes(goal: Pose, pose: Pose, class_id: Int64[Tensor, "*batch"]) -> Float[Tensor, "*batch 4 2"]:
-    """Box of a class at a goal pose, in the frame of another pose."""
+    """Corners of a class's box at a target pose, in the frame of another pose.
+
+    Args:
+        goal: position (m) and heading (rad) of the box.
+        pose: origin and direction of the frame.
+        class_id: index into `CLASS_NAMES`.
+    """
     length, width = torch.tensor(CLASS_BOXES_M, device=class_id.device)[class_id].unbind(-1)
     position = rotate(goal[0] - pose[0], -pose[1])
     return box_corners(position, wrap_angle(goal[1] - pose[1]), length, width)
@@ -205,7 +229,7 @@ def local_boxes(goal: Pose, pose: Pose, class_id: Int64[Tensor, "*batch"]) -> Fl
 def _match_in_local_frame(
     logged: Pose, pose: Pose, class_id: Int64[Tensor, "B A"], valid: Bool[Tensor, "B A"], vocabulary: Vocabulary
 ) -> tuple[Int64[Tensor, "B A"], Float[Tensor, "B A 2"], Float[Tensor, "B A"]]:
-    """Token that leads nearest from a pose to the logged one, and where it leads."""
+    """Token that ends nearest to the logged pose, and the pose at its end."""
     length, width = torch.tensor(CLASS_BOXES_M, device=valid.device)[class_id].unbind(-1)
     target = box_corners(*logged, length, width)
     local = rotate(target - pose[0][..., None, :], -pose[1][..., None])
@@ -218,10 +242,10 @@ def _match_placed(
 ) -> tuple[Int64[Tensor, "B A"], Float[Tensor, "B A 2"], Float[Tensor, "B A"]]:
     """As `_match_in_local_frame`, in the public code's order of operations."""
     length, width = torch.tensor(CLASS_BOXES_M, device=valid.device)[class_id].unbind(-1)
-    target = public_order.boxes_around(*logged, length, width)
-    token_id = public_order.nearest_placed_tokens(target, *pose, class_id, valid, vocabulary)
+    target = catk_ops.boxes_around(*logged, length, width)
+    token_id = catk_ops.nearest_placed_tokens(target, *pose, class_id, valid, vocabulary)
     corners = vocabulary.end_corners()[class_id, token_id]
-    return token_id, *pose_of_corners(public_order.place_boxes(corners[..., None, :, :], *pose)[..., 0, :, :])
+    return token_id, *pose_of_corners(catk_ops.place_boxes(corners[..., None, :, :], *pose)[..., 0, :, :])
 
 
 def nearest_tokens(
@@ -230,8 +254,16 @@ def nearest_tokens(
     valid: Bool[Tensor, "*batch"],
     vocabulary: Vocabulary,
 ) -> Int64[Tensor, "*batch"]:
-    """Token whose end box has the smallest sum of corner distances to a box; lowest index on ties, 0 where not `valid`."""
+    """Token whose end box has the smallest sum of corner distances to a box; lowest index on ties.
+
+    Args:
+        local_corners: boxes in the frame of the token's start.
+        class_id: index into `CLASS_NAMES`.
+        valid: the result is 0 elsewhere.
+        vocabulary: the tokens.
+    """
     out = torch.zeros_like(class_id)
+    # Classes may have different numbers of tokens: rows are found among those that exist, then mapped to token ids.
     for index, (table, exists) in enumerate(zip(vocabulary.end_corners(), vocabulary.token_mask)):
         rows = ((class_id == index) & valid).nonzero(as_tuple=True)
         out[rows] = exists.nonzero()[:, 0][nearest_rows(local_corners[rows], table[exists])]
@@ -239,13 +271,23 @@ def nearest_tokens(
 
 
 def nearest_rows(boxes: Float[Tensor, "n 4 2"], table: Float[Tensor, "V 4 2"]) -> Int64[Tensor, "n"]:
-    """Row of a table whose box has the smallest sum of corner distances to each box; the lowest on ties."""
+    """Row of a table whose box has the smallest sum of corner distances to each box; the lowest on ties.
+
+    Args:
+        boxes: to be matched.
+        table: candidates, same frame.
+    """
+    # In parts, so that the [n, V] tables of distances stay small.
     parts = [_nearest_of_part(part, table) for part in boxes.split(_ROWS_PER_CHUNK)]
     return torch.cat(parts) if parts else torch.zeros(0, dtype=torch.int64, device=boxes.device)
 
 
 def _nearest_of_part(boxes: Float[Tensor, "n 4 2"], table: Float[Tensor, "V 4 2"]) -> Int64[Tensor, "n"]:
-    """Only tokens whose centre is near can win: the corners' distances sum to at least four times that of the centres."""
+    """Nearest rows, found by way of the nearest centers; exact.
+
+    The distances of the four corners sum to at least four times that of the centers, so only rows with a near center
+    win.
+    """
     if len(table) <= 2 * _CANDIDATES:
         return corner_distances(boxes, table).argmin(-1)
     between = torch.cdist(boxes.mean(1), table.mean(1), compute_mode="donot_use_mm_for_euclid_dist")
@@ -254,13 +296,20 @@ def _nearest_of_part(boxes: Float[Tensor, "n 4 2"], table: Float[Tensor, "V 4 2"
     total = corner_distances(boxes, table[candidates])
     best = total.min(-1)
     found = candidates.gather(-1, best.indices[:, None])[:, 0]
+    # Rows beyond the candidates could still win, or tie within rounding: compare all.
     unsure = 4 * near.values.amax(-1) <= best.values * 1.0001 + 1e-4
     found[unsure] = corner_distances(boxes[unsure], table).argmin(-1)
     return found
 
 
 def corner_distances(boxes: Float[Tensor, "n 4 2"], table: Float[Tensor, "*n V 4 2"]) -> Float[Tensor, "n V"]:
-    """Sums of corner distances."""
+    """Sum of the distances of the four corners, for each pair of boxes, m.
+
+    Args:
+        boxes: n boxes.
+        table: V boxes, the same for all or V for each of the n.
+    """
+    # One corner at a time: [n, V] instead of [n, V, 4, 2] in memory.
     total = sum((boxes[:, None, c] - table[..., c, :]).square().sum(-1).sqrt() for c in range(4))
     return torch.as_tensor(total)
 
@@ -272,26 +321,33 @@ def place_pose(
     position: Float[Tensor, "*batch 2"],
     heading: Float[Tensor, "*batch"],
 ) -> tuple[Float[Tensor, "*batch 2"], Float[Tensor, "*batch"]]:
-    """Pose at the end of a token that starts at a pose."""
+    """Pose at the end of a token.
+
+    Args:
+        vocabulary: the tokens.
+        class_id: index into `CLASS_NAMES`.
+        token_id: index of the token.
+        position: start of the token, m.
+        heading: at the start, rad.
+    """
     corners = vocabulary.end_corners()[class_id, token_id]
     local_position, local_heading = pose_of_corners(corners)
     return position + rotate(local_position, heading), wrap_angle(heading + local_heading)
 
 
-def tokenize_agents(
-    batch: ScenarioBatch, vocabulary: Vocabulary, *, public_order_of_operations: bool = False
-) -> AgentTokens:
-    """Tokens of a batch's recorded tracks; each scenario's are computed once and remembered while it is in memory.
+def tokenize_agents(batch: ScenarioBatch, vocabulary: Vocabulary, *, catk_compat: bool = False) -> AgentTokens:
+    """Tokens of a batch's logged tracks; each scenario's are computed once and cached while it is in memory.
 
     Args:
-        batch: its scenarios and its frame count.
+        batch: only its scenarios and its frame are used.
         vocabulary: the tokens.
-        public_order_of_operations: round where the public code rounds, see `tokens.public_order`.
+        catk_compat: round where the public code rounds, see `tokens.catk_compat`.
     """
-    rows = [_tokenize_scenario(s, vocabulary, batch.frame, public_order_of_operations) for s in batch.scenarios]
+    rows = [_tokenize_scenario(s, vocabulary, batch.frame, catk_compat) for s in batch.scenarios]
     num_agents = batch.agent_mask.shape[1]
     num_tokens = max(row.valid.shape[-1] for row in rows)
 
+    # Every field, padded to the batch's agents and to the longest scenario's tokens.
     def padded(name: str) -> Tensor:
         parts = [getattr(row, name)[0] for row in rows]
         out = torch.zeros((len(parts), num_agents, num_tokens, *parts[0].shape[2:]), dtype=parts[0].dtype)
@@ -302,9 +358,9 @@ def tokenize_agents(
     return AgentTokens(**{name: padded(name) for name in AgentTokens.__dataclass_fields__})
 
 
-@derived
-def _tokenize_scenario(scenario: Scenario, vocabulary: Vocabulary, frame: Frame, public: bool) -> AgentTokens:
-    """Tokens of one scenario on the CPU; remembered with the scenario."""
+@cached_on_scenario
+def _tokenize_scenario(scenario: Scenario, vocabulary: Vocabulary, frame: Frame, catk_compat: bool) -> AgentTokens:
+    """Tokens of one scenario on the CPU, cached with the scenario."""
     batch = collate([scenario], frame=frame)
-    tracks = clean_tracks(batch, public_order_of_operations=public)
-    return tokenize_tracks(tracks, batch.object_type, vocabulary.to("cpu"), public_order_of_operations=public)
+    tracks = clean_tracks(batch, catk_compat=catk_compat)
+    return tokenize_tracks(tracks, batch.object_type, vocabulary.to("cpu"), catk_compat=catk_compat)

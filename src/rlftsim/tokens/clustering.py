@@ -1,4 +1,4 @@
-"""Vocabularies from data: motion tokens of each class, by disks over the data or by a grid, and prototypes of map pieces."""
+"""Vocabularies from data: motion tokens of each class, by k-disks or by a grid, and prototypes of map pieces."""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -16,11 +16,11 @@ from rlftsim.tokens.map_tokens import split_map
 from rlftsim.tokens.motions import (
     DistinctSample,
     boxes,
-    drawn_scenarios,
     end_boxes,
     mirrored,
     motion_keys,
     motions_of,
+    sample_scenarios,
     window_keys,
     with_mirror_images,
 )
@@ -28,30 +28,31 @@ from rlftsim.tokens.trajtok import GridMotions, TrajTokConfig, rule_tokens
 from rlftsim.tokens.vocabulary import CLASS_NAMES, STEPS_PER_TOKEN, Vocabulary
 
 MAX_GAP_M = 0.25
-"""Straight ahead no end point is farther from a token: half a metre per second."""
-MAX_STRAIGHT_SHARE = 0.125
-"""Share of the tokens that may go to speeds which the data lack."""
+"""Greatest distance of a straight motion from a token: 0.5 m/s of speed."""
+MAX_STRAIGHT_FRACTION = 0.125
+"""Fraction of the tokens that may be used for speeds which the data lack."""
 
 
 @dataclass(frozen=True)
 class TokensConfig:
-    """How a vocabulary is built."""
+    """Settings of a vocabulary."""
 
     kind: Literal["kdisks", "trajtok"] = "kdisks"
-    """kdisks: means of disks over the motions. trajtok: a token for each cell of a grid that the data use, see `trajtok`."""
+    """kdisks: means of disks over the motions. trajtok: a token for each cell of a grid that the data use."""
     num_tokens: int = 2048
-    """Motion tokens a class (V) at most; of kdisks."""
+    """Greatest number of motion tokens of a class (V); kdisks only."""
     num_map_prototypes: int = 1024
+    """Greatest number of map prototypes (P)."""
     coverage: float = 0.995
-    """Share of all motions that lie within a disk."""
+    """Fraction of the motions that lie within a disk."""
     max_scenarios: int | None = 20_000
-    """Scenarios that are looked at, drawn evenly; None = all."""
+    """Number of scenarios read, sampled uniformly; None = all."""
     max_segments: int = 200_000
-    """Distinct motions a class, and distinct map windows, that disks are laid over; drawn evenly from all there are."""
+    """Number of distinct motions of a class, and of distinct map windows, that are clustered; sampled uniformly."""
     mirror: bool = True
-    """Add each motion's mirror image; tokens then come in mirrored pairs. trajtok always does."""
+    """Add each motion's mirror image, so that tokens come in mirrored pairs. trajtok always does."""
     straight_up_to_mps: float = 45.0
-    """Vehicles straight ahead at every speed up to this one have a token, seen in the data or not; of kdisks."""
+    """Every straight vehicle motion up to this speed has a token, in the data or not; kdisks only."""
     trajtok: TrajTokConfig = field(default_factory=TrajTokConfig)
     seed: int = 2
 
@@ -59,7 +60,7 @@ class TokensConfig:
         if self.num_tokens < 2 or self.num_map_prototypes < 1:
             raise ConfigError(f"a vocabulary needs num_tokens >= 2 and num_map_prototypes >= 1, got {self}.")
         if not 0 < self.coverage <= 1:
-            raise ConfigError(f"coverage is a share in (0, 1], got {self.coverage}.")
+            raise ConfigError(f"coverage is a fraction in (0, 1], got {self.coverage}.")
         require_positive(self, ("max_segments", *given(self, ("max_scenarios",))))
         require_not_negative(self, ("straight_up_to_mps", "seed"))
         require_finite(self, ("straight_up_to_mps",))
@@ -74,19 +75,21 @@ def build_vocabulary(
         scenarios: each is read once at most.
         config: sizes and seed; the same scenarios and the same seed give the same vocabulary.
         origin: written into the vocabulary.
-        show_progress: say on standard error how far it is.
+        show_progress: show a progress bar on standard error.
 
     Returns:
-        The vocabulary, and the radius of the disks of each class in metres (None where there are none).
+        The vocabulary, and the radius of the disks of each class in m (None where there are none).
 
     Raises:
         DataError: no scenario, or no usable motion at all.
     """
     if not len(scenarios):
         raise DataError("no scenario to build a vocabulary from: is the data set empty, or the split misspelt?")
+    # 1. Motions and map windows of the sampled scenarios, in bounded memory.
     material = _Material.collect(scenarios, config, show_progress)
     if not material.num_motions:
         raise DataError("no track moves for half a second in these scenarios: nothing to build a vocabulary from.")
+    # 2. Tokens of each class [V, 6, 4, 2], then map prototypes [P, 11, 2].
     tables, radii = [], []
     with progress_bar("tokens: make classes and map pieces", len(CLASS_NAMES) + 1, show=show_progress) as advance:
         for index in range(len(CLASS_NAMES)):
@@ -95,9 +98,11 @@ def build_vocabulary(
             radii.append(radius)
             advance(note=f"{CLASS_NAMES[index]}: {len(tokens)} tokens")
         windows = material.windows.rows()
+        # The classes have seeds [seed, 0..2], the map [seed, 3].
         rng = np.random.default_rng([config.seed, len(CLASS_NAMES)])
         prototypes = cluster_windows(windows, limit=config.num_map_prototypes, coverage=config.coverage, rng=rng)
         advance(note=f"{len(prototypes)} map pieces")
+    # 3. Classes with fewer tokens are padded with zeros.
     width = config.num_tokens if config.kind == "kdisks" else max(map(len, tables))
     corners = torch.zeros(len(tables), width, STEPS_PER_TOKEN + 1, 4, 2)
     exists = torch.zeros(len(tables), width, dtype=torch.bool)
@@ -108,7 +113,7 @@ def build_vocabulary(
 
 @dataclass(frozen=True, eq=False)
 class _Material:
-    """What the tokens are made from."""
+    """Motions and map windows that tokens are made from."""
 
     samples: tuple[DistinctSample, ...]
     cells: tuple[GridMotions, ...]
@@ -116,18 +121,24 @@ class _Material:
 
     @property
     def num_motions(self) -> int:
-        """Of all classes."""
+        """Number of motions of all classes."""
         return sum(sample.num_seen for sample in self.samples)
 
     @classmethod
     def collect(cls, scenarios: Scenarios, config: TokensConfig, show_progress: bool) -> "_Material":
-        """Read the drawn scenarios."""
+        """Motions and windows of a sample of the scenarios.
+
+        Args:
+            scenarios: the data.
+            config: sizes and seed.
+            show_progress: show a progress bar.
+        """
         samples = tuple(DistinctSample(config.max_segments, config.seed) for _ in CLASS_NAMES)
         cells = tuple(GridMotions(grid) for grid in config.trajtok.grids)
         windows = DistinctSample(config.max_segments, config.seed)
-        drawn = drawn_scenarios(len(scenarios), config.max_scenarios, config.seed)
-        with progress_bar("tokens: read", len(drawn), show=show_progress) as advance:
-            for position in drawn:
+        chosen = sample_scenarios(len(scenarios), config.max_scenarios, config.seed)
+        with progress_bar("tokens: read", len(chosen), show=show_progress) as advance:
+            for position in chosen:
                 scenario = scenarios[position]
                 motions = motions_of(scenario)
                 for index, (sample, grid) in enumerate(zip(samples, cells)):
@@ -147,6 +158,7 @@ def _motion_tokens(
     if config.kind == "trajtok":
         return rule_tokens(material.cells[index], config.trajtok), None
     motions = material.samples[index].rows()
+    # The data have few fast vehicles: without straight tokens of their own these would have no near token.
     straight = _unseen_speeds(motions, config) if index == 0 and len(motions) else motions[:0]
     tokens, radius = cluster_motions(
         motions,
@@ -161,14 +173,14 @@ def _motion_tokens(
 
 
 def _unseen_speeds(motions: Float32[np.ndarray, "n 6 3"], config: TokensConfig) -> Float32[np.ndarray, "s 6 3"]:
-    """Straight vehicle motions at constant speeds that no motion comes near; farther apart where they would be too many."""
+    """Straight motions at constant speeds that the data lack; with larger gaps where they would be too many."""
     ends = end_boxes(motions, 0).numpy()
-    share = np.linspace(0, 1, STEPS_PER_TOKEN + 1, dtype=np.float32)
-    gap, room = MAX_GAP_M, int(MAX_STRAIGHT_SHARE * config.num_tokens)
+    progress = np.linspace(0, 1, STEPS_PER_TOKEN + 1, dtype=np.float32)
+    gap, room = MAX_GAP_M, int(MAX_STRAIGHT_FRACTION * config.num_tokens)
     while True:
         way = np.arange(1, int(config.straight_up_to_mps * STEPS_PER_TOKEN * STEP_S / gap) + 1) * gap
         straight = np.zeros((len(way), STEPS_PER_TOKEN + 1, 3), np.float32)
-        straight[..., 0] = way[:, None] * share
+        straight[..., 0] = way[:, None] * progress
         lonely = np.array([shape_distance(ends, box).min() > gap for box in end_boxes(straight, 0).numpy()], bool)
         if lonely.sum() <= room:
             return straight[lonely]
@@ -178,9 +190,10 @@ def _unseen_speeds(motions: Float32[np.ndarray, "n 6 3"], config: TokensConfig) 
 def _without_dead(
     tokens: Float32[np.ndarray, "V 6 3"], motions: Float32[np.ndarray, "n 6 3"], class_index: int, config: TokensConfig
 ) -> Float32[np.ndarray, "W 6 3"]:
-    """The first token and those that are nearest to some motion; of a mirrored pair, both or none."""
+    """The first token and those that are nearest to some motion; both or none of a mirrored pair."""
     every = with_mirror_images(motions) if config.mirror else motions
     ends = end_boxes(every, class_index)
+    # Repeated, because without a token's mirror image its motions fall on others.
     while True:
         table = end_boxes(tokens, class_index)
         used = torch.bincount(nearest_rows(ends, table), minlength=len(tokens)) > 0

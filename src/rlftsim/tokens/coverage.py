@@ -1,4 +1,4 @@
-"""How well a vocabulary, any vocabulary, stands for the motions of a data set. Memory does not grow with the data."""
+"""Coverage: the error of any vocabulary on the motions of a data set. Memory does not grow with the data."""
 
 from dataclasses import dataclass, field
 
@@ -12,13 +12,14 @@ from rlftsim.progress import progress_bar
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.types import STEP_S, Scenario, Scenarios
 from rlftsim.tokens.agent_tokens import class_boxes, nearest_rows, tokenize_agents
-from rlftsim.tokens.motions import Motions, drawn_scenarios, end_boxes, is_plausible, mirrored, motions_of
+from rlftsim.tokens.motions import Motions, end_boxes, is_plausible, mirrored, motions_of, sample_scenarios
 from rlftsim.tokens.vocabulary import CLASS_NAMES, STEPS_PER_TOKEN, Vocabulary, class_of_type
 
 TOKEN_S = STEPS_PER_TOKEN * STEP_S
 MAX_SPEED_BIN_MPS = 45
+"""Number of bins of 1 m/s; the last one has all higher speeds."""
 _EDGES = np.concatenate([[0.0], np.geomspace(1e-5, 1e3, 4001)])
-"""Of bins that errors are counted in: a bin is 0.5 % wide."""
+"""Edges of the bins that errors are counted in: a bin is 0.5 % wide."""
 
 
 @dataclass(eq=False)
@@ -31,7 +32,7 @@ class Spread:
     histogram: Int64[np.ndarray, "4002"] = field(default_factory=lambda: np.zeros(len(_EDGES), np.int64))
 
     def add(self, values: Float[Tensor, "n"]) -> None:
-        """Count numbers in."""
+        """Add numbers to the stream."""
         if not len(values):
             return
         numbers = values.double().numpy()
@@ -50,46 +51,46 @@ class Spread:
         """95 % of the numbers are at most this, to 0.5 %."""
         return self.quantile(0.95)
 
-    def quantile(self, share: float) -> float:
-        """A share of the numbers is at most this, to 0.5 %; 0 if there was no number."""
+    def quantile(self, fraction: float) -> float:
+        """Value that a fraction of the numbers does not exceed, to 0.5 %; 0 if there was no number."""
         if not self.count:
             return 0.0
-        index = int(np.searchsorted(self.histogram.cumsum(), share * self.count))
+        index = int(np.searchsorted(self.histogram.cumsum(), fraction * self.count))
         return min(float(_EDGES[min(index + 1, len(_EDGES) - 1)]), self.max)
 
     def curve(self) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-        """Values and the share of numbers up to each: the cumulative distribution."""
+        """Cumulative distribution: values, and the fraction of the numbers up to each."""
         values = np.minimum(np.append(_EDGES[1:], np.inf), self.max)
         return values, self.histogram.cumsum() / max(self.count, 1)
 
 
 @dataclass(eq=False)
 class ClassCoverage:
-    """How well the tokens of one class stand for its motions. An error is a mean distance of the four corners of two boxes."""
+    """Coverage of one class's motions by its tokens. Errors are mean distances of the four corners of two boxes."""
 
     class_name: str
     poses: Float[np.ndarray, "V 5 3"]
-    """Of the tokens that exist, steps 1..5."""
+    """Poses of the tokens that exist, steps 1..5."""
     use: Int64[np.ndarray, "V"]
-    """Motions, and mirror images of motions, that fall on each token."""
+    """Number of motions, and of their mirror images, whose nearest token this is."""
     radius_m: float | None
-    """Of the disks the tokens were made from, where that is known."""
+    """Radius of the disks that the tokens were made from, if known."""
     is_implausible: Bool[np.ndarray, "V"]
-    """The token does what nobody can, such as turning by 30 degrees within 0.1 s."""
+    """True for tokens that cannot be driven or walked, such as a turn of 30 degrees within 0.1 s."""
     asymmetry_m: float
     """Error of the token whose mirror image is worst represented; 0 = left and right are the same."""
     single_m: Spread = field(default_factory=Spread)
-    """A motion alone against the nearest token."""
+    """Error of single motions: distance to the nearest token."""
     rolling_m: Spread = field(default_factory=Spread)
-    """Whole tracks, token after token, each from where the last one led."""
+    """Error of whole tracks in rolling tokenization, at the end of each token."""
     heading_rad: Spread = field(default_factory=Spread)
-    """Of whole tracks."""
+    """Error of the heading in rolling tokenization."""
     speed_mps: Spread = field(default_factory=Spread)
-    """Of the motions: way by time."""
+    """Mean speed of each motion."""
     speed_counts: Int64[np.ndarray, "45"] = field(default_factory=lambda: np.zeros(MAX_SPEED_BIN_MPS, np.int64))
-    """Motions by speed, a bin for each metre per second."""
+    """Number of motions in each speed bin of 1 m/s."""
     num_glitches: int = 0
-    """Motions left out because nobody can move like that."""
+    """Number of motions left out as glitches of the log."""
 
     @property
     def num_tokens(self) -> int:
@@ -98,29 +99,29 @@ class ClassCoverage:
 
     @property
     def token_speed_mps(self) -> Float[np.ndarray, "V"]:
-        """Way by time of each token."""
+        """Mean speed of each token."""
         return np.hypot(self.poses[:, -1, 0], self.poses[:, -1, 1]) / TOKEN_S
 
     @property
     def is_unused(self) -> Bool[np.ndarray, "V"]:
-        """No motion falls on the token, nor a mirror image of one."""
+        """True for tokens that are nearest to no motion, and to no mirror image of one."""
         return self.use == 0
 
     @property
     def is_spare(self) -> Bool[np.ndarray, "V"]:
-        """Unused, and there for a speed that the data lack: exactly straight ahead and even."""
+        """True for unused tokens that exist for a speed which the data lack: exactly straight at constant speed."""
         even = self.poses[:, -1:] * np.linspace(0.2, 1.0, STEPS_PER_TOKEN)[:, None]
         straight = (np.abs(self.poses - even).max((1, 2)) < 1e-4) & (np.abs(self.poses[:, -1, 1:]).max(1) < 1e-4)
         return self.is_unused & straight & (self.poses[:, -1, 0] > 0.05)
 
     @property
     def is_dead(self) -> Bool[np.ndarray, "V"]:
-        """Unused and not spare."""
+        """True for tokens that are unused and not spare."""
         return self.is_unused & ~self.is_spare
 
     @property
     def stands_still(self) -> bool:
-        """Token 0 does not move at all."""
+        """True if token 0 does not move at all."""
         return not np.abs(self.poses[0]).max() > 1e-6
 
 
@@ -133,20 +134,20 @@ def measure_coverage(
     seed: int = 0,
     show_progress: bool = False,
 ) -> tuple[ClassCoverage, ...]:
-    """Compare every class of a vocabulary with the recorded motions.
+    """Coverage of each class: a vocabulary compared with logged motions.
 
     Args:
         scenarios: the data.
         vocabulary: built from these scenarios or from others.
-        radii_m: what `build_vocabulary` returned, if it did.
-        max_scenarios: look at so many, drawn evenly; None = at all.
-        seed: of the draw.
-        show_progress: say on standard error how far it is.
+        radii_m: of the disks, from `build_vocabulary`; None = unknown.
+        max_scenarios: number of scenarios read, sampled uniformly; None = all.
+        seed: of the sample.
+        show_progress: show a progress bar on standard error.
     """
     classes = tuple(_begin(vocabulary, index, radius) for index, radius in enumerate(radii_m))
-    drawn = drawn_scenarios(len(scenarios), max_scenarios, seed)
-    with progress_bar("tokens: check", len(drawn), show=show_progress) as advance:
-        for position in drawn:
+    chosen = sample_scenarios(len(scenarios), max_scenarios, seed)
+    with progress_bar("tokens: check", len(chosen), show=show_progress) as advance:
+        for position in chosen:
             scenario = scenarios[position]
             _add_motions(classes, motions_of(scenario), vocabulary)
             _add_tracks(classes, scenario, vocabulary)
@@ -157,8 +158,10 @@ def measure_coverage(
 def _begin(vocabulary: Vocabulary, index: int, radius_m: float | None) -> ClassCoverage:
     exists = vocabulary.token_mask[index]
     poses = vocabulary.poses()[index, exists].numpy()
+    # The pose at step 0 is the origin.
     whole = np.concatenate([np.zeros_like(poses[:, :1]), poses], 1)
-    table = vocabulary.end_corners()[index, exists]
+    # Distance of each token's mirror image to the nearest token.
+    table = vocabulary.end_corners()[index, exists]  # [V, 4, 2]
     reflected = end_boxes(mirrored(poses), index)
     distance = (table[nearest_rows(reflected, table)] - reflected).norm(dim=-1).mean(-1)
     return ClassCoverage(
@@ -172,7 +175,7 @@ def _begin(vocabulary: Vocabulary, index: int, radius_m: float | None) -> ClassC
 
 
 def _add_motions(classes: tuple[ClassCoverage, ...], motions: Motions, vocabulary: Vocabulary) -> None:
-    """Each motion alone."""
+    """Add the single motions of a scenario."""
     for index, coverage in enumerate(classes):
         of_class = motions.of_class(index)
         coverage.num_glitches += int(((motions.class_id == index) & ~motions.is_plausible).sum())
@@ -180,8 +183,8 @@ def _add_motions(classes: tuple[ClassCoverage, ...], motions: Motions, vocabular
         table = vocabulary.end_corners()[index, vocabulary.token_mask[index]]
         nearest = nearest_rows(ends, table)
         reflected = nearest_rows(end_boxes(mirrored(of_class), index), table)
-        for fallen in (nearest, reflected):
-            coverage.use += np.bincount(fallen.numpy(), minlength=len(coverage.use))
+        for token_id in (nearest, reflected):
+            coverage.use += np.bincount(token_id.numpy(), minlength=len(coverage.use))
         coverage.single_m.add((table[nearest] - ends).norm(dim=-1).mean(-1))
         speed = np.hypot(of_class[:, -1, 0], of_class[:, -1, 1]) / TOKEN_S
         coverage.speed_mps.add(torch.from_numpy(speed))
@@ -190,10 +193,11 @@ def _add_motions(classes: tuple[ClassCoverage, ...], motions: Motions, vocabular
 
 
 def _add_tracks(classes: tuple[ClassCoverage, ...], scenario: Scenario, vocabulary: Vocabulary) -> None:
-    """Whole tracks, token after token."""
+    """Add the whole tracks of a scenario, rolling."""
     batch = collate([scenario])
     tokens = tokenize_agents(batch, vocabulary)
     length, width = (side[..., None].expand(tokens.valid.shape) for side in class_boxes(batch.object_type))
+    # Boxes where the tokens end and where the log is [1, A, K, 4, 2].
     led = box_corners(tokens.position, tokens.heading, length, width)
     logged = box_corners(tokens.logged_position, tokens.logged_heading, length, width)
     error = (led - logged).norm(dim=-1).mean(-1)

@@ -1,7 +1,7 @@
-"""k-disks: disks of one radius laid over what agents and maps really do; a token is the mean of a disk.
+"""k-disks: disks of one radius cover the motions, or map pieces, of the data; a token is the mean of a disk.
 
-The published recipe draws disk centres at random until V tokens exist, at a fixed radius. Here the radius is searched: the
-smallest at which V disks cover a wanted share. So a small vocabulary has wide disks instead of holes.
+The published recipe draws disk centers at random until V tokens exist, at a fixed radius. Here the radius is
+searched: the smallest at which V disks cover a given fraction. So a small vocabulary has wide disks instead of holes.
 """
 
 from dataclasses import dataclass
@@ -14,45 +14,58 @@ from rlftsim.tokens.motions import end_boxes, mirrored, straightened, with_mirro
 from rlftsim.tokens.vocabulary import STEPS_PER_TOKEN
 
 MIN_RADIUS_M = 0.02
-"""Finer disks than the jitter of recorded labels would tell noise from noise."""
+"""Finer disks than the jitter of logged positions would only cover noise."""
 MAX_RADIUS_M = 2.0
 RADIUS_STEPS = 7
+"""Bisections of the search, in log space: 2^-7 of the range is 4 %."""
 _STILL = np.zeros((1, STEPS_PER_TOKEN + 1, 3), np.float32)
 
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """Shapes of k points that disks are laid over. Their distance is the mean distance of their points."""
+    """Shapes of k points that disks cover. The distance of two shapes is the mean distance of their points."""
 
     shapes: Float32[np.ndarray, "n k 2"]
     start: Float32[np.ndarray, "k 2"]
-    """Centre of the first disk."""
+    """Center of the first disk."""
     partner: Int64[np.ndarray, "n"] | None = None
-    """Where each shape's mirror image is; None = left and right are not paired."""
+    """Index of each shape's mirror image; None = no mirror images."""
     straight: Float32[np.ndarray, "n k 2"] | None = None
     """Each shape moved onto the axis of the mirror."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "_tree", KDTree(self.shapes.mean(1)))
 
-    def within(self, centre: Float32[np.ndarray, "k 2"], radius_m: float) -> Int64[np.ndarray, "m"]:
-        """Shapes within a radius of a shape. (The means of two shapes are never farther apart than the shapes.)"""
-        near = np.asarray(self._tree.query_ball_point(centre.mean(0), radius_m * 1.001), np.int64)  # type: ignore[attr-defined]
+    def within(self, center: Float32[np.ndarray, "k 2"], radius_m: float) -> Int64[np.ndarray, "m"]:
+        """Indices of the shapes within a radius of a shape.
+
+        Args:
+            center: any shape.
+            radius_m: greatest distance, m.
+        """
+        # The means of two shapes are never farther apart than the shapes: the tree over means finds a superset.
+        found = self._tree.query_ball_point(center.mean(0), radius_m * 1.001)  # type: ignore[attr-defined]
+        near = np.asarray(found, np.int64)
         near.sort()
-        return near[shape_distance(self.shapes[near], centre) <= radius_m]
+        return near[shape_distance(self.shapes[near], center) <= radius_m]
 
 
 @dataclass(frozen=True, eq=False)
 class Disk:
-    """Members of a disk; `is_pair` says that its mirror image is a disk, too."""
+    """Members of a disk. `is_pair` is True if its mirror image is a disk, too."""
 
     members: Int64[np.ndarray, "m"]
     is_pair: bool
 
 
-def shape_distance(shapes: Float32[np.ndarray, "n k 2"], centre: Float32[np.ndarray, "*k 2"]) -> Float[np.ndarray, "n"]:
-    """Mean distance of the points of each shape to those of another one."""
-    return np.sqrt(np.square(shapes - centre).sum(-1)).mean(-1)
+def shape_distance(shapes: Float32[np.ndarray, "n k 2"], center: Float32[np.ndarray, "*k 2"]) -> Float[np.ndarray, "n"]:
+    """Mean distance of the points of each shape to those of another one, m.
+
+    Args:
+        shapes: n shapes.
+        center: one shape, or one for each of the n.
+    """
+    return np.sqrt(np.square(shapes - center).sum(-1)).mean(-1)
 
 
 def cluster_motions(
@@ -67,12 +80,12 @@ def cluster_motions(
     """At most `limit` tokens, the first exactly still, and the radius of their disks.
 
     Args:
-        motions: what is to be covered.
-        class_index: whose box is compared.
+        motions: to be covered.
+        class_index: class whose box is compared.
         limit: V.
-        coverage: share of the motions that lie within a disk.
-        mirror: motions are covered together with their mirror images, by tokens that come in pairs or are straight.
-        rng: in which order disks are laid.
+        coverage: fraction of the motions that lie within a disk.
+        mirror: cover mirror images, too, by tokens that come in pairs or are straight.
+        rng: draws the order in which shapes become centers of disks.
     """
     if not len(motions):
         return _STILL, 0.0
@@ -81,13 +94,28 @@ def cluster_motions(
     order = rng.permutation(len(every))
     radius = smallest_radius(cloud, order, coverage=coverage, limit=limit)
     disks, _ = lay_disks(cloud, order, radius, limit)
-    return np.concatenate([_STILL, *[_tokens_of(disk, every, mirror) for disk in disks[1:]]]), radius
+    tokens = [_STILL]
+    for disk in disks[1:]:
+        token = mean_motion(every[disk.members])[None]
+        if disk.is_pair:
+            tokens += [token, mirrored(token)]
+        else:
+            # With mirror images, a disk that is not one of a pair is its own mirror image.
+            tokens.append(straightened(token) if mirror else token)
+    return np.concatenate(tokens), radius
 
 
 def cluster_windows(
     windows: Float32[np.ndarray, "w 11 2"], *, limit: int, coverage: float, rng: np.random.Generator
 ) -> Float32[np.ndarray, "P 11 2"]:
-    """Prototypes of map pieces: a straight one, and the mean of each disk over the windows."""
+    """Prototypes of map pieces: a straight one, and the mean of each disk over the windows.
+
+    Args:
+        windows: pieces of 5 m, a point every 0.5 m, in their own frame.
+        limit: P.
+        coverage: fraction of the windows that lie within a disk.
+        rng: draws the order in which windows become centers of disks.
+    """
     straight = np.stack([np.arange(11) * 0.5, np.zeros(11)], -1).astype(np.float32)
     if not len(windows):
         return straight[None]
@@ -99,7 +127,15 @@ def cluster_windows(
 
 
 def smallest_radius(cloud: Cloud, order: Int64[np.ndarray, "n"], *, coverage: float, limit: int) -> float:
-    """Radius at which `limit` disks cover the wanted share of shapes, to about 4 %."""
+    """Smallest radius at which `limit` disks cover the given fraction of the shapes, to about 4 %, m.
+
+    Args:
+        cloud: the shapes.
+        order: of the centers.
+        coverage: fraction of the shapes within a disk.
+        limit: number of tokens.
+    """
+    # Bisection of the logarithm: coverage grows with the radius, up to noise from the order.
     low, high = MIN_RADIUS_M, MAX_RADIUS_M
     for _ in range(RADIUS_STEPS):
         middle = float(np.sqrt(low * high))
@@ -111,10 +147,17 @@ def smallest_radius(cloud: Cloud, order: Int64[np.ndarray, "n"], *, coverage: fl
 def lay_disks(
     cloud: Cloud, order: Int64[np.ndarray, "n"], radius_m: float, limit: int
 ) -> tuple[list[Disk], Bool[np.ndarray, "n"]]:
-    """Disks for up to `limit` tokens, and which shapes are left outside.
+    """Disks for up to `limit` tokens, and a mask of the shapes outside all of them.
 
-    The first disk is around the cloud's start, each further one around the first shape in `order` that is left. If that shape is
-    within the radius of its own straightened form, the disk is laid around that; else the mirror image is a disk, too.
+    The first disk is around the cloud's start, each further one around the first shape in `order` that is still
+    outside. If that shape is within the radius of its own straightened form, the disk is centered on that; else its
+    mirror image is a disk, too.
+
+    Args:
+        cloud: the shapes.
+        order: in which shapes become centers.
+        radius_m: of all disks.
+        limit: number of tokens; a pair of disks counts twice.
     """
     left = np.ones(len(cloud.shapes), bool)
     disks = [Disk(cloud.within(cloud.start, radius_m), is_pair=False)]
@@ -122,14 +165,15 @@ def lay_disks(
     count = 1
     off_axis = np.inf if cloud.straight is None else shape_distance(cloud.shapes, cloud.straight)
     is_pair = (off_axis > radius_m) & (cloud.partner is not None) & np.ones(len(left), bool)
-    for centre in order:
+    for center in order:
         if count == limit:
             break
-        pair = bool(is_pair[centre])
-        if not left[centre] or count + 1 + pair > limit:
+        # A pair does not fit into the last free token; a straight disk further on may.
+        pair = bool(is_pair[center])
+        if not left[center] or count + 1 + pair > limit:
             continue
         around = cloud.shapes if pair or cloud.straight is None else cloud.straight
-        members = cloud.within(around[centre], radius_m)
+        members = cloud.within(around[center], radius_m)
         members = members[left[members]]
         left[members] = False
         if cloud.partner is not None:
@@ -140,25 +184,18 @@ def lay_disks(
 
 
 def _motion_cloud(motions: Float32[np.ndarray, "n 6 3"], class_index: int, mirror: bool) -> Cloud:
-    """End boxes of motions, each followed by its mirror image if asked for."""
+    """End boxes of motions; with `mirror` each is followed by its mirror image."""
     start = end_boxes(_STILL, class_index)[0].numpy()
     if not mirror:
         return Cloud(end_boxes(motions, class_index).numpy(), start)
+    # Motion 2i and its mirror image 2i + 1 are partners: i ^ 1.
     both = with_mirror_images(motions)
     ends, on_axis = (end_boxes(m, class_index).numpy() for m in (both, straightened(both)))
     return Cloud(ends, start, np.arange(len(both)) ^ 1, on_axis)
 
 
-def _tokens_of(disk: Disk, motions: Float32[np.ndarray, "n 6 3"], mirror: bool) -> Float32[np.ndarray, "t 6 3"]:
-    """The mean motion of a disk, and its mirror image; straight where the disk is its own mirror image."""
-    token = mean_motion(motions[disk.members])[None]
-    if disk.is_pair:
-        return np.concatenate([token, mirrored(token)])
-    return straightened(token) if mirror else token
-
-
 def mean_motion(motions: Float32[np.ndarray, "n 6 3"]) -> Float32[np.ndarray, "6 3"]:
-    """Mean of positions; of headings, the circular mean."""
+    """Mean motion: mean positions and circular mean of the headings."""
     mean = motions.mean(0)
     mean[:, 2] = np.arctan2(np.sin(motions[..., 2]).mean(0), np.cos(motions[..., 2]).mean(0))
     return mean

@@ -1,4 +1,4 @@
-"""What vocabularies are made of: half-second motions and map windows of a data set, in bounded memory.
+"""Half-second motions of a data set, and samples of motions and map windows in bounded memory.
 
 A *motion* is six poses (x, y, heading) at 10 Hz in the frame of the first: [6, 3].
 """
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Int64, UInt64
+from jaxtyping import Bool, Float, Float32, Int64
 from torch import Tensor
 
 from rlftsim.geometry import box_corners, rotate, wrap_angle
@@ -17,12 +17,13 @@ from rlftsim.tokens.agent_tokens import clean_tracks
 from rlftsim.tokens.vocabulary import CLASS_BOXES_M, STEPS_PER_TOKEN, class_of_type
 
 MIN_VALID_STEPS = 30
+"""Agents with fewer logged steps are left out, as in the public SMART code."""
 MAX_SPEED_MPS = (45.0, 12.0, 25.0)
-"""Of each class; a single step that is faster is a glitch of the record."""
+"""Greatest speed of each class; a faster step is a glitch of the log."""
 MAX_STEP_TURN_RAD = np.deg2rad(30.0)
-"""Within 0.1 s; more is a glitch of the record."""
+"""Greatest turn within 0.1 s; more is a glitch of the log."""
 MAX_TURN_RAD = 1.2
-"""Within half a second."""
+"""Greatest turn within half a second."""
 _MIRROR = np.array([1, -1, -1], np.float32)
 _KEY_M = 0.01
 
@@ -34,18 +35,19 @@ class Motions:
     poses: Float32[np.ndarray, "n 6 3"]
     class_id: Int64[np.ndarray, "n"]
     is_plausible: Bool[np.ndarray, "n"]
-    """False = a glitch of the record, not to be learned from."""
+    """False = a glitch of the log, not to be learned from."""
 
     def of_class(self, index: int) -> Float32[np.ndarray, "m 6 3"]:
-        """The plausible ones of a class."""
+        """The plausible motions of a class."""
         return self.poses[self.is_plausible & (self.class_id == index)]
 
 
 def motions_of(scenario: Scenario) -> Motions:
-    """Motions of the simulated agents with at least 30 recorded steps, one after the other, in the frame of their start."""
+    """Consecutive motions of the simulated agents with at least 30 logged steps, each in the frame of its start."""
     batch = collate([scenario])
     tracks = clean_tracks(batch)
     enough = batch.valid.sum(-1) >= MIN_VALID_STEPS if scenario.has_future else batch.valid[..., CURRENT_STEP]
+    # [1, A, K]: True = all six steps are valid
     windows = tracks.valid.unfold(-1, STEPS_PER_TOKEN + 1, STEPS_PER_TOKEN).all(-1) & enough[..., None]
     position = tracks.position.unfold(2, STEPS_PER_TOKEN + 1, STEPS_PER_TOKEN)[windows].transpose(1, 2)  # [n, 6, 2]
     heading = tracks.heading.unfold(2, STEPS_PER_TOKEN + 1, STEPS_PER_TOKEN)[windows]
@@ -56,7 +58,12 @@ def motions_of(scenario: Scenario) -> Motions:
 
 
 def is_plausible(poses: Float32[np.ndarray, "n 6 3"], class_id: Int64[np.ndarray, "n"] | int) -> Bool[np.ndarray, "n"]:
-    """Whether a motion can be driven, walked or cycled: no step too fast, no turn too sharp."""
+    """True for motions that can be driven, walked or cycled: no step too fast, no turn too sharp.
+
+    Args:
+        poses: the motions.
+        class_id: of each motion, or of all.
+    """
     step = np.diff(poses, axis=1)
     speed = np.hypot(step[..., 0], step[..., 1]).max(1) / STEP_S
     turn = np.abs((step[..., 2] + np.pi) % (2 * np.pi) - np.pi).max(1)
@@ -75,49 +82,66 @@ def with_mirror_images(motions: Float32[np.ndarray, "n 6 3"]) -> Float32[np.ndar
 
 
 def straightened(motions: Float32[np.ndarray, "n 6 3"]) -> Float32[np.ndarray, "n 6 3"]:
-    """The motions moved onto the axis of the mirror: as far ahead, nothing to the side, no turn."""
+    """The motions projected onto the axis of the mirror: same x, y = 0, no turn."""
     return motions * np.array([1, 0, 0], np.float32)
 
 
 def end_boxes(poses: Float[np.ndarray, "n t 3"], class_index: int) -> Float[Tensor, "n 4 2"]:
-    """Box of a class at the end of each motion."""
+    """Corners of a class's box at the end of each motion.
+
+    Args:
+        poses: the motions.
+        class_index: into `CLASS_BOXES_M`.
+    """
     return boxes(poses[:, -1:], class_index)[:, 0]
 
 
 def boxes(poses: Float[np.ndarray, "n t 3"], class_index: int) -> Float[Tensor, "n t 4 2"]:
-    """Boxes of a class at each pose."""
+    """Corners of a class's box at each pose.
+
+    Args:
+        poses: the motions.
+        class_index: into `CLASS_BOXES_M`.
+    """
     tensor = torch.from_numpy(np.ascontiguousarray(poses, dtype=np.float32))
     length, width = (torch.tensor(side) for side in CLASS_BOXES_M[class_index])
     return box_corners(tensor[..., :2], tensor[..., 2], length, width)
 
 
 def motion_keys(poses: Float32[np.ndarray, "n 6 3"]) -> Int64[np.ndarray, "n 6"]:
-    """Motions that are the same to a centimetre (at their middle and end), or each other's mirror images, have the same key."""
+    """Keys that are equal for motions that agree to 1 cm (at steps 2 and 5), and for mirror images."""
     key = np.round(poses[:, [2, 5]] / _KEY_M).astype(np.int64).reshape(len(poses), 6)
     other = np.round(mirrored(poses[:, [2, 5]]) / _KEY_M).astype(np.int64).reshape(len(poses), 6)
+    # Of a key and that of the mirror image take the larger one in lexicographic order.
     first = np.argmax(key != other, axis=1)
     rows = np.arange(len(key))
     return np.where((key[rows, first] < other[rows, first])[:, None], other, key)
 
 
 def window_keys(windows: Float32[np.ndarray, "n 11 2"]) -> Int64[np.ndarray, "n 22"]:
-    """Map windows that are the same to 5 cm have the same key."""
+    """Keys that are equal for map windows that agree to 5 cm."""
     return np.round(windows.reshape(len(windows), 22) / 0.05).astype(np.int64)
 
 
-def drawn_scenarios(num_scenarios: int, limit: int | None, seed: int) -> list[int]:
-    """Positions of at most `limit` scenarios, drawn evenly, in ascending order."""
+def sample_scenarios(num_scenarios: int, limit: int | None, seed: int) -> list[int]:
+    """Positions of at most `limit` scenarios, sampled uniformly, in ascending order.
+
+    Args:
+        num_scenarios: to sample from.
+        limit: size of the sample; None = all.
+        seed: of the sample.
+    """
     if limit is None or num_scenarios <= limit:
         return list(range(num_scenarios))
-    drawn = np.random.default_rng(seed).choice(num_scenarios, limit, replace=False)
-    return sorted(drawn.tolist())
+    chosen = np.random.default_rng(seed).choice(num_scenarios, limit, replace=False)
+    return sorted(chosen.tolist())
 
 
 class DistinctSample:
-    """An even sample of the distinct rows of a stream of any length, in the memory of twice the sample.
+    """Uniform sample of the distinct rows of a stream of any length, in the memory of twice the sample.
 
-    A row's key is hashed; the rows with the smallest hashes stay. So every distinct key has the same chance whenever and however
-    often it comes, and the same seed draws the same keys in any order.
+    A row's key is hashed; the rows with the smallest hashes stay. So every distinct key has the same probability,
+    whenever and however often it comes, and the same seed samples the same keys in any order.
 
     Args:
         capacity: rows that are kept.
@@ -133,9 +157,21 @@ class DistinctSample:
         self._rows: list[np.ndarray] = []
 
     def add(self, rows: Float32[np.ndarray, "n ..."], keys: Int64[np.ndarray, "n k"]) -> None:
-        """Offer rows."""
+        """Add rows to the stream.
+
+        Args:
+            rows: to be sampled.
+            keys: equal for rows that count as the same.
+        """
         self.num_seen += len(rows)
-        hashes = _hash(keys, self._seed)
+        # splitmix64: 64 well-mixed bits of each row.
+        hashes = np.full(len(keys), self._seed, np.uint64)
+        for column in keys.astype(np.uint64).T:
+            hashes = (hashes ^ column) + np.uint64(0x9E3779B97F4A7C15)
+            hashes = (hashes ^ (hashes >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+            hashes = (hashes ^ (hashes >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+            hashes ^= hashes >> np.uint64(31)
+        # Rows above the limit, the largest hash of a full sample, can never be in it.
         wanted = hashes < self._limit
         self._hashes.append(hashes[wanted])
         self._rows.append(rows[wanted])
@@ -143,7 +179,7 @@ class DistinctSample:
             self._shrink()
 
     def rows(self) -> Float32[np.ndarray, "m ..."]:
-        """The sample, in an order that says nothing."""
+        """The sample, ordered by hash."""
         self._shrink()
         return self._rows[0]
 
@@ -153,14 +189,3 @@ class DistinctSample:
             self._limit = hashes[self.capacity]
         self._hashes = [hashes[: self.capacity]]
         self._rows = [np.concatenate(self._rows)[first[: self.capacity]]]
-
-
-def _hash(keys: Int64[np.ndarray, "n k"], seed: int) -> UInt64[np.ndarray, "n"]:
-    """64 well-mixed bits of each row (splitmix64)."""
-    state = np.full(len(keys), seed, np.uint64)
-    for column in keys.astype(np.uint64).T:
-        state = (state ^ column) + np.uint64(0x9E3779B97F4A7C15)
-        state = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-        state = (state ^ (state >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-        state ^= state >> np.uint64(31)
-    return state

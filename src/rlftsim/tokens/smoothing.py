@@ -1,8 +1,9 @@
-"""Label smoothing that knows where tokens lead (TrajTok): what is not certain is spread over the tokens near the right one.
+"""Spatial label smoothing (TrajTok): the smoothed probability goes to the tokens that end near the target.
 
-The other tokens of the class share it in proportion to 1 / (1e-4 + d)^2, d the mean distance in metres of their end box's corners to
-those of the target's. (TrajTok's code divides by the sum twice and so smooths next to nothing; this is the formula as meant.)
-The weights fall off so slowly that no short list of neighbours holds them: rows are computed for the distinct targets of a batch.
+The other tokens of the class get it in proportion to 1 / (1e-4 + d)^2, with d the mean distance in m of their end
+box's corners to those of the target's. (TrajTok's code divides by the sum twice and so hardly smooths; this is the
+formula as intended.) The weights fall off so slowly that a short list of neighbors would lose most of them. So rows
+are computed for the distinct targets of a batch.
 """
 
 import torch
@@ -20,14 +21,22 @@ _ROWS_PER_CHUNK = 256
 def neighbor_weights(
     vocabulary: Vocabulary, class_id: Int64[Tensor, "U"], token_id: Int64[Tensor, "U"]
 ) -> Float[Tensor, "U V"]:
-    """How the smoothed mass of target tokens is spread: each row sums to 1 over the other tokens of the class; all on the target
-    itself where it is the only one."""
+    """Distribution of the smoothed probability of target tokens: each row sums to 1 over the other tokens of the class.
+
+    All of it is on the target itself where it is the only token.
+
+    Args:
+        vocabulary: the tokens.
+        class_id: class of each target.
+        token_id: the targets.
+    """
     ends = vocabulary.end_corners()
     weights = ends.new_zeros(len(token_id), vocabulary.num_tokens)
     for index, (table, exists) in enumerate(zip(ends, vocabulary.token_mask)):
         for rows in (class_id == index).nonzero()[:, 0].split(_ROWS_PER_CHUNK):
             distance = corner_distances(table[token_id[rows]], table) / 4
             weights[rows] = exists / (SOFTNESS_M + distance).square()
+    # The target itself has d = 0 and gets nothing, unless it is alone.
     weights.scatter_(1, token_id[:, None], 0.0)
     total = weights.sum(1, keepdim=True)
     weights.scatter_(1, token_id[:, None], (total == 0).to(weights.dtype))
@@ -40,11 +49,17 @@ def summed_log_prob_nearby(
     class_id: Int64[Tensor, "R"],
     vocabulary: Vocabulary,
 ) -> Float[Tensor, ""]:
-    """Sum over rows of the expected log-probability of a token drawn by `neighbor_weights` of the row's target.
+    """Sum over rows of the expected log-probability under `neighbor_weights` of the row's target, nats.
 
-    Rows with the same target are added up first, so the weights take the memory of the distinct targets.
+    Args:
+        log_probs: of all tokens, for R rows.
+        target: token of each row.
+        class_id: class of each row.
+        vocabulary: the tokens.
     """
+    # Rows with the same target are added up first, so that the weights need memory for the U distinct targets only.
     distinct, group = (class_id * vocabulary.num_tokens + target).unique(return_inverse=True)
     summed = log_probs.new_zeros(len(distinct), log_probs.shape[-1]).index_add(0, group, log_probs)
     weights = neighbor_weights(vocabulary, distinct // vocabulary.num_tokens, distinct % vocabulary.num_tokens)
+    # 0 * -inf would be NaN: masked tokens have log-probability -inf and weight 0.
     return (weights * torch.where(weights > 0, summed, 0.0)).sum()

@@ -1,7 +1,7 @@
-"""TrajTok: a vocabulary by rule and data. A token for every cell of a grid of end positions that the data use, or nearly use.
+"""TrajTok: a vocabulary by rule and data, with a token for every cell of a grid of end positions that the data use.
 
-After TrajTok (first place of the 2025 sim-agents challenge), with three of its defects mended: the grid of every class is
-symmetric, so are the tokens; a token made by rule ends with the heading that was asked for; and it neither starts nor ends at rest.
+After TrajTok (first place of the 2025 sim-agents challenge), with three defects fixed: grids and tokens are
+symmetric, a token made by rule ends with the given heading, and it neither starts nor ends at rest.
 """
 
 from dataclasses import dataclass, field
@@ -15,7 +15,7 @@ from rlftsim.tokens.motions import mirrored
 from rlftsim.tokens.vocabulary import STEPS_PER_TOKEN
 
 MAX_MEAN_STEP_TURN_RAD = np.deg2rad(10.0)
-"""A mean of motions that turns by more within 0.1 s is a blend of unlike ones: a rule makes a better token."""
+"""A mean motion that turns by more within 0.1 s blends unlike motions: a token by rule replaces it."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Grid:
     x_bins: int
     y_max_m: float
     y_bins: int
-    """From end to end; even, so that y = 0 is a grid line."""
+    """Bins from end to end; even, so that y = 0 is a grid line."""
     min_motions: int
     """A cell with fewer is empty."""
 
@@ -42,7 +42,7 @@ class Grid:
 
     @property
     def spacing_m(self) -> tuple[float, float]:
-        """Of neighbouring lines, in x and y."""
+        """Spacing of the grid lines in x and y."""
         return (self.x_max_m - self.x_min_m) / self.x_bins, 2 * self.y_max_m / self.y_bins
 
     @property
@@ -52,7 +52,7 @@ class Grid:
 
     @property
     def origin(self) -> tuple[int, int]:
-        """Cell of standing still."""
+        """Index of the cell of standing still."""
         return round(-self.x_min_m / self.spacing_m[0]), self.y_bins // 2
 
 
@@ -64,7 +64,7 @@ class TrajTokConfig:
     pedestrian: Grid = field(default_factory=lambda: Grid(-1.5, 4.5, 120, 2.0, 80, 1))
     cyclist: Grid = field(default_factory=lambda: Grid(-1.0, 8.0, 180, 1.0, 40, 1))
     neighborhood: int = 9
-    """Cells along a side of the square that is looked at around a cell."""
+    """Side of the square around a cell whose used cells are counted, in cells."""
     num_neighbors: int = 20
     """A used cell with fewer used ones around it is dropped; an unused one with more is added."""
 
@@ -80,7 +80,7 @@ class TrajTokConfig:
 
 
 class GridMotions:
-    """Counts and sums of motions by the cell they end in; memory does not grow with the data. Mirror images are counted, too."""
+    """Counts and sums of motions by the cell they end in, mirror images included, in constant memory."""
 
     def __init__(self, grid: Grid):
         self.grid = grid
@@ -88,7 +88,7 @@ class GridMotions:
         self._sum = np.zeros((*grid.shape, STEPS_PER_TOKEN + 1, 3))
 
     def add(self, motions: Float32[np.ndarray, "n 6 3"]) -> None:
-        """Count motions; those that end outside the grid are not."""
+        """Add motions; those that end outside the grid are ignored."""
         spacing = np.array(self.grid.spacing_m)
         cell = np.round(motions[:, -1, :2] / spacing).astype(np.int64) + np.array(self.grid.origin)
         inside = ((cell >= 0) & (cell < np.array(self.grid.shape))).all(1)
@@ -98,7 +98,8 @@ class GridMotions:
 
     @property
     def count(self) -> Int64[np.ndarray, "X Y"]:
-        """Motions and mirror images in each cell."""
+        """Number of motions and mirror images in each cell."""
+        # Mirroring flips the y axis of the grid, whose middle line is y = 0.
         return self._count + self._count[:, ::-1]
 
     @property
@@ -109,17 +110,29 @@ class GridMotions:
 
 
 def rule_tokens(cells: GridMotions, config: TrajTokConfig) -> Float32[np.ndarray, "V 6 3"]:
-    """Tokens of one class, the first exactly still: left and right alike, one for each cell that is used after smoothing."""
+    """Tokens of one class, symmetric, the first exactly still: one for each cell that is used after smoothing.
+
+    Args:
+        cells: motions of the class.
+        config: thresholds of the smoothing.
+    """
+    # 1. Cells that get a token [X, Y].
     grid = cells.grid
     seen = cells.count >= grid.min_motions
     kept = smoothed(seen, config)
     kept[grid.origin] = True
-    mean = cells.mean
+    # 2. The cell's mean motion, moved to the cell's center, or a curve where the data lack a good mean.
+    mean = cells.mean  # [X, Y, 6, 3]
     turns = np.abs(np.diff(mean[..., 2], axis=2)).max(2) > MAX_MEAN_STEP_TURN_RAD
     by_rule = ~seen | turns
-    ends = _grid_points(grid)
+    axes = ((np.arange(size) - zero) * gap for size, zero, gap in zip(grid.shape, grid.origin, grid.spacing_m))
+    ends = np.stack(np.meshgrid(*axes, indexing="ij"), -1)  # [X, Y, 2], centers of the cells
     heading = _end_headings(mean[..., -1, 2], kept & seen, grid)
-    tokens = np.where(by_rule[..., None, None], _curves(ends, heading), _moved_to(mean, ends))
+    progress = np.linspace(0, 1, STEPS_PER_TOKEN + 1)
+    moved = mean.copy()
+    moved[..., :2] += progress[:, None] * (ends - mean[..., -1, :2])[:, :, None]
+    tokens = np.where(by_rule[..., None, None], _curves(ends, heading), moved)
+    # 3. Exactly symmetric: the middle line is straight, the right half mirrors the left one.
     half = grid.origin[1]
     tokens[:, half, :, 1:] = 0.0
     tokens[:, :half] = mirrored(tokens[:, :half:-1])
@@ -130,38 +143,34 @@ def rule_tokens(cells: GridMotions, config: TrajTokConfig) -> Float32[np.ndarray
 
 
 def smoothed(used: Bool[np.ndarray, "X Y"], config: TrajTokConfig) -> Bool[np.ndarray, "X Y"]:
-    """Used cells without the lonely ones, and unused ones that are surrounded."""
+    """Used cells without isolated ones, plus unused ones that are surrounded by used ones.
+
+    Args:
+        used: cells that the data use.
+        config: size of the square, and number of used cells in it.
+    """
+    # The mean over the square times its size is the number of used cells, minus the cell itself.
     side = config.neighborhood
     around = np.rint(uniform_filter(used.astype(np.float64), side, mode="constant") * side**2).astype(int) - used
     return np.where(used, around >= config.num_neighbors, around > config.num_neighbors)
 
 
-def _grid_points(grid: Grid) -> Float[np.ndarray, "X Y 2"]:
-    x, y = ((np.arange(size) - zero) * spacing for size, zero, spacing in zip(grid.shape, grid.origin, grid.spacing_m))
-    return np.stack(np.meshgrid(x, y, indexing="ij"), -1)
-
-
 def _end_headings(
     heading: Float[np.ndarray, "X Y"], known: Bool[np.ndarray, "X Y"], grid: Grid
 ) -> Float[np.ndarray, "X Y"]:
-    """Heading of the nearest cell where one is known; 0 if there is none."""
+    """Heading of the nearest cell where it is known; 0 if it is known nowhere."""
     if not known.any():
         return np.zeros_like(heading)
     nearest = distance_transform_edt(~known, sampling=grid.spacing_m, return_distances=False, return_indices=True)
     return heading[tuple(nearest)]  # type: ignore[arg-type]
 
 
-def _moved_to(motions: Float[np.ndarray, "X Y 6 3"], ends: Float[np.ndarray, "X Y 2"]) -> Float[np.ndarray, "X Y 6 3"]:
-    """The motions with a growing share of the shift that brings them to other end points."""
-    share = np.linspace(0, 1, STEPS_PER_TOKEN + 1)
-    moved = motions.copy()
-    moved[..., :2] += share[:, None] * (ends - motions[..., -1, :2])[:, :, None]
-    return moved
-
-
 def _curves(ends: Float[np.ndarray, "X Y 2"], heading: Float[np.ndarray, "X Y"]) -> Float[np.ndarray, "X Y 6 3"]:
-    """Cubic curves from the origin to end points: tangents as long as the way, along the headings at the start (0) and at the end
-    (against them where the end lies behind). Headings change evenly."""
+    """Cubic Hermite curves from the origin to end points, with headings that change evenly.
+
+    The tangents are as long as the straight distance. They point along the headings at the start (0) and at the end, or
+    against them where the end lies behind the start.
+    """
     t = np.linspace(0, 1, STEPS_PER_TOKEN + 1)[:, None]
     length = np.hypot(ends[..., 0], ends[..., 1]) * np.where(ends[..., 0] < 0, -1.0, 1.0)
     start = np.stack([length, np.zeros_like(length)], -1)

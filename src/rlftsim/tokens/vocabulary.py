@@ -1,41 +1,45 @@
-"""Templates of motion and of map pieces, and the file they live in.
+"""Vocabulary: templates of motions and of map pieces, and their file.
 
-C = 3 classes (vehicle, pedestrian, cyclist), V motion tokens a class, six 10 Hz poses a token (step 0 is where it starts).
-Frame of a token: the agent at its start. A token's boxes have the size of the class, never of the agent.
+C = 3 classes (vehicle, pedestrian, cyclist), V motion tokens per class, six poses per token at 10 Hz (step 0 is its
+start). Frame of a token: the agent at its start. A token's boxes have the size of the class, never of the agent.
 """
 
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float, Int64
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
+from rlftsim.atomic_io import save_tensors
 from rlftsim.errors import DataError
-from rlftsim.files import save_tensors
 from rlftsim.geometry import pose_of_corners
 from rlftsim.scenario.types import ObjectType
 
 STEPS_PER_TOKEN = 5
 CLASS_NAMES = ("vehicle", "pedestrian", "cyclist")
 CLASS_BOXES_M = ((4.8, 2.0), (1.0, 1.0), (2.0, 1.0))
-"""Length and width of the box a class is matched with."""
+"""Length and width of each class's box, which tokens are matched with."""
 
 _CLASS_OF_TYPE = torch.tensor([0, 0, 1, 2, 0])
 FORMAT = "rlftsim-vocabulary-1"
 
 
 def class_of_type(object_type: Int64[Tensor, "..."]) -> Int64[Tensor, "..."]:
-    """Class index of WOMD object types. Types that are none of the three (unset, other) move as vehicles: they must be
-    simulated, and a box that may drive is the least wrong."""
+    """Class index of WOMD object types; other and unset types count as vehicles."""
+    # The challenge requires agents of every type to be simulated. A box that can drive is the least wrong model of
+    # them.
     return _CLASS_OF_TYPE.to(object_type.device)[object_type.clamp(0, ObjectType.OTHER)]
 
 
 @dataclass(frozen=True, eq=False)
 class Vocabulary:
     """Motion tokens of each class and prototypes of map pieces."""
+
+    fingerprint_name: ClassVar[str] = "rlftsim.tokens.vocabulary.Vocabulary"
 
     corners: Float[Tensor, "C V 6 4 2"]
     """Boxes at steps 0..5 in the frame of the start pose; rows past a class's own number of tokens are zero."""
@@ -44,10 +48,10 @@ class Vocabulary:
     map_prototypes: Float[Tensor, "P 11 2"]
     """Pieces of 5 m, a point every 0.5 m, start at the origin with heading 0."""
     origin: str = ""
-    """The command, data and seed that made it."""
+    """Command, data and seed that it was made with."""
 
     def __deepcopy__(self, memo: object) -> "Vocabulary":
-        """Itself: it never changes, and what was derived with it stays known to a copy of a policy."""
+        """The vocabulary itself: it never changes, and caches keyed by it stay valid for a copy of a policy."""
         return self
 
     @property
@@ -74,7 +78,7 @@ class Vocabulary:
         )
 
     def save(self, path: Path) -> None:
-        """Write to `path` (safetensors), by way of a temporary name."""
+        """Write a safetensors file, atomically."""
         tensors = {
             "corners": self.corners.contiguous(),
             "token_mask": self.token_mask.contiguous(),
@@ -84,10 +88,10 @@ class Vocabulary:
 
     @classmethod
     def load(cls, path: Path) -> "Vocabulary":
-        """Read what `save` wrote.
+        """Vocabulary from a file written by `save`.
 
         Raises:
-            DataError: no such file, damaged, or not a vocabulary.
+            DataError: the file is missing, damaged or not a vocabulary.
         """
         try:
             with safe_open(path, framework="pt") as file:

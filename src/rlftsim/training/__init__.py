@@ -1,1 +1,1 @@
-"""How it learns: pre-training and closed-loop fine-tuning."""
+"""Training: pre-training, closed-loop fine-tuning with rewards, CAT-K and goal relabelling."""

@@ -1,34 +1,35 @@
-"""Alarms: a policy that earns rewards by what nobody wants drifts away from the record in ways a person can name.
+"""Alarms: a policy that exploits its reward drifts away from the log in ways that a few statistics show.
 
-Running means of a few statistics are compared with those of the run's first updates. An alarm is a number in the log, the drift over
-its threshold, so that it rings from 1 on; it is told once when it begins to ring, and stops nothing.
+Running means of these statistics are compared with those of the run's first updates. The level of an alarm is the drift
+over its threshold, so it is raised from 1 on. A warning is logged once when it is raised; the run goes on.
 """
 
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
-from rlftsim.errors import require_positive
+from rlftsim.errors import require_positive, require_types
 
 
 @dataclass(frozen=True)
 class AlarmConfig:
-    """How far is too far."""
+    """Thresholds of the alarms."""
 
     first_updates: int = 20
-    """Updates whose mean the later ones are compared with; until then nothing rings."""
+    """Updates whose mean the later ones are compared with; until then there are no alarms."""
     window: int = 20
-    """Updates a running mean looks back, roughly."""
+    """Updates that a running mean covers, roughly."""
     min_ade_rise: float = 0.5
-    """Share by which minADE may rise."""
+    """Fraction by which minADE may rise."""
     diversity_fall: float = 0.5
-    """Share by which the spread of the rollouts' ends may fall."""
+    """Fraction by which the spread of the rollouts' endpoints may fall."""
     red_light_rise: float = 0.05
-    """By how much the share of evaluated agents that pass a red light may rise."""
+    """Rise of the fraction of evaluated agents that run a red light."""
     speed_drift_mps: float = 1.0
-    """By how much the mean speed, against that of the record at the same steps, may change either way."""
+    """Change, either way, of the mean speed against that of the log at the same steps."""
 
     def __post_init__(self) -> None:
+        require_types(self)
         require_positive(
             self,
             ("first_updates", "window", "min_ade_rise", "diversity_fall", "red_light_rise", "speed_drift_mps"),
@@ -36,42 +37,43 @@ class AlarmConfig:
 
 
 @dataclass(frozen=True)
-class Gauge:
-    """One thing that is watched."""
+class DriftMonitor:
+    """One statistic that is watched."""
 
     alarm: str
-    """Its name in the log."""
+    """Name of the alarm in the metrics."""
     statistic: str
-    """Name in the log of what is watched."""
+    """Name of the statistic in the metrics."""
     words: str
-    """What a person is told, with the values now and at the start."""
+    """Message for the user, with the values now and at the start."""
     drift: Callable[[float, float, AlarmConfig], float]
     """From the values at the start and now to drift over threshold."""
 
 
-GAUGES = (
-    Gauge(
+DRIFT_MONITORS = (
+    DriftMonitor(
         "alarm_min_ade",
         "min_ade_m",
-        "even the best rollouts lie {now:.2f} m from the record, {start:.2f} m at the start",
+        "even the best rollouts lie {now:.2f} m from the log, {start:.2f} m at the start",
+        # Relative to the start, as minADE depends on the data; 1e-6 for a start of exactly 0.
         lambda start, now, limit: (now - start) / (limit.min_ade_rise * max(start, 1e-6)),
     ),
-    Gauge(
+    DriftMonitor(
         "alarm_diversity",
         "diversity_m",
-        "rollouts grow alike: their ends scatter by {now:.2f} m, {start:.2f} m at the start",
+        "rollouts become alike: their endpoints scatter by {now:.2f} m, {start:.2f} m at the start",
         lambda start, now, limit: (start - now) / (limit.diversity_fall * max(start, 1e-6)),
     ),
-    Gauge(
+    DriftMonitor(
         "alarm_red_light",
         "traffic_light_violation_rate",
-        "{now:.1%} of the evaluated agents pass a red light, {start:.1%} at the start",
+        "{now:.1%} of the evaluated agents run a red light, {start:.1%} at the start",
         lambda start, now, limit: (now - start) / limit.red_light_rise,
     ),
-    Gauge(
+    DriftMonitor(
         "alarm_speed",
         "speed_gap_mps",
-        "mean speed lies {now:+.2f} m/s from the record's, {start:+.2f} m/s at the start",
+        "mean speed differs by {now:+.2f} m/s from the log's, {start:+.2f} m/s at the start",
         lambda start, now, limit: abs(now - start) / limit.speed_drift_mps,
     ),
 )
@@ -86,12 +88,19 @@ class Running:
     now: float = 0.0
     """Over the latest."""
     count: int = 0
+    """Updates with a finite value."""
 
     def after(self, value: float, config: AlarmConfig) -> "Running":
-        """The means with one more update."""
+        """The means with one more update.
+
+        Args:
+            value: of the statistic in that update.
+            config: number of first updates and window.
+        """
         if not math.isfinite(value):
             return self
         count = self.count + 1
+        # A plain mean over the first updates; then the start is frozen and `now` becomes an exponential mean.
         if count <= config.first_updates:
             mean = self.start + (value - self.start) / count
             return Running(mean, mean, count)
@@ -102,33 +111,35 @@ class Running:
 class Alarms:
     """The watched means of a run, which its checkpoints hold."""
 
-    means: dict[str, Running] = field(default_factory=lambda: {gauge.alarm: Running() for gauge in GAUGES})
+    means: dict[str, Running] = field(default_factory=lambda: {m.alarm: Running() for m in DRIFT_MONITORS})
 
     def watch(self, logged: Mapping[str, float], config: AlarmConfig) -> tuple[dict[str, float], list[str]]:
         """Take in the statistics of an update.
 
         Args:
-            logged: by the names of the log.
+            logged: metrics of the update, by name.
             config: the thresholds.
 
         Returns:
-            Every alarm's number, and what to tell of those that begin to ring.
+            The level of every alarm, and messages of those that are raised by this update.
         """
-        levels, told = {}, []
-        for gauge in GAUGES:
-            before = self.means[gauge.alarm]
-            after = self.means[gauge.alarm] = before.after(logged[gauge.statistic], config)
-            levels[gauge.alarm] = gauge.drift(after.start, after.now, config)
-            if levels[gauge.alarm] >= 1 > gauge.drift(before.start, before.now, config):
-                told.append(f"{gauge.alarm}: {gauge.words.format(now=after.now, start=after.start)}")
-        return levels, told
+        levels, raised = {}, []
+        for monitor in DRIFT_MONITORS:
+            before = self.means[monitor.alarm]
+            after = self.means[monitor.alarm] = before.after(logged[monitor.statistic], config)
+            levels[monitor.alarm] = monitor.drift(after.start, after.now, config)
+            # Only on the way up, so that an alarm that lasts is one message and not one per update.
+            if levels[monitor.alarm] >= 1 > monitor.drift(before.start, before.now, config):
+                raised.append(f"{monitor.alarm}: {monitor.words.format(now=after.now, start=after.start)}")
+        return levels, raised
 
     def to_numbers(self) -> dict[str, float]:
-        """For a checkpoint."""
+        """Numbers for a checkpoint."""
         return {f"{name}.{key}": value for name, mean in self.means.items() for key, value in vars(mean).items()}
 
     def load_numbers(self, numbers: Mapping[str, float]) -> None:
-        """Go on from a checkpoint."""
+        """Take back the numbers of a checkpoint."""
         for name in self.means:
             start, now, count = (numbers[f"{name}.{key}"] for key in ("start", "now", "count"))
+            # JSON has one kind of number here: all are floats.
             self.means[name] = Running(start, now, int(count))

@@ -1,11 +1,11 @@
-"""Goals that were met by chance, stored beside a data set: stochastic target augmentation (RLFTSim, algorithm 1).
+"""Stochastic target augmentation (RLFTSim, algorithm 1): goals that rollouts have met, stored beside a data set.
 
-Where the record ended is one place an agent could go. For every scenario rollouts are sampled, and where the most realistic one takes its
-agents become further goals, which the policy is known to be able to meet.
+The logged endpoint is one place an agent could go. For every scenario rollouts are sampled, and the endpoints of
+the most realistic one become further goals, which the policy is known to be able to reach.
 """
 
 import math
-from collections.abc import Iterator
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,8 +13,8 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from rlftsim.errors import require_positive
-from rlftsim.goals.recorded import recorded_goals
+from rlftsim.errors import ConfigError, given, require_positive, require_types
+from rlftsim.goals.logged import logged_goals
 from rlftsim.goals.stored import write_goal_part
 from rlftsim.goals.types import Points
 from rlftsim.progress import progress_bar
@@ -28,38 +28,47 @@ from rlftsim.training.data import batch_with_futures
 from rlftsim.training.run_folder import RunFolder, describe_inputs
 
 
-def most_realistic(scores: RealismResult) -> Int64[Tensor, "B"]:
-    """The rollout of each scenario that is most realistic alone."""
-    return torch.nan_to_num(scores.single_meta_metric, nan=-math.inf).argmax(-1)
+def most_realistic(realism: RealismResult) -> Int64[Tensor, "B"]:
+    """Index of the rollout of each scenario with the highest meta-metric of its own."""
+    # A rollout without a finite score (nothing valid to compare with) is never chosen before one that has a score.
+    return torch.nan_to_num(realism.single_meta_metric, nan=-math.inf).argmax(-1)
 
 
 def ends_of(rollouts: Rollouts, chosen: Int64[Tensor, "B"]) -> Float[Tensor, "B A 2"]:
-    """Where the agents are in the end, in one rollout of each scenario."""
+    """Final positions of the agents in one rollout of each scenario, map frame.
+
+    Args:
+        rollouts: N of each scenario.
+        chosen: index of the one.
+    """
     return rollouts.position[torch.arange(len(chosen), device=chosen.device), chosen, :, -1]
 
 
 @dataclass(frozen=True)
 class AugmentConfig:
-    """How goals are drawn."""
+    """Sampling of augmented goals."""
 
     num_rollouts: int = 32
     """Rollouts of a scenario among which the most realistic is taken (N_G); the paper does not give it."""
-    top_k: int = 32
-    """Most likely decisions that are sampled among."""
+    top_k: int | None = 32
+    """Most likely decisions that are sampled among; None = all, for policies whose decisions are not categories."""
     metric: str = "2025"
+    """Configuration of the meta-metric."""
     scenarios_per_part: int = 64
-    """Of a file; what is in a finished file is not done again."""
+    """Scenarios of a file; those of a finished file are not done again."""
     seed: int = 0
+    """Of the rollouts."""
 
     def __post_init__(self) -> None:
-        require_positive(self, ("num_rollouts", "top_k", "scenarios_per_part"))
+        require_types(self)
+        require_positive(self, ("num_rollouts", "scenarios_per_part", *given(self, ("top_k",))))
         metric_by_name(self.metric)
 
 
-def augment_goals(policy: Policy, scenarios: Scenarios, folder: Path, config: AugmentConfig) -> int:
-    """Write where the most realistic rollout of each scenario took its agents (RLFTSim, algorithm 1). Goes on where it was stopped.
+def augment_goals(policy: Policy, scenarios: Scenarios, folder: str | os.PathLike[str], config: AugmentConfig) -> int:
+    """Write the endpoints of the most realistic rollout of each scenario (RLFTSim, algorithm 1); resumes.
 
-    A policy that sees goals is asked to go where the record ended.
+    A goal-conditioned policy has the logged endpoints as its goals.
 
     Args:
         policy: samples the rollouts.
@@ -68,43 +77,44 @@ def augment_goals(policy: Policy, scenarios: Scenarios, folder: Path, config: Au
         config: see its fields.
 
     Returns:
-        How many scenarios have goals now.
+        Number of scenarios that have goals now.
 
     Raises:
         DataError: a scenario withholds its future.
         CheckpointError: the folder holds goals of another policy, other scenarios or other settings.
+        ConfigError: `top_k` is set and the policy's decisions are not categories.
     """
+    folder, size = Path(folder), config.scenarios_per_part
+    if config.top_k is not None and len(scenarios) and not folder.exists():
+        # Tried on one scenario before the folder is claimed for settings that cannot work.
+        batch = batch_with_futures(scenarios, [0]).to(device_of(policy))
+        try:
+            simulate(policy, batch, num_rollouts=1, seed=config.seed, sampling=Sampling(top_k=config.top_k))
+        except ConfigError as error:
+            name = type(policy).__name__
+            raise ConfigError(f"top_k={config.top_k} and {name}: {str(error).rstrip('.')} (--top-k None).") from None
     RunFolder(folder, config, describe_inputs(policy, scenarios))
     with progress_bar("augment", len(scenarios), 0) as advance:
-        for path, indices in _parts(folder, len(scenarios), config.scenarios_per_part):
+        for start in range(0, len(scenarios), size):
+            path = folder / f"part-{start // size:06d}.parquet"
+            indices = range(start, min(start + size, len(scenarios)))
+            # Files are written whole, so one that exists is finished.
             if not path.exists():
-                write_goal_part(path, dict(_drawn_goals(policy, scenarios, indices, config)))
-            for _ in indices:
-                advance()
+                write_goal_part(path, dict(_endpoints(policy, scenarios, i, config) for i in indices))
+            advance(len(indices))
     return len(scenarios)
 
 
-def _parts(folder: Path, count: int, size: int) -> Iterator[tuple[Path, range]]:
-    for start in range(0, count, size):
-        yield folder / f"part-{start // size:06d}.parquet", range(start, min(start + size, count))
-
-
-def _drawn_goals(
-    policy: Policy, scenarios: Scenarios, indices: range, config: AugmentConfig
-) -> Iterator[tuple[str, Points]]:
-    """Scenario ids with the goals of their agents."""
-    for index in indices:
-        batch = batch_with_futures(scenarios, [index]).to(device_of(policy))
-        rollouts = simulate(
-            policy, batch, num_rollouts=config.num_rollouts, seed=config.seed, goals=recorded_goals(batch),
-            sampling=Sampling(top_k=config.top_k),
-        )  # fmt: skip
-        scores = score_batch(
-            batch.scenarios,
-            states_of_rollouts(batch, rollouts),
-            metric_by_name(config.metric),
-            missing_map="neutral",
-        )
-        best = most_realistic(scores)
-        ends = batch.to_world(ends_of(rollouts, best)[:, None, :, None])[0, 0, :, 0]
-        yield batch.scenarios[0].scenario_id, (batch.object_id[0].cpu().numpy(), ends.double().cpu().numpy())
+def _endpoints(policy: Policy, scenarios: Scenarios, index: int, config: AugmentConfig) -> tuple[str, Points]:
+    """Id of a scenario, and the object ids and endpoints (world frame) of its agents."""
+    batch = batch_with_futures(scenarios, [index]).to(device_of(policy))
+    rollouts = simulate(
+        policy, batch, num_rollouts=config.num_rollouts, seed=config.seed, goals=logged_goals(batch),
+        sampling=Sampling(top_k=config.top_k),
+    )  # fmt: skip
+    states = states_of_rollouts(batch, rollouts)
+    # A scenario without a map still has endpoints: it counts as on the road.
+    realism = score_batch(batch.scenarios, states, metric_by_name(config.metric), missing_map="neutral")
+    ends = ends_of(rollouts, most_realistic(realism))  # [1, A, 2]
+    ends = batch.to_world(ends[:, None, :, None])[0, 0, :, 0]  # to_world takes [B, N, A, T, 2]
+    return batch.scenarios[0].scenario_id, (batch.object_id[0].cpu().numpy(), ends.double().cpu().numpy())

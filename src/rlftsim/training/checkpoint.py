@@ -1,7 +1,7 @@
-"""Checkpoints: everything a run needs to go on, in files that execute nothing.
+"""Checkpoints: everything that a run resumes from, in files that execute nothing.
 
-A checkpoint is a folder `update-00000120` with safetensors and a JSON file. It is written under another name and renamed when it is
-whole, so what carries the name is never half-written.
+A checkpoint is a folder `update-00000120` with safetensors and a JSON file. It is written under another name and
+renamed when it is whole, so a folder of that name is never half-written.
 """
 
 import json
@@ -14,22 +14,22 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
+from rlftsim.atomic_io import errors_name, save_tensors, write_text
 from rlftsim.errors import CheckpointError
-from rlftsim.files import save_tensors, write_text
 
 PREFIX = "update-"
 KEPT = 2
-"""Checkpoints that are kept; older ones are removed."""
+"""Number of checkpoints that are kept; older ones are removed."""
 
 
 @dataclass(frozen=True)
 class Progress:
-    """Where a run is."""
+    """Position of a run."""
 
     update: int = 0
     """Updates done."""
     numbers: dict[str, float] = field(default_factory=dict)
-    """What else changes from update to update, such as beta."""
+    """Further state that changes from update to update, such as beta."""
 
 
 def write_checkpoint(folder: Path, progress: Progress, modules: dict[str, nn.Module], optimizer: Optimizer) -> Path:
@@ -37,32 +37,48 @@ def write_checkpoint(folder: Path, progress: Progress, modules: dict[str, nn.Mod
 
     Args:
         folder: the run's folder of checkpoints.
-        progress: where the run is.
+        progress: position of the run.
         modules: weights by file name, such as policy and reference.
         optimizer: its moments are kept too.
+
+    Raises:
+        DataError: a file cannot be written, such as on a full disk; names it. Older checkpoints are untouched.
     """
     target = folder / f"{PREFIX}{progress.update:08d}"
     partial = folder / f".partial-{target.name}"
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir(parents=True)
-    for name, module in modules.items():
-        save_tensors(partial / f"{name}.safetensors", module.state_dict())
-    save_tensors(partial / "optimizer.safetensors", _optimizer_tensors(optimizer))
-    write_text(partial / "progress.json", json.dumps({"update": progress.update, "numbers": progress.numbers}))
-    shutil.rmtree(target, ignore_errors=True)
-    partial.rename(target)
+    with errors_name(target):
+        shutil.rmtree(partial, ignore_errors=True)  # left by a run that was killed
+        partial.mkdir(parents=True)
+        for name, module in modules.items():
+            save_tensors(partial / f"{name}.safetensors", module.state_dict())
+        # "0.exp_avg" = the first moment of the first parameter, in the order of the optimizer's groups.
+        states = optimizer.state_dict()["state"]
+        tensors = {f"{i}.{name}": value.detach().cpu() for i, state in states.items() for name, value in state.items()}
+        save_tensors(partial / "optimizer.safetensors", tensors)
+        write_text(partial / "progress.json", json.dumps({"update": progress.update, "numbers": progress.numbers}))
+        shutil.rmtree(target, ignore_errors=True)
+        partial.rename(target)
+    # Names are padded with zeros, so their order is that of the updates. Only now is an older one expendable.
     for old in sorted(folder.glob(f"{PREFIX}*"))[:-KEPT]:
         shutil.rmtree(old)
     return target
 
 
 def newest_checkpoint(folder: Path) -> Path | None:
-    """The latest whole checkpoint of a run; None = it has none yet."""
+    """The latest whole checkpoint of a run; None if it has none yet."""
     return max(folder.glob(f"{PREFIX}*"), default=None)
 
 
 def read_checkpoint(path: Path, modules: dict[str, nn.Module], optimizer: Optimizer) -> Progress:
-    """Load weights and moments in place and say where the run was.
+    """Load weights and moments in place.
+
+    Args:
+        path: of the checkpoint.
+        modules: as they were given to `write_checkpoint`.
+        optimizer: of the same parameters in the same order; keeps its own learning rate.
+
+    Returns:
+        The position of the run.
 
     Raises:
         CheckpointError: damaged, or of another model.
@@ -70,24 +86,16 @@ def read_checkpoint(path: Path, modules: dict[str, nn.Module], optimizer: Optimi
     try:
         for name, module in modules.items():
             module.load_state_dict(load_file(path / f"{name}.safetensors"))
-        _load_optimizer(optimizer, load_file(path / "optimizer.safetensors"))
+        state: dict[int, dict[str, Tensor]] = {}
+        for key, value in load_file(path / "optimizer.safetensors").items():
+            index, name = key.split(".", 1)
+            state.setdefault(int(index), {})[name] = value
+        # The groups are the new optimizer's own: learning rate and scales follow the settings, not the file.
+        groups = optimizer.state_dict()["param_groups"]
+        optimizer.load_state_dict({"state": state, "param_groups": groups})
         values = json.loads((path / "progress.json").read_text())
         return Progress(values["update"], values["numbers"])
     except (OSError, SafetensorError, RuntimeError, KeyError, TypeError, ValueError) as error:
         raise CheckpointError(
             f"{path}: cannot go on from it ({error}): delete this folder to go on from an older one."
         ) from None
-
-
-def _optimizer_tensors(optimizer: Optimizer) -> dict[str, Tensor]:
-    states = optimizer.state_dict()["state"]
-    return {f"{i}.{name}": value.detach().cpu().contiguous() for i, s in states.items() for name, value in s.items()}
-
-
-def _load_optimizer(optimizer: Optimizer, tensors: dict[str, Tensor]) -> None:
-    state: dict[int, dict[str, Tensor]] = {}
-    for key, value in tensors.items():
-        index, name = key.split(".", 1)
-        state.setdefault(int(index), {})[name] = value
-    groups = optimizer.state_dict()["param_groups"]
-    optimizer.load_state_dict({"state": state, "param_groups": groups})

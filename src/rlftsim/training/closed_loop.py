@@ -1,4 +1,4 @@
-"""Imitation in closed loop: what a policy says along its own rollouts beside what it should have said. CAT-K and `gcsl` share it."""
+"""Imitation in closed loop: predictions along rollouts, with a target for each decision (CAT-K, goal relabelling)."""
 
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
@@ -6,42 +6,35 @@ from typing import Any, Protocol, runtime_checkable
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from rlftsim.rollout.policy import Policy
+from rlftsim.rollout.policy import TokenPolicy
 from rlftsim.rollout.types import Rollouts
-from rlftsim.tokens.vocabulary import Vocabulary
-
-
-@runtime_checkable
-class TokenPolicy(Policy, Protocol):
-    """A policy whose decisions are tokens of a vocabulary."""
-
-    vocabulary: Vocabulary
 
 
 @runtime_checkable
 class TokenLogits(Protocol):
-    """What imitation needs of a distribution over tokens (a dataclass): logits of the R elements where the mask is True, in the mask's
-    order."""
+    """The part of a distribution over tokens that imitation needs."""
 
     logits: Float[Tensor, "R V"]
+    """Of the R elements where the mask is True, in the mask's order."""
     mask: Bool[Tensor, "B N A *L"]
 
 
 @dataclass(frozen=True, eq=False)
 class TargetedRollouts:
-    """Rollouts and what should have been decided in them."""
+    """Rollouts with a target for each decision."""
 
     rollouts: Rollouts
     target: Int64[Tensor, "B N A L"]
+    """Token that should have been chosen."""
     target_mask: Bool[Tensor, "B N A L"]
-    """True = there is something to be learned."""
+    """True = there is a target."""
     class_id: Int64[Tensor, "B A"]
-    """Whose tokens an agent takes."""
+    """Agent class that the token ids refer to."""
 
 
 @dataclass(frozen=True, eq=False)
 class ClosedLoopPrediction:
-    """What a policy says along its own rollouts, and what it should have said."""
+    """A policy's predictions along rollouts, as `imitation.Prediction`."""
 
     logits: Float[Tensor, "R V"]
     target: Int64[Tensor, "R"]
@@ -50,18 +43,19 @@ class ClosedLoopPrediction:
 
 
 def predict_along(
-    policy: TokenPolicy, context: Any, rolled: TargetedRollouts, trained: Bool[Tensor, "B A"]
+    policy: TokenPolicy, context: Any, targeted: TargetedRollouts, trained: Bool[Tensor, "B A"]
 ) -> ClosedLoopPrediction:
     """Predictions along rollouts: differentiable, one parallel pass.
 
     Args:
         policy: the policy that rolled out.
-        context: its view of the same scenarios.
-        rolled: the rollouts and their targets.
+        context: its encoding of the same scenarios.
+        targeted: the rollouts and their targets.
         trained: True = the agent's decisions count.
     """
-    scored: TokenLogits = policy.score(context, rolled.rollouts)  # type: ignore[assignment]
-    counts = rolled.target_mask & rolled.rollouts.decision_mask & trained[:, None, :, None]
-    class_id = rolled.class_id[:, None, :, None].expand(counts.shape)
-    parts = (values[scored.mask] for values in (rolled.target, counts, class_id))
-    return ClosedLoopPrediction(scored.logits, *parts)
+    dist: TokenLogits = policy.score(context, targeted.rollouts)  # type: ignore[assignment]
+    counts = targeted.target_mask & targeted.rollouts.decision_mask & trained[:, None, :, None]  # [B, N, A, L]
+    class_id = targeted.class_id[:, None, :, None].expand(counts.shape)
+    # The distribution has a row for each element of its mask only: pick the same ones, in the same order.
+    rows = (values[dist.mask] for values in (targeted.target, counts, class_id))
+    return ClosedLoopPrediction(dist.logits, *rows)

@@ -1,21 +1,21 @@
-"""Which scenarios, agents and steps an update sees: a function of the seed and the update alone, so that resuming needs nothing else."""
+"""Scenarios, agents and steps of an update: a function of seed and update alone, which resuming relies on."""
 
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from torch import Tensor
 
 from rlftsim.errors import DataError
 from rlftsim.rollout.noise import derive_seed
 from rlftsim.scenario.batch import ScenarioBatch, collate
-from rlftsim.scenario.derived import derived
+from rlftsim.scenario.derived import cached_on_scenario
 from rlftsim.scenario.types import CURRENT_STEP, Scenario, Scenarios
 
 MIN_FUTURE_STEPS = 5
-"""Recorded steps after the current one that an agent needs to be learned from."""
+"""Logged steps after the current one that an agent needs to be learned from."""
 
 
 def batch_with_futures(
@@ -26,7 +26,7 @@ def batch_with_futures(
     Args:
         scenarios: to choose from.
         indices: of the chosen ones.
-        context_radius_m: leave out what is farther from the ego, see `within_reach`; None = leave out nothing.
+        context_radius_m: leave out steps farther from the ego, see `within_reach`; None = leave out nothing.
 
     Raises:
         DataError: one of them withholds its future, so nothing can be learned from it.
@@ -35,7 +35,7 @@ def batch_with_futures(
     for scenario in chosen:
         if not scenario.has_future:
             raise DataError(
-                f"scenario {scenario.scenario_id} records {scenario.num_steps} steps, its future is withheld: "
+                f"scenario {scenario.scenario_id} has {scenario.num_steps} logged steps, its future is withheld: "
                 "train on the training split."
             )
     if context_radius_m is not None:
@@ -44,19 +44,26 @@ def batch_with_futures(
 
 
 def within_reach(scenario: Scenario, radius_m: float) -> Scenario:
-    """A scenario in which a step of an agent is valid only if it is nearer to the ego than a radius at that step (3-D distance).
+    """A scenario in which a step of an agent is valid only if it is within a radius of the ego at that step.
 
-    An agent that is out of reach at the current step is not simulated. Where the ego was not recorded nothing is left out. The same
-    object as `scenario` where everything is within reach.
+    An agent that is out of reach at the current step is not simulated. At steps where the ego is not valid
+    nothing is left out.
+
+    Args:
+        scenario: with any number of steps.
+        radius_m: 3-D distance.
+
+    Returns:
+        The same object as `scenario` where everything is within reach.
     """
     return _without_far_steps(scenario, radius_m) or scenario
 
 
-@derived
+@cached_on_scenario
 def _without_far_steps(scenario: Scenario, radius_m: float) -> Scenario | None:
-    """None = there are none. (What is remembered with a scenario must not be the scenario itself, or neither is ever forgotten.)"""
+    """None where all is within reach: a cache on the scenario must not hold the scenario, or neither is freed."""
     tracks, ego = scenario.tracks, scenario.ego_index
-    distance_m = np.linalg.norm(tracks.position - tracks.position[ego], axis=-1)
+    distance_m = np.linalg.norm(tracks.position - tracks.position[ego], axis=-1)  # [agents, steps]
     far = (distance_m >= radius_m) & tracks.valid & tracks.valid[ego]
     return replace(scenario, tracks=replace(tracks, valid=tracks.valid & ~far)) if far.any() else None
 
@@ -64,45 +71,45 @@ def _without_far_steps(scenario: Scenario, radius_m: float) -> Scenario | None:
 def trained_agents(
     batch: ScenarioBatch, update: int, *, radius_m: float, limit: int | None, seed: int
 ) -> Bool[Tensor, "B A"]:
-    """Agents whose predictions count: the evaluated and interesting ones, then those near the ego with a future, up to a limit.
+    """Agents whose predictions count: evaluated and interesting ones, then others near the ego, up to a limit.
 
-    Who is drawn depends on the seed, the update and the scenario, not on how a batch is put together.
+    The others need a logged future. Their draw depends on the seed, the update and the scenario, not on the rest of the
+    batch.
 
     Args:
         batch: with its future.
         update: counted from 0.
-        radius_m: how far from the ego the others may be at the current step.
+        radius_m: distance from the ego at the current step up to which the others are taken.
         limit: of a scenario; None = all.
         seed: of the run.
     """
-    interest = torch.zeros_like(batch.agent_mask)
+    interest = torch.zeros_like(batch.agent_mask)  # [B, A]
     for row, scenario, ids in zip(interest, batch.scenarios, batch.object_id):
         row |= torch.isin(ids, torch.from_numpy(scenario.objects_of_interest).to(ids.device))
     first = (batch.evaluated_mask | interest) & batch.agent_mask
+    # [B, A] each from here on.
     has_future = batch.valid[:, :, CURRENT_STEP + 1 :].sum(-1) >= MIN_FUTURE_STEPS
-    others = (_distance_from_ego(batch) < radius_m) & has_future & batch.agent_mask & ~first
+    # Distance from the ego at the current step, 3-D; meaningless for padding, which the mask drops.
+    ego_id = torch.tensor([s.tracks.object_id[s.ego_index] for s in batch.scenarios], device=batch.device)
+    is_ego = (batch.object_id == ego_id[:, None]) & batch.agent_mask
+    position = torch.cat([batch.position[:, :, CURRENT_STEP], batch.z[:, :, CURRENT_STEP, None]], -1)  # [B, A, 3]
+    ego = (position * is_ego[..., None]).sum(1, keepdim=True)  # [B, 1, 3]
+    is_near = (position - ego).norm(dim=-1) < radius_m
+    others = is_near & has_future & batch.agent_mask & ~first
     if limit is None:
         return first | others
-    luck = torch.zeros(others.shape)
-    for row, scenario in zip(luck, batch.scenarios):
+    u = torch.zeros(others.shape)
+    for row, scenario in zip(u, batch.scenarios):
+        # One generator per scenario: padding and neighbors in the batch change nothing.
         generator = torch.Generator().manual_seed(derive_seed(seed, "agents", update, scenario.scenario_id) % 2**63)
         count = len(scenario.simulated_indices)
         row[:count] = torch.rand(count, generator=generator)
-    order = torch.where(others, luck.to(batch.device), 2.0).argsort(-1).argsort(-1)
-    return first | (others & (order < limit - first.sum(-1, keepdim=True)))
-
-
-def _distance_from_ego(batch: ScenarioBatch) -> Float[Tensor, "B A"]:
-    """At the current step, metres; nonsense for padding."""
-    ids = torch.tensor([s.tracks.object_id[s.ego_index] for s in batch.scenarios], device=batch.device)
-    is_ego = (batch.object_id == ids[:, None]) & batch.agent_mask
-    position = torch.cat([batch.position[:, :, CURRENT_STEP], batch.z[:, :, CURRENT_STEP, None]], -1)
-    ego = (position * is_ego[..., None]).sum(1, keepdim=True)
-    return (position - ego).norm(dim=-1)
+    rank = torch.where(others, u.to(batch.device), 2.0).argsort(-1).argsort(-1)  # 2 is behind every uniform number
+    return first | (others & (rank < limit - first.sum(-1, keepdim=True)))
 
 
 def scenarios_of_update(update: int, batch_size: int, num_scenarios: int, seed: int) -> list[int]:
-    """Indices of the scenarios of an update: the data set is passed over in a new random order every epoch, nothing is left out.
+    """Indices of the scenarios of an update: the data set in a new random order every epoch, nothing left out.
 
     Args:
         update: counted from 0.
@@ -110,10 +117,11 @@ def scenarios_of_update(update: int, batch_size: int, num_scenarios: int, seed: 
         num_scenarios: in the data set.
         seed: of the run.
     """
+    # Positions in the endless sequence of epochs after epochs.
     places = range(update * batch_size, (update + 1) * batch_size)
-    orders = {epoch: _order(epoch, num_scenarios, seed) for epoch in {p // num_scenarios for p in places}}
+    # A batch may reach over the end of an epoch, so it may need more than one order.
+    orders = {
+        epoch: np.random.default_rng(derive_seed(seed, "order", epoch)).permutation(num_scenarios)
+        for epoch in {p // num_scenarios for p in places}
+    }
     return [int(orders[p // num_scenarios][p % num_scenarios]) for p in places]
-
-
-def _order(epoch: int, num_scenarios: int, seed: int) -> np.ndarray:
-    return np.random.default_rng(derive_seed(seed, "order", epoch)).permutation(num_scenarios)

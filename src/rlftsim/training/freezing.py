@@ -1,4 +1,4 @@
-"""Which weights a training trains, and how fast."""
+"""The weights that a training method trains, and their learning rates."""
 
 from typing import Any, Literal
 
@@ -6,37 +6,53 @@ from torch import nn
 from torch.optim import Optimizer
 
 from rlftsim.errors import ConfigError
+from rlftsim.rollout.policy import is_goal_conditioned
+from rlftsim.training.goals import NOT_CONDITIONED
 
 TrainedParts = Literal["decoder", "goals", "all"]
 
 
 def freeze_untrained(policy: nn.Module, trained: TrainedParts) -> None:
-    """Under "decoder" only the parts that a policy names for fine-tuning stay trainable; one that names none is trained whole. Under
-    "goals" only the weights that see goals, so that whoever is asked nothing goes on deciding as before.
+    """Require a gradient of the weights that are trained, and of no others.
+
+    Args:
+        policy: changed in place.
+        trained: "decoder" = the parts that the policy names in `fine_tuned_parts`, all of it where it names none.
+            "goals" = the goal encoder only, so that agents without a goal go on deciding as before. "all" = everything.
 
     Raises:
-        ConfigError: no weights see goals.
+        ConfigError: the policy is not goal-conditioned, or has no part that only goals use.
     """
     if trained == "goals":
         parts = _goal_parts(policy)
-        if not parts:
+        if not parts and is_goal_conditioned(policy):
             raise ConfigError(
-                "trained=goals, but this model does not see goals: add --goal concat or --goal indication."
+                f"trained=goals, but {type(policy).__name__} has no part that only goals use: set trained=all."
             )
+        if not parts:
+            raise ConfigError(f"trained=goals, but {NOT_CONDITIONED}")
     else:
         named = getattr(policy, "fine_tuned_parts", None)
         parts = (policy,) if trained == "all" or named is None else named()
+    # First nothing, then the parts: a run that trained other parts before leaves no trace.
     policy.requires_grad_(False)
     for part in parts:
         part.requires_grad_(True)
 
 
 def parameter_groups(model: nn.Module, goal_scale: float) -> list[dict[str, Any]]:
-    """What is trained, as an optimiser takes it: the weights that see goals apart, their learning rate is scaled."""
-    sight = [p for part in _goal_parts(model) for p in part.parameters() if p.requires_grad]
-    ids = {id(p) for p in sight}
+    """The weights that require a gradient, as groups for an optimizer: the goal encoder apart from all others.
+
+    Args:
+        model: after `freeze_untrained`.
+        goal_scale: learning rate of the goal encoder over that of the others.
+    """
+    goal_weights = [p for part in _goal_parts(model) for p in part.parameters() if p.requires_grad]
+    # By identity: comparing tensors would compare their values.
+    ids = {id(p) for p in goal_weights}
     others = [p for p in model.parameters() if p.requires_grad and id(p) not in ids]
-    groups = [{"params": others, "scale": 1.0}, {"params": sight, "scale": goal_scale}]
+    groups = [{"params": others, "scale": 1.0}, {"params": goal_weights, "scale": goal_scale}]
+    # AdamW refuses a group without parameters.
     return [group for group in groups if group["params"]]
 
 
@@ -45,6 +61,11 @@ def _goal_parts(model: nn.Module) -> tuple[nn.Module, ...]:
 
 
 def set_learning_rate(optimizer: Optimizer, value: float) -> None:
-    """The learning rate of the next step: each group's by its scale, which is 1 where the optimiser was not built of `parameter_groups`."""
+    """Set the learning rate of the next step.
+
+    Args:
+        optimizer: its groups may have a "scale", see `parameter_groups`; it is 1 where they have none.
+        value: learning rate of a group with scale 1.
+    """
     for group in optimizer.param_groups:
         group["lr"] = value * group.get("scale", 1.0)

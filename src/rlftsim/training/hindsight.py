@@ -1,29 +1,36 @@
-"""Hindsight within an update of fine-tuning with goals.
+"""Hindsight within an update of fine-tuning: rollouts are relabelled with goals that one of them has met.
 
-Reaching a goal may be too rare to learn from. But every rollout gets somewhere: the rollouts of a scenario are looked at again as if the
-goals had been where the most realistic of them ended. They were sampled under other goals, so what each agent's decisions earn is
-weighted by how much likelier they are under the new ones (hindsight policy gradient, Rauber et al., 2019; RLFTSim, section 4.2).
-`training.augment` uses the same idea before training.
+Reaching a goal may be too rare to learn from, but every rollout gets somewhere. So the rollouts of a scenario are
+used a second time, as if their goals had been the endpoints of the most realistic one. They were sampled under
+other goals, so what an agent's decisions earn is weighted by the importance ratio, their probability under the
+new goals over that under the old ones.
+
+Sources: Rauber et al., "Hindsight policy gradients", 2019; RLFTSim, section 4.2. `training.augment` uses the same idea
+before training.
 """
 
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from rlftsim.goals.types import Goals
 from rlftsim.realism import RealismResult
+from rlftsim.rewards import Term
+from rlftsim.rewards.goal import goal_advantage
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.training.augment import ends_of, most_realistic
 from rlftsim.training.experience import Experience, slices
-from rlftsim.training.rewards import Term
-from rlftsim.training.rewards.goal import goal_advantage
+from rlftsim.training.parallel import Fabric, all_reduce_sum
+from rlftsim.training.policy_gradient import GradientSums, LossTerms, agent_log_prob, policy_gradient_loss
 
 LARGEST_RATIO = 10.0
-"""Ratios of probabilities are clipped to it."""
+"""Importance ratios are clipped to it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,52 +40,116 @@ class Relabelled:
     batch: ScenarioBatch
     rollouts: Rollouts
     earned: Float[Tensor, "B N A"]
-    """By each agent for the goals."""
+    """By each agent for the new goals."""
 
     def slices(self, size: int) -> Iterator[tuple[Rollouts, Float[Tensor, "B n A"]]]:
-        """So many of the rollouts of every scenario at once, and what each agent in them earned."""
+        """Yield the rollouts of every scenario, `size` at a time, with what each agent earned in them."""
         return slices(self.rollouts, self.earned, size)
 
 
-def look_back(experiences: Sequence[Experience], terms: Sequence[Term]) -> list[Relabelled]:
-    """The rollouts as if they had been sampled under the goals that the most realistic one has met, and what that earns.
+def goal_terms(terms: Sequence[Term]) -> list[Term]:
+    """The terms of a reward that depend on goals."""
+    return [term for term in terms if term.name == "goal"]
 
-    Realism was rewarded before and does not depend on goals, so only goals count here; each agent earns its own share, because
-    each agent's decisions have a ratio of their own.
+
+def relabel_with_hindsight(experiences: Sequence[Experience], terms: Sequence[Term]) -> list[Relabelled]:
+    """The rollouts as if sampled under goals that the most realistic one has met, and what they earn by that.
+
+    Only the reward's goal terms count: realism does not depend on goals and was rewarded before. Each agent earns
+    its own part, because each agent's decisions have an importance ratio of their own.
 
     Args:
         experiences: of this process.
         terms: of the run's reward.
     """
-    return [_relabel(experience, terms) for experience in experiences]
+    relabelled = []
+    for experience in experiences:
+        batch, rollouts = experience.batch, experience.rollouts
+        rollouts = replace(rollouts, goals=met_goals(rollouts, experience.realism))
+        earned = rollouts.heading.new_zeros(rollouts.heading.shape[:3])  # [B, N, A]
+        for term in goal_terms(terms):
+            options: dict[str, Any] = dict(term.options)
+            earned = earned + term.weight * goal_advantage(rollouts, batch, **options)
+        relabelled.append(Relabelled(batch, rollouts, earned))
+    return relabelled
 
 
-def _relabel(experience: Experience, terms: Sequence[Term]) -> Relabelled:
-    batch, rollouts = experience.batch, experience.rollouts
-    seen = replace(rollouts, goals=met_goals(rollouts, experience.scores))
-    earned = rollouts.heading.new_zeros(rollouts.heading.shape[:3])
-    for term in goal_terms(terms):
-        earned = earned + term.weight * goal_advantage(seen, batch, **dict(term.options))  # type: ignore[arg-type]
-    return Relabelled(batch, seen, earned)
+def met_goals(rollouts: Rollouts, realism: RealismResult) -> Goals:
+    """Endpoints of the most realistic rollout of each scenario, for the agents that have goals.
 
-
-def goal_terms(terms: Sequence[Term]) -> list[Term]:
-    """The terms of a reward that goals matter to."""
-    return [term for term in terms if term.name == "goal"]
-
-
-def met_goals(rollouts: Rollouts, scores: RealismResult) -> Goals:
-    """For the agents that have goals: where the most realistic rollout of their scenario took them."""
+    Args:
+        rollouts: with goals, N of each scenario.
+        realism: of the same rollouts.
+    """
     assert rollouts.goals is not None
-    ends = Goals.of_scenarios(ends_of(rollouts, most_realistic(scores)), rollouts.goals.goal_mask[:, 0])
+    # All rollouts of a scenario have the same goals: the mask of the first one serves.
+    ends = Goals.of_scenarios(ends_of(rollouts, most_realistic(realism)), rollouts.goals.goal_mask[:, 0])
     return ends.repeat(rollouts.num_rollouts)
 
 
-def clipped_ratio(new: Float[Tensor, "B N A"], old: Float[Tensor, "B N A"]) -> Float[Tensor, "B N A"]:
-    """How much likelier each agent's decisions are under other goals: the ratio of their probabilities, clipped, without gradient.
+def importance_ratio(new: Float[Tensor, "B N A"], old: Float[Tensor, "B N A"]) -> Float[Tensor, "B N A"]:
+    """Probability of each agent's decisions under new goals over that under old ones; clipped, without gradient.
 
     Args:
-        new: log-probability of all of an agent's decisions under the other goals.
-        old: under those that were asked.
+        new: log-probability of all of an agent's decisions under the new goals.
+        old: under the goals they were sampled under.
     """
+    # Clipped from above only: a large ratio raises the variance, a small one merely drops an agent.
     return (new - old).detach().clamp(max=math.log(LARGEST_RATIO)).exp()
+
+
+def accumulate_hindsight(
+    policy: Any,
+    experiences: Sequence[Experience],
+    reward: Sequence[Term],
+    first_pass: GradientSums,
+    terms: LossTerms,
+    fabric: Fabric,
+    *,
+    weight: float,
+    rollouts_per_pass: int,
+) -> dict[str, float]:
+    """Add the gradient of what the rollouts earn under hindsight's goals to the policy's parameters.
+
+    Args:
+        policy: scores the relabelled rollouts.
+        experiences: of this process.
+        reward: terms of the run's reward.
+        first_pass: has the log-probabilities under the old goals.
+        terms: reduction and counts of the update.
+        fabric: precision and processes.
+        weight: of this gradient; 0 = nothing is done.
+        rollouts_per_pass: as in `accumulate_gradients`.
+
+    Returns:
+        Metrics: the mean importance ratio. Empty in a run without hindsight.
+    """
+    if not weight:
+        return {}
+    # The gradient is divided by the mean ratio of the whole batch, which is known in the end only: so it is gathered
+    # apart from the gradient of the first pass, and added to it when it has its scale.
+    parameters = [p for p in policy.parameters() if p.requires_grad]
+    before = [p.grad for p in parameters]
+    for parameter in parameters:
+        parameter.grad = None
+    sums = torch.zeros(2, device=fabric.device, dtype=torch.float64)  # ratios, agents
+    relabelled = relabel_with_hindsight(experiences, reward)
+    for part, old_log_probs in zip(relabelled, first_pass.agent_log_prob):
+        for (rollouts, earned), old in zip(part.slices(rollouts_per_pass), old_log_probs):
+            mask, decides = rollouts.decision_mask, rollouts.decision_mask.any(-1)  # [B, n, A, L], [B, n, A]
+            with fabric.autocast():
+                dist = policy.score(policy.encode(part.batch), rollouts)
+            log_prob = dist.log_prob(rollouts.decision)  # [B, n, A, L]
+            ratio = importance_ratio(agent_log_prob(log_prob, mask, "sum"), old)  # [B, n, A]
+            by_agent = agent_log_prob(log_prob, mask, terms.reduction)
+            fabric.backward(policy_gradient_loss(earned * ratio, by_agent, terms.num_scenarios))
+            # Agents that decide nothing have a ratio of exp(0) = 1, which would pull the mean to 1.
+            sums += torch.stack([ratio[decides].sum(), decides.sum()])
+    total, count = all_reduce_sum(sums, fabric).tolist()
+    mean = total / max(count, 1.0)
+    for parameter, gradient in zip(parameters, before):
+        if parameter.grad is not None:
+            parameter.grad *= weight / max(mean, 1e-6)
+        if gradient is not None:
+            parameter.grad = gradient if parameter.grad is None else parameter.grad.add_(gradient)
+    return {"hindsight_ratio": mean}

@@ -1,14 +1,22 @@
-"""REINFORCE with a reward per rollout and a KL penalty, as arithmetic on sums.
+"""REINFORCE with a reward per rollout (or agent) and a KL penalty, as arithmetic on sums.
 
-Every term is a sum over what this process and slice hold, divided by a global count: so slices of the rollouts and processes add up
-to the one estimator. Source: RLFTSim section 4.1; the adaptive penalty is Ziegler et al., 2020.
+Every term is a sum over the agents and decisions of this process and slice, divided by a global count. So slices of the
+rollouts, micro batches and processes add up to one and the same estimator.
+
+Source: RLFTSim, section 4.1; the adaptive penalty is that of Ziegler et al., "Fine-Tuning Language Models from Human
+Preferences", 2020.
 """
 
-from typing import Literal
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+
+from rlftsim.training.experience import Experience
+from rlftsim.training.parallel import Fabric, all_reduce_sum
 
 Reduction = Literal["mean", "sum"]
 
@@ -16,11 +24,15 @@ Reduction = Literal["mean", "sum"]
 def agent_log_prob(
     log_prob: Float[Tensor, "B N A L"], mask: Bool[Tensor, "B N A L"], reduction: Reduction
 ) -> Float[Tensor, "B N A"]:
-    """Each agent's part of the log-probability of its rollout, which is the mean (or sum) over all agents' decisions that count.
+    """Each agent's part of the log-probability of its rollout; summed over agents they are the rollout's.
 
-    Summed over agents it is the rollout's log-probability.
+    Args:
+        log_prob: of each decision, nats.
+        mask: True = the decision counts.
+        reduction: "sum" over all decisions of the rollout, or their "mean".
     """
-    total = torch.where(mask, log_prob, 0.0).sum(-1)
+    total = torch.where(mask, log_prob, 0.0).sum(-1)  # [B, N, A]
+    # The mean is over all agents' decisions of the rollout, so an agent with few decisions weighs less.
     return total if reduction == "sum" else total / mask.sum((-1, -2)).clamp(min=1)[..., None]
 
 
@@ -30,13 +42,101 @@ def policy_gradient_loss(
     """Loss whose gradient is minus the policy gradient: - 1/B sum_b sum_i R[b, i] log pi(rollout i of b).
 
     Args:
-        reward: of each rollout, or of each agent in it; with its baseline inside; no gradient flows through it.
+        reward: of each rollout, or of each agent in it, with its baseline inside; no gradient flows through it.
         log_prob: of the same.
-        num_scenarios: B over all slices and processes.
+        num_scenarios: B, over all slices and processes.
     """
+    # By agent the reward of each multiplies its own part of the log-probability; by rollout all have the same.
     return -(reward.detach() * log_prob).sum() / num_scenarios
 
 
 def masked_sum(values: Float[Tensor, "*shape"], mask: Bool[Tensor, "*shape"]) -> Float[Tensor, ""]:
-    """Sum over what counts."""
+    """Sum of the values that count.
+
+    Args:
+        values: any numbers; those that do not count may be infinite or NaN.
+        mask: True = the value counts.
+    """
     return torch.where(mask, values, 0.0).sum()
+
+
+@dataclass(frozen=True)
+class LossTerms:
+    """Coefficients of the fine-tuning loss in one update, and the global counts that its sums are divided by."""
+
+    num_scenarios: int
+    num_decisions: float
+    beta: float
+    """Strength of the KL penalty."""
+    entropy_bonus: float
+    reduction: Reduction
+    condition_reference: bool
+    """False = the reference is scored without goals."""
+
+
+@dataclass(frozen=True, eq=False)
+class GradientSums:
+    """Statistics of a pass over the rollouts, beside the gradients that it leaves in the parameters."""
+
+    kl: float
+    """From the reference, nats per decision; mean over all processes."""
+    entropy: float
+    """Nats per decision; mean over all processes."""
+    score_gap: float
+    """Largest difference between a log-probability as sampled and as scored, in this process."""
+    agent_log_prob: list[list[Float[Tensor, "_ _ _"]]]
+    """Summed log-probability of each agent's decisions, by experience and slice; no gradient."""
+
+
+def accumulate_gradients(
+    policy: Any,
+    reference: Any,
+    experiences: Sequence[Experience],
+    terms: LossTerms,
+    fabric: Fabric,
+    *,
+    rollouts_per_pass: int,
+) -> GradientSums:
+    """Add this process's gradient of the loss to the policy's parameters.
+
+    The loss is  policy_gradient_loss + (beta * KL - entropy_bonus * entropy) / decisions.
+
+    Args:
+        policy: scores the rollouts with gradient.
+        reference: scores them without; under the same goals, unless `terms.condition_reference` is False. A reference
+            whose goal encoder was added for this run is still goal-free; an already conditioned one anchors the policy
+            to its goal-following.
+        experiences: of this process.
+        terms: coefficients and counts.
+        fabric: precision, and the processes that the statistics are summed over.
+        rollouts_per_pass: rollouts of a scenario that are scored at once; changes memory, not the gradient.
+    """
+    sums = torch.zeros(2, device=fabric.device, dtype=torch.float64)  # KL, entropy
+    gaps: list[Tensor] = []
+    by_experience: list[list[Tensor]] = []
+    num_decisions = max(terms.num_decisions, 1.0)
+    for experience in experiences:
+        by_experience.append([])
+        with fabric.autocast(), torch.no_grad():
+            reference_context = reference.encode(experience.batch)
+        for rollouts, reward in experience.slices(rollouts_per_pass):
+            mask = rollouts.decision_mask  # [B, n, A, L]
+            with fabric.autocast():
+                # Encoded anew for every slice: each slice's graph is freed by its own backward pass.
+                dist = policy.score(policy.encode(experience.batch), rollouts)
+                with torch.no_grad():
+                    conditioned = rollouts if terms.condition_reference else replace(rollouts, goals=None)
+                    ref_dist = reference.score(reference_context, conditioned)
+            log_prob = dist.log_prob(rollouts.decision)  # [B, n, A, L]
+            kl, entropy = masked_sum(dist.kl(ref_dist), mask), masked_sum(dist.entropy(), mask)
+            by_agent = agent_log_prob(log_prob, mask, terms.reduction)  # [B, n, A]
+            loss = policy_gradient_loss(reward, by_agent, terms.num_scenarios)
+            loss = loss + (terms.beta * kl - terms.entropy_bonus * entropy) / num_decisions
+            # Every slice adds its part; nothing is divided by the number of slices.
+            fabric.backward(loss)
+            sums += torch.stack([kl.detach(), entropy.detach()])
+            gaps.append(torch.where(mask, log_prob.detach() - rollouts.log_prob, 0.0).abs().max())
+            by_experience[-1].append(agent_log_prob(log_prob.detach(), mask, "sum"))
+    kl_sum, entropy_sum = all_reduce_sum(sums, fabric).tolist()
+    gap = float(torch.stack(gaps).max())
+    return GradientSums(kl_sum / num_decisions, entropy_sum / num_decisions, gap, by_experience)

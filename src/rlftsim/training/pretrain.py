@@ -1,50 +1,37 @@
-"""Pre-training: predict the next motion token along recorded tracks."""
+"""Pre-training: predict the next motion token along logged tracks, or minimize the policy's own imitation loss."""
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 from jaxtyping import Bool
-from torch import Tensor, nn
+from torch import Tensor
 
-from rlftsim.errors import ConfigError
+from rlftsim.rollout.policy import ImitatedPolicy, ImitationLoss, Prediction, PretrainablePolicy
 from rlftsim.scenario.batch import ScenarioBatch
-from rlftsim.scenario.types import Scenarios
-from rlftsim.training.imitation import ImitationConfig, Prediction, imitate
-
-
-@runtime_checkable
-class NextTokenModel(Protocol):
-    """A model that can be pre-trained."""
-
-    def teacher_forced(self, scenarios: ScenarioBatch, trained: Bool[Tensor, "B A"]) -> Prediction:
-        """Predictions of the next token of every agent at every step of its recorded track."""
-        ...
-
-    def save_pretrained(self, folder: Path, *, card: str = "") -> None:
-        """Write the model into a folder."""
-        ...
+from rlftsim.training.imitation import ImitationConfig, imitate
+from rlftsim.training.run import TrainingScenarios, as_scenarios, require_trainable
 
 
 @dataclass(frozen=True)
 class PretrainConfig(ImitationConfig):
-    """How a model is pre-trained. The defaults are those of the published SMART-tiny on WOMD."""
+    """Pre-training. The defaults are those of the published SMART-tiny on WOMD."""
 
 
 def pretrain(
-    model: NextTokenModel,
-    scenarios: Scenarios,
-    out: Path,
+    model: PretrainablePolicy | ImitatedPolicy,
+    scenarios: TrainingScenarios,
+    out: str | os.PathLike[str],
     config: PretrainConfig,
     *,
-    held_out: Scenarios | None = None,
+    held_out: TrainingScenarios | None = None,
     card: str = "",
 ) -> Path:
-    """Pre-train a model in place; go on where a run in `out` was stopped.
+    """Pre-train a model in place; resumes where a run in `out` was stopped.
 
     Args:
-        model: an nn.Module that is a NextTokenModel.
-        scenarios: with their futures; scenarios without are refused.
+        model: an nn.Module that is a PretrainablePolicy or an ImitatedPolicy; its own loss goes first.
+        scenarios: a data set, a list or one scenario, with their futures.
         out: the run's folder.
         config: see its fields.
         held_out: scenarios to validate on, see `config.validation`; None = no validation.
@@ -57,10 +44,19 @@ def pretrain(
         ConfigError: the model cannot be pre-trained, or there is no scenario.
         CheckpointError: `out` holds another run, or the run diverged.
     """
-    if not isinstance(model, nn.Module) or not isinstance(model, NextTokenModel):
-        raise ConfigError(f"{type(model).__name__} cannot be pre-trained: it needs teacher_forced and save_pretrained.")
+    scenarios = as_scenarios(scenarios)
+    own_loss = getattr(model, "imitation_loss", None)
+    # One of the two is enough; a policy with neither is refused with both names.
+    either = ("teacher_forced", "imitation_loss")
+    needs = () if any(hasattr(model, name) for name in either) else either
+    policy = require_trainable(model, scenarios, "pre-training", needs=needs)
 
-    def along_the_record(batch: ScenarioBatch, trained: Bool[Tensor, "B A"], update: int) -> Prediction:
-        return model.teacher_forced(batch, trained)
+    def predict_along_log(
+        batch: ScenarioBatch, trained: Bool[Tensor, "B A"], update: int
+    ) -> Prediction | ImitationLoss:
+        return policy.teacher_forced(batch, trained) if own_loss is None else own_loss(batch, trained, update)
 
-    return imitate(model, scenarios, out, config, along_the_record, title="pre-train", held_out=held_out, card=card)
+    return imitate(
+        policy, scenarios, out, config, predict_along_log,
+        title="pre-train", held_out=None if held_out is None else as_scenarios(held_out), card=card,
+    )  # fmt: skip

@@ -1,10 +1,10 @@
 """The folder of a run: resolved configuration, environment, metrics, checkpoints.
 
-config.json        what was asked for, every default filled in
+config.json        the settings, every default filled in
 environment.json   versions, machine, command, commit
-metrics.jsonl      a line an update; also as TensorBoard events in tensorboard/
+metrics.jsonl      a line per update; also as TensorBoard events in tensorboard/
 checkpoints/       see `training.checkpoint`
-model/             the result, once the run is done (`save_pretrained`)
+model/             the trained policy, once the run is done (`save_pretrained`)
 """
 
 import dataclasses
@@ -16,33 +16,35 @@ import platform
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
-
-from torch.utils.tensorboard import SummaryWriter
+from typing import TYPE_CHECKING, Any
 
 from rlftsim import __version__
+from rlftsim.aliases import current_names
+from rlftsim.atomic_io import append_text, errors_name, write_text
 from rlftsim.errors import CheckpointError
-from rlftsim.files import write_text
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.scenario.types import Scenarios, scenario_ids_of
 from rlftsim.training.checkpoint import newest_checkpoint
 
-PACKAGES = ("torch", "numpy", "pyarrow", "lightning-fabric", "safetensors")
+if TYPE_CHECKING:
+    from torch.utils.tensorboard import SummaryWriter
 
+PACKAGES = ("torch", "numpy", "pyarrow", "lightning-fabric", "safetensors")
+"""Packages whose versions are stored with a run."""
 
 MAY_CHANGE = (
     *("checkpoint_every", "device.accelerator", "device.devices", "device.num_nodes", "device.threads"),
     *("micro_batch_size", "micro_batch_cost", "rollouts_per_pass", "validation", "goals.augmented"),
 )
-"""Settings, or whole groups of them, that a run may be continued with other values of: they change no estimate. (Where augmented goals lie
-may change; what they are is among a run's inputs.)"""
+"""Settings, or whole groups of them, that may have other values when a run is resumed: they change no estimate.
+(The folder of augmented goals may change; the goals themselves are among a run's inputs.)"""
 
 
 def may_change(name: str) -> bool:
-    """Whether a run may be continued with another value of a setting, named with dots."""
+    """True for a setting, named with dots, that may have another value when a run is resumed."""
     return any(name == free or name.startswith(f"{free}.") for free in MAY_CHANGE)
 
 
@@ -55,7 +57,7 @@ BOARD_GROUPS = {
     "validation": ("validation_",),
     "time": ("seconds",),
 }
-"""How TensorBoard shows metrics together: by how their names begin."""
+"""Groups of metrics in TensorBoard: by the beginnings of their names."""
 
 
 def board_tag(name: str) -> str:
@@ -65,15 +67,26 @@ def board_tag(name: str) -> str:
 
 
 def describe_inputs(policy: object, scenarios: Scenarios) -> dict[str, str]:
-    """What a run starts from, as hashes: weights, settings and vocabulary of the policy, and which scenarios in which order."""
+    """Hashes of what a run starts from.
+
+    Args:
+        policy: its weights, settings and vocabulary count.
+        scenarios: their ids and order count.
+    """
     ids = hashlib.blake2b(digest_size=16)
+    # Ids and order only: reading every scenario would take minutes.
     for scenario_id in scenario_ids_of(scenarios):
         ids.update(f"{scenario_id}\n".encode())
     return {"initial_policy": fingerprint_policy(policy), "scenarios": ids.hexdigest()}
 
 
 def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested settings by their dotted names."""
+    """Nested settings by their dotted names.
+
+    Args:
+        values: mappings at any depth.
+        prefix: put before every name.
+    """
     flat: dict[str, Any] = {}
     for name, value in values.items():
         flat |= flatten(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
@@ -92,36 +105,32 @@ def to_plain(config: Any) -> Any:
 
 
 def describe_environment() -> dict[str, Any]:
-    """Versions, machine, command line and the commit of a checkout."""
+    """Versions, machine, command line, and the commit if the package runs from a checkout."""
+    git = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=12"]
+    try:
+        commit = subprocess.run(git, capture_output=True, text=True, timeout=5, check=True).stdout.strip() or None
+    except (OSError, subprocess.SubprocessError):
+        commit = None
     return {
         "command": " ".join(sys.argv),
         "python": platform.python_version(),
         "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
         "packages": {"rlftsim": __version__, **{name: version(name) for name in PACKAGES}},
-        "commit": _commit(),
+        "commit": commit,
     }
 
 
-def _commit() -> str | None:
-    """Commit of the checkout this package runs from; None where it is installed."""
-    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=12"]
-    try:
-        return subprocess.run(command, capture_output=True, text=True, timeout=5, check=True).stdout.strip() or None
-    except (OSError, subprocess.SubprocessError):
-        return None
-
-
-def _some_of(names: Sequence[str], most: int = 8) -> str:
-    """Names in a line, not too many of them."""
-    rest = f" and {len(names) - most} more" if len(names) > most else ""
-    return f"{', '.join(names[:most])}{rest}"
-
-
 class RunFolder:
-    """Opens a run's folder for the first time or to go on. Only the process of rank 0 writes.
+    """Opens a run's folder for the first time or to resume. Only the process of rank 0 writes.
+
+    Args:
+        path: created if missing.
+        config: a dataclass of settings.
+        inputs: hashes of what the run starts from, see `describe_inputs`.
+        writes: False in all processes but that of rank 0.
 
     Raises:
-        CheckpointError: the folder belongs to a run with another configuration.
+        CheckpointError: the folder belongs to a run with other settings or inputs.
     """
 
     def __init__(self, path: Path, config: Any, inputs: Mapping[str, str] | None = None, *, writes: bool = True):
@@ -131,6 +140,7 @@ class RunFolder:
         self._writes = writes
         self._metrics = path / "metrics.jsonl"
         self._board: SummaryWriter | None = None
+        # Settings and inputs stand in one file: both make a run what it is.
         plain = {**to_plain(config), **(inputs or {})}
         self._refuse_other(plain)
         if writes:
@@ -138,60 +148,86 @@ class RunFolder:
             write_text(path / "environment.json", json.dumps(describe_environment(), indent=1) + "\n")
 
     def _refuse_other(self, config: Any) -> None:
+        """Compare with the stored settings, which may have names of an earlier version."""
         path = self.path / "config.json"
         if not path.exists():
             return
         try:
-            old, new = flatten(json.loads(path.read_text())), flatten(config)
+            old, new = flatten(current_names(json.loads(path.read_text()))), flatten(config)
         except (ValueError, AttributeError) as error:
             raise CheckpointError(f"{path}: damaged ({error}): remove the folder {self.path} to start anew.") from None
+        # Two versions of one kind of run share most names, two kinds do not: a list of them all would explain nothing.
+        if len(old.keys() ^ new.keys()) > len(old.keys() & new.keys()):
+            raise CheckpointError(
+                f"{self.path} belongs to a run of another kind: name another --out, or remove the folder to start anew."
+            )
+        # A setting that only one side has counts as different: None stands for it.
         differing = sorted(k for k in old.keys() | new.keys() if not may_change(k) and old.get(k) != new.get(k))
         if differing:
+            most = 8  # settings named in one line
+            more = f" and {len(differing) - most} more" if len(differing) > most else ""
             raise CheckpointError(
-                f"{self.path} belongs to a run with other settings or inputs ({_some_of(differing)}): "
+                f"{self.path} belongs to a run with other settings or inputs ({', '.join(differing[:most])}{more}): "
                 "name another --out, or remove the folder to start anew."
             )
 
     def diverged(self, cause: str, remedy: str) -> CheckpointError:
-        """The error of a run that makes no sense any more; names its last good checkpoint."""
+        """The error of a run that makes no sense any more; names its last good checkpoint.
+
+        Args:
+            cause: clause that follows the folder's name.
+            remedy: clause with the settings to change.
+        """
         newest = newest_checkpoint(self.checkpoints)
         return CheckpointError(f"{self.path}: {cause}. The last good checkpoint is {newest or 'none'}: {remedy}.")
 
     def continue_from(self, update: int) -> None:
-        """Drop the metrics of updates that will be done again."""
+        """Drop the metrics of updates that will be done again: those after `update`."""
         if not self._writes:
             return
+        from torch.utils.tensorboard import SummaryWriter  # not at the top: `--help` has no use for it
+
         if self._metrics.exists():
             lines = self._metrics.read_text().splitlines()
+            # A line cut short by a kill counts as infinitely late and goes, too.
             kept = [line for line in lines if _update_of(line) <= update]
             write_text(self._metrics, "".join(f"{line}\n" for line in kept))
-        self._board = SummaryWriter(str(self.path / "tensorboard"), purge_step=update + 1)
+        board = self.path / "tensorboard"
+        with errors_name(board):
+            self._board = SummaryWriter(str(board), purge_step=update + 1)
 
     def log(self, update: int, values: Mapping[str, float]) -> None:
-        """Add a line of metrics."""
+        """Add a line of metrics.
+
+        Args:
+            update: updates done.
+            values: by name.
+        """
         if not self._writes:
             return
-        with self._metrics.open("a") as file:
-            file.write(json.dumps({"update": update, "time": round(time.time(), 3), **values}) + "\n")
+        line = json.dumps({"update": update, "time": round(time.time(), 3), **values})
+        append_text(self._metrics, f"{line}\n")
         if self._board is not None:
-            for name, value in values.items():
-                self._board.add_scalar(board_tag(name), value, update)
+            with errors_name(self.path / "tensorboard"):
+                for name, value in values.items():
+                    self._board.add_scalar(board_tag(name), value, update)
 
     def close(self) -> None:
         """Flush what is pending."""
         if self._board is not None:
-            self._board.close()
+            with errors_name(self.path / "tensorboard"):
+                self._board.close()
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:
-    """The metrics of a run's folder, a dictionary an update; empty where there are none."""
+    """The metrics of a run's folder, a dictionary per update; empty where there are none."""
     metrics = path / "metrics.jsonl"
     lines = metrics.read_text().splitlines() if metrics.exists() else []
     return [json.loads(line) for line in lines if math.isfinite(_update_of(line))]
 
 
 def _update_of(line: str) -> float:
-    """Update of a line of metrics; infinite for a line that a kill cut short, or that is none."""
+    """Update of a line of metrics; infinite for one that is no JSON, such as a line that a kill cut short."""
     try:
         return float(json.loads(line)["update"])
     except (ValueError, KeyError, TypeError):

@@ -1,1 +1,1 @@
-"""Look at it: pictures and pages of scenarios and rollouts."""
+"""Pictures and pages of scenarios and rollouts: stills, films, charts, and a player for browsers and notebooks."""

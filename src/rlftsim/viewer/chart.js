@@ -17,7 +17,7 @@
     tip.className = "chart-tip"; tip.hidden = true; figure.append(tip);
     const dots = curves.map((curve) => {
       const dot = document.createElementNS(SVG, "circle");
-      dot.setAttribute("r", 4); dot.setAttribute("fill", curve.colour); dot.style.display = "none";
+      dot.setAttribute("r", 4); dot.setAttribute("fill", curve.color); dot.style.display = "none";
       return svg.appendChild(dot);
     });
     svg.addEventListener("pointermove", (event) => {

@@ -1,4 +1,4 @@
-"""Line charts as inline SVG: axes, labels, a smoothed line over the raw one. Drawn here, so a page needs no plotting library."""
+"""Line charts as inline SVG: axes, labels, a smoothed line over the raw one; a page needs no plotting library."""
 
 import math
 from collections.abc import Sequence
@@ -16,9 +16,9 @@ LEFT, RIGHT, TOP, BOTTOM = 72, 14, 12, 44
 """Room around the plotted area, in the SVG's own units."""
 MAX_DRAWN_POINTS = 600
 MIN_POINTS_TO_SMOOTH = 12
-NUM_SERIES_COLOURS = 4
+NUM_SERIES_COLORS = 4
 DRAWN_MAGNITUDE = 1e30
-"""Values further from zero are left out as if not finite; on a logarithmic axis also those closer to it than one over this."""
+"""Values farther from zero count as not finite; on a logarithmic axis also those closer to it than 1 over this."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Chart:
 
 @dataclass(frozen=True)
 class Axes:
-    """Where a value is drawn. Vertical limits are logarithms where `log_y`."""
+    """Limits of both axes, and the place of a value between them. Vertical limits are logarithms where `log_y`."""
 
     x_low: float
     x_high: float
@@ -68,63 +68,102 @@ class Axes:
     def vertical(self, y: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
         """SVG coordinate of y."""
         height = np.log10(y) if self.log_y else np.asarray(y, float)
-        share = (height - self.y_low) / (self.y_high - self.y_low)
-        return np.asarray(HEIGHT - BOTTOM - share * (HEIGHT - TOP - BOTTOM))
+        fraction = (height - self.y_low) / (self.y_high - self.y_low)
+        # SVG counts from the top.
+        return np.asarray(HEIGHT - BOTTOM - fraction * (HEIGHT - TOP - BOTTOM))
 
 
 def chart_html(chart: Chart) -> str:
-    """A `<figure>` with title, legend (where there is more than one curve), SVG and note."""
-    drawn = [(curve.name, *_drawable(curve, chart.log_y)) for curve in chart.curves]
+    """A `<figure>` with title, legend (for more than one curve), SVG and note."""
+    drawn = [(curve.name, *_drawable(curve, chart.log_y)) for curve in chart.curves]  # name, x [n], y [n]
     title = f'<figcaption class="chart-title">{escape(chart.title)}</figcaption>'
     note = f'<p class="note">{escape(chart.note)}</p>' if chart.note else ""
     if not any(len(x) for _, x, _ in drawn):
-        return f'<figure class="chart">{title}<p class="note">Nothing was recorded.</p>{note}</figure>'
+        return f'<figure class="chart">{title}<p class="note">No data.</p>{note}</figure>'
     axes = _axes(drawn, chart)
     parts = [_frame_svg(axes, chart)]
-    parts += [_curve_svg(axes, x, y, colour_of(index)) for index, (_, x, y) in enumerate(drawn)]
-    parts.append(_reference_svg(axes, chart))
-    hover = embed_json([_hover_points(axes, name, x, y, index) for index, (name, x, y) in enumerate(drawn)])
+    parts += [_curve_svg(axes, x, y, color_of(index)) for index, (_, x, y) in enumerate(drawn)]
+    if chart.reference and not (chart.log_y and chart.reference[1] <= 0):
+        name, height = chart.reference
+        y = float(axes.vertical(np.array(height)))
+        parts.append(f'<path class="reference" d="M{LEFT} {y:.1f}H{WIDTH - RIGHT}"/>')
+        label = f'<text class="halo" x="{WIDTH - RIGHT - 4}" y="{y - 5:.1f}" text-anchor="end">{escape(name)}</text>'
+        parts.append(label)
+    legend = ""
+    if len(chart.curves) > 1:
+        line = '<svg viewBox="0 0 24 16" aria-hidden="true"><path d="M2 8H22" stroke="{}" stroke-width="3"/></svg>'
+        items = "".join(f"<li>{line.format(color_of(i))}{escape(c.name)}</li>" for i, c in enumerate(chart.curves))
+        legend = f'<ul class="legend chart-legend">{items}</ul>'
+    # chart.js shows under the pointer: places in the SVG, and the values as text.
+    hover = embed_json(
+        [
+            {
+                "name": name,
+                "color": color_of(index),
+                "x": [round(float(v), 1) for v in axes.horizontal(x)],
+                "y": [round(float(v), 1) for v in axes.vertical(y)],
+                "at": [f"{v:g}" for v in np.round(x, 2)],
+                "value": [f"{v:.4g}" for v in y],
+            }
+            for index, (name, x, y) in enumerate(drawn)
+        ]
+    )
     return (
-        f'<figure class="chart">{title}{_legend_html(chart)}'
+        f'<figure class="chart">{title}{legend}'
         f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(chart.title)}">{"".join(parts)}</svg>'
         f'<script type="application/json">{hover}</script>{note}</figure>'
     )
 
 
 def smooth(values: Float[np.ndarray, "n"], window: int) -> Float[np.ndarray, "n"]:
-    """At each point the straight line fitted to its neighbours: inside a running mean, at the ends without their bias or jumps.
+    """Value at each point of the straight line fitted to its neighbors.
+
+    In the interior that is a running mean; at the ends it has neither the bias nor the jumps of one.
 
     Args:
         values: at equal distances.
-        window: how many points are fitted; near the ends they lie mostly on one side.
+        window: number of points that are fitted; near the ends they lie mostly on one side.
     """
-    smoothed = np.array(values, float)
+    smoothed = np.array(values, float)  # [n]
     window = min(window, len(smoothed))
     for i in range(len(smoothed)):
         start = min(max(i - window // 2, 0), len(smoothed) - window)
         near = np.arange(start, start + window)
         offset = near - near.mean()
+        # The maximum avoids 0 / 0 for a window of one point, whose slope does not matter.
         slope = offset @ values[near] / max(float(offset @ offset), 1.0)
         smoothed[i] = values[near].mean() + slope * (i - near.mean())
     return smoothed
 
 
-def colour_of(index: int) -> str:
-    """CSS colour of the curve with this number."""
-    return f"var(--series-{index % NUM_SERIES_COLOURS + 1})"
+def color_of(index: int) -> str:
+    """CSS color of the curve with this number."""
+    return f"var(--series-{index % NUM_SERIES_COLORS + 1})"
 
 
 def nice_ticks(low: float, high: float, count: int) -> list[float]:
-    """About `count` round numbers in [low, high]."""
+    """Round numbers in [low, high].
+
+    Args:
+        low: lower limit.
+        high: upper limit, above the lower one.
+        count: approximate number of them.
+    """
     raw = (high - low) / max(count, 1)
     magnitude = 10.0 ** math.floor(math.log10(raw))
     step = min((m * magnitude for m in (1, 2, 2.5, 5, 10)), key=lambda s: abs(s - raw))
+    # 1e-9 keeps a limit that is itself round but for float arithmetic.
     first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
     return [i * step for i in range(first, last + 1)]
 
 
 def format_tick(value: float, step: float) -> str:
-    """As many digits as the distance between ticks needs; powers of ten where there would be too many."""
+    """Number with as many digits as the distance between ticks needs, in powers of ten where there would be too many.
+
+    Args:
+        value: the number.
+        step: distance between ticks.
+    """
     largest = max(abs(value), step)
     if largest >= 1e5 or step < 1e-5:
         return f"{value:.3g}".replace("-", "−")
@@ -133,8 +172,9 @@ def format_tick(value: float, step: float) -> str:
 
 
 def _drawable(curve: Curve, log_y: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Points that can be drawn, averaged over neighbours where there are very many."""
+    """Points that can be drawn, x and y [n], averaged over neighbors where there are very many."""
     x, y = np.asarray(curve.x, float), np.asarray(curve.y, float)
+    # Comparisons with NaN are False, so y needs no isfinite of its own.
     kept = np.isfinite(x) & (np.abs(y) < DRAWN_MAGNITUDE) & ((y > 1 / DRAWN_MAGNITUDE) if log_y else True)
     x, y = x[kept], y[kept]
     if len(x) <= MAX_DRAWN_POINTS:
@@ -144,7 +184,7 @@ def _drawable(curve: Curve, log_y: bool) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _smoothed(y: np.ndarray, log_y: bool) -> np.ndarray:
-    """Smoothed on the scale on which it is drawn, and never beyond the raw values: a rate does not fall below zero."""
+    """Values smoothed on the scale on which they are drawn, never beyond the raw ones: a rate stays above zero."""
     height = np.log10(y) if log_y else y
     smoothed = np.clip(smooth(height, _window(len(y))), height.min(), height.max())
     return 10**smoothed if log_y else smoothed
@@ -156,7 +196,7 @@ def _window(num_points: int) -> int:
 
 
 def _axes(drawn: list[tuple[str, np.ndarray, np.ndarray]], chart: Chart) -> Axes:
-    """Limits around the smoothed lines and all but the wildest raw points."""
+    """Limits around the smoothed lines and all but the most extreme raw points."""
     x = np.concatenate([x for _, x, _ in drawn])
     heights = []
     for _, _, y in drawn:
@@ -166,9 +206,11 @@ def _axes(drawn: list[tuple[str, np.ndarray, np.ndarray]], chart: Chart) -> Axes
         heights.append(chart.reference[1])
     y = np.array([h for h in heights if h > 0]) if chart.log_y else np.array(heights)
     y = np.log10(y) if chart.log_y else y
+    # A constant curve gets a margin of its own, or the axis would have no extent.
     margin = 0.06 * (y.max() - y.min()) or max(0.05 * abs(float(y[0])), 1e-3)
     wide = float(x.max()) if x.max() > x.min() else float(x.min()) + 1
     low = float(y.min() - margin)
+    # The margin must not suggest that a rate or a loss can be negative.
     if not chart.log_y and low < 0 <= y.min():
         low = 0.0
     return Axes(float(x.min()), wide, low, float(y.max() + margin), chart.log_y)
@@ -178,10 +220,12 @@ def _frame_svg(axes: Axes, chart: Chart) -> str:
     """Grid, tick labels, axis labels."""
     bottom, right = HEIGHT - BOTTOM, WIDTH - RIGHT
     parts = []
+    # 1. Horizontal grid lines with their values.
     for value, label in _vertical_ticks(axes):
         y = float(axes.vertical(np.array(value)))
         parts.append(f'<path class="grid" d="M{LEFT} {y:.1f}H{right}"/>')
         parts.append(f'<text x="{LEFT - 8}" y="{y + 4:.1f}" text-anchor="end">{label}</text>')
+    # 2. Ticks below the horizontal axis.
     ticks = nice_ticks(axes.x_low, axes.x_high, 5)
     for value in ticks:
         x = float(axes.horizontal(np.array(value)))
@@ -189,6 +233,7 @@ def _frame_svg(axes: Axes, chart: Chart) -> str:
         parts.append(f'<path class="tick" d="M{x:.1f} {bottom}v5"/>')
         parts.append(f'<text x="{x:.1f}" y="{bottom + 18}" text-anchor="middle">{label}</text>')
     parts.append(f'<path class="axis" d="M{LEFT} {bottom}H{right}"/>')
+    # 3. Names of both axes, the vertical one turned.
     middle = (LEFT + right) / 2
     parts.append(
         f'<text class="label" x="{middle}" y="{HEIGHT - 6}" text-anchor="middle">{escape(chart.x_label)}</text>'
@@ -198,23 +243,13 @@ def _frame_svg(axes: Axes, chart: Chart) -> str:
     return "".join(parts)
 
 
-def _reference_svg(axes: Axes, chart: Chart) -> str:
-    if not chart.reference or (axes.log_y and chart.reference[1] <= 0):
-        return ""
-    name, height = chart.reference
-    y = float(axes.vertical(np.array(height)))
-    return (
-        f'<path class="reference" d="M{LEFT} {y:.1f}H{WIDTH - RIGHT}"/>'
-        f'<text class="halo" x="{WIDTH - RIGHT - 4}" y="{y - 5:.1f}" text-anchor="end">{escape(name)}</text>'
-    )
-
-
 def _vertical_ticks(axes: Axes) -> list[tuple[float, str]]:
     """Values to mark on the vertical axis, with their labels."""
     if not axes.log_y:
         ticks = nice_ticks(axes.y_low, axes.y_high, 5)
         step = ticks[1] - ticks[0] if len(ticks) > 1 else 1.0
         return [(v, format_tick(v, step)) for v in ticks]
+    # Powers of ten, at most about five of them; over less than two decades also their double and fivefold.
     decades = range(math.floor(axes.y_low), math.ceil(axes.y_high) + 1)
     multiples = (1,) if axes.y_high - axes.y_low > 2 else (1, 2, 5)
     exponents = [(m, d) for d in decades[:: max(1, len(decades) // 5)] for m in multiples]
@@ -222,7 +257,7 @@ def _vertical_ticks(axes: Axes) -> list[tuple[float, str]]:
     return [(v, f"{v:.3g}".replace("-", "−")) for v in marks]
 
 
-def _curve_svg(axes: Axes, x: np.ndarray, y: np.ndarray, colour: str) -> str:
+def _curve_svg(axes: Axes, x: np.ndarray, y: np.ndarray, color: str) -> str:
     """The raw line, pale, and the smoothed one; dots where there are too few points to smooth."""
     if not len(x):
         return ""
@@ -230,40 +265,17 @@ def _curve_svg(axes: Axes, x: np.ndarray, y: np.ndarray, colour: str) -> str:
     across, down = axes.horizontal(x), axes.vertical(y)
     raw = _path(across, down)
     if window == 1:
-        dots = "".join(f'<circle cx="{a:.1f}" cy="{b:.1f}" r="3" fill="{colour}"/>' for a, b in zip(across, down))
-        return f'<path class="smooth" d="{raw}" stroke="{colour}"/>{dots}'
+        dots = "".join(f'<circle cx="{a:.1f}" cy="{b:.1f}" r="3" fill="{color}"/>' for a, b in zip(across, down))
+        return f'<path class="smooth" d="{raw}" stroke="{color}"/>{dots}'
     smoothed = _path(across, axes.vertical(_smoothed(y, axes.log_y)))
-    # a nested svg cuts off what lies outside its box: the wildest raw points
+    # A nested svg clips what lies outside its box: the most extreme raw points.
     box = f"{LEFT} {TOP} {WIDTH - LEFT - RIGHT} {HEIGHT - TOP - BOTTOM}"
     place = 'x="{}" y="{}" width="{}" height="{}"'.format(*box.split())
     return (
-        f'<svg {place} viewBox="{box}"><path class="raw" d="{raw}" stroke="{colour}"/></svg>'
-        f'<path class="smooth" d="{smoothed}" stroke="{colour}"/>'
+        f'<svg {place} viewBox="{box}"><path class="raw" d="{raw}" stroke="{color}"/></svg>'
+        f'<path class="smooth" d="{smoothed}" stroke="{color}"/>'
     )
 
 
 def _path(x: np.ndarray, y: np.ndarray) -> str:
     return "M" + "L".join(f"{a:.1f} {b:.1f}" for a, b in zip(x, y))
-
-
-def _hover_points(axes: Axes, name: str, x: np.ndarray, y: np.ndarray, index: int) -> dict[str, object]:
-    """What `chart.js` shows under the pointer: positions in the SVG and the values as text."""
-    return {
-        "name": name,
-        "colour": colour_of(index),
-        "x": [round(float(v), 1) for v in axes.horizontal(x)],
-        "y": [round(float(v), 1) for v in axes.vertical(y)],
-        "at": [f"{v:g}" for v in np.round(x, 2)],
-        "value": [f"{v:.4g}" for v in y],
-    }
-
-
-def _legend_html(chart: Chart) -> str:
-    if len(chart.curves) < 2:
-        return ""
-    items = "".join(
-        f'<li><svg viewBox="0 0 24 16" aria-hidden="true"><path d="M2 8H22" stroke="{colour_of(i)}" stroke-width="3"/></svg>'
-        f"{escape(curve.name)}</li>"
-        for i, curve in enumerate(chart.curves)
-    )
-    return f'<ul class="legend chart-legend">{items}</ul>'

@@ -14,11 +14,11 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import NullFormatter, NullLocator
 
+from rlftsim.atomic_io import write_whole
 from rlftsim.errors import ConfigError
-from rlftsim.files import write_whole
 
-COLOURS = ("#1d63d8", "#e07b00", "#11754b", "#a21caf", "#79828f", "#24292f")
-"""Of curves; the first four are the page's (`page.css`), in the same order."""
+COLORS = ("#1d63d8", "#e07b00", "#11754b", "#a21caf", "#79828f", "#24292f")
+"""Colors of curves; the first four are those of `page.css`, in the same order."""
 INK, PALE = "#24292f", "#c9cfd6"
 BETTER, WORSE, NEITHER, OWN = "#bfe3cf", "#f3c4bf", "#eef0ec", "#d7dbe0"
 DOTS_PER_INCH = 160
@@ -27,7 +27,7 @@ PICTURES = (".png", ".svg", ".pdf")
 
 @dataclass(frozen=True)
 class Band:
-    """A curve and the band around it."""
+    """A curve with a band around it."""
 
     name: str
     x: Float[np.ndarray, "n"]
@@ -35,26 +35,26 @@ class Band:
     low: Float[np.ndarray, "n"] | None = None
     high: Float[np.ndarray, "n"] | None = None
     style: Literal["measured", "theory"] = "measured"
-    """What was measured has dots, a law is a dashed line."""
-    colour: int = 0
-    """Which of `COLOURS`."""
+    """Measurements are dots on a line, a theory is a dashed line."""
+    color: int = 0
+    """Index into `COLORS`."""
 
 
 @dataclass(frozen=True)
 class Interval:
-    """A number with its interval and a name."""
+    """A named number with its interval."""
 
     name: str
     mean: float
     low: float
     high: float
-    colour: int = 0
+    color: int = 0
 
 
 def draw_bands(
     bands: Sequence[Band], *, title: str, x_label: str, y_label: str, log: bool = False, ticks: Sequence[int] = ()
 ) -> Figure:
-    """Curves that share both axes.
+    """Figure of curves that share both axes.
 
     Args:
         bands: the curves.
@@ -62,19 +62,20 @@ def draw_bands(
         x_label: of the horizontal axis.
         y_label: of the vertical axis.
         log: both axes logarithmic.
-        ticks: marks of the horizontal axis; empty = chosen.
+        ticks: values marked on the horizontal axis; empty = matplotlib chooses.
     """
     figure, axis = _axis(6.4, 4.4, title)
     for band in bands:
-        colour = COLOURS[band.colour % len(COLOURS)]
+        color = COLORS[band.color % len(COLORS)]
         if band.low is not None and band.high is not None:
-            axis.fill_between(band.x, band.low, band.high, color=colour, alpha=0.16, lw=0)
-        is_law = band.style == "theory"
-        axis.plot(band.x, band.y, "--" if is_law else "o-", color=colour, lw=1.4 if is_law else 2, ms=5, label=band.name)  # fmt: skip
+            axis.fill_between(band.x, band.low, band.high, color=color, alpha=0.16, lw=0)
+        style, width = ("--", 1.4) if band.style == "theory" else ("o-", 2)
+        axis.plot(band.x, band.y, style, color=color, lw=width, ms=5, label=band.name)
     if log:
         axis.set(xscale="log", yscale="log")
     if len(ticks):
         axis.set_xticks(list(ticks), [f"{t:g}" for t in ticks])
+        # A logarithmic axis labels its minor ticks too, which would stand between the given ones.
         axis.xaxis.set_minor_locator(NullLocator())
         axis.xaxis.set_minor_formatter(NullFormatter())
     axis.set(xlabel=x_label, ylabel=y_label)
@@ -84,15 +85,15 @@ def draw_bands(
 
 
 @dataclass(frozen=True)
-class Panel:
+class Subplot:
     """Curves that share an axis with others beside it."""
 
     title: str
     bands: tuple[Band, ...]
 
 
-def draw_panels(
-    panels: Sequence[Panel],
+def draw_subplots(
+    panels: Sequence[Subplot],
     *,
     title: str,
     x_label: str,
@@ -101,7 +102,7 @@ def draw_panels(
     columns: int,
     is_joined: bool = True,
 ) -> Figure:
-    """Panels of percentages that share both axes, with one legend.
+    """Figure of panels with percentages that share both axes and one legend.
 
     Args:
         panels: the same names in each; the horizontal axis counts ticks from 0.
@@ -110,21 +111,27 @@ def draw_panels(
         y_label: of the vertical axes.
         ticks: names of the places 0, 1, ... of the horizontal axis.
         columns: panels in a row.
-        is_joined: whether the places along the horizontal axis have an order, so that dots are joined.
+        is_joined: True = the places along the horizontal axis have an order, so their dots are joined.
     """
-    rows = -(-len(panels) // columns)
+    rows = -(-len(panels) // columns)  # rounded up
     figure = Figure(figsize=(4.4 * columns, 3.4 * rows + 0.8), layout="constrained")
     figure.suptitle(title, fontsize=12, fontweight="bold", color=INK, x=0.01, ha="left")
     axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).ravel()
     for axis, panel in zip(axes, panels):
         axis.set_title(panel.title, fontsize=10, loc="left", color=INK)
         for band in panel.bands:
-            _draw_points(axis, band, is_joined=is_joined)
+            color, is_theory = COLORS[band.color % len(COLORS)], band.style == "theory"
+            line = ("--" if is_theory else "-") if is_joined else ""
+            face = "white" if is_theory else color  # open dots for a theory
+            axis.plot(band.x, band.y, f"o{line}", color=color, lw=1.2, ms=4, mfc=face, label=band.name, zorder=3)
+            if band.low is not None and band.high is not None:
+                axis.vlines(band.x, band.low, band.high, color=color, lw=2, alpha=0.4)
         axis.set_xticks(range(len(ticks)), list(ticks), fontsize=8)
         axis.set(ylim=(-3, 103))
         axis.grid(color=PALE, lw=0.6, alpha=0.7)
         for side in ("top", "right"):
             axis.spines[side].set_visible(False)
+    # Inner axes share ticks with the outer ones, so only the last row and the first column are labeled.
     for axis in axes[-columns:]:
         axis.set_xlabel(x_label)
     for axis in axes[::columns]:
@@ -134,33 +141,24 @@ def draw_panels(
     return figure
 
 
-def _draw_points(axis: Axes, band: Band, *, is_joined: bool) -> None:
-    """Dots with their intervals, open ones for a theory."""
-    colour = COLOURS[band.colour % len(COLOURS)]
-    is_law = band.style == "theory"
-    line = ("--" if is_law else "-") if is_joined else ""
-    axis.plot(band.x, band.y, f"o{line}", color=colour, lw=1.2, ms=4, mfc="white" if is_law else colour, label=band.name, zorder=3)  # fmt: skip
-    if band.low is not None and band.high is not None:
-        axis.vlines(band.x, band.low, band.high, color=colour, lw=2, alpha=0.4)
-
-
 def draw_intervals(intervals: Sequence[Interval], *, title: str, x_label: str, zero: bool) -> Figure:
-    """A line for each number, the first on top.
+    """Figure with a row for each number and its interval, the first on top.
 
     Args:
         intervals: the numbers.
         title: above them.
-        x_label: what the numbers are.
-        zero: whether zero is marked, for differences.
+        x_label: quantity and unit of the numbers.
+        zero: True = zero is marked, for differences.
     """
     figure, axis = _axis(6.4, 1.3 + 0.42 * len(intervals), title)
     for row, item in enumerate(intervals):
-        colour = COLOURS[item.colour % len(COLOURS)]
-        axis.plot([item.low, item.high], [row, row], color=colour, lw=3, alpha=0.45, solid_capstyle="round")
-        axis.plot([item.mean], [row], "o", color=colour, ms=6)
+        color = COLORS[item.color % len(COLORS)]
+        axis.plot([item.low, item.high], [row, row], color=color, lw=3, alpha=0.45, solid_capstyle="round")
+        axis.plot([item.mean], [row], "o", color=color, ms=6)
     if zero:
         axis.axvline(0.0, color=INK, lw=1, ls=(0, (4, 3)))
     axis.set_yticks(range(len(intervals)), [item.name for item in intervals])
+    # The vertical axis points down, so that the first row is on top.
     axis.set(xlabel=x_label, ylim=(len(intervals) - 0.4, -0.6))
     axis.grid(axis="x", color=PALE, lw=0.6, alpha=0.7)
     axis.tick_params(axis="y", length=0)
@@ -169,22 +167,23 @@ def draw_intervals(intervals: Sequence[Interval], *, title: str, x_label: str, z
 
 
 def draw_verdicts(names: Sequence[str], verdicts: Int[np.ndarray, "n n"], *, title: str, note: str) -> Figure:
-    """Everybody against everybody.
+    """Matrix of all pairwise comparisons.
 
     Args:
         names: of rows and columns.
-        verdicts: 1 the row is better than the column, -1 worse, 0 no difference; the diagonal is not looked at.
+        verdicts: 1 the row is better than the column, -1 worse, 0 no difference; the diagonal is ignored.
         title: above the matrix.
         note: below it.
     """
     size = 0.62 * len(names)
     figure, axis = _axis(size + 3.4, size + 2.6, title)
+    # Signs beside the colors, for readers that cannot tell red from green.
     for row, column in np.ndindex(*verdicts.shape):
         verdict = int(verdicts[row, column])
-        colour, sign = {1: (BETTER, "+"), -1: (WORSE, "−"), 0: (NEITHER, "~")}[verdict]
+        color, sign = {1: (BETTER, "+"), -1: (WORSE, "−"), 0: (NEITHER, "~")}[verdict]
         if row == column:
-            colour, sign = OWN, ""
-        axis.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, fc=colour, ec="white", lw=2))
+            color, sign = OWN, ""
+        axis.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, fc=color, ec="white", lw=2))
         axis.text(column, row, sign, ha="center", va="center", fontsize=13, fontweight="bold", color=INK)
     axis.set(xlim=(-0.5, len(names) - 0.5), ylim=(len(names) - 0.5, -0.5), aspect="equal")
     axis.set_xticks(range(len(names)), names, rotation=40, ha="right", rotation_mode="anchor")
@@ -197,20 +196,31 @@ def draw_verdicts(names: Sequence[str], verdicts: Int[np.ndarray, "n n"], *, tit
 
 
 def refuse_no_picture(path: Path) -> None:
-    """Refuse a name of another ending than pictures have.
+    """Check that a file name has the ending of a picture.
 
     Raises:
-        ConfigError: it has.
+        ConfigError: it has another one.
     """
     if path.suffix not in PICTURES:
         raise ConfigError(f"{path}: pictures are written as {', '.join(PICTURES)}: name the file so.")
 
 
 def save_figure(path: Path, figure: Figure, *, dots_per_inch: int = DOTS_PER_INCH) -> None:
-    """Write a figure as PNG, SVG or PDF, by the ending. Raises as `write_whole` and `refuse_no_picture`."""
+    """Write a figure as PNG, SVG or PDF; nothing half-written is left behind.
+
+    Args:
+        path: file to write; its ending chooses the format.
+        figure: what to write.
+        dots_per_inch: resolution of a PNG.
+
+    Raises:
+        ConfigError: another ending.
+        DataError: the file cannot be written.
+    """
     refuse_no_picture(path)
     kind = path.suffix.removeprefix(".")
     FigureCanvasAgg(figure)
+    # No dates and a fixed salt for ids: the same figure gives the same bytes.
     metadata = {"png": None, "svg": {"Date": None}, "pdf": {"CreationDate": None}}[kind]
     with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "rlftsim"}):
         write_whole(
@@ -222,7 +232,7 @@ def save_figure(path: Path, figure: Figure, *, dots_per_inch: int = DOTS_PER_INC
 
 
 def _axis(width: float, height: float, title: str) -> tuple[Figure, Axes]:
-    """An empty figure, inches."""
+    """Figure of a size in inches with one empty axis."""
     figure = Figure(figsize=(width, height), layout="constrained")
     figure.suptitle(title, fontsize=12, fontweight="bold", color=INK, x=0.01, ha="left")
     axis = figure.subplots()

@@ -1,4 +1,4 @@
-"""A scene as a film: the panels of an animation side by side, from step to step, in a file that plays anywhere."""
+"""Films of scenes: the panels of an animation side by side, step by step, in a file that plays anywhere."""
 
 import os
 from collections.abc import Callable, Iterator
@@ -10,8 +10,8 @@ from jaxtyping import UInt8
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 
+from rlftsim.atomic_io import write_whole
 from rlftsim.errors import ConfigError
-from rlftsim.files import write_whole
 from rlftsim.scenario.types import CURRENT_STEP
 from rlftsim.viewer.page import Animation
 from rlftsim.viewer.picture import agent_shapes, draw_scene, light_dots
@@ -21,11 +21,12 @@ HOLD_AT_END_S = 1.0
 
 
 def to_film(path: str | os.PathLike[str], animation: Animation, *, every: int = 1, dots_per_inch: int = 110) -> None:
-    """Draw an animation's first rollouts from the current step on, in real time.
+    """Write a film of an animation's first rollouts, from the current step on, in real time.
 
     Args:
-        path: file to write, .mp4 (H.264) or .webp (plays where pictures are shown); nothing half-written is left there.
-        animation: what to draw.
+        path: file to write, .mp4 (H.264) or .webp (plays wherever pictures are shown); nothing half-written is left
+            there.
+        animation: scene and panels.
         every: steps of 0.1 s between frames.
         dots_per_inch: 110 makes a panel 440 pixels wide.
 
@@ -36,6 +37,7 @@ def to_film(path: str | os.PathLike[str], animation: Animation, *, every: int = 
     path = Path(path)
     if path.suffix not in WRITERS:
         raise ConfigError(f"{path}: a film is {' or '.join(WRITERS)}, choose one of these endings.")
+    # The last frame stays for a while, or the end could not be seen before a player starts again.
     films = list(_frames(animation, every, dots_per_inch))
     films += films[-1:] * round(HOLD_AT_END_S * STEPS_PER_SECOND / every)
     write_whole(path, lambda temporary: WRITERS[path.suffix](temporary, films, STEPS_PER_SECOND / every))
@@ -45,11 +47,12 @@ Frame = UInt8[np.ndarray, "height width 3"]
 
 
 def _frames(animation: Animation, every: int, dots_per_inch: int) -> Iterator[Frame]:
-    """Pictures; the map is drawn once."""
+    """Frames of a film, one every so many steps."""
     figure, axes = draw_scene(animation)
     figure.set_dpi(dots_per_inch)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
+    # The map is drawn once and copied under every frame, because it takes most of the time.
     ground = canvas.copy_from_bbox(figure.bbox)
     num_steps = max(panel.trajectories.num_steps for panel in animation.panels)
     for step in range(CURRENT_STEP, num_steps, every):
@@ -62,7 +65,8 @@ def _frames(animation: Animation, every: int, dots_per_inch: int) -> Iterator[Fr
                 axis.draw_artist(shape)
                 shape.remove()
         drawn = np.asarray(canvas.buffer_rgba())[..., :3]
-        yield drawn[: len(drawn) // 2 * 2, : drawn.shape[1] // 2 * 2].copy()  # H.264 wants even sizes
+        # H.264 wants even sizes. The copy is needed because the canvas reuses its buffer.
+        yield drawn[: len(drawn) // 2 * 2, : drawn.shape[1] // 2 * 2].copy()
 
 
 def _write_mp4(path: Path, frames: list[Frame], frames_per_second: float) -> None:
@@ -71,7 +75,7 @@ def _write_mp4(path: Path, frames: list[Frame], frames_per_second: float) -> Non
         str(path), (width, height), fps=round(frames_per_second), codec="libx264", quality=5, macro_block_size=2,
         output_params=["-f", "mp4", "-movflags", "+faststart"], ffmpeg_log_level="error",
     )  # fmt: skip
-    writer.send(None)
+    writer.send(None)  # starts the generator
     for frame in frames:
         writer.send(np.ascontiguousarray(frame))
     writer.close()

@@ -1,4 +1,7 @@
-"""Goals on a map: where agents are asked to go, the ways there, and where simulations took them. Handed over in the world frame, drawn in the map's."""
+"""Goals on a map: the goals of agents, the paths there, and the trajectories of simulations.
+
+Everything is handed over in the world frame and drawn in the map frame.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,11 +20,11 @@ from rlftsim.scenario.types import CURRENT_STEP, Scenario
 from rlftsim.viewer.figure import DOTS_PER_INCH, INK, save_figure
 from rlftsim.viewer.page import Panel
 from rlftsim.viewer.picture import POINTS_PER_INCH, agent_shapes, draw_map, light_dots
-from rlftsim.viewer.scene import AgentBoxes, SceneView, Trajectories, build_scene, logged_trajectories
+from rlftsim.viewer.scene import SceneView, build_scene, logged_trajectories
 
 PANEL_INCHES = 4.2
-GOAL_COLOURS = ("#a21caf", "#0f766e", "#7c2d12", "#4d7c0f", "#111827", "#be185d")
-"""None of them is that of an agent (`viewer.picture.COLOURS`)."""
+GOAL_COLORS = ("#a21caf", "#0f766e", "#7c2d12", "#4d7c0f", "#111827", "#be185d")
+"""Colors of goals, none of which is that of an agent (`viewer.picture.COLORS`)."""
 LONGEST_LABEL = 30
 MARGIN_M = 14.0
 MIN_RADIUS_M = 30.0
@@ -29,22 +32,22 @@ MIN_RADIUS_M = 30.0
 
 @dataclass(frozen=True, eq=False)
 class DrawnGoal:
-    """A goal of an agent, world frame, metres."""
+    """A goal of an agent, world frame, meters."""
 
     object_id: int
     position: Float[np.ndarray, "2"] | None = None
-    """None = the agent has none and only its ways are drawn."""
+    """None = the agent has no goal and only its paths are drawn."""
     label: str = ""
     way: Float[np.ndarray, "S 2"] | None = None
-    """How to get there."""
+    """Path to the goal."""
     driven: Float[np.ndarray, "N T 2"] | None = None
-    """Where simulations took the agent."""
-    is_recorded: bool = False
-    """Marked by an x, not by a cross."""
+    """Simulated paths of the agent."""
+    is_logged: bool = False
+    """Marked by an x, other goals by a cross."""
 
     @property
     def name(self) -> str:
-        """What stands beside the goal: who is asked, and the label, cut where it is long."""
+        """Text beside the goal: object id and label, a long one shortened."""
         label = self.label.replace("_", " ")
         cut = label if len(label) <= LONGEST_LABEL else f"{label[: LONGEST_LABEL - 1]}…"
         return f"{self.object_id}: {cut}" if label else str(self.object_id)
@@ -52,7 +55,7 @@ class DrawnGoal:
 
 @dataclass(frozen=True, eq=False)
 class GoalPanel:
-    """A scenario and goals in it, world frame."""
+    """A scenario with goals in the world frame."""
 
     title: str
     scenario: Scenario
@@ -67,7 +70,7 @@ def draw_goals(
     panel_inches: float = PANEL_INCHES,
     dots_per_inch: int = DOTS_PER_INCH,
 ) -> None:
-    """Write a picture with a panel for each scenario. Raises as `save_figure`.
+    """Write a picture with a panel for each scenario.
 
     Args:
         path: .png, .svg or .pdf.
@@ -75,70 +78,71 @@ def draw_goals(
         columns: panels in a row.
         panel_inches: width of a panel.
         dots_per_inch: of a PNG.
+
+    Raises:
+        ConfigError: another ending.
+        DataError: the file cannot be written.
     """
-    rows = -(-len(panels) // columns)
+    rows = -(-len(panels) // columns)  # rounded up
     figure = Figure(figsize=(panel_inches * columns, (panel_inches + 0.3) * rows), layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False).ravel()
-    for axis in axes:
+    for axis in axes:  # those that get no panel stay empty
         axis.set_axis_off()
     for axis, panel in zip(axes, panels):
-        _draw_panel(axis, panel, panel_inches)
+        scene, log = build_scene(panel.scenario), logged_trajectories(panel.scenario)
+        # 1. The map around the goals, with the agents at the current step.
+        x, y, radius = _focus(panel, scene)
+        axis.set_axis_on()
+        axis.set(xlim=(x - radius, x + radius), ylim=(y - radius, y + radius), xticks=[], yticks=[], aspect="equal")
+        axis.set_facecolor("#eef0ec")
+        axis.set_title(panel.title, fontsize=8, loc="left", color=INK)
+        draw_map(axis, scene, points_per_m=panel_inches * POINTS_PER_INCH / (2 * radius))
+        for shape in agent_shapes(scene.agents, Panel(panel.title, log), CURRENT_STEP):
+            axis.add_collection(shape, autolim=False)
+        light_dots(axis, scene, CURRENT_STEP)
+        # 2. Object ids of all agents, as goals files name them.
+        for agent in np.flatnonzero(log.valid[0, :, CURRENT_STEP]):
+            _write(axis, str(scene.agents.object_id[agent]), log.position[0, agent, CURRENT_STEP], INK, size=5.5)
+        # 3. Goals with their paths, a color each, on top of everything else.
+        for number, mark in enumerate(panel.marks):
+            _draw_mark(axis, mark, panel.scenario.origin, GOAL_COLORS[number % len(GOAL_COLORS)])
     save_figure(path, figure, dots_per_inch=dots_per_inch)
 
 
-def _draw_panel(axis: Axes, panel: GoalPanel, inches: float) -> None:
-    scene, log = build_scene(panel.scenario), logged_trajectories(panel.scenario)
-    x, y, radius = _focus(panel, scene)
-    axis.set_axis_on()
-    axis.set(xlim=(x - radius, x + radius), ylim=(y - radius, y + radius), xticks=[], yticks=[], aspect="equal")
-    axis.set_facecolor("#eef0ec")
-    axis.set_title(panel.title, fontsize=8, loc="left", color=INK)
-    draw_map(axis, scene, points_per_m=inches * POINTS_PER_INCH / (2 * radius))
-    for shape in agent_shapes(scene.agents, Panel(panel.title, log), CURRENT_STEP):
-        axis.add_collection(shape, autolim=False)
-    light_dots(axis, scene, CURRENT_STEP)
-    _write_ids(axis, scene.agents, log)
-    for number, mark in enumerate(panel.marks):
-        _draw_mark(axis, mark, panel.scenario.origin, GOAL_COLOURS[number % len(GOAL_COLOURS)])
-
-
-def _write_ids(axis: Axes, agents: AgentBoxes, log: Trajectories) -> None:
-    """The object id of everybody who is there, as goals name them."""
-    for agent in np.flatnonzero(log.valid[0, :, CURRENT_STEP]):
-        _write(axis, str(agents.object_id[agent]), log.position[0, agent, CURRENT_STEP], INK, size=5.5)
-
-
-def _draw_mark(axis: Axes, mark: DrawnGoal, origin: Float[np.ndarray, "2"], colour: str) -> None:
+def _draw_mark(axis: Axes, mark: DrawnGoal, origin: Float[np.ndarray, "2"], color: str) -> None:
     if mark.driven is not None:
+        # Paler the more rollouts there are, so that where most of them went stands out.
         alpha = max(0.15, 1 / np.sqrt(len(mark.driven)))
-        driven = mark.driven - origin
-        axis.add_collection(LineCollection(list(driven), colors=colour, lw=1, alpha=alpha), autolim=False)
-        axis.plot(*driven[:, -1].T, ".", color=colour, ms=3, mec="none", alpha=max(alpha, 0.5), zorder=4)
+        driven = mark.driven - origin  # [N, T, 2], map frame
+        axis.add_collection(LineCollection(list(driven), colors=color, lw=1, alpha=alpha), autolim=False)
+        axis.plot(*driven[:, -1].T, ".", color=color, ms=3, mec="none", alpha=max(alpha, 0.5), zorder=4)
     if mark.way is not None:
-        axis.plot(*(mark.way - origin).T, color=colour, lw=1.4, zorder=4)
+        axis.plot(*(mark.way - origin).T, color=color, lw=1.4, zorder=4)
     if mark.position is None:
         return
-    point = mark.position - origin
+    point = mark.position - origin  # [2], map frame
+    # The circle is as large as the distance at which a goal counts as passed.
     axis.add_patch(Circle(tuple(point), NEAR_M, fc="white", alpha=0.5, zorder=3.5))
-    axis.add_patch(Circle(tuple(point), NEAR_M, fc="none", ec=colour, lw=0.8, zorder=5))
-    axis.plot(*point[:, None], "x" if mark.is_recorded else "+", color=colour, ms=8, mew=0.6, zorder=5)
-    _write(axis, mark.name, point, colour, size=7.0)
+    axis.add_patch(Circle(tuple(point), NEAR_M, fc="none", ec=color, lw=0.8, zorder=5))
+    axis.plot(*point[:, None], "x" if mark.is_logged else "+", color=color, ms=8, mew=0.6, zorder=5)
+    _write(axis, mark.name, point, color, size=7.0)
 
 
-def _write(axis: Axes, text: str, place: Float[np.ndarray, "2"], colour: str, *, size: float) -> None:
-    """Beside a place, on the side where there is more room, as it is: a dollar sign begins no formula."""
+def _write(axis: Axes, text: str, place: Float[np.ndarray, "2"], color: str, *, size: float) -> None:
+    """Write a text beside a place, on the side with more room; a dollar sign begins no formula."""
     is_right = place[0] > sum(axis.get_xlim()) / 2
     outline = [patheffects.withStroke(linewidth=2, foreground="white")]
     axis.annotate(
         text, tuple(place), (-4 if is_right else 4, 4), ha="right" if is_right else "left", textcoords="offset points",
-        fontsize=size, color=colour, zorder=6, path_effects=outline, annotation_clip=True, parse_math=False,
+        fontsize=size, color=color, zorder=6, path_effects=outline, annotation_clip=True, parse_math=False,
     ).set_in_layout(False)  # fmt: skip
 
 
 def _focus(panel: GoalPanel, scene: SceneView) -> tuple[float, float, float]:
-    """A square around the goals and the agents that have them; the scenario's own where there are none."""
+    """Square around the goals and their agents, as center x, y and half width; the scenario's own without goals."""
     ids = [mark.object_id for mark in panel.marks]
     tracks = panel.scenario.tracks
+    # Everything that is to be seen, map frame: current positions, goals, paths and simulated paths, each [n, 2].
     places = [tracks.position[np.isin(tracks.object_id, ids), CURRENT_STEP, :2] - panel.scenario.origin]
     for mark in panel.marks:
         ways = (None if mark.position is None else mark.position[None], mark.way, mark.driven)

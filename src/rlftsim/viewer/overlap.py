@@ -1,4 +1,4 @@
-"""Which boxes overlap, by the separating axis theorem."""
+"""Overlap of boxes by the separating axis theorem."""
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -13,17 +13,17 @@ def compute_overlap(
     *,
     ignore_from: int | None = None,
 ) -> Bool[np.ndarray, "N A S"]:
-    """Whether an agent's box and another one's have an inner point in common.
+    """True where an agent's box has an inner point in common with another one.
 
     Args:
-        position: centres, metres.
+        position: centers, meters.
         heading: radians.
-        length: along the heading, metres.
-        width: metres.
-        valid: an agent that is not valid overlaps nobody.
+        length: along the heading, meters.
+        width: meters.
+        valid: an agent that is not valid overlaps no other.
         ignore_from: a step; two agents that overlap there are never marked for overlapping each other.
     """
-    overlap = np.zeros(valid.shape, bool)
+    overlap = np.zeros(valid.shape, bool)  # [N, A, S]
     half = np.stack([length, width], axis=-1).astype(np.float64) / 2
     for n in range(len(valid)):
         _mark_rollout(overlap[n], position[n].astype(np.float64), heading[n], half, valid[n], ignore_from)
@@ -38,18 +38,21 @@ def _mark_rollout(
     valid: Bool[np.ndarray, "A S"],
     ignore_from: int | None,
 ) -> None:
-    """Write one rollout's overlaps into `overlap`; only pairs whose circles touch are looked at closely."""
-    radius = np.linalg.norm(half, axis=-1)
+    """Mark one rollout's overlaps in `overlap`."""
+    radius = np.linalg.norm(half, axis=-1)  # [A], of the circle around a box
     for agent in range(len(valid) - 1):
         others = slice(agent + 1, None)
-        gap = position[others] - position[agent]
+        gap = position[others] - position[agent]  # [A - agent - 1, S, 2]
+        # Few pairs are so close that their circles touch; only these need the exact test.
         near = (gap**2).sum(-1) < (radius[others, None] + radius[agent]) ** 2
+        # k pairs of another agent and a step
         other, step = np.nonzero(near & valid[others] & valid[agent])
         if not len(other):
             continue
         row = other + agent + 1
         hit = _boxes_overlap(gap[other, step], heading[agent, step], heading[row, step], half[agent], half[row])
         if ignore_from is not None:
+            # A stroller and its pusher overlap from the beginning, which is no collision.
             hit &= ~np.isin(row, row[hit & (step == ignore_from)])
         overlap[agent, step[hit]] = True
         overlap[row[hit], step[hit]] = True
@@ -62,7 +65,9 @@ def _boxes_overlap(
     half: Float[np.ndarray, "2"],
     other_half: Float[np.ndarray, "k 2"],
 ) -> Bool[np.ndarray, "k"]:
-    """Whether no side of either box separates the two. `gap` leads from one centre to the other."""
+    """True where no side of either box separates the two; `gap` is the vector from one center to the other."""
+    # Two convex boxes are apart exactly if one of their four side directions separates them. Along each direction the
+    # distance of the centers is compared with the sum of both half extents.
     turn = other_heading - heading
     cos, sin = np.abs(np.cos(turn)), np.abs(np.sin(turn))
     own, other = _along_axes(gap, heading), _along_axes(gap, other_heading)
@@ -74,6 +79,6 @@ def _boxes_overlap(
 
 
 def _along_axes(vector: Float[np.ndarray, "k 2"], heading: Float[np.ndarray, "k"]) -> Float[np.ndarray, "k 2"]:
-    """Sizes of a vector's parts along and across a heading."""
+    """Lengths of a vector's components along and across a heading."""
     cos, sin = np.cos(heading), np.sin(heading)
     return np.abs(np.stack([cos * vector[:, 0] + sin * vector[:, 1], cos * vector[:, 1] - sin * vector[:, 0]], -1))

@@ -1,4 +1,4 @@
-"""Scenarios that play in a browser: pieces of HTML that need no network, and a page made of them."""
+"""Scenarios that play in a browser: a page, or pieces of one, that need no network."""
 
 import json
 import os
@@ -10,25 +10,25 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from rlftsim.atomic_io import write_text
 from rlftsim.errors import DataError
-from rlftsim.files import write_text
-from rlftsim.viewer.scene import SceneView, Trajectories
+from rlftsim.viewer.scene import SceneMotion, SceneView
 
 SPEEDS = (0.25, 0.5, 1, 2, 4)
-"""How many times real time a scene can play."""
+"""Playback speeds, as multiples of real time."""
 
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """One picture of a scene: who moved the agents, and how."""
+    """One picture of a scene: a title and the motion of its agents."""
 
     title: str
-    trajectories: Trajectories
+    trajectories: SceneMotion
 
 
 @dataclass(frozen=True, eq=False)
 class Animation:
-    """A scene with its panels side by side; they share time, view and the number of the rollout."""
+    """A scene with panels side by side, which share time, view and the number of the rollout."""
 
     title: str
     scene: SceneView
@@ -38,6 +38,7 @@ class Animation:
     def __post_init__(self) -> None:
         if not self.panels:
             raise DataError(f"{self.title}: an animation needs at least one panel.")
+        # Agents have no ids in the panels: the same number means the same agent in all of them.
         for panel in self.panels:
             shown, expected = panel.trajectories.position.shape[1], len(self.scene.agents)
             if shown != expected:
@@ -47,7 +48,7 @@ class Animation:
                 )
 
     def to_payload(self) -> dict[str, Any]:
-        """Lists, numbers and text only, as `player.js` reads them."""
+        """Lists, numbers and text only, in the layout that `player.js` reads."""
         return {
             "scene": self.scene.to_payload(),
             "panels": [
@@ -62,15 +63,21 @@ class Animation:
 
 def animation_html(animation: Animation) -> str:
     """A `<figure>` that plays the animation on a page made by `page_html`."""
-    panels = "".join(_panel_html(panel) for panel in animation.panels)
+    titles = [escape(panel.title) for panel in animation.panels]
+    panels = "".join(
+        f'<div class="panel"><div class="panel-head"><span class="panel-title">{title}</span>'
+        f'<span class="panel-status"></span></div><canvas role="img" aria-label="{title}"></canvas>'
+        '<div class="panel-tip" hidden></div></div>'
+        for title in titles
+    )
     caption = f'<p class="player-caption">{escape(animation.caption)}</p>' if animation.caption else ""
     return (
         f'<figure class="player" tabindex="0" aria-label="{escape(animation.title)}">'
         f'<figcaption><div class="player-title">{escape(animation.title)}</div>{caption}</figcaption>'
         f'<div class="panels">{panels}</div>'
         f"{_controls_html()}{_legend_html(animation)}"
-        '<p class="hint"><kbd>space</kbd> play or pause · <kbd>←</kbd> <kbd>→</kbd> one step · drag to move, wheel to zoom '
-        "(after a click into the picture) · point at an agent to follow it in all panels</p>"
+        '<p class="hint"><kbd>space</kbd> play or pause · <kbd>←</kbd> <kbd>→</kbd> one step · drag to move, wheel to '
+        "zoom (after a click into the picture) · point at an agent to follow it in all panels</p>"
         f'<script type="application/json">{embed_json(animation.to_payload())}</script></figure>'
     )
 
@@ -80,7 +87,7 @@ def page_html(title: str, body: str, *, extra_css: str = "", extra_js: str = "")
 
     Args:
         title: plain text.
-        body: HTML, whose texts are already escaped.
+        body: HTML with texts that are already escaped.
         extra_css: style rules after those of the player.
         extra_js: script after that of the player.
     """
@@ -93,14 +100,25 @@ def page_html(title: str, body: str, *, extra_css: str = "", extra_js: str = "")
 
 
 def write_page(path: str | os.PathLike[str], title: str, animations: Sequence[Animation], *, caption: str = "") -> None:
-    """A page of animations and nothing else. Nothing half-written is left at `path`."""
+    """Write a page of animations.
+
+    Args:
+        path: file to write; nothing half-written is left there.
+        title: plain text, above the animations.
+        animations: scenes, one below the other.
+        caption: plain text below the title.
+
+    Raises:
+        DataError: the file cannot be written.
+    """
     intro = f'<p class="lead">{escape(caption)}</p>' if caption else ""
     figures = "\n".join(animation_html(animation) for animation in animations)
     write_text(Path(path), page_html(title, f"<h1>{escape(title)}</h1>{intro}\n{figures}"))
 
 
 def embed_json(payload: Any) -> str:
-    """Compact JSON that cannot end the `<script>` it stands in."""
+    """Compact JSON that cannot end the `<script>` around it."""
+    # "</script>" inside a text would end the element; an escaped "<" means the same in JSON.
     return json.dumps(payload, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
 
 
@@ -110,40 +128,35 @@ def read_asset(name: str) -> str:
     return (resources.files("rlftsim.viewer") / name).read_text(encoding="utf-8")
 
 
-def _panel_html(panel: Panel) -> str:
-    title = escape(panel.title)
-    return (
-        f'<div class="panel"><div class="panel-head"><span class="panel-title">{title}</span>'
-        f'<span class="panel-status"></span></div><canvas role="img" aria-label="{title}"></canvas>'
-        '<div class="panel-tip" hidden></div></div>'
-    )
-
-
 def _controls_html() -> str:
-    """Buttons found by `data-part`; `several` = only where there is more than one rollout."""
+    """Controls below the panels. `player.js` finds them by `data-part` and hides `several` for a single rollout."""
     speeds = "".join(f'<option value="{s}"{" selected" if s == 1 else ""}>{s}×</option>' for s in SPEEDS)
     return (
         '<div class="controls"><button class="play" data-part="play" aria-label="Play"></button>'
-        '<div class="timeline"><input type="range" data-part="time" min="0" max="90" step="any" value="10" aria-label="Time">'
+        '<div class="timeline">'
+        '<input type="range" data-part="time" min="0" max="90" step="any" value="10" aria-label="Time">'
         '<span class="clock"><b data-part="clock">+0.0 s</b> <span data-part="phase"></span></span></div>'
         f'<label>speed <select data-part="speed">{speeds}</select></label>'
         '<label class="several">rollout <select data-part="rollout"></select></label>'
         '<label class="several"><input type="checkbox" data-part="all" checked> paths of all rollouts</label>'
         '<span class="zoom"><button data-part="zoom-out" aria-label="Zoom out">−</button>'
-        '<button data-part="zoom-in" aria-label="Zoom in">+</button><button data-part="reset">reset view</button></span></div>'
+        '<button data-part="zoom-in" aria-label="Zoom in">+</button>'
+        '<button data-part="reset">reset view</button></span></div>'
     )
 
 
 def _legend_html(animation: Animation) -> str:
-    """Only what can be seen: marks that no panel has are left out."""
+    """Legend of what can be seen; marks that no panel has are left out."""
     trajectories = [panel.trajectories for panel in animation.panels]
+    # Pairs of SVG shapes and names.
     entries = [
         (_box_svg("agent-ego"), "ego"),
         (_box_svg("agent-evaluated"), "evaluated"),
         (_box_svg("agent-other"), "other"),
         ('<ellipse cx="12" cy="8" rx="8" ry="3" fill="var(--agent-other)"/>', "cyclist"),
         (
-            '<circle cx="10" cy="8" r="4.5" fill="var(--agent-other)"/><path d="M14 5l6 3-6 3z" fill="var(--agent-other)"/>',
+            '<circle cx="10" cy="8" r="4.5" fill="var(--agent-other)"/>'
+            '<path d="M14 5l6 3-6 3z" fill="var(--agent-other)"/>',
             "pedestrian",
         ),
     ]
@@ -164,16 +177,17 @@ def _legend_html(animation: Animation) -> str:
     return f'<ul class="legend">{items}</ul>'
 
 
-def _box_svg(colour: str, half: float = 10.0) -> str:
+def _box_svg(color: str, half: float = 10.0) -> str:
     """A vehicle from above, heading right."""
-    shape = f'<rect x="{12 - half}" y="{8 - half * 0.42}" width="{2 * half}" height="{half * 0.84}" rx="1.5" fill="var(--{colour})"/>'
+    place = f'x="{12 - half}" y="{8 - half * 0.42}" width="{2 * half}" height="{half * 0.84}"'
+    shape = f'<rect {place} rx="1.5" fill="var(--{color})"/>'
     tip, root = 12 + half * 0.85, 12 + half * 0.3
     return f'{shape}<path d="M{tip} 8L{root} {8 - half * 0.28}V{8 + half * 0.28}z" fill="var(--heading-mark)"/>'
 
 
-def _ring_svg(colour: str, dashes: str = "") -> str:
+def _ring_svg(color: str, dashes: str = "") -> str:
     """The frame around a marked vehicle."""
     return (
-        f'<rect x="1" y="1" width="22" height="14" rx="3" fill="var(--{colour})" fill-opacity=".3" stroke="var(--{colour})" stroke-width="2"'
-        f' stroke-dasharray="{dashes}"/>'
+        f'<rect x="1" y="1" width="22" height="14" rx="3" fill="var(--{color})" fill-opacity=".3" '
+        f'stroke="var(--{color})" stroke-width="2" stroke-dasharray="{dashes}"/>'
     )

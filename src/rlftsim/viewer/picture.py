@@ -19,7 +19,7 @@ from rlftsim.viewer.scene import AgentBoxes, SceneView
 PANEL_INCHES = 4.0
 POINTS_PER_INCH = 72.0
 LANE_WIDTH_M = {"lane": 4.4, "bike_lane": 2.0}
-COLOURS = {
+COLORS = {
     "ground": "#eef0ec",
     "road": "#d7dbe0",
     "crosswalk": "#f7f8fa",
@@ -34,14 +34,14 @@ COLOURS = {
 }
 ROLES = ("other", "evaluated", "ego")
 MIN_PEDESTRIAN_RADIUS_M = 0.5
-LIGHT_COLOURS = {
+LIGHT_COLORS = {
     **dict.fromkeys("147", "#c4161c"),
     **dict.fromkeys("258", "#d9a514"),
     **dict.fromkeys("36", "#11754b"),
 }
-"""By WOMD's number of a light's state: stop, caution, go."""
+"""Colors of stop, caution and go, by WOMD's numbers of a light's states."""
 MARK_STYLES = {"collides": "-", "offroad": "--"}
-"""How agents are framed, by the field of `Trajectories` that says so."""
+"""Line styles of the frames around agents, by the field of `SceneMotion` that marks them."""
 FRAME_SCALE = {"collides": 1.25, "offroad": 1.6}
 MARK_WIDTH = 1.8
 
@@ -53,9 +53,13 @@ def to_png(
 
     Args:
         path: file to write; nothing half-written is left there.
-        animation: what to draw; its caption is left out.
+        animation: scene and panels; its caption is left out.
         step: 0..90; the boxes are those of each panel's first rollout.
         dots_per_inch: 160 makes a panel 640 pixels wide.
+
+    Raises:
+        ConfigError: another ending than pictures have.
+        DataError: the file cannot be written.
     """
     figure, axes = draw_scene(animation)
     for axis, panel in zip(axes, animation.panels):
@@ -67,17 +71,23 @@ def to_png(
 
 
 def draw_scene(animation: Animation) -> tuple[Figure, Sequence[Axes]]:
-    """What stands still in an animation: a panel of map for each of its own, and a legend."""
+    """Figure with the still part of an animation: a map for each of its panels, and a legend."""
     panels = animation.panels
     figure = Figure(figsize=(PANEL_INCHES * len(panels), PANEL_INCHES + 0.7), layout="constrained")
     axes = figure.subplots(1, len(panels), squeeze=False)[0]
     for axis, panel in zip(axes, panels):
-        _draw_ground(axis, animation.scene, panel.title)
+        x, y, radius = animation.scene.focus
+        axis.set(xlim=(x - radius, x + radius), ylim=(y - radius, y + radius), xticks=[], yticks=[], aspect="equal")
+        axis.set_facecolor(COLORS["ground"])
+        axis.set_title(panel.title, fontsize=12, loc="left", fontweight="bold")
+        for side in axis.spines.values():
+            side.set_visible(False)
+        draw_map(axis, animation.scene, points_per_m=PANEL_INCHES * POINTS_PER_INCH / (2 * radius))
     names = {"ego": "ego", "evaluated": "evaluated agents", "other": "other agents"}
-    handles = [Line2D([], [], color=COLOURS[role], lw=5, label=label) for role, label in names.items()]
+    handles = [Line2D([], [], color=COLORS[role], lw=5, label=label) for role, label in names.items()]
     marks = {"collides": "collides", "offroad": "off road"}
     handles += [
-        Line2D([], [], color=COLOURS[mark], lw=MARK_WIDTH, ls=MARK_STYLES[mark], label=label)
+        Line2D([], [], color=COLORS[mark], lw=MARK_WIDTH, ls=MARK_STYLES[mark], label=label)
         for mark, label in marks.items()
         if any(getattr(panel.trajectories, mark) is not None for panel in panels)
     ]
@@ -85,30 +95,28 @@ def draw_scene(animation: Animation) -> tuple[Figure, Sequence[Axes]]:
     return figure, list(axes)
 
 
-def _draw_ground(axis: Axes, scene: SceneView, title: str) -> None:
-    x, y, radius = scene.focus
-    axis.set(xlim=(x - radius, x + radius), ylim=(y - radius, y + radius), xticks=[], yticks=[], aspect="equal")
-    axis.set_facecolor(COLOURS["ground"])
-    axis.set_title(title, fontsize=12, loc="left", fontweight="bold")
-    for side in axis.spines.values():
-        side.set_visible(False)
-    draw_map(axis, scene, points_per_m=PANEL_INCHES * POINTS_PER_INCH / (2 * radius))
-
-
 def draw_map(axis: Axes, scene: SceneView, *, points_per_m: float) -> None:
-    """Road under crosswalks under lines under edges."""
+    """Draw a scene's map: road, on it crosswalks, lines, and edges on top.
+
+    Args:
+        axis: axes in the map frame, m.
+        scene: the still part of a scenario.
+        points_per_m: points (1/72 inch) on paper for a meter, so that lanes are as wide as they are in the world.
+    """
+    # Autoscaling is off for every collection: the limits show the focus of the scene, not the whole map.
     by_kind: dict[str, list[np.ndarray]] = {}
     for line in scene.lines:
         by_kind.setdefault(line.kind, []).append(line.points)
-    axis.add_collection(PolyCollection(by_kind.get("driveway", []), facecolor=COLOURS["road"], zorder=1), autolim=False)
+    axis.add_collection(PolyCollection(by_kind.get("driveway", []), facecolor=COLORS["road"], zorder=1), autolim=False)
+    # Lanes are logged as center lines; wide strokes with round ends make them a road surface without gaps.
     for kind, width in LANE_WIDTH_M.items():
         lanes = LineCollection(
-            by_kind.get(kind, []), colors=COLOURS["road"], lw=width * points_per_m, capstyle="round", zorder=1
+            by_kind.get(kind, []), colors=COLORS["road"], lw=width * points_per_m, capstyle="round", zorder=1
         )
         axis.add_collection(lanes, autolim=False)
     for kind in ("crosswalk", "speed_bump"):
         areas = PolyCollection(
-            by_kind.get(kind, []), facecolor=COLOURS["crosswalk"], edgecolor=COLOURS["edge"], lw=0.4, zorder=1
+            by_kind.get(kind, []), facecolor=COLORS["crosswalk"], edgecolor=COLORS["edge"], lw=0.4, zorder=1
         )
         axis.add_collection(areas, autolim=False)
     for kind, dashes in (
@@ -117,66 +125,92 @@ def draw_map(axis: Axes, scene: SceneView, *, points_per_m: float) -> None:
         ("yellow", "-"),
         ("yellow_broken", (0, (4, 6))),
     ):
-        colour = COLOURS[kind.removesuffix("_broken")]
+        color = COLORS[kind.removesuffix("_broken")]
         axis.add_collection(
-            LineCollection(by_kind.get(kind, []), colors=colour, lw=0.9, linestyles=[dashes]), autolim=False
+            LineCollection(by_kind.get(kind, []), colors=color, lw=0.9, linestyles=[dashes]), autolim=False
         )
-    axis.add_collection(LineCollection(by_kind.get("edge", []), colors=COLOURS["edge"], lw=1.1), autolim=False)
+    axis.add_collection(LineCollection(by_kind.get("edge", []), colors=COLORS["edge"], lw=1.1), autolim=False)
 
 
 def draw_paths(axis: Axes, agents: AgentBoxes, panel: Panel, step: int) -> None:
-    """Thin lines of the evaluated agents from a step on, paler the more rollouts there are."""
+    """Draw the paths of the evaluated agents as thin lines, paler the more rollouts there are.
+
+    Args:
+        axis: axes in the map frame, m.
+        agents: boxes of the scene.
+        panel: motion of the agents.
+        step: first step that is drawn.
+    """
     trajectories = panel.trajectories
     alpha = max(0.12, 0.9 / np.sqrt(trajectories.num_rollouts))
     for agent in np.flatnonzero(agents.evaluated_mask):
+        # [N, steps, 2]; NaN interrupts a line where the agent is not valid.
         where = np.where(trajectories.valid[:, agent, step:, None], trajectories.position[:, agent, step:], np.nan)
-        colour = COLOURS[ROLES[2 if agents.is_ego[agent] else 1]]
+        color = COLORS[ROLES[2 if agents.is_ego[agent] else 1]]
         width = 2.0 if trajectories.num_rollouts == 1 else 1.0
-        axis.add_collection(LineCollection(list(where), colors=colour, lw=width, alpha=alpha), autolim=False)
+        axis.add_collection(LineCollection(list(where), colors=color, lw=width, alpha=alpha), autolim=False)
 
 
 def agent_shapes(agents: AgentBoxes, panel: Panel, step: int) -> list[PolyCollection]:
-    """The agents of a panel's first rollout at a step: oriented boxes with a wedge that points ahead, pedestrians as discs; who
-    collides or is off the road is framed. To be added to a panel's axes."""
+    """Shapes of the agents of a panel's first rollout, to be added to axes in the map frame.
+
+    Boxes have a wedge that points ahead, pedestrians are discs; agents that collide or are off the road get a frame.
+
+    Args:
+        agents: boxes of the scene.
+        panel: motion of the agents.
+        step: 0..90; beyond the end of the motion there are no shapes.
+    """
     trajectories = panel.trajectories
     if step >= trajectories.num_steps:
         return []
-    chosen = np.flatnonzero(trajectories.valid[0, :, step])
+    chosen = np.flatnonzero(trajectories.valid[0, :, step])  # [k], agents that are there
     roles = np.where(agents.is_ego, 2, agents.evaluated_mask.astype(int))
-    colours = [COLOURS[ROLES[roles[agent]]] for agent in chosen]
+    colors = [COLORS[ROLES[roles[agent]]] for agent in chosen]
     outlines, wedges = [], []
     for agent in chosen:
         cos, sin = np.cos(trajectories.heading[0, agent, step]), np.sin(trajectories.heading[0, agent, step])
+        # Rows are points, so they are multiplied from the left with the transposed rotation.
         turn, place = np.array([[cos, sin], [-sin, cos]]), trajectories.position[0, agent, step]
         outline, wedge = (shape @ turn + place for shape in _outline(agents, int(agent)))
         outlines.append(outline)
         wedges.append(wedge)
     shapes = [
-        PolyCollection(outlines, facecolors=colours, edgecolor="white", lw=0.5, zorder=3),
+        PolyCollection(outlines, facecolors=colors, edgecolor="white", lw=0.5, zorder=3),
         PolyCollection(wedges, facecolor="white", edgecolor="none", zorder=3),
     ]
+    # Frames are enlarged outlines, so that both kinds can be seen around one agent.
     for mark, style in MARK_STYLES.items():
         flags = getattr(trajectories, mark)
         marked = [] if flags is None else [outlines[row] for row in np.flatnonzero(flags[0, chosen, step])]
         frames = [shape.mean(0) + FRAME_SCALE[mark] * (shape - shape.mean(0)) for shape in marked]
         shapes.append(
-            PolyCollection(frames, facecolor="none", edgecolor=COLOURS[mark], lw=MARK_WIDTH, ls=style, zorder=4)
+            PolyCollection(frames, facecolor="none", edgecolor=COLORS[mark], lw=MARK_WIDTH, ls=style, zorder=4)
         )
     return shapes
 
 
 def light_dots(axis: Axes, scene: SceneView, step: int) -> PathCollection:
-    """The traffic lights at a step, added to the axes; those that are not seen are left out."""
-    colours = [(light.stop_point, LIGHT_COLOURS.get(light.states[step : step + 1])) for light in scene.lights]
-    seen = [(point, colour) for point, colour in colours if colour]
+    """Add the traffic lights to axes in the map frame; lights that were not observed at the step are left out.
+
+    Args:
+        axis: the axes.
+        scene: the still part of a scenario.
+        step: 0..90.
+
+    Returns:
+        The dots, which a film removes again.
+    """
+    colors = [(light.stop_point, LIGHT_COLORS.get(light.states[step : step + 1])) for light in scene.lights]
+    seen = [(point, color) for point, color in colors if color]
     points = np.array([point for point, _ in seen]).reshape(-1, 2)
     return axis.scatter(
-        points[:, 0], points[:, 1], s=26, c=[colour for _, colour in seen], edgecolors="white", linewidths=0.6, zorder=5
+        points[:, 0], points[:, 1], s=26, c=[color for _, color in seen], edgecolors="white", linewidths=0.6, zorder=5
     )
 
 
 def _outline(agents: AgentBoxes, agent: int) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "3 2"]]:
-    """Outline and wedge in the agent's own frame, metres."""
+    """Outline and wedge in the agent's own frame, meters."""
     half = np.array([agents.length[agent], agents.width[agent]]) / 2
     wedge = np.array([[0.9, 0], [0.3, 0.65], [0.3, -0.65]])
     if agents.object_type[agent] != ObjectType.PEDESTRIAN:

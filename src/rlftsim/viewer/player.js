@@ -1,11 +1,12 @@
 "use strict";
-// Plays the scenes of a page: every figure.player holds its data as JSON and one canvas a panel; all panels of a figure share time and view.
+// Plays the scenes of a page. Every figure.player holds its data as JSON and one canvas for each panel; the panels of a
+// figure share time and view.
 (() => {
   const STEP_S = 0.1, HOLD_AT_END_S = 1.0;
   const VEHICLE = 1, PEDESTRIAN = 2, CYCLIST = 3;
   const TYPE_NAMES = { 1: "vehicle", 2: "pedestrian", 3: "cyclist" };
   const ROLE_NAMES = ["other", "evaluated", "ego"], EGO = 2;
-  const LIGHT_COLOURS = { 1: "stop", 4: "stop", 7: "stop", 2: "caution", 5: "caution", 8: "caution", 3: "go", 6: "go" };
+  const LIGHT_COLORS = { 1: "stop", 4: "stop", 7: "stop", 2: "caution", 5: "caution", 8: "caution", 3: "go", 6: "go" };
   const POLYGONS = ["crosswalk", "speed_bump", "driveway"];
 
   // ---- data -------------------------------------------------------------------------------------------------------
@@ -74,33 +75,33 @@
 
   // ---- drawing ----------------------------------------------------------------------------------------------------
 
-  function readColours(element) {
+  function readColors(element) {
     const style = getComputedStyle(element);
     return new Proxy({}, { get: (cache, name) => (cache[name] ??= style.getPropertyValue(`--${name}`).trim()) });
   }
 
-  function drawMap(ctx, map, colours, px) {
-    const stroke = (kind, colour, width, dash = []) => {
+  function drawMap(ctx, map, colors, px) {
+    const stroke = (kind, color, width, dash = []) => {
       if (!map[kind]) return;
-      ctx.strokeStyle = colour; ctx.lineWidth = width; ctx.setLineDash(dash); ctx.stroke(map[kind]);
+      ctx.strokeStyle = color; ctx.lineWidth = width; ctx.setLineDash(dash); ctx.stroke(map[kind]);
     };
-    const fill = (kind, colour) => { if (map[kind]) { ctx.fillStyle = colour; ctx.fill(map[kind]); } };
+    const fill = (kind, color) => { if (map[kind]) { ctx.fillStyle = color; ctx.fill(map[kind]); } };
     ctx.lineCap = "round"; ctx.lineJoin = "round";
-    fill("driveway", colours.road);
-    stroke("lane", colours.road, 4.4);
-    stroke("bike_lane", colours.road, 2);
-    stroke("lane", colours["lane-centre"], px);
-    stroke("bike_lane", colours["lane-centre"], px);
+    fill("driveway", colors.road);
+    stroke("lane", colors.road, 4.4);
+    stroke("bike_lane", colors.road, 2);
+    stroke("lane", colors["lane-center"], px);
+    stroke("bike_lane", colors["lane-center"], px);
     for (const kind of ["crosswalk", "speed_bump"]) {
-      fill(kind, colours.crosswalk);
-      stroke(kind, colours["crosswalk-outline"], px, [0.6, 0.6]);
+      fill(kind, colors.crosswalk);
+      stroke(kind, colors["crosswalk-outline"], px, [0.6, 0.6]);
     }
     ctx.lineCap = "butt";
-    stroke("white", colours["line-white"], 1.2 * px);
-    stroke("white_broken", colours["line-white"], 1.2 * px, [1.5, 2.5]);
-    stroke("yellow", colours["line-yellow"], 1.2 * px);
-    stroke("yellow_broken", colours["line-yellow"], 1.2 * px, [1.5, 2.5]);
-    stroke("edge", colours.edge, 1.6 * px);
+    stroke("white", colors["line-white"], 1.2 * px);
+    stroke("white_broken", colors["line-white"], 1.2 * px, [1.5, 2.5]);
+    stroke("yellow", colors["line-yellow"], 1.2 * px);
+    stroke("yellow_broken", colors["line-yellow"], 1.2 * px, [1.5, 2.5]);
+    stroke("edge", colors.edge, 1.6 * px);
     ctx.setLineDash([]);
     for (const [x, y] of map.stop_points) {
       ctx.beginPath();
@@ -108,17 +109,17 @@
         const a = Math.PI / 8 + (i * Math.PI) / 4;
         ctx.lineTo(x + 6 * px * Math.cos(a), y + 6 * px * Math.sin(a));
       }
-      ctx.closePath(); ctx.fillStyle = colours.stop; ctx.fill();
-      ctx.fillStyle = colours.surface; ctx.fillRect(x - 3.5 * px, y - 0.9 * px, 7 * px, 1.8 * px);
+      ctx.closePath(); ctx.fillStyle = colors.stop; ctx.fill();
+      ctx.fillStyle = colors.surface; ctx.fillRect(x - 3.5 * px, y - 0.9 * px, 7 * px, 1.8 * px);
     }
   }
 
-  function drawLights(ctx, lights, step, colours, px) {
+  function drawLights(ctx, lights, step, colors, px) {
     for (const [x, y, states] of lights) {
-      const name = LIGHT_COLOURS[states[Math.min(step, states.length - 1)]];
+      const name = LIGHT_COLORS[states[Math.min(step, states.length - 1)]];
       ctx.beginPath(); ctx.arc(x / 100, y / 100, 4 * px, 0, 2 * Math.PI);
-      ctx.fillStyle = name ? colours[name] : colours.surface;
-      ctx.strokeStyle = colours["light-ring"]; ctx.lineWidth = 1.5 * px;
+      ctx.fillStyle = name ? colors[name] : colors.surface;
+      ctx.strokeStyle = colors["light-ring"]; ctx.lineWidth = 1.5 * px;
       ctx.fill(); ctx.stroke();
     }
   }
@@ -144,29 +145,29 @@
     else ctx.roundRect(-half, -halfWidth, 2 * half, 2 * halfWidth, 0.3 * halfWidth);
   }
 
-  function drawAgent(ctx, state, box, colours, px, hovered) {
+  function drawAgent(ctx, state, box, colors, px, hovered) {
     const [, type, length, width, role] = box;
     const small = type === PEDESTRIAN ? 3.2 : type === CYCLIST ? 2.4 : 2;
     const half = Math.max(length / 200, (type === CYCLIST ? 2 : 1) * small * px), halfWidth = Math.max(width / 200, small * px);
     ctx.save();
     ctx.translate(state.x, state.y); ctx.rotate(state.heading);
-    const ring = (gap, colour, dash) => {
+    const ring = (gap, color, dash) => {
       traceShape(ctx, type, half + gap * px, halfWidth + gap * px);
-      ctx.fillStyle = ctx.strokeStyle = colour; ctx.lineWidth = 2 * px;
+      ctx.fillStyle = ctx.strokeStyle = color; ctx.lineWidth = 2 * px;
       ctx.globalAlpha = 0.3; ctx.fill(); ctx.globalAlpha = 1;
       ctx.setLineDash(dash); ctx.stroke(); ctx.setLineDash([]);
     };
-    if (state.offroad) ring(state.collides ? 8 : 4, colours.offroad, [3 * px, 2 * px]);
-    if (state.collides) ring(4, colours.collision, []);
+    if (state.offroad) ring(state.collides ? 8 : 4, colors.offroad, [3 * px, 2 * px]);
+    if (state.collides) ring(4, colors.collision, []);
     traceShape(ctx, type, half, halfWidth);
-    ctx.fillStyle = colours[`agent-${ROLE_NAMES[role]}`];
+    ctx.fillStyle = colors[`agent-${ROLE_NAMES[role]}`];
     ctx.fill();
-    ctx.strokeStyle = hovered ? colours.ink : colours["agent-outline"]; ctx.lineWidth = (hovered ? 2 : 0.8) * px; ctx.stroke();
+    ctx.strokeStyle = hovered ? colors.ink : colors["agent-outline"]; ctx.lineWidth = (hovered ? 2 : 0.8) * px; ctx.stroke();
     // the heading mark: a wedge that points ahead, outside the disc of a pedestrian
     const tip = type === PEDESTRIAN ? half * 1.9 : half * 0.88, root = type === PEDESTRIAN ? half * 0.9 : half * 0.3;
     const spread = type === PEDESTRIAN ? half * 0.7 : halfWidth * 0.66;
     ctx.beginPath(); ctx.moveTo(tip, 0); ctx.lineTo(root, spread); ctx.lineTo(root, -spread); ctx.closePath();
-    if (type !== PEDESTRIAN) ctx.fillStyle = colours["heading-mark"];
+    if (type !== PEDESTRIAN) ctx.fillStyle = colors["heading-mark"];
     ctx.fill();
     ctx.restore();
   }
@@ -200,25 +201,25 @@
       this.canvas.height = Math.round(this.canvas.clientHeight * ratio);
     }
 
-    draw(colours) {
+    draw(colors) {
       const { ctx, canvas, player } = this, { view, scene, time } = player;
       const ratio = canvas.width / Math.max(canvas.clientWidth, 1), k = this.scale * ratio, px = 1 / this.scale;
       ctx.setTransform(1, 0, 0, 1, 0, 0);
-      ctx.fillStyle = colours.ground; ctx.fillRect(0, 0, canvas.width, canvas.height);
+      ctx.fillStyle = colors.ground; ctx.fillRect(0, 0, canvas.width, canvas.height);
       ctx.setTransform(k, 0, 0, -k, canvas.width / 2 - k * view.x, canvas.height / 2 + k * view.y);
-      drawMap(ctx, player.map, colours, px);
-      this.drawPaths(colours, px);
-      drawLights(ctx, scene.lights, Math.floor(time), colours, px);
-      this.drawAgents(colours, px);
+      drawMap(ctx, player.map, colors, px);
+      this.drawPaths(colors, px);
+      drawLights(ctx, scene.lights, Math.floor(time), colors, px);
+      this.drawAgents(colors, px);
       this.drawStatus();
     }
 
-    drawPaths(colours, px) {
+    drawPaths(colors, px) {
       const { ctx, player } = this, agents = player.scene.agents;
       const strokeAll = (n, alpha, width) => this.fans[n].forEach((path, i) => {
         if (!path) return;
         ctx.globalAlpha = alpha; ctx.lineWidth = width * px;
-        ctx.strokeStyle = colours[`agent-${ROLE_NAMES[agents[i][4]]}`]; ctx.stroke(path);
+        ctx.strokeStyle = colors[`agent-${ROLE_NAMES[agents[i][4]]}`]; ctx.stroke(path);
       });
       ctx.lineCap = "round";
       if (player.showAll) for (let n = 0; n < this.rollouts.length; n++) if (n !== this.shown) strokeAll(n, 0.4, 1);
@@ -226,12 +227,12 @@
       ctx.globalAlpha = 1;
     }
 
-    drawAgents(colours, px) {
+    drawAgents(colors, px) {
       const { ctx, player } = this, { scene, time, hovered } = player, rollout = this.rollouts[this.shown];
       this.states = rollout.map((agent) => stateAt(agent, time));
       for (const role of [0, 1, 2]) {
         this.states.forEach((state, i) => {
-          if (state && scene.agents[i][4] === role) drawAgent(ctx, state, scene.agents[i], colours, px, hovered === i);
+          if (state && scene.agents[i][4] === role) drawAgent(ctx, state, scene.agents[i], colors, px, hovered === i);
         });
       }
     }
@@ -240,7 +241,7 @@
       const { now } = this.player.scene, step = Math.floor(this.player.time), rollout = this.rollouts[this.shown];
       const soFar = (name) => rollout.filter((a) => a[name].subarray(now + 1, step + 1).includes(1)).length;
       const parts = [];
-      if (this.steps <= step) parts.push("no further record");
+      if (this.steps <= step) parts.push("log ends here");
       if (this.marks[0]) parts.push(`<b>${soFar("collides")}</b> collided`);
       if (this.marks[1]) parts.push(`<b>${soFar("offroad")}</b> off road`);
       const text = parts.join(" · ");
@@ -283,7 +284,7 @@
       this.bindControls();
       this.panels.forEach((panel) => this.bindPanel(panel));
       new ResizeObserver(() => { this.panels.forEach((p) => p.resize()); this.draw(); }).observe(root);
-      matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { this.colours = null; this.draw(); });
+      matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { this.colors = null; this.draw(); });
     }
 
     resetView() { const [x, y, r] = this.scene.focus; this.view = { x, y, r }; }
@@ -333,7 +334,7 @@
       });
       canvas.addEventListener("pointerleave", () => this.hover(-1));
       canvas.addEventListener("wheel", (event) => {
-        // the page scrolls on over a figure nobody has clicked into; Ctrl or a pinch zooms always
+        // The wheel scrolls the page until the figure is clicked; Ctrl or a pinch always zooms.
         if (!event.ctrlKey && !this.root.contains(document.activeElement)) return;
         event.preventDefault();
         this.zoom(Math.exp(event.deltaY * (event.ctrlKey ? 0.01 : 0.0015)), panel.toWorld(event));
@@ -377,8 +378,8 @@
     }
 
     draw() {
-      this.colours ??= readColours(this.root);
-      for (const panel of this.panels) { panel.draw(this.colours); panel.describe(this.hovered); }
+      this.colors ??= readColors(this.root);
+      for (const panel of this.panels) { panel.draw(this.colors); panel.describe(this.hovered); }
       const seconds = (this.time - this.scene.now) * STEP_S, distance = Math.round(10 * seconds);
       this.slider.value = this.time;
       this.find("clock").textContent = `${seconds < -0.04 ? "−" : "+"}${Math.abs(seconds).toFixed(1)} s`;

@@ -1,7 +1,8 @@
-"""What a picture of a scenario needs, and nothing else: map, lights, boxes and trajectories in the map frame.
+"""Scenes for pictures and pages: map, lights, boxes and trajectories in the map frame.
 
-Agents are the simulated ones (`Scenario.simulated_indices`), in the order of a batch's axis A. Small on purpose: `to_payload` rounds to
-centimetres and hundredths of a radian and stores second differences, so that smooth motion becomes mostly zeros.
+Agents are the simulated ones (`Scenario.simulated_indices`), in the order of a batch's axis A. Pages stay small because
+`to_payload` rounds to centimeters and hundredths of a radian and stores second differences: smooth motion becomes
+mostly zeros.
 """
 
 from dataclasses import dataclass, replace
@@ -18,14 +19,13 @@ from rlftsim.scenario.types import (
     CURRENT_STEP,
     HISTORY_STEPS,
     LightStates,
-    MapFeatures,
     MapFeatureType,
     Scenario,
 )
 from rlftsim.viewer.overlap import compute_overlap
 
 SIMPLIFY_TOLERANCE_M = 0.1
-"""How far a drawn map line may be from the recorded one."""
+"""Largest distance of a drawn map line from the logged one."""
 MIN_FOCUS_RADIUS_M, MAX_FOCUS_RADIUS_M = 30.0, 80.0
 UNSEEN_LIGHT = "-"
 
@@ -51,17 +51,17 @@ MAP_KINDS = {
     MapFeatureType.SPEED_BUMP: "speed_bump",
     MapFeatureType.DRIVEWAY: "driveway",
 }
-"""How each kind of map feature is drawn."""
+"""Drawing style of each type of map feature."""
 
 
 @dataclass(frozen=True, eq=False)
 class MapLine:
-    """One piece of map: a polyline, a polygon (crosswalk, speed bump, driveway) or a point (stop sign)."""
+    """One map feature: a polyline, a polygon (crosswalk, speed bump, driveway) or a point (stop sign)."""
 
     kind: str
     """A value of `MAP_KINDS`."""
     points: Float[np.ndarray, "n 2"]
-    """Map frame, metres."""
+    """Map frame, meters."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,14 +69,14 @@ class Light:
     """One traffic light at its stop point."""
 
     stop_point: Float[np.ndarray, "2"]
-    """Map frame, metres."""
+    """Map frame, meters."""
     states: str
     """One character a step: WOMD's number of the state, or `UNSEEN_LIGHT`."""
 
 
 @dataclass(frozen=True, eq=False)
 class AgentBoxes:
-    """Who is in the picture; sizes at the current step, metres."""
+    """Boxes of the agents in the picture; sizes at the current step, meters."""
 
     object_id: Int[np.ndarray, "A"]
     object_type: Int[np.ndarray, "A"]
@@ -84,7 +84,7 @@ class AgentBoxes:
     width: Float[np.ndarray, "A"]
     is_ego: Bool[np.ndarray, "A"]
     evaluated_mask: Bool[np.ndarray, "A"]
-    """True = the metric measures this agent; the ego is one of them."""
+    """True = the agent is evaluated by the metric; the ego is one of them."""
 
     def __len__(self) -> int:
         return len(self.object_id)
@@ -92,20 +92,22 @@ class AgentBoxes:
 
 @dataclass(frozen=True, eq=False)
 class SceneView:
-    """What stands still in a scenario, in the map frame."""
+    """Still part of a scenario, map frame."""
 
     scenario_id: str
     lines: tuple[MapLine, ...]
     lights: tuple[Light, ...]
     agents: AgentBoxes
     focus: tuple[float, float, float]
-    """Where to look first: x and y of the centre and half of the shown width, metres."""
+    """View at the beginning: x and y of the center and half of the shown width, meters."""
 
     def to_payload(self) -> dict[str, Any]:
-        """Lists, numbers and text only, as `player.js` reads them: centimetres, the points of a line as differences."""
+        """Lists, numbers and text only, in the layout that `player.js` reads; centimeters, points as differences."""
         kinds: dict[str, list[list[int]]] = {}
         for line in self.lines:
-            kinds.setdefault(line.kind, []).append(_encode_points(line.points))
+            # x0, y0, then differences from point to point
+            steps = np.diff(_centi(line.points), axis=0, prepend=np.zeros((1, 2), np.int64))
+            kinds.setdefault(line.kind, []).append(steps.ravel().tolist())
         agents = self.agents
         roles = np.where(agents.is_ego, 2, agents.evaluated_mask.astype(int))
         columns = (agents.object_id, agents.object_type, _centi(agents.length), _centi(agents.width), roles)
@@ -120,16 +122,16 @@ class SceneView:
 
 
 @dataclass(frozen=True, eq=False)
-class Trajectories:
-    """N ways the agents moved over S steps from step 0 on, map frame. The log is one of them, with N = 1."""
+class SceneMotion:
+    """Motion of the agents over S steps from step 0 on, in N rollouts, map frame. The log has N = 1."""
 
     position: Float[np.ndarray, "N A S 2"]
     heading: Float[np.ndarray, "N A S"]
     valid: Bool[np.ndarray, "N A S"]
     collides: Bool[np.ndarray, "N A S"] | None = None
-    """Where an agent overlaps another one; None = unknown, nothing is marked."""
+    """True = the agent overlaps another one; None = unknown, nothing is marked."""
     offroad: Bool[np.ndarray, "N A S"] | None = None
-    """Where a corner of an agent is off the road; None = unknown, nothing is marked."""
+    """True = a corner of the agent is off the road; None = unknown, nothing is marked."""
 
     @property
     def num_rollouts(self) -> int:
@@ -141,15 +143,16 @@ class Trajectories:
         """S."""
         return self.position.shape[2]
 
-    def first(self, num_rollouts: int) -> "Trajectories":
+    def first(self, num_rollouts: int) -> "SceneMotion":
         """The first rollouts only."""
         kept = {name: None if values is None else values[:num_rollouts] for name, values in vars(self).items()}
         return replace(self, **kept)
 
-    def with_overlaps(self, agents: AgentBoxes) -> "Trajectories":
-        """The same with `collides` = the boxes overlap, and did not at the current step (a recorded stroller and its pusher do).
+    def with_overlaps(self, agents: AgentBoxes) -> "SceneMotion":
+        """The same with `collides` = the boxes overlap, and did not at the current step.
 
-        Boxes have sharp corners here, so these are not exactly the metric's collisions.
+        A logged stroller and its pusher overlap from the beginning, which is no collision. Boxes have sharp corners
+        here and rounded ones in the metric, so these are not exactly the metric's collisions.
         """
         collides = compute_overlap(
             self.position, self.heading, agents.length, agents.width, self.valid, ignore_from=CURRENT_STEP
@@ -162,74 +165,92 @@ class Trajectories:
         *,
         collision: Bool[Tensor | np.ndarray, "N E T"] | None = None,
         offroad: Bool[Tensor | np.ndarray, "N E T"] | None = None,
-    ) -> "Trajectories":
-        """The same with the metric's own marks, which exist for evaluated agents and future steps.
+    ) -> "SceneMotion":
+        """The same with the metric's own marks, which it has for evaluated agents and future steps.
 
         Args:
-            scenario: the one shown.
-            collision: rows in the order of `scenario.evaluated_indices`.
-            offroad: the same.
+            scenario: the scenario of this motion.
+            collision: True = the agent collides; rows in the order of `scenario.evaluated_indices`.
+            offroad: True = the agent is off the road; rows likewise.
         """
-        marks = {"collides": collision, "offroad": offroad}
-        spread = {name: self._spread(scenario, values) for name, values in marks.items() if values is not None}
+        rows = np.searchsorted(scenario.simulated_indices, scenario.evaluated_indices)  # [E]
+        spread = {}
+        for name, values in {"collides": collision, "offroad": offroad}.items():
+            if values is not None:
+                spread[name] = np.zeros(self.valid.shape, bool)  # [N, A, S]
+                # Fewer rollouts or steps may be shown than the metric has marks for.
+                shown = np.asarray(values, bool)[: self.num_rollouts, :, : self.num_steps - HISTORY_STEPS]
+                spread[name][:, rows, HISTORY_STEPS:] = shown
         return replace(self, **spread)
 
-    def _spread(self, scenario: Scenario, values: Tensor | np.ndarray) -> Bool[np.ndarray, "N A S"]:
-        """Values of evaluated agents at future steps, put where they belong."""
-        full = np.zeros(self.valid.shape, bool)
-        rows = np.searchsorted(scenario.simulated_indices, scenario.evaluated_indices)
-        full[:, rows, HISTORY_STEPS:] = np.asarray(values, bool)[
-            : self.num_rollouts, :, : self.num_steps - HISTORY_STEPS
-        ]
-        return full
-
     def to_payload(self) -> dict[str, Any]:
-        """Lists and numbers only, as `player.js` reads them."""
+        """Lists and numbers only, in the layout that `player.js` reads."""
         return {"steps": self.num_steps, "rollouts": [self._encode_rollout(n) for n in range(self.num_rollouts)]}
 
     def _encode_rollout(self, n: int) -> list[list[list[int]]]:
-        """Per agent x, y (centimetres), heading (centiradians) as second differences; intervals of valid, colliding, off-road steps."""
+        """Second differences of x, y (cm) and heading (0.01 rad) of each agent, and its valid, colliding and off-road
+        steps as intervals."""
         position, heading = _hold(self.position[n], self.valid[n]), _hold(self.heading[n], self.valid[n])
+        # Held and unwrapped first: a gap or a jump by a full turn would cost two large differences each.
         channels = _centi(np.stack([position[..., 0], position[..., 1], np.unwrap(heading, axis=-1)], axis=1))
         flags = [self.valid[n]] + [
             np.zeros_like(self.valid[n]) if f is None else f[n] & self.valid[n] for f in (self.collides, self.offroad)
         ]
         return [
-            [*(_second_differences(c) for c in channels[agent]), *(_intervals(f[agent]) for f in flags)]
+            [
+                *(_second_differences(channel) for channel in channels[agent]),
+                # Half-open runs of True as start, stop, start, stop, ...: places where a flag changes.
+                *(np.flatnonzero(np.diff(flag[agent], prepend=False, append=False)).tolist() for flag in flags),
+            ]
             for agent in range(len(channels))
         ]
 
 
 def build_scene(scenario: Scenario) -> SceneView:
-    """The still part of a picture: map (simplified to 10 cm), lights, agents."""
+    """Still part of a scenario: map (simplified to 10 cm), lights, boxes of the agents."""
+    tracks, chosen, features = scenario.tracks, scenario.simulated_indices, scenario.map_features
+    lines = []
+    for index in range(len(features)):
+        # Subtracted in float64: world coordinates are kilometers, where float32 rounds to half a millimeter.
+        points = features.polyline(index)[:, :2].astype(np.float64) - scenario.origin  # [n, 2]
+        points = points[np.isfinite(points).all(-1)]
+        if len(points):
+            lines.append(MapLine(MAP_KINDS[MapFeatureType(int(features.feature_type[index]))], simplify(points)))
     return SceneView(
         scenario_id=scenario.scenario_id,
-        lines=_map_lines(scenario.map_features, scenario.origin),
+        lines=tuple(lines),
         lights=_lights(scenario.lights, scenario.origin, scenario.num_steps),
-        agents=_agent_boxes(scenario),
+        agents=AgentBoxes(
+            object_id=tracks.object_id[chosen],
+            object_type=tracks.object_type[chosen].astype(np.int64),
+            length=tracks.size[chosen, CURRENT_STEP, 0],
+            width=tracks.size[chosen, CURRENT_STEP, 1],
+            is_ego=chosen == scenario.ego_index,
+            evaluated_mask=np.isin(chosen, scenario.evaluated_indices),
+        ),
         focus=_focus(scenario),
     )
 
 
-def logged_trajectories(scenario: Scenario) -> Trajectories:
-    """What was recorded of the simulated agents: 91 steps, 11 where the future is withheld."""
+def logged_trajectories(scenario: Scenario) -> SceneMotion:
+    """Logged motion of the simulated agents: 91 steps, or 11 where the future is withheld."""
     tracks, chosen = scenario.tracks, scenario.simulated_indices
-    position = (tracks.position[chosen][..., :2] - scenario.origin).astype(np.float32)
+    position = (tracks.position[chosen][..., :2] - scenario.origin).astype(np.float32)  # [A, S, 2]
     heading = tracks.heading[chosen]
     finite = np.isfinite(position).all(-1) & np.isfinite(heading)
-    return Trajectories(position[None], heading[None], (tracks.valid[chosen] & finite)[None])
+    return SceneMotion(position[None], heading[None], (tracks.valid[chosen] & finite)[None])
 
 
 def rollout_trajectories(
     scenario: Scenario, rollouts: Rollouts, *, row: int, max_rollouts: int | None = None
-) -> Trajectories:
+) -> SceneMotion:
     """Simulated futures of one scenario of a batch, after its logged history.
 
     Args:
-        scenario: the one in row `row` of the batch.
-        rollouts: of the whole batch.
+        scenario: scenario number `row` of the batch.
+        rollouts: rollouts of the whole batch.
         row: index b of the scenario in the batch.
-        max_rollouts: keep the first so many; None = all.
+        max_rollouts: number of rollouts that are kept, the first ones; None = all.
 
     Raises:
         DataError: the rollouts have fewer agents than the scenario, so they belong to another one.
@@ -240,35 +261,46 @@ def rollout_trajectories(
             f"{scenario.scenario_id}: {num_agents} agents, but the rollouts have {rollouts.position.shape[2]}: "
             "hand over the scenario of the same row."
         )
+    # [N, A, T, 2] and [N, A, T], without the batch's padding
     future_position, future_heading = (
         values[row, :max_rollouts, :num_agents].detach().to("cpu", torch.float32).numpy()
         for values in (rollouts.position, rollouts.heading)
     )
     log = logged_trajectories(scenario)
 
-    def after_history(past: np.ndarray, future: np.ndarray) -> np.ndarray:
+    def join(past: np.ndarray, future: np.ndarray) -> np.ndarray:  # along the axis of steps
+        # The log has one rollout; its history stands before each simulated future.
         repeated = np.repeat(past[:, :, :HISTORY_STEPS], len(future), axis=0)
         return np.concatenate([repeated, future], axis=2)
 
-    return Trajectories(
-        position=after_history(log.position, future_position),
-        heading=after_history(log.heading, future_heading),
-        valid=after_history(log.valid, np.isfinite(future_position).all(-1) & np.isfinite(future_heading)),
+    return SceneMotion(
+        position=join(log.position, future_position),
+        heading=join(log.heading, future_heading),
+        valid=join(log.valid, np.isfinite(future_position).all(-1) & np.isfinite(future_heading)),
     )
 
 
 def simplify(points: Float[np.ndarray, "n 2"], tolerance_m: float = SIMPLIFY_TOLERANCE_M) -> Float[np.ndarray, "m 2"]:
-    """A polyline with fewer points, nowhere further than `tolerance_m` from the given one (Douglas-Peucker)."""
+    """Polyline with fewer points that stays close to the given one (Douglas and Peucker, 1973).
+
+    Args:
+        points: the polyline.
+        tolerance_m: largest distance of a removed point from the result.
+    """
     if len(points) < 3:
         return points
     keep = np.zeros(len(points), bool)
     keep[[0, -1]] = True
     spans = [(0, len(points) - 1)]
+    # A stack in place of recursion: map lines have thousands of points.
     while spans:
         start, stop = spans.pop()
         if stop - start < 2:
             continue
-        distance = _distance_to_segment(points[start + 1 : stop], points[start], points[stop])
+        inner, along = points[start + 1 : stop], points[stop] - points[start]
+        # Place of the nearest point of the segment, 0 at its start and 1 at its end; a segment may have no length.
+        fraction = np.clip((inner - points[start]) @ along / max(float(along @ along), 1e-12), 0, 1)
+        distance = np.linalg.norm(inner - points[start] - fraction[:, None] * along, axis=-1)
         farthest = int(distance.argmax())
         if distance[farthest] > tolerance_m:
             middle = start + 1 + farthest
@@ -277,26 +309,8 @@ def simplify(points: Float[np.ndarray, "n 2"], tolerance_m: float = SIMPLIFY_TOL
     return points[keep]
 
 
-def _distance_to_segment(points: np.ndarray, start: np.ndarray, stop: np.ndarray) -> Float[np.ndarray, "n"]:
-    """Distance of points to a segment, metres; it may have no length."""
-    along = stop - start
-    share = np.clip((points - start) @ along / max(float(along @ along), 1e-12), 0, 1)
-    return np.linalg.norm(points - start - share[:, None] * along, axis=-1)
-
-
-def _map_lines(features: MapFeatures, origin: np.ndarray) -> tuple[MapLine, ...]:
-    """Every feature with finite points, in file order."""
-    lines = []
-    for index in range(len(features)):
-        points = features.polyline(index)[:, :2].astype(np.float64) - origin
-        points = points[np.isfinite(points).all(-1)]
-        if len(points):
-            lines.append(MapLine(MAP_KINDS[MapFeatureType(int(features.feature_type[index]))], simplify(points)))
-    return tuple(lines)
-
-
 def _lights(lights: LightStates, origin: np.ndarray, num_steps: int) -> tuple[Light, ...]:
-    """One light per controlled lane; where a lane is listed twice in a step, the later entry counts."""
+    """One light per controlled lane; of two entries for a lane and a step the later one counts."""
     found = []
     for lane_id in np.unique(lights.lane_id):
         rows = np.flatnonzero(lights.lane_id == lane_id)
@@ -309,20 +323,8 @@ def _lights(lights: LightStates, origin: np.ndarray, num_steps: int) -> tuple[Li
     return tuple(found)
 
 
-def _agent_boxes(scenario: Scenario) -> AgentBoxes:
-    tracks, chosen = scenario.tracks, scenario.simulated_indices
-    return AgentBoxes(
-        object_id=tracks.object_id[chosen],
-        object_type=tracks.object_type[chosen].astype(np.int64),
-        length=tracks.size[chosen, CURRENT_STEP, 0],
-        width=tracks.size[chosen, CURRENT_STEP, 1],
-        is_ego=chosen == scenario.ego_index,
-        evaluated_mask=np.isin(chosen, scenario.evaluated_indices),
-    )
-
-
 def _focus(scenario: Scenario) -> tuple[float, float, float]:
-    """A square around everything the evaluated agents did, neither tiny nor so large that boxes become dots."""
+    """Square around the logged paths of the evaluated agents, neither tiny nor so large that boxes become dots."""
     chosen = scenario.evaluated_indices
     visited = (scenario.tracks.position[chosen][scenario.tracks.valid[chosen]][:, :2] - scenario.origin).astype(float)
     if not len(visited):
@@ -330,42 +332,30 @@ def _focus(scenario: Scenario) -> tuple[float, float, float]:
     low, high = visited.min(0), visited.max(0)
     radius = float(np.clip((high - low).max() / 2 + 8, MIN_FOCUS_RADIUS_M, MAX_FOCUS_RADIUS_M))
     ego = scenario.tracks.position[scenario.ego_index, CURRENT_STEP, :2] - scenario.origin
-    # where not everything fits, the ego at the current step stays in the picture
-    centre = np.clip((low + high) / 2, ego - 0.8 * radius, ego + 0.8 * radius)
-    return float(centre[0]), float(centre[1]), radius
+    # If not everything fits, the ego at the current step stays in the picture.
+    center = np.clip((low + high) / 2, ego - 0.8 * radius, ego + 0.8 * radius)
+    return float(center[0]), float(center[1]), radius
 
 
 def _centi(values: np.ndarray) -> Int[np.ndarray, "..."]:
-    """Hundredths, as whole numbers."""
+    """Values in hundredths, as whole numbers."""
     return np.rint(np.asarray(values, np.float64) * 100).astype(np.int64)
 
 
-def _encode_points(points: Float[np.ndarray, "n 2"]) -> list[int]:
-    """x0, y0, then differences from point to point, centimetres."""
-    centimetres = _centi(points)
-    return np.diff(centimetres, axis=0, prepend=np.zeros((1, 2), np.int64)).ravel().tolist()
-
-
 def _second_differences(values: Int[np.ndarray, "S"]) -> list[int]:
-    """Value, first difference, then second differences; zeros at the end are left out."""
+    """First value, first difference, then second differences; zeros at the end are left out."""
     first = np.diff(values, prepend=0)
     second = first.copy()
     second[2:] = np.diff(first[1:])
     return np.trim_zeros(second, "b").tolist()
 
 
-def _intervals(flags: Bool[np.ndarray, "S"]) -> list[int]:
-    """Start, stop, start, stop, ...: half-open runs of True."""
-    padded = np.concatenate([[False], flags, [False]])
-    return np.flatnonzero(padded[1:] != padded[:-1]).tolist()
-
-
 def _hold(values: np.ndarray, valid: Bool[np.ndarray, "A S"]) -> np.ndarray:
-    """Values with gaps filled by the last valid one (before the first: by the first), which costs nothing when encoded."""
+    """Values with gaps filled by the last valid one, or before it by the first: second differences there are zero."""
     steps = np.arange(valid.shape[1])
-    last = np.maximum.accumulate(np.where(valid, steps, -1), axis=1)
+    last = np.maximum.accumulate(np.where(valid, steps, -1), axis=1)  # [A, S], step of the last valid value or -1
     first = np.where(valid.any(1), valid.argmax(1), 0)
     source = np.where(last < 0, first[:, None], last)
-    held = np.take_along_axis(values, source if values.ndim == 2 else source[..., None], axis=1)
+    filled = np.take_along_axis(values, source if values.ndim == 2 else source[..., None], axis=1)
     known = valid.any(1).reshape(-1, *[1] * (values.ndim - 1))
-    return np.where(known, held, 0)
+    return np.where(known, filled, 0)

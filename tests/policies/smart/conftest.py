@@ -1,4 +1,7 @@
-"""Scenario A, its golden numbers and the model that they were computed with. Everything here needs the official material."""
+"""Scenario A, its golden numbers and the model that they were computed with.
+
+Everything here needs the official material.
+"""
 
 import json
 import runpy
@@ -60,7 +63,8 @@ def scenario_a(record) -> Scenario:
 def batch_a(scenario_a, golden) -> Callable[[str], ScenarioBatch]:
     """Scenario A in a frame ("centred" or "absolute").
 
-    The public code feeds the mean size over all recorded steps, the future included; here a model sees the size at the current step.
+    The public code feeds the mean size over all logged steps, the future included; here a model has the size at
+    the current step.
     """
     shape = torch.from_numpy(golden.arrays("scenario_A/preprocessed")["shape"])[None]
     return cache(lambda frame: replace(collate([scenario_a], frame=FRAMES[frame]), size=shape))

@@ -35,7 +35,7 @@ def vocabulary(num_tokens=NUM_TOKENS):
 
 def fresh(config, num_tokens=NUM_TOKENS):
     torch.manual_seed(1)
-    return SmartPolicy(replace(config, public_code_quirks=True), vocabulary(num_tokens)).eval()
+    return SmartPolicy(replace(config, catk_compat=True), vocabulary(num_tokens)).eval()
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +54,7 @@ def same(a, b):
     return a.keys() == b.keys() and all(torch.equal(a[k], b[k]) for k in a)
 
 
-# ---- round trips -------------------------------------------------------------------------------------------------------
+# ---- round trips ---------------------------------------------------------------------------------
 
 
 def test_a_model_exported_and_imported_again_has_the_same_bits(policy, tables, tmp_path):
@@ -79,7 +79,7 @@ def test_an_imported_model_can_be_saved_as_one_of_ours(policy, tables, tmp_path)
     imported = import_catk(tmp_path / "out.safetensors", tables).policy
     imported.save_pretrained(tmp_path / "model")
     loaded = SmartPolicy.from_pretrained(tmp_path / "model")
-    assert loaded.config.public_code_quirks
+    assert loaded.config.catk_compat
     assert same(loaded, policy)
 
 
@@ -92,7 +92,7 @@ def test_a_vocabulary_of_ours_will_do(policy, tmp_path):
 def test_other_sizes_come_with_their_settings(tables, tmp_path):
     config = SmartConfig(
         dim=16, num_frequencies=4, num_heads=2, head_dim=4, num_map_layers=1, num_decoder_layers=1,
-        agent_map_radius_m=25.0, agent_radius_m=35.0, history_tokens=3, history_drop=0.2, public_code_quirks=True,
+        agent_map_radius_m=25.0, agent_radius_m=35.0, history_tokens=3, history_drop=0.2, catk_compat=True,
     )  # fmt: skip
     other = fresh(config)
     content = {"state_dict": export_catk(other), "hyper_parameters": {"model_config": {"decoder": SETTINGS}}}
@@ -120,7 +120,7 @@ def test_the_command_line_takes_and_returns_a_model(policy, tables, tmp_path, ca
     assert main(["model", "export", names[1], "--to", "catk", str(tmp_path / "back.ckpt")]) == 2
 
 
-# ---- what is refused ---------------------------------------------------------------------------------------------------
+# ---- what is refused -----------------------------------------------------------------------------
 
 
 def write_changed(policy, tmp_path, change):
@@ -241,14 +241,14 @@ def test_a_vocabulary_other_than_the_one_a_checkpoint_names_is_refused(policy, t
         import_catk(tmp_path / "x.ckpt", tables)
 
 
-# ---- the public code's own files ---------------------------------------------------------------------------------------
+# ---- the public code's own files -----------------------------------------------------------------
 
 
 @pytest.mark.official
 def test_a_lightning_file_and_safetensors_give_the_same_model(golden, token_tables, nano):
     other = import_catk(golden.folder / "nano_seed1003.safetensors", token_tables)
     assert same(other.policy, nano)
-    assert other.policy.config == nano.config == replace(smart_nano(), public_code_quirks=True)
+    assert other.policy.config == nano.config == replace(smart_nano(), catk_compat=True)
     assert is_published(nano.vocabulary)
 
 

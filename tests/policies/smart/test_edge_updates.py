@@ -8,6 +8,7 @@ import torch
 from torch.nn.functional import cross_entropy
 
 import scenes
+from catk_loss import catk_loss
 from rlftsim.policies.smart.config import SmartConfig
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.rollout.edge_scenes import edge_scenes
@@ -15,7 +16,7 @@ from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.types import ObjectType
 from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
-from rlftsim.training.catk import catk_loss, roll_out_closest
+from rlftsim.training.catk import roll_out_closest
 from rlftsim.training.data import trained_agents
 
 SMALL = SmartConfig(
@@ -43,11 +44,11 @@ def vocabulary():
 
 def fresh(vocabulary, public):
     torch.manual_seed(5)
-    return SmartPolicy(replace(SMALL, public_code_quirks=public), vocabulary)
+    return SmartPolicy(replace(SMALL, catk_compat=public), vocabulary)
 
 
 def update(policy, loss):
-    """One step of the optimiser; how many weights it moved."""
+    """One step of the optimizer; how many weights it moved."""
     before = {name: p.detach().clone() for name, p in policy.named_parameters()}
     assert loss.isfinite()
     assert loss > 0
@@ -61,19 +62,21 @@ def update(policy, loss):
 @modes
 def test_a_pre_training_update(name, public, vocabulary):
     policy, batch = fresh(vocabulary, public).train(), collate([AWKWARD[name]])
-    said = policy.teacher_forced(batch, trained_agents(batch, 0, radius_m=100.0, limit=32, seed=0))
-    assert said.target_mask.any()
-    moved = update(policy, cross_entropy(said.logits[said.target_mask], said.target[said.target_mask]))
+    prediction = policy.teacher_forced(batch, trained_agents(batch, 0, radius_m=100.0, limit=32, seed=0))
+    assert prediction.target_mask.any()
+    moved = update(
+        policy, cross_entropy(prediction.logits[prediction.target_mask], prediction.target[prediction.target_mask])
+    )
     assert moved > 20
 
 
 @modes
 def test_a_closed_loop_update_and_rollouts_after_it(name, public, vocabulary):
     policy, batch = fresh(vocabulary, public).train(), collate([AWKWARD[name]])
-    pursuing = roll_out_closest(policy, batch, num_candidates=8, public_order_of_operations=public)
-    assert pursuing.rollouts.decision_mask.sum() == 16 * batch.agent_mask.sum()
+    targeted = roll_out_closest(policy, batch, num_candidates=8, catk_compat=public)
+    assert targeted.rollouts.decision_mask.sum() == 16 * batch.agent_mask.sum()
     moved = update(
-        policy, catk_loss(policy, batch, pursuing, trained_agents(batch, 0, radius_m=100.0, limit=32, seed=0))
+        policy, catk_loss(policy, batch, targeted, trained_agents(batch, 0, radius_m=100.0, limit=32, seed=0))
     )
     assert moved > 20
     rollouts = simulate(policy.eval(), batch, num_rollouts=2, seed=0)

@@ -7,7 +7,8 @@ import pytest
 import torch
 from torch import nn
 
-from rlftsim.policies.layers import RelationAttention, normalize
+from rlftsim.policies.smart.attention import RelationAttention
+from rlftsim.policies.smart.embeddings import normalize
 
 pytestmark = pytest.mark.official
 LOGIT_TOLERANCE = 1e-4
@@ -125,8 +126,13 @@ def test_output_of_each_map_layer(layer, passes, golden):
 
 @pytest.mark.parametrize(
     ("kind", "name"),
-    [("t", "decoder.time_relation"), ("pl2a", "decoder.map_relation"), ("a2a", "decoder.agent_relation"), ("pt2pt", "map_encoder.relation")],
-)  # fmt: skip
+    [
+        ("t", "decoder.time_relation"),
+        ("pl2a", "decoder.map_relation"),
+        ("a2a", "decoder.agent_relation"),
+        ("pt2pt", "map_encoder.relation"),
+    ],
+)
 def test_relation_embeddings(kind, name, nano, golden):
     arrays = golden.arrays("nano/centred_layers")
     with torch.no_grad():
@@ -146,13 +152,13 @@ def test_motion_embedding(nano, golden, batch_a):
 
 
 def edges_of(done: Pass, name: str) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Row and neighbour of each edge of the first layer of a kind."""
+    """Row and neighbor of each edge of the first layer of a kind."""
     _, _, around, *_ = done.seen.inputs[f"{name}.0"][0]
     rows, neighbors = [], []
-    for of_piece, piece in zip(around.rows.split(around.sizes), around.pieces):
-        row, column = (piece.bias[:, 0] == 0).nonzero(as_tuple=True)
-        rows.append(of_piece[row].numpy())
-        neighbors.append(piece.neighbors[row, column].numpy())
+    for of_block, block in zip(around.rows.split(around.sizes), around.blocks):
+        row, column = (block.bias[:, 0] == 0).nonzero(as_tuple=True)
+        rows.append(of_block[row].numpy())
+        neighbors.append(block.neighbors[row, column].numpy())
     return np.concatenate(rows), np.concatenate(neighbors)
 
 
@@ -208,8 +214,8 @@ def test_tiny(frame, tiny, golden, batch_a):
         check_edges_of(tiny, done, batch_a(frame), golden.arrays("tiny/centred_edges"))
 
 
-def test_normalised_map_features_are_what_the_decoder_sees(nano, passes, batch_a):
+def test_normalized_map_features_are_what_the_decoder_sees(nano, passes, batch_a):
     (of_map,) = passes["centred"].seen.outputs["map_encoder"]
     _, _, around, *_ = passes["centred"].seen.inputs["decoder.map_layers.0"][0]
-    for piece in around.pieces:
-        torch.testing.assert_close(piece.known[..., of_map.shape[-1] :], normalize(of_map)[piece.neighbors])
+    for block in around.blocks:
+        torch.testing.assert_close(block.edge_features[..., of_map.shape[-1] :], normalize(of_map)[block.neighbors])

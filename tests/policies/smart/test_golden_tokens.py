@@ -9,8 +9,8 @@ from rlftsim.scenario.batch import collate
 from rlftsim.scenario.shards import ShardReader, ShardWriter
 from rlftsim.scenario.types import CURRENT_STEP
 from rlftsim.tokens.agent_tokens import clean_tracks, tokenize_agents
+from rlftsim.tokens.catk_compat import fill_gaps_in_world
 from rlftsim.tokens.map_tokens import split_map, tokenize_map
-from rlftsim.tokens.public_order import fill_gaps_in_world
 from rlftsim.tokens.vocabulary import class_of_type
 
 pytestmark = pytest.mark.official
@@ -103,7 +103,7 @@ def test_map_tokens_are_those_of_the_public_code(frame, batch_a, golden, nano):
 @pytest.mark.parametrize("frame", ["centred", "absolute"])
 def test_agent_tokens_are_those_of_the_public_code_to_the_last_bit(frame, batch_a, golden, nano):
     expected = golden.arrays(f"scenario_A/tokens_{frame}")
-    tokens = tokenize_agents(batch_a(frame), nano.vocabulary, public_order_of_operations=True)
+    tokens = tokenize_agents(batch_a(frame), nano.vocabulary, catk_compat=True)
     valid = expected["valid_mask"]
     np.testing.assert_array_equal(tokens.valid[0], valid)
     np.testing.assert_array_equal(tokens.token_id[0][valid], expected["gt_idx"][valid])
@@ -124,7 +124,7 @@ def test_our_own_order_of_operations_finds_the_same_tokens_in_the_map_frame(batc
 
 
 def test_the_world_frame_changes_one_token_in_twenty(golden):
-    centred, absolute = (golden.arrays(f"scenario_A/tokens_{frame}") for frame in ("centred", "absolute"))
-    valid = centred["valid_mask"]
-    assert (centred["gt_idx"] != absolute["gt_idx"])[valid].sum() == 35
+    centered, absolute = (golden.arrays(f"scenario_A/tokens_{frame}") for frame in ("centred", "absolute"))
+    valid = centered["valid_mask"]
+    assert (centered["gt_idx"] != absolute["gt_idx"])[valid].sum() == 35
     assert valid.sum() == 692

@@ -18,8 +18,9 @@ from rlftsim.tokens.trajtok import TrajTokConfig
 from rlftsim.tokens.vocabulary import class_of_type
 
 SMALL = SmartConfig(
-    dim=16, num_heads=2, head_dim=8, num_map_layers=1, num_decoder_layers=1, num_frequencies=4, dropout=0.0, history_drop=0.0,
-    max_map_neighbors=4, max_agent_map_neighbors=6, max_agent_neighbors=6, head_per_class=True,
+    dim=16, num_heads=2, head_dim=8, num_map_layers=1, num_decoder_layers=1, num_frequencies=4,
+    dropout=0.0, history_drop=0.0, head_per_class=True,
+    max_map_neighbors=4, max_agent_map_neighbors=6, max_agent_neighbors=6,
 )  # fmt: skip
 
 
@@ -71,8 +72,8 @@ def test_a_saved_model_says_the_same(policy, batch, tmp_path):
     policy.save_pretrained(tmp_path)
     again = SmartPolicy.from_pretrained(tmp_path).eval()
     assert again.config.head_per_class
-    said, same = (p.teacher_forced(batch, batch.agent_mask).logits for p in (policy, again))
-    assert torch.equal(said, same)
+    prediction, same = (p.teacher_forced(batch, batch.agent_mask).logits for p in (policy, again))
+    assert torch.equal(prediction, same)
 
 
 def test_weights_with_a_shared_head_are_refused(policy, tmp_path):

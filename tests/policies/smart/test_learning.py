@@ -26,8 +26,8 @@ def learn(policy, batch, trained, num_updates, learning_rate):
     optimizer = torch.optim.AdamW(policy.parameters(), weight_decay=0.0)
     for update in range(num_updates):
         optimizer.param_groups[0]["lr"] = learning_rate * min(1.0, (update + 1) / 5) * (1 - 0.9 * update / num_updates)
-        said = policy.teacher_forced(batch, trained)
-        logits, target = said.logits[said.target_mask], said.target[said.target_mask]
+        prediction = policy.teacher_forced(batch, trained)
+        logits, target = prediction.logits[prediction.target_mask], prediction.target[prediction.target_mask]
         loss = cross_entropy(logits, target)
         yield loss.item(), (logits.argmax(-1) == target).float().mean().item()
         optimizer.zero_grad()

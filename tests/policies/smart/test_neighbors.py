@@ -11,7 +11,7 @@ HERE = torch.zeros(1, 2)
 FIRST = torch.zeros(1, dtype=torch.long)
 
 
-def test_the_radius_is_strict_and_nobody_is_their_own_neighbour():
+def test_the_radius_is_strict_and_nobody_is_their_own_neighbor():
     found = within(HERE, FIRST, PLACES, torch.tensor([2]), radius_m=3.0, limit=None)
     assert found.index[found.mask].tolist() == [0, 1, 3]
     assert not within(HERE, FIRST, PLACES, None, radius_m=1.0, limit=None).mask.any()

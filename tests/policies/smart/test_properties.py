@@ -8,11 +8,13 @@ import pytest
 import torch
 
 import scenes
+from catk_loss import catk_loss
 from rlftsim.geometry import rotate, wrap_angle
-from rlftsim.policies.layers import normalize
 from rlftsim.policies.smart.config import SmartConfig
-from rlftsim.policies.smart.network import Scene, TokenSteps
+from rlftsim.policies.smart.embeddings import normalize
+from rlftsim.policies.smart.network import Scene
 from rlftsim.policies.smart.policy import SmartPolicy
+from rlftsim.policies.smart.token_steps import TokenSteps
 from rlftsim.rollout.edge_scenes import edge_scenes
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.types import CURRENT_STEP, ObjectType
@@ -20,7 +22,7 @@ from rlftsim.tokens.agent_tokens import clean_tracks
 from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
 from rlftsim.tokens.map_tokens import MapTokens, tokenize_map
 from rlftsim.tokens.vocabulary import class_of_type
-from rlftsim.training.catk import catk_loss, roll_out_closest
+from rlftsim.training.catk import roll_out_closest
 
 SCENES = (scenes.bend(), scenes.bend("pair", 2))
 ROUNDING = 2e-5
@@ -54,12 +56,12 @@ def predictions(policy, scenario_list):
     return logits.new_zeros(*valid.shape, logits.shape[-1]).masked_scatter(valid[..., None], logits)
 
 
-# ---- invariances -------------------------------------------------------------------------------------------------------
+# ---- invariances ---------------------------------------------------------------------------------
 
 
 @torch.no_grad()
 def features(policy, batch, turn_rad, shift_m, order=None):
-    """Decoder features in float64, the tokenised scene turned and shifted, its map tokens in another order."""
+    """Decoder features in float64, the tokenized scene turned and shifted, its map tokens in another order."""
 
     def moved(position):
         angle = torch.full(position.shape[:-1], turn_rad, dtype=torch.float64)
@@ -69,10 +71,10 @@ def features(policy, batch, turn_rad, shift_m, order=None):
     order = torch.arange(tokens.heading.shape[1]) if order is None else order
     tokens = MapTokens(**{name: getattr(tokens, name)[:, order] for name in MapTokens.__dataclass_fields__})
     tokens = replace(tokens, position=moved(tokens.position), heading=wrap_angle(tokens.heading.double() + turn_rad))
-    steps = policy._recorded_steps(policy._tokenize(batch), slice(0, -1))
+    steps = policy._logged_steps(policy._tokenize(batch), slice(0, -1))
     steps = TokenSteps(
-        moved(steps.position), wrap_angle(steps.heading.double() + turn_rad), moved(steps.motion) - moved(torch.zeros(2)),
-        steps.token_id, steps.valid,
+        moved(steps.position), wrap_angle(steps.heading.double() + turn_rad),
+        moved(steps.motion) - moved(torch.zeros(2)), steps.token_id, steps.valid,
     )  # fmt: skip
     class_id = class_of_type(batch.object_type)
     scene = Scene(
@@ -127,7 +129,7 @@ def test_logits_do_not_depend_on_the_order_of_scenarios(vocabulary):
     assert (before - after.flip(0)).abs().max() < ROUNDING
 
 
-# ---- quirks of the public code, decided on purpose -----------------------------------------------------------------------
+# ---- quirks of the public code, decided on purpose -----------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["agents first seen at step 7", "agents first seen at the current step"])
@@ -137,11 +139,11 @@ def test_the_first_motion_is_zero_here_and_the_position_in_the_public_code(name,
     tokens = policy._tokenize(batch)
     late = tokens.valid[0, :, 1] & ~tokens.valid[0, :, 0]
     assert late.sum() == batch.agent_mask.sum() - 1  # all but the ego
-    here = policy._recorded_steps(tokens, slice(1, 2)).motion[0, 0, :, 0]
+    here = policy._logged_steps(tokens, slice(1, 2)).motion[0, 0, :, 0]
     assert (here[late] == 0).all()
-    public = smart(vocabulary, public_code_quirks=True)
+    public = smart(vocabulary, catk_compat=True)
     tokens = public._tokenize(batch)
-    there = public._recorded_steps(tokens, slice(1, 2)).motion[0, 0, :, 0]
+    there = public._logged_steps(tokens, slice(1, 2)).motion[0, 0, :, 0]
     assert torch.equal(there[late], tokens.position[0, late, 1])
     assert torch.allclose(there[~late], here[~late], atol=1e-3)
     with torch.no_grad():
@@ -163,7 +165,7 @@ def test_a_pedestrian_that_turns_at_once_keeps_the_heading_before():
 
 
 def test_the_public_order_of_operations_moves_poses_by_rounding_only(vocabulary):
-    ours, public = smart(vocabulary), smart(vocabulary, public_code_quirks=True)
+    ours, public = smart(vocabulary), smart(vocabulary, catk_compat=True)
     batch = collate(SCENES)
     a, b = ours._tokenize(batch), public._tokenize(batch)
     assert torch.equal(a.token_id[a.valid], b.token_id[a.valid])
@@ -176,20 +178,20 @@ def test_the_public_order_of_operations_moves_poses_by_rounding_only(vocabulary)
 
 
 def test_next_tokens_are_the_rolling_ones(vocabulary):
-    for policy in (smart(vocabulary), smart(vocabulary, public_code_quirks=True)):
+    for policy in (smart(vocabulary), smart(vocabulary, catk_compat=True)):
         tokens = policy._tokenize(collate(SCENES))
         follows = tokens.valid[..., 1:] & tokens.valid[..., :-1]
         assert torch.equal(tokens.next_token_id[..., :-1][follows], tokens.token_id[..., 1:][follows])
 
 
-# ---- closest among top-K ---------------------------------------------------------------------------------------------------
+# ---- closest among top-K -------------------------------------------------------------------------
 
 
 def test_with_all_tokens_as_candidates_rollouts_follow_the_record(vocabulary):
     policy, batch = smart(vocabulary), collate(SCENES)
-    pursuing = roll_out_closest(policy, batch, num_candidates=vocabulary.num_tokens)
-    assert torch.equal(pursuing.rollouts.decision[pursuing.target_mask], pursuing.target[pursuing.target_mask])
-    off = pursuing.rollouts.position[:, 0] - batch.position[:, :, CURRENT_STEP + 1 :]
+    targeted = roll_out_closest(policy, batch, num_candidates=vocabulary.num_tokens)
+    assert torch.equal(targeted.rollouts.decision[targeted.target_mask], targeted.target[targeted.target_mask])
+    off = targeted.rollouts.position[:, 0] - batch.position[:, :, CURRENT_STEP + 1 :]
     seen = batch.valid[:, :, CURRENT_STEP + 1 :] & batch.valid.all(-1, keepdim=True)
     assert off.norm(dim=-1)[seen].mean() < 0.3
 
@@ -205,10 +207,10 @@ def test_with_one_candidate_the_most_likely_token_is_taken(vocabulary):
 
 def test_the_loss_is_zero_where_nothing_is_trained(vocabulary):
     policy, batch = smart(vocabulary), collate(SCENES)
-    pursuing = roll_out_closest(policy, batch, num_candidates=4)
-    nobody = catk_loss(policy, batch, pursuing, torch.zeros_like(batch.agent_mask))
-    everybody = catk_loss(policy, batch, pursuing, batch.agent_mask)
-    assert nobody == 0
-    assert everybody > 0
-    everybody.backward()
+    targeted = roll_out_closest(policy, batch, num_candidates=4)
+    none = catk_loss(policy, batch, targeted, torch.zeros_like(batch.agent_mask))
+    all_agents = catk_loss(policy, batch, targeted, batch.agent_mask)
+    assert none == 0
+    assert all_agents > 0
+    all_agents.backward()
     assert all(p.grad is None or p.grad.isfinite().all() for p in policy.parameters())

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from rlftsim.scenario.synthetic.bodies import (
+    BumperPath,
     LabelNoise,
-    LanePath,
     add_label_noise,
     build_pedestrian,
     build_vehicle,
@@ -19,17 +19,17 @@ from rlftsim.scenario.types import ObjectType
 CAR = (4.6, 2.0, 1.6)
 
 
-def straight_path(num_steps: int, speed_mps: float) -> LanePath:
+def straight_path(num_steps: int, speed_mps: float) -> BumperPath:
     """Along +x at constant speed."""
     x = np.arange(num_steps) * 0.1 * speed_mps
-    centre = np.stack([x, np.zeros(num_steps)], axis=1)
-    return LanePath(0, centre, np.tile([1.0, 0.0], (num_steps, 1)), np.full(num_steps, speed_mps))
+    center = np.stack([x, np.zeros(num_steps)], axis=1)
+    return BumperPath(0, center, np.tile([1.0, 0.0], (num_steps, 1)), np.full(num_steps, speed_mps))
 
 
 def test_body_on_a_straight_lane_is_half_a_length_behind_its_bumper():
     body = build_vehicle(straight_path(50, 10.0), ObjectType.VEHICLE, CAR)
     np.testing.assert_allclose(body.heading, 0.0, atol=1e-9)
-    # In the middle, where smoothing over time does not reach the ends: bumper at 25 m, centre 2.3 m behind it.
+    # In the middle, where smoothing over time does not reach the ends: bumper at 25 m, center 2.3 m behind it.
     np.testing.assert_allclose(body.position[25], [25.0 - 2.3, 0.0], atol=1e-6)
     np.testing.assert_allclose(body.velocity[25], [10.0, 0.0], atol=1e-6)
 

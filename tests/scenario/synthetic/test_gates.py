@@ -1,11 +1,13 @@
-"""Gates: what a window is refused for. Boxes and paths drawn by hand."""
+"""Gates: reasons to refuse a window. Boxes and paths drawn by hand."""
 
 import numpy as np
 import pytest
+import torch
 
+from rlftsim.geometry import box_corners
 from rlftsim.scenario.synthetic.gates import (
-    box_corners,
     boxes_overlap,
+    clockwise_corners,
     compute_off_road_m,
     compute_overlap_s,
     moves_plausibly,
@@ -19,9 +21,13 @@ def along_x(speeds_mps: np.ndarray) -> np.ndarray:
     return np.stack([x, np.zeros_like(x)], axis=1)
 
 
-def test_corners_go_counter_clockwise_from_the_front_left():
-    corners = box_corners(np.zeros((1, 2)), np.array([np.pi / 2]), CAR)[0]
-    np.testing.assert_allclose(corners, [[-1, 2], [-1, -2], [1, -2], [1, 2]], atol=1e-12)
+def test_corners_go_clockwise_from_the_front_left_as_those_of_tensors():
+    corners = clockwise_corners(np.zeros((1, 2)), np.array([np.pi / 2]), CAR)[0]
+    np.testing.assert_allclose(corners, [[-1, 2], [1, 2], [1, -2], [-1, -2]], atol=1e-12)
+    position, heading = np.array([[3.0, -2.0]]), np.array([0.7])
+    length, width = (torch.tensor([side], dtype=torch.float64) for side in CAR[:2])
+    tensors = box_corners(torch.from_numpy(position), torch.from_numpy(heading), length, width)
+    np.testing.assert_allclose(clockwise_corners(position, heading, CAR), tensors.numpy(), atol=1e-12)
 
 
 @pytest.mark.parametrize(

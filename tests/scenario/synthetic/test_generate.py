@@ -11,19 +11,19 @@ from rlftsim.scenario.synthetic.generate import SyntheticRequest, generate, plan
 needs_sumo = pytest.mark.skipif(not sumo.is_available(), reason="the extra `synthetic` is not installed")
 
 
-def test_networks_of_all_splits_differ_and_give_what_was_asked():
+def test_networks_of_all_splits_differ_and_give_the_number_wanted():
     tasks = plan_networks(SyntheticRequest(num_scenarios=200, seed=5))
     assert len({task.seed for task in tasks}) == len(tasks) == 20
     assert sum(task.num_scenarios for task in tasks if task.split == "training") == 160
     assert sum(task.num_scenarios for task in tasks if task.split == "validation") == 40
 
 
-def test_shares_that_do_not_sum_to_one_are_refused():
+def test_fractions_that_do_not_sum_to_one_are_refused():
     with pytest.raises(ConfigError, match="sum to 1"):
         SyntheticRequest(num_scenarios=10, seed=0, splits={"training": 0.5})
 
 
-def test_missing_sumo_is_said_in_one_sentence(monkeypatch, tmp_path):
+def test_missing_sumo_is_named_in_one_sentence(monkeypatch, tmp_path):
     monkeypatch.setattr(sumo.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(ConfigError, match=r'pip install "rlftsim\[synthetic\]"'):
         generate(tmp_path / "new", num_scenarios=1, seed=0)
@@ -61,17 +61,21 @@ def test_an_interrupted_generation_goes_on(tmp_path, monkeypatch):
     arguments = {"num_scenarios": 4, "seed": 3, "splits": {"training": 1.0}, "scenarios_per_network": 2}
     write, calls = module._write_shard, []
 
-    def write_once(task, folder):
+    def write_once(task, *worker, folder):
         calls.append(task.index)
         if len(calls) == 2:
             raise KeyboardInterrupt
-        return write(task, folder)
+        write(task, *worker, folder=folder)
+
+    def write_again(task, *worker, folder):
+        calls.append(task.index)
+        write(task, *worker, folder=folder)
 
     monkeypatch.setattr(module, "_write_shard", write_once)
     with pytest.raises(KeyboardInterrupt):
         generate(tmp_path / "data", show_progress=False, **arguments)
     with pytest.raises(DataError, match="not finished"):
         ScenarioDataset(tmp_path / "data")
-    monkeypatch.setattr(module, "_write_shard", lambda task, folder: (calls.append(task.index), write(task, folder))[1])
+    monkeypatch.setattr(module, "_write_shard", write_again)
     assert generate(tmp_path / "data", show_progress=False, **arguments).num_scenarios == 4
     assert calls == [0, 1, 1]

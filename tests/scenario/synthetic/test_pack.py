@@ -9,7 +9,7 @@ import pytest
 from rlftsim.scenario.dataset import INDEX, MANIFEST, ScenarioDataset
 from rlftsim.scenario.shards import hash_file
 from rlftsim.scenario.synthetic import pack_path
-from rlftsim.scenario.synthetic.gates import box_corners
+from rlftsim.scenario.synthetic.gates import clockwise_corners
 from rlftsim.scenario.types import (
     CURRENT_STEP,
     LANE_TYPES,
@@ -54,7 +54,7 @@ def test_checksums_hold_and_the_pack_is_small():
 def test_manifest_tells_how_the_pack_was_made(pack):
     provenance = pack.manifest.provenance
     assert pack.manifest.counts == {"training": 160, "validation": 40}
-    assert provenance["licence"] == "CC0-1.0"
+    assert provenance["license"] == "CC0-1.0"
     assert provenance["arguments"]["num_scenarios"] == 200
     assert {"seed", "splits"} <= set(provenance["arguments"])
     assert provenance["sumo_version"].count(".") == 2
@@ -113,7 +113,7 @@ def test_evaluated_vehicles_are_on_the_road_side_of_the_edges(pack):
             if tracks.object_type[k] == ObjectType.VEHICLE:
                 steps = np.flatnonzero(tracks.valid[k])[::30]
                 position = tracks.position[k, steps, :2].astype(float)
-                corners = box_corners(position, tracks.heading[k, steps], tracks.size[k, CURRENT_STEP])
+                corners = clockwise_corners(position, tracks.heading[k, steps], tracks.size[k, CURRENT_STEP])
                 distance = signed_distance_to_edges(corners.reshape(-1, 2), scenario)
                 off_road += (distance.reshape(-1, 4).max(axis=1) > 0).tolist()
     assert np.mean(off_road) < 0.01

@@ -12,7 +12,7 @@ from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, STEP_S, Scenario
 
 
 def filled_log(scenario: Scenario) -> SimulatedStates:
-    """The recorded future as a rollout; a step at which an agent is hidden repeats the last one seen."""
+    """The logged future as a rollout; a step at which an agent is hidden repeats the last one seen."""
     agents = scenario.simulated_indices
     valid = scenario.tracks.valid[agents, CURRENT_STEP:]
     latest = np.maximum.accumulate(np.where(valid, np.arange(valid.shape[1]), 0), axis=1)[:, 1:] + CURRENT_STEP

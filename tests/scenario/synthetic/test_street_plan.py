@@ -20,7 +20,7 @@ def test_streets_join_their_nodes(kind, seed):
     plan = draw(kind, seed)
     places = {node.node_id: node.position for node in plan.nodes}
     for street in plan.streets:
-        # A street's shape is its left border: beside a median, or on a ramp, that is some metres off the node.
+        # A street's shape is its left border: beside a median, or on a ramp, that is some meters off the node.
         for end, node in ((0, street.from_node), (-1, street.to_node)):
             assert np.linalg.norm(street.points[end] - places[node]) < 25.0
         assert np.abs(street.points).max() < MAX_RADIUS_M + 25.0
@@ -39,7 +39,7 @@ def test_the_same_seed_draws_the_same_plan():
         np.testing.assert_array_equal(a.points, b.points)
 
 
-def test_gutters_vary_between_streets_within_two_metres():
+def test_gutters_vary_between_streets_within_two_meters():
     plan = draw("city", 2)
     gutters = {lane.width_m for street in plan.streets for lane in street.lanes if lane.kind == "gutter"}
     assert len(gutters) > 5

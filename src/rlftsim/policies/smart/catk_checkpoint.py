@@ -14,8 +14,8 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor
 
+from rlftsim.atomic_io import save_tensors
 from rlftsim.errors import CheckpointError, ConfigError
-from rlftsim.files import save_tensors
 from rlftsim.policies.smart.catk_keys import PREFIX, aliases, catk_name
 from rlftsim.policies.smart.catk_vocabulary import (
     PUBLISHED_AGENT_FILE,
@@ -50,13 +50,13 @@ _HEAD_BIAS = PREFIX + "agent_encoder.token_predict_head.mlp.3.bias"
 
 @dataclass(frozen=True, eq=False)
 class CatkImport:
-    """An imported model and what is known of it."""
+    """An imported model, its size and its origin."""
 
     policy: SmartPolicy
     size: str
     """nano, mini, tiny or custom."""
     notes: tuple[str, ...]
-    """What a user should know: where the sizes come from, which vocabulary it is."""
+    """Lines for the user: the source of the sizes, and the vocabulary."""
 
 
 def import_catk(checkpoint: Path, vocabulary: Sequence[Path]) -> CatkImport:
@@ -67,11 +67,11 @@ def import_catk(checkpoint: Path, vocabulary: Sequence[Path]) -> CatkImport:
         vocabulary: the token tables it was trained with, see `read_catk_vocabulary`.
 
     Returns:
-        The model in evaluation mode, with `public_code_quirks` on, so that it computes what the public code computes.
+        The model in evaluation mode, with `catk_compat` on, so that it computes what the public code computes.
 
     Raises:
-        CheckpointError: a file is damaged or holds foreign objects; keys are missing, unknown, of the wrong shape or unequal where
-            they must be equal (all of them are listed); the vocabulary does not belong to the weights.
+        CheckpointError: a file is damaged or holds foreign objects; keys are missing, unknown, of the wrong shape
+            or unequal where they must be equal (all of them are listed); the vocabulary does not belong to the weights.
     """
     weights, settings = _read(checkpoint)
     config, source = _config_of(weights, settings, checkpoint)
@@ -86,7 +86,8 @@ def import_catk(checkpoint: Path, vocabulary: Sequence[Path]) -> CatkImport:
     note = _vocabulary_note(settings, is_published(tables), checkpoint)
     policy = SmartPolicy(config, tables)
     policy.network.load_state_dict(own)
-    return CatkImport(policy.eval(), _size_name(config), (source, note))
+    sizes = (name for name, preset in PRESETS.items() if replace(preset(), catk_compat=True) == config)
+    return CatkImport(policy.eval(), next(sizes, "custom"), (source, note))
 
 
 def export_catk(policy: SmartPolicy) -> dict[str, Tensor]:
@@ -95,9 +96,9 @@ def export_catk(policy: SmartPolicy) -> dict[str, Tensor]:
     Raises:
         CheckpointError: the model has a head for each class, the public code has one for all.
     """
-    if policy.sees_goals:
+    if policy.is_goal_conditioned:
         raise CheckpointError(
-            "a model that sees goals has no form in the public CAT-K code: export the one it came from."
+            "a goal-conditioned model has no form in the public CAT-K code: export the one it came from."
         )
     if policy.config.head_per_class:
         raise CheckpointError(
@@ -109,7 +110,12 @@ def export_catk(policy: SmartPolicy) -> dict[str, Tensor]:
 
 
 def write_catk(policy: SmartPolicy, path: Path) -> None:
-    """Write `export_catk` as a safetensors file, by way of a temporary name."""
+    """Write `export_catk` as a safetensors file, whole or not at all.
+
+    Args:
+        policy: goal-free, with one head for all classes.
+        path: of the file.
+    """
     save_tensors(path, export_catk(policy))
 
 
@@ -131,32 +137,32 @@ def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
 
 def _config_of(weights: dict[str, Tensor], settings: dict[str, Any], path: Path) -> tuple[SmartConfig, str]:
-    """The architecture: from the file's settings, else recognised by shapes."""
+    """The architecture, and a note on its source: the file's settings, else the shapes of the weights."""
+    # 1. a Lightning checkpoint has the settings. Radii and probabilities may be integers there, here they are floats
     decoder = settings.get("decoder") or {}
     values = {ours: decoder[theirs] for theirs, ours in _FIELD_OF_SETTING.items() if theirs in decoder}
     if len(values) == len(_FIELD_OF_SETTING) and isinstance(decoder.get("time_span"), int):
         try:
-            config = SmartConfig(**_typed(values), history_tokens=decoder["time_span"] // STEPS_PER_TOKEN)
+            kinds = {name: type(value) for name, value in vars(SmartConfig()).items()}
+            typed = {name: kinds[name](value) for name, value in values.items()}
+            config = SmartConfig(**typed, history_tokens=decoder["time_span"] // STEPS_PER_TOKEN)
         except (TypeError, ValueError, ConfigError) as error:
             raise CheckpointError(f"{path}: settings of the decoder make no sense: {error}") from None
-        return replace(config, public_code_quirks=True), "sizes and radii: from the checkpoint's settings"
+        return replace(config, catk_compat=True), "sizes and radii: from the checkpoint's settings"
+    # 2. a safetensors file has none: one of the published sizes, or nothing
     for name, preset in PRESETS.items():
-        if _fingerprint(weights) == _expected_fingerprint(preset()):
-            return replace(preset(), public_code_quirks=True), f"sizes: recognised as {name}; radii: those of {name}"
+        size = preset()
+        shapes = (size.dim, size.num_heads * size.head_dim, size.num_map_layers, size.num_decoder_layers)
+        if _shapes_of(weights) == shapes:
+            return replace(size, catk_compat=True), f"sizes: recognized as {name}; radii: those of {name}"
     raise CheckpointError(
         f"{path}: not a SMART model of the public CAT-K code in one of the sizes {', '.join(PRESETS)} "
         "(other sizes need the Lightning checkpoint, which says which)."
     )
 
 
-def _typed(values: dict[str, Any]) -> dict[str, Any]:
-    """Radii and shares as floats, everything else as it is."""
-    kinds = {name: type(value) for name, value in SmartConfig().__dict__.items()}
-    return {name: kinds[name](value) for name, value in values.items()}
-
-
-def _fingerprint(weights: dict[str, Tensor]) -> tuple[int, int, int, int]:
-    """Width, inner width of the attention, and numbers of layers in the map encoder and the decoder; zeros where unknown."""
+def _shapes_of(weights: dict[str, Tensor]) -> tuple[int, int, int, int]:
+    """Width, inner width of the attention, numbers of layers in map encoder and decoder; zeros where unknown."""
     probe = weights.get(_SHAPE_PROBE)
     inner, dim = probe.shape if probe is not None and probe.dim() == 2 else (0, 0)
     layers = (
@@ -166,17 +172,8 @@ def _fingerprint(weights: dict[str, Tensor]) -> tuple[int, int, int, int]:
     return dim, inner, *(len(found) for found in layers)  # type: ignore[return-value]
 
 
-def _expected_fingerprint(config: SmartConfig) -> tuple[int, int, int, int]:
-    return config.dim, config.num_heads * config.head_dim, config.num_map_layers, config.num_decoder_layers
-
-
-def _size_name(config: SmartConfig) -> str:
-    named = (name for name, preset in PRESETS.items() if replace(preset(), public_code_quirks=True) == config)
-    return next(named, "custom")
-
-
 def _vocabulary_note(settings: dict[str, Any], published: bool, path: Path) -> str:
-    """Which vocabulary it is.
+    """Note on the vocabulary: published or not, and the one that the checkpoint names.
 
     Raises:
         CheckpointError: the checkpoint names the published table, and this is another one.
@@ -196,13 +193,16 @@ def _translate(weights: dict[str, Tensor], network: SmartNetwork, source: str) -
     """Weights under our names.
 
     Raises:
-        CheckpointError: lists everything that is missing, unknown, of the wrong shape or kind, or unequal to its second name.
+        CheckpointError: lists everything that is missing, unknown, of the wrong shape or kind, or unequal to its
+            second name.
     """
-    own = {key: value for key, value in network.state_dict().items()}
+    # shapes of all names that must be there, second names of shared norms included
+    own = network.state_dict()
     names = {catk_name(key): key for key in own}
     seconds = aliases(names)
     shapes = {name: own[key].shape for name, key in names.items()}
     shapes |= {second: shapes[first] for second, first in seconds.items()}
+    # collect all problems before refusing: a user mends them at once
     problems = [f"missing {name}" for name in sorted(shapes.keys() - weights.keys())]
     problems += [f"unknown {name}" for name in sorted(weights.keys() - shapes.keys())]
     for name in sorted(shapes.keys() & weights.keys()):

@@ -1,4 +1,4 @@
-"""Names of weights in the public CAT-K code and here."""
+"""Names of weights: those of the public CAT-K code for ours."""
 
 from collections.abc import Iterable
 
@@ -28,7 +28,7 @@ _PARTS = (
     ("decoder.agent_layers", "agent_encoder.a2a_attn_layers", _ATTENTION),
     ("decoder.head", "agent_encoder.token_predict_head", _MLP),
 )
-"""Our part of the network, theirs, and what kind of part it is."""
+"""Prefix of a part of the network here, its prefix there, and the kind of the part."""
 
 _IN_FOURIER = {"frequencies": "freqs", "inputs": "mlps", "out": "to_out"}
 _IN_ATTENTION = {
@@ -53,6 +53,7 @@ _IN_ATTENTION = {
 
 def catk_name(key: str) -> str:
     """The public code's name of one of our weights."""
+    # the longest prefix, as "decoder.tokens.1" is also one of "decoder.tokens.10"
     own, theirs, kind = max((p for p in _PARTS if key.startswith(p[0] + ".")), key=lambda p: len(p[0]))
     rest = key[len(own) + 1 :]
     if kind == _MLP:
@@ -75,5 +76,5 @@ def alias_of(name: str) -> str | None:
 
 
 def aliases(names: Iterable[str]) -> dict[str, str]:
-    """Second name → first name."""
+    """Second names of weights that are stored twice, each with its first name."""
     return {second: name for name in names if (second := alias_of(name))}

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from rlftsim.atomic_io import write_whole
 from rlftsim.errors import CheckpointError, DataError
-from rlftsim.files import write_whole
 from rlftsim.tokens.vocabulary import STEPS_PER_TOKEN, Vocabulary
 
 MOTION_TABLES = ("veh", "ped", "cyc")
@@ -31,8 +31,8 @@ def read_catk_vocabulary(paths: Sequence[Path]) -> Vocabulary:
     """Token tables from npz files, or from one vocabulary file of this package.
 
     Args:
-        paths: npz files that hold, between them, `veh`, `ped`, `cyc` [V, 6, 4, 2] and `traj_src` [P, 11, 2], metres; or a
-            single `.safetensors` written by `Vocabulary.save`.
+        paths: npz files that hold, between them, `veh`, `ped`, `cyc` [V, 6, 4, 2] and `traj_src` [P, 11, 2],
+            meters; or a single `.safetensors` written by `Vocabulary.save`.
 
     Raises:
         CheckpointError: a table is missing or has the wrong size, or a file cannot be read.
@@ -48,6 +48,7 @@ def read_catk_vocabulary(paths: Sequence[Path]) -> Vocabulary:
     if missing:
         raise CheckpointError(f"{where}: no table {', '.join(missing)}: hand over veh, ped, cyc and traj_src.")
     _check_sizes(tables, where)
+    # classes in this package's order: vehicles, pedestrians, cyclists [3, V, 6, 4, 2]
     corners = torch.from_numpy(np.stack([tables[name] for name in MOTION_TABLES]).astype(np.float32))
     prototypes = torch.from_numpy(tables[MAP_TABLE].astype(np.float32))
     mask = torch.ones(corners.shape[:2], dtype=torch.bool)
@@ -55,7 +56,7 @@ def read_catk_vocabulary(paths: Sequence[Path]) -> Vocabulary:
 
 
 def is_published(vocabulary: Vocabulary) -> bool:
-    """Whether the motion tokens are those that CAT-K published."""
+    """True if the motion tokens are those that CAT-K published, by sha256."""
     tables = dict(zip(MOTION_TABLES, vocabulary.corners.cpu().numpy()))
     return all(
         hashlib.sha256(np.ascontiguousarray(t, np.float32).tobytes()).hexdigest() == _PUBLISHED[name]
@@ -64,7 +65,15 @@ def is_published(vocabulary: Vocabulary) -> bool:
 
 
 def write_catk_vocabulary(vocabulary: Vocabulary, path: Path) -> None:
-    """Write the tables as npz, in the form `read_catk_vocabulary` takes. Raises as `write_whole`."""
+    """Write the tables as npz, in the form `read_catk_vocabulary` takes.
+
+    Args:
+        vocabulary: any whose classes have equally many tokens.
+        path: of the file, written whole or not at all.
+
+    Raises:
+        DataError: the file cannot be written.
+    """
     motions = dict(zip(MOTION_TABLES, vocabulary.corners.cpu().numpy()))
     tables = {**motions, MAP_TABLE: vocabulary.map_prototypes.cpu().numpy()}
 
@@ -76,6 +85,7 @@ def write_catk_vocabulary(vocabulary: Vocabulary, path: Path) -> None:
 
 
 def _read_npz(path: Path) -> dict[str, np.ndarray]:
+    # a pickle could run code, so object arrays are refused
     try:
         with np.load(path, allow_pickle=False) as file:
             return {name: file[name] for name in (*MOTION_TABLES, MAP_TABLE) if name in file.files}

@@ -1,17 +1,21 @@
 """Sizes and radii of a SMART model."""
 
-from dataclasses import dataclass
-from typing import Literal, get_args
+from dataclasses import dataclass, replace
+from typing import ClassVar, Literal, get_args
 
 from rlftsim.errors import ConfigError, given, require_finite, require_positive
 
-GoalSight = Literal["concat", "indication"]
-"""How agents see their goals, see `goal_sight`."""
+GoalEncoding = Literal["concat", "indication"]
+"""Encoding of an agent's goal, see `goal_conditioning`."""
 
 
 @dataclass(frozen=True)
 class SmartConfig:
     """SMART's architecture. The defaults are SMART-tiny (7 M parameters)."""
+
+    fingerprint_name: ClassVar[str] = "rlftsim.policies.smart.config.SmartConfig"
+    first_names: ClassVar[dict[str, str]] = {"goal_logit_bias": "goal_aim", "catk_compat": "public_code_quirks"}
+    """Fields that were renamed after models had been stored, and their names in fingerprints."""
 
     dim: int = 128
     """Width of all features (D)."""
@@ -20,40 +24,46 @@ class SmartConfig:
     num_map_layers: int = 3
     num_decoder_layers: int = 6
     num_frequencies: int = 64
-    """Learned frequencies an input of the Fourier embeddings."""
+    """Learned frequencies per input of the Fourier embeddings."""
     map_radius_m: float = 10.0
-    """Between map tokens."""
+    """Radius within which a map token attends to other map tokens."""
     agent_map_radius_m: float = 30.0
+    """Radius within which an agent attends to map tokens."""
     agent_radius_m: float = 60.0
+    """Radius within which an agent attends to other agents."""
     history_tokens: int = 6
-    """Token steps (0.5 s) an agent looks back."""
+    """Earlier token steps (0.5 s) of its own that an agent attends to."""
     max_map_neighbors: int | None = 100
-    """Nearest map tokens a map token attends to; None = all within the radius."""
+    """Most map tokens that a map token attends to, the nearest ones; None = all within the radius."""
     max_agent_map_neighbors: int | None = None
-    """Nearest map tokens an agent attends to; None = all within the radius."""
+    """Most map tokens that an agent attends to, the nearest ones; None = all within the radius."""
     max_agent_neighbors: int | None = None
-    """Nearest agents an agent attends to; None = all within the radius."""
+    """Most agents that an agent attends to, the nearest ones; None = all within the radius."""
     dropout: float = 0.1
+    """Dropout probability of attention weights and feed-forward layers, in training mode."""
     history_drop: float = 0.1
-    """In training mode only: share of (agent, step) pairs that are hidden from the attention over time. In closed loop (CAT-K) each step
-    forgets earlier ones anew."""
+    """In training mode only: probability that an (agent, step) pair is hidden from the attention over time. In
+    closed loop (CAT-K) each step draws anew which earlier ones are hidden."""
     head_per_class: bool = False
-    """Each class has a head of its own, as large as its vocabulary. False = one head as wide as the largest, an index means another
-    motion in each class."""
-    goal: GoalSight | None = None
-    """How agents see their goals; None = they do not, and goals have no effect."""
-    goal_aim: bool = False
-    """Whoever sees a goal also weighs tokens by where they lead, see `goal_sight.GoalAim`."""
-    public_code_quirks: bool = False
-    """Repeat what the public code does where this package differs on purpose: an agent's first motion vector is its position,
-    the sign of what lies exactly behind is left to rounding, and tokens are matched and placed in the order of operations of
-    `tokens.public_order`. Models trained there need it."""
+    """Each class has a head of its own, as large as its vocabulary. False = one head as wide as the largest
+    vocabulary; an index then means a different motion in each class."""
+    goal: GoalEncoding | None = None
+    """Encoding of goals; None = goal-free, goals have no effect."""
+    goal_logit_bias: bool = False
+    """Add a goal-progress bias to the token logits of agents that have goals, see `goal_conditioning.GoalLogitBias`."""
+    catk_compat: bool = False
+    """Repeat what the public CAT-K code does where this package differs on purpose: an agent's first motion vector
+    is its position, the sign of what lies exactly behind is left to rounding, and tokens are matched and placed in
+    the order of operations of `tokens.catk_compat`. Models trained there need it."""
 
     @property
     def seam_rad(self) -> float:
-        """Angles this near to -pi count as +pi: what lies exactly behind is common (straight lanes, opposite directions) and must
-        not be one or the other by the last bit."""
-        return 0.0 if self.public_code_quirks else 1e-3
+        """Angles this near to -pi count as +pi.
+
+        What lies exactly behind is common (straight lanes, opposite directions) and must not be one or the other by
+        the last bit.
+        """
+        return 0.0 if self.catk_compat else 1e-3
 
     def __post_init__(self) -> None:
         sizes = (
@@ -69,28 +79,52 @@ class SmartConfig:
         caps = ("max_map_neighbors", "max_agent_map_neighbors", "max_agent_neighbors")
         require_positive(self, (*sizes, *radii, *given(self, caps)))
         require_finite(self, radii)
-        if self.goal is not None and self.goal not in get_args(GoalSight):
-            raise ConfigError(f"goal={self.goal!r} is no way to see goals: known are {', '.join(get_args(GoalSight))}.")
-        if self.goal_aim and self.goal is None:
-            raise ConfigError("goal_aim=True, but nobody sees goals: set goal to concat or indication.")
+        if self.goal is not None and self.goal not in get_args(GoalEncoding):
+            raise ConfigError(f"goal={self.goal!r} is no goal encoding: known are {', '.join(get_args(GoalEncoding))}.")
+        if self.goal_logit_bias and self.goal is None:
+            raise ConfigError("goal_logit_bias=True, but the model is goal-free: set goal to concat or indication.")
         if not 0 <= self.dropout < 1 or not 0 <= self.history_drop < 1:
             raise ConfigError(
-                f"dropout and history_drop are shares in [0, 1), got {self.dropout} and {self.history_drop}."
+                f"dropout and history_drop are probabilities in [0, 1), got {self.dropout} and {self.history_drop}."
             )
+
+    def with_goal_conditioning(self, goal: GoalEncoding, logit_bias: bool | None) -> "SmartConfig":
+        """The same model, goal-conditioned; itself if it is conditioned in this way.
+
+        Args:
+            goal: encoding of goals.
+            logit_bias: add a goal-progress bias to the token logits; None = yes for a goal-free model, else as the
+                model has it.
+
+        Raises:
+            ConfigError: it is conditioned in another way.
+        """
+        if self.goal is None:
+            return replace(self, goal=goal, goal_logit_bias=logit_bias is not False)
+        if self.goal != goal:
+            raise ConfigError(
+                f"this model is goal-conditioned by {self.goal}, not by {goal}: start from a goal-free model."
+            )
+        if logit_bias not in (None, self.goal_logit_bias):
+            has = "with" if self.goal_logit_bias else "without"
+            raise ConfigError(
+                f"this model is goal-conditioned {has} a goal logit bias: to change that start from a goal-free model."
+            )
+        return self
 
 
 def smart_tiny() -> SmartConfig:
-    """7 001 024 parameters."""
+    """SMART-tiny, 7 001 024 parameters."""
     return SmartConfig()
 
 
 def smart_mini() -> SmartConfig:
-    """3 433 984 parameters."""
+    """SMART-mini, 3 433 984 parameters."""
     return SmartConfig(num_heads=4, head_dim=8, num_map_layers=2, num_decoder_layers=4)
 
 
 def smart_nano() -> SmartConfig:
-    """1 161 344 parameters."""
+    """SMART-nano, 1 161 344 parameters."""
     return SmartConfig(
         dim=64, num_heads=4, head_dim=8, num_map_layers=2, num_decoder_layers=4,
         agent_map_radius_m=20.0, agent_radius_m=20.0, history_tokens=4,
@@ -98,7 +132,7 @@ def smart_nano() -> SmartConfig:
 
 
 def smart_demo() -> SmartConfig:
-    """Small enough to train on two CPU cores in minutes."""
+    """A model small enough to train on two CPU cores in minutes."""
     return SmartConfig(
         dim=48, num_heads=4, head_dim=12, num_map_layers=1, num_decoder_layers=2, num_frequencies=8,
         map_radius_m=11.0, agent_map_radius_m=30.0, agent_radius_m=30.0, history_tokens=4,

@@ -1,17 +1,17 @@
-"""A head for each class of road users, for vocabularies whose classes have sizes of their own."""
+"""A prediction head per agent class, for vocabularies whose classes have different sizes."""
 
 import torch
 from jaxtyping import Float, Int64
 from torch import Tensor, nn
 
-from rlftsim.policies.layers import MlpLayer
+from rlftsim.policies.smart.embeddings import MlpLayer
 
 NEVER = -1e9
 """Logit of a token that does not exist."""
 
 
 class ClassHeads(nn.ModuleList):
-    """Features of R agents → logits of the tokens of their own class, padded to V."""
+    """Features of R agents -> logits of the tokens of their own class, padded to V tokens."""
 
     def __init__(self, dim: int, class_sizes: tuple[int, ...], num_tokens: int):
         super().__init__(MlpLayer(dim, dim, size) for size in class_sizes)
@@ -19,9 +19,15 @@ class ClassHeads(nn.ModuleList):
         self.num_tokens = num_tokens
 
     def forward(self, features: Float[Tensor, "R D"], class_id: Int64[Tensor, "R"]) -> Float[Tensor, "R V"]:
-        """float32 logits; tokens that a class lacks hold `NEVER`."""
+        """float32 logits; tokens that a class lacks get `NEVER`.
+
+        Args:
+            features: of the agents.
+            class_id: of the agents.
+        """
         logits = torch.full((len(features), self.num_tokens), NEVER, device=features.device)
         for index, (head, size) in enumerate(zip(self, self.class_sizes)):
+            # each head sees the rows of its class only
             rows = (class_id == index).nonzero()[:, 0]
             logits[rows, :size] = head(features[rows]).float()
         return logits

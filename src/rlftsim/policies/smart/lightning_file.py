@@ -1,7 +1,7 @@
 """Weights and settings of a Lightning checkpoint, without running anything that the file holds.
 
-Such files are pickles. They are read through torch's restricted unpickler; the few foreign classes that hold settings (OmegaConf)
-are replaced by name with an inert stand-in, everything else is refused.
+Such files are pickles. They are read through torch's restricted unpickler; the few foreign classes that hold
+settings (OmegaConf) are replaced by name with an inert stand-in, everything else is refused.
 """
 
 import collections
@@ -19,7 +19,7 @@ from rlftsim.errors import CheckpointError
 
 
 class _Inert:
-    """Takes the state of a foreign object and does nothing with it."""
+    """Stand-in for foreign classes: holds the state of an object and runs nothing."""
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
@@ -43,7 +43,7 @@ _HARMLESS = {
 
 @dataclass(frozen=True, eq=False)
 class LightningFile:
-    """What is used of a Lightning checkpoint."""
+    """Weights and settings of a Lightning checkpoint."""
 
     weights: dict[str, Tensor]
     settings: dict[str, Any]
@@ -54,7 +54,8 @@ def read_lightning(path: Path) -> LightningFile:
     """Read weights and settings of a Lightning checkpoint.
 
     Raises:
-        CheckpointError: no such file, not a checkpoint, no weights in it, or objects inside that would have to run code to be read.
+        CheckpointError: no such file, not a checkpoint, no weights in it, or objects inside that would have to run
+            code to be read.
     """
     content = _unpickle(path)
     weights = content.get("state_dict") if isinstance(content, dict) else None
@@ -70,11 +71,13 @@ def _unpickle(path: Path) -> Any:
     if not zipfile.is_zipfile(path):
         raise CheckpointError(f"{path}: neither safetensors nor a Lightning checkpoint (a zip file by torch.save).")
     try:
+        # list the classes that the pickle names before any is made
         named = torch.serialization.get_unsafe_globals_in_checkpoint(path)
         unknown = sorted(set(named) - set(_FOREIGN) - set(_HARMLESS))
         if unknown:
             raise CheckpointError(f"{path}: refused, it holds {', '.join(unknown)}: save it again with weights only.")
         known = [(_Inert, name) for name in _FOREIGN] + [(value, name) for name, value in _HARMLESS.items()]
+        # then let torch's restricted unpickler make stand-ins for the known ones
         with torch.serialization.safe_globals(list(known)):  # type: ignore[arg-type]
             return torch.load(path, map_location="cpu", weights_only=True)
     except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, KeyError, AttributeError, TypeError) as error:
@@ -83,8 +86,9 @@ def _unpickle(path: Path) -> Any:
 
 
 def _plain(value: Any) -> Any:
-    """Settings without their containers."""
+    """Settings as plain dictionaries, lists and values; anything else becomes None."""
     if isinstance(value, _Inert):
+        # OmegaConf keeps containers in `_content` and values in `_val`
         state = value.__dict__
         return _plain(state["_content"] if "_content" in state else state.get("_val"))
     if isinstance(value, dict):

@@ -1,6 +1,8 @@
-"""Who looks at whom: padded neighbour lists and the geometry of each relation.
+"""Neighbor search: padded lists of sources within a radius, and the geometry of each relation.
 
-R rows that look, K neighbours a row. A list is padded with index 0 where its mask is False.
+R rows that attend, K neighbors of a row, P places with C candidates each. A list is padded with index 0 where its
+mask is False. A place is a scenario, or a scenario, rollout and step: rows attend to candidates of their own place
+only.
 """
 
 import math
@@ -15,18 +17,19 @@ from torch import Tensor
 
 from rlftsim.geometry import angle_between, heading_vector, wrap_angle
 
-PAIRS_PER_PIECE = {"cpu": 1 << 18}
-"""Distances that are looked at together: on a processor they fit its cache."""
-PAIRS_PER_PIECE_ELSEWHERE = 1 << 26
+PAIRS_PER_BLOCK = {"cpu": 1 << 18}
+"""Distances that are computed together: on a processor they fit its cache."""
+PAIRS_PER_BLOCK_ELSEWHERE = 1 << 26
 MANY_CANDIDATES, ROWS_PER_PATCH = 256, 64
-"""On a processor, rows that choose among so many candidates are sorted by where they are, and so many rows beside each other look only
-at what lies around them."""
+"""On a processor, rows that choose among so many candidates are sorted by where they are, and so many rows beside
+each other look only at what lies around them."""
 MARGIN_M = 0.01
+"""Added to the bounds of a patch, so that rounding excludes no candidate that is within the radius."""
 
 
 @dataclass(frozen=True, eq=False)
 class Neighbors:
-    """For each row the rows of some source it attends to."""
+    """The sources that each row attends to."""
 
     index: Int64[Tensor, "R K"]
     mask: Bool[Tensor, "R K"]
@@ -34,13 +37,13 @@ class Neighbors:
 
 @dataclass(frozen=True, eq=False)
 class Poses:
-    """Where something is and which way it points."""
+    """Positions (meters) and headings (radians)."""
 
     position: Float[Tensor, "*shape 2"]
     heading: Float[Tensor, "*shape"]
 
     def __getitem__(self, index: Any) -> "Poses":
-        """Some of them."""
+        """Poses at an index, as of the tensors."""
         return Poses(self.position[index], self.heading[index])
 
 
@@ -53,28 +56,30 @@ def within(
     radius_m: float,
     limit: int | None,
 ) -> Neighbors:
-    """Candidates nearer than a radius (strictly), the nearest of them where a limit binds, of equally near ones the first.
+    """Candidates nearer than a radius (strictly), or the nearest of them where a limit binds.
 
-    Lists have at least one entry (K >= 1), padding where nobody has a neighbour.
+    Of equally near ones the first counts. Lists have at least one entry (K >= 1), padding where no row has a neighbor.
 
     Args:
         position: of the rows, finite.
-        place: where each row looks: an entry of the candidates' first axis.
-        candidates: positions, infinite where there is nobody. Their flat index p * C + c is what neighbours are named by.
-        own: the candidate of its place that a row is itself, and does not look at.
-        radius_m: of their circle.
-        limit: most neighbours a row has; None = all.
+        place: the place of each row, an entry of the candidates' first axis.
+        candidates: positions, infinite for padding. Neighbors are named by their flat index p * C + c.
+        own: the candidate of its place that is the row itself, and is no neighbor; None = rows are no candidates.
+        radius_m: of the circle around a row.
+        limit: most neighbors of a row; None = all.
     """
     on_processor, (_, num_candidates, _) = position.device.type == "cpu", candidates.shape
-    cut = _patches if on_processor and num_candidates >= MANY_CANDIDATES else _pieces
+    cut = _patches if on_processor and num_candidates >= MANY_CANDIDATES else _blocks
     found = []
     for view in cut(position, place, candidates, radius_m):
-        squared = (view.x - position[view.rows, :1]).square_()
+        # plain differences: torch.cdist goes through a matrix product, which loses digits far from the origin
+        squared = (view.x - position[view.rows, :1]).square_()  # [r, c]
         squared += (view.y - position[view.rows, 1:]).square_()
         if own is not None:
             squared.masked_fill_(view.columns == own[view.rows, None], torch.inf)
         near = _all_near(squared, radius_m) if limit is None else _nearest(squared, radius_m, limit)
         found.append((view.rows, view.columns[near.index] if len(view.columns) else near.index, near.mask))
+    # lists of all views, padded to the longest [R, K]
     width = max([1, *(mask.shape[1] for _, _, mask in found)])
     index, is_near = place.new_zeros(len(place), width), place.new_zeros(len(place), width, dtype=torch.bool)
     for rows, columns, mask in found:
@@ -85,7 +90,7 @@ def within(
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """Rows that look together, and what they look at: positions [r, c], or [1, c] where it is the same for all."""
+    """Rows that are searched together, and their candidates: positions [r, c], or [1, c] if shared by all rows."""
 
     rows: Int64[Tensor, "r"]
     columns: Int64[Tensor, "c"]
@@ -93,13 +98,13 @@ class View:
     y: Float[Tensor, "_ c"]
 
 
-def _pieces(
+def _blocks(
     position: Float[Tensor, "R 2"], place: Int64[Tensor, "R"], candidates: Float[Tensor, "P C 2"], radius_m: float
 ) -> Iterator[View]:
-    """All candidates of each row's place."""
+    """Views of all candidates of each row's place."""
     columns = torch.arange(candidates.shape[1], device=place.device)
     x, y = candidates[..., 0].contiguous(), candidates[..., 1].contiguous()
-    pairs = PAIRS_PER_PIECE.get(place.device.type, PAIRS_PER_PIECE_ELSEWHERE)
+    pairs = PAIRS_PER_BLOCK.get(place.device.type, PAIRS_PER_BLOCK_ELSEWHERE)
     for rows in torch.arange(len(place), device=place.device).split(max(pairs // max(len(columns), 1), 1)):
         yield View(rows, columns, x.index_select(0, place[rows]), y.index_select(0, place[rows]))
 
@@ -107,10 +112,15 @@ def _pieces(
 def _patches(
     position: Float[Tensor, "R 2"], place: Int64[Tensor, "R"], candidates: Float[Tensor, "P C 2"], radius_m: float
 ) -> Iterator[View]:
-    """Of each row's place what lies around some rows beside each other, in squares as wide as the circle."""
+    """Views of rows that lie beside each other in the same place, and the candidates around them.
+
+    A row's circle is much smaller than a map, so most candidates need no distance.
+    """
+    # 1. order rows by place, then by square of a grid as wide as the circle
     squares = (position / (2 * radius_m)).floor()
     order = np.lexsort((squares[:, 0].numpy(), squares[:, 1].numpy(), place.numpy()))
     starts = np.flatnonzero(np.diff(place.numpy()[order], prepend=-1))
+    # 2. some rows in this order at a time, and the candidates in their bounding box plus the radius
     for rows in np.split(order, starts[1:]) if len(order) else ():
         x, y = candidates[place[rows[0]]].unbind(-1)
         for patch in torch.from_numpy(rows).split(ROWS_PER_PATCH):
@@ -122,30 +132,38 @@ def _patches(
 
 
 def _nearest(squared: Float[Tensor, "r C"], radius_m: float, limit: int) -> Neighbors:
-    """Of equally near ones the first. (Which of them `topk` itself takes depends on how many candidates there are, padding included.)"""
+    """The `limit` nearest candidates, of equally near ones the first.
+
+    `topk` of the distances themselves takes any of equally near ones, depending on how many candidates there are,
+    padding included.
+    """
     columns = torch.arange(squared.shape[1], device=squared.device)
-    key = (
-        squared.float().view(torch.int32).long() << 32
-    ) | columns  # floats that are not negative sort as their bits do
+    # distance in the upper 32 bits, column in the lower: floats that are not negative sort as their bits do
+    key = (squared.float().view(torch.int32).long() << 32) | columns
     index = key.topk(min(limit, squared.shape[1]), dim=-1, largest=False).values & 0xFFFFFFFF
     return Neighbors(index, squared.gather(1, index) < radius_m**2)
 
 
 def _all_near(squared: Float[Tensor, "r C"], radius_m: float) -> Neighbors:
+    """All candidates within the radius, in the order of their columns."""
     near = squared < radius_m**2
     count = near.sum(-1, keepdim=True)
-    column = near.nonzero()[:, 1]
+    column = near.nonzero()[:, 1]  # of all rows, one row after the other
     columns = torch.arange(max(int(count.max()) if len(count) else 0, 1), device=near.device)
     mask = columns < count
+    # place of each list's entries among these; padding repeats any
     entry = (count.cumsum(0) - count + columns).clamp(max=max(len(column) - 1, 0))
     index = column[entry] if len(column) else torch.zeros_like(entry)
     return Neighbors(index.masked_fill_(~mask, 0), mask)
 
 
 def relative_pose(row: Poses, other: Poses, *, seam_rad: float) -> Float[Tensor, "R K 3"]:
-    """Distance, bearing in the row's frame, and difference of heading, from rows [R] to their neighbours [R, K].
+    """Distance, bearing in the row's frame, and difference of heading, of each row's neighbors.
 
-    Angles lie in [seam_rad - pi, seam_rad + pi).
+    Args:
+        row: poses [R].
+        other: poses of the neighbors [R, K].
+        seam_rad: angles lie in [seam_rad - pi, seam_rad + pi), see `SmartConfig.seam_rad`.
     """
     offset = other.position - row.position[:, None]
     bearing = angle_between(heading_vector(row.heading)[:, None].expand_as(offset), offset)

@@ -1,4 +1,4 @@
-"""Synthetic scenarios in the shape of WOMD: an embedded pack, and the generator (with SUMO as a subprocess) that made it."""
+"""Synthetic scenarios in the shape of WOMD: an embedded pack, and its generator, which runs SUMO as a subprocess."""
 
 from rlftsim.scenario.synthetic.pack import pack_path
 

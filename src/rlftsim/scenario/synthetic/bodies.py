@@ -1,6 +1,6 @@
-"""From a simulator's bumper on a lane to bodies that move like vehicles, and from striping pedestrians to smooth walkers.
+"""Bodies that move like vehicles, from a simulator's bumper on a lane; smooth walkers, from its jerky pedestrians.
 
-Arrays run over the steps (0.1 s) during which a road user exists; positions in plan coordinates, metres.
+Arrays run over the steps (0.1 s) during which a road user exists; positions in plan coordinates, meters.
 """
 
 import math
@@ -12,7 +12,7 @@ from jaxtyping import Float
 from rlftsim.scenario.types import STEP_S, ObjectType
 
 REAR_AXLE_FROM_BUMPER = 0.78
-"""Share of the length between front bumper and rear axle."""
+"""Fraction of the length between front bumper and rear axle."""
 MIN_LANE_CHANGE_M = 18.0
 LANE_CHANGE_S = 3.0
 BUMPER_SMOOTHING_S = 0.15
@@ -41,18 +41,18 @@ class Body:
 
 
 @dataclass(frozen=True, eq=False)
-class LanePath:
-    """A vehicle's front bumper as SUMO reports it: per step a point on a lane's centre line, its direction, and the lane changes."""
+class BumperPath:
+    """A vehicle's front bumper as SUMO reports it: points on lane centers, their directions, and the lane changes."""
 
     first_step: int
-    centre: Float[np.ndarray, "n 2"]
+    center: Float[np.ndarray, "n 2"]
     direction: Float[np.ndarray, "n 2"]
     """Unit tangent of the lane."""
     speed_mps: Float[np.ndarray, "n"]
     change_steps: tuple[int, ...] = ()
     """First step on the new lane."""
     change_left_m: tuple[float, ...] = ()
-    """How far the new lane lies to the left of the old one (negative: to the right)."""
+    """Distance of the new lane from the old one to the left (negative: to the right)."""
 
 
 def smoother_step(u: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
@@ -64,7 +64,7 @@ def smoother_step(u: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
 def lane_change_offset(
     driven_m: Float[np.ndarray, "n"], speed_mps: Float[np.ndarray, "n"], step: int, left_m: float
 ) -> Float[np.ndarray, "n"]:
-    """Lateral offset that turns a jump between two lane centres into a smooth step along the driven distance.
+    """Lateral offset that turns a jump between two lane centers into a smooth step along the driven distance.
 
     A function of distance, not of time: a car that stops in the middle of a lane change stands where it is.
 
@@ -75,12 +75,13 @@ def lane_change_offset(
         left_m: signed distance of the new lane from the old one, positive to the left.
 
     Returns:
-        Metres to the left to add to the centre of the current lane; adding it to the jump leaves no discontinuity.
+        Meters to the left to add to the center of the current lane; adding it to the jump leaves no discontinuity.
     """
     length = max(MIN_LANE_CHANGE_M, LANE_CHANGE_S * float(speed_mps[step]))
-    share = smoother_step((driven_m - driven_m[step]) / length + 0.5)
+    # half of the change is driven before SUMO jumps to the new lane, half after
+    fraction = smoother_step((driven_m - driven_m[step]) / length + 0.5)
     on_new_lane = np.arange(len(driven_m)) >= step
-    return left_m * (share - on_new_lane)
+    return left_m * (fraction - on_new_lane)
 
 
 def drag_rear_axle(
@@ -93,6 +94,7 @@ def drag_rear_axle(
         length_m: length of the body.
         direction: unit vector the body points along at the first step.
     """
+    # The rear wheels cannot slip sideways, so the axle only ever moves towards the bumper, at a fixed distance from it.
     reach = REAR_AXLE_FROM_BUMPER * length_m
     rear_x, rear_y = bumper[0] - reach * direction
     heading = np.empty(len(bumper))
@@ -105,24 +107,31 @@ def drag_rear_axle(
 
 
 def smooth_over_time(values: Float[np.ndarray, "n ..."], sigma_s: float) -> Float[np.ndarray, "n ..."]:
-    """Values convolved with a Gaussian along the steps; before the first and after the last step they are held."""
+    """Values convolved with a Gaussian along the steps; beyond the ends the first and the last value are repeated.
+
+    Args:
+        values: one row per step.
+        sigma_s: standard deviation of the Gaussian in seconds.
+    """
+    # beyond four standard deviations the Gaussian adds less than the grid that positions are rounded to
     sigma = sigma_s / STEP_S
     radius = int(np.ceil(4 * sigma))
     kernel = np.exp(-0.5 * (np.arange(-radius, radius + 1) / sigma) ** 2)
-    columns = values.reshape(len(values), -1)
+    columns = values.reshape(len(values), -1)  # [n, k]
     padded = np.pad(columns, ((radius, radius), (0, 0)), mode="edge")
     smooth = [np.convolve(column, kernel / kernel.sum(), mode="valid") for column in padded.T]
     return np.stack(smooth, axis=1).reshape(values.shape)
 
 
 def _central_differences(position: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+    """Velocity in m/s; zero for a body of a single step."""
     if len(position) < 2:
         return np.zeros_like(position)
     return np.gradient(position, STEP_S, axis=0)
 
 
 def build_vehicle(
-    path: LanePath,
+    path: BumperPath,
     object_type: ObjectType,
     size: tuple[float, float, float],
     habit: tuple[float, float, float] = (0.0, 0.0, 0.0),
@@ -131,26 +140,30 @@ def build_vehicle(
     """Body of a vehicle that follows a bumper path.
 
     Args:
-        path: bumper on lane centres.
+        path: bumper on lane centers.
         object_type: vehicle or cyclist.
-        size: length, width, height in metres.
-        habit: how the driver keeps the lane: constant offset to the left and amplitude of a slow weave in metres, its phase.
-        is_evaluable: whether it may be a track to predict.
+        size: length, width, height in meters.
+        habit: the driver's way to keep the lane: constant offset to the left and amplitude of a slow weave in meters,
+            its phase.
+        is_evaluable: True = it may be a track to predict.
     """
+    # 1. Offset from the lane centers: the driver's habit and smooth lane changes.
     driven = np.concatenate([[0.0], np.cumsum(path.speed_mps[1:] * STEP_S)])
     left = habit[0] + habit[1] * np.sin(driven / 14.0 + habit[2])
     for step, distance in zip(path.change_steps, path.change_left_m, strict=True):
         left = left + lane_change_offset(driven, path.speed_mps, step, distance)
+    # 2. The bumper's path, the heading of a body dragged by it, the center half a length behind it.
     normal = np.stack([-path.direction[:, 1], path.direction[:, 0]], axis=1)
-    bumper = smooth_over_time(path.centre + left[:, None] * normal, BUMPER_SMOOTHING_S)
+    bumper = smooth_over_time(path.center + left[:, None] * normal, BUMPER_SMOOTHING_S)
+    # [n]: nothing but the path of the bumper decides the heading, so it can neither jump nor slip
     heading = drag_rear_axle(bumper, size[0], path.direction[0])
-    centre = bumper - size[0] / 2 * np.stack([np.cos(heading), np.sin(heading)], axis=1)
+    center = bumper - size[0] / 2 * np.stack([np.cos(heading), np.sin(heading)], axis=1)
     return Body(
         object_type,
         path.first_step,
-        centre,
+        center,
         heading,
-        _central_differences(centre),
+        _central_differences(center),
         size,
         is_evaluable=is_evaluable,
     )
@@ -165,7 +178,7 @@ def build_pedestrian(
         first_step: step of the first position.
         position: as SUMO reports it.
         heading_rad: heading used when the pedestrian never walks.
-        size: length, width, height in metres.
+        size: length, width, height in meters.
     """
     smooth = smooth_over_time(position, WALK_SMOOTHING_S)
     velocity = _central_differences(smooth)
@@ -173,6 +186,7 @@ def build_pedestrian(
     heading = np.full(len(position), heading_rad)
     if len(walking):
         measured = np.unwrap(np.arctan2(velocity[walking, 1], velocity[walking, 0]))
+        # index of the latest walking step: a pedestrian that stands keeps the heading of that step
         latest = np.clip(np.searchsorted(walking, np.arange(len(position)), side="right") - 1, 0, None)
         heading = smooth_over_time(measured[latest], WALK_SMOOTHING_S)
     return Body(ObjectType.PEDESTRIAN, first_step, smooth, heading, velocity, size)
@@ -197,7 +211,16 @@ def draw_label_noise(rng: np.random.Generator) -> LabelNoise:
 def add_label_noise(
     rng: np.random.Generator, noise: LabelNoise, position: np.ndarray, heading: np.ndarray, velocity: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Position [n, 2], heading [n] and velocity [n, 2] with noise that fades below 0.5 m/s: what stands is frozen."""
+    """Position [n, 2], heading [n] and velocity [n, 2] with noise that fades below 0.5 m/s and is 0 at a standstill.
+
+    Args:
+        rng: source of the noise.
+        noise: its standard deviations.
+        position: m.
+        heading: rad.
+        velocity: m/s; decides the noise of a step.
+    """
+    # below a tenth of the limit there is no noise at all: a body that stands does not jitter
     moving = np.clip(np.linalg.norm(velocity, axis=1) / 0.5, 0.0, 1.0)
     moving[moving < 0.1] = 0.0
     forward = np.stack([np.cos(heading), np.sin(heading)], axis=1)

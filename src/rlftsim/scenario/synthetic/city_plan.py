@@ -20,7 +20,7 @@ from rlftsim.scenario.synthetic.street_plan import (
 
 @dataclass(frozen=True)
 class _LineProfile:
-    """What all streets of one line of the grid have in common."""
+    """Properties that all streets of one line of the grid share."""
 
     street_class: StreetClass
     travel_lanes: int
@@ -38,14 +38,14 @@ def _draw_profile(rng: np.random.Generator, street_class: StreetClass, is_column
         "collector": (1 if quiet else int(rng.integers(1, 3)), 11.0, 15.6),
         "residential": (1, 9.5, 12.0),
     }[street_class]
-    bicycle_share = {"arterial": 0.25, "collector": 0.33, "residential": 0.0}[street_class]
+    bicycle_probability = {"arterial": 0.25, "collector": 0.33, "residential": 0.0}[street_class]
     return _LineProfile(
         street_class=street_class,
         travel_lanes=lanes,
         lane_width_m=float(rng.uniform(3.0, 3.8)),
         speed_mps=float(rng.uniform(low, high)),
         median_m=3.0 if street_class == "arterial" and rng.random() < 0.45 else 0.0,
-        bicycle=bool(rng.random() < bicycle_share),
+        bicycle=bool(rng.random() < bicycle_probability),
         priority=PRIORITY[street_class] + int(is_column),
     )
 
@@ -53,8 +53,9 @@ def _draw_profile(rng: np.random.Generator, street_class: StreetClass, is_column
 def _draw_classes(rng: np.random.Generator, columns: int, rows: int, quiet: bool) -> list[StreetClass]:
     """Class of every line, columns first. Two arterials cross somewhere in a city; a quiet quarter has at most one."""
     names: list[StreetClass] = ["arterial", "collector", "residential"]
-    shares = [0.0, 0.42, 0.58] if quiet else [0.3, 0.37, 0.33]
-    classes: list[StreetClass] = [names[int(k)] for k in rng.choice(3, columns + rows, p=shares)]
+    probabilities = [0.0, 0.42, 0.58] if quiet else [0.3, 0.37, 0.33]
+    classes: list[StreetClass] = [names[int(k)] for k in rng.choice(3, columns + rows, p=probabilities)]
+    # then overruled: a quiet quarter may get one arterial, a city gets two that cross
     if quiet and rng.random() < 0.6:
         classes[int(rng.integers(columns + rows))] = "arterial"
     if not quiet:
@@ -69,6 +70,7 @@ def _draw_grid(rng: np.random.Generator, columns: int, rows: int) -> Float[np.nd
     x = np.concatenate([[0.0], np.cumsum(rng.uniform(90, widest, columns - 1))])
     y = np.concatenate([[0.0], np.cumsum(rng.uniform(90, widest, rows - 1))])
     grid = np.stack(np.meshgrid(x - x.mean(), y - y.mean(), indexing="ij"), axis=-1)
+    # irregular, then sheared, then turned: no two streets of a city are parallel to an axis
     grid += np.clip(rng.normal(0, 8.0, grid.shape), -14, 14)
     grid[..., 0] += rng.uniform(-0.25, 0.25) * grid[..., 1]
     angle = rng.uniform(0, 2 * np.pi)
@@ -76,22 +78,11 @@ def _draw_grid(rng: np.random.Generator, columns: int, rows: int) -> Float[np.nd
     return grid @ turn.T
 
 
-def _curve(rng: np.random.Generator, start: np.ndarray, end: np.ndarray) -> Float[np.ndarray, "n 2"]:
-    """Straight or bulging line; the squared sine keeps both ends straight, where a junction is cut out."""
-    length = float(np.linalg.norm(end - start))
-    s = np.linspace(0, 1, max(31, int(length / 4)))
-    points = start + s[:, None] * (end - start)
-    if rng.random() >= 0.6:
-        return points
-    direction = (end - start) / length
-    bulge = np.clip(rng.normal(0, 0.035 * length), -0.08 * length, 0.08 * length) * np.sin(np.pi * s) ** 2
-    return points + bulge[:, None] * np.array([-direction[1], direction[0]])
-
-
 def _draw_lanes(rng: np.random.Generator, profile: _LineProfile, gutter_m: float) -> tuple[PlannedLane, ...]:
-    parking_share = {"arterial": 0.06, "collector": 0.4, "residential": 0.75}[profile.street_class]
+    """Lanes of one direction from right to left."""
+    parking_probability = {"arterial": 0.06, "collector": 0.4, "residential": 0.75}[profile.street_class]
     lanes = [PlannedLane("sidewalk", float(rng.uniform(1.6, 2.6))), PlannedLane("gutter", gutter_m)]
-    if rng.random() < parking_share:
+    if rng.random() < parking_probability:
         lanes.append(PlannedLane("parking", 2.3))
     if profile.bicycle:
         lanes.append(PlannedLane("bicycle", 1.6))
@@ -101,7 +92,16 @@ def _draw_lanes(rng: np.random.Generator, profile: _LineProfile, gutter_m: float
 
 def _both_directions(rng: np.random.Generator, profile: _LineProfile, start: Node, end: Node) -> tuple[Street, Street]:
     """The two directions of one street, each with its own strip of parking."""
-    middle = _curve(rng, start.position, end.position)
+    # The line between the directions is straight or bulges. The squared sine keeps both of its ends straight, where a
+    # junction is cut out.
+    way = end.position - start.position
+    length = float(np.linalg.norm(way))
+    s = np.linspace(0, 1, max(31, int(length / 4)))
+    middle = start.position + s[:, None] * way  # [n, 2]
+    if rng.random() < 0.6:
+        direction = way / length
+        bulge = np.clip(rng.normal(0, 0.035 * length), -0.08 * length, 0.08 * length) * np.sin(np.pi * s) ** 2
+        middle = middle + bulge[:, None] * np.array([-direction[1], direction[0]])
     gutter = float(rng.uniform(0.3, 2.0))
     ids = (f"{start.node_id}to{end.node_id}", f"{end.node_id}to{start.node_id}")
     forward = Street(
@@ -127,30 +127,26 @@ def _both_directions(rng: np.random.Generator, profile: _LineProfile, start: Nod
     return forward, backward
 
 
-def _is_connected(nodes: set[str], links: list[tuple[str, str]]) -> bool:
-    reached, frontier = set(), [next(iter(nodes))]
-    while frontier:
-        here = frontier.pop()
-        if here in reached:
-            continue
-        reached.add(here)
-        frontier += [b if a == here else a for a, b in links if here in (a, b)]
-    return reached >= nodes
-
-
 def _draw_links(
     rng: np.random.Generator, columns: int, rows: int, classes: list[StreetClass]
 ) -> list[tuple[tuple[int, int], tuple[int, int], int]]:
     """Streets of the grid as (node, node, line); some minor ones dropped as long as all nodes stay connected."""
+    # nodes are (column, row), lines are numbered columns first
     links = [((i, j), (i, j + 1), i) for i in range(columns) for j in range(rows - 1)]
     links += [((i, j), (i + 1, j), columns + j) for i in range(columns - 1) for j in range(rows)]
-    share = rng.uniform(0.18, 0.25)
-    nodes = {f"{i}.{j}" for i in range(columns) for j in range(rows)}
+    probability = rng.uniform(0.18, 0.25)
     for link in [links[int(k)] for k in rng.permutation(len(links))]:
-        if classes[link[2]] == "arterial" or rng.random() >= share:
+        if classes[link[2]] == "arterial" or rng.random() >= probability:
             continue
         rest = [other for other in links if other is not link]
-        if _is_connected(nodes, [(f"{a[0]}.{a[1]}", f"{b[0]}.{b[1]}") for a, b, _ in rest]):
+        # walk over the rest from one node: the street may go if all nodes are still reached
+        reached, frontier = set(), [(0, 0)]
+        while frontier:
+            here = frontier.pop()
+            if here not in reached:
+                reached.add(here)
+                frontier += [b if a == here else a for a, b, _ in rest if here in (a, b)]
+        if len(reached) == columns * rows:
             links = rest
     return links
 
@@ -158,7 +154,15 @@ def _draw_links(
 def _draw_control(
     rng: np.random.Generator, crossing: tuple[StreetClass, StreetClass], degree: int, lights: float
 ) -> Control:
-    """Who gives way at a node of the grid; `lights` scales how eager the quarter is to build lights."""
+    """Right of way at a node of the grid, by the classes that cross there.
+
+    Args:
+        rng: source of the choice.
+        crossing: classes of the column and the row.
+        degree: number of streets that meet.
+        lights: factor of the probability of traffic lights.
+    """
+    # at a bend there is nothing to give way to
     if degree <= 2:
         return "priority"
     kinds = frozenset(crossing)
@@ -177,7 +181,7 @@ def _draw_control(
 def _stub_ends(
     rng: np.random.Generator, grid: Float[np.ndarray, "c r 2"], classes: list[StreetClass]
 ) -> list[tuple[tuple[int, int], np.ndarray, int]]:
-    """Where traffic enters: (node, outer end, line) for the two ends of every line."""
+    """Streets by which traffic enters, as (node, outer end, line): one or none at each end of every line."""
     columns, rows = grid.shape[:2]
     ends = [((i, j), (i, inner), i) for i in range(columns) for j, inner in ((0, 1), (rows - 1, rows - 2))]
     ends += [
@@ -197,20 +201,23 @@ def draw_city_plan(rng: np.random.Generator, quiet: bool = False) -> StreetPlan:
     """Irregular grid of arterials, collectors and residential streets with stubs where traffic enters.
 
     Args:
-        rng: decides everything.
+        rng: source of all choices.
         quiet: a quarter of minor streets, at most one arterial, hardly any lights.
 
     Returns:
         A connected plan; every node but the fringe has a control fitting the classes that meet there.
     """
+    # 1. The grid: classes of its lines, places of its nodes, streets between them and out of it.
     columns, rows = int(rng.integers(3, 5)), int(rng.integers(3, 5))
     classes = _draw_classes(rng, columns, rows, quiet)
     profiles = [_draw_profile(rng, kind, line < columns, quiet) for line, kind in enumerate(classes)]
     grid = _draw_grid(rng, columns, rows)
     links = _draw_links(rng, columns, rows, classes)
     stubs = _stub_ends(rng, grid, classes)
+    # shrunk if it is too large, so that every network fits into the same circle
     reach = max(float(np.linalg.norm(end)) for _, end, _ in stubs)
     shrink = min(1.0, MAX_RADIUS_M / reach)
+    # 2. Nodes, whose control depends on the number of streets that meet there.
     degree = np.zeros((columns, rows), int)
     for a, b, _ in links:
         degree[a] += 1
@@ -227,6 +234,7 @@ def draw_city_plan(rng: np.random.Generator, quiet: bool = False) -> StreetPlan:
         for j in range(rows)
     }
     fringe = [Node(f"f{k}", end * shrink, "dead_end", is_fringe=True) for k, (_, end, _) in enumerate(stubs)]
+    # 3. Both directions of every street.
     streets: list[Street] = []
     for a, b, line in links:
         streets += _both_directions(rng, profiles[line], inner[a], inner[b])

@@ -1,4 +1,4 @@
-"""Who travels: vehicle types with their drivers, trips of vehicles and bicycles, walks of pedestrians."""
+"""Travel demand: vehicle types with their drivers, trips of vehicles and bicycles, walks of pedestrians."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,10 +22,10 @@ class RoadUserType:
     height_m: float
 
 
-_SHARES = {"car": 0.62, "suv": 0.24, "van": 0.05, "truck": 0.04, "bus": 0.02, "motorcycle": 0.03}
+_PROBABILITIES = {"car": 0.62, "suv": 0.24, "van": 0.05, "truck": 0.04, "bus": 0.02, "motorcycle": 0.03}
 _CLASSES = {"car": "passenger", "suv": "passenger", "van": "delivery", "truck": "truck", "bus": "bus"}
 _SIZES = {
-    # length, width, height: mean, spread, low, high in metres, mirrors included
+    # length, width, height: mean, spread, low, high in meters, mirrors included
     "car": ((4.55, 0.22, 4.0, 5.1), (2.04, 0.06, 1.9, 2.2), (1.56, 0.08, 1.4, 1.8)),
     "suv": ((4.85, 0.30, 4.3, 5.7), (2.18, 0.09, 2.0, 2.4), (1.85, 0.12, 1.6, 2.2)),
     "van": ((5.70, 0.40, 5.0, 6.8), (2.36, 0.10, 2.2, 2.6), (2.50, 0.20, 2.1, 2.9)),
@@ -38,13 +38,18 @@ _SIZES = {
 
 
 NUM_GAITS = 8
-"""Kinds of pedestrians by how fast they walk."""
+"""Number of kinds of pedestrians, which differ in their speed."""
 VEHICLES_PER_LANE_AND_S = {"city": (0.02, 0.04), "quiet": (0.04, 0.075), "freeway": (0.25, 0.4)}
 """Range of the vehicles that enter per second and lane; much more is gridlock within minutes."""
 
 
 def draw_size(rng: np.random.Generator, kind: str) -> tuple[float, float, float]:
-    """Length, width and height in metres of one road user of a kind such as "car" or "pedestrian"."""
+    """Length, width and height in meters of one road user.
+
+    Args:
+        rng: source of the sizes.
+        kind: such as "car" or "pedestrian".
+    """
     length, width, height = (
         float(np.clip(rng.normal(mean, spread), low, high)) for mean, spread, low, high in _SIZES[kind]
     )
@@ -52,9 +57,14 @@ def draw_size(rng: np.random.Generator, kind: str) -> tuple[float, float, float]
 
 
 def draw_types(rng: np.random.Generator, count: int = 36) -> list[RoadUserType]:
-    """Types of one network: the last four are bicycles, the rest motor vehicles by their shares."""
-    kinds = list(rng.choice(list(_SHARES), count - 4, p=list(_SHARES.values()))) + ["bicycle"] * 4
-    kinds[0] = "car"
+    """Types of one network: the last four are bicycles, the rest motor vehicles by their frequency.
+
+    Args:
+        rng: source of kinds and sizes.
+        count: number of types.
+    """
+    kinds = list(rng.choice(list(_PROBABILITIES), count - 4, p=list(_PROBABILITIES.values()))) + ["bicycle"] * 4
+    kinds[0] = "car"  # at least one: an ego has to be found
     types = []
     for index, kind in enumerate(kinds):
         length, width, height = draw_size(rng, kind)
@@ -65,8 +75,10 @@ def draw_types(rng: np.random.Generator, count: int = 36) -> list[RoadUserType]:
 
 
 def _type_xml(rng: np.random.Generator, kind: RoadUserType) -> str:
+    """Vehicle type of SUMO with the habits of its driver. The order of the draws decides all later ones."""
     common = (
-        f'<vType id="{kind.type_id}" vClass="{kind.vehicle_class}" length="{kind.length_m:.2f}" width="{kind.width_m:.2f}" '
+        f'<vType id="{kind.type_id}" vClass="{kind.vehicle_class}" '
+        f'length="{kind.length_m:.2f}" width="{kind.width_m:.2f}" '
         f'lcStrategic="{rng.uniform(0.6, 1.5):.2f}" lcSpeedGain="{rng.uniform(0.4, 1.8):.2f}" '
         f'lcKeepRight="{rng.uniform(0.0, 0.4):.2f}" lcMaxSpeedLatStanding="0" lcMaxSpeedLatFactor="0.25" '
         f'jmTimegapMinor="{rng.uniform(0.6, 1.4):.2f}" impatience="{rng.uniform(0.0, 0.3):.2f}" '
@@ -81,24 +93,10 @@ def _type_xml(rng: np.random.Generator, kind: RoadUserType) -> str:
     )
 
 
-def _walker_xml(rng: np.random.Generator, gait: int) -> str:
-    factor = rng.uniform(0.55, 1.45)
-    return f'<vType id="walker{gait}" vClass="pedestrian" speedFactor="normc({factor:.2f},0.08,0.4,1.7)"/>'
-
-
 def _poisson_times(rng: np.random.Generator, rate_per_s: float) -> np.ndarray:
+    """Departure times of a Poisson process over the simulated time, in order."""
     count = rng.poisson(rate_per_s * SIMULATED_S)
     return np.sort(rng.uniform(0, SIMULATED_S, count))
-
-
-def _reachable_nodes(plan: StreetPlan, start: str) -> set[str]:
-    reached, frontier = set(), [start]
-    while frontier:
-        here = frontier.pop()
-        if here not in reached:
-            reached.add(here)
-            frontier += [street.to_node for street in plan.streets if street.from_node == here]
-    return reached
 
 
 def _vehicle_trips(rng: np.random.Generator, plan: StreetPlan, types: list[RoadUserType]) -> list[tuple[float, str]]:
@@ -112,13 +110,20 @@ def _vehicle_trips(rng: np.random.Generator, plan: StreetPlan, types: list[RoadU
     motor = [kind.type_id for kind in types if kind.object_type == ObjectType.VEHICLE]
     cycles = [kind.type_id for kind in types if kind.object_type == ObjectType.CYCLIST]
     trips = []
+    # Poisson arrivals at every entrance, by its lanes and class
     for source in sources:
         lanes = sum(lane.kind == "travel" for lane in source.lanes)
-        reachable = _reachable_nodes(plan, source.from_node)
+        # nodes to which streets lead from here: other trips would be dropped by the router
+        reachable, frontier = set(), [source.from_node]
+        while frontier:
+            here = frontier.pop()
+            if here not in reachable:
+                reachable.add(here)
+                frontier += [street.to_node for street in plan.streets if street.from_node == here]
         goals = [sink for sink in sinks if sink.to_node != source.from_node and sink.to_node in reachable]
-        shares = np.array([weight[goal.street_class] * len(goal.lanes) for goal in goals])
+        attraction = np.array([weight[goal.street_class] * len(goal.lanes) for goal in goals])
         for time in _poisson_times(rng, per_lane * lanes * weight[source.street_class]):
-            goal = goals[int(rng.choice(len(goals), p=shares / shares.sum()))]
+            goal = goals[int(rng.choice(len(goals), p=attraction / attraction.sum()))]
             kind = rng.choice(cycles) if rng.random() < bicycles else rng.choice(motor)
             row = (
                 f'<trip id="v{len(trips)}" type="{kind}" depart="{time:.1f}" from="{source.street_id}" '
@@ -129,16 +134,18 @@ def _vehicle_trips(rng: np.random.Generator, plan: StreetPlan, types: list[RoadU
 
 
 def _walks(rng: np.random.Generator, plan: StreetPlan) -> list[tuple[float, str]]:
-    """Short walks between streets; a few busy streets attract most of them."""
+    """Short walks between streets, alone or in groups; a few busy streets attract most of them."""
     if plan.kind == "freeway":
         return []
     streets = [street.street_id for street in plan.streets]
+    # a gamma distribution of small shape: many quiet streets, a few busy ones
     attraction = rng.gamma(0.5, 1.0, len(streets)) + 0.05
     attraction /= attraction.sum()
     walks = []
     for time in _poisson_times(rng, rng.uniform(0.04, 0.24)):
         start, goal = rng.choice(streets, 2, replace=False, p=attraction)
         size, gait = int(rng.choice([1, 2, 3], p=[0.75, 0.2, 0.05])), int(rng.integers(NUM_GAITS))
+        # members of a group follow one another at 1.1 s, on the same way at the same gait
         for member in range(size):
             depart = time + 1.1 * member
             row = (
@@ -150,7 +157,12 @@ def _walks(rng: np.random.Generator, plan: StreetPlan) -> list[tuple[float, str]
 
 
 def write_demand(plan: StreetPlan, rng: np.random.Generator, path: Path) -> dict[str, RoadUserType]:
-    """Write types, trips and walks, ordered by departure.
+    """Write types, trips and walks to a file for SUMO, ordered by departure, as SUMO wants them.
+
+    Args:
+        plan: streets to travel on.
+        rng: source of all choices.
+        path: the file.
 
     Returns:
         Type of each `type_id`.
@@ -158,6 +170,9 @@ def write_demand(plan: StreetPlan, rng: np.random.Generator, path: Path) -> dict
     types = draw_types(rng)
     departures = _vehicle_trips(rng, plan, types) + _walks(rng, plan)
     departures.sort(key=lambda row: row[0])
-    header = [_type_xml(rng, kind) for kind in types] + [_walker_xml(rng, gait) for gait in range(NUM_GAITS)]
+    header = [_type_xml(rng, kind) for kind in types]
+    for gait in range(NUM_GAITS):
+        factor = rng.uniform(0.55, 1.45)
+        header.append(f'<vType id="walker{gait}" vClass="pedestrian" speedFactor="normc({factor:.2f},0.08,0.4,1.7)"/>')
     path.write_text("\n".join(["<routes>", *header, *(row for _, row in departures), "</routes>"]))
     return {kind.type_id: kind for kind in types}

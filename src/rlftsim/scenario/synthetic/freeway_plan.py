@@ -16,16 +16,9 @@ from rlftsim.scenario.synthetic.street_plan import (
 )
 
 
-def _arc(curvature: float, s: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 2"]:
-    """Points at arc lengths `s` of a circle through (0, 0) heading along +x."""
-    if abs(curvature) < 1e-6:
-        return np.stack([s, np.zeros_like(s)], axis=1)
-    return np.stack([np.sin(curvature * s), 1 - np.cos(curvature * s)], axis=1) / curvature
-
-
 @dataclass(frozen=True)
 class _Carriageway:
-    """One direction of a freeway: cuts along the arc and what the segments have in common."""
+    """One direction of a freeway: cuts along the arc and the properties that its segments share."""
 
     name: str
     curvature: float
@@ -38,12 +31,27 @@ class _Carriageway:
     turn: Float[np.ndarray, "2 2"]
 
     def inner_border(self, low_m: float, high_m: float) -> Float[np.ndarray, "n 2"]:
-        """Left border between two arc lengths, driving direction."""
+        """Left border of a stretch, in driving direction.
+
+        Args:
+            low_m: arc length where it begins.
+            high_m: arc length where it ends.
+        """
         s = np.linspace(low_m, high_m, max(8, int((high_m - low_m) / 8)))
-        return offset_polyline(_arc(self.curvature, s), -self.median_half_m) @ self.turn.T
+        # points of a circle through (0, 0) heading along +x; without curvature a straight line
+        arc = np.stack([s, np.zeros_like(s)], axis=1)
+        if abs(self.curvature) >= 1e-6:
+            angle = self.curvature * s
+            arc = np.stack([np.sin(angle), 1 - np.cos(angle)], axis=1) / self.curvature
+        return offset_polyline(arc, -self.median_half_m) @ self.turn.T
 
     def segment(self, index: int, extra_lanes: int) -> Street:
-        """Stretch between two cuts."""
+        """Street between two cuts.
+
+        Args:
+            index: number of the cut where it begins.
+            extra_lanes: lanes beside the through lanes.
+        """
         return Street(
             street_id=f"{self.name}{index}",
             from_node=f"{self.name}n{index}",
@@ -57,7 +65,12 @@ class _Carriageway:
         )
 
     def taper(self, at_m: float, towards_m: float) -> Float[np.ndarray, "3 2"]:
-        """Triangle beside the through lanes, full width at `at_m`, nothing at `towards_m`."""
+        """Triangle of pavement beside the through lanes, where an extra lane begins or ends.
+
+        Args:
+            at_m: arc length at which it is as wide as a lane.
+            towards_m: arc length at which it has no width.
+        """
         low, high = sorted((at_m, towards_m))
         border = self.inner_border(low, high)
         through = offset_polyline(border, -self.lanes * self.width_m - self.gutter_m + 0.2)
@@ -67,11 +80,15 @@ class _Carriageway:
 
 
 def _ramp(rng: np.random.Generator, way: _Carriageway, on: bool) -> Street:
-    """On-ramp ending where segment 1 begins, or off-ramp beginning where segment 3 ends; leaves the carriageway tangentially."""
+    """On-ramp that ends where segment 1 begins, or off-ramp that begins where segment 3 ends.
+
+    It leaves the carriageway tangentially.
+    """
     joint = way.cuts_m[1] if on else way.cuts_m[4]
     length, spread = rng.uniform(160, 200), rng.uniform(34, 48)
     low, high = (joint - length, joint) if on else (joint, joint + length)
     border = offset_polyline(way.inner_border(low, high), -way.lanes * way.width_m)
+    # distance from the carriageway grows with a power above 2: neither a kink nor a jump of curvature at the joint
     away = np.linspace(1.0, 0.0, len(border)) if on else np.linspace(0.0, 1.0, len(border))
     points = border + spread * (away**2.2)[:, None] * (offset_polyline(border, -1.0) - border)
     inner, outer = (f"{way.name}n1", f"{way.name}on") if on else (f"{way.name}n4", f"{way.name}off")
@@ -87,20 +104,6 @@ def _ramp(rng: np.random.Generator, way: _Carriageway, on: bool) -> Street:
     )
 
 
-def _carriageway_connections(way: _Carriageway) -> list[Connection]:
-    """Through lanes straight on; lane 1 (lane 0 is the gutter) of segments 1 and 3 belongs to the ramps."""
-    name = way.name
-    links = []
-    for lane in range(1, way.lanes + 1):
-        links.append(Connection(f"{name}0", f"{name}1", lane, lane + 1))
-        links.append(Connection(f"{name}1", f"{name}2", lane + 1, lane))
-        links.append(Connection(f"{name}2", f"{name}3", lane, lane + 1))
-        links.append(Connection(f"{name}3", f"{name}4", lane + 1, lane))
-    links.append(Connection(f"{name}onramp", f"{name}1", 1, 1))
-    links.append(Connection(f"{name}3", f"{name}offramp", 1, 1))
-    return links
-
-
 def draw_freeway_plan(rng: np.random.Generator) -> StreetPlan:
     """Two carriageways on one arc, each with an on-ramp, an acceleration lane, a deceleration lane and an off-ramp."""
     curvature = float(np.clip(rng.normal(0, 1 / 1200), -1 / 800, 1 / 800))
@@ -111,6 +114,7 @@ def draw_freeway_plan(rng: np.random.Generator) -> StreetPlan:
     streets: list[Street] = []
     links: list[Connection] = []
     tapers: list[np.ndarray] = []
+    # the second carriageway follows the same arc the other way: turned by 180 degrees, with the opposite curvature
     for name, flip in (("a", 1.0), ("b", -1.0)):
         turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]) * flip
         on, off = rng.uniform(-190, -130), rng.uniform(130, 190)
@@ -118,6 +122,7 @@ def draw_freeway_plan(rng: np.random.Generator) -> StreetPlan:
         way = _Carriageway(
             name, flip * curvature, cuts, int(rng.integers(3, 5)), width, median_half, speed, gutter, turn
         )
+        # a node at every cut; at both ends traffic enters and leaves
         for index, cut in enumerate(cuts):
             place = way.inner_border(cut, cut + 1)[0]
             end = index in (0, len(cuts) - 1)
@@ -127,6 +132,13 @@ def draw_freeway_plan(rng: np.random.Generator) -> StreetPlan:
         nodes.append(Node(f"{name}on", on_ramp.points[0], "dead_end", is_fringe=True))
         nodes.append(Node(f"{name}off", off_ramp.points[-1], "dead_end", is_fringe=True))
         streets += [*segments, on_ramp, off_ramp]
-        links += _carriageway_connections(way)
+        # through lanes go straight on; lane 1 (lane 0 is the gutter) of segments 1 and 3 belongs to the ramps
+        for lane in range(1, way.lanes + 1):
+            links.append(Connection(f"{name}0", f"{name}1", lane, lane + 1))
+            links.append(Connection(f"{name}1", f"{name}2", lane + 1, lane))
+            links.append(Connection(f"{name}2", f"{name}3", lane, lane + 1))
+            links.append(Connection(f"{name}3", f"{name}4", lane + 1, lane))
+        links.append(Connection(f"{name}onramp", f"{name}1", 1, 1))
+        links.append(Connection(f"{name}3", f"{name}offramp", 1, 1))
         tapers += [way.taper(cuts[2], cuts[2] + 60), way.taper(cuts[3], cuts[3] - 60)]
     return StreetPlan("freeway", tuple(nodes), tuple(streets), tuple(links), tuple(tapers))

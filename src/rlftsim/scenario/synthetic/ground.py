@@ -15,10 +15,10 @@ class Ground:
     height_m: float
     slope: tuple[float, float]
     waves: tuple[tuple[float, float, float, float], ...]
-    """Amplitude in metres, wave numbers along x and y in rad/m, phase."""
+    """Amplitude in meters, wave numbers along x and y in rad/m, phase."""
 
     def height_at(self, points: Float[np.ndarray, "... 2"]) -> Float[np.ndarray, "..."]:
-        """Height in metres at points of the plane."""
+        """Height in meters at points of the plane."""
         x, y = points[..., 0], points[..., 1]
         height = self.height_m + self.slope[0] * x + self.slope[1] * y
         for amplitude, wave_x, wave_y, phase in self.waves:
@@ -27,9 +27,15 @@ class Ground:
 
 
 def draw_ground(rng: np.random.Generator, base_m: float = 24.0) -> Ground:
-    """Ground that rises and falls by 1-2 m over 150 m and stays within about 5 m of `base_m` in the whole network."""
+    """Ground that rises and falls by 1-2 m over 150 m and stays within about 5 m of `base_m` in the whole network.
+
+    Args:
+        rng: source of the slope and the waves.
+        base_m: height at (0, 0) without waves.
+    """
     waves = []
     for _ in range(2):
+        # a wave of this length, running in this direction
         length, angle = rng.uniform(150, 400), rng.uniform(0, _TWO_PI)
         number = _TWO_PI / length
         waves.append(

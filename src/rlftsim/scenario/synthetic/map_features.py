@@ -1,4 +1,4 @@
-"""Map of a whole network in WOMD's terms: lanes, road lines, road edges, stop signs, crosswalks and how lanes hang together."""
+"""Map of a whole network in WOMD's terms: lanes and their links, road lines, road edges, stop signs, crosswalks."""
 
 from collections import defaultdict
 from dataclasses import dataclass, field
@@ -17,7 +17,7 @@ from rlftsim.scenario.types import MapFeatureType
 POINT_SPACING_M = 0.5
 FREEWAY_LIMIT_MPS = 24.0
 SOLID_BEFORE_JUNCTION_M = 25.0
-KERB_RADIUS_M = 4.5
+CURB_RADIUS_M = 4.5
 OPEN_END_M = 22.0
 MOUTH_M = 4.0
 MEDIAN_AREA_PER_PERIMETER_M = 4.0
@@ -44,7 +44,7 @@ class NetworkMap:
     entry_exit: tuple[tuple[int, int], ...]
     """Lane and the lane after it."""
     neighbors: tuple[tuple[int, int, int], ...]
-    """Lane, side (0 left, 1 right), neighbour."""
+    """Lane, side (0 left, 1 right), neighbor."""
     stop_sign_lanes: tuple[tuple[int, int], ...]
     light_lanes: tuple[tuple[str, int, int, str], ...]
     """Junction, link index, feature id of the connector, direction letter."""
@@ -53,7 +53,12 @@ class NetworkMap:
 
 
 def resample(points: Float[np.ndarray, "n 2"], spacing_m: float = POINT_SPACING_M) -> Float[np.ndarray, "m 2"]:
-    """Points every `spacing_m` along a polyline, first and last kept."""
+    """Points at equal distances along a polyline, first and last kept.
+
+    Args:
+        points: the polyline.
+        spacing_m: largest distance between two points.
+    """
     along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
     count = max(2, int(np.ceil(along[-1] / spacing_m)) + 1)
     at = np.linspace(0.0, along[-1], count)
@@ -69,11 +74,11 @@ def _shapely() -> tuple[Any, Any]:
     return shapely, ops
 
 
-# --- drivable area -------------------------------------------------------------------------------------------------------------
+# --- drivable area ------------------------------------------------------------------------------------------------
 
 
 def _strip(shape: Float[np.ndarray, "n 2"], left_m: float, right_m: float) -> Any:
-    """Polygon between two offsets of a polyline (metres to the left, metres to the right)."""
+    """Polygon between two offsets of a polyline (meters to the left, meters to the right)."""
     shapely, _ = _shapely()
     points = resample(shape, 2.0)
     ring = np.concatenate([offset_polyline(points, left_m), offset_polyline(points, -right_m)[::-1]])
@@ -96,7 +101,7 @@ def _street_strips(network: Network) -> dict[str, Any]:
 
 
 def _mouth(network: Network, street: Street, node_id: str) -> Any:
-    """Roadway of a street continued straight into a junction, without its parking strip, so that kerbs meet there."""
+    """Roadway of a street continued straight into a junction, without its parking strip, so that curbs meet there."""
     leftmost = network.lane((street.street_id, len(street.lanes) - 1))
     end = leftmost.shape[-2:] if street.to_node == node_id else leftmost.shape[:2]
     along = (end[1] - end[0]) / max(float(np.linalg.norm(end[1] - end[0])), 1e-6)
@@ -108,9 +113,10 @@ def _mouth(network: Network, street: Street, node_id: str) -> Any:
 
 
 def _junction_area(network: Network, node_id: str, strips: dict[str, Any]) -> Any:
-    """Connectors and crosswalks, kerbs rounded, cut to the surroundings of the junction."""
+    """Connectors and crosswalks with rounded curbs, cut to the neighborhood of the junction."""
     shapely, _ = _shapely()
     shape = shapely.Polygon(network.junction_shapes[node_id]).buffer(0)
+    # streets count up to 14 m before the junction, far enough to round the corners between them
     near = shape.buffer(14.0)
     parts = [
         shapely.LineString(connector.shape).buffer(connector.width_m / 2 + 0.2, cap_style="flat")
@@ -122,18 +128,12 @@ def _junction_area(network: Network, node_id: str, strips: dict[str, Any]) -> An
         for junction, line, width in network.crosswalks
         if junction == node_id
     ]
-    parts += [
-        strips[street.street_id].intersection(near)
-        for street in network.plan.streets
-        if node_id in (street.from_node, street.to_node)
-    ]
-    parts += [
-        _mouth(network, street, node_id).intersection(shape)
-        for street in network.plan.streets
-        if node_id in (street.from_node, street.to_node)
-    ]
+    streets = [street for street in network.plan.streets if node_id in (street.from_node, street.to_node)]
+    parts += [strips[street.street_id].intersection(near) for street in streets]
+    parts += [_mouth(network, street, node_id).intersection(shape) for street in streets]
     area = shapely.union_all(parts)
-    rounded = area.buffer(KERB_RADIUS_M).buffer(-KERB_RADIUS_M)
+    # growing and shrinking by the same radius rounds inner corners only: those are the curbs
+    rounded = area.buffer(CURB_RADIUS_M).buffer(-CURB_RADIUS_M)
     return shapely.union_all([area, rounded.intersection(shape.buffer(5.0))])
 
 
@@ -149,7 +149,7 @@ def compute_drivable_area(network: Network) -> Any:
             for node in network.plan.nodes
             if node.node_id not in fringe and node.node_id in network.junction_shapes
         ]
-    area = shapely.union_all(parts).buffer(0.3).buffer(-0.3)
+    area = shapely.union_all(parts).buffer(0.3).buffer(-0.3)  # closes slits between strips
     if network.plan.kind != "freeway":
         return area
     # One carriageway at a time: smoothing both at once would close a narrow median here and there.
@@ -165,9 +165,11 @@ def oriented_rings(area: Any) -> list[tuple[Float[np.ndarray, "n 2"], bool]]:
     shapely, _ = _shapely()
     rings = []
     for polygon in getattr(area, "geoms", [area]):
+        # WOMD's convention, which the metric relies on: the road is to the left of a road edge
         oriented = shapely.geometry.polygon.orient(polygon, 1.0)
         rings.append((np.asarray(oriented.exterior.coords), False))
         for hole in oriented.interiors:
+            # tiny holes are slits between strips, no places a car could not drive to
             size = shapely.Polygon(hole).area
             if size > 2.0:
                 rings.append((np.asarray(hole.coords), size / hole.length < MEDIAN_AREA_PER_PERIMETER_M))
@@ -175,12 +177,18 @@ def oriented_rings(area: Any) -> list[tuple[Float[np.ndarray, "n 2"], bool]]:
 
 
 def split_ring(ring: Float[np.ndarray, "n 2"], keep: np.ndarray) -> list[Float[np.ndarray, "m 2"]]:
-    """Runs of consecutive kept points of a closed ring, order kept; a run may pass the seam. The whole ring stays closed."""
+    """Runs of consecutive kept points of a closed ring in its order. The whole ring stays closed.
+
+    Args:
+        ring: closed, i.e. the first point is repeated at the end.
+        keep: True for the points to keep, one per point.
+    """
     if keep.all():
         return [ring]
     if not keep.any():
         return []
     points, kept = ring[:-1], keep[:-1]
+    # start at a point that goes: then no run passes the seam
     start = int(np.flatnonzero(~kept)[0])
     points, kept = np.roll(points, -start, axis=0), np.roll(kept, -start)
     bounds = np.flatnonzero(np.diff(np.concatenate([[0], kept.astype(np.int8), [0]])))
@@ -188,6 +196,7 @@ def split_ring(ring: Float[np.ndarray, "n 2"], keep: np.ndarray) -> list[Float[n
 
 
 def _edge_features(network: Network, area: Any) -> list[tuple[MapFeatureType, np.ndarray]]:
+    """Road edges: borders of the drivable area, open at the ends of the network, where the road goes on."""
     ends = np.stack([node.position for node in network.plan.fringe_nodes])
     rows = []
     for ring, is_median in oriented_rings(area):
@@ -198,19 +207,13 @@ def _edge_features(network: Network, area: Any) -> list[tuple[MapFeatureType, np
     return rows
 
 
-# --- lanes and lines -----------------------------------------------------------------------------------------------------------
+# --- lanes and lines ----------------------------------------------------------------------------------------------
 
 
 def _lane_type(lane: Lane) -> MapFeatureType:
     if lane.kind == "bicycle":
         return MapFeatureType.LANE_BIKE
     return MapFeatureType.LANE_FREEWAY if lane.speed_mps > FREEWAY_LIMIT_MPS else MapFeatureType.LANE_SURFACE_STREET
-
-
-def _split_before_end(points: np.ndarray, tail_m: float) -> tuple[np.ndarray, np.ndarray]:
-    fine = resample(points)
-    cut = max(0, len(fine) - 1 - int(tail_m / POINT_SPACING_M))
-    return fine[: cut + 1], fine[cut:]
 
 
 def _left_border(network: Network, lane: Lane) -> Float[np.ndarray, "n 2"]:
@@ -225,28 +228,19 @@ def _left_border(network: Network, lane: Lane) -> Float[np.ndarray, "n 2"]:
 def _between_lanes(
     line: Float[np.ndarray, "n 2"], beside_bicycles: bool, solid_tail: bool
 ) -> list[tuple[MapFeatureType, np.ndarray]]:
-    """Line between two lanes of one direction, solid where nobody should change any more."""
+    """Line between two lanes of one direction, solid before a junction, where lanes must not be changed any more."""
+    points = resample(line)
     if beside_bicycles:
-        return [(MapFeatureType.LINE_SOLID_SINGLE_WHITE, resample(line))]
+        return [(MapFeatureType.LINE_SOLID_SINGLE_WHITE, points)]
     if not solid_tail:
-        return [(MapFeatureType.LINE_BROKEN_SINGLE_WHITE, resample(line))]
-    body, tail = _split_before_end(line, SOLID_BEFORE_JUNCTION_M)
-    rows = [(MapFeatureType.LINE_SOLID_SINGLE_WHITE, tail)]
-    return [(MapFeatureType.LINE_BROKEN_SINGLE_WHITE, body), *rows] if len(body) > 1 else rows
-
-
-def _separator(street: Street, line: Float[np.ndarray, "n 2"]) -> list[tuple[MapFeatureType, np.ndarray]]:
-    """Line to the left of a direction: between the directions, or along a median."""
-    if street.reverse_id is None:
-        return [] if street.street_class == "ramp" else [(MapFeatureType.LINE_SOLID_SINGLE_YELLOW, resample(line))]
-    if street.street_id > street.reverse_id:
-        return []
-    is_minor = street.street_class == "residential"
-    kind = MapFeatureType.LINE_BROKEN_SINGLE_YELLOW if is_minor else MapFeatureType.LINE_SOLID_DOUBLE_YELLOW
-    return [(kind, resample(line))]
+        return [(MapFeatureType.LINE_BROKEN_SINGLE_WHITE, points)]
+    cut = max(0, len(points) - 1 - int(SOLID_BEFORE_JUNCTION_M / POINT_SPACING_M))
+    rows = [(MapFeatureType.LINE_SOLID_SINGLE_WHITE, points[cut:])]
+    return [(MapFeatureType.LINE_BROKEN_SINGLE_WHITE, points[: cut + 1]), *rows] if cut > 0 else rows
 
 
 def _line_features(network: Network) -> list[tuple[MapFeatureType, np.ndarray]]:
+    """Road lines of all streets."""
     fringe = {node.node_id for node in network.plan.fringe_nodes}
     rows = []
     for street in network.plan.streets:
@@ -255,14 +249,22 @@ def _line_features(network: Network) -> list[tuple[MapFeatureType, np.ndarray]]:
         solid_tail = network.plan.kind != "freeway" and street.to_node not in fringe
         for lane, left in pairwise(driven):
             rows += _between_lanes(_left_border(network, lane), "bicycle" in (lane.kind, left.kind), solid_tail)
-        rows += _separator(street, _left_border(network, driven[-1]))
+        # To the left of a direction: a line along a median, or one between the directions, which share it.
+        separator = resample(_left_border(network, driven[-1]))
+        if street.reverse_id is None:
+            if street.street_class != "ramp":
+                rows.append((MapFeatureType.LINE_SOLID_SINGLE_YELLOW, separator))
+        elif street.street_id < street.reverse_id:
+            is_minor = street.street_class == "residential"
+            kind = MapFeatureType.LINE_BROKEN_SINGLE_YELLOW if is_minor else MapFeatureType.LINE_SOLID_DOUBLE_YELLOW
+            rows.append((kind, separator))
         if street.street_class == "freeway":
             rows.append((MapFeatureType.LINE_SOLID_SINGLE_WHITE, resample(_left_border(network, lanes[0]))))
     return rows
 
 
-def _stop_points(network: Network) -> list[tuple[str, np.ndarray, list[Connector]]]:
-    """Approaches with a stop sign: street, place right of the stop line, connectors it controls."""
+def _stop_points(network: Network) -> list[tuple[np.ndarray, list[Connector]]]:
+    """Approaches with a stop sign: place right of the stop line, connectors it controls."""
     approaches: dict[str, list[Connector]] = defaultdict(list)
     for connector in network.connectors:
         if connector.state in ("s", "w"):
@@ -272,14 +274,11 @@ def _stop_points(network: Network) -> list[tuple[str, np.ndarray, list[Connector
         outermost = network.lane((street_id, min(c.from_lane[1] for c in connectors)))
         street = outermost.street
         assert street is not None
+        # everything between the outermost lane and the sidewalk lies between the lane and the sign
         right = sum(x.width_m for x in street.lanes[: outermost.index] if x.kind != "sidewalk")
         border = offset_polyline(outermost.shape, -(outermost.width_m / 2 + right + 0.6))
-        rows.append((street_id, border[-1], connectors))
+        rows.append((border[-1], connectors))
     return rows
-
-
-def _crosswalk_polygon(line: Float[np.ndarray, "n 2"], width_m: float) -> Float[np.ndarray, "m 2"]:
-    return np.concatenate([offset_polyline(line, width_m / 2), offset_polyline(line, -width_m / 2)[::-1]])
 
 
 def build_network_map(network: Network) -> NetworkMap:
@@ -288,58 +287,56 @@ def build_network_map(network: Network) -> NetworkMap:
     features: list[Feature] = []
     lane_ids: dict[str, int] = {}
 
-    def add(kind: MapFeatureType, points: np.ndarray, speed: float = 0.0, interpolating: bool = False) -> int:
+    def _add(kind: MapFeatureType, points: np.ndarray, speed: float = 0.0, interpolating: bool = False) -> int:
+        """Append a feature; its id counts from 1."""
         features.append(Feature(len(features) + 1, kind, points, speed, interpolating))
         return len(features)
 
+    # 1. Lanes of streets, then those through junctions.
     for lane in network.lanes.values():
         if lane.street is not None and lane.kind in ("travel", "bicycle"):
-            lane_ids[lane.lane_id] = add(_lane_type(lane), resample(lane.shape), lane.speed_mps)
+            lane_ids[lane.lane_id] = _add(_lane_type(lane), resample(lane.shape), lane.speed_mps)
     connectors = [c for c in network.connectors if c.junction not in fringe and len(c.shape) > 1]
     for connector in connectors:
         kind = MapFeatureType.LANE_BIKE if connector.is_bicycle else _lane_type(network.lane(connector.from_lane))
-        lane_ids[connector.parts[0]] = add(kind, resample(connector.shape), connector.speed_mps, True)
+        lane_ids[connector.parts[0]] = _add(kind, resample(connector.shape), connector.speed_mps, True)
+
+    # 2. Lines, edges, crosswalks, stop signs.
     for kind, points in _line_features(network):
-        add(kind, points)
+        _add(kind, points)
     area = compute_drivable_area(network)
     for kind, points in _edge_features(network, area):
-        add(kind, points)
+        _add(kind, points)
     for _, line, width in network.crosswalks:
-        add(MapFeatureType.CROSSWALK, _crosswalk_polygon(line, width))
+        polygon = np.concatenate([offset_polyline(line, width / 2), offset_polyline(line, -width / 2)[::-1]])
+        _add(MapFeatureType.CROSSWALK, polygon)
     signs = []
-    for _, place, controlled in _stop_points(network):
-        sign = add(MapFeatureType.STOP_SIGN, place[None])
+    for place, controlled in _stop_points(network):
+        sign = _add(MapFeatureType.STOP_SIGN, place[None])
         lanes = sorted({f"{c.from_lane[0]}_{c.from_lane[1]}" for c in controlled})
         signs += [(sign, lane_ids[lane_id]) for lane_id in lanes]
+
+    # 3. Links between lanes.
+    entry_exit, neighbors = [], []
+    for connector in connectors:
+        middle = lane_ids[connector.parts[0]]
+        entry_exit.append((lane_ids[f"{connector.from_lane[0]}_{connector.from_lane[1]}"], middle))
+        entry_exit.append((middle, lane_ids[f"{connector.to_lane[0]}_{connector.to_lane[1]}"]))
+    for lane in network.lanes.values():
+        if lane.lane_id not in lane_ids or lane.street is None:
+            continue
+        for side, step in ((0, 1), (1, -1)):  # SUMO counts lanes from right to left
+            other = f"{lane.street.street_id}_{lane.index + step}"
+            if other in lane_ids:
+                neighbors.append((lane_ids[lane.lane_id], side, lane_ids[other]))
     return NetworkMap(
         features=tuple(features),
         lane_ids=lane_ids,
-        entry_exit=_lane_links(connectors, lane_ids),
-        neighbors=_lane_neighbors(network, lane_ids),
+        entry_exit=tuple(entry_exit),
+        neighbors=tuple(neighbors),
         stop_sign_lanes=tuple(signs),
         light_lanes=tuple(
             (c.light, c.link_index, lane_ids[c.parts[0]], c.direction) for c in connectors if c.light is not None
         ),
         drivable=area,
     )
-
-
-def _lane_links(connectors: list[Connector], lane_ids: dict[str, int]) -> tuple[tuple[int, int], ...]:
-    links = []
-    for connector in connectors:
-        middle = lane_ids[connector.parts[0]]
-        links.append((lane_ids[f"{connector.from_lane[0]}_{connector.from_lane[1]}"], middle))
-        links.append((middle, lane_ids[f"{connector.to_lane[0]}_{connector.to_lane[1]}"]))
-    return tuple(links)
-
-
-def _lane_neighbors(network: Network, lane_ids: dict[str, int]) -> tuple[tuple[int, int, int], ...]:
-    rows = []
-    for lane in network.lanes.values():
-        if lane.lane_id not in lane_ids or lane.street is None:
-            continue
-        for side, step in ((0, 1), (1, -1)):
-            other = f"{lane.street.street_id}_{lane.index + step}"
-            if other in lane_ids:
-                rows.append((lane_ids[lane.lane_id], side, lane_ids[other]))
-    return tuple(rows)

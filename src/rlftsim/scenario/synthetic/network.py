@@ -1,4 +1,4 @@
-"""The compiled network, read back: lanes, connectors through junctions, crosswalks, signal programs' places."""
+"""The compiled network, read back: lanes, connectors through junctions, crosswalks, places of traffic lights."""
 
 import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ class Lane:
     lane_id: str
     shape: Float[np.ndarray, "n 2"]
     length_m: float
-    """What SUMO drives; may differ from the length of the shape."""
+    """Length that SUMO drives; may differ from the length of the shape."""
     width_m: float
     speed_mps: float
     kind: str
@@ -51,14 +51,14 @@ class Connector:
 
 @dataclass(frozen=True, eq=False)
 class Network:
-    """What the compiler made of a plan."""
+    """A plan as compiled by SUMO."""
 
     plan: StreetPlan
     lanes: dict[str, Lane]
     connectors: tuple[Connector, ...]
     junction_shapes: dict[str, Float[np.ndarray, "_ 2"]]
     crosswalks: tuple[tuple[str, Float[np.ndarray, "_ 2"], float], ...]
-    """Junction, centre line, width in metres."""
+    """Junction, center line, width in meters."""
     lights: tuple[str, ...]
 
     def lane(self, key: LaneKey) -> Lane:
@@ -67,28 +67,8 @@ class Network:
 
 
 def _points(text: str) -> Float[np.ndarray, "n 2"]:
+    """Points of a shape attribute, "x,y x,y ..."; a height is dropped."""
     return np.array([[float(value) for value in pair.split(",")[:2]] for pair in text.split()])
-
-
-def _read_lanes(root: ElementTree.Element, plan: StreetPlan) -> dict[str, Lane]:
-    streets = {street.street_id: street for street in plan.streets}
-    lanes = {}
-    for edge in root.iter("edge"):
-        street = streets.get(edge.get("id", ""))
-        for row in edge.iter("lane"):
-            index = int(row.get("index", 0))
-            kind = street.lanes[index].kind if street else edge.get("function", "internal")
-            lanes[row.get("id", "")] = Lane(
-                lane_id=row.get("id", ""),
-                shape=_points(row.get("shape", "")),
-                length_m=float(row.get("length", 0)),
-                width_m=float(row.get("width", 3.2)),
-                speed_mps=float(row.get("speed", 0)),
-                kind=kind,
-                street=street,
-                index=index,
-            )
-    return lanes
 
 
 def join_shapes(shapes: list[Float[np.ndarray, "_ 2"]]) -> Float[np.ndarray, "n 2"]:
@@ -99,13 +79,16 @@ def join_shapes(shapes: list[Float[np.ndarray, "_ 2"]]) -> Float[np.ndarray, "n 
 
 
 def _read_connectors(root: ElementTree.Element, lanes: dict[str, Lane]) -> list[Connector]:
+    """Ways of vehicles and bicycles through all junctions."""
     rows = list(root.iter("connection"))
+    # rows from ":..." lead out of an internal lane, and so on to the next part of a way
     onward = {f"{row.get('from')}_{row.get('fromLane')}": row for row in rows if row.get("from", "").startswith(":")}
     connectors = []
     for row in rows:
         origin = lanes.get(f"{row.get('from')}_{row.get('fromLane')}")
         if origin is None or origin.street is None or origin.kind not in ("travel", "bicycle") or not row.get("via"):
             continue
+        # a way may consist of several internal lanes, e.g. where left turns wait inside the junction
         parts = [row.get("via", "")]
         while onward[parts[-1]].get("via"):
             parts.append(onward[parts[-1]].get("via", ""))
@@ -131,9 +114,32 @@ def _read_connectors(root: ElementTree.Element, lanes: dict[str, Lane]) -> list[
 
 
 def read_network(path: Path, plan: StreetPlan) -> Network:
-    """Parse the compiled network file of `plan`."""
+    """Parse a compiled network file.
+
+    Args:
+        path: file of netconvert.
+        plan: the plan it was compiled from.
+    """
     root = ElementTree.parse(path).getroot()
-    lanes = _read_lanes(root, plan)
+    # 1. Lanes: those of streets take their kinds from the plan, which the compiler does not keep.
+    streets = {street.street_id: street for street in plan.streets}
+    lanes = {}
+    for edge in root.iter("edge"):
+        street = streets.get(edge.get("id", ""))
+        for row in edge.iter("lane"):
+            index = int(row.get("index", 0))
+            kind = street.lanes[index].kind if street else edge.get("function", "internal")
+            lanes[row.get("id", "")] = Lane(
+                lane_id=row.get("id", ""),
+                shape=_points(row.get("shape", "")),
+                length_m=float(row.get("length", 0)),
+                width_m=float(row.get("width", 3.2)),
+                speed_mps=float(row.get("speed", 0)),
+                kind=kind,
+                street=street,
+                index=index,
+            )
+    # 2. Junctions and the crosswalks at them, whose lanes are named ":junction_number_0".
     shapes = {
         row.get("id", ""): _points(row.get("shape", ""))
         for row in root.iter("junction")

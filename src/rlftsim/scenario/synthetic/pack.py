@@ -1,4 +1,4 @@
-"""The data set that ships with the package: 200 synthetic scenarios, made by `generate` with the arguments in its manifest."""
+"""The embedded data set: 200 synthetic scenarios, made by `generate` with the arguments in its manifest."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Parked cars: along the kerb in parking strips, and in rows in the interior of blocks."""
+"""Parked cars: along the curb in parking strips, and in rows in the interior of blocks."""
 
 from typing import Any
 
@@ -7,16 +7,18 @@ from jaxtyping import Float
 
 from rlftsim.scenario.synthetic.bodies import Body
 from rlftsim.scenario.synthetic.demand import draw_size
+from rlftsim.scenario.synthetic.gates import boxes_overlap
 from rlftsim.scenario.synthetic.map_features import resample
 from rlftsim.scenario.synthetic.network import Network
 from rlftsim.scenario.synthetic.street_plan import Street, offset_polyline
 from rlftsim.scenario.types import ObjectType
 
 CLEAR_AT_JUNCTION_M = 12.0
-_KINDS, _SHARES = ("car", "suv", "van"), (0.66, 0.29, 0.05)
+_KINDS, _PROBABILITIES = ("car", "suv", "van"), (0.66, 0.29, 0.05)
 
 
 def _parked(position: np.ndarray, heading: float, size: tuple[float, float, float], num_steps: int) -> Body:
+    """Body that stands still throughout the recording and is never among the tracks to predict."""
     return Body(
         ObjectType.VEHICLE,
         0,
@@ -30,13 +32,21 @@ def _parked(position: np.ndarray, heading: float, size: tuple[float, float, floa
 
 
 def _draw_car(rng: np.random.Generator) -> tuple[float, float, float]:
-    return draw_size(rng, str(rng.choice(_KINDS, p=_SHARES)))
+    """Length, width and height of a car, SUV or van."""
+    return draw_size(rng, str(rng.choice(_KINDS, p=_PROBABILITIES)))
 
 
 def park_along(
     rng: np.random.Generator, line: Float[np.ndarray, "n 2"], occupancy: float, num_steps: int
 ) -> list[Body]:
-    """Cars one behind another along the centre line of a parking strip, `occupancy` of the places taken."""
+    """Cars one behind another along a parking strip.
+
+    Args:
+        rng: source of all choices.
+        line: center line of the strip.
+        occupancy: fraction of the places that is taken.
+        num_steps: length of the recording.
+    """
     points = resample(line)
     spacing = float(np.linalg.norm(points[1] - points[0]))
     cars, at = [], CLEAR_AT_JUNCTION_M
@@ -57,7 +67,13 @@ def park_along(
 
 
 def park_in_strips(rng: np.random.Generator, network: Network, num_steps: int) -> list[Body]:
-    """Cars in all parking strips of a network; every street has its own occupancy."""
+    """Cars in all parking strips of a network; every street has its own occupancy.
+
+    Args:
+        rng: source of all choices.
+        network: compiled network.
+        num_steps: length of the recording.
+    """
     cars = []
     for lane in network.lanes.values():
         if lane.kind == "parking":
@@ -90,9 +106,18 @@ def _row_of_places(
 def park_in_lots(
     rng: np.random.Generator, network: Network, drivable: Any, num_steps: int, lots_per_street: float
 ) -> list[Body]:
-    """Rows of parked cars 8-25 m beside the streets, away from every roadway and from one another."""
+    """Rows of parked cars 8-25 m beside the streets, away from every roadway and from one another.
+
+    Args:
+        rng: source of all choices.
+        network: compiled network.
+        drivable: its drivable area as a shapely geometry.
+        num_steps: length of the recording.
+        lots_per_street: mean number of lots beside a direction of a street.
+    """
     import shapely
 
+    # prepared: thousands of points are tested against one large area
     shapely.prepare(near_road := drivable.buffer(5.5))
     cars: list[Body] = []
     taken: list[np.ndarray] = []
@@ -100,9 +125,11 @@ def park_in_lots(
         for _ in range(int(rng.poisson(lots_per_street))):
             occupancy, square = rng.uniform(0.3, 0.95), bool(rng.random() < 0.75)
             setback = rng.uniform(8.5, 20.0)
+            # square to the street a row is as deep as a car is long
             rows = [setback, setback + (rng.uniform(5.6, 6.2) if square else rng.uniform(8, 10))]
             for row in rows[: int(rng.integers(1, 3))]:
                 for place, heading in _row_of_places(rng, street, row, square):
+                    # drawn before the place is judged: a place that is refused must not change the cars after it
                     size = _draw_car(rng)
                     clear = 2.6 if square else 6.0
                     if rng.random() >= occupancy or shapely.intersects_xy(near_road, *place):
@@ -117,8 +144,6 @@ def park_in_lots(
 
 def drop_overlapping(cars: list[Body]) -> list[Body]:
     """Cars in order, without those whose box meets an earlier one's."""
-    from rlftsim.scenario.synthetic.gates import boxes_overlap
-
     kept: list[Body] = []
     for car in cars:
         near = [other for other in kept if np.linalg.norm(other.position[0] - car.position[0]) < 8.0]

@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow.csv
 from jaxtyping import Float
 
-from rlftsim.scenario.synthetic.bodies import Body, LanePath, build_pedestrian, build_vehicle
+from rlftsim.scenario.synthetic.bodies import Body, BumperPath, build_pedestrian, build_vehicle
 from rlftsim.scenario.synthetic.demand import RoadUserType, draw_size
 from rlftsim.scenario.synthetic.network import Lane, Network
 from rlftsim.scenario.synthetic.sumo import DISCARDED_S
@@ -17,7 +17,10 @@ from rlftsim.scenario.types import STEP_S
 MIN_STEPS = 12
 LONGEST_STRIDE_M = 1.6
 SMALLEST_JUMP_M = 0.3
-"""Lanes that follow one another may not quite meet (bicycles keep right in a car's lane); this far apart it is a lane change."""
+"""Smallest sideways jump that is a lane change.
+
+Lanes that follow one another may not quite meet: bicycles keep right in a car's lane.
+"""
 LONGEST_EVALUATED_M = 7.0
 
 
@@ -29,7 +32,12 @@ class _LaneRuler:
         self._along: dict[str, np.ndarray] = {}
 
     def points_at(self, lane_id: str, positions_m: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 2"]:
-        """Points at SUMO's positions, which count the lane's nominal length, not that of its shape."""
+        """Points on a lane's center line.
+
+        Args:
+            lane_id: a compiled lane.
+            positions_m: of SUMO, which count the lane's nominal length, not that of its shape.
+        """
         lane = self._lanes[lane_id]
         if lane_id not in self._along:
             steps = np.linalg.norm(np.diff(lane.shape, axis=0), axis=1)
@@ -39,7 +47,12 @@ class _LaneRuler:
         return np.stack([np.interp(at, along, lane.shape[:, k]) for k in range(2)], axis=1)
 
     def directions_at(self, lane_id: str, positions_m: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 2"]:
-        """Unit tangents over one metre around the positions."""
+        """Unit tangents of a lane's center line over one meter.
+
+        Args:
+            lane_id: a compiled lane.
+            positions_m: of SUMO, as in `points_at`.
+        """
         length = self._lanes[lane_id].length_m
         reach = min(0.5, 0.4 * length)
         middle = np.clip(positions_m, reach, max(length - reach, reach))
@@ -48,6 +61,7 @@ class _LaneRuler:
 
 
 def _read_table(path: Path, wanted: tuple[str, ...]) -> dict[str, np.ndarray] | None:
+    """Columns of a trajectory file; None where SUMO has written none, because there was nothing to write."""
     if not path.exists():
         return None
     table = pyarrow.csv.read_csv(path, parse_options=pyarrow.csv.ParseOptions(delimiter=";"))
@@ -58,38 +72,48 @@ def _read_table(path: Path, wanted: tuple[str, ...]) -> dict[str, np.ndarray] | 
 
 def _runs_by_id(ids: np.ndarray, step: np.ndarray) -> list[np.ndarray]:
     """Row indices of every road user in time order; a user with a gap in time counts as two."""
+    # by road user, then by time
     order = np.lexsort((step, ids.astype(str)))
     new = (ids[order][1:] != ids[order][:-1]) | (np.diff(step[order]) != 1)
     return [run for run in np.split(order, np.flatnonzero(new) + 1) if len(run) >= MIN_STEPS]
 
 
-def _lane_path(ruler: _LaneRuler, lanes: dict[str, Lane], rows: dict[str, np.ndarray], first_step: int) -> LanePath:
+def _lane_path(ruler: _LaneRuler, lanes: dict[str, Lane], rows: dict[str, np.ndarray], first_step: int) -> BumperPath:
+    """Bumper of one vehicle along lane centers, with the jumps between neighboring lanes listed as lane changes."""
     lane_ids, positions = rows["vehicle_lane"], rows["vehicle_pos"]
-    centre = np.empty((len(lane_ids), 2))
-    direction = np.empty_like(centre)
+    center = np.empty((len(lane_ids), 2))
+    direction = np.empty_like(center)
     starts = np.append(0, np.flatnonzero(lane_ids[1:] != lane_ids[:-1]) + 1)
     changes, distances = [], []
     for start, stop in zip(starts, np.append(starts[1:], len(lane_ids)), strict=True):
         lane_id = str(lane_ids[start])
-        centre[start:stop] = ruler.points_at(lane_id, positions[start:stop])
+        center[start:stop] = ruler.points_at(lane_id, positions[start:stop])
         direction[start:stop] = ruler.directions_at(lane_id, positions[start:stop])
         before = lanes[str(lane_ids[start - 1])] if start else None
         now = lanes[lane_id]
         if before is None:
             continue
+        # Side by side, the jump is measured at one position; through a junction the two lanes have none in common.
         if before.street is not None and before.street is now.street:
-            jump = centre[start] - ruler.points_at(before.lane_id, positions[start : start + 1])[0]
+            jump = center[start] - ruler.points_at(before.lane_id, positions[start : start + 1])[0]
         else:
-            jump = centre[start] - centre[start - 1]
+            jump = center[start] - center[start - 1]
         left_m = float(jump @ np.array([-direction[start, 1], direction[start, 0]]))
         if abs(left_m) > SMALLEST_JUMP_M:
             changes.append(int(start))
             distances.append(left_m)
-    return LanePath(first_step, centre, direction, rows["vehicle_speed"], tuple(changes), tuple(distances))
+    return BumperPath(first_step, center, direction, rows["vehicle_speed"], tuple(changes), tuple(distances))
 
 
 def read_vehicles(path: Path, network: Network, types: dict[str, RoadUserType], rng: np.random.Generator) -> list[Body]:
-    """Bodies of all motor vehicles and bicycles in the vehicles' trajectory file."""
+    """Bodies of all motor vehicles and bicycles.
+
+    Args:
+        path: trajectory file of the vehicles.
+        network: compiled network.
+        types: by type id.
+        rng: source of heights and of the drivers' habits.
+    """
     names = ("timestep_time", "vehicle_id", "vehicle_type", "vehicle_speed", "vehicle_pos", "vehicle_lane")
     table = _read_table(path, names)
     if table is None:
@@ -102,6 +126,7 @@ def read_vehicles(path: Path, network: Network, types: dict[str, RoadUserType], 
     for run in _runs_by_id(table["vehicle_id"], step):
         kind = types[str(table["vehicle_type"][run[0]])]
         lane_path = _lane_path(ruler, network.lanes, {name: table[name][run] for name in names}, int(step[run[0]]))
+        # a type has one size for SUMO; heights may differ, because SUMO does not know them
         height = kind.height_m + float(np.clip(rng.normal(0, 0.04), -0.1, 0.1))
         habit = (float(rng.normal(0, 0.14)), float(rng.uniform(0.0, 0.12)), float(rng.uniform(0, 2 * np.pi)))
         size = (kind.length_m, kind.width_m, height)
@@ -110,7 +135,12 @@ def read_vehicles(path: Path, network: Network, types: dict[str, RoadUserType], 
 
 
 def read_pedestrians(path: Path, rng: np.random.Generator) -> list[Body]:
-    """Bodies of all pedestrians in the persons' trajectory file."""
+    """Bodies of all pedestrians.
+
+    Args:
+        path: trajectory file of the persons.
+        rng: source of their sizes.
+    """
     names = ("timestep_time", "person_id", "person_x", "person_y", "person_angle")
     table = _read_table(path, names)
     if table is None:
@@ -120,7 +150,9 @@ def read_pedestrians(path: Path, rng: np.random.Generator) -> list[Body]:
     for run in _runs_by_id(table["person_id"], step):
         position = np.stack([table["person_x"][run], table["person_y"][run]], axis=1).astype(float)
         if np.linalg.norm(np.diff(position, axis=0), axis=1).max() > LONGEST_STRIDE_M:
-            continue  # SUMO moves a few of them at once to the other side of a junction; smoothing hides jumps of a metre
+            # SUMO moves a few of them at once to the other side of a junction; smoothing hides jumps of a meter only
+            continue
+        # SUMO's angles are clockwise from north
         heading = np.pi / 2 - np.radians(float(table["person_angle"][run[0]]))
         bodies.append(build_pedestrian(int(step[run[0]]), position, heading, draw_size(rng, "pedestrian")))
     return bodies
@@ -128,17 +160,22 @@ def read_pedestrians(path: Path, rng: np.random.Generator) -> list[Body]:
 
 @dataclass(frozen=True, eq=False)
 class SignalStates:
-    """SUMO's letters of all links of one junction, one string per recorded step."""
+    """SUMO's letters of all links of one junction, one string per simulated step."""
 
     junction: str
     states: tuple[str, ...]
 
     def has_protected_phase(self, link_index: int) -> bool:
-        """Whether the link is ever both allowed to go with and without right of way."""
+        """True if the link may go with right of way (G) in one phase and without it (g) in another."""
         return {"G", "g"} <= {state[link_index] for state in self.states}
 
 
 def read_signals(path: Path, junction: str) -> SignalStates:
-    """Signal states of a junction from the first recorded step on."""
+    """Signal states of a junction from the first simulated step on.
+
+    Args:
+        path: file of the junction's states.
+        junction: its id.
+    """
     found = re.findall(r'time="([\d.]+)"[^>]*state="([^"]*)"', path.read_text())
     return SignalStates(junction, tuple(state for time, state in found if float(time) >= DISCARDED_S - 1e-6))

@@ -1,7 +1,7 @@
-"""Street plans drawn from a seed: what is built, before any simulator sees it.
+"""Street plans drawn from a seed, before any simulator is involved.
 
-A plan is a list of nodes and *directed* streets in metres around (0, 0). The shape of a street is its left border (the line between the
-two directions); its lanes lie to the right of it and are listed from right to left, as SUMO counts them.
+A plan is a list of nodes and *directed* streets in meters around (0, 0). The shape of a street is its left border (the
+line between the two directions). Its lanes lie to the right of it and are listed from right to left, as SUMO counts.
 """
 
 from collections.abc import Mapping
@@ -12,14 +12,14 @@ import numpy as np
 from jaxtyping import Float
 
 LaneKind = Literal["sidewalk", "gutter", "parking", "bicycle", "travel"]
-"""A gutter is the paved width between the outermost usable lane and the road edge; nobody may use it, as the parking strip."""
+"""A gutter is the pavement between the outermost usable lane and the road edge. Nothing drives on it."""
 Control = Literal["traffic_light", "allway_stop", "priority_stop", "right_before_left", "priority", "dead_end"]
 StreetClass = Literal["arterial", "collector", "residential", "freeway", "ramp"]
 
 MAX_RADIUS_M = 485.0
 """No node lies farther from (0, 0)."""
 PRIORITY: Mapping[StreetClass, int] = {"freeway": 12, "ramp": 8, "arterial": 9, "collector": 6, "residential": 3}
-"""Who has the right of way where nothing else says it; higher goes first."""
+"""Right of way where no sign or light rules; the higher number goes first."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class Connection:
 
 @dataclass(frozen=True, eq=False)
 class StreetPlan:
-    """Everything the network compiler needs, and what it would forget."""
+    """Everything the network compiler needs, and the kinds of lanes and the tapers, which it would lose."""
 
     kind: Literal["city", "quiet", "freeway"]
     nodes: tuple[Node, ...]
@@ -91,12 +91,18 @@ class StreetPlan:
 
 
 def offset_polyline(points: Float[np.ndarray, "n 2"], left_m: float) -> Float[np.ndarray, "n 2"]:
-    """Polyline moved sideways by `left_m` metres (negative = to the right), corners mitred up to twice the distance."""
+    """Polyline moved sideways, corners mitered up to twice the distance.
+
+    Args:
+        points: the polyline.
+        left_m: distance to the left in meters; negative = to the right.
+    """
     delta = np.diff(points, axis=0)
     delta /= np.maximum(np.linalg.norm(delta, axis=1, keepdims=True), 1e-9)
     normal = np.stack([-delta[:, 1], delta[:, 0]], axis=1)
     before = np.concatenate([normal[:1], normal])
     after = np.concatenate([normal, normal[-1:]])
     bisector = before + after
+    # the bisector is 2 cos(turn / 2) long, its product with a normal 2 cos(turn / 2)^2: corners keep their distance
     scale = np.maximum((bisector * before).sum(1, keepdims=True), 0.5)
     return points + left_m * bisector / scale

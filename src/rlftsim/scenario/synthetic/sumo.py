@@ -1,4 +1,4 @@
-"""SUMO as a subprocess: compile a street plan, route demand, simulate. Nothing of SUMO is imported into this process."""
+"""SUMO as a subprocess: compile a street plan, route demand, simulate. Nothing of SUMO is imported here."""
 
 import importlib.util
 import re
@@ -8,7 +8,7 @@ from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
 from rlftsim.errors import ConfigError, RlftsimError
-from rlftsim.scenario.synthetic.street_plan import Street, StreetPlan
+from rlftsim.scenario.synthetic.street_plan import StreetPlan
 
 INSTALL_HINT = 'Making synthetic scenarios needs SUMO and shapely: pip install "rlftsim[synthetic]".'
 SIMULATED_S = 300
@@ -19,16 +19,17 @@ _ALLOWED = {"sidewalk": "pedestrian", "bicycle": "bicycle", "travel": _VEHICLES}
 
 
 def is_available() -> bool:
-    """Whether both SUMO and shapely are installed."""
+    """True if both SUMO and shapely are installed."""
     return all(importlib.util.find_spec(name) is not None for name in ("sumo", "shapely"))
 
 
 def find_binary(name: str) -> Path:
-    """Path of `netconvert`, `duarouter` or `sumo` inside the installed `sumo` package (PATH is not looked at).
+    """Path of `netconvert`, `duarouter` or `sumo` inside the installed `sumo` package; PATH is ignored.
 
     Raises:
         ConfigError: the extra `synthetic` is not installed.
     """
+    # find_spec does not import the package: nothing of SUMO runs in this process
     package = importlib.util.find_spec("sumo")
     if package is None or not package.submodule_search_locations:
         raise ConfigError(INSTALL_HINT)
@@ -47,6 +48,8 @@ def sumo_version() -> str:
 
 
 def _run(name: str, *options: object) -> None:
+    """Run a program of SUMO; its last line of standard error is the reason if it fails."""
+    # no standard input: a program that asks something fails at once instead of waiting
     command = [str(find_binary(name)), *(str(option) for option in options)]
     done = subprocess.run(command, capture_output=True, text=True, stdin=subprocess.DEVNULL)
     if done.returncode != 0:
@@ -54,46 +57,26 @@ def _run(name: str, *options: object) -> None:
         raise RlftsimError(f"{name} failed with code {done.returncode}: {reason}")
 
 
-def _lane_xml(street: Street) -> str:
-    rows = []
-    for index, lane in enumerate(street.lanes):
-        allowed = _ALLOWED.get(lane.kind)
-        if lane.kind == "travel" and street.street_class == "residential":
-            allowed = _VEHICLES.replace("bus truck ", "")  # long vehicles would cut the corners of narrow streets
-        if lane.kind == "travel" and street.street_class in ("freeway", "ramp"):
-            allowed = _VEHICLES.replace(" bicycle", "")
-        permission = f'allow="{allowed}"' if allowed else 'disallow="all"'
-        rows.append(f'    <lane index="{index}" width="{lane.width_m:.2f}" {permission}/>')
-    return "\n".join(rows)
-
-
 def _edges_xml(plan: StreetPlan) -> str:
+    """Streets of a plan in SUMO's plain XML, with the vehicle classes that may use each lane."""
     rows = ["<edges>"]
     for street in plan.streets:
         shape = " ".join(f"{x:.3f},{y:.3f}" for x, y in street.points)
         rows.append(
             f'  <edge id={quoteattr(street.street_id)} from="{street.from_node}" to="{street.to_node}" '
             f'numLanes="{len(street.lanes)}" speed="{street.speed_mps:.2f}" priority="{street.priority}" '
-            f'spreadType="right" shape="{shape}">\n{_lane_xml(street)}\n  </edge>'
+            f'spreadType="right" shape="{shape}">'
         )
+        for index, lane in enumerate(street.lanes):
+            allowed = _ALLOWED.get(lane.kind)
+            if lane.kind == "travel" and street.street_class == "residential":
+                allowed = _VEHICLES.replace("bus truck ", "")  # long vehicles would cut the corners of narrow streets
+            if lane.kind == "travel" and street.street_class in ("freeway", "ramp"):
+                allowed = _VEHICLES.replace(" bicycle", "")
+            permission = f'allow="{allowed}"' if allowed else 'disallow="all"'
+            rows.append(f'    <lane index="{index}" width="{lane.width_m:.2f}" {permission}/>')
+        rows.append("  </edge>")
     return "\n".join([*rows, "</edges>"])
-
-
-def _nodes_xml(plan: StreetPlan) -> str:
-    rows = [
-        f'  <node id="{node.node_id}" x="{node.position[0]:.3f}" y="{node.position[1]:.3f}" type="{node.control}"'
-        + (' radius="7"/>' if plan.kind != "freeway" else "/>")
-        for node in plan.nodes
-    ]
-    return "\n".join(["<nodes>", *rows, "</nodes>"])
-
-
-def _connections_xml(plan: StreetPlan) -> str:
-    rows = [
-        f'  <connection from="{link.from_street}" to="{link.to_street}" fromLane="{link.from_lane}" toLane="{link.to_lane}"/>'
-        for link in plan.connections
-    ]
-    return "\n".join(["<connections>", *rows, "</connections>"])
 
 
 def compile_network(plan: StreetPlan, folder: Path, signal_layout: str = "opposites") -> Path:
@@ -107,12 +90,23 @@ def compile_network(plan: StreetPlan, folder: Path, signal_layout: str = "opposi
     Returns:
         Path of the network file.
     """
-    (folder / "plan.nod.xml").write_text(_nodes_xml(plan))
+    nodes = [
+        f'  <node id="{node.node_id}" x="{node.position[0]:.3f}" y="{node.position[1]:.3f}" type="{node.control}"'
+        + (' radius="7"/>' if plan.kind != "freeway" else "/>")
+        for node in plan.nodes
+    ]
+    (folder / "plan.nod.xml").write_text("\n".join(["<nodes>", *nodes, "</nodes>"]))
     (folder / "plan.edg.xml").write_text(_edges_xml(plan))
     options: list[object] = ["--node-files", folder / "plan.nod.xml", "--edge-files", folder / "plan.edg.xml"]
     if plan.connections:
-        (folder / "plan.con.xml").write_text(_connections_xml(plan))
+        links = [
+            f'  <connection from="{link.from_street}" to="{link.to_street}" '
+            f'fromLane="{link.from_lane}" toLane="{link.to_lane}"/>'
+            for link in plan.connections
+        ]
+        (folder / "plan.con.xml").write_text("\n".join(["<connections>", *links, "</connections>"]))
         options += ["--connection-files", folder / "plan.con.xml"]
+    # pedestrians cross wherever cars drive slowly enough
     if plan.kind != "freeway":
         options += ["--crossings.guess", "--crossings.guess.speed-threshold", 22, "--walkingareas"]
     network = folder / "network.net.xml"
@@ -128,7 +122,16 @@ def compile_network(plan: StreetPlan, folder: Path, signal_layout: str = "opposi
 
 
 def route_demand(network: Path, demand: Path, seed: int) -> Path:
-    """Give every trip a route and drop the impossible ones; otherwise they stand in a lane for ever."""
+    """Give every trip a route and drop the impossible ones, which would block a lane forever.
+
+    Args:
+        network: compiled network.
+        demand: types, trips and walks.
+        seed: of SUMO's own choices.
+
+    Returns:
+        Path of the routes.
+    """
     routes = demand.with_name("demand.rou.xml")
     _run(
         "duarouter", "-n", network, "-r", demand, "-o", routes, "--seed", seed,
@@ -138,7 +141,13 @@ def route_demand(network: Path, demand: Path, seed: int) -> Path:
 
 
 def simulate(network: Path, routes: Path, additional: Path, seed: int) -> tuple[Path, Path]:
-    """Simulate `SIMULATED_S` seconds at 10 Hz; the first `DISCARDED_S` are not recorded.
+    """Simulate `SIMULATED_S` seconds at 10 Hz; the first `DISCARDED_S` are not written.
+
+    Args:
+        network: compiled network; SUMO writes into its folder.
+        routes: file of `route_demand`.
+        additional: further instructions for SUMO.
+        seed: of SUMO's own choices.
 
     Returns:
         CSV files of the vehicles and of the pedestrians (the latter may not exist).
@@ -148,8 +157,8 @@ def simulate(network: Path, routes: Path, additional: Path, seed: int) -> tuple[
         "sumo", "-n", network, "-r", routes, "-a", additional, "--seed", seed,
         "--step-length", 0.1, "--default.action-step-length", 0.1, "--step-method.ballistic",
         "--begin", 0, "--end", SIMULATED_S, "--time-to-teleport", -1, "--collision.action", "warn",
-        "--lanechange.duration", 3, "--fcd-output", folder / "vehicles.csv", "--person-fcd-output", folder / "persons.csv",
-        "--device.fcd.begin", DISCARDED_S,
+        "--lanechange.duration", 3, "--fcd-output", folder / "vehicles.csv",
+        "--person-fcd-output", folder / "persons.csv", "--device.fcd.begin", DISCARDED_S,
         "--fcd-output.attributes", "x,y,angle,type,speed,pos,lane", "--precision", 4,
         "--no-step-log", "--no-warnings", "--xml-validation", "never", "--ignore-route-errors",
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""From minutes of traffic to scenarios of 9.1 seconds: who watches, who is seen, who is evaluated."""
+"""Scenarios of 9.1 seconds cut from minutes of traffic: choice of the ego, of visible agents, of tracks to predict."""
 
 import hashlib
 from collections.abc import Iterator
@@ -43,18 +43,26 @@ POSITION_GRID_PER_M = 512
 HEADING_GRID_PER_RAD = 4096
 VELOCITY_GRID_PER_MPS = 256
 SIZE_GRID_PER_M = 128
+_STOP = (LightState.STOP, LightState.ARROW_STOP)
+_LIGHT_STATES = {
+    "G": (LightState.GO, LightState.ARROW_GO),
+    "g": (LightState.GO, LightState.GO),
+    "y": (LightState.CAUTION, LightState.ARROW_CAUTION),
+    "Y": (LightState.CAUTION, LightState.ARROW_CAUTION),
+}
+"""WOMD's states, without and with an arrow, for the letters of SUMO; all others mean stop."""
 
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """A simulated network: everything windows are cut from."""
+    """A simulated network with its traffic, from which windows are cut."""
 
     name: str
     bodies: tuple[Body, ...]
     cropper: MapCropper
     signals: dict[str, SignalStates]
     ends: Float[np.ndarray, "n 2"]
-    """Where the network ends."""
+    """Positions of the network's ends."""
     num_steps: int
 
 
@@ -69,59 +77,56 @@ class _View:
     valid: Bool[np.ndarray, "o 91"]
 
     @property
-    def travelled_m(self) -> Float[np.ndarray, "o"]:
+    def traveled_m(self) -> Float[np.ndarray, "o"]:
         """Distance driven while valid."""
         both = self.valid[:, 1:] & self.valid[:, :-1]
         return (np.linalg.norm(np.diff(self.position, axis=1), axis=-1) * both).sum(axis=1)
 
 
-def _slice_body(body: Body, start: int) -> tuple[int, int, int] | None:
-    """First and last+1 step of the window in which the body exists, and the body's own index of the first."""
-    first = max(0, body.first_step - start)
-    last = min(TOTAL_STEPS, body.first_step + body.num_steps - start)
-    return (first, last, start + first - body.first_step) if last > first else None
-
-
-def _see(distance_m: Float[np.ndarray, "n"], range_m: float, rng: np.random.Generator) -> Bool[np.ndarray, "n"]:
-    """Steps at which a body is seen: those within range, less now and then a spell behind something, the more likely the farther."""
-    seen = distance_m < range_m
-    if rng.random() < 0.5 * np.clip(distance_m.mean() / range_m, 0.0, 1.0):
-        begin = int(rng.integers(-20, TOTAL_STEPS))
-        seen[max(0, begin) : max(0, begin + int(rng.integers(5, 50)))] = False
-    return seen
-
-
 def _look(bodies: list[Body], start: int, ego: Body, range_m: float, rng: np.random.Generator) -> _View:
     """All bodies the ego sees at any step of the window; the ego comes last."""
     ego_slice = slice(start - ego.first_step, start - ego.first_step + TOTAL_STEPS)
-    ego_path = ego.position[ego_slice]
+    ego_path = ego.position[ego_slice]  # [91, 2]
     kept, arrays = [], []
     for body in [*(other for other in bodies if other is not ego), ego]:
-        span = _slice_body(body, start)
-        if span is None:
+        # 1. Steps [first, last) of the window in which the body exists, and the same steps of the body's own life.
+        first = max(0, body.first_step - start)
+        last = min(TOTAL_STEPS, body.first_step + body.num_steps - start)
+        if last <= first:
             continue
-        first, last, index = span
+        index = start + first - body.first_step
         own = slice(index, index + last - first)
+
+        # 2. Steps at which the ego sees it.
         distance = np.linalg.norm(body.position[own] - ego_path[first:last], axis=1)
         if distance.min() > range_m:
             continue
-        near = _see(distance, range_m, rng) if body is not ego else np.ones(TOTAL_STEPS, bool)
-        if not near.any():
+        seen = np.ones(TOTAL_STEPS, bool)
+        if body is not ego:
+            seen = distance < range_m
+            # now and then a spell behind something, the more likely the farther away
+            if rng.random() < 0.5 * np.clip(distance.mean() / range_m, 0.0, 1.0):
+                begin = int(rng.integers(-20, TOTAL_STEPS))
+                seen[max(0, begin) : max(0, begin + int(rng.integers(5, 50)))] = False
+        if not seen.any():
             continue
+
+        # 3. Its states, where it exists; `valid` where it is seen.
         position, heading = np.zeros((TOTAL_STEPS, 2)), np.zeros(TOTAL_STEPS)
         velocity, valid = np.zeros((TOTAL_STEPS, 2)), np.zeros(TOTAL_STEPS, bool)
         position[first:last], heading[first:last] = body.position[own], body.heading[own]
-        velocity[first:last], valid[first:last] = body.velocity[own], near
+        velocity[first:last], valid[first:last] = body.velocity[own], seen
         kept.append(body)
         arrays.append((position, heading, velocity, valid))
     return _View(kept, *(np.stack(column) for column in zip(*arrays, strict=True)))
 
 
 def _passes_gates(view: _View, rng: np.random.Generator) -> bool:
-    moving = view.travelled_m > 1.0
+    """True for a window with enough motion, in which all bodies move and keep apart like real ones."""
+    moving = view.traveled_m > 1.0  # [o]
     if moving.sum() < MIN_MOVING_AGENTS:
         return False
-    if not moving[-1] and rng.random() >= 0.15:
+    if not moving[-1] and rng.random() >= 0.15:  # few scenarios with an ego that stands
         return False
     for index in np.flatnonzero(moving):
         seen = np.flatnonzero(view.valid[index])
@@ -136,6 +141,7 @@ def _passes_gates(view: _View, rng: np.random.Generator) -> bool:
 
 
 def _is_on_road(view: _View, index: int, drivable: Any) -> bool:
+    """True for a vehicle that keeps to the drivable area, and for everything that is no vehicle."""
     body, valid = view.bodies[index], view.valid[index]
     if body.object_type != ObjectType.VEHICLE:
         return True
@@ -144,7 +150,14 @@ def _is_on_road(view: _View, index: int, drivable: Any) -> bool:
 
 
 def choose_tracks_to_predict(view: _View, rng: np.random.Generator, drivable: Any) -> list[int]:
-    """2 to 8 tracks, the far-travelling ones first, pedestrians and cyclists favoured; in half the sets one that stands."""
+    """2 to 8 tracks, far-traveling ones first, pedestrians and cyclists preferred; in half of the sets one that stands.
+
+    Args:
+        view: a window; the ego is its last body.
+        rng: source of all choices.
+        drivable: drivable area as a shapely geometry.
+    """
+    # 1. Candidates: seen now and mostly later, near the ego.
     future = slice(CURRENT_STEP + 1, None)
     ego_now = view.position[-1, CURRENT_STEP]
     candidates = [
@@ -156,15 +169,17 @@ def choose_tracks_to_predict(view: _View, rng: np.random.Generator, drivable: An
         and np.linalg.norm(view.position[k, CURRENT_STEP] - ego_now) < PREDICT_WITHIN_M
         and not (body.object_type == ObjectType.VEHICLE and rng.random() < 0.1)
     ]
-    travelled = np.minimum(view.travelled_m, 40.0)
+    # 2. Their order: by distance traveled with some noise.
+    traveled = np.minimum(view.traveled_m, 40.0)
     rank = {
-        k: travelled[k] * (1.0 if view.bodies[k].object_type == ObjectType.VEHICLE else 2.0) + rng.normal(0, 8.0)
+        k: traveled[k] * (1.0 if view.bodies[k].object_type == ObjectType.VEHICLE else 2.0) + rng.normal(0, 8.0)
         for k in candidates
     }
     wanted = int(rng.choice([2, 3, 4, 5, 6, 7, 8], p=[0.14, 0.18, 0.2, 0.16, 0.13, 0.1, 0.09]))
-    moving = sorted((k for k in candidates if travelled[k] > 1.0), key=lambda k: -rank[k])
-    standing = [k for k in candidates if travelled[k] <= 1.0]
+    moving = sorted((k for k in candidates if traveled[k] > 1.0), key=lambda k: -rank[k])
+    standing = [k for k in candidates if traveled[k] <= 1.0]
     order = ([standing[0]] if standing and rng.random() < 0.5 else []) + moving + standing
+    # 3. The first ones that are on the road, not too many pedestrians among them.
     chosen: list[int] = []
     pedestrians = 0
     for k in dict.fromkeys(order):
@@ -184,6 +199,7 @@ def _observe_lights(
     first_point = {
         int(features.feature_id[k]): features.points[features.offsets[k]] for k in range(len(features.feature_id))
     }
+    # 1. Lights that the ego ever comes near, and whose lane is not cut at its beginning.
     seen = []
     for junction, link, lane_id, direction in world.cropper.network_map.light_lanes:
         stop = world.cropper.network_map.features[lane_id - 1].points[0]
@@ -191,10 +207,12 @@ def _observe_lights(
         if kept is None or np.linalg.norm(kept[:2] - stop) > 0.01:
             continue
         if np.linalg.norm(ego_path - stop, axis=1).min() < range_m:
+            # a left turn that has a phase of its own is shown by arrows
             arrow = direction in "lL" and world.signals[junction].has_protected_phase(link)
             seen.append((junction, link, lane_id, kept, arrow))
+    # 2. Their states, step by step.
     rows = [
-        (step, lane_id, _light_state(world.signals[junction].states[start + step][link], arrow), stop)
+        (step, lane_id, _LIGHT_STATES.get(world.signals[junction].states[start + step][link], _STOP)[arrow], stop)
         for step in range(TOTAL_STEPS)
         for junction, link, lane_id, stop, arrow in seen
     ]
@@ -206,20 +224,10 @@ def _observe_lights(
     )
 
 
-def _light_state(letter: str, arrow: bool) -> LightState:
-    """WOMD's state for a letter of SUMO; a protected turn shows arrows."""
-    if letter == "G":
-        return LightState.ARROW_GO if arrow else LightState.GO
-    if letter == "g":
-        return LightState.GO
-    if letter in "yY":
-        return LightState.ARROW_CAUTION if arrow else LightState.CAUTION
-    return LightState.ARROW_STOP if arrow else LightState.STOP
-
-
 def _label(view: _View, world: World, rng: np.random.Generator) -> Tracks:
     """Noisy, rounded tracks with heights; zero where not valid."""
     position, heading, velocity = view.position.copy(), view.heading.copy(), view.velocity.copy()
+    # label noise, less and less of it the slower a body is; parked cars have none
     for k, body in enumerate(view.bodies):
         if not body.is_parked:
             noise = draw_label_noise(rng)
@@ -245,9 +253,10 @@ def _label(view: _View, world: World, rng: np.random.Generator) -> Tracks:
     )
 
 
-def _candidate_egos(world: World, start: int) -> list[tuple[Body, bool]]:
-    """Cars that exist throughout the window and keep away from the network's ends, and whether each moves."""
-    egos = []
+def _choose_egos(world: World, start: int, rng: np.random.Generator) -> list[Body]:
+    """At most two egos of a window, far apart, so that their scenarios share little."""
+    # 1. Cars that exist throughout the window and keep away from the network's ends; moving ones are preferred.
+    candidates, weights = [], []
     for body in world.bodies:
         index = start - body.first_step
         if body.object_type != ObjectType.VEHICLE or not body.is_evaluable or body.is_parked:
@@ -256,29 +265,33 @@ def _candidate_egos(world: World, start: int) -> list[tuple[Body, bool]]:
             continue
         path = body.position[index : index + TOTAL_STEPS]
         if np.linalg.norm(path[::10, None] - world.ends[None], axis=-1).min() > EGO_TO_END_M:
-            egos.append((body, bool(np.linalg.norm(path[-1] - path[0]) > 1.0)))
-    return egos
-
-
-def _choose_egos(world: World, start: int, rng: np.random.Generator) -> list[Body]:
-    candidates = _candidate_egos(world, start)
+            candidates.append(body)
+            weights.append(6.0 if np.linalg.norm(path[-1] - path[0]) > 1.0 else 1.0)
     if not candidates:
         return []
-    weights = np.array([6.0 if moving else 1.0 for _, moving in candidates])
-    order = rng.choice(len(candidates), len(candidates), replace=False, p=weights / weights.sum())
-    first = candidates[order[0]][0]
-    chosen = [first]
+
+    # 2. The first in a random order, and the next one that is far from it.
+    probabilities = np.array(weights) / np.sum(weights)
+    order = rng.choice(len(candidates), len(candidates), replace=False, p=probabilities)
+    first = candidates[order[0]]
     now = start + CURRENT_STEP
     for index in order[1:]:
-        other = candidates[index][0]
+        other = candidates[index]
         gap = other.position[now - other.first_step] - first.position[now - first.first_step]
         if np.linalg.norm(gap) > EGO_TO_EGO_M:
-            return [*chosen, other]
-    return chosen
+            return [first, other]
+    return [first]
 
 
 def cut_scenario(world: World, start: int, ego: Body, rng: np.random.Generator) -> Scenario | None:
-    """Scenario that begins at step `start` of the recording as `ego` sees it, or None if it fails a gate."""
+    """Scenario of one window as the ego sees it; None if it fails a gate.
+
+    Args:
+        world: simulated network.
+        start: step of the recording at which the window begins.
+        ego: a body that exists throughout the window.
+        rng: source of all choices.
+    """
     range_m = float(rng.uniform(65.0, 95.0))
     view = _look(list(world.bodies), start, ego, range_m, rng)
     drivable = world.cropper.network_map.drivable
@@ -287,8 +300,10 @@ def cut_scenario(world: World, start: int, ego: Body, rng: np.random.Generator) 
     predicted = choose_tracks_to_predict(view, rng, drivable)
     if len(predicted) < 2:
         return None
+    # the map reaches beyond the range of vision, so that agents at its rim stand on lanes
     ego_path = view.position[-1]
     features = world.cropper.crop(ego_path[::6], range_m + MAP_BEYOND_RANGE_M)
+    # an id that is stable, and unlike those of other worlds
     name = f"{world.name}/{start}/{world.bodies.index(ego)}"
     return Scenario(
         scenario_id=hashlib.sha256(name.encode()).hexdigest()[:16],
@@ -304,7 +319,14 @@ def cut_scenario(world: World, start: int, ego: Body, rng: np.random.Generator) 
 
 
 def cut_scenarios(world: World, rng: np.random.Generator) -> Iterator[Scenario]:
-    """Scenarios of a world in random order, no two of them overlapping in time and place; those that fail a gate are left out."""
+    """Scenarios of a world in random order, without those that fail a gate.
+
+    No two of them overlap in time and place.
+
+    Args:
+        world: simulated network.
+        rng: source of all choices.
+    """
     starts = rng.permutation(np.arange(FIRST_START, world.num_steps - TOTAL_STEPS, WINDOW_EVERY_STEPS))
     for start in starts.tolist():
         for ego in _choose_egos(world, start, rng):

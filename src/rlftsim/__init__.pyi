@@ -1,0 +1,30 @@
+"""The public names for editors and type checkers; `__init__.py` loads them. A test holds both together."""
+
+from rlftsim._api.evaluation import compare as compare
+from rlftsim._api.evaluation import evaluate as evaluate
+from rlftsim._api.look import check_policy as check_policy
+from rlftsim._api.look import score as score
+from rlftsim._api.loop import simulate as simulate
+from rlftsim._api.sources import load_dataset as load_dataset
+from rlftsim._api.sources import load_policy as load_policy
+from rlftsim._api.train import finetune as finetune
+from rlftsim._api.train import pretrain as pretrain
+from rlftsim._api.train import recipe as recipe
+from rlftsim.errors import RlftsimError as RlftsimError
+from rlftsim.evaluation.results import Evaluation as Evaluation
+from rlftsim.goals.types import Goals as Goals
+from rlftsim.policies.smart.policy import SmartPolicy as SmartPolicy
+from rlftsim.realism import RealismResult as RealismResult
+from rlftsim.rewards import leave_one_out as leave_one_out
+from rlftsim.rewards import register_reward as register_reward
+from rlftsim.rollout.baselines import ConstantVelocity as ConstantVelocity
+from rlftsim.rollout.policy import Policy as Policy
+from rlftsim.rollout.policy import Sampling as Sampling
+from rlftsim.rollout.types import Rollouts as Rollouts
+from rlftsim.scenario.dataset import write_dataset as write_dataset
+from rlftsim.scenario.types import Scenario as Scenario
+from rlftsim.training.finetune import FinetuneConfig as FinetuneConfig
+from rlftsim.viewer.notebook import show as show
+
+__version__: str
+__all__: list[str]

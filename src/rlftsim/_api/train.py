@@ -1,0 +1,168 @@
+"""Public `recipe`, `pretrain` and `finetune`: training that leaves the given policy as it is."""
+
+import copy
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from torch import nn
+
+from rlftsim._api.sources import policy_of, require_name
+from rlftsim.errors import ConfigError
+from rlftsim.recipes.card import model_card
+from rlftsim.recipes.registry import RECIPES, Recipe, recipe_by_name
+from rlftsim.rollout.policy import Policy, device_of
+from rlftsim.scenario.any_form import AnyScenarios, Name, scenarios_of
+from rlftsim.scenario.dataset import ScenarioDataset
+from rlftsim.scenario.types import Scenarios
+from rlftsim.tokens.clustering import build_vocabulary
+from rlftsim.training.catk import CatkConfig
+from rlftsim.training.finetune import FinetuneConfig
+from rlftsim.training.goal_relabeling import GcslConfig
+from rlftsim.training.methods import FinetuningConfig, describe_method, finetune_policy
+from rlftsim.training.pretrain import PretrainConfig
+from rlftsim.training.pretrain import pretrain as pretrain_in_place
+
+
+def recipe(name: str) -> Any:
+    """Settings of every stage from vocabulary to fine-tuned policy.
+
+    Args:
+        name: "smart-tiny" (the paper), "smart-mini", "smart-nano", "smart-demo" (minutes on two CPU cores), or a
+            recipe of another package.
+
+    Returns:
+        A frozen dataclass with the sections tokens, model, pretrain, finetune, catk and gcsl; `dataclasses.replace`
+        makes one with other values.
+
+    Raises:
+        ConfigError: no such recipe.
+    """
+    return recipe_by_name(require_name(name, "recipe", "smart-demo"))
+
+
+def pretrain(
+    policy: Policy | Recipe | Name,
+    scenarios: AnyScenarios,
+    out: Name | None = None,
+    config: PretrainConfig | None = None,
+    *,
+    held_out: AnyScenarios | None = None,
+) -> Policy:
+    """Pre-train a policy to predict the next decision along logged tracks, and return a new one.
+
+    Args:
+        policy: a recipe or its name, for a policy with fresh weights and a vocabulary built from the scenarios. Or a
+            policy, or a name for `load_policy`, whose weights are trained further; it stays as it is.
+        scenarios: training scenarios with their logged futures.
+        out: folder of the run; an interrupted run goes on there, a finished one is not repeated. None keeps no files.
+        config: settings; None stands for those of the recipe, or the defaults.
+        held_out: scenarios for validation in closed loop, see `config.validation`.
+
+    Returns:
+        The pre-trained policy, ready to simulate.
+
+    Raises:
+        ConfigError: the policy cannot be pre-trained, no scenario, or no such recipe.
+        CheckpointError: `out` holds another run, or the run diverged.
+    """
+    _require_config(config, "pretrain", PretrainConfig)
+    training = scenarios_of(scenarios)
+    if isinstance(policy, str) and policy in RECIPES.names():
+        policy = recipe_by_name(policy)
+    if isinstance(policy, Recipe):
+        config = config or policy.pretrain
+        vocabulary = None if policy.tokens is None else build_vocabulary(training, policy.tokens)[0]
+        start: Any = policy.new_policy(vocabulary)
+    else:
+        start = policy_of(policy)
+    settings = config or PretrainConfig()
+    validation = None if held_out is None else scenarios_of(held_out)
+    card = _card("pre-trained", training)
+    return _train_copy(
+        start,
+        out,
+        lambda learner, folder: pretrain_in_place(learner, training, folder, settings, held_out=validation, card=card),
+    )
+
+
+def finetune(
+    policy: Policy | Name,
+    scenarios: AnyScenarios,
+    out: Name | None = None,
+    config: FinetuningConfig | None = None,
+) -> Policy:
+    """Fine-tune a policy in closed loop, and return a new one; the given policy stays as it is.
+
+    Equals `rlftsim finetune` with the same settings.
+
+    Args:
+        policy: a policy, or a name for `load_policy`.
+        scenarios: training scenarios with their logged futures.
+        out: folder of the run; an interrupted run goes on there, a finished one is not repeated. None keeps no files.
+        config: settings, such as `FinetuneConfig(reward="mloo", epochs=0.5)` or `recipe("smart-demo").finetune`; those
+            of a recipe's `catk` or `gcsl` choose that method. None stands for the paper's settings.
+
+    Returns:
+        The fine-tuned policy, ready to simulate.
+
+    Raises:
+        ConfigError: a policy without weights, or no scenario.
+        CheckpointError: `out` holds another run, or the run diverged (the message names its last good checkpoint).
+    """
+    _require_config(config, "finetune", FinetuneConfig, CatkConfig, GcslConfig)
+    training, settings = scenarios_of(scenarios), config or FinetuneConfig()
+    base = policy if isinstance(policy, str | os.PathLike) else type(policy).__name__
+
+    card = _card(f"fine-tuned ({describe_method(settings)}) from {base}", training)
+    return _train_copy(
+        policy_of(policy), out, lambda learner, folder: finetune_policy(learner, training, folder, settings, card=card)
+    )
+
+
+def _require_config(config: object, section: str, *kinds: type) -> None:
+    """Refuse settings of another kind, mostly a whole recipe.
+
+    Args:
+        config: None or settings.
+        section: of a recipe, for the message.
+        kinds: settings that are taken.
+
+    Raises:
+        ConfigError: settings of no such kind.
+    """
+    if not isinstance(config, (*kinds, type(None))):
+        *most, last = (kind.__name__ for kind in kinds)
+        names = f"{', '.join(most)} or {last}" if most else last
+        raise ConfigError(
+            f"config must be a {names}, got {type(config).__name__}: pass rs.recipe(name).{section} or make one."
+        )
+
+
+def _train_copy(policy: Policy, out: Name | None, train: Callable[[Any, Path], object]) -> Any:
+    """A trained copy of a policy, on the policy's device.
+
+    Args:
+        policy: stays as it is.
+        out: folder of the run; None = a temporary one.
+        train: trains a policy in place with a folder for its files.
+    """
+    # Without weights there is nothing to copy; `train` refuses such a policy with a message.
+    # Weights of a loaded policy are frozen; each method freezes again what it does not train.
+    learner = copy.deepcopy(policy).requires_grad_(True) if isinstance(policy, nn.Module) else policy
+    if out is None:
+        with tempfile.TemporaryDirectory(prefix="rlftsim-") as folder:
+            train(learner, Path(folder))
+    else:
+        train(learner, Path(out))
+    assert isinstance(learner, nn.Module)
+    return learner.eval().requires_grad_(False).to(device_of(policy))
+
+
+def _card(what: str, scenarios: Scenarios) -> str:
+    """README of the model folder; the terms of the data are known for data sets only."""
+    if isinstance(scenarios, ScenarioDataset):
+        return model_card(what, scenarios.folder, len(scenarios))
+    return f"# Traffic model, {what}\n\n* trained on {len(scenarios)} scenarios handed over in Python\n"

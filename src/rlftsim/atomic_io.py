@@ -1,0 +1,125 @@
+"""Files that are written whole or not at all: under another name beside their own, then renamed."""
+
+import errno
+import os
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+from safetensors import SafetensorError
+from safetensors.torch import save_file
+from torch import Tensor
+
+from rlftsim.errors import DataError
+
+
+@contextmanager
+def errors_name(path: Path) -> Iterator[None]:
+    """Turn an error of the operating system, such as a full disk, into one line that names a path and the way out.
+
+    Raises:
+        DataError: in place of an OSError.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise cannot_write(path, error) from None
+
+
+def cannot_write(path: Path, error: OSError) -> DataError:
+    """Error of a file that cannot be written, with a way out that fits the cause.
+
+    Args:
+        path: of the file.
+        error: of the operating system, such as that of a full disk.
+    """
+    remedy = "choose another place, then run the same command again."
+    # safetensors tells no error number: a full disk is the likeliest cause there
+    if error.errno in (None, errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        remedy = f"make room or {remedy}"
+    elif isinstance(error, FileExistsError | NotADirectoryError):
+        # the file stands where the path needs a folder
+        file = next((place for place in (path, *path.parents) if place.is_file()), None)
+        remedy = f"{file} is a file, not a folder: choose another place." if file else remedy
+    elif isinstance(error, IsADirectoryError):
+        remedy = "it is a folder: name a file."
+    return DataError(f"cannot write {path} ({error.strerror or error}): {remedy}")
+
+
+def write_whole(path: Path, write: Callable[[Path], object]) -> None:
+    """Let `write` fill a temporary file beside `path`, then give it that name. A missing folder is created.
+
+    Args:
+        path: of the file.
+        write: called with the path of the temporary file.
+
+    Raises:
+        DataError: the file cannot be written, such as on a full disk. Then, and after any other error, nothing is left
+            behind and a file that was there before is untouched.
+    """
+    # Beside the file, as a rename is atomic within a file system only; with the process id, as two runs may write it.
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with errors_name(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write(temporary)
+            # On disk before it gets the name: after a power cut the name must not stand for an empty file.
+            with temporary.open("rb") as file:
+                os.fsync(file.fileno())
+            temporary.replace(path)
+    finally:
+        if temporary.is_file():
+            temporary.unlink()
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text in UTF-8.
+
+    Args:
+        path: of the file; its folder is created if missing.
+        text: the whole content.
+
+    Raises:
+        DataError: as `write_whole`.
+    """
+    write_whole(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+
+
+def append_text(path: Path, text: str) -> None:
+    """Add a text to the end of a file, in UTF-8. Unlike the others this may leave a part of it.
+
+    Args:
+        path: of the file, created if missing.
+        text: whole lines, so that a reader can drop one that was cut short.
+
+    Raises:
+        DataError: the file cannot be written, such as on a full disk.
+    """
+    with errors_name(path), path.open("a", encoding="utf-8") as file:
+        file.write(text)
+
+
+def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: dict[str, str] | None = None) -> None:
+    """Write named tensors as safetensors, readable by all users that may read the folder.
+
+    Args:
+        path: of the file.
+        tensors: on any device.
+        metadata: stored in the file's header.
+
+    Raises:
+        DataError: as `write_whole`.
+    """
+
+    def write(temporary: Path) -> None:
+        contiguous = {name: t.detach().cpu().contiguous() for name, t in tensors.items()}
+        try:
+            save_file(contiguous, temporary, metadata=metadata)
+        except SafetensorError as error:  # safetensors reports a full disk by an error of its own
+            raise OSError(str(error)) from None
+        # safetensors writes files that only their owner may read, whatever the umask.
+        mask = os.umask(0)
+        os.umask(mask)
+        temporary.chmod(0o666 & ~mask)
+
+    write_whole(path, write)

@@ -1,0 +1,93 @@
+"""Words of a command line that make no sense, explained in one line."""
+
+import difflib
+import re
+from collections.abc import Sequence
+from itertools import pairwise
+
+RULE = re.compile(r"^(╭|╰|─{4}|-{4})")
+FLAG = re.compile(r"--[A-Za-z][\w.-]*")
+
+
+def flags_of(words: Sequence[str]) -> list[str]:
+    """Flags among words, without their values, as help texts write them."""
+    return [word.partition("=")[0].replace("_", "-") for word in words if FLAG.match(word)]
+
+
+def explain(words: Sequence[str], complaint: str, help_text: str) -> str:
+    """One line that says what is wrong with a command line.
+
+    Args:
+        words: the words behind the verb.
+        complaint: what tyro printed, a box of lines.
+        help_text: the verb's help, for the flags that exist.
+    """
+    known = list(dict.fromkeys(FLAG.findall(help_text)))
+    for flag in flags_of(words):
+        if flag not in known:
+            near = nearest(flag, known)
+            return f"no flag {flag}: " + (f"did you mean {near}?" if near else "`--help` lists them all.")
+    # `--switch yes`: tyro complains about the value alone
+    left_over = re.search(r"Unrecognized options: (\S+)", complaint)
+    for flag, word in pairwise(words):
+        group, dot, last = flag.replace("_", "-").removeprefix("--").rpartition(".")
+        off = f"--{group}{dot}no-{last}"
+        if left_over and word == left_over[1] and flag.startswith("--") and off in known:
+            return f"{flag} is a switch, it takes no value: write {flag} or {off}."
+    return _one_line(complaint)
+
+
+def nearest(flag: str, known: Sequence[str]) -> str | None:
+    """The known flag that a mistyped one most likely stands for; None = none is near.
+
+    Args:
+        flag: e.g. "--finetune.lr", "--learning-rate" or "--finetune.learnig-rate".
+        known: flags that exist.
+    """
+    group, _, last = flag.removeprefix("--").rpartition(".")
+    siblings = [name for name in known if name.removeprefix("--").rpartition(".")[0].startswith(group)]
+    by_last = {name: name.removeprefix("--").rpartition(".")[2] for name in siblings}
+    # 1. the right name without its group, 2. initials, 3. a typing mistake in the last part, 4. one anywhere
+    for fits in (lambda name: name == last, lambda name: "".join(part[:1] for part in name.split("-")) == last):
+        found = next((flag for flag, name in by_last.items() if fits(name)), None)
+        if found:
+            return found
+    close = difflib.get_close_matches(last, list(by_last.values()), n=1, cutoff=0.75)
+    if close:
+        return next(flag for flag, name in by_last.items() if name == close[0])
+    if group and siblings:  # the group is right: a flag of another one would be a wild guess
+        return None
+    return next(iter(difflib.get_close_matches(flag, known, n=1)), None)
+
+
+def _one_line(complaint: str) -> str:
+    """The message inside tyro's box, without the frame, the advice and the help texts around it."""
+    lines = [line.strip("│| ") for line in complaint.splitlines()]
+    # The first lines are the top of the frame and the title. A terminal without Unicode gets rules of hyphens.
+    title = next((i for i, line in enumerate(lines) if RULE.search(line)), 0)
+    inside = lines[title + 1 :]
+    # The message ends at the next rule or empty line; behind it stand help texts.
+    end = next((i for i, line in enumerate(inside) if not line or RULE.search(line)), len(inside))
+    message = " ".join(inside[:end]) or complaint.strip()
+    if message.startswith("Missing from"):
+        # Several flags may be missing. Help texts, of one line or more, stand deeper than the names.
+        rows = [line.strip("│|").rstrip() for line in complaint.splitlines()[title + 2 :][: end - 1]]
+        depth = min(len(row) - len(row.lstrip()) for row in rows)
+        return f"missing: {', '.join(row.split()[0] for row in rows if not row[depth].isspace())}."
+    message = message.removeprefix("Error parsing ")
+    for pattern, words in _REWORDED:
+        message = re.sub(pattern, words, message)
+    return message
+
+
+_REWORDED = (
+    (r"^Unrecognized options: (.*)$", r"not understood: \1 (one word too many, or a pattern without quotes)."),
+    (r"^invalid choice '(.*)' for argument '(.*)'\. Expected one of \((.*?),?\)\.$", r"\2 \1: expected one of \3."),
+    (r"^Missing value for argument '(.*)'\. Expected 1 values\.$", r"\1 needs a value."),
+    (r"^Missing value for argument '(.*)'\. Expected (\d+) values\.$", r"\1 needs \2 values."),
+    (r"^(.*): no type matching (.*) could be instantiated from \['?(.*?)'?\]\.$", r"\1 \3: expected \2."),
+    (r"^(.*): could not convert string to float: '(.*)'$", r"\1 \2: expected a number."),
+    (r"^(.*): invalid literal for int\(\) with base 10: '(.*)'$", r"\1 \2: expected a whole number."),
+    (r"^Expected one of \{(.*)\}\.$", r"missing: one of \1."),
+)
+"""Messages of tyro and Python, and ours."""

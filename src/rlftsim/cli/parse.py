@@ -1,0 +1,172 @@
+"""From the words of a command line to a verb with its settings."""
+
+import importlib
+import io
+import os
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from dataclasses import fields, is_dataclass
+from typing import Any
+
+from rlftsim.aliases import current_name, current_words
+from rlftsim.cli.mistakes import FLAG, explain, flags_of
+from rlftsim.cli.stand_ins import stand_ins
+from rlftsim.errors import ConfigError
+from rlftsim.progress import log
+
+HELP = ("-h", "--help")
+COUNTS = ("jobs", "num_rollouts", "num_scenarios", "limit", "seeds", "top_k")
+"""Fields of verbs that are 1 or more."""
+EITHER_OR = {"--goal-logit-bias": "True", "--no-goal-logit-bias": "False"}
+"""Switches that may also be left out, which is a third value. tyro has no such kind: it is handed the value."""
+NUMBERS = re.compile(r"[\d.eE+\-\s]+(,[\d.eE+\-\s]+)+,?")
+
+
+def parse(words: Sequence[str], verbs: Mapping[str, tuple[str, str]]) -> Any:
+    """The verb of a command line with its settings; has a method `run`.
+
+    Args:
+        words: the verb and what follows it.
+        verbs: name -> module and class.
+
+    Raises:
+        ConfigError: the words make no sense; says which word and what it may have meant.
+        SystemExit: they ask for help, which has been printed.
+    """
+    name, *rest = words
+    # 1. words of earlier versions become words of today
+    rest = _flags_of_set(current_words(rest))
+    # 2. switches that may be left out get the value that tyro expects
+    rest = [part for word in rest for part in (["--goal-logit-bias", EITHER_OR[word]] if word in EITHER_OR else [word])]
+    # 3. help leaves here by SystemExit
+    if any(word in HELP for word in rest):
+        try:
+            with stand_ins():
+                _parsed(name, rest, verbs)
+        # A package that computes with torch, when it is imported or in a recipe, fails with stand-ins in ways of
+        # its own. Then help waits for the real libraries, and so does the message of a real mistake.
+        except Exception as error:
+            log.debug(f"help without torch failed: {error!r}")
+    return _parsed(name, rest, verbs)
+
+
+def _parsed(name: str, words: list[str], verbs: Mapping[str, tuple[str, str]], recipe: str | None = None) -> Any:
+    """The verb, or its help, or one line of complaint. Defaults are those of a recipe; None = guessed."""
+    # Imported late: the overview of verbs does not need tyro, and most verbs do not need recipes.
+    import tyro
+
+    module, attribute = verbs[name]
+    verb, stored = getattr(importlib.import_module(module), attribute), words
+    has_settings = hasattr(verb, "sections")
+    if has_settings:
+        from rlftsim.cli.recipe_verb import with_settings
+
+        verb, stored = with_settings(verb, words, recipe)
+
+    def cli(these: list[str]) -> Any:
+        return tyro.cli(verb, args=these, prog=f"rlftsim {name}", config=(tyro.conf.OmitSubcommandPrefixes,))
+
+    if any(word in HELP for word in words):
+        return cli(stored)
+    # tyro prints a box of lines and exits; the box is caught and made one line.
+    complaint = io.StringIO()
+    try:
+        with redirect_stderr(complaint), _wide():
+            parsed = cli(stored)
+    except SystemExit:
+        # The first word may be an action ("data verify"), which has flags of its own.
+        chosen = [word for word in words[:1] if not word.startswith("-")]
+        message = explain(words, complaint.getvalue(), _help_text(cli, chosen))
+        # A setting of a file is a flag that the user never typed: the file is to blame.
+        blamed = FLAG.match(message)
+        if blamed and blamed[0] in set(flags_of(stored)) - set(flags_of(words)):
+            message = f"{stored[stored.index('--config') + 1]}: {message.removeprefix('--')}"
+        raise ConfigError(message) from None
+    # A word behind a switch may have been mistaken for its value; tyro knows which word is the recipe.
+    if has_settings and parsed.recipe != verb.starting_name:
+        return _parsed(name, words, verbs, parsed.recipe)
+    # Warnings on the way, such as that of a reward that is registered twice, are shown after all.
+    if complaint.getvalue():
+        log.warning(complaint.getvalue().rstrip())
+    _refuse_no_count(parsed)
+    if has_settings:
+        parsed.refuse_useless(flags_of(words))
+    return parsed
+
+
+def _help_text(cli: Any, chosen: list[str]) -> str:
+    """Help of an action, or of the verb where the action does not exist."""
+    text = io.StringIO()
+    for words in ([*chosen, "--help"], ["--help"]):
+        try:
+            with redirect_stdout(text), redirect_stderr(io.StringIO()), _wide():
+                cli(words)
+        except SystemExit as stop:
+            if not stop.code:
+                break
+    return text.getvalue()
+
+
+@contextmanager
+def _wide() -> Iterator[None]:
+    """Let tyro write lines as long as they are: each message stands on one line of its box."""
+    before = os.environ.get("COLUMNS")
+    os.environ["COLUMNS"] = "10000"
+    try:
+        yield
+    finally:
+        del os.environ["COLUMNS"]
+        if before is not None:
+            os.environ["COLUMNS"] = before
+
+
+def _flags_of_set(words: Sequence[str]) -> list[str]:
+    """The same words with flags in place of `--set field=value ...`, the way of 0.1 to give settings.
+
+    Raises:
+        ConfigError: a value without "=".
+    """
+    flags: list[str] = []
+    is_setting = False
+    for word in words:
+        # `--set` takes all words up to the next flag.
+        is_setting = word == "--set" or (is_setting and not word.startswith("-"))
+        if not is_setting:
+            flags.append(word)
+        elif word != "--set":
+            flags += _flag_of_setting(word)
+    return flags
+
+
+def _flag_of_setting(setting: str) -> list[str]:
+    name, equals, value = setting.partition("=")
+    if not equals:
+        raise ConfigError(f"--set {setting} is not field=value. Settings are flags now: --{name} VALUE.")
+    flag = f"--{current_name(name.replace('-', '_')).replace('_', '-')}"
+    group, dot, last = flag.removeprefix("--").rpartition(".")
+    value = value.strip()
+    # Kinds of values that are written otherwise now: switches, tuples, none.
+    if value.lower() in ("true", "false"):
+        flags = [f"--{group}{dot}{'' if value.lower() == 'true' else 'no-'}{last}"]
+    elif NUMBERS.fullmatch(value.strip("()[] ")):
+        flags = [flag, *(part.strip() for part in value.strip("()[] ").split(",") if part.strip())]
+    else:
+        flags = [flag, "None" if value.lower() == "none" else value]
+    log.warning(f"--set {setting} is written {' '.join(flags)} from 0.2 on.")
+    return flags
+
+
+def _refuse_no_count(verb: Any, prefix: str = "--") -> None:
+    """Refuse zero and less where something is counted.
+
+    Raises:
+        ConfigError: names the flag.
+    """
+    for field in fields(verb):
+        value = getattr(verb, field.name)
+        if field.name in COUNTS and isinstance(value, int) and value < 1:
+            raise ConfigError(f"{prefix}{field.name.replace('_', '-')} must be at least 1, got {value}.")
+        # Fields of these two are shown without a prefix, so they belong to the verb.
+        if field.name in ("config", "action") and is_dataclass(value):
+            _refuse_no_count(value)

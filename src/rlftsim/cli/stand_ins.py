@@ -1,0 +1,117 @@
+"""Imports without the libraries that take seconds to load, for help texts.
+
+A help text needs the names, types and docstrings of settings, not torch. While it is made, slow libraries are
+replaced by stand-ins that accept whatever a module does with a library while it is imported: subclass,
+annotate, decorate, call. (Sphinx documents packages in the same way: `autodoc_mock_imports`.)
+"""
+
+import importlib.abc
+import importlib.machinery
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from types import ModuleType
+from typing import Any
+
+KEPT = {*sys.stdlib_module_names, "numpy"}
+"""Packages that cannot hold a stand-in: they import no slow library. numpy also refuses to be loaded twice."""
+SLOW = ("torch", "lightning_fabric", "scipy", "matplotlib", "pyarrow", "safetensors", "PIL", "imageio_ffmpeg")
+
+
+class _AnyClass(type):
+    """Class of a stand-in: attributes and unions of it are stand-ins, too."""
+
+    def __getattr__(cls, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return _Anything
+
+    def __or__(cls, other: object) -> Any:
+        return _Anything
+
+    __ror__ = __or__
+
+
+class _Anything(metaclass=_AnyClass):
+    """Stands for any class, function, constant or decorator of a slow library."""
+
+    def __new__(cls, *arguments: Any, **options: Any) -> Any:
+        # A decorator without arguments hands back what it decorates, so that docstrings and signatures survive.
+        if cls is _Anything and len(arguments) == 1 and callable(arguments[0]) and not options:
+            return arguments[0]
+        return super().__new__(cls)
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        pass
+
+    def __class_getitem__(cls, item: object) -> type:
+        return cls
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return _Anything
+
+    def __call__(self, *arguments: Any, **options: Any) -> Any:
+        return _Anything(*arguments, **options)
+
+    def __getitem__(self, item: object) -> Any:
+        return self
+
+    def __iter__(self) -> Iterator[Any]:
+        return iter(())
+
+    def __len__(self) -> int:
+        return 0
+
+
+class _EmptyModule(ModuleType):
+    __path__: Sequence[str] = ()
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return _Anything
+
+
+class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
+    """Finds an empty module for every slow library and each of its submodules."""
+
+    def find_spec(self, fullname: str, path: Any, target: ModuleType | None = None) -> Any:
+        is_slow = fullname.partition(".")[0] in SLOW
+        return importlib.machinery.ModuleSpec(fullname, self, is_package=True) if is_slow else None
+
+    def create_module(self, spec: importlib.machinery.ModuleSpec) -> ModuleType:
+        return _EmptyModule(spec.name)
+
+    def exec_module(self, module: ModuleType) -> None:
+        pass
+
+
+@contextmanager
+def stand_ins() -> Iterator[None]:
+    """Replace slow libraries in imports inside the `with`; modules imported inside are forgotten after it.
+
+    Does nothing where torch is loaded already: then there is no time to save.
+    """
+    if "torch" in sys.modules:
+        yield
+        return
+    finder, before = _Finder(), set(sys.modules)
+    sys.meta_path.insert(0, finder)
+    try:
+        yield
+    finally:
+        sys.meta_path.remove(finder)
+        # All, those of other packages included: any of them may hold a stand-in by name, base class or default.
+        for name in set(sys.modules) - before:
+            if name.partition(".")[0] not in KEPT:
+                _forget(name)
+
+
+def _forget(name: str) -> None:
+    """Remove a module, also from its package: `from package import module` would find it there."""
+    module = sys.modules.pop(name)
+    package, _, last = name.rpartition(".")
+    if getattr(sys.modules.get(package), last, None) is module:
+        delattr(sys.modules[package], last)

@@ -1,0 +1,1 @@
+"""Measure a policy on a data set: rollouts, realism scores, tables, comparisons, pages."""

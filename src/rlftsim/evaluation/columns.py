@@ -1,0 +1,107 @@
+"""Columns of tables of evaluations, the same on the command line, in reports and in experiments."""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from rlftsim.statistics import MeanInterval
+
+ARROWS = {"higher": "↑", "lower": "↓"}
+
+
+def direction_of(source: str) -> Literal["higher", "lower"]:
+    """The better direction of a column of an evaluation: errors and rates are better lower, all others higher."""
+    return "lower" if source.endswith(("_error", "_rate")) else "higher"
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of an evaluation as tables show it."""
+
+    source: str
+    """Its name in an `Evaluation`."""
+    heading: str
+    meaning: str
+    unit: Literal["", "m", "%"] = ""
+    """Rates are stored as fractions and shown in percent."""
+    rate_heading: str = ""
+    """Heading where a rate is shown as a fraction; empty = the heading and the word rate."""
+
+    @property
+    def higher_is_better(self) -> bool:
+        """True for scores, False for errors and rates."""
+        return direction_of(self.source) == "higher"
+
+    @property
+    def label(self) -> str:
+        """Heading with the unit and an arrow in the better direction."""
+        return f"{self.heading}{f' [{self.unit}]' if self.unit else ''} {ARROWS[direction_of(self.source)]}"
+
+    @property
+    def fraction_label(self) -> str:
+        """As `label`, for tables that show rates as fractions."""
+        if self.unit != "%":
+            return self.label
+        return f"{self.rate_heading or f'{self.heading} rate'} {ARROWS[direction_of(self.source)]}"
+
+    def text(self, number: float) -> str:
+        """A number in the column's unit and digits."""
+        # rates are fractions in [0, 1] in an evaluation
+        factor, digits = {"": (1.0, 4), "m": (1.0, 2), "%": (100.0, 2)}[self.unit]
+        return format_number(factor * number, digits)
+
+    def cell(self, estimate: MeanInterval | None) -> str:
+        """Mean ± standard error; a dash without a finite mean."""
+        if estimate is None or not math.isfinite(estimate.mean):
+            return "–"
+        error = f" ± {self.text(estimate.standard_error)}" if math.isfinite(estimate.standard_error) else ""
+        return f"{self.text(estimate.mean)}{error}"
+
+
+SCORES = (
+    Column("meta_metric", "RMM", "realism meta-metric"),
+    Column("kinematic", "kinematic", "kinematic sub-score"),
+    Column("interactive", "interactive", "interactive sub-score"),
+    Column("map_based", "map-based", "map-based sub-score"),
+    Column("min_average_displacement_error", "minADE", "displacement from the log of the best rollout", "m"),
+    Column("collision_rate", "collision", "evaluated agents that collide", "%"),
+    Column("offroad_rate", "off-road", "evaluated agents that leave the road", "%"),
+)
+"""Shown in every table of policies."""
+COLUMNS = (
+    *SCORES,
+    Column("average_displacement_error", "ADE", "displacement from the log, mean over rollouts", "m"),
+    Column("miss_rate", "miss", "evaluated agents that end too far from the log's end", "%"),
+)
+"""Shown in reports, where some row has a value."""
+_MISSES = (
+    Column(
+        "passing_miss_rate", "passing miss",
+        "evaluated agents that never come near the log's end", "%", "goal missed",
+    ),
+    Column(
+        "min_passing_miss_rate", "in all rollouts",
+        "evaluated agents that never come near the log's end in any rollout", "%", "in all rollouts",
+    ),
+)  # fmt: skip
+GOAL_COLUMNS = (*_MISSES, *SCORES[1:4], SCORES[0])
+"""Shown in the table of goal conditioning, in the order of the paper's."""
+# The next two are on the command line only: reports and papers show neither.
+_LIGHT_ONE = Column(
+    "meta_metric_light_one", "RMM, light = 1", "realism meta-metric with the traffic light term set to 1"
+)
+_RED_LIGHT = Column("traffic_light_violation_rate", "red light", "evaluated agents that pass a red light", "%")
+TERMINAL_COLUMNS = (SCORES[0], _LIGHT_ONE, *SCORES[1:], _RED_LIGHT)
+"""Shown on the command line; rates as fractions."""
+TERMINAL_GOAL_COLUMNS = (*TERMINAL_COLUMNS, *_MISSES)
+"""Shown on the command line where agents had goals."""
+
+
+def format_number(value: float, digits: int) -> str:
+    """A number with fixed digits and a real minus sign.
+
+    Args:
+        value: in the unit that is shown.
+        digits: after the decimal point.
+    """
+    return f"{value:.{digits}f}".replace("-", "−")

@@ -1,0 +1,252 @@
+"""Evaluations side by side: tables with standard errors, and the paired difference of two."""
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from rich.table import Table
+
+from rlftsim.errors import ConfigError, DataError
+from rlftsim.evaluation.columns import TERMINAL_COLUMNS, TERMINAL_GOAL_COLUMNS, Column, direction_of
+from rlftsim.evaluation.results import LABELS, SCORE_COLUMNS, Evaluation
+from rlftsim.statistics import mean_interval
+
+
+@dataclass(frozen=True)
+class PairedDifference:
+    """One column of two evaluations on the same scenarios; the difference is b minus a."""
+
+    column: str
+    count: int
+    """Scenarios with a value in both."""
+    mean_a: float
+    mean_b: float
+    difference: float
+    """Mean of the scenarios' differences; NaN where no scenario has both values."""
+    standard_error: float
+    """NaN for fewer than two scenarios."""
+    interval: tuple[float, float]
+    """Holds the true difference with probability 1 - alpha (Student's t); NaN for fewer than two scenarios."""
+    p_value: float
+    """Two-sided, of a true difference of 0; NaN for fewer than two scenarios."""
+    alpha: float
+
+    def __repr__(self) -> str:
+        return f"{self.column}: {self.mean_a:.4f} -> {self.mean_b:.4f}, {self.verdict}"
+
+    @property
+    def is_difference(self) -> bool:
+        """True if the difference is more than chance at level alpha."""
+        return self.p_value < self.alpha
+
+    @property
+    def verdict(self) -> str:
+        """The result of the test, in words."""
+        if self.count == 0:
+            return "nothing to compare: no scenario has a value in both."
+        if self.count == 1:
+            return f"no verdict: a single scenario, which differs by {self.difference:+.4f}."
+        # the same difference everywhere: there is no test to make
+        if self.standard_error == 0:
+            if self.difference == 0:
+                return f"no difference: equal in all {self.count} scenarios."
+            return f"difference: {self.difference:+.4f} in every one of the {self.count} scenarios."
+        low, high = self.interval
+        level = 100 - 100 * self.alpha
+        numbers = f"{self.difference:+.4f}, {level:g}% interval [{low:+.4f}, {high:+.4f}], p = {self.p_value:.2g}"
+        if not self.is_difference:
+            return f"no difference at the {100 * self.alpha:g}% level: {numbers}."
+        is_better = (self.difference > 0) == (direction_of(self.column) == "higher")
+        return f"difference, for the {'better' if is_better else 'worse'}: {numbers}."
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Two evaluations, scenario by scenario; `comparison["meta_metric"]` is the difference of one column."""
+
+    name_a: str
+    name_b: str
+    num_paired: int
+    num_only_a: int
+    """Scenarios that only the first has; they are left out."""
+    num_only_b: int
+    differences: tuple[PairedDifference, ...]
+    """In the order of `SCORE_COLUMNS`."""
+
+    def __repr__(self) -> str:
+        return f"{self.name_b} against {self.name_a}, {self.pairing}; {self['meta_metric']!r}"
+
+    def __getitem__(self, column: str) -> PairedDifference:
+        """Difference of one column.
+
+        Raises:
+            ConfigError: there is no such column.
+        """
+        column = LABELS.get(column, column)
+        for difference in self.differences:
+            if difference.column == column:
+                return difference
+        raise ConfigError(f"a comparison has no column {column!r}, only {', '.join(SCORE_COLUMNS)}.")
+
+    @property
+    def pairing(self) -> str:
+        """Numbers of scenarios that are compared and left out, in words."""
+        alone = [(self.num_only_a, self.name_a), (self.num_only_b, self.name_b)]
+        left_out = "".join(f", {count} only in {name} left out" for count, name in alone if count)
+        return f"{self.num_paired} scenario{'s' if self.num_paired != 1 else ''} in both{left_out}"
+
+
+def compare(a: Evaluation, b: Evaluation, *, alpha: float = 0.05) -> Comparison:
+    """Paired comparison, b against a.
+
+    Args:
+        a: the reference, e.g. the base model.
+        b: the other one, e.g. the fine-tuned model.
+        alpha: probability of calling a difference that is none.
+
+    Raises:
+        ConfigError: alpha is no probability.
+        DataError: other metric or number of rollouts, or no scenario in common.
+    """
+    if not 0 < alpha < 1:
+        raise ConfigError(f"alpha must lie between 0 and 1, got {alpha}: 0.05 is usual.")
+    # The meta-metric depends on both. Other settings (temperature, goals) may be what is compared.
+    for setting in ("metric", "num_rollouts"):
+        values = [getattr(e.config, setting) for e in (a, b)]
+        if values[0] != values[1]:
+            raise DataError(
+                f"{a.name} and {b.name} cannot be compared, {setting} is {values[0]} and {values[1]}: evaluate both "
+                "alike."
+            )
+    rows_a, rows_b = pair_rows(a, b)
+    return Comparison(
+        name_a=a.name,
+        name_b=b.name,
+        num_paired=len(rows_a),
+        num_only_a=len(a) - len(rows_a),
+        num_only_b=len(b) - len(rows_b),
+        differences=tuple(
+            compare_paired(column, a.values(column)[rows_a], b.values(column)[rows_b], alpha=alpha)
+            for column in SCORE_COLUMNS
+        ),
+    )
+
+
+def pair_rows(a: Evaluation, b: Evaluation) -> tuple[list[int], list[int]]:
+    """Rows of the scenarios that both have, in the order of the first.
+
+    Args:
+        a: an evaluation.
+        b: another one.
+
+    Raises:
+        DataError: they have none in common, or one of them has several rows of a scenario.
+    """
+    # scored files may hold several sets of rollouts of a scenario: nothing says which of them make a pair
+    for evaluation in (a, b):
+        repeated = [scenario_id for scenario_id, count in Counter(evaluation.scenario_ids).items() if count > 1]
+        if repeated:
+            raise DataError(
+                f"{evaluation.name}: scenario {repeated[0]} has several rows, a pair needs one: score its sets apart."
+            )
+    place = {scenario_id: row for row, scenario_id in enumerate(b.scenario_ids)}
+    rows_a = [row for row, scenario_id in enumerate(a.scenario_ids) if scenario_id in place]
+    if not rows_a:
+        raise DataError(f"{a.name} ({len(a)} scenarios) and {b.name} ({len(b)}) have no scenario in common.")
+    return rows_a, [place[a.scenario_ids[row]] for row in rows_a]
+
+
+def paired_values(a: Evaluation, b: Evaluation, column: str) -> tuple[list[str], np.ndarray, np.ndarray]:
+    """Ids of the scenarios that both have, and both columns [scenarios] there.
+
+    Args:
+        a: an evaluation.
+        b: another one.
+        column: one of `SCORE_COLUMNS`.
+
+    Raises:
+        DataError: they have none in common.
+        ConfigError: there is no such column.
+    """
+    rows_a, rows_b = pair_rows(a, b)
+    return [a.scenario_ids[row] for row in rows_a], a.values(column)[rows_a], b.values(column)[rows_b]
+
+
+def compare_paired(
+    column: str, a: Float[np.ndarray, "scenarios"], b: Float[np.ndarray, "scenarios"], *, alpha: float = 0.05
+) -> PairedDifference:
+    """Paired t-test of two columns; scenarios without a value in both are left out.
+
+    Args:
+        column: their name.
+        a: the reference's values.
+        b: the other one's, of the same scenarios in the same order.
+        alpha: probability of calling a difference that is none.
+    """
+    known = np.isfinite(a) & np.isfinite(b)  # [scenarios]
+    a, b = a[known], b[known]
+    # a paired t-test is a t-test of the differences: scenarios differ far more than policies do
+    gain = mean_interval(b - a, alpha=alpha)
+    means = (float(a.mean()), float(b.mean())) if gain.count else (math.nan, math.nan)
+    return PairedDifference(
+        column, gain.count, *means, gain.mean, gain.standard_error, gain.interval, gain.p_value, alpha
+    )
+
+
+def columns_of(*evaluations: Evaluation) -> tuple[Column, ...]:
+    """Columns of a table of some evaluations: with misses where agents of some evaluation had goals."""
+    have_goals = any(evaluation.config.goals != "none" for evaluation in evaluations)
+    return TERMINAL_GOAL_COLUMNS if have_goals else TERMINAL_COLUMNS
+
+
+def format_table(*evaluations: Evaluation, columns: Sequence[Column] | None = None) -> Table:
+    """One row per evaluation: mean ± standard error over its scenarios. Arrows point in the better direction.
+
+    Args:
+        evaluations: the rows.
+        columns: None = `columns_of` the evaluations.
+    """
+    columns = columns or columns_of(*evaluations)
+    with_goals = [evaluation.name for evaluation in evaluations if evaluation.config.goals != "none"]
+    caption = (
+        f"{', '.join(with_goals)}: the goals of evaluated agents were their logged final positions; an agent that "
+        "never comes near its goal has missed it."
+        if with_goals
+        else None
+    )
+    table = Table(caption=caption, caption_justify="left")
+    table.add_column("policy", no_wrap=True)
+    table.add_column("scenarios", justify="right")
+    for column in columns:
+        table.add_column(column.fraction_label, justify="right")
+    for evaluation in evaluations:
+        means = [evaluation.mean_and_error(column.source) for column in columns]
+        cells = [_plus_minus(found.mean, found.standard_error) for found in means]
+        table.add_row(evaluation.name, str(len(evaluation)), *cells)
+    return table
+
+
+def format_comparison(comparison: Comparison, *, columns: Sequence[Column] = TERMINAL_COLUMNS) -> Table:
+    """One row per column: both means, the difference ± standard error and the verdict.
+
+    Args:
+        comparison: of two evaluations.
+        columns: the rows.
+    """
+    table = Table(title=f"{comparison.name_b} against {comparison.name_a}: {comparison.pairing}", title_justify="left")
+    table.add_column("", no_wrap=True)
+    for name in (comparison.name_a, comparison.name_b, "difference"):
+        table.add_column(name, justify="right")
+    table.add_column("verdict")
+    for column in columns:
+        row = comparison[column.source]
+        difference = _plus_minus(row.difference, row.standard_error, sign="+")
+        table.add_row(column.fraction_label, f"{row.mean_a:.4f}", f"{row.mean_b:.4f}", difference, row.verdict)
+    return table
+
+
+def _plus_minus(mean: float, error: float, sign: str = "") -> str:
+    return f"{mean:{sign}.4f}" + ("" if math.isnan(error) else f" ± {error:.4f}")

@@ -1,0 +1,219 @@
+"""Scores of a policy on a data set: simulate every scenario, score all its rollouts together, keep the numbers of each.
+
+An interrupted evaluation is resumed by the same call, see `evaluation.resumable`.
+"""
+
+import copy
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from os import PathLike
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+import torch
+from torch import nn
+
+from rlftsim.errors import ConfigError, DataError
+from rlftsim.evaluation.results import EvaluateConfig, Evaluation, GoalsGiven, Provenance, Skipped, row_of_result
+from rlftsim.evaluation.resumable import resume_evaluation
+from rlftsim.evaluation.scenario_source import choose_scenarios, hash_manifest, open_held_out
+from rlftsim.goals.logged import logged_goals
+from rlftsim.goals.types import Goals
+from rlftsim.realism import SimulatedStates, metric_by_name, scenario_log, score
+from rlftsim.realism.from_rollouts import logged_states, states_of_rollouts
+from rlftsim.rollout.fingerprint import fingerprint_policy
+from rlftsim.rollout.policy import Policy, device_of, is_goal_conditioned
+from rlftsim.rollout.simulate import simulate
+from rlftsim.scenario.batch import ScenarioBatch, collate
+from rlftsim.scenario.dataset import ScenarioDataset
+from rlftsim.scenario.types import Scenario
+
+__all__ = [
+    "EvaluateConfig",
+    "Evaluation",
+    "GoalsGiven",
+    "Provenance",
+    "Skipped",
+    "evaluate",
+    "evaluation_name",
+    "simulate_states",
+]
+
+Oracle = Literal["oracle"]
+AnyPolicy = TypeVar("AnyPolicy")
+
+
+def evaluate(
+    policy: Policy | Oracle,
+    data: str | PathLike[str] | ScenarioDataset,
+    out: str | PathLike[str] | None = None,
+    config: EvaluateConfig = EvaluateConfig(),  # noqa: B008
+    *,
+    name: str | None = None,
+    show_progress: bool = True,
+) -> Evaluation:
+    """Score a policy on the scenarios of a data set; the result is also written to `out/<name>.parquet`.
+
+    Interrupted in any way, the same call goes on where it was. Once finished, it reads the file.
+
+    Args:
+        policy: any policy, or "oracle" for the log itself.
+        data: data set's folder, or "synthetic", or an opened data set, whose split then counts.
+        out: folder of the result, made if missing; None keeps nothing.
+        config: rollouts, metric, sampling, scenarios, processes.
+        name: of the row and the file; None = class and fingerprint of the policy. Unfinished work and results of
+            another policy, data set or setting under this name are replaced, with a message on stderr, but never a
+            result of more scenarios by one with a limit.
+        show_progress: False = no progress and time left on stderr.
+
+    Raises:
+        DataError: no such data set or split, scenarios whose future is withheld (a test split), or one with a NaN.
+        ConfigError: an impossible name, several processes for a policy on a GPU, goals for a policy that is not
+            goal-conditioned, or a limit that would replace a result of more scenarios.
+    """
+    is_oracle = isinstance(policy, str)
+    kind, fingerprint = ("oracle", "oracle") if is_oracle else (type(policy).__name__, fingerprint_policy(policy))
+    name = name or (kind if is_oracle else f"{kind}-{fingerprint[:8]}")
+    if config.goals != "none" and not is_goal_conditioned(policy):
+        raise ConfigError(f"evaluate.goals={config.goals} has no effect: {name} is not goal-conditioned, leave it out.")
+    # Everything that can be refused is refused before anything is simulated or written.
+    dataset, config = open_held_out(data, config)
+    positions = choose_scenarios(dataset, config)
+    check_jobs(config, device_of(policy))
+    provenance = Provenance(
+        config=config,
+        policy=kind,
+        policy_fingerprint=fingerprint,
+        dataset=str(dataset.folder.resolve()),
+        manifest_sha256=hash_manifest(dataset.folder),
+    )
+    return resume_evaluation(
+        partial(_evaluate_scenario, _Job(frozen_copy(policy), dataset, config)),
+        dataset.scenario_ids[: len(positions)],
+        name,
+        provenance,
+        None if out is None else Path(out),
+        jobs=config.jobs,
+        title=f"evaluate {name}",
+        show_progress=show_progress,
+    )
+
+
+def evaluation_name(model: str | PathLike[str]) -> str:
+    """Name of an evaluation of a model: that of its folder, or of its run, as a run's model lies in RUN/model."""
+    path = Path(model)
+    return path.parent.name if path.name == "model" else path.name
+
+
+def frozen_copy(policy: AnyPolicy) -> AnyPolicy:
+    """A copy without dropout and gradients, so that a policy may keep parts of it in tables; itself without weights."""
+    return copy.deepcopy(policy).eval().requires_grad_(False) if isinstance(policy, nn.Module) else policy
+
+
+def evaluated_ends(batch: ScenarioBatch) -> Goals:
+    """Logged final positions of the evaluated agents, as their goals."""
+    return logged_goals(batch, batch.evaluated_mask)
+
+
+def check_jobs(config: EvaluateConfig, device: torch.device) -> None:
+    """Refuse several processes for a policy on a GPU.
+
+    Args:
+        config: settings with the number of processes.
+        device: of the policy.
+
+    Raises:
+        ConfigError: the settings want that.
+    """
+    if config.jobs > 1 and device.type != "cpu":
+        raise ConfigError(
+            f"evaluate.jobs={config.jobs} works on CPUs only, the policy is on {device}: use --jobs 1 or --device cpu."
+        )
+
+
+def simulate_states(
+    policy: Policy,
+    scenario: Scenario,
+    config: EvaluateConfig,
+    device: torch.device,
+    *,
+    goals_of: Callable[[ScenarioBatch], Goals] | None = None,
+) -> SimulatedStates:
+    """All rollouts of one scenario, simulated a few at a time; a deterministic policy is simulated once.
+
+    Args:
+        policy: decides for all agents.
+        scenario: logged; it is simulated from its current step on.
+        config: rollouts, seed, sampling.
+        device: of the policy.
+        goals_of: goals of the agents of a batch, the same in all rollouts; None = goal-free.
+
+    Raises:
+        ConfigError: the policy cannot sample as `config` says, e.g. top-k without categories.
+    """
+    batch = collate([scenario]).to(device)
+    with torch.no_grad():
+        context = policy.encode(batch)
+    return simulate_encoded(policy, batch, context, config, goals=goals_of and goals_of(batch))
+
+
+def simulate_encoded(
+    policy: Policy, batch: ScenarioBatch, context: Any, config: EvaluateConfig, *, goals: Goals | None = None
+) -> SimulatedStates:
+    """All rollouts of one scenario that the policy has encoded, see `simulate_states`.
+
+    Args:
+        policy: decides for all agents.
+        batch: the scenario alone, on the policy's device.
+        context: `policy.encode(batch)`.
+        config: rollouts, seed, sampling.
+        goals: of a single rollout, the same in all; None = goal-free.
+    """
+    is_random = policy.initial_noise_size or (policy.noise_size and config.temperature > 0)
+    ids = range(config.num_rollouts if is_random else 1)
+    passes = []
+    for first in range(0, len(ids), config.rollouts_per_pass):
+        # Noise belongs to rollout ids, so the passes together draw what a single pass would.
+        some = ids[first : first + config.rollouts_per_pass]
+        rollouts = simulate(
+            policy, batch, num_rollouts=some, seed=config.seed, context=context, sampling=config.sampling, goals=goals
+        )
+        passes.append(states_of_rollouts(batch, rollouts)[0])
+    x, y, z, heading = (torch.cat([getattr(p, axis) for p in passes]) for axis in ("x", "y", "z", "heading"))
+    joined = SimulatedStates(passes[0].object_id, x, y, z, heading)  # each [N, A, T]
+    # Equal rollouts of a deterministic policy are counted by the metric as often as rollouts were wanted.
+    return joined if is_random else replace(joined, repeat=config.num_rollouts)
+
+
+@dataclass(frozen=True, eq=False)
+class _Job:
+    """Input of the work on a scenario; is handed to other processes."""
+
+    policy: Policy | Oracle
+    dataset: ScenarioDataset
+    config: EvaluateConfig
+
+
+def _evaluate_scenario(job: _Job, position: int) -> dict[str, object] | Skipped:
+    """Row of one scenario, or why there is none."""
+    scenario, config, device = job.dataset[position], job.config, device_of(job.policy)
+    try:
+        scenario.refuse_not_finite()
+    except DataError as error:
+        # An error, not a skipped scenario: NaN would lie in a histogram's last bin and look like a bad score.
+        raise DataError(
+            f"{job.dataset.folder}: scenario {scenario.scenario_id}: {error}: convert the data set again, which leaves "
+            "such scenarios out."
+        ) from None
+    # Without a road edge, for instance, the official metric is undefined.
+    try:
+        log = scenario_log(scenario, device)
+    except DataError as error:
+        return Skipped(scenario.scenario_id, str(error))
+    if isinstance(job.policy, str):
+        states = logged_states(scenario, num_rollouts=config.num_rollouts, device=device)
+    else:
+        goals_of = evaluated_ends if config.goals == "logged" else None
+        states = simulate_states(job.policy, scenario, config, device, goals_of=goals_of)
+    return row_of_result(score(log, states, metric_by_name(config.metric)), scenario, states)

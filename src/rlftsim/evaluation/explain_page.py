@@ -1,0 +1,292 @@
+"""Explanations of scores as self-contained HTML pages: costs by feature, agent and step, and the histograms behind."""
+
+from collections.abc import Callable
+from functools import partial
+from html import escape
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from rlftsim.atomic_io import write_text
+from rlftsim.evaluation.explain import WHOLE_FUTURE, Explanation, FeatureHistogram, explain
+from rlftsim.evaluation.rollout_files import RolloutEntry, find_rollouts, read_states
+from rlftsim.evaluation.scenario_source import ScenarioSource, open_scenarios
+from rlftsim.evaluation.score_files import ScoreConfig, check_entries, has_road_edge
+from rlftsim.progress import progress_bar
+from rlftsim.realism import metric_by_name
+from rlftsim.realism.config import BERNOULLI_FEATURES, FEATURE_NAMES, HISTOGRAM_FEATURES
+from rlftsim.scenario.types import STEP_S
+from rlftsim.threads import one_thread
+from rlftsim.viewer.chart import Chart, Curve, chart_html
+from rlftsim.viewer.page import Animation, Panel, animation_html, page_html
+from rlftsim.viewer.scene import build_scene, logged_trajectories
+from rlftsim.workers import run_tasks
+
+MAX_STRIPS = 10
+"""Rows of (feature, agent) drawn over time."""
+MAX_SHOWN_ROLLOUTS = 8
+_UNITS = {
+    "linear_speed": "m/s",
+    "linear_acceleration": "m/s²",
+    "angular_speed": "rad/s",
+    "angular_acceleration": "rad/s²",
+    "distance_to_nearest_object": "m",
+    "time_to_collision": "s",
+    "distance_to_road_edge": "m",
+}
+_BAR_WIDTH, _BAR_HEIGHT, _LEFT, _BOTTOM, _TOP = 380, 190, 40, 46, 8
+_CSS = """
+.results thead th.narrow { white-space: normal; min-width: 64px; padding-left: 8px; padding-right: 8px; }
+.cost { background: color-mix(in srgb, var(--bad) calc(var(--heat) * 70%), transparent); }
+.gain { background: color-mix(in srgb, var(--good) calc(var(--heat) * 70%), transparent); }
+.strip {
+  display: grid; grid-template-columns: minmax(200px, 290px) minmax(0, 1fr) 70px; gap: 4px 14px; align-items: center;
+  font-size: 14px; padding: 14px 18px; font-variant-numeric: tabular-nums;
+}
+.strip svg { width: 100%; height: 20px; display: block; border-radius: 4px; background: var(--page); }
+.strip .amount { text-align: right; }
+.strip .clock { display: flex; justify-content: space-between; color: var(--muted); font-size: 12px; min-width: 0; }
+.swatch { width: 12px; height: 12px; border-radius: 3px; }
+"""
+
+
+def explain_rollouts(
+    rollouts: str | PathLike[str],
+    scenarios: str | PathLike[str],
+    out: str | PathLike[str],
+    config: ScoreConfig = ScoreConfig(),  # noqa: B008
+    *,
+    show_progress: bool = True,
+) -> list[Path]:
+    """Write `out/<scenario id>.html` for every scenario with rollouts, anew. Returns the pages.
+
+    Further sets of rollouts of the same scenario are numbered: `<scenario id>-2.html`.
+
+    Args:
+        rollouts: npz, submission file or a folder of them, see `find_rollouts`.
+        scenarios: converted data set, or tfrecords (file, folder or glob).
+        out: folder of the pages, made if missing.
+        config: metric, handling of missing maps and scenarios, processes.
+        show_progress: False = no progress bar.
+
+    Raises:
+        DataError: as `score_rollouts`.
+    """
+    entries, source = find_rollouts(rollouts)[: config.limit], open_scenarios(scenarios)
+    check_entries(entries, source, config, Path(scenarios))
+    # Pages are named before any is written, so that the names do not depend on the order of the processes.
+    pages: dict[Path, RolloutEntry] = {}
+    for entry in entries:
+        name = entry.scenario_id.replace("/", "_") or "scenario"
+        numbered = (name, *(f"{name}-{k}" for k in range(2, len(entries) + 2)))
+        pages[next(path for path in (Path(out) / f"{n}.html" for n in numbered) if path not in pages)] = entry
+    with progress_bar("explain", len(pages), show=show_progress) as advance, one_thread():
+        written = run_tasks(
+            partial(_write_page, source, config), list(pages.items()), jobs=config.num_jobs, advance=advance
+        )
+    return [page for page, is_written in zip(pages, written) if is_written]
+
+
+def _write_page(
+    source: ScenarioSource,
+    config: ScoreConfig,
+    item: tuple[Path, RolloutEntry],
+    advance: Callable[[int], None],
+    is_stopped: Callable[[], bool],
+) -> bool:
+    """Write one page; False where there is nothing to explain."""
+    path, entry = item
+    if is_stopped():
+        return False
+    scenario = source.by_id(entry.scenario_id) if entry.scenario_id in source else None
+    # Without road edges there is no score to explain; scoring says so.
+    is_scored = scenario is not None and (config.missing_map == "error" or has_road_edge(scenario))
+    if scenario is not None and is_scored:
+        explanation = explain(scenario, read_states(entry), metric_by_name(config.metric))
+        write_text(path, explanation_html(explanation))
+    advance(1)
+    return is_scored
+
+
+def explanation_html(explanation: Explanation) -> str:
+    """The whole page."""
+    name, result = explanation.scenario.scenario_id, explanation.result
+    metric = escape(explanation.config.name)
+    lead = (
+        f"{result.single_meta_metric.shape[-1]} rollouts reach a meta-metric of {float(result.meta_metric):.4f} "
+        f"(metric {metric}); the log itself, as often, reaches {float(explanation.ceiling.meta_metric):.4f}. The "
+        f"difference of {explanation.lost:.4f} is split below over features, evaluated agents and steps; the parts add "
+        "up to it."
+    )
+    tiles = "".join(
+        f'<div class="card tile"><div class="what">{_words(score)} ({metric})</div>'
+        f'<div class="value">{float(getattr(result, score)):.4f}</div>'
+        f'<div class="interval">ceiling {float(getattr(explanation.ceiling, score)):.4f}</div></div>'
+        for score in ("meta_metric", "kinematic", "interactive", "map_based")
+    )
+    # few: the page holds every drawn trajectory
+    shown = explanation.rollouts.first(MAX_SHOWN_ROLLOUTS)
+    panels = [
+        Panel("logged", logged_trajectories(explanation.scenario)),
+        Panel(f"first {shown.num_rollouts} rollouts", shown),
+    ]
+    parts = [
+        f"<h1>Scenario {escape(name)}</h1>",
+        f'<p class="lead">{lead}</p>',
+        f'<div class="tiles">{tiles}</div>',
+        "<h2>Which feature</h2>",
+        _features_html(explanation),
+        "<h2>Which agent</h2>",
+        _agents_html(explanation),
+        "<h2>Which steps</h2>",
+        _strips_html(explanation),
+        _charts_html(explanation),
+        "<h2>Histograms</h2>",
+        '<p class="note">Evaluated agents together, official bins; values beyond the range lie in the outer bins. As '
+        "in the official evaluator, steps without a value (the last one or two of speeds and accelerations) lie in a "
+        "rollout's last bin, and the metric itself keeps one histogram per agent.</p>",
+        f'<div class="charts">{"".join(_histogram_html(h) for h in explanation.histograms)}</div>',
+        "<h2>What happened</h2>",
+        animation_html(Animation(f"Scenario {name}", build_scene(explanation.scenario), panels)),
+    ]
+    return page_html(f"Scenario {name}", "\n".join(parts), extra_css=_CSS)
+
+
+def _features_html(explanation: Explanation) -> str:
+    """Features with their costs, the costliest first."""
+    lost = explanation.cost.sum((1, 2))  # [F]
+    rows = []
+    for index in np.argsort(-np.nan_to_num(lost), kind="stable"):
+        name = FEATURE_NAMES[index]
+        values = [float(r.likelihoods[index]) for r in (explanation.result, explanation.ceiling)]
+        rows.append(
+            f"<tr><th>{_words(name)}</th><td>{explanation.config.weights[index]:.2f}</td><td>{values[0]:.4f}</td>"
+            f"<td>{values[1]:.4f}</td>{_heat_cell(lost[index], lost)}</tr>"
+        )
+    head = "<tr><th>feature</th><th>weight</th><th>likelihood ↑</th><th>of the log</th><th>cost ↓</th></tr>"
+    return _table_html(head, rows)
+
+
+def _agents_html(explanation: Explanation) -> str:
+    """Evaluated agents by features."""
+    by_agent = explanation.cost.sum(2)  # [F, E]
+    # features that this year's metric does not count have no column
+    shown = [i for i in range(len(FEATURE_NAMES)) if explanation.config.weights[i] > 0]
+    head = "".join(f'<th class="narrow">{_words(FEATURE_NAMES[i])}</th>' for i in shown)
+    totals = np.nansum(by_agent, axis=0)  # [E]; NaN: a feature without a scored step
+    rows = []
+    for agent in np.argsort(-totals, kind="stable"):
+        cells = "".join(_heat_cell(by_agent[i, agent], by_agent) for i in shown)
+        rows.append(
+            f"<tr><th>{escape(explanation.agent_names[agent])}</th>{_heat_cell(totals[agent], totals)}{cells}</tr>"
+        )
+    return _table_html(f"<tr><th>agent</th><th>cost ↓</th>{head}</tr>", rows)
+
+
+def _strips_html(explanation: Explanation) -> str:
+    """The costliest pairs of feature and agent over the 8 seconds."""
+    steps = np.nan_to_num(explanation.cost[: len(HISTOGRAM_FEATURES), :, :WHOLE_FUTURE])  # [H, E, T]
+    totals = steps.sum(-1)  # [H, E]
+    order = [divmod(int(i), totals.shape[1]) for i in np.argsort(-totals.ravel(), kind="stable")[:MAX_STRIPS]]
+    seen = np.abs(steps)[steps != 0]  # [steps with a cost]
+    # a quantile, so that a single step does not make all others pale
+    scale = float(np.quantile(seen, 0.95)) if len(seen) else 1.0
+    rows = []
+    for feature, agent in order:
+        label = f"{_words(HISTOGRAM_FEATURES[feature])}, {escape(explanation.agent_names[agent])}"
+        # A step is a bar one unit wide, the stronger colored the more it costs; invisible ones are left out.
+        values = steps[feature, agent].tolist()
+        bars = "".join(
+            f'<rect x="{step}" width="1" height="1" fill="var(--{"bad" if value > 0 else "good"})" '
+            f'opacity="{min(abs(value) / scale, 1):.2f}"/>'
+            for step, value in enumerate(values)
+            if abs(value) / scale >= 0.01
+        )
+        rows.append(
+            f'<span>{label}</span><svg viewBox="0 0 {len(values)} 1" preserveAspectRatio="none" role="img" '
+            f'aria-label="{label}" shape-rendering="crispEdges">{bars}</svg>'
+            f'<span class="amount">{totals[feature, agent]:.4f}</span>'
+        )
+    num_steps = steps.shape[-1]
+    rows.append(
+        f'<span class="muted">time after now, cost at right</span><span class="clock"><span>+{STEP_S:.1f} s</span>'
+        f"<span>+{num_steps * STEP_S:.0f} s</span></span><span></span>"
+    )
+    return f'<div class="card strip">{"".join(rows)}</div><p class="note">Red: costs; green: better than the log.</p>'
+
+
+def _charts_html(explanation: Explanation) -> str:
+    """Two charts over time: the four costliest histogram features, and frequencies of collisions and violations."""
+    steps = np.nan_to_num(explanation.cost[: len(HISTOGRAM_FEATURES), :, :WHOLE_FUTURE]).sum(1)  # [H, T]
+    seconds = ((np.arange(steps.shape[1]) + 1) * STEP_S).tolist()
+    chosen = np.argsort(-steps.sum(1), kind="stable")[:4]
+    # in thousandths: a single step costs little
+    costs = [Curve(_words(HISTOGRAM_FEATURES[i]), seconds, (1000 * steps[i]).tolist()) for i in chosen]
+    fraction = explanation.event_fraction.mean(1)  # [J, T]
+    events = [Curve(_words(name), seconds, fraction[row].tolist()) for row, name in enumerate(BERNOULLI_FEATURES)]
+    note = "Evaluated agents, where the log is valid. Their cost belongs to the whole future and is in the tables only."
+    charts = (
+        Chart("Cost of a step, all evaluated agents", "seconds after now", "thousandths for 0.1 s", costs),
+        Chart("Rollouts with an event", "seconds after now", "fraction", events, note=note),
+    )
+    return f'<div class="charts">{"".join(chart_html(chart) for chart in charts)}</div>'
+
+
+def _histogram_html(histogram: FeatureHistogram) -> str:
+    """Log and rollouts beside each other in every official bin."""
+    bottom = _BAR_HEIGHT - _BOTTOM
+    # the tallest bar fills the height; 1e-12 for a feature without a scored step
+    top = max(float(histogram.log_fraction.max()), float(histogram.rollout_fraction.max()), 1e-12)
+    width = (_BAR_WIDTH - _LEFT) / len(histogram.log_fraction)
+    bars, ticks = [], []
+    for k, pair in enumerate(zip(histogram.log_fraction.tolist(), histogram.rollout_fraction.tolist())):
+        for side, fraction in enumerate(pair):
+            height = fraction / top * (bottom - _TOP)
+            # the pair takes 84 % of a bin's width, 8 % stay free on either side
+            x = _LEFT + (k + 0.08 + 0.42 * side) * width
+            bars.append(
+                f'<rect x="{x:.1f}" y="{bottom - height:.1f}" width="{0.42 * width:.1f}" height="{height:.1f}" '
+                f'fill="var(--series-{side + 1})"><title>{fraction:.1%}</title></rect>'
+            )
+    # every other edge where there are many: labels would overlap
+    for k in range(0, len(histogram.edges), 2 if len(histogram.edges) > 8 else 1):
+        edge = f"{float(histogram.edges[k]):.3g}".replace("-", "−")
+        ticks.append(f'<text x="{_LEFT + k * width:.1f}" y="{bottom + 15}" text-anchor="middle">{edge}</text>')
+    title = _words(histogram.feature)
+    axis = (
+        f'<path class="axis" d="M{_LEFT} {bottom}H{_BAR_WIDTH}"/>'
+        f'<text x="{_LEFT - 5}" y="{_TOP + 10}" text-anchor="end">{top:.0%}</text>'
+        f'<text class="label" x="{(_LEFT + _BAR_WIDTH) / 2}" y="{_BAR_HEIGHT - 6}" text-anchor="middle">'
+        f"{_UNITS[histogram.feature]}</text>"
+    )
+    legend = "".join(
+        f'<li><span class="swatch" style="background:var(--series-{side + 1})"></span>{name}</li>'
+        for side, name in enumerate(("log", "rollouts"))
+    )
+    return (
+        f'<figure class="chart"><figcaption class="chart-title">{title}</figcaption>'
+        f'<ul class="legend chart-legend">{legend}</ul>'
+        f'<svg viewBox="0 0 {_BAR_WIDTH + 14} {_BAR_HEIGHT}" role="img" aria-label="{title}">'
+        f"{''.join(bars)}{axis}{''.join(ticks)}</svg></figure>"
+    )
+
+
+def _table_html(head: str, rows: list[str]) -> str:
+    body = "".join(rows)
+    return f'<div class="card scroll"><table class="results"><thead>{head}</thead><tbody>{body}</tbody></table></div>'
+
+
+def _heat_cell(value: float, among: Float[np.ndarray, "..."]) -> str:
+    """A cost, the redder the larger it is among others; green where it is a gain."""
+    if not np.isfinite(value):
+        return "<td>none scored</td>"
+    heat = abs(value) / max(float(np.nanmax(np.abs(among))), 1e-12)
+    text = f"{value:.4f}".replace("-", "−")
+    return f'<td class="{"cost" if value > 0 else "gain"}" style="--heat:{heat:.2f}">{text}</td>'
+
+
+def _words(name: str) -> str:
+    words = name.replace("_", " ").replace("map based", "map-based").replace("meta metric", "meta-metric")
+    return escape(words)

@@ -1,0 +1,82 @@
+"""The metrics of a training run as charts, and as a picture in its folder."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rlftsim.training.run_folder import read_metrics
+from rlftsim.viewer.chart import Chart, Curve
+from rlftsim.viewer.chart_picture import charts_to_png
+
+Lines = Sequence[Mapping[str, Any]]
+"""Values of each update, see `read_metrics`."""
+NOT_DRAWN = ("update", "time", "seconds", "predictions", "learning_rate", "gradient_norm")
+"""Metrics of every imitation that say nothing about its objective."""
+
+
+def write_learning_curve(run: Path) -> Path | None:
+    """Draw `learning_curve.png` into the folder of a run of any stage, finished or not.
+
+    Returns:
+        The picture; None if the run has no metrics yet.
+    """
+    lines = read_metrics(run)
+    if not lines:
+        return None
+    # Only fine-tuning with a reward logs the realism of its own rollouts.
+    charts = finetuning_charts(lines) if "rmm" in lines[0] else imitation_charts(lines)
+    charts_to_png(run / "learning_curve.png", charts)
+    return run / "learning_curve.png"
+
+
+def imitation_charts(lines: Lines) -> list[Chart]:
+    """Charts of pre-training and CAT-K: loss, accuracy and, where the model was validated, its realism.
+
+    A run with an objective of the policy's own has its loss and a chart for each further metric instead.
+    """
+    realism = _chart(
+        lines, "Realism of held-out rollouts", "RMM, mean and 95 % interval",
+        validation_rmm="RMM", validation_rmm_low="low", validation_rmm_high="high",
+    )  # fmt: skip
+    if "accuracy" in lines[0]:
+        learned = [
+            _chart(lines, "Cross-entropy", "nats per token", loss="loss", entropy="entropy of predictions"),
+            _chart(lines, "Next token right", "fraction", accuracy="first guess", top5_accuracy="among five"),
+        ]
+    else:
+        names = [name for name in lines[0] if name not in NOT_DRAWN and not name.startswith("validation_")]
+        learned = [Chart(name.replace("_", " ").capitalize(), "update", name, [_curve(lines, name)]) for name in names]
+    return [*learned, *([realism] if len(realism.curves[0].x) else [])]
+
+
+def finetuning_charts(lines: Lines, kl_target: float | None = None) -> list[Chart]:
+    """Charts of fine-tuning with a reward: realism, reward, distance from the base model, KL penalty, violations.
+
+    Args:
+        lines: values of each update.
+        kl_target: drawn as a dashed line, nats per decision; None = not drawn.
+    """
+    return [
+        _chart(lines, "Realism of the training rollouts", "RMM", rmm="RMM"),
+        _chart(lines, "Reward", "std over a scenario's rollouts", reward_std="reward"),
+        _chart(
+            lines, "Distance from the base model", "nats per decision",
+            reference=None if kl_target is None else ("target", kl_target), kl="KL",
+        ),
+        _chart(lines, "Strength of the KL penalty", "beta", beta="beta"),
+        _chart(
+            lines, "Off-road and collision", "fraction of evaluated agents",
+            offroad_rate="off-road", collision_rate="collision",
+        ),
+    ]  # fmt: skip
+
+
+def _chart(lines: Lines, title: str, label: str, *, reference: tuple[str, float] | None = None, **named: str) -> Chart:
+    """Curves of metrics under other names; a metric that is not logged at every update has fewer points."""
+    curves = [_curve(lines, key, name) for key, name in named.items()]
+    return Chart(title, "update", label, curves, reference=reference)
+
+
+def _curve(lines: Lines, key: str, name: str | None = None) -> Curve:
+    there = [line for line in lines if key in line]
+    return Curve(name or key, [line["update"] for line in there], [line[key] for line in there])

@@ -1,0 +1,313 @@
+"""A report as one page of HTML: table, paired comparison, learning curves, animations and the facts to repeat it."""
+
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from html import escape
+from pathlib import Path
+
+import numpy as np
+from rich.table import Table
+
+from rlftsim.atomic_io import write_text
+from rlftsim.evaluation.columns import COLUMNS, Column, format_number
+from rlftsim.evaluation.results import Evaluation
+from rlftsim.statistics import MeanInterval
+from rlftsim.viewer.chart import Chart, chart_html, format_tick, nice_ticks
+from rlftsim.viewer.page import Animation, animation_html, page_html, read_asset
+
+
+@dataclass(frozen=True)
+class ResultRow:
+    """One policy's row in the table of a report."""
+
+    name: str
+    estimates: Mapping[str, MeanInterval]
+    """By column of an `Evaluation`; one that is missing was not measured."""
+    note: str = ""
+    emphasized: bool = False
+
+    @classmethod
+    def of(
+        cls, evaluation: Evaluation, columns: Sequence[Column], *, note: str = "", emphasized: bool = False
+    ) -> "ResultRow":
+        """The row of an evaluation.
+
+        Args:
+            evaluation: of the policy.
+            columns: to show, some of `COLUMNS`.
+            note: below the name.
+            emphasized: True = in bold.
+        """
+        estimates = {column.source: evaluation.mean_and_error(column.source) for column in columns}
+        return cls(evaluation.name, estimates, note, emphasized)
+
+
+@dataclass(frozen=True)
+class PairedComparison:
+    """Two policies on the same scenarios: mean of the differences `second - first`."""
+
+    first: str
+    second: str
+    mean_difference: float
+    interval: tuple[float, float]
+    """95 %."""
+    p_value: float
+    num_scenarios: int
+    metric: str = "RMM"
+    test: str = "paired t-test"
+    differences: Sequence[float] | np.ndarray = ()
+    """One per scenario; drawn where given."""
+    verdict: str = ""
+    """A sentence; empty = written from the interval."""
+
+    @property
+    def is_better(self) -> bool:
+        """True if the whole interval lies above zero."""
+        return self.interval[0] > 0
+
+    @property
+    def is_worse(self) -> bool:
+        """True if the whole interval lies below zero."""
+        return self.interval[1] < 0
+
+    @property
+    def verdict_text(self) -> str:
+        """`verdict`, or a sentence made from the interval."""
+        if self.verdict:
+            return self.verdict
+        if self.is_better or self.is_worse:
+            word, side = ("higher", "above") if self.is_better else ("lower", "below")
+            return (
+                f"{_sentence(self.second)} scores {word} than {self.first} in {self.metric}: "
+                f"the whole 95 % interval of the mean difference lies {side} zero."
+            )
+        return (
+            f"No difference in {self.metric} between {self.second} and {self.first} can be claimed: "
+            "the 95 % interval of the mean difference contains zero."
+        )
+
+
+@dataclass(frozen=True)
+class ChartGroup:
+    """Charts side by side under one heading."""
+
+    title: str
+    charts: Sequence[Chart]
+    caption: str = ""
+
+
+@dataclass(frozen=True)
+class Report:
+    """Everything on the page. Only the title is needed; what is empty is left out."""
+
+    title: str
+    summary: Sequence[str] = ()
+    """Paragraphs."""
+    rows: Sequence[ResultRow] = ()
+    table_note: str = ""
+    """For instance how many scenarios and rollouts the means are over."""
+    comparison: PairedComparison | None = None
+    chart_groups: Sequence[ChartGroup] = ()
+    animations: Sequence[Animation] = ()
+    animations_note: str = ""
+    facts: Mapping[str, str] = field(default_factory=dict)
+    """Configuration, versions, durations, command, commit, ..."""
+    footnotes: Sequence[str] = ()
+
+
+def write_report(path: str | os.PathLike[str], report: Report) -> None:
+    """Write the report as one self-contained HTML page, whole or not at all.
+
+    Args:
+        path: of the page.
+        report: its contents.
+    """
+    write_text(Path(path), report_html(report))
+
+
+def report_html(report: Report) -> str:
+    """The whole page; what is empty is left out."""
+    lead = "".join(f'<p class="lead">{escape(text)}</p>' for text in report.summary)
+    # 1. The result.
+    sections = [
+        f"<header><h1>{escape(report.title)}</h1>{lead}</header>",
+        _tiles_html(report),
+        _table_html(report),
+        _comparison_html(report.comparison),
+    ]
+    # 2. Pictures of it, and of the runs behind it.
+    if report.animations:
+        note = f'<p class="muted">{escape(report.animations_note)}</p>' if report.animations_note else ""
+        players = "\n".join(animation_html(animation) for animation in report.animations)
+        sections.append(f"<h2>Scenarios in motion</h2>{note}{players}")
+    for group in report.chart_groups:
+        caption = f'<p class="muted">{escape(group.caption)}</p>' if group.caption else ""
+        charts = "".join(chart_html(chart) for chart in group.charts)
+        sections.append(f'<h2>{escape(group.title)}</h2>{caption}<div class="charts">{charts}</div>' if charts else "")
+    # 3. The facts to repeat it.
+    if report.facts:
+        facts = (f"<dt>{escape(name)}</dt><dd>{escape(str(value))}</dd>" for name, value in report.facts.items())
+        sections.append(f'<h2>How this was made</h2><dl class="card facts">{"".join(facts)}</dl>')
+    if report.footnotes:
+        notes = "".join(f"<li>{escape(text)}</li>" for text in report.footnotes)
+        sections.append(f'<h2>Notes</h2><ol class="footnotes">{notes}</ol>')
+    return page_html(report.title, "\n".join(s for s in sections if s), extra_js=read_asset("chart.js"))
+
+
+def report_table(report: Report) -> Table:
+    """The result table, for `print_wide`."""
+    caption = f"{report.table_note} Mean ± standard error over scenarios.".lstrip() if report.rows else None
+    table = Table(title=report.title, caption=caption, title_justify="left", caption_justify="left")
+    table.add_column("policy", no_wrap=True)
+    shown = _shown_columns(report.rows)
+    for column in shown:
+        table.add_column(column.label, justify="right")
+    for row in report.rows:
+        cells = [column.cell(row.estimates.get(column.source)) for column in shown]
+        table.add_row(row.name, *cells, style="bold" if row.emphasized else None)
+    return table
+
+
+def _shown_columns(rows: Sequence[ResultRow]) -> list[Column]:
+    return [column for column in COLUMNS if any(column.source in row.estimates for row in rows)]
+
+
+def _sentence(text: str) -> str:
+    """With a capital first letter."""
+    return text[:1].upper() + text[1:]
+
+
+def _tiles_html(report: Report) -> str:
+    """The two compared means and their difference, large."""
+    comparison = report.comparison
+    if comparison is None:
+        return ""
+    # the two means only where the table has them in the same unit
+    tiles = []
+    by_name = {row.name: row.estimates.get("meta_metric") for row in report.rows}
+    for name in (comparison.first, comparison.second):
+        estimate = by_name.get(name)
+        if estimate is not None and comparison.metric == "RMM" and math.isfinite(estimate.mean):
+            tiles.append(_tile_html(f"RMM, {name}", format_number(estimate.mean, 4), estimate.interval))
+    sign = "+" if comparison.mean_difference > 0 else ""
+    tone = "good" if comparison.is_better else "bad" if comparison.is_worse else ""
+    difference = sign + format_number(comparison.mean_difference, 4)
+    tiles.append(_tile_html("mean paired difference", difference, comparison.interval, tone))
+    return f'<div class="tiles">{"".join(tiles)}</div>'
+
+
+def _tile_html(what: str, value: str, interval: tuple[float, float], tone: str = "") -> str:
+    # no interval over fewer than two scenarios
+    limits = (
+        f'<div class="interval">95 % interval {_interval_text(interval, 4)}</div>' if math.isfinite(interval[0]) else ""
+    )
+    return (
+        f'<div class="card tile {tone}"><div class="what">{escape(what)}</div>'
+        f'<div class="value">{value}</div>{limits}</div>'
+    )
+
+
+def _interval_text(interval: tuple[float, float], digits: int) -> str:
+    low, high = (format_number(value, digits) for value in interval)
+    return f"{low} to {high}"
+
+
+def _table_html(report: Report) -> str:
+    if not report.rows:
+        return ""
+    shown = _shown_columns(report.rows)
+    headings = "".join(
+        f'<th scope="col"><abbr title="{escape(c.meaning)}; {"higher" if c.higher_is_better else "lower"} is better">'
+        f"{escape(c.label)}</abbr></th>"
+        for c in shown
+    )
+    body = []
+    for row in report.rows:
+        note = f'<span class="note">{escape(row.note)}</span>' if row.note else ""
+        style = ' class="emphasized"' if row.emphasized else ""
+        cells = "".join(_cell_html(column, row.estimates.get(column.source)) for column in shown)
+        body.append(f'<tr{style}><th scope="row">{escape(row.name)}{note}</th>{cells}</tr>')
+    note = f"{escape(report.table_note)} " if report.table_note else ""
+    return (
+        '<h2>Results</h2><div class="card scroll"><table class="results"><thead><tr><th scope="col">policy</th>'
+        f"{headings}</tr></thead><tbody>{''.join(body)}</tbody></table></div>"
+        f'<p class="note" style="margin-top:10px">{note}'
+        "Mean ± standard error over scenarios; point at a number for its 95 % interval. ↑ higher is better, ↓ lower is "
+        "better.</p>"
+    )
+
+
+def _cell_html(column: Column, estimate: MeanInterval | None) -> str:
+    """A cell with the 95 % interval as its tooltip."""
+    if estimate is None or not math.isfinite(estimate.mean):
+        return "<td>–</td>"
+    if not math.isfinite(estimate.standard_error):
+        return f"<td>{column.text(estimate.mean)}</td>"
+    low, high = (column.text(limit) for limit in estimate.interval)
+    error = f'<span class="error">± {column.text(estimate.standard_error)}</span>'
+    return f'<td title="95 % interval {low} to {high}">{column.text(estimate.mean)} {error}</td>'
+
+
+def _comparison_html(comparison: PairedComparison | None) -> str:
+    if comparison is None:
+        return ""
+    p_text = "p < 0.0001" if comparison.p_value < 1e-4 else f"p = {comparison.p_value:.2g}"
+    sign = "+" if comparison.mean_difference > 0 else ""
+    return (
+        f"<h2>{escape(_sentence(comparison.second))} against {escape(comparison.first)}, scenario by scenario</h2>"
+        f'<div class="card comparison"><div><p class="verdict">{escape(comparison.verdict_text)}</p>'
+        f"<p>Mean difference in {escape(comparison.metric)} {sign}{format_number(comparison.mean_difference, 4)}, "
+        f"95 % interval {_interval_text(comparison.interval, 4)}, {p_text} ({escape(comparison.test)}), "
+        f"{comparison.num_scenarios} scenarios.</p></div>{_difference_svg(comparison)}</div>"
+    )
+
+
+def _difference_svg(comparison: PairedComparison) -> str:
+    """A dot per scenario, the mean with its interval below, zero dashed."""
+    width, margin, base = 520, 24, 108
+    # one dot per scenario, from left to right: `_stacked` needs them sorted
+    dots = np.sort(np.asarray(comparison.differences, float))
+    dots = dots[np.isfinite(dots)]
+    # zero belongs to the axis even if all differences lie on one side
+    shown = np.concatenate([dots, comparison.interval, [0.0, comparison.mean_difference]])
+    low, high = float(shown.min()), float(shown.max())
+    if low == high:
+        low, high = low - 1, high + 1
+
+    def across(value: float) -> float:
+        return margin + (value - low) / (high - low) * (width - 2 * margin)
+
+    tone = "var(--good)" if comparison.is_better else "var(--bad)" if comparison.is_worse else "var(--accent)"
+    parts = []
+    ticks = nice_ticks(low, high, 6)
+    for tick in ticks:
+        label = format_tick(tick, ticks[1] - ticks[0] if len(ticks) > 1 else 1.0)
+        parts.append(f'<path class="tick" d="M{across(tick):.1f} {base}v5"/>')
+        parts.append(f'<text x="{across(tick):.1f}" y="{base + 18}" text-anchor="middle">{label}</text>')
+    parts.append(f'<path class="axis" d="M{margin} {base}H{width - margin}"/>')
+    parts.append(f'<path class="zero" d="M{across(0.0):.1f} 4V{base}"/>')
+    for value, height in zip(dots, _stacked(np.array([across(v) for v in dots]), diameter=7.0)):
+        color = "var(--good)" if value > 0 else "var(--bad)" if value < 0 else "var(--muted)"
+        # dots that touch are stacked, up to the upper border
+        y = 70 - min(height * 7, 62)
+        parts.append(f'<circle cx="{across(value):.1f}" cy="{y}" r="3.2" fill="{color}" opacity=".65"/>')
+    start, stop = (across(v) for v in comparison.interval)
+    parts.append(f'<path d="M{start:.1f} 91H{stop:.1f}" stroke="{tone}" stroke-width="4" stroke-linecap="round"/>')
+    parts.append(f'<circle cx="{across(comparison.mean_difference):.1f}" cy="91" r="6.5" fill="{tone}"/>')
+    dots_label = "a dot per scenario, " if len(dots) else ""
+    caption = f"{dots_label}mean and 95 % interval; {escape(comparison.second)} minus {escape(comparison.first)}"
+    parts.append(f'<text x="{width / 2}" y="{base + 38}" text-anchor="middle">{caption}</text>')
+    return f'<svg viewBox="0 0 {width} 152" role="img" aria-label="{caption}">{"".join(parts)}</svg>'
+
+
+def _stacked(across: np.ndarray, diameter: float) -> list[int]:
+    """For sorted positions, the lowest row in which each dot touches no earlier one."""
+    last: list[float] = []  # position of the last dot of each row
+    rows = []
+    for x in across:
+        row = next((i for i, end in enumerate(last) if x - end >= diameter), len(last))
+        last[row : row + 1] = [float(x)]
+        rows.append(row)
+    return rows

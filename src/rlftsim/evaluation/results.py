@@ -1,0 +1,308 @@
+"""Scores of a policy on scenarios, one row per scenario, and how they came about, in one Parquet file.
+
+Columns: likelihoods and meta-metrics, higher is better; `*_error` in meters and `*_rate` in [0, 1], lower is better.
+"""
+
+import json
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from html import escape
+from os import PathLike
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+import rlftsim
+from rlftsim.aliases import RENAMED_VALUES, current_names
+from rlftsim.atomic_io import write_whole
+from rlftsim.errors import ConfigError, DataError, require_types
+from rlftsim.evaluation.columns import SCORES
+from rlftsim.realism import FEATURE_NAMES, RealismResult, SimulatedStates, metric_by_name
+from rlftsim.realism.miss import compute_miss_rates
+from rlftsim.realism.official_names import LIGHT
+from rlftsim.rollout.policy import Sampling
+from rlftsim.scenario.types import Scenario
+from rlftsim.statistics import MeanInterval, mean_interval
+
+FORMAT = "rlftsim-evaluation-1"
+NUMBERS_VERSION = "0.1.0"
+"""Raised when a score or a rollout changes: stored results of other numbers are computed anew. A release that changes
+no number keeps it, so that results outlive releases."""
+LIKELIHOOD_COLUMNS = tuple(f"{feature}_likelihood" for feature in FEATURE_NAMES)
+SCORE_COLUMNS = (
+    "meta_metric",
+    "meta_metric_light_one",
+    "kinematic",
+    "interactive",
+    "map_based",
+    *LIKELIHOOD_COLUMNS,
+    "min_average_displacement_error",
+    "average_displacement_error",
+    "collision_rate",
+    "offroad_rate",
+    "traffic_light_violation_rate",
+    "miss_rate",
+    "passing_miss_rate",
+    "min_passing_miss_rate",
+)
+"""`meta_metric_light_one` is the meta-metric with the traffic light likelihood set to 1, as published tables of models
+without a light feature have it; `meta_metric` is the official one. Miss rates: see `realism.miss`."""
+LABELS = {"RMM": "meta_metric"}
+"""Name in tables -> column."""
+SCHEMA = pa.schema(
+    [
+        pa.field("scenario_id", pa.string()),
+        pa.field("num_agents", pa.int32()),
+        pa.field("num_evaluated", pa.int32()),
+        *(pa.field(name, pa.float64()) for name in SCORE_COLUMNS),
+    ]
+)
+
+GoalsGiven = Literal["none", "logged"]
+
+
+@dataclass(frozen=True)
+class EvaluateConfig:
+    """Settings of an evaluation: rollouts, metric, sampling, scenarios, processes."""
+
+    num_rollouts: int = 32
+    """Rollouts per scenario; the official metric is defined for 32."""
+    metric: str = "2025"
+    """Year of the meta-metric."""
+    seed: int = 0
+    temperature: float = 1.0
+    """Below 1 likely decisions become likelier; 0 always takes the most likely one."""
+    top_k: int | None = None
+    """Keep only this many of the most likely decisions; None keeps all."""
+    split: str | None = "validation"
+    """Split of the data set; None = all scenarios."""
+    limit: int | None = None
+    """Only the first so many scenarios."""
+    rollouts_per_pass: int = 8
+    """Rollouts simulated together: bounds memory, and small passes stay in the processor's cache. Changes no result."""
+    jobs: int = 1
+    """Processes, each with one thread. Changes no result."""
+    goals: GoalsGiven = "none"
+    """Goals of the evaluated agents: none, or their logged final positions, for a goal-conditioned model."""
+
+    def __post_init__(self) -> None:
+        if isinstance(self.goals, str):  # the word of an earlier version
+            object.__setattr__(self, "goals", RENAMED_VALUES.get(("goals", self.goals), self.goals))
+        require_types(self)
+        for name in ("num_rollouts", "rollouts_per_pass", "jobs", "limit"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ConfigError(f"evaluate.{name} must be at least 1, got {value}.")
+        metric_by_name(self.metric)
+        _ = self.sampling
+
+    @property
+    def sampling(self) -> Sampling:
+        """Temperature and truncation of decisions."""
+        return Sampling(self.temperature, self.top_k)
+
+    def what_counts(self) -> dict[str, object]:
+        """The settings that results depend on, for one and the same scenario."""
+        # Three change no result of a scenario. goals="none" is left out, too: evaluations from before there were goals
+        # are still what they were.
+        ignored = ("limit", "rollouts_per_pass", "jobs", *(("goals",) if self.goals == "none" else ()))
+        return {name: value for name, value in asdict(self).items() if name not in ignored}
+
+
+@dataclass(frozen=True)
+class Skipped:
+    """A scenario that cannot be scored."""
+
+    scenario_id: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Policy, data, settings and version that an evaluation was made with."""
+
+    config: EvaluateConfig
+    policy: str
+    """Class of the policy, or "oracle"."""
+    policy_fingerprint: str
+    """Hash of weights and settings."""
+    dataset: str
+    """Folder of the data set."""
+    manifest_sha256: str
+    rlftsim_version: str = NUMBERS_VERSION
+    """Version of the numbers, see `NUMBERS_VERSION`."""
+    package_version: str = rlftsim.__version__
+    """For information; not compared."""
+
+    @classmethod
+    def from_plain(cls, values: dict[str, Any]) -> "Provenance":
+        """The provenance that `dataclasses.asdict` made plain, by this version or an earlier one."""
+        values = current_names(values)
+        # 0.1 had one version for both
+        values.setdefault("package_version", values["rlftsim_version"])
+        return cls(**{**values, "config": EvaluateConfig(**values["config"])})
+
+    def what_counts(self) -> dict[str, object]:
+        """The values that results of the same work share. The data set may move: its manifest identifies it."""
+        return {
+            "policy_fingerprint": self.policy_fingerprint,
+            "manifest_sha256": self.manifest_sha256,
+            "rlftsim_version": self.rlftsim_version,
+            **self.config.what_counts(),
+        }
+
+    def differences(self, other: "Provenance") -> list[str]:
+        """Names of the values that count and differ."""
+        mine, theirs = self.what_counts(), other.what_counts()
+        return [name for name in {**mine, **theirs} if mine.get(name) != theirs.get(name)]
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """Scores of one policy on the scenarios of a data set.
+
+    `evaluation["meta_metric"]` is a column [scenarios], `len(evaluation)` the number of scored scenarios.
+    """
+
+    name: str
+    provenance: Provenance
+    table: pa.Table
+    """Columns of `SCHEMA`, one row per scenario, in the order of the data set."""
+    skipped: tuple[Skipped, ...] = ()
+    """Scenarios without scores, and why."""
+
+    def __len__(self) -> int:
+        return self.table.num_rows
+
+    def __getitem__(self, column: str) -> np.ndarray:
+        return self.values(column)
+
+    def __repr__(self) -> str:
+        means = (f"{column.heading} {column.cell(self.mean_and_error(column.source))}" for column in SCORES)
+        units = (f" {column.unit}" if column.unit else "" for column in SCORES)
+        return f"{self._title}: {' | '.join(mean + unit for mean, unit in zip(means, units))}"
+
+    def _repr_html_(self) -> str:
+        """The main means ± standard errors as a table, for notebooks."""
+        head = "".join(f'<th title="{escape(column.meaning)}">{escape(column.label)}</th>' for column in SCORES)
+        cells = "".join(f"<td>{column.cell(self.mean_and_error(column.source))}</td>" for column in SCORES)
+        return f"<table><caption>{escape(self._title)}</caption><tr>{head}</tr><tr>{cells}</tr></table>"
+
+    @property
+    def _title(self) -> str:
+        skipped = f" ({len(self.skipped)} skipped)" if self.skipped else ""
+        config = self.config
+        return f"{self.name}, {len(self)} scenarios{skipped} x {config.num_rollouts} rollouts, metric {config.metric}"
+
+    @property
+    def config(self) -> EvaluateConfig:
+        """Settings of the evaluation."""
+        return self.provenance.config
+
+    @cached_property
+    def scenario_ids(self) -> list[str]:
+        """Scored scenarios, in the order of the rows."""
+        return self.table["scenario_id"].to_pylist()
+
+    def values(self, column: str) -> np.ndarray:
+        """A column as float64 [scenarios].
+
+        Raises:
+            ConfigError: there is no such column.
+        """
+        column = LABELS.get(column, column)
+        if column not in SCORE_COLUMNS:
+            raise ConfigError(f"an evaluation has no column {column!r}, only {', '.join(SCORE_COLUMNS)}.")
+        return self.table[column].to_numpy()
+
+    def mean_and_error(self, column: str) -> MeanInterval:
+        """Mean, standard error and 95 % interval over the scenarios that have a value.
+
+        Raises:
+            ConfigError: there is no such column.
+        """
+        return mean_interval(self.values(column))
+
+    def write(self, path: str | PathLike[str]) -> None:
+        """Write as Parquet, whole or not at all."""
+        about = {
+            "format": FORMAT,
+            "name": self.name,
+            "provenance": asdict(self.provenance),
+            "skipped": [asdict(skipped) for skipped in self.skipped],
+        }
+        table = self.table.replace_schema_metadata({"rlftsim": json.dumps(about)})
+        write_whole(Path(path), lambda temporary: pq.write_table(table, temporary, compression="zstd"))
+
+    @classmethod
+    def read(cls, path: str | PathLike[str]) -> "Evaluation":
+        """Read the file that `write` wrote, of this version or an earlier one.
+
+        Raises:
+            DataError: no such file, a folder, a damaged file, or not an evaluation of this version.
+        """
+        # Parquet readers take a folder for one table in many files: two evaluations would become one.
+        if Path(path).is_dir():
+            files = sorted(file.name for file in Path(path).glob("*.parquet") if file.is_file())
+            hint = f"name one of {', '.join(files)}" if files else "name a Parquet file of `rlftsim evaluate`"
+            raise DataError(f"{path} is a folder: {hint}.")
+        try:
+            table = pq.read_table(path)
+        except FileNotFoundError:
+            raise DataError(f"{path}: no such evaluation: make one with `rlftsim evaluate`.") from None
+        except (OSError, pa.ArrowException) as error:
+            raise DataError(f"{path}: damaged evaluation ({error}): evaluate again.") from None
+        # our part of the file's metadata; pandas and others may add theirs
+        about = json.loads((table.schema.metadata or {}).get(b"rlftsim", b"{}"))
+        if about.get("format") != FORMAT or table.schema.names != SCHEMA.names:
+            raise DataError(f"{path}: not an evaluation of this version: evaluate again.")
+        try:
+            provenance = Provenance.from_plain(about["provenance"])
+        except (TypeError, KeyError, ConfigError) as error:
+            raise DataError(f"{path}: made by a later version ({error}): update rlftsim or evaluate again.") from None
+        skipped = tuple(Skipped(**one) for one in about["skipped"])
+        return cls(about["name"], provenance, table.replace_schema_metadata(None), skipped)
+
+
+def join_evaluations(name: str, provenance: Provenance, parts: list[Evaluation]) -> Evaluation:
+    """One evaluation of the scenarios of several, in their order.
+
+    Args:
+        name: of the result.
+        provenance: of the result.
+        parts: evaluations of disjoint scenarios.
+    """
+    # the empty table: there may be no part with rows; one chunk, so that equal evaluations have equal tables
+    table = pa.concat_tables([SCHEMA.empty_table(), *(part.table for part in parts)]).combine_chunks()
+    return Evaluation(name, provenance, table, tuple(skipped for part in parts for skipped in part.skipped))
+
+
+def row_of_result(result: RealismResult, scenario: Scenario, states: SimulatedStates) -> dict[str, object]:
+    """Row of `SCHEMA` for a scenario's rollouts and their scores.
+
+    Args:
+        result: scores of the rollouts, one scenario.
+        scenario: the scenario, for its miss rates and numbers of agents.
+        states: the rollouts.
+    """
+    # The meta-metric is a weighted sum of likelihoods: a light likelihood of 1 adds its weight times what it lacks.
+    light = result.likelihood(LIGHT)
+    light_weight = dict(zip(FEATURE_NAMES, result.config.weights))[LIGHT]
+    missing = light_weight * (1.0 - light) if light_weight else 0.0
+    misses = compute_miss_rates(scenario, states)
+    scores = {
+        "meta_metric_light_one": result.meta_metric + missing,
+        "miss_rate": misses.at_goal,
+        "passing_miss_rate": misses.passing,
+        "min_passing_miss_rate": misses.passing_in_all,
+    }
+    numbers = {name: float(scores[name] if name in scores else result.score_of(name)) for name in SCORE_COLUMNS}
+    return {
+        "scenario_id": result.scenario_ids[0],
+        "num_agents": len(scenario.simulated_indices),
+        "num_evaluated": len(scenario.evaluated_indices),
+        **numbers,
+    }

@@ -1,0 +1,254 @@
+"""Interruptible measurements of many scenarios: finished groups are kept in files, a later call does the rest.
+
+`map_scenarios` is the loop, shared by evaluations, scores of rollout files, goal attainment and reward variances. They
+differ in the work on one scenario and in their files: `EvaluationParts` (Parquet) or `JsonParts`.
+"""
+
+import json
+import shutil
+import tempfile
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar, Generic, TypeVar
+
+import pyarrow as pa
+
+from rlftsim.atomic_io import write_text
+from rlftsim.errors import ConfigError, DataError
+from rlftsim.evaluation.results import SCHEMA, Evaluation, Provenance, Skipped, join_evaluations
+from rlftsim.progress import log, progress_bar
+from rlftsim.threads import one_thread
+from rlftsim.workers import run_tasks
+
+Result = TypeVar("Result")
+"""Result of one scenario, as the work on it returns it."""
+Part = TypeVar("Part")
+"""Results of a group of scenarios, as they are read back."""
+
+
+class PartFiles(ABC, Generic[Result, Part]):
+    """Files of finished groups. They are handed to other processes, so they can be pickled."""
+
+    group_size: ClassVar[int]
+    """Scenarios in a file: for each process, what an interruption loses at most."""
+
+    @abstractmethod
+    def write(self, group: range, results: Sequence[Result]) -> None:
+        """Write a finished group, whole or not at all.
+
+        Args:
+            group: positions of its scenarios.
+            results: one per scenario, in this order.
+        """
+
+    @abstractmethod
+    def read(self, group: range) -> Part | None:
+        """A group that an earlier call finished; None if it is missing, damaged or of other work."""
+
+
+def map_scenarios(
+    work: Callable[[int], Result],
+    num_scenarios: int,
+    files: PartFiles[Result, Part],
+    *,
+    jobs: int,
+    title: str,
+    show_progress: bool = True,
+) -> list[Part]:
+    """Do the missing groups, in one process or several, and return all of them in order.
+
+    Args:
+        work: measures the scenario at a position; can be pickled, if there is more than one job.
+        num_scenarios: positions run from 0 to this.
+        files: of the finished groups.
+        jobs: processes, each with one thread. Changes no result.
+        title: beside the progress bar.
+        show_progress: False = no progress bar.
+
+    Raises:
+        DataError: another process removed finished files meanwhile.
+    """
+    positions = range(num_scenarios)
+    groups = [positions[first : first + files.group_size] for first in range(0, num_scenarios, files.group_size)]
+    missing = [group for group in groups if files.read(group) is None]
+    num_done = num_scenarios - sum(len(group) for group in missing)
+    with progress_bar(title, num_scenarios, num_done, show=show_progress) as advance, one_thread():
+        run_tasks(partial(_work_on_group, work, files), missing, jobs=jobs, advance=advance)
+    # Read back even what was just written: a resumed and an uninterrupted call go the same way from here.
+    parts = [part for part in map(files.read, groups) if part is not None]
+    if len(parts) < len(groups):
+        raise DataError(f"{title}: results vanished meanwhile (another process in the same folder?): run again.")
+    return parts
+
+
+def _work_on_group(
+    work: Callable[[int], Any],
+    files: PartFiles[Any, Any],
+    group: range,
+    advance: Callable[[int], None],
+    is_stopped: Callable[[], bool],
+) -> None:
+    results = []
+    for position in group:
+        # another process failed, or Ctrl-C: an unfinished group leaves no file
+        if is_stopped():
+            return
+        results.append(work(position))
+        advance(1)
+    files.write(group, results)
+
+
+@dataclass(frozen=True, eq=False)
+class JsonParts(PartFiles[Mapping[str, object], Part]):
+    """A file per scenario, `<folder>/<scenario id>.json`."""
+
+    folder: Path
+    scenario_ids: Sequence[str]
+    """In the order of positions."""
+    identity: Mapping[str, Mapping[str, object]]
+    """By scenario id: plain values that a file must agree with to belong to this work."""
+    information: Mapping[str, object]
+    """Written into each file and not compared."""
+    parse: Callable[[str, Mapping[str, Any]], Part]
+    """Reads a scenario's values; a KeyError, TypeError or ValueError means that the file is damaged."""
+
+    group_size: ClassVar[int] = 1
+
+    def write(self, group: range, results: Sequence[Mapping[str, object]]) -> None:
+        """Write the file of a scenario, see `PartFiles`."""
+        scenario_id = self.scenario_ids[group.start]
+        values = {**self.identity[scenario_id], **results[0], **self.information}
+        write_text(self.folder / f"{scenario_id}.json", json.dumps(values) + "\n")
+
+    def read(self, group: range) -> Part | None:
+        """The parsed values of a scenario, see `PartFiles`."""
+        scenario_id = self.scenario_ids[group.start]
+        try:
+            values = json.loads((self.folder / f"{scenario_id}.json").read_text())
+            # A name that is missing agrees: 0.1 wrote fewer, and kept one setting per folder.
+            if any(values.get(name, own) != own for name, own in self.identity[scenario_id].items()):
+                return None
+            return self.parse(scenario_id, values)
+        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+            return None
+
+
+@dataclass(frozen=True, eq=False)
+class EvaluationParts(PartFiles[Mapping[str, object] | Skipped, Evaluation]):
+    """Rows of an evaluation: `<name>.parts/000000-000004.parquet` until all are there, then `<name>.parquet`."""
+
+    name: str
+    provenance: Provenance
+    out: Path
+
+    group_size: ClassVar[int] = 4
+
+    def __post_init__(self) -> None:
+        if not self.name or Path(self.name).name != self.name:
+            raise ConfigError(f"an evaluation's name becomes a file name, {self.name!r} cannot: pass another name.")
+
+    @property
+    def result_path(self) -> Path:
+        """The finished evaluation."""
+        return self.out / f"{self.name}.parquet"
+
+    @property
+    def parts_folder(self) -> Path:
+        """Finished groups of an unfinished evaluation."""
+        return self.out / f"{self.name}.parts"
+
+    def part_path(self, group: range) -> Path:
+        """File of one finished group."""
+        return self.parts_folder / f"{group.start:06d}-{group.stop:06d}.parquet"
+
+    def write(self, group: range, results: Sequence[Mapping[str, object] | Skipped]) -> None:
+        """Write rows of `SCHEMA` and scenarios without scores, see `PartFiles`."""
+        rows = [dict(result) for result in results if not isinstance(result, Skipped)]
+        skipped = tuple(result for result in results if isinstance(result, Skipped))
+        table = pa.Table.from_pylist(rows, schema=SCHEMA)
+        Evaluation(self.name, self.provenance, table, skipped).write(self.part_path(group))
+
+    def read(self, group: range) -> Evaluation | None:
+        """The rows of a group, see `PartFiles`."""
+        found = _read_if_readable(self.part_path(group))
+        return found if found is not None and self._is_ours(found, self.part_path(group), "discarded") else None
+
+    def read_finished(self, scenario_ids: Sequence[str]) -> Evaluation | None:
+        """The result of an earlier call for the same scenarios; None if there is none.
+
+        Raises:
+            ConfigError: a result of more scenarios is there, which a limit would replace.
+        """
+        found = _read_if_readable(self.result_path)
+        if found is None:
+            return None
+        # Before anything else: also a result of another policy or setting is worth more than a quick look.
+        num_found, limit = len(found) + len(found.skipped), self.provenance.config.limit
+        if limit is not None and num_found > len(scenario_ids):
+            raise ConfigError(
+                f"{self.result_path} holds {num_found} scenarios and limit={limit} would replace them by fewer: "
+                "name this one apart with --name, or leave the limit out."
+            )
+        if not self._is_ours(found, self.result_path, "it will be replaced"):
+            return None
+        # as a set: a scenario may have several sets of rollouts
+        found_ids = {*found.scenario_ids, *(skipped.scenario_id for skipped in found.skipped)}
+        return found if found_ids == set(scenario_ids) else None
+
+    def _is_ours(self, found: Evaluation, path: Path, fate: str) -> bool:
+        other = found.provenance.differences(self.provenance)
+        if other:
+            log.info(f"{path} is of another {', '.join(other)}: {fate}.")
+        return not other
+
+
+def resume_evaluation(
+    work: Callable[[int], Mapping[str, object] | Skipped],
+    scenario_ids: Sequence[str],
+    name: str,
+    provenance: Provenance,
+    out: Path | None,
+    *,
+    jobs: int,
+    title: str,
+    show_progress: bool = True,
+) -> Evaluation:
+    """Do what is missing of an evaluation, write `out/<name>.parquet` and return it; only read it if it is there.
+
+    Args:
+        work: from the position of a scenario to its row of `SCHEMA`, or why there is none.
+        scenario_ids: all scenarios of the evaluation.
+        name: of the evaluation and its file.
+        provenance: what a stored result must agree with to be this one.
+        out: folder of the result; None keeps nothing.
+        jobs: processes.
+        title: beside the progress bar.
+        show_progress: False = no progress bar.
+
+    Raises:
+        ConfigError: the name cannot be a file's, or a limit would replace a result of more scenarios.
+    """
+    # Processes hand their rows over in files, so even a result that is not kept needs a folder.
+    with tempfile.TemporaryDirectory() as nowhere:
+        files = EvaluationParts(name, provenance, out or Path(nowhere))
+        finished = files.read_finished(scenario_ids)
+        if finished is None:
+            parts = map_scenarios(work, len(scenario_ids), files, jobs=jobs, title=title, show_progress=show_progress)
+            finished = join_evaluations(name, provenance, parts)
+            finished.write(files.result_path)
+        # Only now: an interruption between the two leaves the parts, and the next call finds the result.
+        shutil.rmtree(files.parts_folder, ignore_errors=True)
+    return finished
+
+
+def _read_if_readable(path: Path) -> Evaluation | None:
+    if not path.exists():
+        return None
+    try:
+        return Evaluation.read(path)
+    except DataError as error:
+        log.info(f"{error} Doing so.")
+        return None

@@ -1,0 +1,190 @@
+"""Logged scenarios to measure on: those of a split, or by id, of a converted data set or of tfrecord files."""
+
+import hashlib
+import io
+from dataclasses import dataclass, replace
+from os import PathLike
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+from rlftsim.errors import DataError
+from rlftsim.evaluation.results import EvaluateConfig
+from rlftsim.evaluation.wire_format import BYTES, iterate_fields
+from rlftsim.scenario.dataset import MANIFEST, ScenarioDataset
+from rlftsim.scenario.open import dataset_folder
+from rlftsim.scenario.shards import hash_file
+from rlftsim.scenario.tfrecord import RECORD_OVERHEAD_BYTES, read_records
+from rlftsim.scenario.types import TOTAL_STEPS, Scenario
+from rlftsim.scenario.womd import find_tfrecords, scenario_from_bytes
+
+_SCENARIO_ID_FIELD = 5
+_HEADER_BYTES = 12
+_CACHED_SCENARIOS = 2  # each is read once
+
+
+@runtime_checkable
+class ScenarioSource(Protocol):
+    """Scenarios by id; can be handed to other processes."""
+
+    @property
+    def fingerprint(self) -> str:
+        """Hash of the contents."""
+        ...
+
+    def __contains__(self, scenario_id: object) -> bool: ...
+
+    def __len__(self) -> int: ...
+
+    def by_id(self, scenario_id: str) -> Scenario:
+        """One scenario.
+
+        Raises:
+            DataError: it is not there, or its bytes are damaged.
+        """
+        ...
+
+
+def open_held_out(
+    data: str | PathLike[str] | ScenarioDataset, config: EvaluateConfig
+) -> tuple[ScenarioDataset, EvaluateConfig]:
+    """The scenarios to measure on, and the settings with their split.
+
+    Args:
+        data: data set's folder, or "synthetic", or an opened data set, whose split then replaces that of the settings.
+        config: settings.
+
+    Raises:
+        DataError: no such data set.
+    """
+    if isinstance(data, ScenarioDataset):
+        config = replace(config, split=data.split)
+    folder = data.folder if isinstance(data, ScenarioDataset) else dataset_folder(data)
+    return ScenarioDataset(folder, config.split, cache_size=_CACHED_SCENARIOS), config
+
+
+def choose_scenarios(dataset: ScenarioDataset, config: EvaluateConfig) -> range:
+    """Positions of the scenarios to evaluate: all, or the first ones up to the limit.
+
+    Args:
+        dataset: the scenarios of the split.
+        config: settings with the limit.
+
+    Raises:
+        DataError: none, or one without its future.
+    """
+    chosen = range(min(len(dataset), config.limit or len(dataset)))
+    place = f"{dataset.folder}" + (f" (split {dataset.split})" if dataset.split else "")
+    if not chosen:
+        raise DataError(f"{place} has no scenarios: nothing to evaluate.")
+    steps = dataset.index["num_steps"].to_pylist()
+    short = [i for i in chosen if steps[i] < TOTAL_STEPS]
+    if short:
+        raise DataError(
+            f"{place}: {len(short)} of {len(chosen)} scenarios withhold their future, the first is "
+            f"{dataset.scenario_ids[short[0]]} with {steps[short[0]]} steps: a test split can be simulated but not "
+            "evaluated, use training or validation data."
+        )
+    return chosen
+
+
+def hash_manifest(folder: Path) -> str:
+    """SHA-256 of a data set's manifest, which lists the checksums of all its files: equal for moved data sets."""
+    return hash_file(folder / MANIFEST)
+
+
+def open_scenarios(source: str | PathLike[str]) -> ScenarioSource:
+    """The scenarios of a converted data set's folder, or of tfrecords: a file, a folder or a glob.
+
+    Raises:
+        DataError: neither is there, or a record is damaged.
+    """
+    if (Path(source) / MANIFEST).is_file():
+        return ConvertedScenarios(Path(source))
+    return index_tfrecords(Path(source))
+
+
+class ConvertedScenarios:
+    """The scenarios of a data set's folder, of all splits."""
+
+    def __init__(self, folder: Path) -> None:
+        self._dataset = ScenarioDataset(folder, cache_size=_CACHED_SCENARIOS)
+        self.fingerprint = hash_manifest(folder)
+
+    def __contains__(self, scenario_id: object) -> bool:
+        return scenario_id in self._dataset
+
+    def __len__(self) -> int:
+        return len(self._dataset)
+
+    def by_id(self, scenario_id: str) -> Scenario:
+        """One scenario, see `ScenarioSource`."""
+        return self._dataset.by_id(scenario_id)
+
+
+@dataclass(frozen=True)
+class RecordPlace:
+    """Place of a record's bytes."""
+
+    file: Path
+    offset: int
+    length: int
+
+
+@dataclass(frozen=True, eq=False)
+class LoggedScenarios:
+    """The scenarios of tfrecord files; each is parsed when it is read."""
+
+    places: dict[str, RecordPlace]
+    fingerprint: str
+
+    def __contains__(self, scenario_id: object) -> bool:
+        return scenario_id in self.places
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+    def by_id(self, scenario_id: str) -> Scenario:
+        """One scenario, see `ScenarioSource`."""
+        if scenario_id not in self.places:
+            raise DataError(f"no scenario {scenario_id!r} among {len(self)} logged ones")
+        place = self.places[scenario_id]
+        with place.file.open("rb") as file:
+            file.seek(place.offset)
+            data = file.read(place.length)
+        try:
+            return scenario_from_bytes(data)
+        except DataError as error:
+            raise DataError(f"{place.file}: scenario {scenario_id}: {error}") from error
+
+
+def index_tfrecords(source: Path) -> LoggedScenarios:
+    """Find the scenarios of tfrecord files, checking every record's checksums but parsing none.
+
+    Raises:
+        DataError: no such files, or a damaged record (converting with errors skipped makes a data set of the others).
+    """
+    places: dict[str, RecordPlace] = {}
+    digest = hashlib.sha256()
+    for path in find_tfrecords(source):
+        # A record is length (8 bytes), checksum (4), data, checksum (4): its data begin after a header of 12 bytes.
+        offset = 0
+        for record, data in read_records(path):
+            scenario_id = _scenario_id_of(data)
+            if scenario_id is None:
+                raise DataError(f"{path}: record {record}: not a WOMD Scenario message, it has no scenario_id")
+            # of a scenario that occurs twice the first is taken, as by the converter
+            places.setdefault(scenario_id, RecordPlace(path, offset + _HEADER_BYTES, len(data)))
+            offset += len(data) + RECORD_OVERHEAD_BYTES
+            digest.update(data)
+    return LoggedScenarios(places, digest.hexdigest())
+
+
+def _scenario_id_of(record: bytes) -> str | None:
+    # Field by field: parsing the whole message would decode its map and all tracks.
+    try:
+        for field in iterate_fields(io.BytesIO(record), 0, len(record)):
+            if (field.number, field.wire_type) == (_SCENARIO_ID_FIELD, BYTES):
+                return record[field.start : field.stop].decode("utf-8", "replace")
+    except DataError:
+        return None
+    return None

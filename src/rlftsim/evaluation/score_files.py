@@ -1,0 +1,260 @@
+"""Scores of rollouts in files, from any simulator: matched with logged scenarios, scored scenario by scenario.
+
+The result is an `Evaluation`, as `evaluate` makes one: the same Parquet file, comparable with `compare`. An interrupted
+scoring is resumed by the same call, see `evaluation.resumable`.
+"""
+
+import hashlib
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from os import PathLike
+from pathlib import Path
+from typing import Any, Literal
+
+from rich.table import Table
+
+from rlftsim.errors import ConfigError, DataError
+from rlftsim.evaluation.columns import ARROWS, direction_of
+from rlftsim.evaluation.results import (
+    SCORE_COLUMNS,
+    EvaluateConfig,
+    Evaluation,
+    Provenance,
+    Skipped,
+    row_of_result,
+)
+from rlftsim.evaluation.resumable import resume_evaluation
+from rlftsim.evaluation.rollout_files import RolloutEntry, find_rollouts, read_states
+from rlftsim.evaluation.scenario_source import ScenarioSource, open_scenarios
+from rlftsim.progress import log
+from rlftsim.realism import MetricConfig, metric_by_name, scenario_log, score
+from rlftsim.realism.map_based import select_polylines
+from rlftsim.realism.official_names import is_reported, official_buckets, official_fields
+from rlftsim.scenario.types import ROAD_EDGE_TYPES, Scenario
+from rlftsim.workers import usable_cores
+
+_NO_ROAD_EDGE = "has no road edge, so the distance to it is undefined"
+
+
+@dataclass(frozen=True)
+class ScoreConfig:
+    """Settings of scoring rollouts from files."""
+
+    metric: Literal["2025", "2024", "2024_original_code", "2023"] = "2025"
+    """Year of the meta-metric. 2024 is the configuration of that year read by today's code, 2024_original_code the code
+    of that year too."""
+    missing_map: Literal["error", "skip"] = "error"
+    """A scenario without road edges stops the run, as in the official evaluator, or is left out and listed."""
+    missing_scenario: Literal["error", "skip"] = "error"
+    """Rollouts of a scenario that is not among the given ones stop the run, or are left out and listed."""
+    limit: int | None = None
+    """Only the first so many scenarios."""
+    jobs: int | None = None
+    """Processes, each with one thread; left out, as many as there are cores. Changes no result."""
+
+    def __post_init__(self) -> None:
+        for name in ("limit", "jobs"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ConfigError(f"score.{name} must be at least 1, got {value}.")
+        metric_by_name(self.metric)
+
+    @property
+    def num_jobs(self) -> int:
+        """Processes to start."""
+        return self.jobs or usable_cores()
+
+
+def score_rollouts(
+    rollouts: str | PathLike[str],
+    scenarios: str | PathLike[str],
+    out: str | PathLike[str] | None = None,
+    config: ScoreConfig = ScoreConfig(),
+    *,
+    name: str | None = None,
+    show_progress: bool = True,
+) -> Evaluation:
+    """Score rollouts from files; every scenario's numbers are also written to `out/<name>.parquet`.
+
+    Interrupted in any way, the same call goes on where it was. Once finished, it reads the file. Scenarios come in the
+    order of the files and of their places in them.
+
+    Args:
+        rollouts: npz, submission file or a folder of them, see `find_rollouts`.
+        scenarios: converted data set, or tfrecords (file, folder or glob). Those without rollouts are not read.
+        out: folder of the result, made if missing; None keeps nothing.
+        config: metric, handling of missing maps and scenarios, processes.
+        name: of the row and the file; None = the name of `rollouts`.
+        show_progress: False = no progress and time left on stderr.
+
+    Raises:
+        DataError: files that cannot be read, agents that are not the scenario's, values that are no numbers or more
+            than 1000 km from the origin, sets of different numbers of rollouts; under "error" also scenarios without
+            road edges or unknown ones.
+        ConfigError: a limit that would replace a stored result of more scenarios.
+    """
+    rollouts, scenarios = Path(rollouts), Path(scenarios)
+    entries, source = find_rollouts(rollouts)[: config.limit], open_scenarios(scenarios)
+    check_entries(entries, source, config, scenarios)
+    known = next((entry for entry in entries if entry.scenario_id in source), None)
+    if known is None:
+        raise DataError(f"{rollouts}: none of its {len(entries)} scenarios is in {scenarios}: nothing to score.")
+    # Read once more by the work on its scenario; all others are compared with this number.
+    num_rollouts = read_states(known).num_rollouts
+    provenance = Provenance(
+        config=EvaluateConfig(num_rollouts=num_rollouts, metric=config.metric, split=None, limit=config.limit),
+        policy="rollouts from files",
+        policy_fingerprint=_fingerprint(entries),
+        dataset=str(scenarios.absolute()),
+        manifest_sha256=source.fingerprint,
+    )
+    name = name or rollouts.resolve().name.removesuffix(".npz").removesuffix(".binproto").removesuffix(".pb")
+    result = resume_evaluation(
+        partial(_score_entry, _Job(tuple(entries), source, config, num_rollouts)),
+        [entry.scenario_id for entry in entries],
+        name,
+        provenance,
+        None if out is None else Path(out),
+        jobs=config.num_jobs,
+        title=f"score {name}",
+        show_progress=show_progress,
+    )
+    # The result may be a stored one, made under missing_map="skip".
+    _refuse_mapless(result.skipped, config)
+    return result
+
+
+def to_json(evaluation: Evaluation) -> dict[str, Any]:
+    """Plain values under the names of the official messages; None where there is no number.
+
+    `{"metric", "scenarios": [{"scenario_id", fields, "buckets"}], "mean": {fields, "buckets"}, "standard_error": ...}`.
+    Means are over the scenarios that have a number; the standard error needs two of them.
+    """
+    metric = metric_by_name(evaluation.config.metric)
+    rows = evaluation.table.to_pylist()
+    summary = {column: evaluation.mean_and_error(column) for column in SCORE_COLUMNS}
+    return {
+        "metric": metric.name,
+        "scenarios": [{"scenario_id": row["scenario_id"], **_official_fields(row, metric)} for row in rows],
+        "mean": _official_fields({column: value.mean for column, value in summary.items()}, metric),
+        "standard_error": _official_fields({c: value.standard_error for c, value in summary.items()}, metric),
+    }
+
+
+def format_scores(evaluation: Evaluation) -> Table:
+    """Every mean ± standard error with the metric's version beside it; arrows say which way is better."""
+    metric = metric_by_name(evaluation.config.metric)
+    title = f"{evaluation.name}: {len(evaluation)} scenarios, {evaluation.config.num_rollouts} rollouts each"
+    table = Table(title=title, title_justify="left")
+    for heading in ("", "mean", "standard error", "scenarios", "metric"):
+        table.add_column(heading, justify="left" if heading in ("", "metric") else "right", no_wrap=True)
+    # all columns by their stored names, other than in tables of policies: the place to look a single score up
+    for column in SCORE_COLUMNS:
+        if not is_reported(column, metric):
+            continue
+        found = evaluation.mean_and_error(column)
+        label = "meta_metric, traffic light term set to 1" if column == "meta_metric_light_one" else column
+        spread = "" if math.isnan(found.standard_error) else f"± {found.standard_error:.4f}"
+        table.add_row(
+            f"{label} {ARROWS[direction_of(column)]}", f"{found.mean:.4f}", spread, str(found.count), metric.name
+        )
+    return table
+
+
+@dataclass(frozen=True, eq=False)
+class _Job:
+    """Input of the work on a scenario; is handed to other processes."""
+
+    entries: tuple[RolloutEntry, ...]
+    source: ScenarioSource
+    config: ScoreConfig
+    num_rollouts: int
+    """Of the first scenario; all others must have as many."""
+
+
+def check_entries(entries: Sequence[RolloutEntry], source: ScenarioSource, config: ScoreConfig, place: Path) -> None:
+    """Refuse or mention rollouts without scenario, and mention scenarios with several sets of rollouts.
+
+    Args:
+        entries: the rollouts.
+        source: the scenarios.
+        config: says if rollouts without scenario are an error.
+        place: of the scenarios, for messages.
+
+    Raises:
+        DataError: rollouts without scenario, under `missing_scenario="error"`.
+    """
+    unknown = [entry for entry in entries if entry.scenario_id not in source]
+    if unknown and config.missing_scenario == "error":
+        raise DataError(
+            f"{unknown[0]}: {len(unknown)} of {len(entries)} scenarios with rollouts, this one first, are not among "
+            f"the {len(source)} of {place}: give all scenarios, or leave them out with missing_scenario=skip "
+            "(--missing-scenario skip)."
+        )
+    counts = Counter(entry.scenario_id for entry in entries)
+    repeated = [scenario_id for scenario_id, count in counts.items() if count > 1]
+    if repeated:
+        log.info(
+            f"{len(repeated)} scenarios, {repeated[0]} first, have several sets of rollouts: each set is scored and "
+            "counts in the means."
+        )
+
+
+def _fingerprint(entries: Sequence[RolloutEntry]) -> str:
+    """Hash of places, sizes and modification times of the rollouts."""
+    # not of their bytes: a submission has gigabytes
+    digest = hashlib.sha256()
+    stats = {path: path.stat() for path in {entry.file for entry in entries}}
+    for entry in entries:
+        stat = stats[entry.file]
+        place = (entry.scenario_id, entry.file.name, entry.start, entry.stop, stat.st_size, stat.st_mtime_ns)
+        digest.update(repr(place).encode())
+    return digest.hexdigest()
+
+
+def _score_entry(job: _Job, position: int) -> dict[str, object] | Skipped:
+    """Row of one scenario, or why there is none."""
+    entry = job.entries[position]
+    if entry.scenario_id not in job.source:
+        return Skipped(entry.scenario_id, "not among the given scenarios")
+    scenario = job.source.by_id(entry.scenario_id)
+    if not has_road_edge(scenario):
+        skipped = Skipped(scenario.scenario_id, _NO_ROAD_EDGE)
+        _refuse_mapless([skipped], job.config)
+        return skipped
+    states = read_states(entry)
+    if states.num_rollouts != job.num_rollouts:
+        raise DataError(
+            f"{entry}: {states.num_rollouts} rollouts, others have {job.num_rollouts}: the meta-metric depends on the "
+            "number, so a mean over both means nothing. Score them apart."
+        )
+    try:
+        result = score(scenario_log(scenario), states, metric_by_name(job.config.metric))
+    except DataError as error:
+        raise DataError(f"{entry}: {error}") from error
+    return row_of_result(result, scenario, states)
+
+
+def has_road_edge(scenario: Scenario) -> bool:
+    """True if the map has a road edge of two points or more; without one the official metric is undefined."""
+    return len(select_polylines(scenario.map_features, ROAD_EDGE_TYPES).count) > 0
+
+
+def _refuse_mapless(skipped: Sequence[Skipped], config: ScoreConfig) -> None:
+    """Under "error" nothing may be missing from the means, also where an earlier run left it out."""
+    mapless = [scenario for scenario in skipped if scenario.reason == _NO_ROAD_EDGE]
+    if mapless and config.missing_map == "error":
+        raise DataError(
+            f"scenario {mapless[0].scenario_id} {_NO_ROAD_EDGE}, as for the official evaluator: leave such scenarios "
+            "out with missing_map=skip (--missing-map skip)."
+        )
+
+
+def _official_fields(values: dict[str, Any], metric: MetricConfig) -> dict[str, Any]:
+    def named(names: dict[str, str]) -> dict[str, float | None]:
+        return {official: values[c] if math.isfinite(values[c]) else None for c, official in names.items()}
+
+    return {**named(official_fields(metric)), "buckets": named(official_buckets(metric))}

@@ -1,0 +1,194 @@
+"""Models that experiments compare: baselines, pre-trained models, and fine-tunings of them. Descriptions only,
+nothing runs here."""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from rlftsim.errors import ConfigError
+from rlftsim.recipes.registry import Recipe
+from rlftsim.rewards import CreditTo
+from rlftsim.training.catk import CatkConfig
+from rlftsim.training.finetune import FinetuneConfig
+from rlftsim.training.goal_relabeling import GcslConfig
+from rlftsim.training.goals import GoalConfig, with_goals
+from rlftsim.training.methods import FinetuningConfig
+
+WEAK_EPOCHS = 1.0
+"""Pre-training of the paper's weaker base model."""
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """A policy without weights: the log itself, or constant velocity."""
+
+    name: Literal["oracle", "constant_velocity"]
+
+
+@dataclass(frozen=True)
+class Base:
+    """A pre-trained model."""
+
+    epochs: float | None = None
+    """Of pre-training. None = as the recipe has it, or the base model that the suite was given."""
+
+    @property
+    def name(self) -> str:
+        """Name of its files."""
+        return "base" if self.epochs is None else f"base-{self.epochs:g}-epochs"
+
+
+GoalKind = Literal["soft", "hard"]
+
+
+@dataclass(frozen=True)
+class GoalTraining:
+    """Goal conditioning that a fine-tuning adds to a model, and the goal reward it is trained with."""
+
+    encoding: str
+    """Encoding of goals, an argument of the policy's `with_goal_conditioning`: SMART has "concat" and "indication"."""
+    kind: GoalKind | None = None
+    """Reward for passing the goal (soft) or for ending there (hard). None = no reward: rollouts relabelled
+    with their own endpoints are imitated."""
+    weight: float = 0.1
+    """Of the goal in the reward (lambda)."""
+
+    @property
+    def name(self) -> str:
+        """Part of the name of its files; the weight is not in it."""
+        return self.encoding if self.kind is None else f"{self.encoding}-{self.kind}"
+
+
+@dataclass(frozen=True)
+class FineTuned:
+    """A base model after fine-tuning. All other settings are the recipe's, so all of them have the same budget."""
+
+    method: str = "mloo"
+    """Name of a reward, or "catk" or "gcsl"."""
+    credit: CreditTo = "rollout"
+    """Credit assignment: one reward per rollout, or one per agent."""
+    seed: int = 0
+    epochs_fraction: float = 1.0
+    """Of the recipe's fine-tuning epochs."""
+    base: "Base | FineTuned" = Base()
+    """Model that the fine-tuning starts from."""
+    goals: GoalTraining | None = None
+    """None = goal-free."""
+
+    @property
+    def name(self) -> str:
+        """Name of its files, without the epochs."""
+        # Names of files: those of release 0.1 must be found, so default values add nothing to a name.
+        credit = "" if self.credit == "rollout" else f"-{self.credit}"
+        base = "" if self.base == Base() else f"-from-{self.base.name}"
+        goals = "" if self.goals is None else f"-{self.goals.name}"
+        return f"{self.method}{goals}{credit}{base}-seed{self.seed}"
+
+    def training_config(self, recipe: Recipe) -> FinetuningConfig:
+        """Settings of the training; their type is that of the method.
+
+        Raises:
+            ConfigError: there is no such reward, or the recipe has no section for the method.
+        """
+        if self.method == CATK and recipe.catk is not None:
+            return catk_config(self, recipe.catk, recipe.finetune)
+        if self.method == GCSL and recipe.gcsl is not None:
+            return gcsl_config(self, recipe.gcsl)
+        if self.method in (CATK, GCSL):
+            raise ConfigError(f"the recipe has no section {self.method}: its policies cannot be trained so.")
+        return finetune_config(self, recipe.finetune)
+
+
+@dataclass(frozen=True)
+class Guided:
+    """A goal-conditioned model with guidance: its goal logit bias is scaled, nothing is trained. See
+    `SmartPolicy.with_guidance`."""
+
+    of: FineTuned
+    scale: float
+
+    @property
+    def name(self) -> str:
+        """Name of its files."""
+        return f"{self.of.name}-guided-{self.scale:g}"
+
+
+ModelSpec = Baseline | Base | FineTuned | Guided
+ORACLE, CONSTANT_VELOCITY, BASE = Baseline("oracle"), Baseline("constant_velocity"), Base()
+CATK, GCFT, GCSL = "catk", "gcft", "gcsl"
+VARIED = (
+    *("finetune.reward", "finetune.credit", "finetune.seed"),
+    *("catk.seed", "catk.epochs", "catk.batch_size", "gcsl.seed"),
+)
+"""Fields of a recipe that specs set for themselves."""
+
+
+@dataclass(frozen=True)
+class Budget:
+    """Budget of every fine-tuned model of a suite."""
+
+    updates: int
+    scenarios_an_update: int
+    rollouts_a_scenario: int
+
+    def __str__(self) -> str:
+        simulated = f"{self.scenarios_an_update} scenarios with {self.rollouts_a_scenario} rollouts each"
+        return f"{self.updates} updates of {simulated}"
+
+    @property
+    def note(self) -> str:
+        """Note for tables with fine-tuned rows."""
+        return (
+            f"Every fine-tuned row had the same budget: {self}. One base model; the seeds are those of fine-tuning, "
+            "evaluations share theirs."
+        )
+
+
+def over_seeds(spec: FineTuned, num_seeds: int) -> tuple[FineTuned, ...]:
+    """The same fine-tuning with several seeds: one row of a table.
+
+    Args:
+        spec: its own seed is replaced.
+        num_seeds: seeds are 0, 1, ..., num_seeds - 1.
+    """
+    return tuple(replace(spec, seed=seed) for seed in range(num_seeds))
+
+
+def finetune_config(spec: FineTuned, recipe: FinetuneConfig) -> FinetuneConfig:
+    """Settings of a fine-tuning with a reward.
+
+    Args:
+        spec: its method is the reward.
+        recipe: all that the spec leaves open. Without a goal training in the spec, goals are switched off.
+
+    Raises:
+        ConfigError: there is no such reward.
+    """
+    # Goals of the recipe are for goal-conditioned rows alone.
+    reward, goals = spec.method, GoalConfig()
+    if spec.goals is not None:
+        reward = f"{spec.method}(goal_weight={spec.goals.weight}, kind='{spec.goals.kind}')"
+        goals = with_goals(recipe.goals)
+    epochs = recipe.epochs * spec.epochs_fraction
+    return replace(recipe, reward=reward, seed=spec.seed, epochs=epochs, credit=spec.credit, goals=goals)
+
+
+def catk_config(spec: FineTuned, catk: CatkConfig, finetune: FinetuneConfig) -> CatkConfig:
+    """Settings of a fine-tuning with CAT-K that makes as many updates of as many scenarios as one with a reward.
+
+    Args:
+        spec: the seed and the fraction of the epochs.
+        catk: the recipe's settings of CAT-K.
+        finetune: the recipe's settings of fine-tuning with a reward, which have the budget.
+    """
+    epochs = finetune.epochs * spec.epochs_fraction
+    return replace(catk, seed=spec.seed, epochs=epochs, batch_size=finetune.batch_size)
+
+
+def gcsl_config(spec: FineTuned, recipe: GcslConfig) -> GcslConfig:
+    """Settings of goal-conditioned supervised learning on the model's own relabelled rollouts.
+
+    Args:
+        spec: the seed and the fraction of the epochs.
+        recipe: all that the spec leaves open.
+    """
+    return replace(recipe, seed=spec.seed, epochs=recipe.epochs * spec.epochs_fraction)

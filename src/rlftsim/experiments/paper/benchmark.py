@@ -1,0 +1,118 @@
+"""Table 1, extended: base model, CAT-K and RLFTSim, between constant velocity and the log itself (the oracle)."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from rlftsim.evaluation.columns import SCORES
+from rlftsim.evaluation.compare import paired_values
+from rlftsim.evaluation.results import Evaluation
+from rlftsim.experiments import tables
+from rlftsim.experiments.model_specs import BASE, CATK, CONSTANT_VELOCITY, ORACLE, FineTuned, over_seeds
+from rlftsim.experiments.paper import published
+from rlftsim.experiments.results import Experiment, ExperimentResult
+from rlftsim.experiments.rows import RMM, Row
+from rlftsim.experiments.suite import ExperimentSuite
+
+REFERENCE, IMITATION, TUNED, CEILING, FLOOR = "base", "CAT-K", "RLFTSim (MLOO)", "oracle", "constant velocity"
+NUM_RESAMPLES = 10_000
+
+
+def run(suite: ExperimentSuite) -> dict[str, Row]:
+    """Rows of the table, without CAT-K for a policy that it cannot train."""
+    rows = {
+        REFERENCE: (BASE,),
+        IMITATION: over_seeds(FineTuned(CATK), suite.num_seeds),
+        TUNED: over_seeds(FineTuned("mloo"), suite.num_seeds),
+        CEILING: (ORACLE,),
+        FLOOR: (CONSTANT_VELOCITY,),
+    }
+    return suite.evaluate(suite.feasible(rows))
+
+
+def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResult:
+    """The table, the differences, and the part of the gap to the oracle that fine-tuning closes."""
+    base, tuned = rows[REFERENCE], rows[TUNED]
+    # None or one row, so that everything about CAT-K appears with it.
+    imitations = [rows[IMITATION]] if IMITATION in rows else []
+    closed = {row.name: gap_closed(base.mean, row.mean, rows[CEILING].mean) for row in (*imitations, tuned)}
+    return ExperimentResult(
+        title="Benchmark: realism of the base model, CAT-K and RLFTSim",
+        tables=(tables.of_rows("Ours", rows.values(), SCORES), published.BENCHMARK),
+        verdicts=(
+            *(tuned.against(base), tuned.seeds_against(base)),
+            *(
+                verdict
+                for row in imitations
+                for verdict in (row.against(base), row.seeds_against(base), tuned.against(row))
+            ),
+            *(f"{name}: {gap}" for name, gap in closed.items()),
+        ),
+        notes=(
+            suite.budget.note,
+            *(
+                f"{row.name} needs one rollout of a scenario where the rewards need several: it has as many updates "
+                "of as many scenarios, and fewer rollouts."
+                for row in imitations
+            ),
+            "Intervals over scenarios take the trained models as given; the interval over seeds says what other runs "
+            "would give.",
+        ),
+        numbers={
+            "rows": tables.numbers(rows.values(), SCORES),
+            "gain_by_seed": {row.name: row.gains_over(base).tolist() for row in (*imitations, tuned)},
+            "gap_closed": {name: {"fraction": g.fraction, "interval": g.interval} for name, g in closed.items()},
+        },
+        figure=tables.draw_gains(base, [tuned, *imitations, rows[CEILING], rows[FLOOR]]),
+    )
+
+
+@dataclass(frozen=True)
+class GapClosed:
+    """Fraction of the gap in realism between base model and oracle that a model closes."""
+
+    fraction: float
+    """1 = as realistic as the oracle; NaN where there is no gap."""
+    interval: tuple[float, float]
+    """95 %, bootstrap over scenarios."""
+
+    def __str__(self) -> str:
+        low, high = self.interval
+        interval = f"95% interval over scenarios [{low:.1%}, {high:.1%}]"
+        return f"{self.fraction:.1%} of the gap from base to oracle closed, {interval}."
+
+
+def gap_closed(base: Evaluation, tuned: Evaluation, ceiling: Evaluation) -> GapClosed:
+    """Mean gain over mean gap of the meta-metric, scenarios paired.
+
+    Args:
+        base: start of the gap.
+        tuned: model whose gain is measured.
+        ceiling: end of the gap, such as the oracle.
+
+    Raises:
+        DataError: no scenario in common.
+    """
+    ids, before, after = paired_values(base, tuned, RMM)
+    above = dict(zip(ceiling.scenario_ids, ceiling.values(RMM)))
+    best = np.array([above.get(i, np.nan) for i in ids])
+    # A scenario counts where all three have a score.
+    known = np.isfinite(before) & np.isfinite(after) & np.isfinite(best)
+    gain, gap = (after - before)[known], (best - before)[known]  # [scenarios]
+    if not len(gain):
+        return GapClosed(np.nan, (np.nan, np.nan))
+    # Bootstrap: scenarios are drawn again and again with replacement. [resamples, scenarios]
+    drawn = np.random.default_rng(0).integers(len(gain), size=(NUM_RESAMPLES, len(gain)))
+    # Ratio of means, not mean of ratios: scenarios in which the base model is as good as the oracle have no ratio.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        low, high = np.quantile(gain[drawn].mean(1) / gap[drawn].mean(1), (0.025, 0.975))
+        return GapClosed(float(np.divide(gain.mean(), gap.mean())), (float(low), float(high)))
+
+
+EXPERIMENT = Experiment(
+    "Does closed-loop fine-tuning make the simulation more realistic, and more so than CAT-K with the same budget?",
+    run,
+    summarize,
+    default_seeds=3,
+)

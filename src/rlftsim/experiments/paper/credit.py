@@ -1,0 +1,44 @@
+"""Credit assignment: the leave-one-out reward given to whole rollouts, beside one that is split over agents."""
+
+from collections.abc import Mapping
+
+from rlftsim.evaluation.columns import COLUMNS
+from rlftsim.experiments import tables
+from rlftsim.experiments.model_specs import BASE, over_seeds
+from rlftsim.experiments.paper.reward_ablation import REFERENCE, REWARDS
+from rlftsim.experiments.results import Experiment, ExperimentResult
+from rlftsim.experiments.rows import Row
+from rlftsim.experiments.suite import ExperimentSuite
+
+COMPARED = ("MLOO", "MLOO, credit by agent")
+
+
+def run(suite: ExperimentSuite) -> dict[str, Row]:
+    """Rows of the base model, and of MLOO with either credit assignment."""
+    tuned = {name: over_seeds(REWARDS[name], suite.num_seeds) for name in COMPARED}
+    return suite.evaluate({REFERENCE: (BASE,), **tuned})
+
+
+def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResult:
+    """The table, and a verdict on the split."""
+    # In the order of `run`.
+    base, plain, split = rows.values()
+    return ExperimentResult(
+        title="Credit assignment: MLOO for whole rollouts, and for each agent",
+        tables=(tables.of_rows("Ours", rows.values(), COLUMNS),),
+        verdicts=(
+            *(split.against(plain), plain.against(base), split.against(base)),
+            *(plain.seeds_against(base), split.seeds_against(base)),
+        ),
+        notes=(
+            suite.budget.note,
+            "The paper gives every decision of a rollout the same reward; it has no number for the other.",
+        ),
+        numbers={"rows": tables.numbers(rows.values(), COLUMNS)},
+        figure=tables.draw_gains(base, [plain, split]),
+    )
+
+
+EXPERIMENT = Experiment(
+    "Does it help to give each agent its own leave-one-out reward?", run, summarize, default_seeds=3
+)

@@ -1,0 +1,90 @@
+"""Goals of the maneuver benchmark: logged and alternative maneuvers of egos that have both, in an editable file."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from rlftsim.errors import DataError
+from rlftsim.experiments.goal_proposals import LOGGED, entry_of, propose, split_label
+from rlftsim.experiments.suite import ExperimentSuite
+from rlftsim.experiments.suite_goals import held_out
+from rlftsim.goals.goals_file import GoalEntry, GoalsFile, read_goals, write_goals
+from rlftsim.goals.placement import track_of
+from rlftsim.scenario.dataset import ScenarioDataset
+from rlftsim.scenario.maneuver import BENCHMARK_MANEUVERS, Maneuver
+
+NAME = "maneuver-controllability"
+
+
+def goals_path(suite: ExperimentSuite) -> Path:
+    """The goals file of a suite, which may be edited by hand."""
+    return suite.out / f"{NAME}.goals.json"
+
+
+def propose_goals(dataset: ScenarioDataset, scenario_ids: Sequence[str]) -> GoalsFile:
+    """Logged and alternative maneuvers of every ego that has both. The logged ones are the file's goals.
+
+    Args:
+        dataset: scenarios with their futures.
+        scenario_ids: scenarios to propose goals for.
+    """
+    logged, alternatives = [], []
+    for scenario_id in scenario_ids:
+        scenario = dataset.by_id(scenario_id)
+        proposals = propose(scenario, scenario.ego_index)
+        kinds = {proposal.is_logged for proposal in proposals}
+        # An ego without an alternative, or whose logged maneuver has no name, cannot be compared with itself.
+        if kinds == {True, False}:
+            for proposal in proposals:
+                (logged if proposal.is_logged else alternatives).append(entry_of(scenario, proposal))
+    return GoalsFile(tuple(logged), tuple(alternatives))
+
+
+def find_goals(suite: ExperimentSuite) -> list[GoalEntry]:
+    """Goals of the suite's held-out scenarios from its goals file, which is written first if there is none.
+
+    Raises:
+        DataError: there is no ego with two maneuvers, or the file was edited and makes no sense.
+    """
+    dataset, ids = held_out(suite)
+    path = goals_path(suite)
+    # 1. Goals are proposed once: the file may have been edited since.
+    if not path.exists():
+        write_goals(path, propose_goals(dataset, ids))
+    file = read_goals(path)
+    goals = [goal for goal in (*file.goals, *file.alternatives) if goal.scenario_id in ids]
+    # 2. All of them are checked, before anything is trained.
+    for goal in goals:
+        maneuver_of(goal)
+        scenario = dataset.by_id(goal.scenario_id)
+        if track_of(goal, scenario) != scenario.ego_index:
+            raise DataError(
+                f"{goal}: agent {goal.agent_id} is not the ego of scenario {scenario.scenario_id}, and only the ego "
+                f"may have a goal here: write agent {scenario.tracks.object_id[scenario.ego_index]}, or remove the "
+                "entry."
+            )
+    if all(is_logged(goal) for goal in goals):
+        raise DataError(
+            f"{path}: not one ego of {len(ids)} scenarios has an alternative maneuver: take more scenarios."
+        )
+    return goals
+
+
+def is_logged(goal: GoalEntry) -> bool:
+    """True if the goal's maneuver is the logged one."""
+    return split_label(goal.label)[1]
+
+
+def maneuver_of(goal: GoalEntry) -> Maneuver:
+    """The maneuver that a goal's label names.
+
+    Raises:
+        DataError: it names none.
+    """
+    try:
+        return Maneuver(split_label(goal.label)[0])
+    except ValueError:
+        known = ", ".join(m.value for m in BENCHMARK_MANEUVERS)
+        raise DataError(
+            f"{goal}: label {goal.label!r} names no maneuver: known are {known}, each with {LOGGED!r} if it is the "
+            "logged one."
+        ) from None

@@ -1,0 +1,94 @@
+"""Table 2 and the table of heuristic rewards: the same budget spent on different rewards."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from rlftsim.evaluation.columns import COLUMNS
+from rlftsim.experiments import tables
+from rlftsim.experiments.model_specs import BASE, FineTuned, over_seeds
+from rlftsim.experiments.paper import published
+from rlftsim.experiments.results import Experiment, ExperimentResult
+from rlftsim.experiments.rows import Row
+from rlftsim.experiments.suite import ExperimentSuite
+from rlftsim.training.run_folder import read_metrics
+
+REFERENCE, MLOO = "base", "MLOO"
+REWARDS = {
+    MLOO: FineTuned("mloo"),
+    "MLOO, credit by agent": FineTuned("mloo", credit="agent"),
+    "RLOO": FineTuned("rloo"),
+    "minADE, RLOO": FineTuned("minade_rloo"),
+    "collision + off-road + ADE": FineTuned("collision_offroad_ade"),
+    "collision + off-road": FineTuned("collision_offroad"),
+}
+"""Rows, in the order of the tables."""
+DISTANCES = {
+    "kl": "KL to the base model [nats a decision]",
+    "entropy": "entropy [nats]",
+    "diversity_m": "spread of rollouts [m]",
+    "speed_gap_mps": "speed minus the log's [m/s]",
+    "reward_std": "std of the reward",
+}
+"""Headings, by metric of a run."""
+LAST_PART = 5
+"""Metrics are averaged over the last 1 / 5 of a run."""
+
+
+def run(suite: ExperimentSuite) -> dict[str, Row]:
+    """Rows of the base model and of a fine-tuning with each reward."""
+    tuned = {name: over_seeds(spec, suite.num_seeds) for name, spec in REWARDS.items()}
+    return suite.evaluate({REFERENCE: (BASE,), **tuned})
+
+
+def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResult:
+    """The table, every reward against the base model, and MLOO against every other."""
+    # In the order of `run`.
+    base, mloo, *others = rows.values()
+    tuned = [mloo, *others]
+    distances = _distances(suite)
+    return ExperimentResult(
+        title="Rewards: the same budget of fine-tuning with each of them",
+        tables=(
+            tables.of_rows("Ours", rows.values(), COLUMNS),
+            *((distances,) if distances.rows else ()),
+            published.REWARDS,
+            published.HEURISTICS,
+        ),
+        verdicts=(
+            *(row.against(base) for row in tuned),
+            *(mloo.against(row) for row in others),
+            *(row.seeds_against(base) for row in tuned if len(row.by_seed) > 1),
+        ),
+        notes=(
+            suite.budget.note,
+            "A miss: an evaluated agent ends further from its logged endpoint than WOMD tolerates.",
+            "Equal budgets are not equal distances: rewards differ in size, so they pull with different force "
+            "against the same KL penalty, and in a short run its controller does not catch up.",
+        ),
+        numbers={"rows": tables.numbers(rows.values(), COLUMNS)},
+        figure=tables.draw_gains(base, tuned),
+    )
+
+
+def _distances(suite: ExperimentSuite) -> tables.TextTable:
+    """Distance of each fine-tuned model from the base model at the end of its runs; no rows where there are no runs."""
+    rows = []
+    for name, spec in REWARDS.items():
+        runs = [suite.model_folder(one) for one in over_seeds(spec, suite.num_seeds)]
+        metrics = [read_metrics(run) for run in runs if (run / "metrics.jsonl").exists()]
+        # The last part of every run, at least its last update.
+        ends = [line for lines in metrics for line in lines[-max(len(lines) // LAST_PART, 1) :]]
+        if ends:
+            means = (f"{np.mean([line[metric] for line in ends]):.3g}" for metric in DISTANCES)
+            rows.append((name, *means))
+    note = f"Means over the last {100 // LAST_PART} % of the updates; training rollouts."
+    return tables.TextTable("Distance from the base model", ("", *DISTANCES.values()), tuple(rows), note)
+
+
+EXPERIMENT = Experiment(
+    "Which reward makes the simulation more realistic, and what does it do to collisions, off-road driving and "
+    "displacement?",
+    run,
+    summarize,
+)

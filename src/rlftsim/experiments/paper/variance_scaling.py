@@ -1,0 +1,180 @@
+"""Figure 3: variance of a rollout's reward against the number N of rollouts it is computed from, and fits to it."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.figure import Figure
+
+from rlftsim.evaluation.reward_variance import MIN_SIZES_FOR_A_SLOPE, REWARDS, Variances, measure_variances
+from rlftsim.experiments.results import Experiment, ExperimentResult, TextTable
+from rlftsim.experiments.suite import ExperimentSuite
+from rlftsim.policies.registry import load_policy
+from rlftsim.statistics import MeanInterval, mean_interval
+from rlftsim.viewer.figure import Band, draw_bands
+
+FROM_SIZES = (2, 8)
+"""Slopes are fitted from each of these on: over all N, and where N is large enough for laws of large numbers."""
+CLAIMED_SLOPE = {"mloo": -2.0, "rloo": 0.0}
+"""Of the logarithm of the variance against that of N, as the paper has it for large N."""
+
+
+def run(suite: ExperimentSuite) -> Variances:
+    """Variances of the base model's rewards, see `measure_variances`."""
+    policy = load_policy(str(suite.base()), suite.device)
+    return measure_variances(policy, suite.data, suite.out / "variances", suite.evaluation)
+
+
+def slope_of(variance: Float[np.ndarray, "sizes"], sizes: Sequence[int], first: int = 0) -> float:
+    """Slope of the straight line fitted to logarithms; NaN where a variance is zero.
+
+    Args:
+        variance: by number of rollouts.
+        sizes: numbers of rollouts.
+        first: smallest number that the line is fitted to.
+    """
+    used = np.array(sizes) >= first
+    # a reward that never varies at some N has no logarithm there
+    if not (variance > 0).all():
+        return float("nan")
+    return float(np.polyfit(np.log(np.array(sizes)[used]), np.log(variance[used]), 1)[0])
+
+
+def law(sizes: Sequence[int]) -> dict[str, Float[np.ndarray, "sizes"]]:
+    """Variances under a metric that is a mean over independent rollouts, up to a factor.
+
+    1 / (N (N - 1)) for MLOO, from the proof in the paper's appendix, and N / (N - 1) for RLOO.
+    """
+    size = np.array(sizes, float)
+    return {"mloo": 1 / (size * (size - 1)), "rloo": size / (size - 1)}
+
+
+@dataclass(frozen=True)
+class Scaling:
+    """Fit to the variances of one reward."""
+
+    middle: Float[np.ndarray, "sizes"]
+    """Geometric mean over scenarios."""
+    low: Float[np.ndarray, "sizes"]
+    """One standard deviation of the logarithm below."""
+    high: Float[np.ndarray, "sizes"]
+    alpha: float
+    """Of alpha / N^2, fitted to the logarithms of `middle`."""
+    slopes: dict[int, MeanInterval]
+    """Over the scenarios' own slopes, by the smallest size they are fitted to."""
+
+
+def scaling_of(variance: Float[np.ndarray, "scenarios sizes"], sizes: Sequence[int]) -> Scaling:
+    """Fit of one reward; scenarios in which a reward never varies are left out.
+
+    Args:
+        variance: of the reward.
+        sizes: numbers of rollouts.
+    """
+    varied = np.log(variance[(variance > 0).all(1)])  # [varied scenarios, sizes]
+    middle, spread = varied.mean(0), varied.std(0)
+    slopes = {
+        first: mean_interval(np.array([slope_of(line, sizes, first) for line in np.exp(varied)]))
+        for first in FROM_SIZES
+        if sum(size >= first for size in sizes) >= MIN_SIZES_FOR_A_SLOPE
+    }
+    # least squares of log(alpha) - 2 log(N) to the logarithms: the mean of the residuals
+    alpha = float(np.exp((middle + 2 * np.log(sizes)).mean()))
+    return Scaling(np.exp(middle), np.exp(middle - spread), np.exp(middle + spread), alpha, slopes)
+
+
+def summarize(measured: Variances, suite: ExperimentSuite) -> ExperimentResult:
+    """Slopes with their intervals, beside the paper's claim and the slopes of independent rollouts.
+
+    Args:
+        measured: variances.
+        suite: for the notes.
+    """
+    sizes = measured.sizes
+    scalings = {name: scaling_of(values, sizes) for name, values in measured.by_reward.items()}
+    # slopes of the laws over the same N, so that both have the same curvature at small N
+    expected = {
+        (name, first): slope_of(curve, sizes, first)
+        for name, curve in law(sizes).items()
+        for first in scalings[name].slopes
+    }
+    rows = tuple((str(size), *(f"{scalings[name].middle[k]:.3g}" for name in REWARDS)) for k, size in enumerate(sizes))
+    note = f"Geometric mean over the scenarios; base model, metric {suite.evaluation.metric}."
+    slopes = []
+    for (name, first), law_slope in expected.items():
+        slope = scalings[name].slopes[first]
+        low, high = slope.interval
+        numbers = (f"{slope.mean:.3f}", f"[{low:.3f}, {high:.3f}]", f"{law_slope:.3f}", f"{CLAIMED_SLOPE[name]:g}")
+        slopes.append((f"{name.upper()}, N ≥ {first}", *numbers))
+    headings = ("", "slope", "95 % interval", "of independent rollouts", "the paper, large N")
+    slope_note = "Mean and interval over the scenarios' own slopes (Student's t)."
+    return ExperimentResult(
+        title="Variance of the rewards against the number of rollouts",
+        tables=(
+            TextTable("Variance of a rollout's reward", ("N", "MLOO", "RLOO"), rows, note),
+            TextTable("Slope in logarithms", headings, tuple(slopes), slope_note),
+        ),
+        verdicts=tuple(_verdict(name, first, scalings[name], expected[name, first]) for name, first in expected),
+        notes=(
+            "The paper fits alpha / N² to its MLOO curve (Fig. 3) and gives no slope; it finds RLOO to flatten out.",
+            "Its proof has 1 / (N (N − 1)) for MLOO, which is steeper than 1 / N² at small N, and N / (N − 1) for "
+            "RLOO: the slopes of independent rollouts are those of these laws over the same N. They hold where a score "
+            "is a mean over rollouts; the meta-metric is one only when N is large: of few rollouts it is a geometric "
+            "mean of nearly empty histograms.",
+            "Small variance alone makes no better gradient: a reward that is scaled down has it too. What matters is "
+            "the variance beside the differences that a policy is to learn.",
+        ),
+        numbers={
+            "sizes": sizes,
+            "rewards": {name: _plain(name, scaling, expected) for name, scaling in scalings.items()},
+            "scenario_ids": measured.scenario_ids,
+            "by_scenario": {name: values.tolist() for name, values in measured.by_reward.items()},
+        },
+        figure=_figure(scalings, sizes),
+    )
+
+
+def _plain(name: str, scaling: Scaling, expected: Mapping[tuple[str, int], float]) -> dict[str, object]:
+    """Numbers of one reward for machines."""
+    slopes = [
+        {
+            "from_size": first, "slope": slope.mean, "interval": slope.interval, "of_law": expected[name, first],
+            "scenarios": slope.count,
+        }
+        for first, slope in scaling.slopes.items()
+    ]  # fmt: skip
+    return {"variance": scaling.middle.tolist(), "alpha": scaling.alpha, "slopes": slopes}
+
+
+def _verdict(name: str, first: int, scaling: Scaling, expected: float) -> str:
+    slope = scaling.slopes[first]
+    low, high = slope.interval
+    if slope.count < 2:
+        return f"{name.upper()}, N ≥ {first}: no verdict: fewer than two scenarios in which the reward varies."
+    verdict = "no difference from" if low <= expected <= high else "difference from"
+    return (
+        f"{name.upper()}, N ≥ {first}: {verdict} the slope {expected:.3f} of independent rollouts: slope "
+        f"{slope.mean:.3f}, 95% interval over {slope.count} scenarios [{low:.3f}, {high:.3f}]."
+    )
+
+
+def _figure(scalings: dict[str, Scaling], sizes: Sequence[int]) -> Figure:
+    across = np.array(sizes, float)
+    mloo, rloo = scalings["mloo"], scalings["rloo"]
+    bands = [
+        Band("MLOO", across, mloo.middle, mloo.low, mloo.high),
+        Band(f"{mloo.alpha:.2g} / N²", across, mloo.alpha / across**2, style="theory"),
+        Band("RLOO", across, rloo.middle, rloo.low, rloo.high, color=1),
+    ]
+    return draw_bands(
+        bands, title="Variance of a rollout's reward", x_label="rollouts N", log=True, ticks=sizes,
+        y_label="variance, geometric mean ± 1 std",
+    )  # fmt: skip
+
+
+EXPERIMENT = Experiment(
+    question="Does the variance of the leave-one-out reward fall with the square of the number of rollouts?",
+    run=run,
+    summarize=summarize,
+)

@@ -1,0 +1,136 @@
+"""An experiment and its result: tables, verdicts and a figure, written as Markdown, JSON and pictures.
+
+A new experiment is two functions: `run` trains and evaluates, `summarize` makes tables and verdicts of that.
+`experiments.tables` makes tables of rows, `Row.against` makes verdicts. `EXPERIMENTS` in
+`experiments.registry` has them by name.
+"""
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Generic, TypeVar
+
+from matplotlib.figure import Figure
+
+from rlftsim.atomic_io import write_text
+from rlftsim.experiments.suite import ExperimentSuite
+from rlftsim.experiments.tables import TextTable
+from rlftsim.training.run_folder import describe_environment, to_plain
+from rlftsim.viewer.figure import save_figure
+from rlftsim.viewer.film import to_film
+from rlftsim.viewer.page import Animation, write_page
+
+
+@dataclass(frozen=True)
+class ExperimentResult:
+    """Tables, verdicts and a figure of an experiment."""
+
+    title: str
+    tables: tuple[TextTable, ...]
+    """Ours first, then published ones."""
+    verdicts: tuple[str, ...] = ()
+    """A line each: difference or no difference."""
+    notes: tuple[str, ...] = ()
+    """Remarks needed to read the numbers."""
+    numbers: Mapping[str, Any] = field(default_factory=dict)
+    """The same for machines; what is not finite becomes null."""
+    figure: Figure | None = None
+    animations: tuple[Animation, ...] = ()
+
+
+Found = TypeVar("Found")
+FILMS = {".webp": 2, ".mp4": 1}
+"""Endings of an animation's films and their steps between frames."""
+
+
+@dataclass(frozen=True)
+class Experiment(Generic[Found]):
+    """A question, and the two functions that answer it."""
+
+    question: str
+    run: Callable[[ExperimentSuite], Found]
+    """Trains and evaluates what is missing, and returns what `summarize` needs: mostly the rows of a table."""
+    summarize: Callable[[Found, ExperimentSuite], ExperimentResult]
+    """Computes from stored results alone."""
+    default_seeds: int = 1
+
+
+def run_experiment(name: str, experiment: Experiment[Any], suite: ExperimentSuite) -> ExperimentResult:
+    """Run what is missing of an experiment and write its result, each file whole or not at all.
+
+    Always NAME.md and NAME.json; with a figure NAME.png and NAME.svg; with animations NAME.html, where they
+    can be played, and films of each: NAME-1.webp, NAME-1.mp4, ...
+
+    Args:
+        name: of the files.
+        experiment: question and functions.
+        suite: folder of the files; models and evaluations that are in it are not made again.
+
+    Raises:
+        RlftsimError: a stage failed; the message says which and why.
+    """
+    # 1. Train and evaluate what is missing, then make tables of stored results alone.
+    result = experiment.summarize(experiment.run(suite), suite)
+    # 2. Figure and films, before the page that shows them.
+    if result.figure is not None:
+        for ending in ("png", "svg"):
+            save_figure(suite.out / f"{name}.{ending}", result.figure)
+    for number, animation in enumerate(result.animations, 1):
+        for ending, every in FILMS.items():
+            to_film(suite.out / f"{name}-{number}{ending}", animation, every=every)
+    if result.animations:
+        write_page(suite.out / f"{name}.html", result.title, result.animations, caption=experiment.question)
+    # 3. Everything for machines, with the settings that the numbers depend on.
+    for_machines = {
+        "experiment": name,
+        "question": experiment.question,
+        "title": result.title,
+        "verdicts": result.verdicts,
+        "notes": result.notes,
+        **result.numbers,
+        "tables": [to_plain(table) for table in result.tables],
+        "budget": to_plain(suite.budget),
+        "num_seeds": suite.num_seeds,
+        "data": str(suite.data),
+        "recipe": to_plain(suite.recipe),
+        "evaluation": to_plain(suite.evaluation),
+        "environment": describe_environment(),
+    }
+    write_text(suite.out / f"{name}.json", json.dumps(finite_or_none(for_machines), indent=1) + "\n")
+    # 4. The page for people.
+    write_text(suite.out / f"{name}.md", _markdown(name, experiment, result, suite))
+    return result
+
+
+def _markdown(name: str, experiment: Experiment[Any], result: ExperimentResult, suite: ExperimentSuite) -> str:
+    parts = [f"# {result.title}", experiment.question]
+    for table in result.tables:
+        parts += [f"## {table.title}", table.markdown(), *([table.note] if table.note else [])]
+        # Verdicts and figure belong to the first table: ours. Published tables follow.
+        if table is result.tables[0]:
+            parts += ["\n".join(f"* {line}" for line in result.verdicts)] if result.verdicts else []
+            parts += [f"![{result.title}]({name}.png)"] if result.figure is not None else []
+    for number, animation in enumerate(result.animations, 1):
+        film = f"{name}-{number}"
+        caption = f"{animation.caption} [Film]({film}.mp4)"
+        parts += [f"## {animation.title}", caption, f"![{animation.title}]({film}.webp)"]
+    environment = describe_environment()
+    packages = ", ".join(f"{package} {version}" for package, version in environment["packages"].items())
+    commit = environment["commit"] or "of an installed package"
+    facts = (
+        f"Data: {suite.data.name}, split {suite.evaluation.split}.",
+        f"Made with `{environment['command']}`, commit {commit}, on {environment['machine']}; {packages}.",
+    )
+    parts += ["## Notes", "\n".join(f"* {line}" for line in (*result.notes, *facts))]
+    return "\n\n".join(parts) + "\n"
+
+
+def finite_or_none(value: Any) -> Any:
+    """The same for JSON, with None for numbers that are not finite."""
+    if isinstance(value, Mapping):
+        return {str(key): finite_or_none(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite_or_none(inner) for inner in value]
+    # JSON has no NaN or infinity.
+    return None if isinstance(value, float) and not math.isfinite(value) else value

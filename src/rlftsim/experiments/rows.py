@@ -1,0 +1,87 @@
+"""A row of an experiment: one model specification, evaluated for each seed, and compared with other rows."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import pyarrow as pa
+from jaxtyping import Float
+
+from rlftsim.errors import DataError
+from rlftsim.evaluation.compare import compare
+from rlftsim.evaluation.results import SCHEMA, SCORE_COLUMNS, Evaluation
+from rlftsim.statistics import mean_interval
+
+RMM = "meta_metric"
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """Evaluations of one model specification on the same scenarios, one for each seed."""
+
+    name: str
+    by_seed: tuple[Evaluation, ...]
+
+    @cached_property
+    def mean(self) -> Evaluation:
+        """Each scenario's mean over the seeds."""
+        return mean_of_seeds(self.name, self.by_seed)
+
+    def against(self, other: "Row", column: str = RMM, *, alpha: float = 0.05) -> str:
+        """Verdict of a paired t-test in one line, such as "tuned against base, 40 scenarios in both: difference, ...".
+
+        Args:
+            other: row to compare with, such as the base model; the difference is this row minus the other.
+            column: score to compare.
+            alpha: level of the test.
+        """
+        # Difference is self minus other.
+        comparison = compare(other.mean, self.mean, alpha=alpha)
+        return f"{self.name} against {other.name}, {comparison.pairing}: {comparison[column].verdict}"
+
+    def gains_over(self, other: "Row", column: str = RMM) -> Float[np.ndarray, "seeds"]:
+        """Difference of the means to another row, one for each seed of this row.
+
+        Args:
+            other: row to compare with; its own seeds are averaged.
+            column: score to compare.
+        """
+        reference = other.mean.mean_and_error(column).mean
+        return np.array([evaluation.mean_and_error(column).mean - reference for evaluation in self.by_seed])
+
+    def seeds_against(self, other: "Row") -> str:
+        """Gain in RMM of every seed in one line, with a 95 % interval over the seeds where there are several.
+
+        This interval answers another question than a paired t-test over scenarios: the gain that another run
+        would have.
+        """
+        gains = self.gains_over(other)
+        line = f"{self.name} minus {other.name}, RMM by seed: {', '.join(f'{gain:+.4f}' for gain in gains)}"
+        if len(gains) == 1:
+            return f"{line}; a single seed says nothing about others."
+        # Student's t over seeds: with two or three of them the interval is wide, as it should be.
+        mean = mean_interval(gains)
+        low, high = mean.interval
+        return f"{line}; mean {mean.mean:+.4f}, 95% interval over seeds [{low:+.4f}, {high:+.4f}]."
+
+
+def mean_of_seeds(name: str, evaluations: Sequence[Evaluation]) -> Evaluation:
+    """An evaluation whose scores are means over evaluations of the same scenarios, scenario by scenario.
+
+    Args:
+        name: of the mean.
+        evaluations: one for each seed.
+
+    Raises:
+        DataError: they are of different scenarios.
+    """
+    first = evaluations[0]
+    if any(other.scenario_ids != first.scenario_ids for other in evaluations):
+        raise DataError(f"{name}: the evaluations of its seeds are of different scenarios: remove them to start anew.")
+    # Ids and numbers of agents are the same for all seeds; only scores are averaged. NaN in one seed stays NaN.
+    table = first.table
+    for column in SCORE_COLUMNS:
+        mean = np.mean([evaluation.values(column) for evaluation in evaluations], axis=0)  # [scenarios]
+        table = table.set_column(table.schema.get_field_index(column), SCHEMA.field(column), pa.array(mean))
+    return Evaluation(name, first.provenance, table, first.skipped)

@@ -1,0 +1,273 @@
+"""Experiment suite: a folder in which models are trained and evaluated once, for all experiments that need them.
+
+config.json, environment.json   settings of the suite; a folder of other settings is refused
+vocabulary.safetensors          motion and map tokens
+runs/base/                      a training run each, see `training.run_folder`
+runs/mloo-seed0/3-epochs/
+evaluations/*.parquet           an evaluation each
+variances/                      see `evaluation.reward_variance`
+attainment/                     goals reached and passed, see `evaluation.goal_attainment`
+NAME.md, NAME.json, NAME.png    results of an experiment
+
+Stages are shared: a model that one experiment has trained is found by the next.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from rlftsim.errors import ConfigError
+from rlftsim.evaluation.evaluate import EvaluateConfig, GoalsGiven, evaluate
+from rlftsim.experiments.model_specs import BASE, CATK, GCSL, Base, Baseline, Budget, FineTuned, Guided, ModelSpec
+from rlftsim.experiments.rows import Row
+from rlftsim.experiments.stage_progress import StageProgress
+from rlftsim.experiments.stages import (
+    GoalConditioning,
+    find_vocabulary,
+    finetune_model,
+    open_training,
+    pretrain_policy,
+    start_from_shorter_run,
+)
+from rlftsim.policies.registry import Device, find_model, load_policy, load_policy_or_oracle, with_guidance
+from rlftsim.progress import log
+from rlftsim.recipes.registry import Recipe
+from rlftsim.rollout.fingerprint import fingerprint_policy
+from rlftsim.rollout.policy import Policy
+from rlftsim.scenario.dataset import MANIFEST, ScenarioDataset
+from rlftsim.scenario.shards import hash_file
+from rlftsim.training.run_folder import RunFolder, flatten, may_change, to_plain
+
+GOALS_SUFFIX: Mapping[GoalsGiven, str] = {"none": "", "logged": "-recorded-goals"}
+"""End of the names of evaluations; release 0.1 named them so, and its evaluations are found."""
+
+
+@dataclass(frozen=True)
+class ExperimentSuite:
+    """A folder of stages and the settings they share.
+
+    Raises:
+        CheckpointError: the folder belongs to other settings, data or base model.
+        DataError: no such data set.
+        ConfigError: no seed, or training in several processes.
+    """
+
+    recipe: Recipe
+    data: Path
+    """A data set with the splits training and validation."""
+    out: Path
+    evaluation: EvaluateConfig = field(default_factory=EvaluateConfig)
+    num_seeds: int = 1
+    """Of fine-tuning. More may be added later."""
+    base_model: str | None = None
+    """Model folder to fine-tune, of any policy; None = one is pre-trained by the recipe."""
+    device: Device = "cpu"
+    """Of evaluations; training has its own in the recipe."""
+
+    def __post_init__(self) -> None:
+        if self.num_seeds < 1:
+            raise ConfigError(f"an experiment needs at least one seed, got {self.num_seeds}.")
+        recipe = self.recipe
+        methods = (recipe.pretrain, recipe.finetune, recipe.catk, recipe.gcsl)
+        if any(one is not None and one.device.devices != 1 for one in methods):
+            raise ConfigError(
+                "experiments train in one process: leave device.devices at 1, or train by `rlftsim finetune` and "
+                "compare by `rlftsim evaluate`."
+            )
+        # A data set that is not there must not claim the folder, and one without the split to evaluate on must not be
+        # trained on: both are opened before anything is written.
+        _ = self.training
+        ScenarioDataset(self.data, self.evaluation.split)
+        RunFolder(self.out, self._what_counts())
+
+    @cached_property
+    def training(self) -> ScenarioDataset:
+        """The training scenarios."""
+        return open_training(self.data)
+
+    @property
+    def budget(self) -> Budget:
+        """The budget of fine-tuning, from the recipe."""
+        config = self.recipe.finetune
+        return Budget(config.num_updates(len(self.training)), config.batch_size, config.num_rollouts)
+
+    def evaluate(self, rows: Mapping[str, Sequence[ModelSpec]], *, goals: GoalsGiven = "none") -> dict[str, Row]:
+        """Rows of a table, by their names; models that are missing are trained and evaluated.
+
+        Args:
+            rows: by name, the model of a row: one specification, or the same with several seeds.
+            goals: goals of the evaluated agents: none, or their logged endpoints.
+        """
+        # A model that is in several rows is trained and evaluated once.
+        specs = list(dict.fromkeys(spec for row in rows.values() for spec in row))
+        progress = StageProgress(self._stages(specs, goals=goals))
+        config, folder, found = replace(self.evaluation, goals=goals), self.out / "evaluations", {}
+        for spec in specs:
+            model = self._model(spec, progress)
+            with progress.stage(self._evaluation_title(spec, goals)):
+                policy = load_policy_or_oracle(model, self.device)
+                # An evaluation that is finished is read from its file.
+                found[spec] = evaluate(policy, self.data, folder, config, name=self.evaluation_name(spec, goals))
+        return {name: Row(name, tuple(found[spec] for spec in row)) for name, row in rows.items()}
+
+    def feasible(self, rows: Mapping[str, Sequence[ModelSpec]]) -> dict[str, Sequence[ModelSpec]]:
+        """The rows without those of methods that cannot train the suite's policies; a warning names these rows.
+
+        Args:
+            rows: as in `evaluate`.
+        """
+        # CAT-K and goal relabeling learn tokens; a recipe may leave either out.
+        if self.base_model is None:
+            has_tokens = self.recipe.tokens is not None
+        else:
+            has_tokens = hasattr(load_policy(self.base_model), "vocabulary")
+        sections = {CATK: self.recipe.catk, GCSL: self.recipe.gcsl}
+        refused = {method for method, section in sections.items() if section is None or not has_tokens}
+
+        def is_feasible(spec: ModelSpec) -> bool:
+            return all(not isinstance(one, FineTuned) or one.method not in refused for one in self._lineage(spec))
+
+        left_out = [name for name, specs in rows.items() if not all(is_feasible(spec) for spec in specs)]
+        if left_out:
+            methods = " and ".join(sorted(refused))
+            log.warning(f"left out: {', '.join(left_out)} (the policy cannot be trained with {methods})")
+        return {name: specs for name, specs in rows.items() if name not in left_out}
+
+    def base(self) -> Path:
+        """Folder of the base model, which is pre-trained if it is missing."""
+        return Path(self.models([BASE])[BASE])
+
+    def models(self, specs: Sequence[ModelSpec]) -> dict[ModelSpec, str]:
+        """Names or folders of policies, for `load_policy_or_oracle`; models that are missing are trained."""
+        progress = StageProgress(self._stages(specs, evaluated=False))
+        return {spec: self._model(spec, progress) for spec in specs}
+
+    def policy(self, spec: ModelSpec) -> Policy:
+        """A policy on the device of evaluations; trained if it is missing."""
+        return load_policy(self.models([spec])[spec], self.device)
+
+    def title(self, spec: ModelSpec) -> str:
+        """A specification in words."""
+        if isinstance(spec, Guided):
+            return f"{self.title(spec.of)}, guidance scale {spec.scale:g}"
+        if not isinstance(spec, FineTuned):
+            return spec.name.replace("_", " ")
+        epochs = self._epochs(spec)
+        return f"{spec.name} ({epochs:g} epoch{'s' if epochs != 1 else ''})"
+
+    def model_folder(self, spec: Base | FineTuned) -> Path:
+        """Folder of the run that trains a model."""
+        folder = self.out / "runs" / spec.name
+        return folder if isinstance(spec, Base) else folder / f"{self._epochs(spec):g}-epochs"
+
+    def evaluation_name(self, spec: ModelSpec, goals: GoalsGiven = "none") -> str:
+        """Name of the files with a model's results.
+
+        Args:
+            spec: the model.
+            goals: goals of the evaluated agents.
+        """
+        if isinstance(spec, Guided):
+            return f"{self.evaluation_name(spec.of, goals)}-guided-{spec.scale:g}"
+        epochs = f"-{self._epochs(spec):g}-epochs" if isinstance(spec, FineTuned) else ""
+        return f"{spec.name}{epochs}{GOALS_SUFFIX[goals]}"
+
+    # ---- stages ---------------------------------------------------------------------------------------------------
+
+    def _stages(
+        self, specs: Sequence[ModelSpec], *, evaluated: bool = True, goals: GoalsGiven = "none"
+    ) -> dict[str, bool]:
+        """Titles of the stages ahead in their order, each with True if it was finished before."""
+        # A title is a key: a base model that several models start from is one stage.
+        stages: dict[str, bool] = {}
+        for spec in specs:
+            for needed in self._lineage(spec):
+                stages[self._training_title(needed)] = (self.model_folder(needed) / "model").exists()
+            if evaluated:
+                path = self.out / "evaluations" / f"{self.evaluation_name(spec, goals)}.parquet"
+                stages[self._evaluation_title(spec, goals)] = path.exists()
+        return stages
+
+    def _training_title(self, spec: Base | FineTuned) -> str:
+        return f"{'pre-train' if isinstance(spec, Base) else 'fine-tune'} {self.title(spec)}"
+
+    def _evaluation_title(self, spec: ModelSpec, goals: GoalsGiven) -> str:
+        return f"evaluate {self.title(spec)}{'' if goals == 'none' else f', {goals} goals'}"
+
+    def _lineage(self, spec: ModelSpec) -> list[Base | FineTuned]:
+        """Models to train for a specification, the base model first."""
+        if isinstance(spec, Guided):
+            return self._lineage(spec.of)
+        # A base model that was given is not trained, but a weaker one beside it is.
+        if isinstance(spec, Baseline) or (spec == BASE and self.base_model):
+            return []
+        before = self._lineage(spec.base) if isinstance(spec, FineTuned) else []
+        return [*before, spec]
+
+    def _model(self, spec: ModelSpec, progress: StageProgress) -> str:
+        """Name or folder of a policy, which is trained if it is missing."""
+        if isinstance(spec, Baseline):
+            return spec.name
+        for needed in self._lineage(spec):
+            # A run that is finished returns at once.
+            with progress.stage(self._training_title(needed)):
+                self._pretrain(needed) if isinstance(needed, Base) else self._finetune(needed)
+        if not isinstance(spec, Guided):
+            return str(self._trained(spec))
+        # Guidance scales a weight: the folder is written anew each time, nothing is trained.
+        folder = self.model_folder(spec.of) / f"guided-{spec.scale:g}"
+        policy = with_guidance(load_policy(str(self._trained(spec.of))), spec.scale)
+        policy.save_pretrained(folder, card=f"# {self.title(spec)}\n")
+        return str(folder)
+
+    def _trained(self, spec: Base | FineTuned) -> Path:
+        """Model folder of a finished run, or the base model that was given."""
+        if spec == BASE and self.base_model:
+            return find_model(self.base_model)
+        return self.model_folder(spec) / "model"
+
+    def _pretrain(self, base: Base) -> None:
+        recipe, vocabulary, folder = self.recipe, None, self.model_folder(base)
+        if self.base_model:
+            # Another base model for comparison, such as a weaker one: the architecture and tokens of the given one.
+            given = load_policy(self.base_model)
+            try:
+                recipe = recipe.like(given)
+            except ConfigError as error:
+                message = f"the recipe pre-trains no model like {self.base_model}: leave the base model out"
+                raise ConfigError(f"{message} ({str(error).removesuffix('.')}).") from None
+            vocabulary = getattr(given, "vocabulary", None)
+        elif recipe.tokens is not None:
+            origin = f"experiments on {self.data.name}, {recipe.tokens}"
+            path = self.out / "vocabulary.safetensors"
+            vocabulary = find_vocabulary(self.training, recipe.tokens, path, origin=origin)
+        config = recipe.pretrain if base.epochs is None else replace(recipe.pretrain, epochs=base.epochs)
+        pretrain_policy(recipe.new_policy(vocabulary), self.training, config, folder)
+
+    def _finetune(self, spec: FineTuned) -> None:
+        out, conditioning = self.model_folder(spec), None
+        if spec.goals is not None:
+            conditioning = GoalConditioning(spec.goals.encoding)
+        if spec.method not in (CATK, GCSL):
+            # Only runs with a reward continue shorter ones. The learning rate of the other methods decays over the
+            # whole run, so that a shorter run is no part of a longer one.
+            start_from_shorter_run(out, self._epochs(spec))
+        config = spec.training_config(self.recipe)
+        finetune_model(self._trained(spec.base), self.training, config, out, conditioning=conditioning)
+
+    def _epochs(self, spec: FineTuned) -> float:
+        section = (self.recipe.gcsl if spec.method == GCSL else None) or self.recipe.finetune
+        return section.epochs * spec.epochs_fraction
+
+    def _what_counts(self) -> dict[str, Any]:
+        """Settings that all stages of the folder share, without those that change no result."""
+        recipe = flatten(to_plain(self.recipe))
+        return {
+            # `may_change` knows names inside of a section: "finetune.device.threads" -> "device.threads".
+            "recipe": {name: value for name, value in recipe.items() if not may_change(name.partition(".")[2])},
+            "evaluation": {**self.evaluation.what_counts(), "limit": self.evaluation.limit},
+            "data": hash_file(self.data / MANIFEST),
+            "base_model": fingerprint_policy(load_policy(self.base_model)) if self.base_model else None,
+        }

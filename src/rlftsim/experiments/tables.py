@@ -1,0 +1,99 @@
+"""Tables and figures of an experiment's rows.
+
+tables.of_rows("Ours", rows.values(), SCORES)     a table, mean ± standard error
+tables.numbers(rows.values(), SCORES)             the same for machines
+tables.draw_gains(base, [tuned, other])           paired differences with their intervals
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from matplotlib.figure import Figure
+from rich.table import Table
+
+from rlftsim.evaluation.columns import Column
+from rlftsim.evaluation.compare import compare
+from rlftsim.experiments.rows import RMM, Row
+from rlftsim.viewer.figure import Interval, draw_intervals
+
+
+@dataclass(frozen=True)
+class TextTable:
+    """A table of formatted cells; the first column names the rows."""
+
+    title: str
+    headings: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    note: str = ""
+
+    def markdown(self) -> str:
+        """The table in Markdown, without title and note."""
+        # Names to the left, numbers to the right.
+        dashes = ["---", *["--:"] * (len(self.headings) - 1)]
+        lines = ["| " + " | ".join(cells) + " |" for cells in (self.headings, dashes, *self.rows)]
+        return "\n".join(lines)
+
+    def for_terminal(self) -> Table:
+        """The table for `print_wide`."""
+        table = Table(title=self.title, caption=self.note or None, title_justify="left", caption_justify="left")
+        for i, heading in enumerate(self.headings):
+            table.add_column(heading, justify="right" if i else "left", no_wrap=not i)
+        for cells in self.rows:
+            table.add_row(*cells)
+        return table
+
+
+def of_rows(title: str, rows: Iterable[Row], columns: Sequence[Column]) -> TextTable:
+    """Table of scores: mean ± standard error over scenarios, of each scenario's mean over the seeds.
+
+    Args:
+        title: of the table.
+        rows: evaluated on the same scenarios in the same way.
+        columns: scores to show, such as `evaluation.columns.SCORES`.
+    """
+    rows = list(rows)
+    first, seeds = rows[0].mean, max(len(row.by_seed) for row in rows)
+    over_seeds = f", means over {seeds} seeds where a row has them" if seeds > 1 else ""
+    # Seeds are averaged within each scenario first: the error is over scenarios, and more seeds do not shrink it.
+    cells = [(row.name, *(c.cell(row.mean.mean_and_error(c.source)) for c in columns)) for row in rows]
+    note = (
+        f"{len(first)} held-out scenarios, {first.config.num_rollouts} rollouts each, metric {first.config.metric}; "
+        f"mean ± standard error over scenarios{over_seeds}."
+    )
+    return TextTable(title, ("", *(c.label for c in columns)), tuple(cells), note)
+
+
+def numbers(rows: Iterable[Row], columns: Sequence[Column]) -> dict[str, Any]:
+    """Means with standard errors and 95 % intervals, and the mean of every seed, by row and column.
+
+    Args:
+        rows: as in `of_rows`.
+        columns: scores; keys are the column names of evaluations ("meta_metric").
+    """
+    return {
+        row.name: {
+            column.source: {
+                **asdict(row.mean.mean_and_error(column.source)),
+                "by_seed": [evaluation.mean_and_error(column.source).mean for evaluation in row.by_seed],
+            }
+            for column in columns
+        }
+        for row in rows
+    }
+
+
+def draw_gains(base: Row, others: Iterable[Row]) -> Figure:
+    """Figure of paired differences in RMM with their 95 % intervals.
+
+    Args:
+        base: row to compare with.
+        others: rows to draw; the first is highlighted.
+    """
+    intervals = []
+    for number, row in enumerate(others):
+        gain = compare(base.mean, row.mean)[RMM]
+        # Color 0 is highlighted, 4 is gray.
+        intervals.append(Interval(row.name, gain.difference, *gain.interval, color=4 if number else 0))
+    label = "gain in RMM over the base model, 95 % interval"
+    return draw_intervals(intervals, title="Against the base model", x_label=label, zero=True)

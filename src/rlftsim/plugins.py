@@ -1,0 +1,142 @@
+"""Extension points: names that other packages and notebooks can add to, by one mechanism for every kind of thing.
+
+Rewards, policies, data sources, recipes and experiments are each an `ExtensionPoint`. A name is looked for
+
+1. among what was registered by a decorator, in a notebook or in an imported module,
+2. among what this package ships, which is imported on first use,
+3. among the entry points of installed packages. In the pyproject.toml of such a package:
+
+    [project.entry-points."rlftsim.rewards"]
+    on_the_road = "my_package.rewards:on_the_road"
+
+A name that ships with this package cannot be taken. Any other name can be registered again, which replaces the earlier
+thing with a warning: so a notebook's cell can be run twice.
+"""
+
+import difflib
+import importlib
+import warnings
+from collections.abc import Callable, Mapping
+from importlib.metadata import entry_points
+from types import ModuleType
+from typing import Generic, TypeVar
+
+from rlftsim.errors import ConfigError
+
+Value = TypeVar("Value")
+Registered = TypeVar("Registered")
+
+
+class ExtensionPoint(Generic[Value]):
+    """A table of named things of one kind.
+
+    Args:
+        kind: word for one of them in messages, such as "reward".
+        group: entry-point group in which other packages announce theirs, such as "rlftsim.rewards". An entry
+            point is the thing itself, or a module that registers things when it is imported.
+        shipped: things of this package, name to "module:attribute"; imported on first use. Modules of this package may
+            also register theirs.
+    """
+
+    def __init__(self, kind: str, group: str, shipped: Mapping[str, str] | None = None):
+        self.kind = kind
+        self.group = group
+        self._shipped = dict(shipped or {})
+        self._registered: dict[str, Value] = {}
+
+    def register(self, name: str) -> Callable[[Registered], Registered]:
+        """Decorator that adds a thing under a name, see `add`."""
+
+        def decorate(value: Registered) -> Registered:
+            self.add(name, value, stacklevel=3)  # type: ignore[arg-type]
+            return value
+
+        return decorate
+
+    def add(self, name: str, value: Value, *, stacklevel: int = 2) -> None:
+        """Add a thing under a name, in place of an earlier one from outside this package.
+
+        Args:
+            name: to look it up by.
+            value: the thing.
+            stacklevel: frames up to the line that the warning points to, as in `warnings.warn`.
+
+        Raises:
+            ConfigError: the name is taken by a thing that ships with this package.
+        """
+        # A module of this package registers its things by the same decorator, and may be reloaded.
+        known = self._registered.get(name)
+        ships = name in self._shipped or (known is not None and is_ours(known))
+        if ships and not is_ours(value):
+            raise ConfigError(f"{self.kind} {name!r} ships with rlftsim: choose another name.")
+        if known is not None and known is not value and not ships:
+            message = f"{self.kind} {name!r} is registered again and replaces the earlier one."
+            warnings.warn(message, stacklevel=stacklevel)
+        self._registered[name] = value
+
+    def remove(self, name: str) -> None:
+        """Forget what was registered under a name, if anything was."""
+        self._registered.pop(name, None)
+
+    def get(self, name: str) -> Value:
+        """The thing of a name.
+
+        Raises:
+            ConfigError: unknown, with the nearest known name; or a package that may have it cannot be imported.
+        """
+        found = self.find(name)
+        if found is None:
+            names = self.names()
+            near = difflib.get_close_matches(name, names, n=1)
+            hint = f"did you mean {near[0]!r}? " if near else ""
+            known = f"known are {', '.join(names)}" if names else "there are none"
+            raise ConfigError(f"unknown {self.kind} {name!r}: {hint}{known}.")
+        return found
+
+    def find(self, name: str) -> Value | None:
+        """The thing of a name; None if there is none.
+
+        Raises:
+            ConfigError: a package that may have it cannot be imported.
+        """
+        # Shipped things first: looking one up does not import other packages.
+        if name not in self._registered and name in self._shipped:
+            module, _, attribute = self._shipped[name].partition(":")
+            return getattr(importlib.import_module(module), attribute)
+        if name not in self._registered:
+            self._load_entry_points(name)
+        return self._registered.get(name)
+
+    def names(self) -> list[str]:
+        """All names in alphabetical order, those of installed packages included.
+
+        Raises:
+            ConfigError: an installed package cannot be imported.
+        """
+        self._load_entry_points()
+        return sorted({*self._shipped, *self._registered})
+
+    def _load_entry_points(self, name: str | None = None) -> None:
+        """Add what installed packages announce: the entry point of a name if there is one, else all of them.
+
+        All, because a module that registers things by itself may have any of them.
+        """
+        entries = list(entry_points(group=self.group))
+        for entry in [one for one in entries if one.name == name] or entries:
+            if entry.name in self._registered:
+                continue
+            # Any error, not only ImportError: the package runs code of its own.
+            try:
+                value = entry.load()
+            except Exception as error:
+                raise ConfigError(
+                    f"{self.kind} {entry.name!r} of {entry.value} cannot be imported ({error}): "
+                    "repair or uninstall its package."
+                ) from error
+            if not isinstance(value, ModuleType):  # a module has registered its things itself
+                self.add(entry.name, value)
+
+
+def is_ours(value: object) -> bool:
+    """True for functions and classes that are defined in this package."""
+    return (getattr(value, "__module__", None) or "").partition(".")[0] == "rlftsim"

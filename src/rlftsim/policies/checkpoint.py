@@ -1,0 +1,208 @@
+"""Model folders of policies of any architecture: config.json, model.safetensors and README.md.
+
+A policy class needs this much to be saved and loaded:
+
+    def save_pretrained(self, folder, *, card=""):
+        save_model(folder, self, {"width": self.width}, card=card)
+
+    @classmethod
+    def from_pretrained(cls, folder):
+        return read_model(folder).load(cls)
+"""
+
+import difflib
+import json
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+from torch import Tensor, nn
+
+from rlftsim.aliases import current_names
+from rlftsim.atomic_io import save_tensors, write_text
+from rlftsim.errors import CheckpointError, ConfigError
+
+CONFIG, WEIGHTS, CARD = "config.json", "model.safetensors", "README.md"
+_FIRST_FORMAT = {"rlftsim-smart-1": "smart"}
+"""Architecture of folders of release 0.1, which name a format instead."""
+
+Loaded = TypeVar("Loaded")
+
+
+@dataclass(frozen=True, eq=False)
+class StoredModel:
+    """A model folder's settings; its weights are read on demand."""
+
+    folder: Path
+    architecture: str
+    """Name of the policy class in `policies.registry.POLICIES`."""
+    config: dict[str, Any]
+    """Settings that were saved, under the names of today."""
+
+    def read_weights(self) -> dict[str, Tensor]:
+        """Weights by name, on the CPU.
+
+        Raises:
+            CheckpointError: the file is missing or damaged.
+        """
+        try:
+            return load_file(self.folder / WEIGHTS)
+        except FileNotFoundError:
+            raise CheckpointError(f"{self.folder}: not a model folder, {WEIGHTS} is missing.") from None
+        except (SafetensorError, OSError) as error:
+            raise CheckpointError(f"{self.folder}: damaged model folder ({error}): write it again.") from None
+
+    def build(self, make: Callable[..., Loaded]) -> Loaded:
+        """Call a class with the stored settings as keyword arguments.
+
+        Raises:
+            CheckpointError: settings that it does not take, or takes in other types.
+        """
+        try:
+            return make(**self.config)
+        except TypeError as error:
+            # a wrong call, not a damaged file: the folder may be of a newer version, or was edited
+            cause = " ".join(str(error).split())
+            raise CheckpointError(f"{self.folder / CONFIG}: settings do not fit {make.__name__} ({cause}).") from error
+
+    def load(self, make: Callable[..., Loaded]) -> Loaded:
+        """Build a policy from the stored settings and load its weights, if it has any.
+
+        Raises:
+            CheckpointError: settings or weights that do not fit, or weights that are missing.
+        """
+        policy = self.build(make)
+        if isinstance(policy, nn.Module):
+            load_strictly(policy, self.read_weights(), source=str(self.folder))
+        return policy
+
+
+def save_model(
+    folder: str | os.PathLike,
+    policy: object,
+    config: Mapping[str, Any],
+    *,
+    card: str = "",
+    weights: Mapping[str, Tensor] | None = None,
+) -> None:
+    """Write a model folder.
+
+    Args:
+        folder: created where it is missing.
+        policy: its class attribute `architecture` is the name it is registered under.
+        config: settings it is built with again, values that JSON has.
+        card: text of README.md.
+        weights: by name; None = the policy's state dict, or no weights file if it is not an nn.Module.
+
+    Raises:
+        ConfigError: the policy declares no architecture.
+        DataError: the folder cannot be written.
+    """
+    folder, architecture = Path(folder), getattr(policy, "architecture", None)
+    if not isinstance(architecture, str):
+        kind = type(policy).__name__
+        raise ConfigError(
+            f'{kind} cannot be saved: give the class an attribute such as architecture = "{kind.lower()}".'
+        )
+    if weights is None and isinstance(policy, nn.Module):
+        weights = policy.state_dict()
+    if weights is not None:
+        save_tensors(folder / WEIGHTS, weights)
+    write_text(folder / CARD, card or f"A traffic model ({architecture}). Origin unknown.\n")
+    # last, so that a folder with a config.json is complete
+    write_text(folder / CONFIG, json.dumps({"architecture": architecture, **config}, indent=1) + "\n")
+
+
+def read_model(folder: str | os.PathLike) -> StoredModel:
+    """Settings of a model folder, or of the one inside a run's folder.
+
+    Raises:
+        ConfigError: there is no such folder.
+        CheckpointError: it is not a model folder, is damaged, or belongs to a run that has not finished.
+    """
+    path = find_model(folder)
+    try:
+        values = json.loads((path / CONFIG).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        inside = list_models(path)
+        hint = f": did you mean {' or '.join(str(path / name) for name in inside)}?" if inside else "."
+        raise CheckpointError(f"{path}: not a model folder, {CONFIG} is missing{hint}") from None
+    except (ValueError, OSError) as error:
+        raise CheckpointError(f"{path}: damaged model folder ({CONFIG}: {error}): write it again.") from None
+    if not isinstance(values, dict):
+        raise CheckpointError(f"{path}: damaged model folder ({CONFIG} is no object): write it again.")
+    # Only folders of 0.1 have old names, and only theirs is a format: other architectures may use any of these words.
+    first = _FIRST_FORMAT.get(str(values.get("format")))
+    config = dict(values) if first is None else current_names({k: v for k, v in values.items() if k != "format"})
+    architecture = config.pop("architecture", first)
+    if not isinstance(architecture, str):
+        # a run's folder has a config.json of its own beside its checkpoints
+        is_run = (path / "environment.json").exists() or (path / "checkpoints").is_dir()
+        raise CheckpointError(
+            f"{path}: the run has not finished, it has no model folder yet: run its command again to go on."
+            if is_run
+            else f"{path / CONFIG}: names no architecture, so this is no model folder."
+        )
+    return StoredModel(path, architecture, config)
+
+
+def find_model(name: str | os.PathLike) -> Path:
+    """Model folder of a name: the folder itself, or the one inside a run's folder.
+
+    Raises:
+        ConfigError: there is no such folder.
+    """
+    folder = Path(name).expanduser()
+    if folder.is_file():
+        raise ConfigError(f"{str(name)!r} is a file: name its folder, {folder.parent}.")
+    if (folder / "model" / CONFIG).exists():
+        folder = folder / "model"
+    if not folder.is_dir():
+        near = similar_model(folder)
+        raise ConfigError(
+            f"{str(name)!r} is no model folder: there is none of that name"
+            + (f", did you mean {near!r}?" if near else ".")
+        )
+    return folder
+
+
+def list_models(folder: Path) -> list[str]:
+    """Names of the model folders and finished runs directly in a folder; empty where there is no such folder."""
+    if not folder.is_dir():
+        return []
+    places = (CONFIG, f"model/{CONFIG}")
+    return sorted(path.name for path in folder.iterdir() if any((path / place).is_file() for place in places))
+
+
+def similar_model(folder: Path) -> str | None:
+    """A model folder or run beside a missing one, of a similar name; None if there is none."""
+    near = difflib.get_close_matches(folder.name, list_models(folder.parent), n=1)
+    return str(folder.parent / near[0]) if near else None
+
+
+def load_strictly(module: nn.Module, weights: Mapping[str, Tensor], *, source: str) -> None:
+    """Load weights; refuse, with the whole list, missing or unknown keys and wrong shapes.
+
+    Args:
+        module: receives the weights.
+        weights: by name, as in the module's state dict.
+        source: place they come from, for the message.
+
+    Raises:
+        CheckpointError: anything differs.
+    """
+    own = module.state_dict()
+    problems = [f"missing {k}" for k in sorted(own.keys() - weights.keys())]
+    problems += [f"unknown {k}" for k in sorted(weights.keys() - own.keys())]
+    problems += [
+        f"{k} has shape {tuple(weights[k].shape)} instead of {tuple(own[k].shape)}"
+        for k in sorted(own.keys() & weights.keys())
+        if own[k].shape != weights[k].shape
+    ]
+    if problems:
+        raise CheckpointError(f"{source}: {len(problems)} weights do not fit this model: {'; '.join(problems)}.")
+    module.load_state_dict(weights)

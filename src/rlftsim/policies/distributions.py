@@ -1,0 +1,91 @@
+"""A categorical distribution over motion tokens for every agent that decides."""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+
+from rlftsim.rollout.policy import Sampling
+
+
+@dataclass(frozen=True, eq=False)
+class TokenDistribution:
+    """Distributions of the R elements whose mask is True, in the order of `mask.nonzero()`.
+
+    All other elements (padding) decide 0 with probability 1.
+    """
+
+    logits: Float[Tensor, "R V"]
+    """float32; tokens that do not exist have a large negative logit."""
+    mask: Bool[Tensor, "*batch"]
+    _likeliest: dict[int, Int64[Tensor, "R K"]] = field(default_factory=dict, init=False, repr=False)
+    """Ids of the K most likely tokens, by K: a memo for repeated calls."""
+
+    @cached_property
+    def log_probs(self) -> Float[Tensor, "R V"]:
+        """Log-probabilities of all tokens."""
+        return torch.log_softmax(self.logits, -1)
+
+    @torch.no_grad()
+    def sample(self, sampling: Sampling, noise: Float[Tensor, "*batch 1"]) -> Int64[Tensor, "*batch"]:
+        """Token ids, by inverting the cumulative distribution at the noise.
+
+        Args:
+            sampling: temperature and truncation.
+            noise: uniform in [0, 1).
+        """
+        if sampling.temperature == 0:
+            return self._dense(self.logits.argmax(-1))
+        logits, token_id = self._kept(sampling)
+        cumulative = torch.softmax(logits, -1).cumsum(-1)
+        # the sum of float32 probabilities is 1 up to rounding: scaled by it, no noise lies beyond the last token
+        level = noise[self.mask] * cumulative[:, -1:]  # [R, 1]
+        chosen = torch.searchsorted(cumulative, level, right=True).clamp(max=logits.shape[-1] - 1)
+        return self._dense((chosen if token_id is None else token_id.gather(-1, chosen))[:, 0])
+
+    def log_prob(
+        self,
+        decision: Int64[Tensor, "*batch"],
+        sampling: Sampling = Sampling(),  # noqa: B008
+    ) -> Float[Tensor, "*batch"]:
+        """Log-probability of token ids under the distribution that `sampling` draws from.
+
+        Args:
+            decision: token ids.
+            sampling: temperature and truncation they were drawn with. A token that truncation excludes has -inf.
+        """
+        if sampling.temperature == 0:
+            return self._dense(torch.zeros_like(self.logits[:, 0]))
+        chosen = decision[self.mask][:, None]  # [R, 1]
+        if sampling.is_full:
+            return self._dense(self.log_probs.gather(-1, chosen)[:, 0])
+        logits, token_id = self._kept(sampling)
+        # log p = own logit - logsumexp of the kept ones, at the temperature
+        own = self.logits.gather(-1, chosen) / sampling.temperature
+        if token_id is not None:
+            own = own.masked_fill((token_id != chosen).all(-1, keepdim=True), -torch.inf)
+        return self._dense(own[:, 0] - logits.logsumexp(-1))
+
+    def kl(self, other: "TokenDistribution") -> Float[Tensor, "*batch"]:
+        """KL(self || other), nats."""
+        return self._dense((self.log_probs.exp() * (self.log_probs - other.log_probs)).sum(-1))
+
+    def entropy(self) -> Float[Tensor, "*batch"]:
+        """Entropy, nats."""
+        return self._dense(-(self.log_probs.exp() * self.log_probs).sum(-1))
+
+    def _kept(self, sampling: Sampling) -> tuple[Float[Tensor, "R K"], Int64[Tensor, "R K"] | None]:
+        """Logits that `sampling` keeps, at its temperature, and their token ids in increasing order (None = all)."""
+        if sampling.top_k is None or sampling.top_k >= self.logits.shape[-1]:
+            return self.logits / sampling.temperature, None
+        if sampling.top_k not in self._likeliest:
+            # sorted by id, so that sampling walks through tokens in the same order as without truncation
+            self._likeliest[sampling.top_k] = self.logits.topk(sampling.top_k, dim=-1).indices.sort(-1).values
+        token_id = self._likeliest[sampling.top_k]
+        return self.logits.gather(-1, token_id) / sampling.temperature, token_id
+
+    def _dense(self, values: Tensor) -> Tensor:
+        """Values of the R elements at their places, zero elsewhere."""
+        return values.new_zeros(self.mask.shape).masked_scatter(self.mask, values)

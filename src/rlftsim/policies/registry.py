@@ -1,0 +1,146 @@
+"""Policies by name: from a registered name, a model folder or a run's folder to a policy.
+
+A package of your own adds an architecture with an entry point, and then every command takes its folders:
+
+    [project.entry-points."rlftsim.policies"]
+    cruise = "cruise_package:Cruise"
+"""
+
+import difflib
+import inspect
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import torch
+from torch import nn
+
+from rlftsim.errors import ConfigError
+from rlftsim.plugins import ExtensionPoint
+from rlftsim.policies.checkpoint import find_model as find_model
+from rlftsim.policies.checkpoint import read_model, similar_model
+from rlftsim.rollout.policy import LoadablePolicy, Policy
+
+POLICIES: ExtensionPoint[Callable[..., Any]] = ExtensionPoint(
+    "policy",
+    "rlftsim.policies",
+    {
+        "smart": "rlftsim.policies.smart.policy:SmartPolicy",
+        "constant_velocity": "rlftsim.rollout.baselines:ConstantVelocity",
+    },
+)
+"""Architecture name -> policy class. A class that can be called without arguments is a policy by its name alone."""
+
+Device = Literal["auto", "cpu", "cuda"]
+"""auto = the GPU where torch sees one."""
+
+
+def load_policy(name: str | os.PathLike, device: Device = "cpu") -> Policy:
+    """Policy of a name, in evaluation mode and with frozen weights.
+
+    Args:
+        name: a registered name ("constant_velocity"), a model folder as `save_pretrained` writes it, or a run's folder.
+            Where a folder is named like a registered policy, "./name" is the folder.
+        device: of its weights.
+
+    Raises:
+        ConfigError: neither a known name nor a folder, no such device, or a registered policy that needs its weights.
+        CheckpointError: a folder that is damaged or holds something else.
+    """
+    return _load(name, device)
+
+
+def load_policy_or_oracle(name: str | os.PathLike, device: Device = "cpu") -> Policy | Literal["oracle"]:
+    """As `load_policy`; "oracle" stands for the logged futures themselves.
+
+    Args:
+        name: "oracle", or as in `load_policy`.
+        device: of the weights.
+
+    Raises:
+        ConfigError: as `load_policy`.
+        CheckpointError: as `load_policy`.
+    """
+    return "oracle" if name == "oracle" else _load(name, device, "oracle")
+
+
+def _load(name: str | os.PathLike, device: Device, *more_names: str) -> Policy:
+    """`load_policy`, offering `more_names` where a name is unknown."""
+    place = find_device(device)  # first, so that a policy without weights refuses a wrong word, too
+    # anything with a separator is a path: no entry point of another package is imported for it
+    registered = POLICIES.find(name) if isinstance(name, str) and Path(name).name == name else None
+    if registered is not None and _needs_no_arguments(registered):
+        policy = registered()
+    elif Path(name).expanduser().exists():
+        # a folder; a file is refused by name
+        stored = read_model(name)
+        kind = POLICIES.get(stored.architecture)
+        if not isinstance(kind, LoadablePolicy):
+            raise ConfigError(
+                f"{stored.folder}: policy {stored.architecture!r} cannot be read from a folder: "
+                "give its class an attribute architecture and a classmethod from_pretrained(folder)."
+            )
+        policy = kind.from_pretrained(stored.folder)
+    elif registered is not None:
+        raise ConfigError(f"policy {name!r} needs its weights: name a model folder or a run's folder instead.")
+    elif name == "oracle" and not more_names:
+        raise ConfigError("'oracle' stands for the log itself and is no policy: only evaluate takes it.")
+    else:
+        # names that are policies by themselves: an architecture that needs weights is no answer
+        names = [name for name in POLICIES.names() if _needs_no_arguments(POLICIES.get(name))]
+        names += more_names
+        near = next(iter(difflib.get_close_matches(str(name), names, n=1)), similar_model(Path(name).expanduser()))
+        hint = f": did you mean {near!r}?" if near else "."
+        raise ConfigError(f"{str(name)!r} is neither a model folder nor one of {', '.join(names)}{hint}")
+    # A class has its instances' attributes, so a function that returns one would pass for a policy.
+    if not isinstance(policy, Policy) or isinstance(policy, type):
+        kind = policy if isinstance(policy, type) else type(policy)
+        raise ConfigError(
+            f"policy {str(name)!r} is a {kind.__name__} without what a policy needs: five methods and three numbers, "
+            "see rlftsim.rollout.policy.Policy."
+        )
+    if isinstance(policy, nn.Module):
+        policy.eval().requires_grad_(False).to(place)
+    return policy
+
+
+def _needs_no_arguments(make: Any) -> bool:
+    try:
+        inspect.signature(make).bind()
+    except (TypeError, ValueError):  # ValueError: built-in classes and functions may have no signature
+        return False
+    return True
+
+
+def with_guidance(policy: Policy | Literal["oracle"], scale: float) -> Any:
+    """Copy of a policy that follows goals more closely than it learned to; itself at 1.
+
+    See `SmartPolicy.with_guidance`.
+
+    Args:
+        policy: any.
+        scale: factor of what pulls towards goals.
+
+    Raises:
+        ConfigError: it has nothing that could be scaled, or `scale` is no number of 0 or more.
+    """
+    if scale == 1.0:
+        return policy
+    guided = getattr(policy, "with_guidance", None)
+    if guided is None:
+        raise ConfigError(f"guidance_scale={scale:g} has no effect: this model has no goal logit bias, leave it out.")
+    return guided(scale)
+
+
+def find_device(device: Device) -> torch.device:
+    """Device that a name stands for on this machine.
+
+    Raises:
+        ConfigError: no such name, or "cuda" where there is no CUDA device.
+    """
+    if device not in get_args(Device):
+        raise ConfigError(f"device must be one of {', '.join(get_args(Device))}, got {device!r}.")
+    if device == "cuda" and not torch.cuda.is_available():
+        raise ConfigError("device=cuda, but torch sees no CUDA device: use cpu, or install a CUDA build of torch.")
+    return torch.device("cuda" if device != "cpu" and torch.cuda.is_available() else "cpu")

@@ -1,0 +1,270 @@
+"""Goal conditioning of SMART: two encodings of an agent's goal, and a bias of its token logits.
+
+* `concat`: distance and bearing of the goal join the continuous state of the agent's token, at every step.
+* `indication`: the relation to the goal's polyline (the map token whose point is nearest to the goal) has a learned
+  embedding added, at any distance.
+
+With either, a bias may be added to the token logits (`GoalLogitBias`), which is not in the paper. All weights start
+such that a fresh goal-conditioned model decides exactly as the goal-free one.
+
+Source: RLFTSim, section 4.2 and its appendix on goal conditioning; docs/decisions.md has what it leaves open.
+
+B scenarios, N rollouts, A agents, M map tokens, g goal-conditioned rows, C classes, V tokens, D width.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor, nn
+
+from rlftsim.geometry import rotate
+from rlftsim.goals.types import Goals
+from rlftsim.policies.distributions import TokenDistribution
+from rlftsim.policies.smart.config import GoalEncoding
+from rlftsim.policies.smart.embeddings import FourierEmbedding, normalize
+from rlftsim.policies.smart.neighbors import Poses, relative_pose, within
+from rlftsim.scenario.types import FUTURE_STEPS, STEP_S
+from rlftsim.tokens.vocabulary import CLASS_NAMES, STEPS_PER_TOKEN, Vocabulary
+
+GOAL_POLYLINE_REACH_M = 200.0
+"""A goal that is farther than this from all of the map has no polyline."""
+NUM_DECISIONS = FUTURE_STEPS // STEPS_PER_TOKEN
+TOKEN_S = STEPS_PER_TOKEN * STEP_S
+ROUNDING_MPS = 0.5
+"""Misfits smaller than this differ little: |x| is replaced by sqrt(x^2 + 0.5^2)."""
+BIAS_GAIN = 8.0
+"""Factor on the weights of the logit bias, so that the other weights' learning rate suits them: they are few and
+have far to go."""
+ROWS_PER_BLOCK = {"cpu": 128}
+"""Rows whose tokens are processed together: on a processor they fit its cache."""
+ROWS_PER_BLOCK_ELSEWHERE = 1 << 12
+
+
+@dataclass(frozen=True, eq=False)
+class EncodedGoals:
+    """Goals and the map tokens nearest to them."""
+
+    position: Float[Tensor, "B N A 2"]
+    goal_mask: Bool[Tensor, "B N A"]
+    polyline: Int64[Tensor, "B N A"]
+    """The map token nearest to the goal, map tokens of all scenarios counted one after the other; -1 = none."""
+
+
+def encode_goals(goals: Goals, map_position: Float[Tensor, "B M 2"]) -> EncodedGoals:
+    """Find the polyline of each goal. A goal that is no finite point counts as none.
+
+    Args:
+        goals: of all agents, map frame.
+        map_position: points of the map tokens, infinite for padding.
+    """
+    goals = goals.only(goals.position.isfinite().all(-1))
+    place = goals.goal_mask.nonzero(as_tuple=True)
+    nearest = within(
+        goals.position[place], place[0], map_position, None, radius_m=GOAL_POLYLINE_REACH_M, limit=1
+    )  # fmt: skip
+    polyline = torch.full(goals.goal_mask.shape, -1, device=goals.position.device)
+    polyline[place] = torch.where(nearest.mask, nearest.index, -1)[:, 0]
+    return EncodedGoals(goals.position, goals.goal_mask, polyline)
+
+
+class GoalEmbedding(FourierEmbedding):
+    """`concat`: embedding of distance and bearing that joins an agent's continuous state."""
+
+    def __init__(self, dim: int, num_frequencies: int):
+        super().__init__(2, dim, num_frequencies)
+
+    def zero_init(self) -> None:
+        """Zero the last map: the embedding of any goal is zero."""
+        last = self.out[-1]
+        assert isinstance(last, nn.Linear)
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
+
+    @torch.no_grad()
+    def init_from(self, relation: FourierEmbedding) -> None:
+        """Copy the networks of another embedding's first two inputs, which must be distance and bearing."""
+        self.frequencies.weight.copy_(relation.frequencies.weight[:2])
+        for own, trained in zip(self.inputs, relation.inputs):
+            own.load_state_dict(trained.state_dict())
+
+    def embed(
+        self, goals: EncodedGoals, poses: Poses, rows: tuple[Tensor, ...], *, seam_rad: float
+    ) -> tuple[Int64[Tensor, "g"], Float[Tensor, "g D"]]:
+        """Embeddings of the goals of rows.
+
+        Args:
+            goals: of all agents.
+            poses: of the rows.
+            rows: scenario, rollout, agent and step of each.
+            seam_rad: see `relative_pose`.
+
+        Returns:
+            The rows whose agents have goals, and the embeddings of these.
+        """
+        place = rows[:3]
+        conditioned = goals.goal_mask[place].nonzero()[:, 0]  # [g]
+        goal = goals.position[place][conditioned, None]  # [g, 1, 2]
+        # a goal has no heading; the difference of headings is computed and dropped
+        values = relative_pose(poses[conditioned], Poses(goal, torch.zeros_like(goal[..., 0])), seam_rad=seam_rad)
+        return conditioned, self(values[:, 0, :2])
+
+
+class GoalEdgeEmbedding(nn.Embedding):
+    """`indication`: the embedding that is added to the relation to an agent's goal polyline."""
+
+    def __init__(self, dim: int):
+        super().__init__(1, dim)
+
+    def zero_init(self) -> None:
+        """Zero the embedding: the relation to the goal polyline is as to any other map token."""
+        nn.init.zeros_(self.weight)
+
+    def embed(
+        self, embedding: FourierEmbedding, values: Float[Tensor, "g n"]
+    ) -> tuple[Float[Tensor, "g D"], Float[Tensor, "g D"]]:
+        """Normalized embeddings of relations without and with the goal embedding.
+
+        Args:
+            embedding: of relations.
+            values: of each relation.
+        """
+        goal = self.weight.expand(len(values), -1)  # [g, D]
+        nothing = torch.zeros_like(goal)  # added, so that both round alike in half precision
+        return normalize(embedding(values, nothing)), normalize(embedding(values, goal))
+
+
+def goal_encoder(encoding: GoalEncoding | None, dim: int, frequencies: int) -> GoalEmbedding | GoalEdgeEmbedding | None:
+    """Module of a goal encoding, with random weights; None for a goal-free model.
+
+    Args:
+        encoding: see the module's text.
+        dim: D.
+        frequencies: learned frequencies per input.
+    """
+    match encoding:
+        case "concat":
+            return GoalEmbedding(dim, frequencies)
+        case "indication":
+            return GoalEdgeEmbedding(dim)
+        case None:
+            return None
+
+
+class GoalLogitBias(nn.Module):
+    """Goal-progress bias of token logits: three features per token, weighted by class and number of decisions left.
+
+    With T the time left after a token:
+
+    * progress: by how much the token brings the agent nearer to the goal, meters,
+    * pace: the rest of the way minus the token's speed times T, divided by 1 s + T,
+    * direction: distance from the goal after going straight on at the token's speed for T, divided by 1 s + T.
+
+    Pace and direction are misfits in m/s, rounded at zero (`ROUNDING_MPS`). The logit is raised by progress and
+    lowered by the misfits, each times its weight. So the policy becomes a product of the token's probability and of
+    how well it suits the goal, as for a random walk that is conditioned on its end (Doob's h-transform; here with a
+    learned, log-linear h). The goal is to be reached when the simulation ends.
+    """
+
+    def __init__(self):
+        super().__init__()
+        self.weight = nn.Parameter(torch.zeros(len(CLASS_NAMES), NUM_DECISIONS, 3))
+
+    def zero_init(self) -> None:
+        """Zero the weights: no bias."""
+        nn.init.zeros_(self.weight)
+
+    def forward(
+        self,
+        goal: Float[Tensor, "g 2"],
+        num_left: Int64[Tensor, "g"],
+        class_id: Int64[Tensor, "g"],
+        moves: Float[Tensor, "C V 2"],
+    ) -> Float[Tensor, "g V"]:
+        """Bias of the logits of all tokens. Differentiable in the weights.
+
+        Args:
+            goal: meters, in the frame of each agent.
+            num_left: decisions left, this one included.
+            class_id: agent class that each row's token ids refer to.
+            moves: displacement by each token, meters, in the agent's frame.
+        """
+        weights = BIAS_GAIN * self.weight[class_id, num_left - 1]  # [g, 3]
+        with torch.autocast(goal.device.type, enabled=False):  # logits are float32
+            return (weights[:, None] @ suitability(goal, num_left, class_id, moves))[:, 0]
+
+    def apply_to(
+        self,
+        dist: TokenDistribution,
+        goals: EncodedGoals,
+        poses: Poses,
+        num_left: Int64[Tensor, "*batch"],
+        class_id: Int64[Tensor, "B A"],
+        vocabulary: Vocabulary,
+    ) -> TokenDistribution:
+        """Distribution with the bias added for agents that have goals.
+
+        Args:
+            dist: of the elements of its mask [B, N, A] or [B, N, A, L].
+            goals: of all agents.
+            poses: of the agents before each decision, in the shape of the mask.
+            num_left: decisions left at each element, that one included.
+            class_id: of the agents.
+            vocabulary: of the tokens.
+        """
+        place = dist.mask.nonzero(as_tuple=True)
+        conditioned = goals.goal_mask[place[:3]].nonzero()[:, 0]  # [g] of the R rows of dist
+        rows = tuple(index[conditioned] for index in place)
+        here = poses[rows]
+        goal = rotate(goals.position[rows[:3]] - here.position, -here.heading)  # [g, 2], agent's frame
+        row_class = class_id[rows[0], rows[2]]
+        # a token's displacement is the mean of the four corners of its last box
+        bias = self(goal, num_left[rows], row_class, vocabulary.end_corners().mean(-2))  # [g, V]
+        bias = bias.masked_fill(~vocabulary.token_mask[row_class], 0.0)  # tokens of other classes stay impossible
+        return TokenDistribution(dist.logits.index_add(0, conditioned, bias), dist.mask)
+
+
+@torch.no_grad()
+def suitability(
+    goal: Float[Tensor, "g 2"],
+    num_left: Int64[Tensor, "g"],
+    class_id: Int64[Tensor, "g"],
+    moves: Float[Tensor, "C V 2"],
+) -> Float[Tensor, "g 3 V"]:
+    """Features of `GoalLogitBias`: progress, minus pace, minus direction. Each is larger for a token that suits better.
+
+    Args:
+        goal: meters, in the frame of each agent.
+        num_left: decisions left, this one included.
+        class_id: agent class that each row's token ids refer to.
+        moves: displacement by each token, meters, in the agent's frame.
+    """
+    features = goal.new_empty(len(goal), 3, moves.shape[1])
+    left_s = (num_left[:, None] - 1).to(goal.dtype) * TOKEN_S  # [g, 1]
+    size = ROWS_PER_BLOCK.get(goal.device.type, ROWS_PER_BLOCK_ELSEWHERE)
+    for own in range(len(moves)):
+        x, y = moves[own].unbind(-1)  # [V]
+        speed = moves[own].norm(dim=-1) / TOKEN_S
+        # in blocks, and in place where possible: at 2048 tokens these [r, V] tensors dominate a rollout's time
+        for rows in (class_id == own).nonzero()[:, 0].split(size):
+            (goal_x, goal_y), time_s = goal[rows].split(1, dim=-1), left_s[rows]  # [r, 1]
+            rest = _length_in_place(goal_x - x, goal_y - y)  # [r, V] distance to the goal after the token
+            reach = 1 + time_s / TOKEN_S
+            miss = _length_in_place(
+                torch.addcmul(goal_x, reach, x, value=-1), torch.addcmul(goal_y, reach, y, value=-1)
+            )
+            progress = _length_in_place(goal_x.clone(), goal_y.clone()) - rest
+            pace = torch.addcmul(rest, time_s, speed, value=-1)
+            found = progress, _misfit_in_place(pace.div_(1 + time_s)), _misfit_in_place(miss.div_(1 + time_s))
+            features[rows] = torch.stack(found, dim=1)
+    return features
+
+
+def _length_in_place(x: Tensor, y: Tensor) -> Tensor:
+    """Length of vectors, in the storage of x."""
+    return x.square_().addcmul_(y, y).sqrt_()
+
+
+def _misfit_in_place(x: Float[Tensor, "r V"]) -> Float[Tensor, "r V"]:
+    """-sqrt(x^2 + ROUNDING_MPS^2): minus the absolute value without its corner at zero, in x's storage."""
+    return x.square_().add_(ROUNDING_MPS**2).sqrt_().neg_()

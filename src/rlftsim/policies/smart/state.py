@@ -1,0 +1,74 @@
+"""Values that `SmartPolicy` works on: contexts, states and predictions.
+
+B scenarios, N rollouts, A agents, D width, R selected elements, V tokens. Map frame, meters and radians.
+"""
+
+from dataclasses import dataclass, field
+
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+
+from rlftsim.policies.smart.goal_conditioning import EncodedGoals
+from rlftsim.policies.smart.network import Past, Scene
+from rlftsim.policies.smart.token_steps import TokenSteps
+
+
+@dataclass(frozen=True, eq=False)
+class SmartContext:
+    """Everything that does not depend on the agents' decisions, computed once per scenario."""
+
+    scene: Scene
+    past: Past
+    """Of the two history tokens, with a single rollout."""
+    now: TokenSteps
+    """The last of them, at the current step: it goes through the decoder again where agents have goals."""
+    features: Float[Tensor, "B A D"]
+    """Decoder features at the current step of goal-free agents; zeros for padding."""
+    position: Float[Tensor, "B A 2"]
+    """End of the last history token, which is near the logged position, not at it."""
+    heading: Float[Tensor, "B A"]
+    object_type: Int64[Tensor, "B A"]
+    agent_mask: Bool[Tensor, "B A"]
+
+
+@dataclass(eq=False)
+class DecoderCache:
+    """Decoder outputs of a state, filled at the first use. They follow from the state: a memo, no part of its value."""
+
+    features: Float[Tensor, "B N A D"] | None = None
+    """Decoder features at the state's last step."""
+    past: Past | None = None
+    """The past that includes the state's last step."""
+
+
+@dataclass(frozen=True, eq=False)
+class SmartState:
+    """Running simulations.
+
+    Steps that have not been through the decoder wait in `pending`; they go through it at most once.
+    """
+
+    position: Float[Tensor, "B N A 2"]
+    heading: Float[Tensor, "B N A"]
+    past: Past
+    pending: TokenSteps | None
+    poses: Float[Tensor, "B N A 5 3"] | None = None
+    draws: Tensor | None = None
+    goals: EncodedGoals | None = None
+    """None = no agent has a goal, or the model is goal-free."""
+    num_decisions: int = 0
+    """Decisions taken so far."""
+    cache: DecoderCache = field(default_factory=DecoderCache)
+
+
+@dataclass(frozen=True, eq=False)
+class TeacherForced:
+    """Predictions along logged tracks, and the tokens of the log."""
+
+    logits: Float[Tensor, "R V"]
+    target: Int64[Tensor, "R"]
+    """Token that came next."""
+    target_mask: Bool[Tensor, "R"]
+    """True = the next state was logged and the agent is trained on."""
+    class_id: Int64[Tensor, "R"]
+    """Agent class that each row's token ids refer to."""

@@ -1,0 +1,109 @@
+"""Recipes by name, and the contract of a recipe.
+
+A recipe holds every number of a model's way from fresh weights to the fine-tuned policy, a section for each
+stage. The command line shows each field of each section in `--help`, with its docstring, and takes it as a
+flag: `--finetune.learning-rate 1e-5`.
+
+A recipe for another policy is a frozen dataclass that extends `Recipe` and a function that returns one. In the
+pyproject.toml of its package:
+
+    [project.entry-points."rlftsim.recipes"]
+    cruise-small = "my_package.recipes:cruise_small"
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+
+from torch import nn
+
+from rlftsim.errors import ConfigError
+from rlftsim.plugins import ExtensionPoint
+from rlftsim.rollout.policy import Policy
+from rlftsim.tokens.clustering import TokensConfig
+from rlftsim.tokens.vocabulary import Vocabulary
+from rlftsim.training.catk import CatkConfig
+from rlftsim.training.finetune import FinetuneConfig
+from rlftsim.training.goal_relabeling import GcslConfig
+from rlftsim.training.goals import with_goals
+from rlftsim.training.pretrain import PretrainConfig
+
+SECTIONS = ("tokens", "model", "pretrain", "finetune", "catk", "gcsl")
+"""Sections that the verbs of the command line know, in the order of their use; see `section_names`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recipe:
+    """Sections that every policy has. A subclass adds `model`, the sizes of its policies, and whatever else it needs:
+    each field that is a dataclass is a section."""
+
+    tokens: TokensConfig | None = None
+    """Vocabulary; None for policies without one."""
+    pretrain: PretrainConfig = field(default_factory=PretrainConfig)
+    finetune: FinetuneConfig = field(default_factory=FinetuneConfig)
+    catk: CatkConfig | None = field(default_factory=CatkConfig)
+    """None for policies without tokens, which CAT-K cannot train."""
+    gcsl: GcslConfig | None = field(default_factory=GcslConfig)
+    """None likewise."""
+
+    def new_policy(self, vocabulary: Vocabulary | None) -> nn.Module:
+        """A policy with fresh weights, drawn with the seed of pre-training (`torch.manual_seed(self.pretrain.seed)`).
+
+        Args:
+            vocabulary: tokens built with the settings `tokens`; None where these are None.
+        """
+        raise ConfigError(
+            f"{type(self).__name__} describes no new policy: take a recipe that does, or fine-tune an existing model."
+        )
+
+    def like(self, policy: Policy) -> "Recipe":
+        """The same recipe for policies of the architecture and sizes of an existing one.
+
+        Raises:
+            ConfigError: this recipe makes no such policies.
+        """
+        raise ConfigError(f"{type(self).__name__} describes no policy like a {type(policy).__name__}.")
+
+    def with_goals(self) -> "Recipe":
+        """The same recipe for goal-conditioned fine-tuning: every agent's goal is its logged endpoint, the
+        reward is `gcft`.
+
+        CAT-K, if the recipe has it, then trains the goal-conditioned weights alone.
+        """
+        # Goals that the recipe has chosen already stay: `with_goals` fills in what is off.
+        finetune = replace(self.finetune, goals=with_goals(self.finetune.goals), reward="gcft")
+        catk = self.catk and replace(self.catk, goal_probability=1.0, trained="goals")
+        return replace(self, finetune=finetune, catk=catk)
+
+
+def section_names(recipe: Recipe) -> tuple[str, ...]:
+    """Names of the sections of a recipe: the known ones in the order of their use, then its own."""
+    present = [one.name for one in fields(recipe) if is_dataclass(getattr(recipe, one.name))]
+    return tuple(sorted(present, key=lambda name: SECTIONS.index(name) if name in SECTIONS else len(SECTIONS)))
+
+
+RECIPES: ExtensionPoint[Callable[[], Recipe]] = ExtensionPoint(
+    "recipe",
+    "rlftsim.recipes",
+    {
+        "smart-tiny": "rlftsim.recipes.smart:smart_tiny_rlftsim",
+        "smart-mini": "rlftsim.recipes.smart:smart_mini_rlftsim",
+        "smart-nano": "rlftsim.recipes.smart:smart_nano_rlftsim",
+        "smart-demo": "rlftsim.recipes.smart:smart_demo_rlftsim",
+        "synthetic": "rlftsim.recipes.smart:smart_synthetic",
+    },
+)
+
+
+def recipe_by_name(name: str) -> Recipe:
+    """The recipe of a name, this package's or another's.
+
+    Raises:
+        ConfigError: unknown, with the nearest known names, or not a recipe.
+    """
+    # Registered functions come from other packages, so their result is checked.
+    recipe = RECIPES.get(name)()
+    if not isinstance(recipe, Recipe):
+        raise ConfigError(
+            f"recipe {name!r} is a {type(recipe).__name__}: make it extend rlftsim.recipes.registry.Recipe."
+        )
+    return recipe

@@ -1,0 +1,146 @@
+"""Settings as text: a recipe printed with its documentation, and files of settings read back as flags."""
+
+import ast
+import difflib
+import inspect
+import json
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import fields, is_dataclass
+from itertools import pairwise
+from operator import attrgetter
+from pathlib import Path
+from typing import Any, get_type_hints
+
+from rlftsim.aliases import current_names
+from rlftsim.errors import ConfigError
+from rlftsim.recipes.registry import SECTIONS, Recipe, section_names
+from rlftsim.training.run_folder import flatten, to_plain
+
+RUN_INPUTS = ("initial_policy", "scenarios", "augmented_goals")
+"""Entries of a run's config.json that describe what the run started from. They are hashes, not settings."""
+
+
+def recipe_as_json(recipe: Recipe) -> str:
+    """A recipe as JSON, a mapping for each section. `--config FILE` reads it back."""
+    return json.dumps({name: to_plain(section) for name, section in sections_of(recipe).items()}, indent=1)
+
+
+def recipe_as_text(recipe: Recipe) -> str:
+    """A recipe with the documentation of every field as a comment above it, in the notation of YAML."""
+    return "\n\n".join(
+        "\n".join([f"# {summary_of(type(section))}", f"{name}:", *_lines_of(section, "  ")])
+        for name, section in sections_of(recipe).items()
+    )
+
+
+def sections_of(recipe: Recipe) -> dict[str, Any]:
+    """Sections that a recipe has, by name, in the order of their use."""
+    return {name: getattr(recipe, name) for name in section_names(recipe)}
+
+
+def summary_of(documented: object) -> str:
+    """First sentence or line of a docstring."""
+    return (inspect.getdoc(documented) or "").partition("\n")[0]
+
+
+def _lines_of(section: Any, indent: str) -> Iterator[str]:
+    documentation = field_documentation(type(section))
+    for field in fields(section):
+        value = getattr(section, field.name)
+        # A section without a docstring of its own is described by its class.
+        text = documentation.get(field.name) or (summary_of(type(value)) if is_dataclass(value) else "")
+        yield from (f"{indent}# {line}" for line in textwrap.wrap(text, 110))
+        if is_dataclass(value):
+            yield f"{indent}{field.name}:"
+            yield from _lines_of(value, f"{indent}  ")
+        else:
+            yield f"{indent}{field.name}: {json.dumps(to_plain(value))}"
+
+
+def field_documentation(config: type) -> dict[str, str]:
+    """Docstrings below the fields of a dataclass, inherited ones included, each on one line."""
+    found: dict[str, str] = {}
+    for owner in reversed(config.__mro__):
+        if not is_dataclass(owner):
+            continue
+        body = ast.parse(textwrap.dedent(inspect.getsource(owner))).body[0].body  # type: ignore[attr-defined]
+        # A field's docstring is the string that follows it; at run time it is gone, so the source is read.
+        for statement, after in pairwise(body):
+            if not isinstance(statement, ast.AnnAssign) or not isinstance(statement.target, ast.Name):
+                continue
+            if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant):
+                found[statement.target.id] = " ".join(str(after.value.value).split())
+    return found
+
+
+def flags_of_file(path: Path, recipe: Recipe, sections: Sequence[str], run_section: str) -> list[str]:
+    """Settings of a file as flags of the command line, which checks their values.
+
+    Args:
+        path: JSON that `rlftsim recipe NAME --json` printed, or the config.json of a run.
+        recipe: gives the names and types that settings may have.
+        sections: sections whose settings are used; others in the file are skipped.
+        run_section: section that the config.json of a run belongs to.
+
+    Raises:
+        ConfigError: the file cannot be read, or a setting is unknown (the nearest known name is in the message).
+    """
+    # 1. sections by name, under the names of today
+    values = _read_mapping(path)
+    run_fields = [field.name for field in fields(getattr(recipe, run_section))]
+    is_run, is_recipe = set(values) & {*run_fields, *RUN_INPUTS}, set(values) & {*SECTIONS, *section_names(recipe)}
+    # A run's config.json holds one section without its name; a printed recipe holds sections by name. A single
+    # known name tells which it is, so that a mistyped one beside it is complained about in the right words.
+    if is_run and not is_recipe:
+        values = {run_section: {name: value for name, value in values.items() if name not in RUN_INPUTS}}
+    for name in is_recipe:
+        if not isinstance(values[name], Mapping):
+            raise ConfigError(f"{path}: {name} is {json.dumps(values[name])}, not settings by name.")
+    # 2. unknown names are refused here, in the words of the file; tyro would name a flag that was never given
+    known = {f"{name}.{field}" for name, section in sections_of(recipe).items() for field in flatten(to_plain(section))}
+    given = flatten(values)
+    unknown = sorted(set(given) - known)
+    if unknown:
+        inside = [name for name in known if name.startswith(f"{unknown[0]}.")]
+        names = sorted(known) if is_run or is_recipe else [*run_fields, *sorted(known)]
+        near = sorted(inside) or difflib.get_close_matches(unknown[0], names, n=1)
+        hint = f"did you mean {near[0]}?" if near else f"sections are {', '.join(sections_of(recipe))}."
+        raise ConfigError(f"{path}: no setting {unknown[0]}: {hint}")
+    # 3. values become words; tyro checks their types
+    words: list[str] = []
+    for name, value in given.items():
+        if name.partition(".")[0] not in sections:
+            continue
+        group, _, last = name.rpartition(".")
+        owner = attrgetter(group)(recipe)
+        words += flag_words(name, value, is_switch=get_type_hints(type(owner)).get(last) is bool)
+    return words
+
+
+def flag_words(name: str, value: Any, *, is_switch: bool) -> list[str]:
+    """A setting as words of the command line.
+
+    Args:
+        name: dotted name, e.g. "finetune.kl.target".
+        value: as JSON has it: a number, a text, true, false, null or a list.
+        is_switch: True = written `--name` or `--no-name`, without a value.
+    """
+    group, dot, last = name.replace("_", "-").rpartition(".")
+    if is_switch and isinstance(value, bool):
+        return [f"--{group}{dot}{'' if value else 'no-'}{last}"]
+    values = value if isinstance(value, list | tuple) else [value]
+    return [f"--{group}{dot}{last}", *(str(one) for one in values)]
+
+
+def _read_mapping(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        problem = "a folder, not a file" if path.is_dir() else "no such file"
+        raise ConfigError(f"--config {path}: {problem}; `rlftsim recipe NAME --json` prints one.")
+    try:
+        values = json.loads(path.read_text())
+    except ValueError as error:  # includes text that is not UTF-8
+        raise ConfigError(f"--config {path}: not JSON ({error}).") from None
+    if not isinstance(values, Mapping):
+        raise ConfigError(f"--config {path}: holds {json.dumps(values)[:40]}, not settings by name.")
+    return current_names(values)

@@ -1,0 +1,42 @@
+"""Scenarios in all the forms that public functions take."""
+
+import os
+from collections.abc import Mapping
+from typing import Any, TypeAlias
+
+from rlftsim.errors import ConfigError, in_short
+from rlftsim.scenario.batch import ScenarioBatch
+from rlftsim.scenario.dataset import ScenarioDataset
+from rlftsim.scenario.open import open_dataset
+from rlftsim.scenario.types import Scenario, Scenarios
+
+Name: TypeAlias = str | os.PathLike[str]
+AnyScenarios: TypeAlias = Scenario | ScenarioBatch | Scenarios | Name
+"""One scenario, several, a batch, a data set, or the name of a data set."""
+
+
+def scenarios_of(scenarios: Any) -> Scenarios:
+    """Scenarios by position, in whatever form they were handed over.
+
+    Raises:
+        ConfigError: there is none, or something else was handed over.
+        DataError: no data set of this name.
+    """
+    # A string has a length and items too, so names are looked at first.
+    if isinstance(scenarios, str | os.PathLike):
+        found: Any = open_dataset(scenarios)
+    elif isinstance(scenarios, Scenario):
+        found = (scenarios,)
+    else:
+        found = scenarios.scenarios if isinstance(scenarios, ScenarioBatch) else scenarios
+    wanted = "hand over one, a list of them, a batch or a data set."
+    if not isinstance(found, Scenarios) or isinstance(found, Mapping):
+        raise ConfigError(f"{in_short(scenarios)}: not scenarios: {wanted}")
+    # A data set reads its scenarios from files, and has nothing else.
+    items = () if isinstance(found, ScenarioDataset) else (found[position] for position in range(len(found)))
+    for one in items:
+        if not isinstance(one, Scenario):
+            raise ConfigError(f"{type(scenarios).__name__} with {in_short(one)}: not scenarios: {wanted}")
+    if not len(found):
+        raise ConfigError("no scenario: hand over at least one.")
+    return found

@@ -1,0 +1,193 @@
+"""Data sources: readers that turn files of one origin into scenarios. `convert` makes a data set of what they read.
+
+A source is an object (or a class without arguments) under a name in `SOURCES`. One file is enough for a new one:
+
+    from rlftsim.scenario.sources import SOURCES, units_of_files
+
+    @SOURCES.register("my_logs")
+    class MyLogs:
+        license_note = "CC0-1.0"
+
+        def find(self, path):
+            return units_of_files(sorted(Path(path).glob("*.mylog")))
+
+        def read(self, unit):
+            for record in parse(unit.files[0]):
+                yield Scenario(...)
+
+        def describe(self):
+            return {"source": "my_logs", "guessed": ["size"]}
+
+Installed packages announce theirs by the entry-point group `rlftsim.sources`.
+"""
+
+import os
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+from rlftsim.errors import ConfigError, DataError
+from rlftsim.plugins import ExtensionPoint
+from rlftsim.scenario.tfrecord import OnError, SkippedRecord
+from rlftsim.scenario.types import Scenario
+
+AUTO = "auto"
+DEFAULT_SOURCE = "womd"
+"""Reads what no source recognizes, and says what is wrong with it."""
+_SPLIT = re.compile(r"training|validation|testing")
+
+
+@dataclass(frozen=True)
+class Unit:
+    """One piece of work of a source. It becomes one shard of the data set."""
+
+    name: str
+    """Differs from those of all other units of a path; the shard is named after it."""
+    files: tuple[Path, ...]
+    """All files that are read for it. When one of them changes, the unit is converted again."""
+    split: str = "unknown"
+
+
+class BytesRead(int):
+    """Bytes of a unit that were read since the last report: moves the progress bar. Sources may leave them out."""
+
+
+Item = Scenario | SkippedRecord | BytesRead
+"""Yielded by a source: a scenario, the cause why a record is none, or progress."""
+
+
+@runtime_checkable
+class DataSource(Protocol):
+    """Reader of one kind of files.
+
+    It may also have `detects(path) -> bool`, True for files of its kind, which `convert` calls when no source is named.
+    A source is pickled when several processes convert.
+    """
+
+    license_note: str
+    """License of the data, for the manifest of the data set."""
+
+    def find(self, path: str | os.PathLike[str]) -> Sequence[Unit]:
+        """Units of work at a path, in a fixed order.
+
+        Raises:
+            DataError: there are none.
+        """
+        ...
+
+    def read(self, unit: Unit) -> Iterator[Item]:
+        """Scenarios of a unit, the same ones in the same order each time.
+
+        A bad record is yielded as a `SkippedRecord`, so that those after it can still be read. A `DataError` that is
+        raised costs the rest of the unit.
+        """
+        ...
+
+    def describe(self) -> Mapping[str, object]:
+        """Plain JSON values for the provenance in the manifest, above all what had to be guessed."""
+        ...
+
+
+SOURCES: ExtensionPoint[Any] = ExtensionPoint(
+    "data source", "rlftsim.sources", {DEFAULT_SOURCE: "rlftsim.scenario.womd:WomdSource"}
+)
+
+
+def find_source(reader: str, path: str | os.PathLike[str]) -> DataSource:
+    """Source of a name, or for "auto" the one that recognizes the files at a path.
+
+    Args:
+        reader: a name in `SOURCES`, or "auto".
+        path: file, folder or glob to be converted.
+
+    Raises:
+        ConfigError: the name is unknown, or "auto" and several sources recognize the files.
+    """
+    if reader != AUTO:
+        return _source(reader)
+    default = _source(DEFAULT_SOURCE)
+    # The default comes first: then packages of other people are not even imported.
+    if default.detects(path):  # type: ignore[attr-defined]
+        return default
+    others = [name for name in SOURCES.names() if name != DEFAULT_SOURCE]
+    found = [name for name in others if getattr(_source(name), "detects", lambda _: False)(path)]
+    if len(found) > 1:
+        raise ConfigError(f"{path} could be read as {' or '.join(found)}: name the data source.")
+    return _source(found[0]) if found else default
+
+
+def read_unit(
+    source: DataSource,
+    unit: Unit,
+    *,
+    on_error: OnError,
+    report: Callable[[SkippedRecord], None],
+    advance: Callable[[int], object] = lambda _: None,
+) -> Iterator[tuple[int, Scenario]]:
+    """Read a unit; yields the number of the record, from 0, with its scenario.
+
+    Args:
+        source: reader of the unit.
+        unit: one of those that the source has found.
+        on_error: "stop" raises at the first bad record, "skip" reports it and goes on.
+        report: called with each skipped record, only under "skip".
+        advance: called with the number of bytes read since its last call, if the source counts them.
+
+    Raises:
+        DataError: under "stop", a bad record: names file, record and cause. Always: a file cannot be read.
+    """
+    # Errors of the code that consumes the scenarios do not pass through here: only reading is inside the `try`.
+    record = 0
+    try:
+        for item in source.read(unit):
+            if isinstance(item, BytesRead):
+                advance(item)  # no record
+                continue
+            if isinstance(item, Scenario):
+                yield record, item
+            elif on_error == "stop":
+                raise DataError(str(item))
+            else:
+                report(item)
+            record += 1
+    except DataError as error:
+        if on_error == "stop":
+            raise
+        report(SkippedRecord(unit.name, record, str(error)))
+    except OSError as error:
+        raise DataError(f"{error.filename or unit.name}: cannot be read: {error.strerror or error}") from error
+
+
+def units_of_files(files: Sequence[Path]) -> list[Unit]:
+    """One unit per file, named by its path below the folder that all of them share.
+
+    Args:
+        files: at least one.
+    """
+    common = os.path.commonpath([file.absolute().parent for file in files])
+    return [Unit(file.absolute().relative_to(common).as_posix(), (file,), infer_split(file)) for file in files]
+
+
+def infer_split(path: Path) -> str:
+    """Split by the name of a file or else of its folder: training, validation, testing or unknown."""
+    for name in (path.name, path.absolute().parent.name):
+        match = _SPLIT.search(name)
+        if match:
+            return match.group()
+    return "unknown"
+
+
+def _source(name: str) -> DataSource:
+    """Source of a name, made if it is a class.
+
+    Raises:
+        ConfigError: the name is unknown, or not that of a data source.
+    """
+    found = SOURCES.get(name)
+    source = found() if isinstance(found, type) else found
+    missing = [part for part in ("license_note", "find", "read", "describe") if not hasattr(source, part)]
+    if missing:
+        raise ConfigError(f"data source {name!r} has no {', '.join(missing)}: see rlftsim.scenario.sources.")
+    return source

@@ -1,0 +1,71 @@
+"""One simulated street network with its traffic, from a seed."""
+
+from pathlib import Path
+
+import numpy as np
+
+from rlftsim.scenario.synthetic import sumo
+from rlftsim.scenario.synthetic.city_plan import draw_city_plan
+from rlftsim.scenario.synthetic.crop import MapCropper
+from rlftsim.scenario.synthetic.demand import write_demand
+from rlftsim.scenario.synthetic.freeway_plan import draw_freeway_plan
+from rlftsim.scenario.synthetic.ground import draw_ground
+from rlftsim.scenario.synthetic.map_features import build_network_map
+from rlftsim.scenario.synthetic.network import read_network
+from rlftsim.scenario.synthetic.parking import park_in_lots, park_in_strips
+from rlftsim.scenario.synthetic.recording import read_pedestrians, read_signals, read_vehicles
+from rlftsim.scenario.synthetic.windows import World
+from rlftsim.scenario.types import STEP_S
+
+LOTS_PER_STREET = {"city": 0.35, "quiet": 0.22, "freeway": 0.0}
+_NUM_STEPS = round((sumo.SIMULATED_S - sumo.DISCARDED_S) / STEP_S)
+
+
+def simulate_world(kind: str, seed: tuple[int, ...], folder: Path) -> World:
+    """Draw a network, let SUMO fill it with traffic, and turn its output into bodies, lights and a map.
+
+    Args:
+        kind: "city", "quiet" or "freeway".
+        seed: source of all choices; the same seed and version of SUMO give the same world.
+        folder: existing folder for SUMO's files.
+
+    Raises:
+        ConfigError: SUMO or shapely is not installed.
+        RlftsimError: a program of SUMO failed.
+    """
+    # One generator for all steps: their order is part of what a seed means.
+    rng = np.random.default_rng(seed)
+
+    # 1. Streets.
+    plan = draw_freeway_plan(rng) if kind == "freeway" else draw_city_plan(rng, quiet=kind == "quiet")
+    layout = "opposites" if rng.random() < 0.75 else "incoming"
+    network_file = sumo.compile_network(plan, folder, layout)
+    network = read_network(network_file, plan)
+
+    # 2. Traffic. An additional file makes SUMO write every junction's signal states.
+    types = write_demand(plan, rng, folder / "demand.xml")
+    sumo_seed = int(rng.integers(1, 2**31 - 1))
+    routes = sumo.route_demand(network_file, folder / "demand.xml", sumo_seed)
+    signal_files = {junction: folder / f"signals_{junction}.xml" for junction in network.lights}
+    events = [
+        f'<timedEvent type="SaveTLSStates" source="{junction}" dest="{path}"/>'
+        for junction, path in signal_files.items()
+    ]
+    additional = folder / "additional.xml"
+    additional.write_text("\n".join(["<additional>", *events, "</additional>"]))
+    vehicles_file, persons_file = sumo.simulate(network_file, routes, additional, sumo_seed)
+
+    # 3. Map and bodies.
+    network_map = build_network_map(network)
+    bodies = read_vehicles(vehicles_file, network, types, rng)
+    bodies += read_pedestrians(persons_file, rng)
+    bodies += park_in_strips(rng, network, _NUM_STEPS)
+    bodies += park_in_lots(rng, network, network_map.drivable, _NUM_STEPS, LOTS_PER_STREET[kind])
+    return World(
+        name="/".join(map(str, seed)),
+        bodies=tuple(bodies),
+        cropper=MapCropper.of(network_map, draw_ground(rng)),
+        signals={junction: read_signals(path, junction) for junction, path in signal_files.items()},
+        ends=np.stack([node.position for node in plan.fringe_nodes]),
+        num_steps=_NUM_STEPS,
+    )

@@ -1,0 +1,42 @@
+"""Use of the processor and of memory by this process: one thread, and freed memory kept."""
+
+import ctypes
+import platform
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
+"""Parameters of glibc's `mallopt`."""
+KEPT_BYTES = 1 << 30
+LARGEST_KEPT_BYTES = 1 << 25
+"""Larger blocks are always returned to the system; glibc takes no larger limit."""
+
+
+def keep_freed_memory() -> None:
+    """Let glibc keep freed memory for the next allocation. Other C libraries stay as they are.
+
+    By default it returns most of it to the system after every simulated step and gets it again page by page, which
+    takes up to a twelfth of a rollout.
+    """
+    if platform.libc_ver()[0] == "glibc":
+        libc = ctypes.CDLL(None)
+        # the heap keeps its free top, and large blocks are taken from it instead of mapped one by one
+        libc.mallopt(_TRIM_THRESHOLD, KEPT_BYTES)
+        libc.mallopt(_MMAP_THRESHOLD, LARGEST_KEPT_BYTES)
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Let torch compute with a single thread inside the block.
+
+    Rollouts consist of small steps, between which threads mostly wait for each other. And with one thread neither the
+    number of cores nor that of processes changes a result.
+    """
+    import torch  # not at the top: `--help` does not need it and would wait seconds
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)

@@ -1,0 +1,266 @@
+"""The loop of a training run, once for all methods: resuming, skips, divergence, checkpoints, logs and progress.
+
+A method brings its `Learner` (the weights and counters that change) and a function that makes one update. `TrainingRun`
+does the rest, and leaves files through `training.run_folder` and `training.checkpoint`.
+"""
+
+import math
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float
+from torch import nn
+from torch.optim import Optimizer
+
+from rlftsim.errors import ConfigError
+from rlftsim.progress import log, progress_bar
+from rlftsim.scenario.batch import ScenarioBatch
+from rlftsim.scenario.types import Scenario, Scenarios
+from rlftsim.training.checkpoint import Progress, newest_checkpoint, read_checkpoint, write_checkpoint
+from rlftsim.training.data import batch_with_futures, scenarios_of_update
+from rlftsim.training.parallel import Fabric, local_indices
+from rlftsim.training.run_folder import RunFolder, describe_inputs
+
+TrainingScenarios = Scenarios | Scenario
+"""Scenarios that a training function takes: a data set, a list, or a single scenario."""
+
+
+def as_scenarios(scenarios: TrainingScenarios) -> Scenarios:
+    """A sequence of scenarios, also where a single one is given."""
+    return [scenarios] if isinstance(scenarios, Scenario) else scenarios
+
+
+def require_trainable(policy: object, scenarios: Scenarios, method: str, *, needs: Sequence[str] = ()) -> Any:
+    """Return the policy if a method can train it on these scenarios.
+
+    Args:
+        policy: has to be an nn.Module with a method `save_pretrained(folder, *, card)`.
+        scenarios: at least one.
+        method: name of the training method in messages, such as "CAT-K".
+        needs: further attributes that the method uses, such as "vocabulary".
+
+    Raises:
+        ConfigError: the policy has no weights or lacks an attribute, or there is no scenario.
+    """
+    name = type(policy).__name__
+    if not isinstance(policy, nn.Module):
+        raise ConfigError(f"{name} has no weights: there is nothing for {method} to train.")
+    missing = [attribute for attribute in (*needs, "save_pretrained") if not hasattr(policy, attribute)]
+    if missing:
+        raise ConfigError(f"{name} cannot be trained with {method}: it has no {' and no '.join(missing)}.")
+    if not len(scenarios):
+        raise ConfigError("no scenario to train on: is the data set empty, or the split misspelled?")
+    return policy
+
+
+@dataclass(eq=False, kw_only=True)
+class Learner:
+    """The parts of a run that change from update to update, which its checkpoints hold."""
+
+    policy: Any
+    optimizer: Optimizer
+    update: int = 0
+    """Updates done, skipped ones included."""
+    skipped_in_a_row: int = 0
+
+    @property
+    def parameters(self) -> list[nn.Parameter]:
+        """The weights that are trained."""
+        return [p for p in self.policy.parameters() if p.requires_grad]
+
+    @property
+    def modules(self) -> dict[str, nn.Module]:
+        """Modules that a checkpoint holds, by their file name."""
+        return {"policy": self.policy}
+
+    def to_numbers(self) -> dict[str, float]:
+        """Numbers that a checkpoint holds beside the weights."""
+        return {}
+
+    def load_numbers(self, numbers: Mapping[str, float]) -> None:
+        """Take back the numbers of a checkpoint."""
+
+    def finish_update(self, *, is_good: bool) -> None:
+        """Take the optimizer's step, or skip it, and count the update either way.
+
+        Args:
+            is_good: False = the gradient cannot be used; weights and moments stay.
+        """
+        self.update += 1
+        if is_good:
+            self.optimizer.step()
+            self.skipped_in_a_row = 0
+        else:
+            self.skipped_in_a_row += 1
+
+
+@dataclass(frozen=True, eq=False)
+class UpdateReport:
+    """The outcome of one update."""
+
+    values: dict[str, float]
+    """Metrics by the names of metrics.jsonl."""
+    note: str
+    """Text beside the progress bar."""
+    skipped_because: str = ""
+    """Reason why the optimizer's step was skipped."""
+    warnings: Sequence[str] = ()
+    """Messages for the user, such as alarms."""
+
+
+@runtime_checkable
+class RunConfig(Protocol):
+    """Settings that every training method has."""
+
+    @property
+    def batch_size(self) -> int:
+        """Scenarios per update, over all processes."""
+        ...
+
+    @property
+    def warmup_updates(self) -> int:
+        """Updates over which the learning rate rises."""
+        ...
+
+    @property
+    def checkpoint_every(self) -> int:
+        """Updates between two checkpoints."""
+        ...
+
+    @property
+    def max_skipped_in_a_row(self) -> int:
+        """Skipped updates in a row that end the run."""
+        ...
+
+    @property
+    def seed(self) -> int:
+        """Seed of the run."""
+        ...
+
+    def num_updates(self, num_scenarios: int) -> int:
+        """Optimizer steps of the run."""
+        ...
+
+
+class TrainingRun:
+    """A run in a folder, new or resumed.
+
+    Args:
+        policy: the initial policy; its fingerprint becomes part of the run's identity.
+        scenarios: training scenarios.
+        out: the run's folder.
+        config: settings of the method; stored in the folder.
+        fabric: processes and device.
+        inputs: further hashes of what the run starts from.
+        skip_rule: condition under which updates are skipped, for the message of a run that diverged.
+        remedy: settings to change after a divergence, for the same message.
+
+    Raises:
+        CheckpointError: the folder belongs to a run with other settings or inputs.
+    """
+
+    def __init__(
+        self,
+        policy: object,
+        scenarios: Scenarios,
+        out: str | os.PathLike[str],
+        config: RunConfig,
+        fabric: Fabric,
+        *,
+        inputs: Mapping[str, str] | None = None,
+        skip_rule: str = "their gradients are not finite",
+        remedy: str = "lower learning_rate",
+    ):
+        self.scenarios = scenarios
+        self.total = config.num_updates(len(scenarios))
+        # The identity of the run: another policy, data set or order of scenarios is refused.
+        described = {**describe_inputs(policy, scenarios), **(inputs or {})}
+        self.folder = RunFolder(Path(out), config, described, writes=fabric.is_global_zero)
+        self._config = config
+        self._fabric = fabric
+        self._skip_rule = skip_rule
+        self._remedy = remedy
+        # Such a run ends with nearly its initial weights, which looks like a method that does not work.
+        if self.total < config.warmup_updates and fabric.is_global_zero:
+            log.warning(
+                f"the run ends after {self.total} of {config.warmup_updates} warm-up updates, so its weights hardly "
+                "move: raise epochs, or lower warmup_updates."
+            )
+
+    def local_batch(self, update: int) -> ScenarioBatch:
+        """The scenarios that this process sees in an update (counted from 0), as one batch."""
+        return batch_with_futures(self.scenarios, self.local_indices(update))
+
+    def local_indices(self, update: int, costs: Float[np.ndarray, "n"] | None = None) -> list[int]:
+        """Indices of the scenarios that this process sees in an update.
+
+        Args:
+            update: counted from 0.
+            costs: of all scenarios; processes then get parts of about equal cost, else of equal number.
+        """
+        chosen = scenarios_of_update(update, self._config.batch_size, len(self.scenarios), self._config.seed)
+        return local_indices(chosen, self._fabric, None if costs is None else costs[chosen].tolist())
+
+    def train(self, learner: Learner, make_update: Callable[[], UpdateReport], *, title: str, card: str = "") -> Path:
+        """Make all updates that are left, and save the trained policy.
+
+        Args:
+            learner: fresh; brought to the state of the newest checkpoint if there is one.
+            make_update: makes the update `learner.update` and ends it with `Learner.finish_update`.
+            title: label of the progress bar.
+            card: README of the resulting model folder.
+
+        Returns:
+            The model folder, `out/model`.
+
+        Raises:
+            CheckpointError: the run diverged (its last good checkpoint is named), or a checkpoint is damaged.
+        """
+        newest = newest_checkpoint(self.folder.checkpoints)
+        if newest:
+            progress = read_checkpoint(newest, learner.modules, learner.optimizer)
+            learner.update = progress.update
+            learner.load_numbers(progress.numbers)
+        # Metrics of updates behind the checkpoint would appear twice.
+        self.folder.continue_from(learner.update)
+        with progress_bar(title, self.total, learner.update) as advance:
+            while learner.update < self.total:
+                report = make_update()
+                # The line is written first, so that a run that ends here shows why.
+                self.folder.log(learner.update, report.values)
+                self._report(learner, report)
+                # A checkpoint is always the state after a good update, so that a run resumes from sound weights.
+                is_due = learner.update % self._config.checkpoint_every == 0 or learner.update == self.total
+                is_due = is_due and not learner.skipped_in_a_row
+                self._refuse_divergence(learner, report, check_weights=is_due)
+                if is_due and self._fabric.is_global_zero:
+                    progress = Progress(learner.update, learner.to_numbers())
+                    write_checkpoint(self.folder.checkpoints, progress, learner.modules, learner.optimizer)
+                advance(note=report.note)
+        self.folder.close()
+        if self._fabric.is_global_zero:
+            learner.policy.eval().save_pretrained(self.folder.model, card=card)
+        return self.folder.model
+
+    def _report(self, learner: Learner, report: UpdateReport) -> None:
+        if not self._fabric.is_global_zero:
+            return
+        if learner.skipped_in_a_row:
+            limit = f"{learner.skipped_in_a_row} in a row, the run stops at {self._config.max_skipped_in_a_row}"
+            log.warning(f"update {learner.update} skipped: {report.skipped_because} ({limit})")
+        for warning in report.warnings:
+            log.warning(f"update {learner.update}, {warning}")
+
+    def _refuse_divergence(self, learner: Learner, report: UpdateReport, *, check_weights: bool) -> None:
+        """Raise where more updates make no sense; on every process, or the others would wait forever."""
+        if learner.skipped_in_a_row >= self._config.max_skipped_in_a_row:
+            cause = f"{learner.skipped_in_a_row} updates in a row were skipped, {self._skip_rule}"
+            raise self.folder.diverged(cause, self._remedy)
+        # Not after every update: reading all weights makes a GPU wait.
+        loss = report.values.get("loss", 0.0)
+        if check_weights and not (math.isfinite(loss) and all(p.isfinite().all() for p in learner.parameters)):
+            raise self.folder.diverged("the loss or a weight is not finite any more", self._remedy)

@@ -1,0 +1,127 @@
+"""Scenarios and rollouts in a notebook: the player of `viewer.page` in a frame below the cell.
+
+`show` is the public function; `scenario_html` and `rollouts_html` serve the `_repr_html_` of `Scenario` and `Rollouts`.
+"""
+
+import os
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+
+from rlftsim.atomic_io import write_text
+from rlftsim.errors import ConfigError
+from rlftsim.rollout.types import Rollouts
+from rlftsim.scenario.any_form import AnyScenarios, scenarios_of
+from rlftsim.scenario.types import Scenario
+from rlftsim.viewer.page import Animation, Panel, animation_html, page_html
+from rlftsim.viewer.scene import build_scene, logged_trajectories, rollout_trajectories
+
+MAX_ROLLOUTS = 4
+"""Rollouts that play in one panel: a notebook stores the page in its file, and every rollout adds about 50 kB."""
+MAX_SCENARIOS = 3
+"""Scenarios of one cell."""
+FRAME_HEIGHT = 660
+"""Pixels that one scenario takes."""
+FRAME_CSS = (
+    "body { background: none } main { padding: 0; max-width: none } figure.player { margin: 0 0 8px }"
+    ".panels { grid-template-columns: repeat(auto-fit, minmax(min(100%, 260px), 420px)) }"
+)
+"""Panels stay small enough for the frame, whatever the width of the cell."""
+
+
+class Cell:
+    """A page that a notebook shows in a frame, and that can be written to a file.
+
+    Args:
+        page: HTML of a whole self-contained page.
+        height: of the frame, pixels.
+    """
+
+    def __init__(self, page: str, height: int = FRAME_HEIGHT) -> None:
+        self.page = page
+        self.height = height
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the page, which opens in any browser without a network."""
+        write_text(Path(path), self.page)
+
+    def __repr__(self) -> str:
+        return f"Cell({len(self.page) / 1000:.0f} kB page: plays in a notebook, .save('page.html') writes it)"
+
+    def _repr_html_(self) -> str:
+        style = f"width:100%;height:{self.height}px;border:0"
+        # srcdoc keeps styles and scripts of the page apart from those of the notebook.
+        return f'<iframe style="{style}" sandbox="allow-scripts" srcdoc="{escape(self.page)}"></iframe>'
+
+
+def require_rollouts(function: str, scenarios: object, *rollouts: object) -> None:
+    """Refuse something else in place of rollouts, mostly arguments in the other order.
+
+    Args:
+        function: public name, for the message.
+        scenarios: as handed over, in whatever form.
+        rollouts: as handed over.
+
+    Raises:
+        ConfigError: there is something else.
+    """
+    for one in rollouts:
+        if not isinstance(one, Rollouts) or isinstance(scenarios, Rollouts):
+            kinds = ", ".join(type(value).__name__ for value in (scenarios, *rollouts))
+            raise ConfigError(f"write rs.{function}(scenario, rollouts), got ({kinds}).")
+
+
+def show(scenario: AnyScenarios, *rollouts: Rollouts, titles: Sequence[str] = ()) -> Cell:
+    """Player of the logged scenario beside its rollouts, for a notebook cell.
+
+    Boxes that overlap are marked; the first rollouts of each kind can be played.
+
+    Args:
+        scenario: one scenario; of several, a batch or a data set the first few are shown.
+        rollouts: of the same scenarios, such as those of a base model and of a tuned one.
+        titles: of the panels with rollouts, in their order; left out, "rollouts" or "rollouts 1", "rollouts 2", ...
+
+    Returns:
+        A value that a notebook displays; `save(path)` writes it as a page.
+
+    Raises:
+        ConfigError: rollouts of other scenarios, more titles than rollouts, or no scenario.
+        DataError: no data set of this name.
+    """
+    require_rollouts("show", scenario, *rollouts)
+    if len(titles) > len(rollouts):
+        raise ConfigError(f"{len(titles)} titles for {len(rollouts)} rollouts: give one each, or none.")
+    numbered = [f"rollouts {i + 1}" for i in range(len(rollouts))] if len(rollouts) > 1 else ["rollouts"]
+    names = [*titles, *numbered[len(titles) :]]
+    found = scenarios_of(scenario)
+    shown = [found[row] for row in range(min(len(found), MAX_SCENARIOS))]
+    # One figure a scenario: the log, then one panel for each kind of rollouts.
+    figures = []
+    for row, one in enumerate(shown):
+        scene = build_scene(one)
+        panels = [Panel("logged", logged_trajectories(one).with_overlaps(scene.agents))]
+        for name, simulated in zip(names, rollouts):
+            if simulated.provenance is None and len(simulated.position) != len(found):
+                raise ConfigError(
+                    f"rollouts of {len(simulated.position)} scenarios do not belong to {len(found)}: hand over the "
+                    "scenarios they are of."
+                )
+            # By id where the rollouts know their scenarios, else by position.
+            place = row if simulated.provenance is None else simulated.row_of(one.scenario_id)
+            motion = rollout_trajectories(one, simulated, row=place, max_rollouts=MAX_ROLLOUTS)
+            panels.append(Panel(name, motion.with_overlaps(scene.agents)))
+        figures.append(animation_html(Animation(f"Scenario {one.scenario_id}", scene, panels)))
+    page = page_html(f"Scenario {shown[0].scenario_id}", "\n".join(figures), extra_css=FRAME_CSS)
+    return Cell(page, FRAME_HEIGHT * len(shown))
+
+
+def scenario_html(scenario: Scenario) -> str:
+    """Frame that plays a logged scenario."""
+    return show(scenario)._repr_html_()
+
+
+def rollouts_html(rollouts: Rollouts) -> str | None:
+    """Frame that plays rollouts beside the log; None where they do not know their scenarios."""
+    if rollouts.provenance is None:
+        return None
+    return show(rollouts.provenance.scenarios, rollouts)._repr_html_()

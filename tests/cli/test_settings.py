@@ -1,0 +1,332 @@
+"""Settings on the command line: flags for every field, files of settings, `--set` and names of earlier versions."""
+
+import json
+import re
+from dataclasses import fields, is_dataclass, replace
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from rlftsim.aliases import current_words
+from rlftsim.cli.main import main, parse
+from rlftsim.errors import ConfigError
+from rlftsim.policies.smart.config import smart_demo
+from rlftsim.policies.smart.policy import SmartPolicy
+from rlftsim.recipes.registry import RECIPES, recipe_by_name
+from rlftsim.recipes.settings import recipe_as_json, recipe_as_text, sections_of
+from rlftsim.scenario.open import open_dataset
+from rlftsim.tokens.clustering import build_vocabulary
+from rlftsim.training.run_folder import flatten, to_plain
+
+PRETRAIN = ["pretrain", "smart-demo", "--data", "d", "--out", "o", "--vocabulary", "v"]
+FINETUNE = ["finetune", "smart-demo", "--model", "m", "--data", "d", "--out", "o"]
+TOKENS = ["tokens", "--data", "d", "--out", "o"]
+EXPERIMENT = ["experiment", "benchmark"]
+
+
+def value_at(settings, name):
+    """Value of a dotted name."""
+    for part in name.split("."):
+        settings = getattr(settings, part)
+    return settings
+
+
+def names_of(config, path=""):
+    """Dotted names of all settings."""
+    if not is_dataclass(config):
+        return [path]
+    return [n for f in fields(config) for n in names_of(getattr(config, f.name), f"{path}.{f.name}".strip("."))]
+
+
+@pytest.mark.parametrize(
+    ("words", "name", "value"),
+    [
+        ([*PRETRAIN, "--pretrain.epochs", "2"], "pretrain.epochs", 2.0),
+        ([*PRETRAIN, "--pretrain.max-trained-agents", "16"], "pretrain.max_trained_agents", 16),
+        ([*PRETRAIN, "--pretrain.max-trained-agents", "None"], "pretrain.max_trained_agents", None),
+        ([*PRETRAIN, "--model.catk-compat"], "model.catk_compat", True),
+        ([*FINETUNE, "--finetune.kl.target", "0.02"], "finetune.kl.target", 0.02),
+        ([*FINETUNE, "--finetune.learning_rate=1e-5"], "finetune.learning_rate", 1e-5),
+        (
+            [*FINETUNE, "--finetune.reward", "mloo + 0.1*collision_offroad"],
+            "finetune.reward",
+            "mloo + 0.1*collision_offroad",
+        ),
+        ([*FINETUNE, "--finetune.betas", "0.8", "0.95"], "finetune.betas", (0.8, 0.95)),
+        ([*FINETUNE, "--finetune.entropy-bonus", "-0.5"], "finetune.entropy_bonus", -0.5),
+        ([*FINETUNE, "--finetune.metric", "2024"], "finetune.metric", "2024"),
+        ([*FINETUNE, "--finetune.device.accelerator", "cpu"], "finetune.device.accelerator", "cpu"),
+        ([*FINETUNE, "--finetune.kl.min-beta", "0.5", "--finetune.kl.initial-beta", "1"], "finetune.kl.min_beta", 0.5),
+        ([*FINETUNE, "--finetune.seed", "1", "--finetune.seed", "2"], "finetune.seed", 2),
+        ([*FINETUNE, "--method", "catk", "--catk.num-candidates", "4"], "catk.num_candidates", 4),
+        ([*TOKENS, "--tokens.no-mirror"], "tokens.mirror", False),
+        ([*TOKENS, "--tokens.trajtok.vehicle.min-motions", "5"], "tokens.trajtok.vehicle.min_motions", 5),
+        ([*EXPERIMENT, "--finetune.epochs", "0.5"], "finetune.epochs", 0.5),
+        (["finetune", "--model", "m", "--data", "d", "smart-nano", "--out", "o"], "pretrain.batch_size", 16),
+    ],
+)
+def test_a_flag_changes_one_field(words, name, value):
+    found = value_at(parse(words).settings, name)
+    assert found == value
+    assert type(found) is type(value)
+
+
+def test_flags_leave_everything_else_as_the_recipe_has_it():
+    changed = parse([*FINETUNE, "--finetune.kl.target", "0.02"]).settings
+    recipe = recipe_by_name("smart-demo")
+    kl = replace(recipe.finetune.kl, target=0.02)
+    assert changed == replace(recipe, finetune=replace(recipe.finetune, kl=kl))
+
+
+@pytest.mark.parametrize(
+    ("words", "section"),
+    [(FINETUNE, "finetune"), (FINETUNE, "catk"), (FINETUNE, "gcsl"), (PRETRAIN, "model"), (TOKENS, "tokens")],
+)
+def test_help_shows_every_field_even_without_a_recipe(words, section, capsys):
+    with pytest.raises(SystemExit):
+        main([words[0], "--help"])
+    text = capsys.readouterr().out
+    for name in names_of(getattr(recipe_by_name("smart-tiny"), section), section):
+        group, _, last = name.replace("_", "-").rpartition(".")
+        assert re.search(rf"--{re.escape(group)}\.(no-)?{re.escape(last)}\b", text), name
+
+
+SWITCHES = ["--finetune.kl.no-condition-reference", "--no-goal-logit-bias", "--goal=concat"]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        [SWITCHES[0], "smart-demo", *FINETUNE[2:]],
+        ["smart-demo", SWITCHES[0], *FINETUNE[2:]],
+        [*FINETUNE[2:], SWITCHES[0], "smart-demo"],
+        [*FINETUNE[2:], "smart-demo", SWITCHES[0]],
+        [*FINETUNE[2:], *SWITCHES[:2], "smart-demo", SWITCHES[2]],
+        # the run's folder has the name of a recipe, too
+        [*FINETUNE[2:-1], "smart-nano", SWITCHES[0], "smart-demo"],
+    ],
+    ids=" ".join,
+)
+def test_a_switch_beside_the_recipe_changes_no_other_setting(words):
+    verb = parse(["finetune", *words])
+    recipe = recipe_by_name("smart-demo").finetune
+    assert verb.recipe == "smart-demo"
+    assert verb.settings.finetune.kl.condition_reference is False
+    assert (verb.settings.finetune.epochs, verb.settings.finetune.num_rollouts) == (recipe.epochs, recipe.num_rollouts)
+    assert recipe.num_rollouts != recipe_by_name("smart-tiny").finetune.num_rollouts
+
+
+def test_an_unknown_recipe_is_named_even_beside_a_known_one():
+    with pytest.raises(ConfigError, match="unknown recipe 'smart-dmo'"):
+        parse(["finetune", "smart-dmo", "--model", "m", "--data", "d", "--out", "smart-tiny"])
+
+
+BAD = [
+    (["finetune", "--finetune.epochs", "1"], r"^missing: RECIPE, --model, --data, --out\.$"),
+    (["evaluate", "--data", "synthetic"], r"^missing: MODEL, --out\.$"),
+    ([*FINETUNE, "--finetune.kl.condition-reference", "yes"], "is a switch, it takes no value: write --finetune.kl"),
+    (["convert", "a.tfrecord", "b.tfrecord", "out"], "not understood: out .one word too many, or a pattern without"),
+    ([*PRETRAIN, "--pretrain.epoch", "2"], "did you mean --pretrain.epochs"),
+    ([*PRETRAIN, "--training.epochs", "2"], "no flag --training.epochs: did you mean --pretrain.epochs"),
+    ([*PRETRAIN, "--epochs", "2"], "did you mean --pretrain.epochs"),
+    ([*PRETRAIN, "--pretrain.batch-size", "2.5"], "--pretrain.batch-size 2.5: expected a whole number"),
+    ([*PRETRAIN, "--pretrain.epochs", "many"], "--pretrain.epochs many: expected a number"),
+    ([*PRETRAIN, "--pretrain.epochs", "inf"], "pretrain: epochs must be a finite number, got inf"),
+    ([*PRETRAIN, "--pretrain.validation.seed", "-1"], "seed must not be negative"),
+    ([*PRETRAIN, "--model.num-frequencies", "0"], "model: num_frequencies must be positive"),
+    ([*PRETRAIN, "--tokens.seed", "1"], "--tokens.seed has no effect here: the settings of pretrain are --model"),
+    ([*FINETUNE, "--finetune.lr", "1"], "no flag --finetune.lr: did you mean --finetune.learning-rate"),
+    ([*FINETUNE, "--finetune.kl.goal", "1"], "no flag --finetune.kl.goal"),
+    ([*FINETUNE, "--finetune.betas", "0.9"], "--finetune.betas needs 2 values"),
+    ([*FINETUNE, "--finetune.betas", "0.9", "2"], r"finetune: betas are .* in \[0, 1\)"),
+    ([*FINETUNE, "--finetune.trained", "some"], "--finetune.trained some: expected one of 'decoder', 'goals', 'all'"),
+    ([*FINETUNE, "--finetune.reward", "joy"], "unknown reward 'joy'"),
+    ([*FINETUNE, "--finetune.num-rollouts", "1"], "at least 2 rollouts"),
+    ([*FINETUNE, "--finetune.kl.target", "0"], "finetune.kl: target must be positive"),
+    ([*FINETUNE, "--catk.choice", "closest"], "--catk.choice has no effect with --method rlft"),
+    ([*FINETUNE, "--method", "gcsl", "--finetune.seed", "1"], "--finetune.seed has no effect with --method gcsl"),
+    ([*TOKENS, "--tokens.trajtok.vehicle.x-max-m", "inf"], "x_max_m must be a finite number"),
+    ([*EXPERIMENT, "--finetune.reward", "rloo"], "--finetune.reward has no effect: experiments vary it"),
+    ([*EXPERIMENT, "--catk.batch-size", "3"], "--catk.batch-size has no effect: experiments vary it"),
+    (["finetune", "smart-dmo", "--model", "m"], "unknown recipe 'smart-dmo': did you mean 'smart-demo'"),
+    (["tokens", "--recipe", "smarttiny", "--data", "d"], "unknown recipe 'smarttiny': did you mean 'smart-tiny'"),
+]
+
+
+@pytest.mark.parametrize(("words", "message"), BAD, ids=[" ".join(words[-2:]) for words, _ in BAD])
+def test_a_bad_setting_is_refused_in_one_line(words, message):
+    with pytest.raises(ConfigError, match=message) as caught:
+        parse(words)
+    assert "\n" not in str(caught.value)
+
+
+# ---- files of settings ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["smart-tiny", "smart-demo"])
+def test_a_printed_recipe_is_read_back(name, tmp_path, capsys):
+    assert main(["recipe", name, "--json"]) == 0
+    (tmp_path / "mine.json").write_text(capsys.readouterr().out)
+    recipe = recipe_by_name(name)
+    for words in (PRETRAIN, FINETUNE, TOKENS):
+        verb = parse([*words, "--config", str(tmp_path / "mine.json")])
+        for section in verb.sections:
+            assert getattr(verb.settings, section) == getattr(recipe, section)
+
+
+def test_the_text_of_a_recipe_has_every_field_and_its_documentation():
+    recipe = recipe_by_name("smart-tiny")
+    text = recipe_as_text(recipe)
+    for name in flatten(to_plain(recipe)):
+        assert f"  {name.rpartition('.')[2]}: " in text
+    assert "# Rollouts per scenario and update (N).\n  num_rollouts: 4" in text
+    assert list(json.loads(recipe_as_json(recipe))) == list(sections_of(recipe))
+
+
+def test_recipes_are_listed_with_a_summary_each(capsys):
+    assert main(["recipe"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == ["smart-demo", "smart-mini", "smart-nano", "smart-tiny", "synthetic"]
+    assert all(len(line.split()) > 2 for line in lines)
+
+
+def test_flags_override_a_file_which_overrides_the_recipe(tmp_path):
+    path = tmp_path / "some.json"
+    path.write_text(json.dumps({"finetune": {"learning_rate": 1e-5, "kl": {"target": 0.5}, "betas": [0.7, 0.8]}}))
+    settings = parse([*FINETUNE, "--finetune.kl.target", "0.02", "--config", str(path)]).settings.finetune
+    recipe = recipe_by_name("smart-demo").finetune
+    assert (settings.kl.target, settings.learning_rate, settings.betas) == (0.02, 1e-5, (0.7, 0.8))
+    assert settings.num_rollouts == recipe.num_rollouts
+
+
+def test_a_runs_config_of_an_earlier_version_is_read_by_its_method(tmp_path):
+    path = tmp_path / "config.json"
+    path.write_text(json.dumps({"num_candidates": 7, "goal_share": 0.5, "initial_policy": "ab", "scenarios": "cd"}))
+    settings = parse([*FINETUNE, "--method", "catk", "--config", str(path)]).settings
+    assert (settings.catk.num_candidates, settings.catk.goal_probability) == (7, 0.5)
+    with pytest.raises(
+        ConfigError, match=r"config\.json: no setting finetune\.goal_probability: did you mean finetune\."
+    ):
+        parse([*FINETUNE, "--config", str(path)])
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ('{"finetune": {"lerning_rate": 1}}', "no setting finetune.lerning_rate: did you mean finetune.learning_rate"),
+        ('{"finetune": {"kl": 1}}', r"no setting finetune\.kl: did you mean finetune\.kl\."),
+        ('{"finetune": {"epochs": "many"}}', r"some\.json: finetune\.epochs many: expected a number"),
+        ('{"finetune": {"betas": [1]}}', r"some\.json: finetune\.betas needs 2 values"),
+        ('{"finetune": {"epochs": -1}}', "finetune: epochs must be positive"),
+        ('{"finetune": {"epochs": 1}, "comment": "mine"}', "no setting comment: sections are tokens, model, pretrain"),
+        ('{"finetune": {"epochs": 1}, "lerning_rate": 1}', r"no setting lerning_rate: did you mean \w+\.learning_rate"),
+        ('{"finetun": {"epochs": 1}}', "no setting finetun.epochs: did you mean finetune.epochs"),
+        ('{"epochs": 1, "lerning_rate": 1}', "no setting finetune.lerning_rate: did you mean finetune.learning_rate"),
+        ('{"lerning_rate": 1}', "no setting lerning_rate: did you mean learning_rate"),
+        ('{"finetune": 3}', "finetune is 3, not settings by name"),
+        ('{"finetune": null}', "finetune is null, not settings by name"),
+        ("null", "holds null, not settings by name"),
+        ("[1]", r"holds \[1\], not settings by name"),
+        ("{", "not JSON"),
+    ],
+)
+def test_a_file_that_makes_no_sense_is_refused_in_one_line(content, message, tmp_path):
+    path = tmp_path / "some.json"
+    path.write_text(content)
+    with pytest.raises(ConfigError, match=message) as caught:
+        parse([*FINETUNE, "--config", str(path)])
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.slow
+def test_a_run_repeated_from_its_own_config_gives_the_same_bits(tmp_path):
+    scenarios = open_dataset("synthetic", "validation")
+    tokens = replace(recipe_by_name("smart-demo").tokens, num_tokens=32, num_map_prototypes=8, max_scenarios=8)
+    model = replace(smart_demo(), dim=16, num_heads=2, head_dim=8, num_decoder_layers=1)
+    torch.manual_seed(0)
+    SmartPolicy(model, build_vocabulary(scenarios, tokens)[0]).save_pretrained(tmp_path / "base")
+    common = [
+        "finetune",
+        "smart-demo",
+        "--model",
+        str(tmp_path / "base"),
+        "--data",
+        "synthetic",
+        "--split",
+        "validation",
+    ]
+    few = ["--finetune.epochs", "0.05", "--finetune.batch-size", "1", "--finetune.num-rollouts", "2"]
+    other = ["--finetune.seed", "3", "--finetune.betas", "0.8", "0.9", "--finetune.learning-rate", "1e-3"]
+    assert main([*common, "--out", str(tmp_path / "first"), *few, *other]) == 0
+    assert main([*common, "--out", str(tmp_path / "again"), "--config", str(tmp_path / "first" / "config.json")]) == 0
+    first, again = (load_file(tmp_path / run / "model" / "model.safetensors") for run in ("first", "again"))
+    assert set(first) == set(again)
+    assert all(torch.equal(first[key], again[key]) for key in first)
+    before = load_file(tmp_path / "base" / "model.safetensors")
+    assert any(not torch.equal(first[key], before[key]) for key in first)
+
+
+# ---- words of earlier versions -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("setting", "name", "value"),
+    [
+        ("finetune.learning-rate=1e-5", "finetune.learning_rate", 1e-5),
+        ("finetune.betas=(0.8, 0.95)", "finetune.betas", (0.8, 0.95)),
+        ("finetune.betas=0.8,0.95", "finetune.betas", (0.8, 0.95)),
+        ("finetune.goals.augmented=none", "finetune.goals.augmented", None),
+        ("finetune.shared-credit=0.5", "finetune.credit_mixing", 0.5),
+        ("finetune.kl.reference_share=0.5", "finetune.kl.reference_ema", 0.5),
+        ("finetune.reward=mloo + 0.1*collision_offroad", "finetune.reward", "mloo + 0.1*collision_offroad"),
+    ],
+)
+def test_set_of_the_first_version_still_works_with_a_hint(setting, name, value, capsys):
+    assert value_at(parse([*FINETUNE, "--set", setting]).settings, name) == value
+    assert f"--set {setting} is written --{name.replace('_', '-')}" in capsys.readouterr().err
+
+
+def test_set_takes_switches_and_many_settings_in_any_place():
+    once = parse([*TOKENS[:1], "--set", "tokens.mirror=false", "tokens.seed=5", *TOKENS[1:]]).settings.tokens
+    many = parse([*TOKENS, "--set", "tokens.mirror=False", "--set", "tokens.seed=5"]).settings.tokens
+    assert once == many
+    assert (once.mirror, once.seed) == (False, 5)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("--goal concat --goal-aim yes", "--goal concat --goal-logit-bias"),
+        ("--goal-aim=no --goal concat", "--no-goal-logit-bias --goal concat"),
+        ("--goal-guidance 2 --goals recorded", "--guidance-scale 2 --goals logged"),
+        ("--goal-guidance=2 --goals=recorded", "--guidance-scale 2 --goals logged"),
+        ("--goals mine.json --choose recorded", "--goals mine.json --choose logged"),
+        ("--out=recorded", "--out=recorded"),
+    ],
+)
+def test_flags_of_the_first_version_have_the_names_of_today(old, new):
+    assert current_words(old.split()) == new.split()
+
+
+@pytest.mark.parametrize(
+    ("words", "bias"),
+    [([], None), (["--goal-logit-bias"], True), (["--no-goal-logit-bias"], False), (["--goal-aim", "no"], False)],
+)
+def test_the_goal_logit_bias_is_on_off_or_left_to_the_model(words, bias):
+    verb = parse([*FINETUNE, "--goal", "concat", *words])
+    assert verb.goal_logit_bias is bias
+    assert "goal" in verb.settings.finetune.reward
+    assert verb.settings.catk.goal_probability == 1
+
+
+def test_a_recipe_without_a_method_has_no_flags_of_it_and_refuses_it(monkeypatch):
+    without = replace(recipe_by_name("smart-demo"), catk=None)
+    monkeypatch.setitem(RECIPES._registered, "without", lambda: without)
+    words = ["without", *FINETUNE[2:]]
+    verb = parse(["finetune", *words])
+    assert verb.settings.catk is None
+    with pytest.raises(ConfigError, match=r"no flag --catk\.num-candidates"):
+        parse(["finetune", *words, "--catk.num-candidates", "4", "--method", "catk"])
+    with pytest.raises(ConfigError, match="recipe without has no section catk: its models cannot be trained so"):
+        parse(["finetune", *words, "--method", "catk"]).run()

@@ -1,0 +1,64 @@
+"""Processor time of help texts: they must not import torch, which alone takes longer than a reader waits."""
+
+import os
+import resource
+import subprocess
+import sys
+
+import pytest
+
+from rlftsim.cli.main import VERBS, main
+from rlftsim.cli.mistakes import FLAG
+
+OVERVIEW_SECONDS = 0.3
+VERB_SECONDS = 1.5
+ACTIONS = {"data": ["verify"], "goals": ["propose"], "model": ["import"]}
+"""Verbs whose flags are those of an action."""
+
+
+def run_for(*arguments: str) -> tuple[float, str]:
+    """Processor time of a command in seconds (user and system), and its output."""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    command = [sys.executable, "-m", "rlftsim", *arguments]
+    output = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, output
+
+
+def shortest(*arguments: str, limit: float) -> float:
+    """Least processor time of a few tries: the first one may compile Python files, others share a busy machine."""
+    times: list[float] = []
+    while len(times) < 3 and not (times and min(times) <= limit):
+        times.append(run_for(*arguments)[0])
+    return min(times)
+
+
+def test_the_overview_is_there_at_once():
+    assert shortest("--help", limit=OVERVIEW_SECONDS) <= OVERVIEW_SECONDS
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_the_help_of_a_verb_takes_no_longer_than_a_second_or_two(verb):
+    assert shortest(verb, *ACTIONS.get(verb, []), "--help", limit=VERB_SECONDS) <= VERB_SECONDS
+
+
+@pytest.mark.parametrize("line", [["--help"], ["finetune", "--help"], ["evaluate", "--help"]])
+def test_help_does_not_import_torch(line):
+    code = (
+        f"import sys; from rlftsim.cli import main\ntry:\n main({line})\nfinally:\n assert 'torch' not in sys.modules"
+    )
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "usage" in done.stdout
+
+
+def test_help_without_torch_is_the_help_with_torch(capsys):
+    """The help of this process is made with the real libraries, because torch is loaded here."""
+    with pytest.raises(SystemExit):
+        main(["finetune", "smart-demo", "--help"])
+    real = set(FLAG.findall(capsys.readouterr().out))
+    assert "torch" in sys.modules
+    assert len(real) > 60
+    assert set(FLAG.findall(run_for("finetune", "smart-demo", "--help")[1])) == real

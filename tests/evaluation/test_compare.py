@@ -1,0 +1,155 @@
+import io
+import math
+from dataclasses import replace
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from rich.console import Console
+from scipy import stats
+
+from made_up import evaluation
+from rlftsim.errors import ConfigError, DataError
+from rlftsim.evaluation.compare import compare, compare_paired, format_comparison, format_table
+from rlftsim.evaluation.results import Evaluation
+
+
+def render(table):
+    console = Console(width=220, record=True, file=io.StringIO())
+    console.print(table)
+    return console.export_text()
+
+
+def test_interval_and_p_value_are_those_of_a_paired_t_test():
+    a, b = np.array([0.50, 0.61, 0.72, 0.43]), np.array([0.55, 0.64, 0.75, 0.50])
+    row = compare(evaluation("base", a), evaluation("tuned", b))["meta_metric"]
+    # differences 0.05, 0.03, 0.03, 0.07: mean 0.045, standard deviation sqrt(0.0011 / 3), t(0.975, 3) = 3.1824
+    assert row.difference == pytest.approx(0.045)
+    assert row.standard_error == pytest.approx(math.sqrt(0.0011 / 3) / 2)
+    half = 3.182446 * math.sqrt(0.0011 / 3) / 2
+    assert row.interval == pytest.approx((0.045 - half, 0.045 + half), abs=1e-6)
+    assert row.p_value == pytest.approx(stats.ttest_rel(b, a).pvalue)
+    assert (row.mean_a, row.mean_b) == pytest.approx((0.565, 0.61))
+    assert row.verdict.startswith("difference, for the better: +0.0450, 95% interval [+0.0")
+
+
+def test_scenarios_are_paired_by_id_and_the_others_counted():
+    a = evaluation("base", [0.1, 0.2, 0.3], ["x", "y", "z"])
+    b = evaluation("tuned", [0.5, 0.31, 0.22, 0.9], ["v", "z", "y", "u"])
+    comparison = compare(a, b)
+    assert (comparison.num_paired, comparison.num_only_a, comparison.num_only_b) == (2, 1, 2)
+    assert comparison["meta_metric"].difference == pytest.approx(0.015)
+    assert comparison.pairing == "2 scenarios in both, 1 only in base left out, 2 only in tuned left out"
+
+
+def test_what_chance_explains_is_called_no_difference():
+    row = compare(evaluation("a", [0.1, 0.2, 0.3]), evaluation("b", [0.2, 0.1, 0.31]))["meta_metric"]
+    assert not row.is_difference
+    assert row.verdict.startswith("no difference at the 5% level")
+
+
+def test_a_lower_error_is_better():
+    row = compare_paired("collision_rate", np.array([0.3, 0.4, 0.5]), np.array([0.2, 0.31, 0.39]))
+    assert row.verdict.startswith("difference, for the better: -0.1000")
+    assert compare_paired("kinematic", np.array([0.3, 0.4, 0.5]), np.array([0.2, 0.31, 0.39])).verdict.startswith(
+        "difference, for the worse"
+    )
+
+
+def test_a_single_scenario_gives_no_verdict():
+    row = compare(evaluation("a", [0.1]), evaluation("b", [0.3]))["meta_metric"]
+    assert row.verdict == "no verdict: a single scenario, which differs by +0.2000."
+    assert math.isnan(row.p_value)
+    assert not row.is_difference
+
+
+def test_no_spread_has_its_own_words():
+    equal = compare(evaluation("a", [0.1, 0.2]), evaluation("b", [0.1, 0.2]))["meta_metric"]
+    assert equal.verdict == "no difference: equal in all 2 scenarios."
+    shifted = compare(evaluation("a", [0.1, 0.2, 0.3]), evaluation("b", [0.2, 0.3, 0.4]))["meta_metric"]
+    assert shifted.verdict == "difference: +0.1000 in every one of the 3 scenarios."
+    assert shifted.is_difference
+
+
+def test_scenarios_without_a_value_in_both_are_left_out():
+    row = compare_paired("time_to_collision_likelihood", np.array([np.nan, 0.2, 0.4]), np.array([0.1, 0.3, np.nan]))
+    assert (row.count, row.mean_a, row.mean_b) == (1, 0.2, 0.3)
+    neither = compare_paired("time_to_collision_likelihood", np.array([np.nan]), np.array([0.1]))
+    assert neither.verdict.startswith("nothing to compare")
+
+
+def test_evaluations_of_different_kinds_are_refused():
+    a = evaluation("a", [0.1, 0.2])
+    with pytest.raises(DataError, match="metric is 2025 and 2024"):
+        compare(a, evaluation("b", [0.1, 0.2], metric="2024"))
+    with pytest.raises(DataError, match="num_rollouts is 32 and 8"):
+        compare(a, evaluation("b", [0.1, 0.2], num_rollouts=8))
+    with pytest.raises(DataError, match="no scenario in common"):
+        compare(a, evaluation("b", [0.1, 0.2], ["x", "y"]))
+    with pytest.raises(ConfigError, match="alpha"):
+        compare(a, a, alpha=5.0)
+
+
+def test_an_interval_holds_the_truth_as_often_as_it_says():
+    rng = np.random.default_rng(0)
+    holds = []
+    for _ in range(2000):
+        a = rng.normal(size=12)
+        low, high = compare_paired("kinematic", a, a + 0.3 + rng.normal(size=12), alpha=0.1).interval
+        holds.append(low <= 0.3 <= high)
+    assert abs(np.mean(holds) - 0.9) < 0.025  # 3.7 standard errors
+
+
+def test_a_table_shows_means_errors_and_which_way_is_better():
+    text = render(format_table(evaluation("base", [0.4, 0.6]), evaluation("tuned", [0.7])))
+    assert "RMM ↑" in text
+    assert "collision rate ↓" in text
+    assert "0.5000 ± 0.1000" in text
+    assert "0.7000 " in text
+    assert "nan" not in text
+
+
+def test_a_comparison_is_shown_with_its_verdict():
+    text = render(format_comparison(compare(evaluation("base", [0.4, 0.6]), evaluation("tuned", [0.5, 0.71]))))
+    assert "tuned against base: 2 scenarios in both" in text
+    assert "+0.1050 ± 0.0050" in text
+    assert "difference, for the better" in text
+
+
+def test_files_of_another_version_are_refused(tmp_path):
+    whole = evaluation("a", [0.1])
+    whole.write(tmp_path / "a.parquet")
+    pq.write_table(whole.table, tmp_path / "b.parquet")
+    assert Evaluation.read(tmp_path / "a.parquet").name == "a"
+    with pytest.raises(DataError, match="not an evaluation of this version"):
+        Evaluation.read(tmp_path / "b.parquet")
+    with pytest.raises(DataError, match="no such evaluation"):
+        Evaluation.read(tmp_path / "c.parquet")
+
+
+def test_provenance_lists_what_differs():
+    one = evaluation("a", [0.1]).provenance
+    assert one.differences(replace(one, dataset="/moved", config=replace(one.config, jobs=3, limit=9))) == []
+    assert one.differences(replace(one, manifest_sha256="b", config=replace(one.config, seed=3))) == [
+        "manifest_sha256",
+        "seed",
+    ]
+
+
+def test_differences_and_comparisons_are_shown_in_a_line():
+    comparison = compare(evaluation("base", [0.4, 0.6]), evaluation("tuned", [0.5, 0.71]))
+    assert repr(comparison["meta_metric"]).startswith(
+        "meta_metric: 0.5000 -> 0.6050, difference, for the better: +0.10"
+    )
+    assert repr(comparison).startswith("tuned against base, 2 scenarios in both; meta_metric: 0.5000 -> 0.6050")
+
+
+def test_a_folder_and_a_scenario_with_two_rows_are_refused(tmp_path):
+    for name in ("base", "tuned"):
+        evaluation(name, [0.1, 0.2]).write(tmp_path / f"{name}.parquet")
+    with pytest.raises(DataError, match=r"is a folder: name one of base\.parquet, tuned\.parquet\.$"):
+        Evaluation.read(tmp_path)
+    twice = evaluation("twice", [0.1, 0.2], ["x", "x"])
+    for pair in ((twice, evaluation("b", [0.1], ["x"])), (evaluation("b", [0.1], ["x"]), twice)):
+        with pytest.raises(DataError, match="twice: scenario x has several rows, a pair needs one"):
+            compare(*pair)

@@ -1,0 +1,91 @@
+import numpy as np
+import pytest
+from rollout_drawing import draw_arrays, write_npz
+
+import scenes
+from rlftsim.evaluation.explain import WHOLE_FUTURE, explain
+from rlftsim.evaluation.explain_page import explain_rollouts, explanation_html
+from rlftsim.evaluation.rollout_files import find_rollouts, read_states
+from rlftsim.evaluation.score_files import ScoreConfig
+from rlftsim.realism import METRIC_2023, METRIC_2025, SimulatedStates
+from rlftsim.realism.config import FEATURE_NAMES
+from rlftsim.realism.from_rollouts import logged_states
+from rlftsim.scenario.dataset import write_dataset
+
+
+@pytest.fixture(scope="module")
+def scenario():
+    return scenes.junction_with_light()
+
+
+@pytest.fixture(scope="module")
+def states(scenario, tmp_path_factory):
+    path = write_npz(tmp_path_factory.mktemp("explain") / "a.npz", draw_arrays(scenario))
+    return read_states(find_rollouts(path)[0])
+
+
+@pytest.mark.parametrize("config", [METRIC_2025, METRIC_2023])
+def test_costs_add_up_to_what_lies_between_score_and_ceiling(scenario, states, config):
+    explanation = explain(scenario, states, config)
+    assert explanation.cost.shape == (10, len(scenario.evaluated_indices), 81)
+    assert explanation.cost.sum() == pytest.approx(explanation.lost, abs=1e-6)
+    weights = np.array(config.weights)
+    by_feature = weights * (explanation.ceiling.likelihoods - explanation.result.likelihoods).numpy()
+    assert explanation.cost.sum((1, 2)) == pytest.approx(by_feature, abs=1e-6)
+
+
+def test_the_oracle_loses_nothing(scenario):
+    explanation = explain(scenario, logged_states(scenario, num_rollouts=4))
+    assert explanation.lost == 0
+    assert not explanation.cost.any()
+
+
+def test_an_agent_that_leaves_the_road_pays_for_it(scenario, states):
+    ego = int(np.searchsorted(scenario.simulated_indices, scenario.ego_index))
+    y = states.y.clone()
+    y[:, ego, 40:] += 500.0
+    explanation = explain(scenario, SimulatedStates(states.object_id, states.x, y, states.z, states.heading))
+    (row,) = (k for k, name in enumerate(explanation.agent_names) if "ego" in name)
+    off_road, edge = FEATURE_NAMES.index("offroad_indication"), FEATURE_NAMES.index("distance_to_road_edge")
+    assert explanation.cost[off_road, :, WHOLE_FUTURE].argmax() == row
+    assert explanation.event_fraction[1, row, 40:44].all()
+    assert explanation.cost[edge, row, :WHOLE_FUTURE].sum() > 0
+
+
+def test_histograms_are_fractions_over_the_official_bins(scenario, states):
+    for histogram in explain(scenario, states).histograms:
+        assert len(histogram.edges) == len(histogram.log_fraction) + 1
+        assert histogram.log_fraction.sum() == pytest.approx(1)
+        assert histogram.rollout_fraction.sum() == pytest.approx(1)
+
+
+def test_the_page_needs_no_network_and_names_feature_agent_and_ceiling(scenario, states):
+    explanation = explain(scenario, states)
+    page = explanation_html(explanation)
+    assert "http" not in page.replace("http://www.w3.org", "")
+    for text in (f"{float(explanation.ceiling.meta_metric):.4f}", "time to collision", *explanation.agent_names):
+        assert text in page
+
+
+def test_every_scenario_has_a_page_and_other_rollouts_another_one(scenario, tmp_path):
+    write_dataset([scenario, scenes.lone_agent(), scenes.without_road_edges()], tmp_path / "data")
+    (tmp_path / "rollouts").mkdir()
+    for one in (scenario, scenes.lone_agent(), scenes.without_road_edges()):
+        write_npz(tmp_path / "rollouts" / f"{one.scenario_id}.npz", draw_arrays(one, num_rollouts=2))
+    config = ScoreConfig(jobs=1, missing_map="skip")
+    pages = explain_rollouts(tmp_path / "rollouts", tmp_path / "data", tmp_path / "out", config)
+    assert [page.name for page in pages] == ["junction.html", "lone.html"]
+    before = pages[0].read_text()
+    arrays = draw_arrays(scenario, num_rollouts=2)
+    write_npz(tmp_path / "rollouts" / "junction.npz", {**arrays, "x": arrays["x"] + 3})
+    explain_rollouts(tmp_path / "rollouts", tmp_path / "data", tmp_path / "out", config)
+    assert pages[0].read_text() != before
+
+
+def test_pages_of_several_sets_of_a_scenario_are_numbered(scenario, tmp_path):
+    write_dataset([scenario], tmp_path / "data")
+    for policy in "abc":
+        (tmp_path / "rollouts" / policy).mkdir(parents=True)
+        write_npz(tmp_path / "rollouts" / policy / "s.npz", draw_arrays(scenario, num_rollouts=2))
+    pages = explain_rollouts(tmp_path / "rollouts", tmp_path / "data", tmp_path / "out", ScoreConfig(jobs=1))
+    assert [page.name for page in pages] == ["junction.html", "junction-2.html", "junction-3.html"]

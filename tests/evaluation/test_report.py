@@ -1,0 +1,171 @@
+import io
+import math
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from rlftsim.evaluation.report import (
+    ChartGroup,
+    PairedComparison,
+    Report,
+    ResultRow,
+    report_html,
+    report_table,
+    write_report,
+)
+from rlftsim.statistics import MeanInterval, interval_around
+from rlftsim.viewer.chart import Chart, Curve
+from rlftsim.viewer.page import Animation, Panel
+from rlftsim.viewer.scene import AgentBoxes, MapLine, SceneMotion, SceneView
+
+SVG_NAMESPACE = "http://www.w3.org/2000/svg"
+VOID = {"meta", "input", "br"}
+
+
+class Nesting(HTMLParser):
+    """Checks that every element is closed in order (SVG shapes that close themselves excepted)."""
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.seen = [], []
+
+    def handle_starttag(self, tag, attrs):
+        self.seen.append(tag)
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.seen.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+def measured(mean: float, error: float = math.nan) -> MeanInterval:
+    return interval_around(mean, error, 1000 if math.isfinite(error) else 1)
+
+
+def parse(html: str) -> list[str]:
+    """Names of all elements, in order."""
+    parser = Nesting()
+    parser.feed(html)
+    assert parser.open == []
+    return parser.seen
+
+
+def draw_animation() -> Animation:
+    """One car that drives along x, logged and simulated."""
+    boxes = AgentBoxes(*(np.array([v]) for v in (7, 1, 4.5, 2.0, True, True)))
+    scene = SceneView("drawn", (MapLine("lane", np.array([[-50.0, 0], [50, 0]])),), (), boxes, (0.0, 0.0, 40.0))
+    position = np.stack([np.arange(91) - 10.0, np.zeros(91)], -1)[None, None]
+    motion = SceneMotion(position, np.zeros((1, 1, 91)), np.ones((1, 1, 91), bool))
+    return Animation("A drive", scene, [Panel("Logged", motion), Panel("Base", motion), Panel("Fine-tuned", motion)])
+
+
+@pytest.fixture
+def report() -> Report:
+    loss = Curve("training", range(100), np.exp(-np.arange(100) / 30))
+    return Report(
+        title="Fine-tuning <demo>",
+        summary=["Fine-tuned beats base & all."],
+        rows=[
+            ResultRow("base", {"meta_metric": measured(0.7, 0.01), "collision_rate": measured(0.051, 0.002)}),
+            ResultRow(
+                "fine-tuned", {"meta_metric": measured(0.72, 0.01), "collision_rate": measured(0.04)}, emphasized=True
+            ),
+            ResultRow("oracle", {"meta_metric": measured(0.9, 0.01)}, note="the log"),
+        ],
+        comparison=PairedComparison(
+            "base", "fine-tuned", 0.02, (0.01, 0.03), 0.0004, 3, differences=[0.01, 0.02, 0.03]
+        ),
+        chart_groups=[ChartGroup("Pre-training", [Chart("Loss", "update", "nats", [loss])])],
+        animations=[draw_animation(), draw_animation()],
+        facts={"command": "rlftsim demo <quick>"},
+        footnotes=["Synthetic numbers say nothing about WOMD."],
+    )
+
+
+def test_whole_report_is_well_formed_and_complete(report, tmp_path):
+    write_report(tmp_path / "runs" / "report.html", report)
+    html = (tmp_path / "runs" / "report.html").read_text()
+    tags = parse(html)
+    assert tags.count("table") == 1
+    assert tags.count("canvas") == 6
+    for heading in ("Results", "Scenarios in motion", "Pre-training", "How this was made", "Notes"):
+        assert f"<h2>{heading}</h2>" in html
+    assert [p.name for p in (tmp_path / "runs").iterdir()] == ["report.html"]
+
+
+def test_report_loads_nothing_from_elsewhere(report):
+    html = report_html(report).replace(SVG_NAMESPACE, "")
+    assert not re.search(r"<link|<img|<iframe|@import|\b(src|href)\s*=|url\(|https?://", html)
+
+
+def test_texts_are_escaped(report):
+    html = report_html(report)
+    assert "Fine-tuning &lt;demo&gt;" in html
+    assert "beats base &amp; all" in html
+    assert "rlftsim demo &lt;quick&gt;" in html
+    assert "<demo>" not in html
+
+
+def test_report_with_nothing_but_a_title_is_a_page():
+    tags = parse(report_html(Report("Empty")))
+    assert "h1" in tags
+    assert not {"h2", "table", "canvas"} & set(tags)
+
+
+@pytest.mark.parametrize(
+    "missing",
+    [{"rows": ()}, {"comparison": None}, {"chart_groups": ()}, {"animations": ()}, {"facts": {}}, {"footnotes": ()}],
+    ids=lambda missing: next(iter(missing)),
+)
+def test_each_part_may_be_missing(report, missing):
+    parse(report_html(Report(**{**vars(report), **missing})))
+
+
+def test_table_shows_mean_standard_error_and_interval(report):
+    html = report_html(report)
+    # 0.7 ± 1.962 x 0.01 (t, 999 degrees of freedom); a rate of 0.051 is 5.1 %
+    assert '<td title="95 % interval 0.6804 to 0.7196">0.7000 <span class="error">± 0.0100</span></td>' in html
+    assert '5.10 <span class="error">± 0.20</span>' in html
+    assert "<td>4.00</td>" in html  # no standard error, no interval
+    assert "kinematic" not in re.search(r"<thead>.*</thead>", html)[0]  # no row has it
+
+
+def test_missing_and_undefined_numbers_are_dashes():
+    rows = [ResultRow(name, {"meta_metric": measured(mean)}) for name, mean in (("a", math.nan), ("b", 0.5))]
+    html = report_html(Report("t", rows=rows))
+    assert html.count("<td>–</td>") == 1
+    assert "nan" not in re.search(r"<table.*</table>", html)[0]
+
+
+@pytest.mark.parametrize(
+    ("interval", "words"),
+    [((0.01, 0.03), "scores higher"), ((-0.03, -0.01), "scores lower"), ((-0.01, 0.03), "No difference")],
+)
+def test_verdict_follows_the_interval(interval, words):
+    comparison = PairedComparison("base", "fine-tuned", 0.01, interval, 0.04, 20)
+    assert words in comparison.verdict_text
+    assert words in report_html(Report("t", comparison=comparison))
+
+
+def test_own_verdict_is_kept():
+    comparison = PairedComparison("a", "b", 0.01, (0.0, 0.1), 0.5, 2, verdict="Too few to tell.")
+    assert comparison.verdict_text == "Too few to tell."
+
+
+def test_terminal_table_has_the_same_numbers(report):
+    out = io.StringIO()
+    Console(file=out, width=120, markup=False).print(report_table(report))
+    text = out.getvalue()
+    assert "0.7000 ± 0.0100" in text
+    assert "collision [%] ↓" in text
+    assert "5.10 ± 0.20" in text
+
+
+def test_report_without_rows_prints_an_empty_table():
+    Console(file=io.StringIO()).print(report_table(Report("Empty")))

@@ -1,0 +1,1 @@
+from tiny_fixtures import drawn_scenarios, measured, simulated, vocabulary  # noqa: F401

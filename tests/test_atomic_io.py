@@ -1,0 +1,108 @@
+"""Files are there whole or not at all."""
+
+import errno
+import os
+import resource
+import stat
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from rlftsim.atomic_io import append_text, errors_name, save_tensors, write_text, write_whole
+from rlftsim.errors import DataError
+
+
+def names(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_a_failed_write_leaves_the_old_file_and_no_other(tmp_path, monkeypatch):
+    write_text(tmp_path / "page.html", "old")
+
+    def fail(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", fail)
+    with pytest.raises(DataError, match=r"cannot write .*page\.html \(No space left on device\): make room"):
+        write_text(tmp_path / "page.html", "new")
+    assert names(tmp_path) == ["page.html"]
+    assert (tmp_path / "page.html").read_text() == "old"
+
+
+def test_an_interrupted_write_leaves_nothing(tmp_path):
+    def stopped(path):
+        path.write_text("half")
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_whole(tmp_path / "page.html", stopped)
+    assert names(tmp_path) == []
+
+
+def test_a_folder_that_is_a_file_is_named(tmp_path):
+    (tmp_path / "runs").write_text("")
+    cause = r"cannot write .*runs/config\.json \((Not a directory|File exists)\)"
+    with pytest.raises(DataError, match=rf"{cause}: \S+/runs is a file, not a folder: choose another place\.$"):
+        write_text(tmp_path / "runs" / "config.json", "{}")
+
+
+def test_only_a_full_disk_needs_room(tmp_path):
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(DataError, match=r"cannot write .*/folder \(Is a directory\): it is a folder: name a file\.$"):
+        write_text(tmp_path / "folder", "text")
+    with pytest.raises(DataError, match=r"\(Permission denied\): choose another place"), errors_name(tmp_path):
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+
+def test_tensors_come_back_and_all_users_may_read_them(tmp_path):
+    save_tensors(tmp_path / "new" / "a.safetensors", {"x": torch.arange(6.0).view(2, 3).T})
+    assert torch.equal(load_file(tmp_path / "new" / "a.safetensors")["x"], torch.arange(6.0).view(2, 3).T)
+    mask = os.umask(0)
+    os.umask(mask)
+    assert stat.S_IMODE((tmp_path / "new" / "a.safetensors").stat().st_mode) == 0o666 & ~mask
+
+
+@pytest.fixture
+def full_disk():
+    """No file may grow beyond a kilobyte, as if the disk were full behind it."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1024, before[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.mark.parametrize(
+    "write",
+    [
+        lambda path: write_text(path, "x" * 5000),
+        lambda path: append_text(path, "x" * 5000),
+        lambda path: save_tensors(path, {"x": torch.zeros(5000)}),
+        lambda path: write_whole(path, lambda temporary: temporary.write_bytes(b"x" * 5000)),
+    ],
+    ids=["write_text", "append_text", "save_tensors", "write_whole"],
+)
+def test_a_write_that_does_not_fit_names_its_path_in_one_line(write, tmp_path, full_disk):
+    (tmp_path / "run").mkdir()
+    with pytest.raises(DataError, match=r"cannot write .*run/file \(.+\): make room or choose another place") as caught:
+        write(tmp_path / "run" / "file")
+    assert "\n" not in str(caught.value)
+    assert [name for name in names(tmp_path / "run") if name.startswith(".")] == []  # no temporary file
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="a device that is always full")
+def test_a_full_disk_is_named_where_lines_are_added():
+    with pytest.raises(DataError, match=r"cannot write /dev/full \(No space left on device\): make room"):
+        append_text(Path("/dev/full"), "a line\n")
+
+
+def test_lines_are_added_to_what_is_there(tmp_path):
+    append_text(tmp_path / "lines", "one\n")
+    append_text(tmp_path / "lines", "two\n")
+    assert (tmp_path / "lines").read_text() == "one\ntwo\n"
+
+
+def test_errors_that_are_not_of_the_system_pass_as_they_are(tmp_path):
+    with pytest.raises(KeyError), errors_name(tmp_path):
+        raise KeyError("x")

@@ -1,0 +1,58 @@
+"""The report on a vocabulary: whole or not at all, and its numbers are those that were measured."""
+
+import json
+
+import pytest
+
+import scenes
+from rlftsim.errors import DataError
+from rlftsim.scenario.types import ObjectType
+from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
+from rlftsim.tokens.coverage import measure_coverage
+from rlftsim.viewer import vocabulary_report
+from rlftsim.viewer.vocabulary_report import ROWS, write_vocabulary_report
+
+
+@pytest.fixture(scope="module")
+def classes():
+    """Of a vocabulary without cyclists."""
+    data = [scenes.build_scenario("two", tuple(m for m in scenes.TRAFFIC if m.kind != ObjectType.CYCLIST))]
+    vocabulary, radii = build_vocabulary(data, TokensConfig(num_tokens=64, num_map_prototypes=4))
+    return measure_coverage(data, vocabulary, radii_m=radii)
+
+
+def test_page_numbers_and_picture_stand_in_one_folder(classes, tmp_path):
+    folder = tmp_path / "new" / "v.report"
+    for _ in range(2):  # the second gives way to the first
+        write_vocabulary_report(folder, classes, vocabulary="v", data="two cars")
+    assert {p.name for p in folder.iterdir()} == {"report.md", "report.json", "picture.png"}
+    assert [p.name for p in folder.parent.iterdir()] == ["v.report"]
+    assert (folder / "picture.png").read_bytes().startswith(b"\x89PNG")
+    page = (folder / "report.md").read_text()
+    assert all(name in page for name in ROWS)
+    numbers = json.loads((folder / "report.json").read_text())["classes"]
+    assert numbers["vehicle"]["num_motions"] == classes[0].single_m.count > 0
+    assert numbers["vehicle"]["rolling_error_m"]["p95"] == classes[0].rolling_m.p95
+    assert numbers["cyclist"]["num_tokens"] == 1
+    assert numbers["cyclist"]["token_0_stands_still"] is True
+
+
+def test_a_folder_with_other_things_in_it_is_left_alone(classes, tmp_path):
+    (tmp_path / "thesis.tex").write_text("x")
+    with pytest.raises(DataError, match=r"not a report on a vocabulary.*--report"):
+        write_vocabulary_report(tmp_path, classes, vocabulary="v", data="two cars")
+    assert (tmp_path / "thesis.tex").read_text() == "x"
+
+
+def test_what_goes_wrong_half_way_leaves_the_old_report(classes, tmp_path, monkeypatch):
+    folder = tmp_path / "v.report"
+    write_vocabulary_report(folder, classes, vocabulary="old", data="two cars")
+
+    def full(*_, **__):
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(vocabulary_report, "coverage_picture", full)
+    with pytest.raises(DataError, match="no space left"):
+        write_vocabulary_report(folder, classes, vocabulary="new", data="two cars")
+    assert (folder / "report.md").read_text().startswith("# A vocabulary\n\nold")
+    assert [p.name for p in tmp_path.iterdir()] == ["v.report"]
