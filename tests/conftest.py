@@ -4,6 +4,13 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+from rlftsim.experiments.registry import EXPERIMENTS
+from rlftsim.plugins import is_ours
+from rlftsim.policies.registry import POLICIES
+from rlftsim.recipes.registry import RECIPES
+from rlftsim.rewards.base import REWARDS
+from rlftsim.scenario.sources import SOURCES
+
 # slow machines are no failure; the same examples every time
 settings.register_profile("rlftsim", deadline=None, derandomize=True)
 settings.load_profile("rlftsim")
@@ -16,3 +23,12 @@ def shared() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no official material at {folder}: set RLFTSIM_SHARED to compare with it")
     return folder
+
+
+@pytest.fixture(autouse=True)
+def forget_registered_names():
+    """Names that a test registers are forgotten after it, so that no other test of the same process finds them."""
+    yield
+    for point in (REWARDS, POLICIES, SOURCES, RECIPES, EXPERIMENTS):
+        for name in [name for name, value in point._registered.items() if not is_ours(value)]:
+            point.remove(name)
