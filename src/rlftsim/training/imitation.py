@@ -10,6 +10,7 @@ import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -29,8 +30,8 @@ from rlftsim.tokens.vocabulary import Vocabulary
 from rlftsim.training.batches import micro_batches, scenario_costs
 from rlftsim.training.data import batch_with_futures, trained_agents
 from rlftsim.training.freezing import parameter_groups, set_learning_rate
-from rlftsim.training.parallel import DeviceConfig, Fabric, all_reduce_gradients, all_reduce_sum, start_fabric
-from rlftsim.training.run import Learner, TrainingRun, UpdateReport
+from rlftsim.training.parallel import DeviceConfig, Fabric, all_reduce_gradients, all_reduce_sum, num_sharing_memory
+from rlftsim.training.run import Learner, TrainingRun, UpdateReport, train_in_processes
 from rlftsim.training.validation import ValidationConfig, refuse_to_validate, validate
 
 IMPOSSIBLE = -1e8
@@ -51,10 +52,11 @@ class ImitationConfig:
     batch_size: int = 80
     """Scenarios per update, over all processes."""
     micro_batch_size: int = 8
-    """Scenarios in memory at once, at most; gradients add up over the rest."""
+    """Scenarios in memory at once, at most, on each GPU or in all processes on a CPU together; gradients add up over
+    the rest."""
     micro_batch_cost: float | None = None
     """Thousands of map points in memory at once, at most, an agent counted as 200: large scenarios come in
-    smaller groups. None = no limit."""
+    smaller groups. Processes on a CPU share it. None = no limit."""
     learning_rate: float = 5e-4
     """At its highest, after the warm-up."""
     final_lr_ratio: float = 0.01
@@ -153,7 +155,23 @@ def imitate(
         )
     if held_out is not None and config.validation.every:
         refuse_to_validate(model, held_out)
-    fabric = start_fabric(config.device)
+    train = partial(_imitate, model, scenarios, out, predict, title=title, held_out=held_out, card=card)
+    return train_in_processes(train, config, len(scenarios), out)
+
+
+def _imitate(
+    model: Any,
+    scenarios: Scenarios,
+    out: str | os.PathLike[str],
+    predict: Predict,
+    config: ImitationConfig,
+    fabric: Fabric,
+    *,
+    title: str,
+    held_out: Scenarios | None,
+    card: str,
+) -> Path:
+    """Training in one of the processes of a run."""
     run = TrainingRun(model, scenarios, out, config, fabric)
     # Dropout is on: unlike fine-tuning with rewards, imitation has no sampled log-probabilities to reproduce.
     model.to(fabric.device).train()
@@ -211,8 +229,10 @@ def _update(learner: _Imitator, update: int) -> dict[str, float]:
     # 1. Gradients of the summed loss add up over micro batches.
     names: list[str] = []  # of further metrics; every micro batch has the same
     sums = torch.zeros((), device=fabric.device)  # becomes [2 + names]: loss, further metrics, number of predictions
-    own = run.local_indices(update, learner.costs)
-    for micro in micro_batches(own, learner.costs, max_count=config.micro_batch_size, max_cost=config.micro_batch_cost):
+    own, sharing = run.local_indices(update, learner.costs), num_sharing_memory(fabric)
+    max_count = max(config.micro_batch_size // sharing, 1)
+    max_cost = None if config.micro_batch_cost is None else config.micro_batch_cost / sharing
+    for micro in micro_batches(own, learner.costs, max_count=max_count, max_cost=max_cost):
         batch = batch_with_futures(run.scenarios, micro, context_radius_m=config.context_radius_m).to(fabric.device)
         trained = trained_agents(
             batch, update, radius_m=config.trained_radius_m, limit=config.max_trained_agents, seed=config.seed

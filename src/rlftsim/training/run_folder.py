@@ -36,7 +36,7 @@ PACKAGES = ("torch", "numpy", "pyarrow", "lightning-fabric", "safetensors")
 """Packages whose versions are stored with a run."""
 
 MAY_CHANGE = (
-    *("checkpoint_every", "device.accelerator", "device.devices", "device.num_nodes", "device.threads"),
+    *("checkpoint_every", "device.accelerator", "device.processes", "device.num_nodes", "device.threads"),
     *("micro_batch_size", "micro_batch_cost", "rollouts_per_pass", "validation", "goals.augmented"),
 )
 """Settings, or whole groups of them, that may have other values when a run is resumed: they change no estimate.
@@ -91,6 +91,21 @@ def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     for name, value in values.items():
         flat |= flatten(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
     return flat
+
+
+def stored_settings(path: Path) -> dict[str, Any]:
+    """Settings and inputs of the run in a folder, by the names of today; empty where no run has begun.
+
+    Raises:
+        CheckpointError: the file that holds them is damaged.
+    """
+    file = path / "config.json"
+    if not file.exists():
+        return {}
+    try:
+        return current_names(json.loads(file.read_text()))
+    except (ValueError, AttributeError) as error:
+        raise CheckpointError(f"{file}: damaged ({error}): remove the folder {path} to start anew.") from None
 
 
 def to_plain(config: Any) -> Any:
@@ -148,14 +163,10 @@ class RunFolder:
             write_text(path / "environment.json", json.dumps(describe_environment(), indent=1) + "\n")
 
     def _refuse_other(self, config: Any) -> None:
-        """Compare with the stored settings, which may have names of an earlier version."""
-        path = self.path / "config.json"
-        if not path.exists():
+        """Compare with the settings of the run that was begun here."""
+        old, new = flatten(stored_settings(self.path)), flatten(config)
+        if not old:
             return
-        try:
-            old, new = flatten(current_names(json.loads(path.read_text()))), flatten(config)
-        except (ValueError, AttributeError) as error:
-            raise CheckpointError(f"{path}: damaged ({error}): remove the folder {self.path} to start anew.") from None
         # Two versions of one kind of run share most names, two kinds do not: a list of them all would explain nothing.
         if len(old.keys() ^ new.keys()) > len(old.keys() & new.keys()):
             raise CheckpointError(
