@@ -62,17 +62,21 @@ class SmartRecipe(Recipe):
 
 def smart_tiny_rlftsim() -> SmartRecipe:
     """The paper: SMART-tiny (7 M), pre-trained on WOMD for 32 epochs, fine-tuned for one."""
-    return SmartRecipe(model=smart_tiny())
+    return SmartRecipe(model=replace(smart_tiny(), frequency_init="log_spaced"))
 
 
 def smart_mini_rlftsim() -> SmartRecipe:
     """SMART-mini (3 M)."""
-    return SmartRecipe(model=smart_mini())
+    return SmartRecipe(model=replace(smart_mini(), frequency_init="log_spaced"))
 
 
 def smart_nano_rlftsim() -> SmartRecipe:
     """SMART-nano (1 M): fits one small GPU."""
-    return SmartRecipe(model=smart_nano(), pretrain=PretrainConfig(batch_size=16), catk=CatkConfig(batch_size=16))
+    return SmartRecipe(
+        model=replace(smart_nano(), frequency_init="log_spaced"),
+        pretrain=PretrainConfig(batch_size=16),
+        catk=CatkConfig(batch_size=16),
+    )
 
 
 def smart_demo_rlftsim() -> SmartRecipe:
