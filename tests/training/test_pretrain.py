@@ -209,7 +209,12 @@ def test_the_average_of_the_weights_is_saved_and_resumes(vocabulary, drawn_scena
 
 
 @pytest.mark.parametrize(
-    ("setting", "message"), [({"still_weight": 1.5}, "still_weight is a weight"), ({"ema_decay": 1.0}, "ema_decay is")]
+    ("setting", "message"),
+    [
+        ({"still_weight": 1.5}, "still_weight is a weight"),
+        ({"ema_decay": 1.0}, "ema_decay is"),
+        ({"mirror_probability": -0.1}, "mirror_probability is a probability"),
+    ],
 )
 def test_impossible_weights_are_refused(setting, message):
     with pytest.raises(ConfigError, match=message):

@@ -28,7 +28,7 @@ from rlftsim.scenario.types import Scenarios
 from rlftsim.tokens.smoothing import summed_log_prob_nearby
 from rlftsim.tokens.vocabulary import STILL_TOKEN, Vocabulary
 from rlftsim.training.batches import micro_batches, scenario_costs
-from rlftsim.training.data import batch_with_futures, trained_agents
+from rlftsim.training.data import batch_with_futures, mirrored_of_update, trained_agents
 from rlftsim.training.freezing import parameter_groups, set_learning_rate
 from rlftsim.training.parallel import DeviceConfig, Fabric, all_reduce_gradients, all_reduce_sum, start_fabric
 from rlftsim.training.run import Learner, TrainingRun, UpdateReport
@@ -79,6 +79,9 @@ class ImitationConfig:
     """Agents farther from the ego at the current step are context only."""
     max_trained_agents: int | None = 32
     """Of a scenario; the evaluated ones always, the rest at random. None = all."""
+    mirror_probability: float = 0.0
+    """Probability of a scenario to be seen mirrored, left and right exchanged: twice the scenes, but half of them with
+    traffic on the other side of the road."""
     still_weight: float = 1.0
     """Weight of a prediction whose target stands still, in the loss and all metrics; others count 1. Three quarters of
     all tokens stand and few turn, so a small weight teaches more per update. Needs a policy with a vocabulary."""
@@ -103,6 +106,8 @@ class ImitationConfig:
         require_finite(self, ("epochs", "learning_rate", "weight_decay"))
         if not 0 <= self.final_lr_ratio <= 1:
             raise ConfigError(f"final_lr_ratio is a fraction in [0, 1], got {self.final_lr_ratio}.")
+        if not 0 <= self.mirror_probability <= 1:
+            raise ConfigError(f"mirror_probability is a probability in [0, 1], got {self.mirror_probability}.")
         if not 0 <= self.still_weight <= 1:
             raise ConfigError(f"still_weight is a weight in [0, 1], got {self.still_weight}.")
         if self.ema_decay is not None and not 0 < self.ema_decay < 1:
@@ -185,7 +190,9 @@ def imitate(
     if not isinstance(getattr(model, "vocabulary", None), Vocabulary):
         name = type(model).__name__
         if config.label_smoothing_kind == "spatial":
-            raise ConfigError(f"{name} has no vocabulary, so nothing is near a token: set label_smoothing_kind=uniform.")
+            raise ConfigError(
+                f"{name} has no vocabulary, so nothing is near a token: set label_smoothing_kind=uniform."
+            )
         if config.still_weight != 1.0:
             raise ConfigError(f"{name} has no vocabulary, so no token is known to stand still: set still_weight=1.")
     if held_out is not None and config.validation.every:
@@ -250,8 +257,13 @@ def _update(learner: _Imitator, update: int) -> dict[str, float]:
     names: list[str] = []  # of further metrics; every micro batch has the same
     sums = torch.zeros((), device=fabric.device)  # becomes [2 + names]: loss, further metrics, number of predictions
     own = run.local_indices(update, learner.costs)
+    mirror = (
+        mirrored_of_update(update, own, config.mirror_probability, config.seed) if config.mirror_probability else ()
+    )
     for micro in micro_batches(own, learner.costs, max_count=config.micro_batch_size, max_cost=config.micro_batch_cost):
-        batch = batch_with_futures(run.scenarios, micro, context_radius_m=config.context_radius_m).to(fabric.device)
+        batch = batch_with_futures(run.scenarios, micro, context_radius_m=config.context_radius_m, mirror=mirror).to(
+            fabric.device
+        )
         trained = trained_agents(
             batch, update, radius_m=config.trained_radius_m, limit=config.max_trained_agents, seed=config.seed
         )

@@ -76,9 +76,7 @@ def measure_map_use(policy: PretrainablePolicy, batch: ScenarioBatch) -> MapUse:
     return MapUse(torch.stack([columns.sum(0), columns[turning].sum(0)]))
 
 
-def _vehicle_losses(
-    policy: PretrainablePolicy, batch: ScenarioBatch
-) -> tuple[Float[Tensor, "r"], Bool[Tensor, "r"]]:
+def _vehicle_losses(policy: PretrainablePolicy, batch: ScenarioBatch) -> tuple[Float[Tensor, "r"], Bool[Tensor, "r"]]:
     """Cross-entropy of each predicted vehicle token, nats; and True where the token turns."""
     vocabulary: Vocabulary = policy.vocabulary  # type: ignore[attr-defined]
     predicted: Prediction = policy.teacher_forced(batch, batch.agent_mask)

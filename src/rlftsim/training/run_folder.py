@@ -174,8 +174,8 @@ class RunFolder:
             raise CheckpointError(
                 f"{self.path} belongs to a run of another kind: name another --out, or remove the folder to start anew."
             )
-        # A setting that was added after the run began has the default, with which runs are as before. Any other that only
-        # one side has counts as different: None stands for it.
+        # A setting that was added after the run began has its default, with which runs are as before. Any other that
+        # only one side has counts as different: None stands for it.
         old = {name: defaults.get(name) for name in new} | old
         differing = sorted(k for k in old.keys() | new.keys() if not may_change(k) and old.get(k) != new.get(k))
         if differing:
