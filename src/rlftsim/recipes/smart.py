@@ -104,6 +104,18 @@ def smart_demo_rlftsim() -> SmartRecipe:
     )  # fmt: skip
 
 
+def smart_demo_long() -> SmartRecipe:
+    """The demo's model, pre-trained for an hour of one core or more on thousands of scenarios."""
+    recipe = smart_demo_rlftsim()
+    return replace(
+        recipe,
+        # Scenarios that are seen a few times leave nothing to learn by heart, so the effort goes into reading the map:
+        # moving tokens, more map tokens, and a history that is often hidden.
+        model=replace(recipe.model, history_drop=0.2, max_agent_map_neighbors=32),
+        pretrain=replace(recipe.pretrain, epochs=6.0, still_weight=0.15, ema_decay=0.998, final_lr_ratio=0.0),
+    )
+
+
 def smart_demo_quick() -> SmartRecipe:
     """The demo's stages, each at the smallest size that still exercises it."""
     recipe = smart_demo_rlftsim()
