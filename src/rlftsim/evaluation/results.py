@@ -43,6 +43,7 @@ SCORE_COLUMNS = (
     "average_displacement_error",
     "collision_rate",
     "offroad_rate",
+    "unlogged_offroad_rate",
     "traffic_light_violation_rate",
     "miss_rate",
     "passing_miss_rate",
@@ -60,6 +61,9 @@ SCHEMA = pa.schema(
         *(pa.field(name, pa.float64()) for name in SCORE_COLUMNS),
     ]
 )
+
+ADDED_COLUMNS = ("unlogged_offroad_rate",)
+"""Columns that earlier evaluations lack; NaN when such a file is read."""
 
 GoalsGiven = Literal["none", "logged"]
 
@@ -257,6 +261,10 @@ class Evaluation:
             raise DataError(f"{path}: damaged evaluation ({error}): evaluate again.") from None
         # our part of the file's metadata; pandas and others may add theirs
         about = json.loads((table.schema.metadata or {}).get(b"rlftsim", b"{}"))
+        for name in ADDED_COLUMNS:
+            if name not in table.schema.names:
+                missing = pa.array(np.full(len(table), np.nan))
+                table = table.add_column(SCHEMA.get_field_index(name), SCHEMA.field(name), missing)
         if about.get("format") != FORMAT or table.schema.names != SCHEMA.names:
             raise DataError(f"{path}: not an evaluation of this version: evaluate again.")
         try:

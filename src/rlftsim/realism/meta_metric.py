@@ -49,6 +49,8 @@ class RealismResult:
     collision_rate: Float[Tensor, "*B"]
     """Fraction of (rollout, evaluated agent) pairs that ever collide in simulation while the log is valid."""
     offroad_rate: Float[Tensor, "*B"]
+    unlogged_offroad_rate: Float[Tensor, "*B"]
+    """As `offroad_rate`, over the evaluated agents whose log never leaves the road; NaN if there is none."""
     traffic_light_violation_rate: Float[Tensor, "*B"]
     """Over all evaluated agents, while the likelihood counts vehicles only (as officially)."""
     leave_one_out_meta_metric: Float[Tensor, "*B N"]
@@ -156,6 +158,8 @@ def score_features(log: ScenarioLog, features: Features, config: MetricConfig = 
     displacement = features.displacement_error.mean(-1).repeat_interleave(repeat)
     collision = _any_rate(features.collision, log, repeat)
     offroad = _any_rate(features.offroad, log, repeat)
+    stays = ~(log.features.offroad & log.agents.future_valid).any(-1)[0]  # [E]
+    left = (features.offroad & log.agents.future_valid).any(-1)[:, stays]  # [N, agents that stay in the log]
     light = _any_rate(features.traffic_light_violation, log, repeat)
     return RealismResult(
         scenario_ids=(log.scenario_id,),
@@ -169,6 +173,7 @@ def score_features(log: ScenarioLog, features: Features, config: MetricConfig = 
         min_average_displacement_error=displacement.min(),
         collision_rate=collision.mean(),
         offroad_rate=offroad.mean(),
+        unlogged_offroad_rate=left.to(torch.float32).mean(),
         traffic_light_violation_rate=light.mean(),
         leave_one_out_meta_metric=without_each,
         single_meta_metric=alone,

@@ -100,6 +100,7 @@ RECIPES: ExtensionPoint[Callable[[], Recipe]] = ExtensionPoint(
         "smart-mini": "rlftsim.recipes.smart:smart_mini_rlftsim",
         "smart-nano": "rlftsim.recipes.smart:smart_nano_rlftsim",
         "smart-demo": "rlftsim.recipes.smart:smart_demo_rlftsim",
+        "smart-demo-long": "rlftsim.recipes.smart:smart_demo_long",
         "synthetic": "rlftsim.recipes.smart:smart_synthetic",
     },
 )

@@ -193,12 +193,6 @@ def local_indices(items: list[int], fabric: Fabric, costs: Sequence[float] | Non
     return [items[place] for place in parts[fabric.global_rank]]
 
 
-def num_in_memory(fabric: Fabric) -> int:
-    """Number of processes that share this machine's memory: all on its CPU; GPUs have a memory each."""
-    local = int(os.environ["LOCAL_WORLD_SIZE"]) if is_torchrun() else fabric.world_size
-    return local if fabric.device.type == "cpu" else 1
-
-
 def num_sharing_memory(fabric: Fabric) -> int:
     """Number of processes that have one memory: all on a machine's CPU; each GPU has its own."""
     if fabric.device.type != "cpu":

@@ -79,6 +79,11 @@ class Learner:
         """Modules that a checkpoint holds, by their file name."""
         return {"policy": self.policy}
 
+    @property
+    def result(self) -> Any:
+        """The policy that the run saves in the end."""
+        return self.policy
+
     def to_numbers(self) -> dict[str, float]:
         """Numbers that a checkpoint holds beside the weights."""
         return {}
@@ -278,7 +283,7 @@ class TrainingRun:
                 advance(note=report.note)
         self.folder.close()
         if self._fabric.is_global_zero:
-            learner.policy.eval().save_pretrained(self.folder.model, card=card)
+            learner.result.eval().save_pretrained(self.folder.model, card=card)
         return self.folder.model
 
     def _report(self, learner: Learner, report: UpdateReport) -> None:

@@ -119,6 +119,19 @@ def to_plain(config: Any) -> Any:
     return config if isinstance(config, str | int | float | bool | None) else str(config)
 
 
+def default_settings(config: Any) -> dict[str, Any]:
+    """The defaults of a configuration dataclass's fields and of those nested in it, plain; fields without one are left
+    out."""
+    defaults: dict[str, Any] = {}
+    for field in dataclasses.fields(config) if dataclasses.is_dataclass(config) else ():
+        value = getattr(config, field.name)
+        if dataclasses.is_dataclass(value):
+            defaults[field.name] = default_settings(value)
+        elif field.default is not dataclasses.MISSING:
+            defaults[field.name] = to_plain(field.default)
+    return defaults
+
+
 def describe_environment() -> dict[str, Any]:
     """Versions, machine, command line, and the commit if the package runs from a checkout."""
     git = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=12"]
@@ -157,13 +170,13 @@ class RunFolder:
         self._board: SummaryWriter | None = None
         # Settings and inputs stand in one file: both make a run what it is.
         plain = {**to_plain(config), **(inputs or {})}
-        self._refuse_other(plain)
+        self._refuse_other(plain, flatten(default_settings(config)))
         if writes:
             write_text(path / "config.json", json.dumps(plain, indent=1) + "\n")
             write_text(path / "environment.json", json.dumps(describe_environment(), indent=1) + "\n")
 
-    def _refuse_other(self, config: Any) -> None:
-        """Compare with the settings of the run that was begun here."""
+    def _refuse_other(self, config: Any, defaults: Mapping[str, Any]) -> None:
+        """Compare with the stored settings of the run that was begun here, which may lack later ones."""
         old, new = flatten(stored_settings(self.path)), flatten(config)
         if not old:
             return
@@ -172,7 +185,9 @@ class RunFolder:
             raise CheckpointError(
                 f"{self.path} belongs to a run of another kind: name another --out, or remove the folder to start anew."
             )
-        # A setting that only one side has counts as different: None stands for it.
+        # A setting that was added after the run began has its default, with which runs are as before. Any other that
+        # only one side has counts as different: None stands for it.
+        old = {name: defaults.get(name) for name in new} | old
         differing = sorted(k for k in old.keys() | new.keys() if not may_change(k) and old.get(k) != new.get(k))
         if differing:
             most = 8  # settings named in one line
