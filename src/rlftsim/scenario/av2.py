@@ -27,6 +27,8 @@ from rlftsim.scenario.tfrecord import SkippedRecord
 from rlftsim.scenario.types import (
     CURRENT_STEP,
     HISTORY_STEPS,
+    MEDIAN_SIZE_M,
+    OTHER_SIZE_M,
     STEP_S,
     LightStates,
     MapFeatures,
@@ -57,16 +59,15 @@ OTHER_KINDS = ("static", "background", "construction", "riderless_bicycle", "unk
 """Left out, or `ObjectType.OTHER` with `keep_other`."""
 EGO, OTHER = "ego", "other"
 SIZES_M = {
-    "vehicle": (4.61, 2.06, 1.59),
+    "vehicle": MEDIAN_SIZE_M[ObjectType.VEHICLE],
     "bus": (12.0, 2.9, 3.2),
-    "pedestrian": (0.88, 0.84, 1.70),
-    "cyclist": (1.84, 0.84, 1.77),
+    "pedestrian": MEDIAN_SIZE_M[ObjectType.PEDESTRIAN],
+    "cyclist": MEDIAN_SIZE_M[ObjectType.CYCLIST],
     "motorcyclist": (2.1, 0.9, 1.7),
-    OTHER: (1.0, 1.0, 1.0),
+    OTHER: OTHER_SIZE_M,
     EGO: (4.87, 1.85, 1.48),
 }
-"""Length, width and height where no file of sizes is given: medians of WOMD for vehicles, pedestrians and cyclists, the
-make of the recording vehicle for the ego."""
+"""Length, width and height where no file of sizes is given; for the ego those of the make of the recording vehicles."""
 SPLITS = {"train": "training", "val": "validation", "test": "testing"}
 FOCAL, SCORED = 3, 2
 _COLUMNS = {
@@ -149,7 +150,7 @@ class Av2Source:
                     yield scenario
                     record += 1
                     if num_cut:
-                        yield Tally("tracks to predict that leave through the border of the map: not evaluated", num_cut)
+                        yield Tally("tracks to predict not evaluated, as they leave the ground that the map covers", num_cut)
             except DataError as error:
                 yield SkippedRecord(_id_of(file), record, str(error))
                 record += 1
@@ -202,7 +203,8 @@ def read_scenario(file: Path, source: Av2Source) -> Iterator[tuple[Scenario, int
     whole, category, ego = _read_tracks(file, columns, num_steps, source, ground)
     for first, end in windows:
         suffix = f"-{first}" if len(windows) > 1 else ""
-        yield _cut_window(f"{columns['scenario_id'][0]}{suffix}", whole, category, ego, slice(first, end), map_features, ground)
+        scenario_id = f"{columns['scenario_id'][0]}{suffix}"
+        yield _cut_window(scenario_id, whole, category, ego, slice(first, end), map_features, ground)
 
 
 def _cut_window(
@@ -264,7 +266,8 @@ def _read_columns(file: Path) -> dict[str, np.ndarray]:
     unknown = [name for name in names if name not in _COLUMNS]
     missing = [name for name in _NEEDED if name not in names]
     if unknown or missing or len(set(names)) < len(names):
-        cause = f"the unknown column {unknown[0]}" if unknown else f"no column {missing[0]}" if missing else "a column twice"
+        cause = f"no column {missing[0]}" if missing else "a column twice"
+        cause = f"the unknown column {unknown[0]}" if unknown else cause
         raise DataError(f"{file.name} has {cause}: its schema is not the published one")
     if not table.num_rows:
         raise DataError(f"{file.name} has no rows")
@@ -290,7 +293,8 @@ def _count_steps(file: Path, columns: Mapping[str, np.ndarray]) -> int:
     allowed = (RECORDED_STEPS, OBSERVED_STEPS)
     if announced not in allowed or num_steps not in allowed or num_steps > announced:
         found = announced if announced not in allowed else num_steps
-        raise DataError(f"{file.name} has {found} steps instead of {RECORDED_STEPS} ({OBSERVED_STEPS} in the test split)")
+        wanted = f"{RECORDED_STEPS} ({OBSERVED_STEPS} in the test split)"
+        raise DataError(f"{file.name} has {found} steps instead of {wanted}")
     if step.min() < 0:
         raise DataError(f"{file.name}: row {int(step.argmin())} has the timestep {int(step.min())}")
     wrong = np.flatnonzero(columns["observed"] != (step < OBSERVED_STEPS))

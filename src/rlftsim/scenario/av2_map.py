@@ -5,7 +5,7 @@ area is no curb: such pieces are left out of the road edges, see `find_cuts`.
 """
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -255,14 +255,13 @@ def _topology(
     interpolating = np.zeros(num_features, bool)
     interpolating[: len(lanes)] = [lane.is_intersection for lane in lanes]
 
-    def rows(columns: int, values: Iterable[tuple[int, ...]]) -> np.ndarray:
-        return np.array(list(values), np.int64).reshape(-1, columns)
-
+    before = [(lane.lane_id, other) for lane in lanes for other in lane.predecessors if other in centers]
+    after = [(lane.lane_id, other) for lane in lanes for other in lane.successors if other in centers]
     return LaneTopology(
-        entry_lanes=rows(2, ((lane.lane_id, other) for lane in lanes for other in lane.predecessors if other in centers)),
-        exit_lanes=rows(2, ((lane.lane_id, other) for lane in lanes for other in lane.successors if other in centers)),
-        neighbors=rows(7, neighbors),
-        boundaries=rows(6, boundaries),
+        entry_lanes=np.array(before, np.int64).reshape(-1, 2),
+        exit_lanes=np.array(after, np.int64).reshape(-1, 2),
+        neighbors=np.array(neighbors, np.int64).reshape(-1, 7),
+        boundaries=np.array(boundaries, np.int64).reshape(-1, 6),
         interpolating=interpolating,
     )
 
@@ -270,11 +269,10 @@ def _topology(
 def _read_lane(where: str, value: Any) -> Lane:
     if not isinstance(value, dict):
         raise DataError(f"{where} is no object")
-    missing = [name for name in ("id", "lane_type", "is_intersection", "predecessors", "successors") if name not in value]
-    missing += [f"{side}_{part}" for part in ("lane_mark_type", "neighbor_id") for side in ("left", "right")
-                if f"{side}_{part}" not in value]  # fmt: skip
-    if missing:
-        raise DataError(f"{where} has no {missing[0]}")
+    sided = [f"{side}_{part}" for part in ("lane_mark_type", "neighbor_id") for side in ("left", "right")]
+    for name in ("id", "lane_type", "is_intersection", "predecessors", "successors", *sided):
+        if name not in value:
+            raise DataError(f"{where} has no {name}")
     kind = value["lane_type"]
     if kind not in list(LANE_KINDS):  # a list: the value may be of any type
         raise DataError(f"{where} has the unknown lane type {kind!r}")

@@ -228,7 +228,8 @@ class ShardReader:
             arrays: dict[str, Any] = {
                 name: None if data is None else decode_array(data) for name, data in encoded.items()
             }
-            plain = {name: self._table[name][row].as_py() for name in ("scenario_id", "ego_index", "source", "guessed") if name in known}
+            names = [name for name in ("scenario_id", "ego_index", "source", "guessed") if name in known]
+            plain = {name: self._table[name][row].as_py() for name in names}
             return _from_arrays({**_INDEX_DEFAULTS, **plain}, arrays)
         except (ValueError, OSError, pa.ArrowException) as error:
             cause = "it cannot be read" if isinstance(error, OSError | pa.ArrowException) else error

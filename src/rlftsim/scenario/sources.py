@@ -24,7 +24,7 @@ Installed packages announce theirs by the entry-point group `rlftsim.sources`.
 import inspect
 import os
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -127,13 +127,14 @@ def find_source(
     if reader != AUTO:
         return _source(reader, options)
     # Those that ship come first: then packages of other people are not even imported.
-    for names in (_SHIPPED, SOURCES.names()):
-        found = [name for name in names if getattr(_source(name), "detects", lambda _: False)(path)]
-        if len(found) > 1:
-            raise ConfigError(f"{path} could be read as {' or '.join(found)}: name the data source.")
-        if found:
-            return _source(found[0], options)
-    return _source(DEFAULT_SOURCE, options)
+    found = _detecting(_SHIPPED, path) or _detecting(SOURCES.names(), path)
+    if len(found) > 1:
+        raise ConfigError(f"{path} could be read as {' or '.join(found)}: name the data source.")
+    return _source(found[0] if found else DEFAULT_SOURCE, options)
+
+
+def _detecting(names: Iterable[str], path: str | os.PathLike[str]) -> list[str]:
+    return [name for name in names if getattr(_source(name), "detects", lambda _: False)(path)]
 
 
 def attribution_of(source: str) -> str:

@@ -38,6 +38,16 @@ class ObjectType(IntEnum):
     OTHER = 4
 
 
+MEDIAN_SIZE_M = {
+    ObjectType.VEHICLE: (4.61, 2.06, 1.59),
+    ObjectType.PEDESTRIAN: (0.88, 0.84, 1.70),
+    ObjectType.CYCLIST: (1.84, 0.84, 1.77),
+}
+"""Length, width and height where a log has none: medians of WOMD (18 631 vehicles, 2 288 pedestrians, 127 cyclists)."""
+OTHER_SIZE_M = (1.0, 1.0, 1.0)
+"""The same for all other objects."""
+
+
 class MapFeatureType(IntEnum):
     """Kind of map feature; the numbers of WOMD's `roadgraph_samples/type`."""
 
