@@ -18,7 +18,6 @@ from typing import Literal, get_args
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from jaxtyping import Float
 
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.scenario.av2_map import Ground, read_map
@@ -150,7 +149,9 @@ class Av2Source:
                     yield scenario
                     record += 1
                     if num_cut:
-                        yield Tally("tracks to predict not evaluated, as they leave the ground that the map covers", num_cut)
+                        yield Tally(
+                            "tracks to predict not evaluated, as they leave the ground that the map covers", num_cut
+                        )
             except DataError as error:
                 yield SkippedRecord(_id_of(file), record, str(error))
                 record += 1
@@ -324,9 +325,12 @@ def _read_tracks(
     if (counts > 1).any():
         track, when = divmod(int(cells[counts > 1][0]), num_steps)
         raise DataError(f"{file.name}: track {names[track]} has two rows for timestep {when}")
-    motion = np.column_stack([
-        columns[name].astype(np.float64) for name in ("position_x", "position_y", "heading", "velocity_x", "velocity_y")
-    ])  # fmt: skip [rows, 5]
+    motion = np.column_stack(
+        [
+            columns[name].astype(np.float64)
+            for name in ("position_x", "position_y", "heading", "velocity_x", "velocity_y")
+        ]
+    )  # fmt: skip [rows, 5]
     wrong = np.flatnonzero(~(np.abs(motion) < 1e7).all(1))  # NaN is not, either
     if len(wrong):
         raise DataError(
@@ -344,9 +348,9 @@ def _read_tracks(
     shape = (len(names), num_steps)
     states, valid = np.zeros((*shape, 5)), np.zeros(shape, bool)
     states[owner, step], valid[owner, step] = motion, True
-    size = np.array([
-        source.sizes[EGO if name == "AV" else kind if kind in KINDS else OTHER] for name, kind in zip(names, kinds)
-    ])  # fmt: skip [O, 3]
+    size = np.array(
+        [source.sizes[EGO if name == "AV" else kind if kind in KINDS else OTHER] for name, kind in zip(names, kinds)]
+    )  # fmt: skip [O, 3]
     z = np.zeros(shape)
     z[valid] = ground.heights.at(states[valid][:, :2])
     z += size[:, 2:] / 2  # centers of boxes that stand on the ground
@@ -397,5 +401,7 @@ def _read_sizes(path: Path) -> dict[str, tuple[float, float, float]]:
             raise ConfigError(f"{path}: no kind {kind!r}: known are {', '.join(SIZES_M)}.")
         is_size = isinstance(size, list) and len(size) == 3
         if not is_size or not all(type(v) in (int, float) and 0 < v < 100 for v in size):
-            raise ConfigError(f"{path}: the size of {kind} is {size}: write length, width, height in meters, {example}.")
+            raise ConfigError(
+                f"{path}: the size of {kind} is {size}: write length, width, height in meters, {example}."
+            )
     return {kind: tuple(map(float, size)) for kind, size in given.items()}

@@ -110,9 +110,7 @@ _SHIPPED = {
 SOURCES: ExtensionPoint[Any] = ExtensionPoint("data source", "rlftsim.sources", _SHIPPED)
 
 
-def find_source(
-    reader: str, path: str | os.PathLike[str], options: Mapping[str, object] | None = None
-) -> DataSource:
+def find_source(reader: str, path: str | os.PathLike[str], options: Mapping[str, object] | None = None) -> DataSource:
     """Source of a name, or for "auto" the one that recognizes the files at a path.
 
     Args:
@@ -140,6 +138,21 @@ def _detecting(names: Iterable[str], path: str | os.PathLike[str]) -> list[str]:
 def attribution_of(source: str) -> str:
     """Line that pictures of a data source's scenarios carry; empty for most, and for those of other packages."""
     return getattr(SOURCES.find(source), "attribution", "") if source in _SHIPPED else ""
+
+
+def guessed_note(sources: Iterable[str], guessed: Iterable[str]) -> str:
+    """A sentence on the values that are guessed in some scenarios; empty where none is.
+
+    Args:
+        sources: names of the data sources.
+        guessed: words of `Scenario.guessed`.
+    """
+    words, names = sorted(set(guessed)), sorted(set(sources))
+    if not words:
+        return ""
+    return (
+        f"Data of {', '.join(names)} with guessed {', '.join(words)}: scores compare with others on the same data only."
+    )
 
 
 def read_unit(

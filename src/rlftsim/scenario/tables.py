@@ -216,9 +216,7 @@ def _read_scenario(row: _Rows, parts: Mapping[str, _Rows]) -> Scenario:
     )
 
 
-def _read_tracks(
-    rows: _Rows, first_step: int, step_s: float, ground: MapFeatures | None
-) -> tuple[Tracks, set[str]]:
+def _read_tracks(rows: _Rows, first_step: int, step_s: float, ground: MapFeatures | None) -> tuple[Tracks, set[str]]:
     """Tracks at 10 Hz, and the words for what is guessed of them.
 
     Args:

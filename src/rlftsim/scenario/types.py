@@ -150,9 +150,7 @@ class MapFeatures:
     """
 
     @classmethod
-    def of(
-        cls, features: Iterable[tuple[int, int, np.ndarray]], topology: LaneTopology | None = None
-    ) -> "MapFeatures":
+    def of(cls, features: Iterable[tuple[int, int, np.ndarray]], topology: LaneTopology | None = None) -> "MapFeatures":
         """Map of features one by one.
 
         Args:
