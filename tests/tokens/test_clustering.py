@@ -21,7 +21,7 @@ LONELY_CELLS_STAY = TrajTokConfig(num_neighbors=0)
 
 
 def test_token_0_of_every_class_stands_exactly_still(vocabulary):
-    assert torch.equal(vocabulary.poses()[:, 0], torch.zeros(3, 5, 3))
+    assert torch.equal(vocabulary.poses[:, 0], torch.zeros(3, 5, 3))
     assert vocabulary.token_mask[:, 0].all()
 
 
@@ -36,7 +36,7 @@ def test_vehicles_of_every_speed_up_to_45_meters_per_second_have_a_token(pack_sc
     config = replace(SMALL, num_tokens=512)
     for limit_mps, fastest_mps in ((45.0, 44.0), (0.0, 30.0)):
         vocabulary, _ = build_vocabulary(pack_scenarios, replace(config, straight_up_to_mps=limit_mps))
-        end = vocabulary.poses()[0, :, -1][vocabulary.token_mask[0]]
+        end = vocabulary.poses[0, :, -1][vocabulary.token_mask[0]]
         ahead = end[(end[:, 1].abs() < 0.2) & (end[:, 2].abs() < 0.05), 0].sort().values
         assert (ahead.max() / 0.5 > fastest_mps) == (limit_mps > 0)
         if limit_mps:
@@ -98,7 +98,7 @@ def test_the_mirror_image_of_every_token_is_a_token(kind):
         assert coverage.poses[:, -1, 1].min() < -0.03
     if kind == "kdisks":
         one_sided = build_vocabulary(only_left, replace(config, mirror=False))[0]
-        assert one_sided.poses()[:, :, -1, 1][one_sided.token_mask].min() > -1e-3
+        assert one_sided.poses[:, :, -1, 1][one_sided.token_mask].min() > -1e-3
 
 
 def test_boxes_of_tokens_have_the_size_of_their_class(vocabulary):
@@ -124,7 +124,7 @@ def test_a_vocabulary_of_any_size_can_be_built(num_tokens, num_map_prototypes, m
     config = TokensConfig(num_tokens=num_tokens, num_map_prototypes=num_map_prototypes, mirror=mirror)
     vocabulary, _ = build_vocabulary([scenes.crowd(num_agents=12)], config)
     assert vocabulary.num_tokens == num_tokens
-    assert not vocabulary.poses()[:, 0].any()
+    assert not vocabulary.poses[:, 0].any()
     if mirror:
         classes = measure_coverage([scenes.crowd(num_agents=12)], vocabulary)
         assert max(coverage.asymmetry_m for coverage in classes) < 1e-6

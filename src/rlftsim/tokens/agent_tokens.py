@@ -15,12 +15,13 @@ from rlftsim.scenario.batch import Frame, ScenarioBatch, collate
 from rlftsim.scenario.derived import cached_on_scenario
 from rlftsim.scenario.types import CURRENT_STEP, STEP_S, Scenario
 from rlftsim.tokens import catk_compat as catk_ops
-from rlftsim.tokens.vocabulary import CLASS_BOXES_M, STEPS_PER_TOKEN, Vocabulary, class_of_type
+from rlftsim.tokens.vocabulary import STEPS_PER_TOKEN, Vocabulary, box_of_class, class_of_type
 
 HISTORY_TOKENS = 2
 """Token steps up to the current step."""
 MAX_HEADING_STEP_RAD = 1.5
 _ROWS_PER_CHUNK = 512
+_ROWS_PER_CHUNK_ELSEWHERE = 1 << 12
 _CANDIDATES = 64
 """Tokens whose corners are compared first; all tokens are, where these may not contain the nearest one."""
 
@@ -141,8 +142,7 @@ def _begin_earlier(tracks: CleanTracks, *, stepwise: bool) -> CleanTracks:
 
 def class_boxes(object_type: Int64[Tensor, "..."]) -> tuple[Float[Tensor, "..."], Float[Tensor, "..."]]:
     """Length and width of the box of an agent's class, which tokens are matched with, m."""
-    table = torch.tensor(CLASS_BOXES_M, device=object_type.device)[class_of_type(object_type)]
-    return table[..., 0], table[..., 1]
+    return box_of_class(class_of_type(object_type))
 
 
 def tokenize_tracks(
@@ -221,7 +221,7 @@ def local_boxes(goal: Pose, pose: Pose, class_id: Int64[Tensor, "*batch"]) -> Fl
         pose: origin and direction of the frame.
         class_id: index into `CLASS_NAMES`.
     """
-    length, width = torch.tensor(CLASS_BOXES_M, device=class_id.device)[class_id].unbind(-1)
+    length, width = box_of_class(class_id)
     position = rotate(goal[0] - pose[0], -pose[1])
     return box_corners(position, wrap_angle(goal[1] - pose[1]), length, width)
 
@@ -230,7 +230,7 @@ def _match_in_local_frame(
     logged: Pose, pose: Pose, class_id: Int64[Tensor, "B A"], valid: Bool[Tensor, "B A"], vocabulary: Vocabulary
 ) -> tuple[Int64[Tensor, "B A"], Float[Tensor, "B A 2"], Float[Tensor, "B A"]]:
     """Token that ends nearest to the logged pose, and the pose at its end."""
-    length, width = torch.tensor(CLASS_BOXES_M, device=valid.device)[class_id].unbind(-1)
+    length, width = box_of_class(class_id)
     target = box_corners(*logged, length, width)
     local = rotate(target - pose[0][..., None, :], -pose[1][..., None])
     token_id = nearest_tokens(local, class_id, valid, vocabulary)
@@ -241,7 +241,7 @@ def _match_placed(
     logged: Pose, pose: Pose, class_id: Int64[Tensor, "B A"], valid: Bool[Tensor, "B A"], vocabulary: Vocabulary
 ) -> tuple[Int64[Tensor, "B A"], Float[Tensor, "B A 2"], Float[Tensor, "B A"]]:
     """As `_match_in_local_frame`, in the public code's order of operations."""
-    length, width = torch.tensor(CLASS_BOXES_M, device=valid.device)[class_id].unbind(-1)
+    length, width = box_of_class(class_id)
     target = catk_ops.boxes_around(*logged, length, width)
     token_id = catk_ops.nearest_placed_tokens(target, *pose, class_id, valid, vocabulary)
     corners = vocabulary.end_corners()[class_id, token_id]
@@ -262,12 +262,24 @@ def nearest_tokens(
         valid: the result is 0 elsewhere.
         vocabulary: the tokens.
     """
+    if class_id.device.type != "cpu":
+        # All tokens of each row's class are compared: to select rows, the host would wait for their number.
+        chunks = zip(*(v.split(_ROWS_PER_CHUNK_ELSEWHERE) for v in (local_corners.reshape(-1, 4, 2), class_id.flatten())))
+        return torch.cat([_nearest_of_class(*chunk, vocabulary) for chunk in chunks]).view_as(class_id) * valid
     out = torch.zeros_like(class_id)
     # Classes may have different numbers of tokens: rows are found among those that exist, then mapped to token ids.
     for index, (table, exists) in enumerate(zip(vocabulary.end_corners(), vocabulary.token_mask)):
         rows = ((class_id == index) & valid).nonzero(as_tuple=True)
         out[rows] = exists.nonzero()[:, 0][nearest_rows(local_corners[rows], table[exists])]
     return out
+
+
+def _nearest_of_class(
+    boxes: Float[Tensor, "n 4 2"], class_id: Int64[Tensor, "n"], vocabulary: Vocabulary
+) -> Int64[Tensor, "n"]:
+    """As `nearest_tokens`, one row of the tables of all tokens for each box."""
+    distance = corner_distances(boxes, vocabulary.end_corners()[class_id])
+    return distance.masked_fill(~vocabulary.token_mask[class_id], torch.inf).argmin(-1)
 
 
 def nearest_rows(boxes: Float[Tensor, "n 4 2"], table: Float[Tensor, "V 4 2"]) -> Int64[Tensor, "n"]:

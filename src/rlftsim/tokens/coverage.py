@@ -157,7 +157,7 @@ def measure_coverage(
 
 def _begin(vocabulary: Vocabulary, index: int, radius_m: float | None) -> ClassCoverage:
     exists = vocabulary.token_mask[index]
-    poses = vocabulary.poses()[index, exists].numpy()
+    poses = vocabulary.poses[index, exists].numpy()
     # The pose at step 0 is the origin.
     whole = np.concatenate([np.zeros_like(poses[:, :1]), poses], 1)
     # Distance of each token's mirror image to the nearest token.

@@ -6,8 +6,9 @@ start). Frame of a token: the agent at its start. A token's boxes have the size 
 
 import json
 from dataclasses import dataclass, replace
+from functools import cache, cached_property
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Bool, Float, Int64
@@ -26,7 +27,7 @@ CLASS_NAMES = ("vehicle", "pedestrian", "cyclist")
 CLASS_BOXES_M = ((4.8, 2.0), (1.0, 1.0), (2.0, 1.0))
 """Length and width of each class's box, which tokens are matched with."""
 
-_CLASS_OF_TYPE = torch.tensor([0, 0, 1, 2, 0])
+_CLASS_OF_TYPE = (0, 0, 1, 2, 0)
 FORMAT = "rlftsim-vocabulary-1"
 
 
@@ -34,7 +35,19 @@ def class_of_type(object_type: Int64[Tensor, "..."]) -> Int64[Tensor, "..."]:
     """Class index of WOMD object types; other and unset types count as vehicles."""
     # The challenge requires agents of every type to be simulated. A box that can drive is the least wrong model of
     # them.
-    return _CLASS_OF_TYPE.to(object_type.device)[object_type.clamp(0, ObjectType.OTHER)]
+    return _on_device(_CLASS_OF_TYPE, object_type.device)[object_type.clamp(0, ObjectType.OTHER)]
+
+
+def box_of_class(class_id: Int64[Tensor, "..."]) -> tuple[Float[Tensor, "..."], Float[Tensor, "..."]]:
+    """Length and width of the box of a class, which tokens are matched with, m."""
+    table = _on_device(CLASS_BOXES_M, class_id.device)[class_id]
+    return table[..., 0], table[..., 1]
+
+
+@cache
+def _on_device(table: tuple[Any, ...], device: torch.device) -> Tensor:
+    """A table as a tensor; kept, because the host waits while it copies one to a device."""
+    return torch.tensor(table, device=device)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +78,7 @@ class Vocabulary:
         """Box at the end of each token."""
         return self.corners[:, :, STEPS_PER_TOKEN]
 
+    @cached_property
     def poses(self) -> Float[Tensor, "C V 5 3"]:
         """x, y, heading at steps 1..5 of each token."""
         position, heading = pose_of_corners(self.corners[:, :, 1:])

@@ -32,7 +32,7 @@ from rlftsim.tokens.agent_tokens import (
     tokenize_agents,
     tokens_towards,
 )
-from rlftsim.tokens.vocabulary import CLASS_BOXES_M, Vocabulary, class_of_type
+from rlftsim.tokens.vocabulary import Vocabulary, box_of_class, class_of_type
 from rlftsim.training.closed_loop import TargetedRollouts, TokenLogits, predict_along
 from rlftsim.training.freezing import TrainedParts, freeze_untrained
 from rlftsim.training.goals import GoalConfig, choose_goals, refuse_goals
@@ -213,7 +213,7 @@ class _Target:
         """True for agents within so many lengths of their class's box from their logged position, or without one."""
         if max_lengths is None:
             return torch.ones_like(self.logged_valid)
-        length = torch.tensor(CLASS_BOXES_M, device=self.class_id.device)[self.class_id][..., 0]
+        length, _ = box_of_class(self.class_id)
         distance = (self.pose[0] - self.logged_now[0]).norm(dim=-1)  # [B, N, A]
         return (distance <= max_lengths * length) | ~self.logged_now_valid
 
@@ -230,7 +230,7 @@ class _Target:
         if not self.catk_compat:
             return (ends - local_boxes(logged, pose, class_id)[:, None]).norm(dim=-1).mean(-1)
         # The public code compares in the map frame, where float32 rounds coarser: another candidate may win.
-        length, width = torch.tensor(CLASS_BOXES_M, device=class_id.device)[class_id].unbind(-1)
+        length, width = box_of_class(class_id)
         boxes = catk_compat.boxes_around(*logged, length, width)
         return (catk_compat.place_boxes(ends, *pose) - boxes[:, None]).norm(dim=-1).mean(-1)
 

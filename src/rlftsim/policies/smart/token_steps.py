@@ -82,7 +82,7 @@ def place_tokens(
         corners = vocabulary.corners[class_id, decision, 1:]  # [B, N, A, 5, 4, 2]
         new_position, new_heading = pose_of_corners(catk_ops.place_boxes(corners, position, heading))
     else:
-        local = vocabulary.poses()[class_id, decision]  # [B, N, A, 5, 3], agent's frame
+        local = vocabulary.poses[class_id, decision]  # [B, N, A, 5, 3], agent's frame
         new_position = position[..., None, :] + rotate(local[..., :2], heading[..., None])
         new_heading = wrap_angle(heading[..., None] + local[..., 2])
     return torch.cat([new_position, new_heading[..., None]], -1)

@@ -1,0 +1,200 @@
+"""The whole package on a device that is not the CPU: equal results, no tensor left behind, and how often it waits.
+
+There is no GPU here, see `pretend_device`.
+"""
+
+import copy
+from contextlib import nullcontext
+
+import pytest
+import torch
+
+import tiny
+from pretend_device import DEVICE, PretendDevice
+from rlftsim.evaluation.evaluate import evaluate
+from rlftsim.evaluation.results import SCORE_COLUMNS, EvaluateConfig
+from rlftsim.goals.logged import logged_goals
+from rlftsim.rollout import simulate as simulate_module
+from rlftsim.rollout.fingerprint import fingerprint_policy
+from rlftsim.rollout.simulate import simulate
+from rlftsim.scenario.batch import collate
+from rlftsim.scenario.dataset import write_dataset
+from rlftsim.training import finetune, imitation
+from rlftsim.training.goals import GoalConfig
+from rlftsim.training.run_folder import read_metrics
+from rlftsim.training.validation import ValidationConfig
+
+TIMES = ("seconds", "time")
+"""Metrics of an update that are times."""
+
+
+class PretendFabric:
+    """One process on the pretend device."""
+
+    device, world_size, global_rank, is_global_zero = DEVICE, 1, 0, True
+
+    def autocast(self):
+        return nullcontext()
+
+    def backward(self, tensor):
+        tensor.backward()
+
+    def all_reduce(self, data, *, reduce_op):
+        raise AssertionError("a single process has nothing to reduce")
+
+
+@pytest.fixture
+def device(monkeypatch):
+    for module in (finetune, imitation):
+        monkeypatch.setattr(module, "start_fabric", lambda config: PretendFabric())
+    with PretendDevice() as device:
+        yield device
+
+
+@pytest.fixture
+def policy(vocabulary):
+    return tiny.tiny_policy(vocabulary, tiny.WITHOUT_CHANCE).eval().requires_grad_(False)
+
+
+@pytest.fixture
+def batch(drawn_scenarios):
+    return collate(drawn_scenarios[:2])
+
+
+# ---- the device itself ---------------------------------------------------------------------------------------------
+
+
+def test_the_device_refuses_what_cuda_refuses():
+    host = torch.ones(3, 2)
+    with PretendDevice():
+        there = host.to(DEVICE)
+        with pytest.raises(RuntimeError, match="same device"):
+            there + host
+        with pytest.raises(RuntimeError, match="same device"):
+            host[torch.zeros(3, dtype=torch.int64, device=DEVICE)]
+        with pytest.raises(RuntimeError, match="numpy"):
+            there.numpy()
+        assert (there + host.sum()).sum().item() == 42.0, "a single number of the host is no tensor of it"
+
+
+def test_the_device_counts_launches_waits_and_copies():
+    host = torch.arange(6.0).view(3, 2)
+    with PretendDevice() as device, device.count() as counts:
+        there = host.to(DEVICE)  # a copy
+        assert there.device == DEVICE
+        assert counts.totals == (1, 0, 1)
+        there.view(2, 3)[:1].unsqueeze(0)
+        assert counts.totals == (1, 0, 1), "views are free"
+        there[[0, 2]]  # its index is copied
+        torch.tensor([1.0, 2.0], device=DEVICE)
+        assert counts.copies.total() == 3
+        there[there > 1]  # the result's shape
+        there.nonzero()
+        assert counts.waits.total() == 2
+        assert there.sum().item() == 15
+        assert there.tolist() == host.tolist()
+        assert there.cpu().equal(host)
+        assert counts.waits.total() == 5
+        there[there > 1] = 0.0  # shapes stay
+        assert counts.waits.total() == 5
+
+
+def test_the_device_has_the_gradients_of_the_cpu():
+    layer = torch.nn.Sequential(torch.nn.Linear(3, 4), torch.nn.LayerNorm(4), torch.nn.Linear(4, 1))
+    inputs = torch.randn(5, 3, generator=torch.Generator().manual_seed(0))
+    layer(inputs).square().sum().backward()
+    with PretendDevice():
+        there = copy.deepcopy(layer).to(DEVICE)
+        there.zero_grad()
+        there(inputs.to(DEVICE)).square().sum().backward()
+        for own, expected in zip(there.parameters(), layer.parameters()):
+            assert own.grad.device == DEVICE
+            torch.testing.assert_close(own.grad.cpu(), expected.grad)
+
+
+# ---- planted mistakes ----------------------------------------------------------------------------------------------
+
+
+def test_a_table_that_stays_on_the_host_is_found(device, policy, batch, monkeypatch):
+    table = torch.tensor([0, 0, 1, 2, 0])
+    monkeypatch.setattr("rlftsim.policies.smart.model.class_of_type", lambda object_type: table[object_type])
+    with pytest.raises(RuntimeError, match=r"same device.*index"):
+        policy.to(DEVICE).encode(batch.to(DEVICE))
+
+
+def test_noise_that_stays_on_the_host_is_found(device, policy, batch, monkeypatch):
+    draw = simulate_module.draw_noise
+    monkeypatch.setattr(simulate_module, "draw_noise", lambda *args, **named: draw(*args, **named).cpu())
+    with pytest.raises(RuntimeError, match=r"same device.*distributions.py"):
+        simulate(policy.to(DEVICE), batch.to(DEVICE), num_rollouts=1, seed=0)
+
+
+def test_a_missing_copy_to_the_host_is_found(device, policy, batch, monkeypatch):
+    monkeypatch.setattr(torch.Tensor, "cpu", lambda self: self)
+    with pytest.raises(RuntimeError, match="numpy"):
+        fingerprint_policy(policy.to(DEVICE))
+
+
+# ---- the same results as on the CPU --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("goal", [None, "concat", "indication"])
+def test_rollouts_are_those_of_the_cpu(device, policy, batch, goal):
+    goals = logged_goals(batch) if goal else None
+    if goal:
+        policy = policy.with_goal_conditioning(goal)
+        with torch.no_grad():
+            for part in policy.goal_parts():
+                for weight in part.parameters():
+                    weight.add_(0.1)
+    expected = simulate(policy, batch, num_rollouts=2, seed=1, goals=goals)
+    policy, batch = policy.to(DEVICE), batch.to(DEVICE)
+    found = simulate(policy, batch, num_rollouts=2, seed=1, goals=logged_goals(batch) if goal else None)
+    assert found.position.device == DEVICE
+    assert found.decision.cpu().equal(expected.decision)
+    torch.testing.assert_close(found.position.cpu(), expected.position)
+    torch.testing.assert_close(found.log_prob.cpu(), expected.log_prob, atol=1e-5, rtol=0)
+
+
+TRAINING = {
+    "pretrain": {},
+    "pretrain, spatial smoothing": {"label_smoothing": 0.1, "label_smoothing_kind": "spatial"},
+    "catk": {"validation": ValidationConfig(every=1, num_scenarios=1, num_rollouts=2)},
+    "catk, top_k": {"choice": "top_k"},
+    "catk, trajeglish": {"choice": "trajeglish", "max_distance_lengths": 1.0},
+    "everything, concat": {},
+    "everything, indication": {},
+}
+
+
+@pytest.mark.parametrize("name", TRAINING)
+def test_an_update_is_that_of_the_cpu(device, vocabulary, drawn_scenarios, tmp_path, monkeypatch, name):
+    stage, _, variant = name.partition(", ")
+    # a small step: Adam's first one has the size of the learning rate wherever a gradient is not exactly zero
+    changes = {"epochs": 0.5, "batch_size": 2, "learning_rate": 1e-7, **TRAINING[name]}
+    policy = tiny.tiny_policy(vocabulary, tiny.WITHOUT_CHANCE)
+    if stage == "everything":
+        policy = policy.with_goal_conditioning(variant)
+        changes |= {
+            "reward": tiny.OF_EVERYTHING.reward + " + 0.1*goal", "goals": GoalConfig(probability=1.0, hindsight=1.0),
+        }  # fmt: skip
+    held_out = drawn_scenarios[2:] if "validation" in changes else None
+    there = copy.deepcopy(policy)
+    tiny.train(stage, there, drawn_scenarios[:2], tmp_path / "device", held_out, **changes)
+    assert next(there.parameters()).device == DEVICE
+    monkeypatch.undo()
+    tiny.train(stage, policy, drawn_scenarios[:2], tmp_path / "cpu", held_out, **changes)
+    (found,), (expected,) = (read_metrics(tmp_path / folder) for folder in ("device", "cpu"))
+    assert found.keys() == expected.keys()
+    for key in found:
+        if not key.startswith(TIMES):
+            assert found[key] == pytest.approx(expected[key], rel=1e-3, abs=1e-5, nan_ok=True), key
+
+
+def test_scores_are_those_of_the_cpu(device, policy, drawn_scenarios, tmp_path):
+    write_dataset(drawn_scenarios[:2], tmp_path / "data")
+    config = EvaluateConfig(num_rollouts=4, top_k=8, split=None)
+    expected = evaluate(policy, tmp_path / "data", config=config, show_progress=False).table
+    found = evaluate(policy.to(DEVICE), tmp_path / "data", config=config, show_progress=False).table
+    for column in SCORE_COLUMNS:
+        assert found[column].to_pylist() == pytest.approx(expected[column].to_pylist(), abs=1e-6, nan_ok=True), column
