@@ -152,8 +152,8 @@ class Worker:
 def cpu_of_command(command: list[str], env: dict[str, str]) -> Numbers:
     """CPU seconds and peak memory of a command, start-up included."""
     process = subprocess.Popen(command, env=env, stdout=subprocess.DEVNULL)
-    _, status, usage = os.wait4(process.pid, 0)
-    if status:
+    _, process.returncode, usage = os.wait4(process.pid, 0)
+    if process.returncode:
         sys.exit(f"this command failed, see above: {' '.join(command)}")
     return {"seconds": usage.ru_utime + usage.ru_stime, "peak_mib": usage.ru_maxrss / 1024}
 
@@ -173,8 +173,13 @@ class Measurement:
 
     def missing(self, options: Options) -> str:
         """Why it cannot be measured."""
-        there = {"": True, "real scenarios": options.womd, "GPU": has_gpu(), "public code": options.sides(("public",))}
-        return "" if there[self.needs] else f"no {self.needs}"
+        there = {
+            "": lambda: True,
+            "real scenarios": lambda: options.womd,
+            "public code": lambda: options.sides(("public",)),
+            "GPU": has_gpu,
+        }
+        return "" if there[self.needs]() else f"no {self.needs}"
 
 
 @functools.cache
@@ -371,7 +376,7 @@ NOTES = f"""- Median (least to greatest) of the repetitions. The processes of a 
   agents never stand still. In "held as logged" an agent keeps its pose wherever it moves less than 5 cm in the half second of a decision in the log, on all sides.
 - The public code makes rollouts one after the other and encodes the map anew in each; a few were timed and all extrapolated. Where torch-cluster is not
   installed, an exact search stands in for it (`speed_public.py`). Before it is timed it is compared with its golden numbers.
-- The demo's base models for the fine-tuning updates were trained for five passes; agents of the real one are those of the first four training scenarios.
+- The demo's base models for the fine-tuning updates were trained for two passes; the scenarios are the first four for training.
 - "slowest process": CPU seconds of the process that used most, in each stage, start-up included; `rlftsim demo --quick` unless it says otherwise.
 - The evaluation reads prepared files on both sides (a data set, pickles) and is the CPU time of whole processes; {NUM_EVALUATED} scenarios, one run.
 """

@@ -23,7 +23,7 @@ CONTEXT_RADIUS_M = 150.0
 """In updates a step of an agent farther from the ego than this is taken as not logged, by both sides."""
 SCENARIOS = {"637f20cafde22ff8": "A", "ee519cf571686d19": "B"}
 WEIGHTS_SEED = 1003
-BASE_EPOCHS = 5.0
+BASE_EPOCHS = 2.0
 NUM_EVALUATED = 8
 CURRENT_STEP, STEPS_PER_DECISION, NUM_DECISIONS = 10, 5, 16
 
@@ -36,7 +36,7 @@ class Job:
     """One thing that is measured; handed to its process as JSON."""
 
     task: str
-    inputs: str
+    inputs: str = ""
     """Folder that `speed.py` prepared."""
     scenarios: tuple[str, ...] = ()
     """Names of files in INPUTS/records."""
