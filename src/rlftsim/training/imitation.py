@@ -14,9 +14,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from torch import Tensor
 from torch.nn import functional
 
@@ -27,7 +26,7 @@ from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import Scenarios
 from rlftsim.tokens.smoothing import summed_log_prob_nearby
 from rlftsim.tokens.vocabulary import Vocabulary
-from rlftsim.training.batches import micro_batches, scenario_costs
+from rlftsim.training.batches import micro_batches
 from rlftsim.training.data import batch_with_futures, trained_agents
 from rlftsim.training.freezing import parameter_groups, set_learning_rate
 from rlftsim.training.parallel import DeviceConfig, Fabric, all_reduce_gradients, all_reduce_sum, num_sharing_memory
@@ -114,7 +113,6 @@ class _Imitator(Learner):
 
     run: TrainingRun
     predict: Predict
-    costs: Float[np.ndarray, "n"]
     config: ImitationConfig
     fabric: Fabric
 
@@ -181,7 +179,6 @@ def _imitate(
         optimizer=torch.optim.AdamW(groups, lr=config.learning_rate, weight_decay=config.weight_decay),
         run=run,
         predict=predict,
-        costs=scenario_costs(scenarios),
         config=config,
         fabric=fabric,
     )
@@ -229,10 +226,10 @@ def _update(learner: _Imitator, update: int) -> dict[str, float]:
     # 1. Gradients of the summed loss add up over micro batches.
     names: list[str] = []  # of further metrics; every micro batch has the same
     sums = torch.zeros((), device=fabric.device)  # becomes [2 + names]: loss, further metrics, number of predictions
-    own, sharing = run.local_indices(update, learner.costs), num_sharing_memory(fabric)
+    own, sharing = run.local_indices(update), num_sharing_memory(fabric)
     max_count = max(config.micro_batch_size // sharing, 1)
     max_cost = None if config.micro_batch_cost is None else config.micro_batch_cost / sharing
-    for micro in micro_batches(own, learner.costs, max_count=max_count, max_cost=max_cost):
+    for micro in micro_batches(own, run.costs, max_count=max_count, max_cost=max_cost):
         batch = batch_with_futures(run.scenarios, micro, context_radius_m=config.context_radius_m).to(fabric.device)
         trained = trained_agents(
             batch, update, radius_m=config.trained_radius_m, limit=config.max_trained_agents, seed=config.seed
