@@ -176,7 +176,7 @@ def _imitate(
     groups = parameter_groups(model, config.goal_learning_rate_scale)
     learner = _Imitator(
         policy=model,
-        optimizer=torch.optim.AdamW(groups, lr=config.learning_rate, weight_decay=config.weight_decay),
+        optimizer=torch.optim.AdamW(groups, lr=config.learning_rate, weight_decay=config.weight_decay, fused=True),
         run=run,
         predict=predict,
         config=config,
