@@ -44,7 +44,7 @@ def list_all_pairs(agents):
     mask[:, torch.arange(len(agents.evaluated)), agents.evaluated] = False
     if agents.valid is not None:
         mask &= agents.valid[:, None]
-    return _list_pairs(mask, agents.evaluated)
+    return _list_pairs(mask, agents)
 
 
 @pytest.mark.parametrize(

@@ -12,8 +12,12 @@ from realism_drawing import draw_map, draw_red_light, draw_rollouts, draw_traffi
 from rlftsim.errors import DataError
 from rlftsim.realism import (
     METRIC_2024_ORIGINAL,
+    METRIC_2025,
+    AgentScores,
     ComputeConfig,
+    ScenarioFeatures,
     SimulatedStates,
+    compute_batch_features,
     compute_features,
     scenario_log,
     score,
@@ -21,6 +25,7 @@ from rlftsim.realism import (
     score_features,
 )
 from rlftsim.realism import features as realism_features
+from rlftsim.realism.features import JoinedLogs, compute_joined_features
 
 
 @pytest.fixture(scope="module")
@@ -120,6 +125,38 @@ def test_a_batch_is_its_scenarios_stacked():
         single = score(scenario, item)
         assert torch.equal(batch.leave_one_out_meta_metric[row], single.leave_one_out_meta_metric)
         assert batch.to_official_fields()[row] == single.to_official_fields()[0]
+
+
+def test_scenarios_measured_side_by_side_have_the_scores_of_each_alone():
+    no_edges = draw_map([(2, [[-300.0, -2, 0], [300.0, -2, 0]])])
+    scenarios = [
+        draw_traffic(0, num_agents=7, lights=draw_red_light()),
+        draw_traffic(1, num_agents=4, num_evaluated=1),
+        draw_traffic(2, num_agents=5, map_features=no_edges),
+        draw_traffic(3, num_agents=9, num_evaluated=6, lights=draw_red_light(at_x=35.0)),
+    ]
+    states = [draw_rollouts(scenario, 4, seed=5, spread=4.0) for scenario in scenarios]
+    # rollouts may name their agents in any order
+    order = np.arange(len(states[0].object_id))[::-1].copy()
+    swapped = (v[:, order] for v in (states[0].x, states[0].y, states[0].z, states[0].heading))
+    states[0] = SimulatedStates(states[0].object_id[order], *swapped)
+    logs = [scenario_log(scenario, missing_map="neutral") for scenario in scenarios]
+    joined = JoinedLogs.of(logs)
+    features = compute_joined_features(joined, states)
+    expected = score_batch(logs, states)
+    result = score_features(joined, features)
+    assert result.traffic_light_violation_rate.max() > 0
+    assert result.offroad_rate.min() == 0 < result.offroad_rate.max()
+    for field in dataclasses.fields(result):
+        found, wanted = getattr(result, field.name), getattr(expected, field.name)
+        if isinstance(found, torch.Tensor):
+            torch.testing.assert_close(found, wanted, atol=1e-6, rtol=0, equal_nan=True, msg=field.name)
+        else:
+            assert found == wanted
+    side_by_side = AgentScores((ScenarioFeatures(joined, features),), METRIC_2025, 10)
+    one_by_one = AgentScores(compute_batch_features(logs, states), METRIC_2025, 10)
+    for name in ("leave_one_out", "single", "displacement_error", "collision", "offroad"):
+        torch.testing.assert_close(getattr(side_by_side, name), getattr(one_by_one, name), atol=1e-6, rtol=0, msg=name)
 
 
 def test_batches_must_match(scenario):

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from rlftsim.realism.agents import sum_over_agents, to_agents
 from rlftsim.realism.batch import ScenarioFeatures
 from rlftsim.realism.config import MetricConfig
 from rlftsim.realism.credit import compute_credit, compute_single_credit
@@ -39,7 +40,7 @@ class AgentScores:
     @cached_property
     def displacement_error(self) -> Float[Tensor, "B N A"]:
         """Parts of `RealismResult.rollout_displacement_error`, m: an agent's own error over the number of agents E."""
-        return self._place(lambda item: item.features.displacement_error / item.features.displacement_error.shape[-1])
+        return self._place(lambda item: item.features.displacement_error / _num_evaluated(item))
 
     @cached_property
     def collision(self) -> Float[Tensor, "B N A"]:
@@ -55,13 +56,22 @@ class AgentScores:
         """Values [N, E] of each scenario's evaluated agents, scattered to their places in the batch: [B, N, A]."""
         rows = []
         for item in self.measured:
-            values = compute(item)
-            row = values.new_zeros(len(values), self.num_agents)
-            rows.append(row.index_copy(1, item.log.agents.evaluated, values))
-        return torch.stack(rows)
+            values, agents, place = compute(item), item.log.agents, item.log.agents.evaluated
+            if agents.layout is not None:
+                # From places among the agents of all scenarios to those in the padded batch.
+                scenario = agents.layout.scenario
+                place = place - agents.layout.first_agent[scenario] + scenario * self.num_agents
+            row = values.new_zeros(len(values), len(item.log.scenario_ids) * self.num_agents)
+            rows.append(row.index_copy(1, place, values).view(len(values), -1, self.num_agents))
+        return torch.cat(rows, 1).transpose(0, 1)
 
 
 def _part_of_rate(item: ScenarioFeatures, outcome: int) -> Float[Tensor, "N E"]:
     """Part of each evaluated agent in the rate of an outcome (index into `BERNOULLI_FEATURES`)."""
-    happened = compute_outcomes(item.features, item.log)[:, outcome]  # [N, E]
-    return happened.float() / happened.shape[-1]
+    return compute_outcomes(item.features, item.log)[:, outcome].float() / _num_evaluated(item)
+
+
+def _num_evaluated(item: ScenarioFeatures) -> Float[Tensor, "E_or_1"]:
+    """Number of evaluated agents of each agent's scenario."""
+    layout, ones = item.log.agents.layout, torch.ones_like(item.features.displacement_error[0])
+    return to_agents(sum_over_agents(ones, layout), layout)

@@ -102,8 +102,55 @@ class Trajectories:
 
 
 @dataclass(frozen=True, eq=False)
+class Layout:
+    """Places of the agents of B scenarios that lie side by side, so that all are measured together.
+
+    E evaluated agents in all, M at most in one scenario; K agents at most in one scenario.
+    """
+
+    scenario: Int64[Tensor, "E"]
+    """Scenario of each evaluated agent."""
+    first_agent: Int64[Tensor, "B"]
+    """Place of each scenario's first agent among all."""
+    evaluated: Int64[Tensor, "B M"]
+    """Each scenario's evaluated agents, as places among the E; any where the mask is False."""
+    evaluated_mask: Bool[Tensor, "B M"]
+    others: Int64[Tensor, "E K"]
+    """The agents of each evaluated agent's scenario, as places among all; any where the mask is False."""
+    other_mask: Bool[Tensor, "E K"]
+    """False for padding, and for the evaluated agent itself."""
+
+
+def sum_over_agents(values: Float[Tensor, "..."], layout: Layout | None) -> Float[Tensor, "..."]:
+    """Sums over evaluated agents: [..., E] to [...], or to [..., B] where they are those of several scenarios.
+
+    Args:
+        values: of each evaluated agent.
+        layout: of several scenarios; None = all agents are of one.
+    """
+    if layout is None:
+        return values.sum(-1)
+    return torch.where(layout.evaluated_mask, values[..., layout.evaluated], 0.0).sum(-1)
+
+
+def mean_over_agents(values: Float[Tensor, "..."], layout: Layout | None) -> Float[Tensor, "..."]:
+    """Means over evaluated agents, as `sum_over_agents`."""
+    return values.mean(-1) if layout is None else sum_over_agents(values, layout) / layout.evaluated_mask.sum(-1)
+
+
+def to_agents(values: Float[Tensor, "..."], layout: Layout | None) -> Float[Tensor, "..."]:
+    """A scenario's value for each of its evaluated agents: [...] to [..., 1], or [..., B] to [..., E].
+
+    Args:
+        values: of each scenario.
+        layout: of several scenarios; None = there is one.
+    """
+    return values[..., None] if layout is None else values[..., layout.scenario]
+
+
+@dataclass(frozen=True, eq=False)
 class LoggedAgents:
-    """The simulated agents of a scenario as logged, on a device."""
+    """The simulated agents of a scenario, or of several side by side, as logged, on a device."""
 
     object_id: Int64[np.ndarray, "A"]
     """Track order."""
@@ -117,6 +164,8 @@ class LoggedAgents:
     trajectories: Trajectories
     """[A, 91]. Invalid states keep what the file stores, because speeds of neighboring steps read them."""
     valid: Bool[Tensor, "A 91"]
+    layout: Layout | None = None
+    """Of several scenarios; None = there is one."""
 
     @property
     def future_valid(self) -> Bool[Tensor, "E T"]:
@@ -156,6 +205,42 @@ def build_logged_agents(scenario: Scenario, device: torch.device) -> LoggedAgent
         trajectories=Trajectories(*fields.unbind(0)),
         valid=torch.from_numpy(tracks.valid[simulated, :TOTAL_STEPS]).to(device),
     )
+
+
+def join_agents(parts: Sequence[LoggedAgents]) -> LoggedAgents:
+    """The agents of several scenarios side by side."""
+    device = parts[0].valid.device
+    # On the host, whose arrays know the numbers of agents without waiting for the device.
+    num_agents, num_evaluated = (
+        np.array([len(ids) for ids in column])
+        for column in zip(*((part.object_id, part.evaluated_object_id) for part in parts))
+    )
+    first_agent, first_evaluated = np.cumsum(num_agents) - num_agents, np.cumsum(num_evaluated) - num_evaluated
+    scenario = np.repeat(np.arange(len(parts)), num_evaluated)  # [E]
+    column, rank = np.arange(num_agents.max()), np.arange(num_evaluated.max())
+    others = np.minimum(first_agent[scenario, None] + column, num_agents.sum() - 1)  # [E, K]
+    members = np.minimum(first_evaluated[:, None] + rank, num_evaluated.sum() - 1)  # [B, M]
+    is_other, is_member = column < num_agents[scenario, None], rank < num_evaluated[:, None]
+    arrays = (scenario, first_agent, members, is_member, others, is_other)
+    scenario, first_agent, members, is_member, others, is_other = (torch.from_numpy(a).to(device) for a in arrays)
+    evaluated = torch.cat([part.evaluated for part in parts]) + first_agent[scenario]
+    is_other = is_other & (others != evaluated[:, None])
+    return LoggedAgents(
+        object_id=np.concatenate([part.object_id for part in parts]),
+        evaluated=evaluated,
+        evaluated_object_id=np.concatenate([part.evaluated_object_id for part in parts]),
+        evaluated_object_type=np.concatenate([part.evaluated_object_type for part in parts]),
+        is_vehicle=torch.cat([part.is_vehicle for part in parts]),
+        size=torch.cat([part.size for part in parts]),
+        trajectories=join_trajectories([part.trajectories for part in parts]),
+        valid=torch.cat([part.valid for part in parts]),
+        layout=Layout(scenario, first_agent, members, is_member, others, is_other),
+    )
+
+
+def join_trajectories(parts: Sequence[Trajectories]) -> Trajectories:
+    """Trajectories of several groups of agents side by side."""
+    return Trajectories(*(torch.cat(values, -2) for values in zip(*(part.fields for part in parts))))
 
 
 def _shorten(ids: Sequence[int]) -> str:

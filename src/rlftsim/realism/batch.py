@@ -1,4 +1,8 @@
-"""Scores of several scenarios: features are computed once, then scored by any number of metrics."""
+"""Scores of several scenarios: features are computed once, then scored by any number of metrics.
+
+A CPU measures one scenario after the other, which stay in its cache. A device measures all of them side by side, so
+that what the host asks of it does not grow with their number.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -10,11 +14,14 @@ from rlftsim.realism.agents import SimulatedStates
 from rlftsim.realism.config import METRIC_2025, MetricConfig
 from rlftsim.realism.features import (
     DEFAULT_COMPUTE,
+    AnyLog,
     ComputeConfig,
     Features,
+    JoinedLogs,
     MissingMap,
     ScenarioLog,
     compute_features,
+    compute_joined_features,
     scenario_log,
 )
 from rlftsim.realism.meta_metric import RealismResult, score_features
@@ -23,9 +30,9 @@ from rlftsim.scenario.types import Scenario
 
 @dataclass(frozen=True, eq=False)
 class ScenarioFeatures:
-    """The scenario's own part of the metric and the features of its rollouts."""
+    """The own part of a scenario, or of several side by side, and the features of their rollouts."""
 
-    log: ScenarioLog
+    log: AnyLog
     features: Features
 
 
@@ -36,7 +43,7 @@ def compute_batch_features(
     missing_map: MissingMap = "error",
     compute: ComputeConfig = DEFAULT_COMPUTE,
 ) -> tuple[ScenarioFeatures, ...]:
-    """Features of B scenarios with N rollouts each, on the rollouts' device.
+    """Features of B scenarios with N rollouts each, on the rollouts' device: one entry each, or one of all.
 
     Args:
         scenarios: logged scenarios, or their `scenario_log`.
@@ -53,13 +60,18 @@ def compute_batch_features(
     sizes = sorted({item.num_rollouts for item in states})
     if len(sizes) > 1:
         raise DataError(f"Scenarios scored together need equally many rollouts, got {sizes}: score them one by one.")
-    found = []
-    for scenario, item in zip(scenarios, states):
-        log = scenario
-        if isinstance(log, Scenario):
-            log = scenario_log(log, item.device, missing_map=missing_map, compute=compute)
-        found.append(ScenarioFeatures(log, compute_features(log, item, compute=compute)))
-    return tuple(found)
+    logs = [
+        scenario_log(scenario, item.device, missing_map=missing_map, compute=compute)
+        if isinstance(scenario, Scenario)
+        else scenario
+        for scenario, item in zip(scenarios, states)
+    ]
+    # Side by side all have the same number of distinct rollouts.
+    can_join = len({item.repeat for item in states}) == 1
+    if can_join and states[0].device.type != "cpu":
+        joined = JoinedLogs.of(logs)
+        return (ScenarioFeatures(joined, compute_joined_features(joined, states, compute=compute)),)
+    return tuple(ScenarioFeatures(log, compute_features(log, item, compute=compute)) for log, item in zip(logs, states))
 
 
 def score_batch_features(features: Sequence[ScenarioFeatures], config: MetricConfig = METRIC_2025) -> RealismResult:
@@ -70,6 +82,8 @@ def score_batch_features(features: Sequence[ScenarioFeatures], config: MetricCon
         config: the metric's year.
     """
     results = [score_features(item.log, item.features, config) for item in features]
+    if isinstance(features[0].log, JoinedLogs):
+        return results[0]
     stacked = {
         field.name: torch.stack([getattr(result, field.name) for result in results])
         for field in fields(RealismResult)

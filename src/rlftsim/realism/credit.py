@@ -16,8 +16,9 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from rlftsim.errors import DataError
+from rlftsim.realism.agents import Layout, sum_over_agents, to_agents
 from rlftsim.realism.config import METRIC_2025, MetricConfig
-from rlftsim.realism.features import Features, ScenarioLog
+from rlftsim.realism.features import AnyLog, Features
 from rlftsim.realism.likelihood import (
     RolloutCounts,
     compute_agent_log_likelihoods,
@@ -70,7 +71,7 @@ def log_mean_of_exp(log_x: Float[Tensor, "..."], log_y: Float[Tensor, "..."]) ->
     return log_y.exp() * ratio
 
 
-def compute_credit(log: ScenarioLog, features: Features, config: MetricConfig = METRIC_2025) -> Credit:
+def compute_credit(log: AnyLog, features: Features, config: MetricConfig = METRIC_2025) -> Credit:
     """Parts of agents and features in the contribution of each rollout to the meta-metric.
 
     Args:
@@ -84,11 +85,12 @@ def compute_credit(log: ScenarioLog, features: Features, config: MetricConfig = 
     distinct = _require_two(features)
     # [1 + N, F, E]: of all rollouts, and of all but each
     terms = _log_likelihood_terms(log, features, config, slice(0, 1 + distinct))
-    return Credit(split_difference(terms[:1], terms[1:], config).transpose(1, 2), features.repeat)
+    added = split_difference(terms[:1], terms[1:], config, log.agents.layout)  # [N, F, E]
+    return Credit(added.transpose(1, 2), features.repeat)
 
 
 def compute_single_credit(
-    log: ScenarioLog, features: Features, config: MetricConfig = METRIC_2025
+    log: AnyLog, features: Features, config: MetricConfig = METRIC_2025
 ) -> Float64[Tensor, "N E F"]:
     """Parts of agents and features in RMM_i - mean_{j != i} RMM_j, the reward `rloo`.
 
@@ -105,7 +107,7 @@ def compute_single_credit(
     distinct = _require_two(features)
     # [N, F, E]: of each rollout alone
     terms = _log_likelihood_terms(log, features, config, slice(1 + distinct, None))
-    between = split_difference(terms[:, None], terms[None], config)  # [N, N, F, E]
+    between = split_difference(terms[:, None], terms[None], config, log.agents.layout)  # [N, N, F, E]
     # Pairs of equal rollouts add nothing, so the mean over all others is the sum over distinct ones times their repeat.
     return (between.sum(1) * (features.repeat / (distinct * features.repeat - 1))).transpose(1, 2)
 
@@ -119,18 +121,18 @@ def _require_two(features: Features) -> int:
 
 
 def _log_likelihood_terms(
-    log: ScenarioLog, features: Features, config: MetricConfig, sets: slice
+    log: AnyLog, features: Features, config: MetricConfig, sets: slice
 ) -> Float64[Tensor, "S F E"]:
     """Terms of the agents in each feature's mean log-probability, under some of the sets of `form_sets`, nats."""
     target, table = log_target(log, config), histogram_table(config, features.linear_speed.device)
     counts, size = form_sets(count_rollouts(features, log, config), features.repeat)
     chosen = RolloutCounts(counts.bins[sets].double(), counts.agreement[sets].double(), counts.num_steps)
     by_agent = compute_agent_log_likelihoods(chosen, size[sets].double(), target, table)
-    return by_agent / count_terms(target).double()[:, None]
+    return by_agent / to_agents(count_terms(target).double(), target.layout)
 
 
 def split_difference(
-    x: Float64[Tensor, "*S F E"], y: Float64[Tensor, "*S2 F E"], config: MetricConfig
+    x: Float64[Tensor, "*S F E"], y: Float64[Tensor, "*S2 F E"], config: MetricConfig, layout: Layout | None = None
 ) -> Float64[Tensor, "*S3 F E"]:
     """Meta-metric of x minus that of y, split over features and agents.
 
@@ -138,7 +140,8 @@ def split_difference(
         x: term of each agent (or agent and step, in one axis) in the mean log-probability of each feature, nats.
         y: the same of other rollouts; broadcast against x.
         config: the weights.
+        layout: of the agents of several scenarios, whose meta-metrics are split separately; None = there is one.
     """
     weight = torch.tensor(config.weights, dtype=x.dtype, device=x.device)[:, None]  # [F, 1]
-    mean = log_mean_of_exp(x.sum(-1, keepdim=True), y.sum(-1, keepdim=True))
-    return torch.where(weight > 0, weight * mean * (x - y), 0.0)
+    mean = log_mean_of_exp(sum_over_agents(x, layout), sum_over_agents(y, layout))
+    return torch.where(weight > 0, weight * to_agents(mean, layout) * (x - y), 0.0)

@@ -4,7 +4,7 @@
 """
 
 from collections import deque
-from collections.abc import Hashable
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 from weakref import WeakValueDictionary
@@ -19,7 +19,9 @@ from rlftsim.realism.agents import (
     SimulatedStates,
     Trajectories,
     build_logged_agents,
+    join_agents,
     join_history,
+    join_trajectories,
 )
 from rlftsim.realism.displacement import compute_displacement_error
 from rlftsim.realism.interactive import (
@@ -32,8 +34,9 @@ from rlftsim.realism.map_based import (
     RoadEdges,
     build_road_edges,
     compute_distance_to_road_edge,
+    join_road_edges,
 )
-from rlftsim.realism.traffic_lights import Signals, build_signals, compute_traffic_light_violation
+from rlftsim.realism.traffic_lights import Signals, build_signals, compute_traffic_light_violation, join_signals
 from rlftsim.scenario.derived import cached_on_scenario
 from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, HISTORY_STEPS, Scenario
 
@@ -123,6 +126,49 @@ class ScenarioLog:
     features: Features
     """Features of the log, N = 1."""
 
+    @property
+    def scenario_ids(self) -> tuple[str, ...]:
+        """The one scenario's id."""
+        return (self.scenario_id,)
+
+    @property
+    def leaves_road(self) -> Bool[Tensor, "E"]:
+        """True = an evaluated agent that leaves the road at some logged step."""
+        return (self.features.offroad & self.agents.future_valid).any(-1)[0]
+
+
+@dataclass(frozen=True, eq=False)
+class JoinedLogs:
+    """The logs of several scenarios side by side: a device measures their rollouts in one go."""
+
+    parts: tuple[ScenarioLog, ...]
+    agents: LoggedAgents
+    road_edges: RoadEdges | None
+    signals: Signals | None
+
+    @classmethod
+    def of(cls, parts: Sequence[ScenarioLog]) -> "JoinedLogs":
+        """Logs on the same device, side by side."""
+        return cls(
+            tuple(parts),
+            join_agents([part.agents for part in parts]),
+            join_road_edges([part.road_edges for part in parts]),
+            join_signals([part.signals for part in parts]),
+        )
+
+    @property
+    def scenario_ids(self) -> tuple[str, ...]:
+        """Ids of the scenarios."""
+        return tuple(part.scenario_id for part in self.parts)
+
+    @property
+    def leaves_road(self) -> Bool[Tensor, "E"]:
+        """True = an evaluated agent that leaves the road at some logged step."""
+        return torch.cat([part.leaves_road for part in self.parts])
+
+
+AnyLog = ScenarioLog | JoinedLogs
+
 
 def scenario_log(
     scenario: Scenario,
@@ -195,11 +241,34 @@ def compute_features(
     Raises:
         DataError: the rollouts' agents are not the scenario's simulated agents.
     """
-    with torch.no_grad():
-        joined = join_history(log.agents, states, HISTORY_USED, log.scenario_id)  # [N, A, 82]
-        max_pairs = compute.pairs_on(states.device)
-        features = _compute(joined, log.agents, log.road_edges, log.signals, is_log=False, max_pairs=max_pairs)
-    return replace(features, repeat=states.repeat)
+    return _compute_with_history([log], log, [states], compute)
+
+
+def compute_joined_features(
+    logs: JoinedLogs, states: Sequence[SimulatedStates], *, compute: ComputeConfig = DEFAULT_COMPUTE
+) -> Features:
+    """Features of the rollouts of several scenarios, whose evaluated agents are side by side on axis E.
+
+    Args:
+        logs: the scenarios' own part.
+        states: rollouts of each, all with the same N and repeat.
+        compute: memory bound.
+
+    Raises:
+        DataError: the rollouts' agents are not their scenario's simulated agents.
+    """
+    return _compute_with_history(logs.parts, logs, states, compute)
+
+
+@torch.no_grad()
+def _compute_with_history(
+    parts: Sequence[ScenarioLog], log: AnyLog, states: Sequence[SimulatedStates], compute: ComputeConfig
+) -> Features:
+    histories = [join_history(p.agents, s, HISTORY_USED, p.scenario_id) for p, s in zip(parts, states)]
+    trajectories = histories[0] if len(parts) == 1 else join_trajectories(histories)  # [N, A, 82]
+    max_pairs = compute.pairs_on(states[0].device)
+    features = _compute(trajectories, log.agents, log.road_edges, log.signals, is_log=False, max_pairs=max_pairs)
+    return replace(features, repeat=states[0].repeat)
 
 
 def _compute(
@@ -226,8 +295,9 @@ def _compute(
     violation = torch.zeros_like(valid)
     if signals is not None:
         violation = compute_traffic_light_violation(
-            with_current.x, with_current.y, valid, signals, first_step=HISTORY_STEPS - 1, max_pairs=max_pairs
-        )
+            with_current.x, with_current.y, valid, signals, first_step=HISTORY_STEPS - 1, max_pairs=max_pairs,
+            scenario=None if agents.layout is None else agents.layout.scenario,
+        )  # fmt: skip
     # 4. Displacement from the log.
     logged = agents.trajectories.of_agents(agents.evaluated).from_step(-FUTURE_STEPS)
     displacement = compute_displacement_error(
@@ -252,14 +322,15 @@ def _compute_interaction(
     """Distance to the nearest object and time to collision, some rollouts at a time."""
     speed = compute_ground_speed(trajectories.x, trajectories.y)[..., -FUTURE_STEPS:]
     future = trajectories.from_step(-FUTURE_STEPS)
-    num_agents, num_evaluated = len(agents.object_id), len(agents.evaluated)
-    rollouts_at_once = max(1, max_pairs // (num_agents * num_evaluated * FUTURE_STEPS))
+    others, other_mask = (agents.layout.others, agents.layout.other_mask) if agents.layout else (None, None)
+    num_others = len(agents.object_id) if others is None else others.shape[1]
+    rollouts_at_once = max(1, max_pairs // (num_others * len(agents.evaluated) * FUTURE_STEPS))
     log_valid = agents.valid[None, :, -FUTURE_STEPS:] if is_log else None  # [1, A, 80]
     length, width = agents.size[:, 0], agents.size[:, 1]
     nearest, seconds = [], []
     parts = zip(*(values.split(rollouts_at_once) for values in (future.x, future.y, future.heading, speed)))
     for x, y, heading, part_speed in parts:
-        boxes = PlanarAgents(x, y, heading, length, width, agents.evaluated, log_valid)
+        boxes = PlanarAgents(x, y, heading, length, width, agents.evaluated, log_valid, others, other_mask)
         nearest.append(compute_distance_to_nearest_object(boxes))
         seconds.append(compute_time_to_collision(boxes, part_speed))
     return torch.cat(nearest), torch.cat(seconds)
@@ -284,5 +355,8 @@ def _compute_road_edge(
             for values, here in zip(future.fields, current.fields)
         )
     )
-    distance = compute_distance_to_road_edge(filled, size, road_edges, max_pairs=max_pairs)
+    scenario = None if agents.layout is None else agents.layout.scenario
+    distance = compute_distance_to_road_edge(filled, size, road_edges, max_pairs=max_pairs, scenario=scenario)
+    if scenario is not None and road_edges.is_known is not None:
+        valid = valid & road_edges.is_known[scenario, None]
     return torch.where(valid, distance, INVALID_ROAD_EDGE_M)

@@ -39,6 +39,25 @@ class PlanarAgents(NamedTuple):
     evaluated: Int64[Tensor, "E"]
     valid: Bool[Tensor, "N A T"] | None = None
     """None: all agents are valid at every step."""
+    others: Int64[Tensor, "E K"] | None = None
+    """Agents that each evaluated one may meet. None: all; then K is A."""
+    other_mask: Bool[Tensor, "E K"] | None = None
+    """False for padding of `others` and for the evaluated agent itself."""
+
+    def of_others(self, values: Tensor) -> Tensor:
+        """Values of each evaluated agent's others at each step: [N, A, T] to [N, E, K, T], or with E = 1 if shared."""
+        return values[:, None] if self.others is None else values[:, self.others]
+
+    def size_of_others(self, values: Float[Tensor, "A"]) -> Tensor:
+        """The same of values that do not change, broadcast: [K, 1] or [E, K, 1]."""
+        return (values if self.others is None else values[self.others])[..., None]
+
+    def fill_impossible(self, values: Tensor, fill: float | bool) -> None:
+        """Fill values [N, E, K, T] in place where there is no pair: of an agent with itself, and of padding."""
+        if self.other_mask is None:
+            values[:, torch.arange(len(self.evaluated), device=values.device), self.evaluated] = fill
+        else:
+            values.masked_fill_(~self.other_mask[..., None], fill)
 
 
 class _Pairs(NamedTuple):
@@ -54,11 +73,13 @@ class _Pairs(NamedTuple):
     other_agent: Int64[Tensor, "P"]
 
 
-def _list_pairs(mask: Bool[Tensor, "N E A T"], evaluated: Int64[Tensor, "E"]) -> _Pairs:
+def _list_pairs(mask: Bool[Tensor, "N E K T"], agents: PlanarAgents) -> _Pairs:
     # Flat indices, so that later gathers need one index instead of three.
-    num_evaluated, num_agents, num_steps = mask.shape[1:]
+    _, num_agents, num_steps = agents.x.shape
+    num_evaluated = len(agents.evaluated)
     rollout, rank, other, step = mask.nonzero().unbind(-1)
-    ego = evaluated[rank]
+    other = other if agents.others is None else agents.others[rank, other]
+    ego = agents.evaluated[rank]
     return _Pairs(
         row=(rollout * num_evaluated + rank) * num_steps + step,
         ego=(rollout * num_agents + ego) * num_steps + step,
@@ -74,26 +95,25 @@ def _find_nearest_candidates(agents: PlanarAgents) -> _Pairs:
     A rounded box contains the disc of half its smaller side and lies in the disc of half its diagonal, so with center
     distance c the distance of i and j lies between c - outer_i - outer_j and c - inner_i - inner_j.
     """
-    # 1. Distances of centers; in place, because [N, E, A, T] is the largest tensor of the metric.
+    # 1. Distances of centers; in place, because [N, E, K, T] is the largest tensor of the metric.
     inner = torch.minimum(agents.length, agents.width) / 2
     outer = torch.hypot(agents.length, agents.width) / 2
-    dx = agents.x[:, None] - agents.x[:, agents.evaluated, None]  # [N, E, A, T]
-    dy = agents.y[:, None] - agents.y[:, agents.evaluated, None]
+    dx = agents.of_others(agents.x) - agents.x[:, agents.evaluated, None]  # [N, E, K, T]
+    dy = agents.of_others(agents.y) - agents.y[:, agents.evaluated, None]
     center_distance = dx.square_().add_(dy.square_()).sqrt_()
     # 2. An agent with itself, and with invalid others, is no pair.
-    rank = torch.arange(len(agents.evaluated), device=dx.device)
-    center_distance[:, rank, agents.evaluated] = torch.inf
+    agents.fill_impossible(center_distance, torch.inf)
     if agents.valid is not None:
-        center_distance.masked_fill_(~agents.valid[:, None], torch.inf)
+        center_distance.masked_fill_(~agents.of_others(agents.valid), torch.inf)
     # 3. Candidates: their lower bound does not exceed the smallest upper bound of the row.
     slack = (outer - inner)[agents.evaluated] + BOUND_SLACK_M
     # A row without any pair is all infinite, and inf <= inf must not pass: its bound becomes the largest finite number.
-    enough = (center_distance - inner[:, None]).amin(2) + slack[:, None]  # [N, E, T]
+    enough = (center_distance - agents.size_of_others(inner)).amin(2) + slack[:, None]  # [N, E, T]
     enough.clamp_(max=torch.finfo(enough.dtype).max)
-    mask = (center_distance - outer[:, None]) <= enough[:, :, None]
+    mask = (center_distance - agents.size_of_others(outer)) <= enough[:, :, None]
     if agents.valid is not None:
         mask &= agents.valid[:, agents.evaluated, None]
-    return _list_pairs(mask, agents.evaluated)
+    return _list_pairs(mask, agents)
 
 
 def _compute_core_corners(
@@ -187,20 +207,19 @@ def _find_follow_candidates(agents: PlanarAgents, speed: Float[Tensor, "N A T"])
     outer = torch.hypot(agents.length, agents.width) / 2
     heading = agents.heading[:, agents.evaluated, None]
     cos, sin = heading.cos(), heading.sin()
-    dx = agents.x[:, None] - agents.x[:, agents.evaluated, None]  # [N, E, A, T]
-    dy = agents.y[:, None] - agents.y[:, agents.evaluated, None]
+    dx = agents.of_others(agents.x) - agents.x[:, agents.evaluated, None]  # [N, E, K, T]
+    dy = agents.of_others(agents.y) - agents.y[:, agents.evaluated, None]
     ahead = dx * cos + dy * sin
     aside = dy.mul_(cos).sub_(dx.mul_(sin)).abs_()
     reach = TIME_HORIZON_S * speed[:, agents.evaluated] * 1.001 + (outer[agents.evaluated] + BOUND_SLACK_M)[:, None]
     half_width = (agents.width[agents.evaluated] / 2 + BOUND_SLACK_M)[:, None]  # [E, 1]
     # A speed of NaN (first and last step of a log) fails the comparison, as it does in the official rule.
-    mask = (ahead - outer[:, None] <= reach[:, :, None]) & (ahead > 0)
-    mask &= aside < half_width[:, :, None] + outer[:, None]
-    rank = torch.arange(len(agents.evaluated), device=mask.device)
-    mask[:, rank, agents.evaluated] = False
+    mask = (ahead - agents.size_of_others(outer) <= reach[:, :, None]) & (ahead > 0)
+    mask &= aside < half_width[:, :, None] + agents.size_of_others(outer)
+    agents.fill_impossible(mask, False)
     if agents.valid is not None:
-        mask &= agents.valid[:, None]
-    return _list_pairs(mask, agents.evaluated)
+        mask &= agents.of_others(agents.valid)
+    return _list_pairs(mask, agents)
 
 
 def _compute_gaps(agents: PlanarAgents, pairs: _Pairs) -> tuple[Float[Tensor, "P"], Bool[Tensor, "P"]]:

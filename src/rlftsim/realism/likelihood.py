@@ -2,7 +2,8 @@
 
 Rollouts enter a score only through counts, so counts are stored per rollout: any set of rollouts (all, all but one, one
 alone) is a sum of them, and scoring every leave-one-out set costs one reduction. Feature axes: H = 7 histogram features
-in the order of `HISTOGRAM_FEATURES`, J = 3 Bernoulli features in that of `BERNOULLI_FEATURES`, F = H + J. K bins.
+in the order of `HISTOGRAM_FEATURES`, J = 3 Bernoulli features in that of `BERNOULLI_FEATURES`, F = H + J. K bins. An
+axis B is there where several scenarios are scored together.
 """
 
 from dataclasses import dataclass
@@ -13,8 +14,9 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
+from rlftsim.realism.agents import Layout, sum_over_agents
 from rlftsim.realism.config import HISTOGRAM_FEATURES, HistogramConfig, MetricConfig
-from rlftsim.realism.features import Features, ScenarioLog
+from rlftsim.realism.features import CACHED_LOGS, AnyLog, Features, JoinedLogs, ScenarioLog
 
 
 def compute_bin_edges(histogram: HistogramConfig) -> Float[np.ndarray, "K1"]:
@@ -108,12 +110,14 @@ class LogTarget:
 
     steps_in_bin: Float[Tensor, "H E K"]
     """Number of scored steps whose logged value lies in the bin."""
-    num_scored_steps: Float[Tensor, "H"]
+    num_scored_steps: Float[Tensor, "H *B"]
     outcome: Bool[Tensor, "J E"]
     """True if the agent ever collides, leaves the road or runs a red light in the log."""
+    layout: Layout | None = None
+    """Of the agents of B scenarios; None = all are of one, and there is no axis B."""
 
 
-def compute_outcomes(features: Features, log: ScenarioLog) -> Bool[Tensor, "N J E"]:
+def compute_outcomes(features: Features, log: AnyLog) -> Bool[Tensor, "N J E"]:
     """True for agents that ever collide, leave the road or run a red light at a step where the log is valid.
 
     Light violations of agents other than vehicles do not count.
@@ -141,13 +145,21 @@ def stack_scored_steps(log: ScenarioLog, config: MetricConfig) -> Bool[Tensor, "
     return torch.stack([speed, acceleration, speed, acceleration, valid, collision_time, valid])
 
 
-def build_log_target(log: ScenarioLog, config: MetricConfig) -> LogTarget:
+def build_log_target(log: AnyLog, config: MetricConfig) -> LogTarget:
     """Bins and outcomes of the log.
 
     Args:
         log: the scenario's own part.
         config: the metric's year.
     """
+    if isinstance(log, JoinedLogs):
+        parts = [log_target(part, config) for part in log.parts]
+        return LogTarget(
+            torch.cat([part.steps_in_bin for part in parts], 1),
+            torch.stack([part.num_scored_steps for part in parts], -1),
+            torch.cat([part.outcome for part in parts], -1),
+            log.agents.layout,
+        )
     table = histogram_table(config, log.agents.valid.device)
     values = stack_histogram_features(log.features)[:, 0]  # [H, E, T]
     scored = stack_scored_steps(log, config).to(values.dtype)
@@ -156,7 +168,7 @@ def build_log_target(log: ScenarioLog, config: MetricConfig) -> LogTarget:
     return LogTarget(steps, scored.sum((1, 2)), compute_outcomes(log.features, log)[0])
 
 
-log_target = lru_cache(maxsize=8)(build_log_target)
+log_target = lru_cache(maxsize=CACHED_LOGS)(build_log_target)
 """`build_log_target`, cached (logs are compared by identity)."""
 
 
@@ -171,7 +183,7 @@ class RolloutCounts:
     """Values per rollout and agent, T."""
 
 
-def count_rollouts(features: Features, log: ScenarioLog, config: MetricConfig) -> RolloutCounts:
+def count_rollouts(features: Features, log: AnyLog, config: MetricConfig) -> RolloutCounts:
     """Counts of each distinct rollout.
 
     Args:
@@ -223,15 +235,15 @@ def compute_agent_log_likelihoods(
     return torch.cat([histogram, agreement.log_()], dim=1)
 
 
-def count_terms(target: LogTarget) -> Float[Tensor, "F"]:
+def count_terms(target: LogTarget) -> Float[Tensor, "F *B"]:
     """Number of terms in a feature's mean log-probability: scored (agent, step) pairs, or agents."""
-    num_bernoulli, num_agents = target.outcome.shape
-    return torch.cat([target.num_scored_steps, target.num_scored_steps.new_full((num_bernoulli,), num_agents)])
+    ones = torch.ones_like(target.outcome, dtype=target.num_scored_steps.dtype)  # [J, E]
+    return torch.cat([target.num_scored_steps, sum_over_agents(ones, target.layout)])
 
 
 def compute_likelihoods(
     counts: RolloutCounts, num_rollouts: Float[Tensor, "S"], target: LogTarget, table: HistogramTable
-) -> Float[Tensor, "S F"]:
+) -> Float[Tensor, "S F *B"]:
     """Likelihood of the log under S sets of rollouts, one per feature: the exponential of the mean log-probability.
 
     Histogram features average over all scored (agent, step) pairs together (not over means of agents), Bernoulli ones
@@ -244,4 +256,4 @@ def compute_likelihoods(
         table: the metric's bins.
     """
     by_agent = compute_agent_log_likelihoods(counts, num_rollouts, target, table)
-    return (by_agent.sum(-1) / count_terms(target)).exp_()
+    return (sum_over_agents(by_agent, target.layout) / count_terms(target)).exp_()

@@ -5,17 +5,19 @@ the plane is signed by the side of the edge that the corner lies on. Road edges 
 search over them is exact. Frame: world, float32.
 """
 
+import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from rlftsim.realism.agents import Trajectories
 from rlftsim.realism.rounding import compute_sqrt
-from rlftsim.realism.segment_search import ChunkedSegments, chunk_segments, find_nearest_segment
+from rlftsim.realism.segment_search import ChunkedSegments, chunk_segments, find_nearest_segment, join_chunks
 from rlftsim.scenario.types import ROAD_EDGE_TYPES, MapFeatures
 
 HEIGHT_STRETCH = 3.0
@@ -66,7 +68,7 @@ def _cut_segments(
 
 @dataclass(frozen=True, eq=False)
 class RoadEdges:
-    """Road edges of a scenario, packed for the search; s segments."""
+    """Road edges of a scenario, or of B scenarios side by side, packed for the search; s segments."""
 
     segments: ChunkedSegments
     start: Float[Tensor, "s 2"]
@@ -77,6 +79,26 @@ class RoadEdges:
     """Index of the segment before, or of the segment itself at an end."""
     next: Int64[Tensor, "s"]
     """Index of the segment after, likewise."""
+    is_known: Bool[Tensor, "B"] | None = None
+    """False for a scenario without road edges; None = all have some."""
+
+
+def join_road_edges(parts: Sequence[RoadEdges | None]) -> RoadEdges | None:
+    """Road edges of several scenarios side by side; None if none of them has any."""
+    known = [part for part in parts if part is not None]
+    if not known:
+        return None
+    num_segments = [0 if part is None else len(part.previous) for part in parts]
+    first = [0, *itertools.accumulate(len(part.previous) for part in known)]
+    is_known = torch.tensor([part is not None for part in parts], device=known[0].start.device)
+    return RoadEdges(
+        segments=join_chunks([part and part.segments for part in parts], num_segments),
+        start=torch.cat([part.start for part in known]),
+        delta=torch.cat([part.delta for part in known]),
+        previous=torch.cat([part.previous + i for part, i in zip(known, first)]),
+        next=torch.cat([part.next + i for part, i in zip(known, first)]),
+        is_known=is_known if len(known) < len(parts) else None,
+    )
 
 
 def _link_neighbors(polylines: Polylines) -> tuple[Int64[np.ndarray, "s"], Int64[np.ndarray, "s"]]:
@@ -163,7 +185,7 @@ def _compute_signed_distance(
 
 
 def compute_point_distance_to_road_edge(
-    groups: Float[Tensor, "G Q 3"], edges: RoadEdges, *, max_pairs: int
+    groups: Float[Tensor, "G Q 3"], edges: RoadEdges, *, max_pairs: int, scenario: Int64[Tensor, "G"] | None = None
 ) -> Float[Tensor, "G Q"]:
     """Signed distance of points to the nearest road edge, m, negative on the road (left of the edge).
 
@@ -171,13 +193,19 @@ def compute_point_distance_to_road_edge(
         groups: x, y, z of points, G groups of Q nearby ones.
         edges: packed road edges.
         max_pairs: memory bound, see `find_nearest_segment`.
+        scenario: of each group, where the edges are those of several.
     """
-    segment = find_nearest_segment(groups, edges.segments, _measure_road_edge, max_pairs=max_pairs)
+    segment = find_nearest_segment(groups, edges.segments, _measure_road_edge, max_pairs=max_pairs, scenario=scenario)
     return _compute_signed_distance(groups[..., 0], groups[..., 1], edges, segment)
 
 
 def compute_distance_to_road_edge(
-    agents: Trajectories, size: Float[Tensor, "E 3"], edges: RoadEdges, *, max_pairs: int
+    agents: Trajectories,
+    size: Float[Tensor, "E 3"],
+    edges: RoadEdges,
+    *,
+    max_pairs: int,
+    scenario: Int64[Tensor, "E"] | None = None,
 ) -> Float[Tensor, "N E T"]:
     """Signed distance of agents to the road edge, m: that of the bottom corner farthest off (or least on) the road.
 
@@ -186,16 +214,19 @@ def compute_distance_to_road_edge(
         size: length, width, height.
         edges: packed road edges.
         max_pairs: memory bound, see `find_nearest_segment`.
+        scenario: of each agent, where the edges are those of several.
     """
-    half = (size / 2)[:, :, None]  # [E, 3, 1]
-    along = half[:, :1] * half.new_tensor([1.0, -1.0, -1.0, 1.0])  # [E, 1, 4]
-    across = half[:, 1:2] * half.new_tensor([1.0, 1.0, -1.0, -1.0])
+    half_length, half_width, half_height = (size / 2)[:, :, None].unbind(1)  # [E, 1] each
+    along = torch.stack([half_length, -half_length, -half_length, half_length], -1)  # [E, 1, 4]
+    across = torch.stack([half_width, half_width, -half_width, -half_width], -1)
     cos, sin = agents.heading.cos()[..., None], agents.heading.sin()[..., None]
     x = cos * along - sin * across + agents.x[..., None]  # [N, E, T, 4]
     y = sin * along + cos * across + agents.y[..., None]
-    z = (agents.z - half[:, 2])[..., None].expand_as(x)
+    z = (agents.z - half_height)[..., None].expand_as(x)
     corners = torch.stack([x, y, z], dim=-1)  # [N, E, T, 4, 3]
     # The corners of a few steps lie close together: they make a group.
     steps = math.gcd(corners.shape[2], GROUP_STEPS)
-    distance = compute_point_distance_to_road_edge(corners.view(-1, 4 * steps, 3), edges, max_pairs=max_pairs)
+    groups = corners.view(*corners.shape[:2], -1, 4 * steps, 3)  # [N, E, T / steps, 4 steps, 3]
+    of_group = None if scenario is None else scenario[:, None].expand(groups.shape[:3]).flatten()
+    distance = compute_point_distance_to_road_edge(groups.flatten(0, 2), edges, max_pairs=max_pairs, scenario=of_group)
     return distance.view(x.shape).amax(-1)

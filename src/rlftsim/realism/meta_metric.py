@@ -11,10 +11,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from rlftsim.realism.agents import SimulatedStates
+from rlftsim.realism.agents import SimulatedStates, mean_over_agents, sum_over_agents
 from rlftsim.realism.config import FEATURE_NAMES, METRIC_2025, SUB_SCORES, MetricConfig
 from rlftsim.realism.features import (
     DEFAULT_COMPUTE,
+    AnyLog,
     ComputeConfig,
     Features,
     MissingMap,
@@ -128,17 +129,21 @@ def form_sets(counts: RolloutCounts, repeat: int) -> tuple[RolloutCounts, Float[
     return sets, size
 
 
-def _any_rate(event: Bool[Tensor, "N E T"], log: ScenarioLog, repeat: int) -> Float[Tensor, "N_repeat"]:
+def _mean_per_rollout(values: Float[Tensor, "N E"], log: AnyLog, repeat: int) -> Float[Tensor, "*B N_repeat"]:
+    """Means over a scenario's evaluated agents."""
+    return mean_over_agents(values, log.agents.layout).movedim(0, -1).repeat_interleave(repeat, dim=-1)
+
+
+def _any_rate(event: Bool[Tensor, "N E T"], log: AnyLog, repeat: int) -> Float[Tensor, "*B N_repeat"]:
     """Fraction of a rollout's evaluated agents with an event at any step where the log is valid."""
-    occurred = (event & log.agents.future_valid).any(-1).to(torch.float32)
-    return occurred.mean(-1).repeat_interleave(repeat)
+    return _mean_per_rollout((event & log.agents.future_valid).any(-1).to(torch.float32), log, repeat)
 
 
-def score_features(log: ScenarioLog, features: Features, config: MetricConfig = METRIC_2025) -> RealismResult:
+def score_features(log: AnyLog, features: Features, config: MetricConfig = METRIC_2025) -> RealismResult:
     """Scores of rollouts from their features, which several metrics of the same rollouts share.
 
     Args:
-        log: the scenario's own part.
+        log: the scenario's own part, or those of B scenarios; their scores have an axis B.
         features: of its rollouts.
         config: the metric's year.
     """
@@ -146,35 +151,36 @@ def score_features(log: ScenarioLog, features: Features, config: MetricConfig = 
     # 1. Likelihoods of all sets of rollouts at once.
     sets, size = form_sets(count_rollouts(features, log, config), repeat)
     table = histogram_table(config, features.linear_speed.device)
-    likelihoods = compute_likelihoods(sets, size, log_target(log, config), table)  # [S, F]
+    likelihoods = compute_likelihoods(sets, size, log_target(log, config), table).movedim(1, -1)  # [S, *B, F]
     # 2. Meta-metric of each set; without a rollout there is no score, so leave-one-out values need two.
     weights = _score_weights(config, likelihoods.device)
-    rmm = _weigh(likelihoods, weights[0])  # [S]
-    without_each, alone = rmm[1:].view(2, distinct).repeat_interleave(repeat, dim=1)
+    rmm = _weigh(likelihoods, weights[0]).movedim(0, -1)  # [*B, S]
+    without_each, alone = (part.repeat_interleave(repeat, dim=-1) for part in rmm[..., 1:].split(distinct, -1))
     if distinct * repeat == 1:
         without_each = torch.full_like(without_each, torch.nan)
-    meta_metric, kinematic, interactive, map_based = _weigh(likelihoods[:1], weights)
-    # 3. Reported beside the metric, for each rollout [N].
-    displacement = features.displacement_error.mean(-1).repeat_interleave(repeat)
+    meta_metric, kinematic, interactive, map_based = (_weigh(likelihoods[0], row) for row in weights)
+    # 3. Reported beside the metric, for each rollout [*B, N].
+    displacement = _mean_per_rollout(features.displacement_error, log, repeat)
     collision = _any_rate(features.collision, log, repeat)
     offroad = _any_rate(features.offroad, log, repeat)
-    stays = ~(log.features.offroad & log.agents.future_valid).any(-1)[0]  # [E]
-    left = (features.offroad & log.agents.future_valid).any(-1)[:, stays]  # [N, agents that stay in the log]
+    stays = ~log.leaves_road  # [E]
+    left = ((features.offroad & log.agents.future_valid).any(-1) & stays).to(torch.float32)  # [N, E]
+    left = sum_over_agents(left, log.agents.layout)  # [N, *B]
     light = _any_rate(features.traffic_light_violation, log, repeat)
     return RealismResult(
-        scenario_ids=(log.scenario_id,),
+        scenario_ids=log.scenario_ids,
         config=config,
         likelihoods=likelihoods[0],
         meta_metric=meta_metric,
         kinematic=kinematic,
         interactive=interactive,
         map_based=map_based,
-        average_displacement_error=displacement.mean(),
-        min_average_displacement_error=displacement.min(),
-        collision_rate=collision.mean(),
-        offroad_rate=offroad.mean(),
-        unlogged_offroad_rate=left.to(torch.float32).mean(),
-        traffic_light_violation_rate=light.mean(),
+        average_displacement_error=displacement.mean(-1),
+        min_average_displacement_error=displacement.amin(-1),
+        collision_rate=collision.mean(-1),
+        offroad_rate=offroad.mean(-1),
+        unlogged_offroad_rate=left.sum(0) / (distinct * sum_over_agents(stays.to(torch.float32), log.agents.layout)),
+        traffic_light_violation_rate=light.mean(-1),
         leave_one_out_meta_metric=without_each,
         single_meta_metric=alone,
         rollout_displacement_error=displacement,

@@ -4,10 +4,12 @@ Segments are cut into chunks of up to 16 neighbors of one polyline with bounding
 close together (an agent's corners over a few steps) shares a list of the chunks nearest to the group's box. Each
 point searches the nearest of them, then every other one whose box is not farther than the best distance so far.
 Points for which a chunk outside the list could still win look at all boxes. The result is always that of a full
-search: the smallest float32 distance, the first segment in polyline-then-segment order among equals.
+search: the smallest float32 distance, the first segment in polyline-then-segment order among equals. Segments of
+several scenarios may lie side by side; a point then searches those of its own.
 """
 
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,7 +31,7 @@ _KEY_SHIFT = 32
 class ChunkedSegments:
     """Segments of polylines in chunks; slots beyond a polyline's last segment are padding far away.
 
-    C chunks, U = 16 slots, D dimensions of the boxes.
+    C chunks of B scenarios, M at most in one of them, U = 16 slots, D dimensions of the boxes.
     """
 
     start: tuple[Float[Tensor, "C U"], ...]
@@ -38,13 +40,24 @@ class ChunkedSegments:
     """End minus start."""
     squared_length: Float[Tensor, "C U"]
     """In the plane; 1 where zero, so that a projection on a segment of no length is 0."""
-    low: Float[Tensor, "D C"]
-    """Lowest corner of a chunk's box: no segment of the chunk is nearer than its box."""
-    high: Float[Tensor, "D C"]
+    low: Float[Tensor, "D B M"]
+    """Lowest corner of the box of each scenario's chunks: no segment of a chunk is nearer than its box. Padding is far
+    away."""
+    high: Float[Tensor, "D B M"]
+    first_chunk: Int64[Tensor, "B"]
+    """Index of each scenario's first chunk."""
     axis_scale: tuple[float, ...]
     """Weight of each axis in the distance to a box."""
     first_segment: Int64[Tensor, "C"]
     """Index of a chunk's first segment among all segments."""
+
+    def of_scenario(
+        self, scenario: Int64[Tensor, "n"] | None
+    ) -> tuple[Float[Tensor, "D _ M"], Float[Tensor, "D _ M"], Int64[Tensor, "_ 1"]]:
+        """Corners of the boxes that each of n points searches, and the index of its first chunk; shared if None."""
+        if scenario is None:
+            return self.low, self.high, self.first_chunk[:, None]
+        return self.low[:, scenario], self.high[:, scenario], self.first_chunk[scenario, None]
 
 
 DistanceRule = Callable[[Float[Tensor, "P D"], ChunkedSegments, Int64[Tensor, "P"]], Float[Tensor, "P U"]]
@@ -90,11 +103,49 @@ def chunk_segments(
         start=tuple(scatter(column, _FAR) for column in start.T),
         delta=tuple(scatter(column, 0.0) for column in delta.T),
         squared_length=scatter(np.where(squared_length > 0, squared_length, 1), 1.0),
-        low=torch.from_numpy(np.minimum.reduceat(bounds[0], opening).T.copy()).to(device),
-        high=torch.from_numpy(np.maximum.reduceat(bounds[1], opening).T.copy()).to(device),
+        low=torch.from_numpy(np.minimum.reduceat(bounds[0], opening).T[:, None].copy()).to(device),
+        high=torch.from_numpy(np.maximum.reduceat(bounds[1], opening).T[:, None].copy()).to(device),
+        first_chunk=torch.zeros(1, dtype=torch.int64, device=device),
         axis_scale=axis_scale,
         first_segment=torch.from_numpy(opening).to(device),
     )
+
+
+def join_chunks(parts: Sequence[ChunkedSegments | None], num_segments: Sequence[int]) -> ChunkedSegments:
+    """Segments of several scenarios side by side.
+
+    Args:
+        parts: of each scenario, at least one of them; None = a scenario without segments, in which nothing is searched.
+        num_segments: of each scenario.
+    """
+    known = [part for part in parts if part is not None]
+    device = known[0].squared_length.device
+    num_chunks = [0 if part is None else len(part.squared_length) for part in parts]
+    boxes = []
+    for name in ("low", "high"):
+        columns = [
+            getattr(part, name)[:, 0].T if part else known[0].low.new_zeros(0, len(known[0].low)) for part in parts
+        ]
+        # [B, M, D] to [D, B, M]
+        boxes.append(torch.nn.utils.rnn.pad_sequence(columns, batch_first=True, padding_value=_FAR).permute(2, 0, 1))
+    first_segment = [
+        part.first_segment + first for part, first in zip(parts, _starts(num_segments)) if part is not None
+    ]
+    return ChunkedSegments(
+        start=tuple(torch.cat(columns) for columns in zip(*(part.start for part in known))),
+        delta=tuple(torch.cat(columns) for columns in zip(*(part.delta for part in known))),
+        squared_length=torch.cat([part.squared_length for part in known]),
+        low=boxes[0],
+        high=boxes[1],
+        first_chunk=torch.tensor(_starts(num_chunks), device=device),
+        axis_scale=known[0].axis_scale,
+        first_segment=torch.cat(first_segment),
+    )
+
+
+def _starts(counts: Sequence[int]) -> list[int]:
+    """Index of the first item of each group."""
+    return [0, *itertools.accumulate(counts)][:-1]
 
 
 def _squared_box_distance(
@@ -150,39 +201,48 @@ def _widen(
     rule: DistanceRule,
     key: Int64[Tensor, "n"],
     open_rows: Int64[Tensor, "r"],
+    scenario: Int64[Tensor, "n"] | None,
     max_pairs: int,
 ) -> None:
     """Search all chunks for the points whose list was too short; lowers `key` in place."""
-    for rows in open_rows.split(max(1, max_pairs // segments.low.shape[1])):
+    for rows in open_rows.split(max(1, max_pairs // segments.low.shape[-1])):
         own = points[rows].T[:, :, None]  # [D, r, 1]
-        boxes = (segments.low[:, None], segments.high[:, None])
-        bound = _squared_box_distance((own, own), boxes, segments.axis_scale)  # [r, C]
+        low, high, first_chunk = segments.of_scenario(None if scenario is None else scenario[rows])
+        bound = _squared_box_distance((own, own), (low, high), segments.axis_scale)  # [r, M]
         row, chunk = (bound <= _squared_limit(key[rows])[:, None]).nonzero().unbind(-1)
+        chunk = chunk + first_chunk.expand(len(rows), 1)[row, 0]
         row = rows[row]
         key.scatter_reduce_(0, row, _search_chunks(points, segments, rule, (row, chunk), max_pairs), "amin")
 
 
 def _search_block(
-    groups: Float[Tensor, "G Q D"], segments: ChunkedSegments, rule: DistanceRule, max_pairs: int
+    groups: Float[Tensor, "G Q D"],
+    segments: ChunkedSegments,
+    rule: DistanceRule,
+    scenario: Int64[Tensor, "G"] | None,
+    max_pairs: int,
 ) -> Int64[Tensor, "n"]:
     """Keys of one block of groups, n = G Q."""
     # 1. The chunks nearest to each group's box, and the bound of the first one that is not listed.
-    group_size = groups.shape[1]
+    num_groups, group_size, num_axes = groups.shape
     points, axes = groups.flatten(0, 1), groups.permute(2, 0, 1)
-    num_chunks = segments.low.shape[1]
+    low, high, first_chunk = segments.of_scenario(scenario)
+    num_chunks = low.shape[-1]
     listed = min(LISTED_CHUNKS, num_chunks)
     bound = _squared_box_distance(
-        (axes.amin(-1)[..., None], axes.amax(-1)[..., None]),
-        (segments.low[:, None], segments.high[:, None]),
-        segments.axis_scale,
-    )  # [G, C]
+        (axes.amin(-1)[..., None], axes.amax(-1)[..., None]), (low, high), segments.axis_scale
+    )  # [G, M]
     near, chunks = bound.topk(min(listed + 1, num_chunks), largest=False)
-    listed_chunks = chunks[:, :listed]  # [G, M]
+    chunks = chunks[:, :listed]  # [G, L]
     # 2. Each point searches the nearest chunk of its list.
-    own = axes[..., None]  # [D, G, Q, 1]
-    listed_boxes = (segments.low[:, listed_chunks][:, :, None], segments.high[:, listed_chunks][:, :, None])
-    bound = _squared_box_distance((own, own), listed_boxes, segments.axis_scale).flatten(0, 1)  # [n, M]
-    chunks = listed_chunks.repeat_interleave(group_size, 0)
+    own, index = axes[..., None], chunks.expand(num_axes, -1, -1)  # [D, G, Q, 1], [D, G, L]
+    listed_boxes = (
+        low.expand(-1, num_groups, -1).gather(-1, index)[:, :, None],
+        high.expand(-1, num_groups, -1).gather(-1, index)[:, :, None],
+    )
+    bound = _squared_box_distance((own, own), listed_boxes, segments.axis_scale).flatten(0, 1)  # [n, L]
+    # Indices of padding may lie beyond the last chunk; it is never searched, but for points of scenarios without any.
+    chunks = (chunks + first_chunk).clamp_(max=len(segments.squared_length) - 1).repeat_interleave(group_size, 0)
     rows = torch.arange(len(points), device=points.device)
     first = bound.argmin(-1, keepdim=True)
     key = _search_chunks(points, segments, rule, (rows, chunks.gather(1, first).squeeze(1)), max_pairs)
@@ -196,12 +256,19 @@ def _search_block(
     # 4. Points for which an unlisted chunk may hold something nearer search all boxes.
     if listed < num_chunks:
         beyond = near[:, listed].repeat_interleave(group_size)
-        _widen(points, segments, rule, key, (beyond <= _squared_limit(key)).nonzero().squeeze(1), max_pairs)
+        open_rows = (beyond <= _squared_limit(key)).nonzero().squeeze(1)
+        of_point = None if scenario is None else scenario.repeat_interleave(group_size)
+        _widen(points, segments, rule, key, open_rows, of_point, max_pairs)
     return key
 
 
 def find_nearest_segment(
-    groups: Float[Tensor, "G Q D"], segments: ChunkedSegments, rule: DistanceRule, *, max_pairs: int
+    groups: Float[Tensor, "G Q D"],
+    segments: ChunkedSegments,
+    rule: DistanceRule,
+    *,
+    max_pairs: int,
+    scenario: Int64[Tensor, "G"] | None = None,
 ) -> Int64[Tensor, "G Q"]:
     """Index of the nearest segment of each point, by `rule`, the first among equals.
 
@@ -210,9 +277,16 @@ def find_nearest_segment(
         segments: cut into chunks, in the same frame as the points.
         rule: squared distance of points to the segments of a chunk, never below that to the chunk's box.
         max_pairs: bound on the point-segment or group-box pairs in memory; changes no result.
+        scenario: of each group, where the segments are those of several.
     """
-    num_chunks = segments.low.shape[1]
-    per_group = max(num_chunks, groups.shape[1] * max(LISTED_CHUNKS, CHUNK_SEGMENTS))
-    keys = [_search_block(block, segments, rule, max_pairs) for block in groups.split(max(1, max_pairs // per_group))]
+    num_chunks = segments.low.shape[-1]
+    size = max(1, max_pairs // max(num_chunks, groups.shape[1] * max(LISTED_CHUNKS, CHUNK_SEGMENTS)))
+    starts = range(0, max(len(groups), 1), size)
+    keys = [
+        _search_block(
+            groups[i : i + size], segments, rule, None if scenario is None else scenario[i : i + size], max_pairs
+        )
+        for i in starts
+    ]
     packed = torch.cat(keys).view(groups.shape[:2]) & ((1 << _KEY_SHIFT) - 1)
     return segments.first_segment[packed // CHUNK_SEGMENTS] + packed % CHUNK_SEGMENTS

@@ -5,6 +5,7 @@ packed once per scenario; an agent's lane is looked up only where it passes a st
 without z. Quirks of the official code that change results are reproduced and marked.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +14,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from rlftsim.realism.map_based import Polylines, select_polylines
-from rlftsim.realism.segment_search import ChunkedSegments, chunk_segments, find_nearest_segment
+from rlftsim.realism.segment_search import ChunkedSegments, chunk_segments, find_nearest_segment, join_chunks
 from rlftsim.scenario.types import TOTAL_STEPS, LightState, LightStates, MapFeatures, MapFeatureType
 
 RED_STATES = (LightState.ARROW_STOP, LightState.STOP)
@@ -24,21 +25,52 @@ RED_STATES = (LightState.ARROW_STOP, LightState.STOP)
 class Signals:
     """Traffic lights of surface-street lanes over the steps of a log, and the lanes that agents may be on.
 
-    S steps (91), J signals, s segments.
+    B scenarios, S steps (91), J signals at most in one scenario, s segments.
     """
 
     lanes: ChunkedSegments
     lane_of_segment: Int64[Tensor, "s"]
-    lane: Int64[Tensor, "J"]
+    lane: Int64[Tensor, "B J"]
     """Index of a signal's lane among the surface-street lanes, as in `lane_of_segment`."""
-    is_red: Bool[Tensor, "S J"]
-    stop_start: Float[Tensor, "S J 2"]
+    is_red: Bool[Tensor, "B S J"]
+    """False for padding."""
+    stop_start: Float[Tensor, "B S J 2"]
     """Start of the segment of the signal's lane that is nearest to its stop point."""
-    stop_direction: Float[Tensor, "S J 2"]
+    stop_direction: Float[Tensor, "B S J 2"]
     """End minus start of that segment."""
-    stop_squared_length: Float[Tensor, "S J"]
-    stop_progress: Float[Tensor, "S J"]
+    stop_squared_length: Float[Tensor, "B S J"]
+    stop_progress: Float[Tensor, "B S J"]
     """Projection of the stop point on that segment, in segment lengths."""
+
+
+def join_signals(parts: Sequence[Signals | None]) -> Signals | None:
+    """Traffic lights of several scenarios side by side; None if none of them has any."""
+    known = [part for part in parts if part is not None]
+    if not known:
+        return None
+    num_signals = max(part.lane.shape[1] for part in known)
+
+    def padded(name: str, axis: int) -> Tensor:
+        """A field of all scenarios, padded with zeros along the axis of signals: padding is never red."""
+        shape = list(getattr(known[0], name).shape)
+        shape[0], shape[axis] = len(parts), num_signals
+        out = getattr(known[0], name).new_zeros(shape)
+        for row, part in zip(out, parts):
+            if part is not None:
+                row.narrow(axis - 1, 0, part.lane.shape[1]).copy_(getattr(part, name)[0])
+        return out
+
+    # Lanes keep the numbers that they have in their own scenario: a point finds no other ones.
+    fields = ("is_red", "stop_start", "stop_direction", "stop_squared_length", "stop_progress")
+    return Signals(
+        lanes=join_chunks(
+            [part and part.lanes for part in parts],
+            [0 if part is None else len(part.lane_of_segment) for part in parts],
+        ),
+        lane_of_segment=torch.cat([part.lane_of_segment for part in known]),
+        lane=padded("lane", 1),
+        **{name: padded(name, 2) for name in fields},
+    )
 
 
 def _lane_rule(
@@ -126,8 +158,9 @@ def build_signals(features: MapFeatures, lights: LightStates, device: torch.devi
     progress = ((stop[:, known] - start) * direction).sum(-1) / squared_length
     # 4. The lane rule is bounded by the distance to a segment's start, so boxes are those of the starts.
     chunks = chunk_segments(*segments, (segments[0], segments[0]), axis_scale=(1.0, 1.0), device=device)
-    arrays = (segments[2], lane, np.isin(state[:, known], RED_STATES), start, direction, squared_length, progress)
-    return Signals(chunks, *(torch.from_numpy(array).to(device) for array in arrays))
+    arrays = (lane, np.isin(state[:, known], RED_STATES), start, direction, squared_length, progress)
+    lane_of_segment = torch.from_numpy(segments[2]).to(device)
+    return Signals(chunks, lane_of_segment, *(torch.from_numpy(array[None]).to(device) for array in arrays))
 
 
 def compute_traffic_light_violation(
@@ -138,6 +171,7 @@ def compute_traffic_light_violation(
     *,
     first_step: int,
     max_pairs: int,
+    scenario: Int64[Tensor, "E"] | None = None,
 ) -> Bool[Tensor, "N E T"]:
     """True where an agent's center crosses the stop point of a red light on that light's lane.
 
@@ -148,22 +182,29 @@ def compute_traffic_light_violation(
         signals: packed lights and lanes.
         first_step: step of the log that x and y begin with.
         max_pairs: memory bound, see `find_nearest_segment`.
+        scenario: of each agent, where the signals are those of several.
     """
+
+    # Values of the signals that each agent may pass, [E, T + 1, J, ...], or with E = 1 if they are shared.
+    def of_agents(values: Tensor) -> Tensor:
+        return (values if scenario is None else values[scenario])[:, first_step : first_step + x.shape[-1]]
+
     # 1. Crossings of red lights since the step before, along the light's lane and at any distance to its side.
-    steps = slice(first_step, first_step + x.shape[-1])
-    start, direction = signals.stop_start[steps], signals.stop_direction[steps]  # [T + 1, J, 2]
+    start, direction = of_agents(signals.stop_start), of_agents(signals.stop_direction)
     along = (x[..., None] - start[..., 0]) * direction[..., 0] + (y[..., None] - start[..., 1]) * direction[..., 1]
-    progress = along / signals.stop_squared_length[steps]  # [N, E, T + 1, J]
-    stop = signals.stop_progress[steps]
-    crossed = (progress[..., :-1, :] < stop[:-1]) & (progress[..., 1:, :] > stop[1:])
-    crossings = crossed & signals.is_red[steps][1:] & valid[..., None]  # [N, E, T, J]
+    progress = along / of_agents(signals.stop_squared_length)  # [N, E, T + 1, J]
+    stop = of_agents(signals.stop_progress)
+    crossed = (progress[..., :-1, :] < stop[:, :-1]) & (progress[..., 1:, :] > stop[:, 1:])
+    crossings = crossed & of_agents(signals.is_red)[:, 1:] & valid[..., None]  # [N, E, T, J]
     violation = crossings.new_zeros(crossings.shape[:-1])
     # 2. The agent's lane, which is expensive to find, only for these few crossings.
     rollout, agent, step = crossings.any(-1).nonzero().unbind(-1)
     if len(rollout) == 0:
         return violation
     points = torch.stack([x[rollout, agent, step + 1], y[rollout, agent, step + 1]], dim=-1)
-    segment = find_nearest_segment(points[:, None], signals.lanes, _lane_rule, max_pairs=max_pairs)
-    on_lane = signals.lane_of_segment[segment] == signals.lane
+    of_point = None if scenario is None else scenario[agent]
+    segment = find_nearest_segment(points[:, None], signals.lanes, _lane_rule, max_pairs=max_pairs, scenario=of_point)
+    lane = signals.lane if of_point is None else signals.lane[of_point]
+    on_lane = signals.lane_of_segment[segment] == lane
     violation[rollout, agent, step] = (crossings[rollout, agent, step] & on_lane).any(-1)
     return violation
