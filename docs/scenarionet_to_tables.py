@@ -1,6 +1,6 @@
 """ScenarioNet's scenario files to the tables that `rlftsim convert --from tables` reads.
 
-    python docs/scenarionet_to_tables.py FOLDER_WITH_sd_FILES TABLES_FOLDER      needs numpy, pyarrow and what the pickles need
+    python docs/scenarionet_to_tables.py FOLDER_WITH_sd_FILES TABLES_FOLDER      needs numpy and pyarrow
     rlftsim convert TABLES_FOLDER data/scenarionet
 
 Run it in the environment that made the files: opening a pickle runs the code in it. Their coordinates are those of the
@@ -21,10 +21,12 @@ FEATURES = {
     "LANE_FREEWAY": "lane_freeway", "LANE_SURFACE_STREET": "lane_surface_street", "LANE_BIKE_LANE": "lane_bike",
     "LANE_UNKNOWN": "lane_undefined", "ROAD_EDGE_BOUNDARY": "edge_boundary", "ROAD_EDGE_MEDIAN": "edge_median",
     "UNKNOWN_LINE": "line_unknown", "ROAD_LINE_BROKEN_SINGLE_WHITE": "line_broken_single_white",
-    "ROAD_LINE_SOLID_SINGLE_WHITE": "line_solid_single_white", "ROAD_LINE_SOLID_DOUBLE_WHITE": "line_solid_double_white",
+    "ROAD_LINE_SOLID_SINGLE_WHITE": "line_solid_single_white",
+    "ROAD_LINE_SOLID_DOUBLE_WHITE": "line_solid_double_white",
     "ROAD_LINE_BROKEN_SINGLE_YELLOW": "line_broken_single_yellow", "CROSSWALK": "crosswalk", "DRIVEWAY": "driveway",
     "ROAD_LINE_BROKEN_DOUBLE_YELLOW": "line_broken_double_yellow", "SPEED_BUMP": "speed_bump", "STOP_SIGN": "stop_sign",
-    "ROAD_LINE_SOLID_SINGLE_YELLOW": "line_solid_single_yellow", "ROAD_LINE_PASSING_DOUBLE_YELLOW": "line_passing_double_yellow",
+    "ROAD_LINE_SOLID_SINGLE_YELLOW": "line_solid_single_yellow",
+    "ROAD_LINE_PASSING_DOUBLE_YELLOW": "line_passing_double_yellow",
     "ROAD_LINE_SOLID_DOUBLE_YELLOW": "line_solid_double_yellow",
 }  # fmt: skip
 STATES = {"TRAFFIC_LIGHT_RED": "stop", "TRAFFIC_LIGHT_YELLOW": "caution", "TRAFFIC_LIGHT_GREEN": "go",
@@ -43,7 +45,7 @@ def main(source, destination):
             state, kind = track["state"], OBJECTS.get(track["type"], "other")
             for step in np.flatnonzero(state["valid"]).tolist():
                 row = {"scenario_id": name, "object_id": numbers[key], "type": kind, "step": step}
-                row |= dict(zip("xyz", map(float, state["position"][step]))) | {"heading": float(state["heading"][step])}
+                row |= {"heading": float(state["heading"][step]), **dict(zip("xyz", map(float, state["position"][step])))}
                 row |= dict(zip(("vx", "vy"), map(float, state["velocity"][step])))
                 row |= {size: float(np.ravel(state[size][step])[0]) for size in ("length", "width", "height")}
                 tables["tracks"].append(row)
@@ -61,8 +63,9 @@ def main(source, destination):
                     tables["lights"].append({"scenario_id": name, "step": step, "state": STATES[state],
                                              "lane_id": features[light["lane"]]})  # fmt: skip
         predict = [numbers[key] for key in about.get("tracks_to_predict", {}) if key in numbers]
-        row = {"scenario_id": name, "ego_id": numbers[about["sdc_id"]], "step_s": float(np.diff(about["ts"]).mean().round(3))}
-        tables["scenarios"].append({**row, "first_step": 0, **({"predict": predict} if predict else {})})
+        step_s = float(np.diff(about["ts"]).mean().round(3))
+        row = {"scenario_id": name, "ego_id": numbers[about["sdc_id"]], "step_s": step_s, "first_step": 0}
+        tables["scenarios"].append({**row, **({"predict": predict} if predict else {})})
     Path(destination).mkdir(parents=True, exist_ok=True)
     for name, rows in tables.items():
         if rows:

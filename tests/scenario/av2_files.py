@@ -174,5 +174,7 @@ def map_archive(scenario: Scenario, reach_m: float = REACH_M) -> dict:
         if len(corner) >= 4:
             number = str(features.feature_id[index])
             crossings[number] = {"id": int(number), "edge1": points(corner[:2]), "edge2": points(corner[[3, 2]])}
-    areas = {str(k): {"id": k, "area_boundary": points(ring)} for k, ring in enumerate(drivable_tiles(scenario, reach_m))}
+    areas = {
+        str(k): {"id": k, "area_boundary": points(ring)} for k, ring in enumerate(drivable_tiles(scenario, reach_m))
+    }
     return {"lane_segments": lanes, "pedestrian_crossings": crossings, "drivable_areas": areas}

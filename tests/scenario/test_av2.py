@@ -117,7 +117,9 @@ def test_the_map_of_the_sample_is_counted(sample):
     assert len(features.indices_of(LANE_TYPES)) == 71
     assert features.topology.interpolating.sum() == 32
     lanes = archive["lane_segments"].values()
-    sides = [(lane[f"{side}_lane_boundary"], lane[f"{side}_lane_mark_type"]) for lane in lanes for side in ("left", "right")]
+    sides = [
+        (lane[f"{side}_lane_boundary"], lane[f"{side}_lane_mark_type"]) for lane in lanes for side in ("left", "right")
+    ]
     assert (len(sides), sum(mark == "NONE" for _, mark in sides)) == (142, 92)
     shapes = {}
     for line, mark in sides:
@@ -200,8 +202,7 @@ def test_synthetic_scenarios_come_back_from_files_of_this_shape(pack, tmp_path):
         # 3. The ground: random places are on the same side, and the road is left of every edge.
         _, ground = read_map(next(place.glob("*.json")))
         edges = [
-            found.map_features.polyline(k)[:, :2].astype(float)
-            for k in found.map_features.indices_of(ROAD_EDGE_TYPES)
+            found.map_features.polyline(k)[:, :2].astype(float) for k in found.map_features.indices_of(ROAD_EDGE_TYPES)
         ]
         x0, y0, x1, y1 = crop_box(scenario).bounds
         places = rng.uniform((x0, y0), (x1, y1), (250, 2))  # 10 000 in all
@@ -266,7 +267,11 @@ def test_a_file_of_sizes_replaces_guesses(tmp_path):
     (tmp_path / "sizes.json").write_text('{"vehicle": [5.0, 2.2, 1.5]}')
     scenario, _ = read_one(place, sizes=tmp_path / "sizes.json")
     assert scenario.tracks.size[1, CURRENT_STEP].tolist() == pytest.approx([5.0, 2.2, 1.5])
-    for text, cause in (("[]", "are written like"), ('{"tram": [1, 1, 1]}', "no kind 'tram'"), ('{"bus": [1, 0, 1]}', "size of bus")):
+    for text, cause in (
+        ("[]", "are written like"),
+        ('{"tram": [1, 1, 1]}', "no kind 'tram'"),
+        ('{"bus": [1, 0, 1]}', "size of bus"),
+    ):
         (tmp_path / "sizes.json").write_text(text)
         with pytest.raises(ConfigError, match=cause):
             Av2Source(sizes=tmp_path / "sizes.json")
@@ -279,8 +284,8 @@ def test_a_file_of_sizes_replaces_guesses(tmp_path):
 def test_pieces_along_the_grid_are_cuts_and_short_ones_are_not():
     ring = np.array([[-10, 10], [30, 10], [30, 12], [30, 25], [20, 30.0], [19.5, 30.0], [-10, 28], [-10, 10]])
     assert find_cuts(ring).tolist() == [False, True, True, False, False, False, False]
-    assert find_cuts(ring + [0, 0.02]).tolist() == find_cuts(ring).tolist()
-    assert not find_cuts(ring + [0.02, 0]).any()
+    assert find_cuts(ring + np.array([0, 0.02])).tolist() == find_cuts(ring).tolist()
+    assert not find_cuts(ring + np.array([0.02, 0])).any()
     # a piece that begins before the ring's first point
     assert find_cuts(np.concatenate([ring[2:], ring[1:3]])).tolist() == [True, False, False, False, False, False, True]
 
@@ -306,6 +311,11 @@ def edit_rows(place, change):
     pq.write_table(pa.Table.from_pylist(change(pq.read_table(path).to_pylist())), path)
 
 
+def edit_each(place, **values):
+    """Set columns of all rows; None drops one."""
+    edit_rows(place, lambda rows: [{k: v for k, v in (row | values).items() if v is not None} for row in rows])
+
+
 def edit_map(place, change):
     path = next(place.glob("*.json"))
     archive = json.loads(path.read_text())
@@ -316,17 +326,17 @@ def edit_map(place, change):
 BAD = {
     "no map": (lambda p: next(p.glob("*.json")).unlink(), "there is no log_map_archive_aa.json beside it"),
     "no ego": (lambda p: edit_rows(p, lambda r: [x for x in r if x["track_id"] != "AV"]), "no track AV"),
-    "109 steps": (lambda p: edit_rows(p, lambda r: [x for x in r if x["timestep"] < 109]), "has 109 steps instead of 110"),
+    "109 steps": (lambda p: edit_rows(p, lambda r: [x for x in r if x["timestep"] < 109]), "has 109 steps instead"),
     "NaN": (lambda p: edit_rows(p, lambda r: [{**r[0], "heading": float("nan")}, *r[1:]]), "row 0: .* NaN"),
     "twice": (lambda p: edit_rows(p, lambda r: [r[0], *r]), "has two rows for timestep"),
-    "column": (lambda p: edit_rows(p, lambda r: [{**x, "lidar": 1} for x in r]), "the unknown column lidar"),
-    "no column": (lambda p: edit_rows(p, lambda r: [{k: v for k, v in x.items() if k != "heading"} for x in r]), "no column heading"),
-    "kind": (lambda p: edit_rows(p, lambda r: [{**x, "object_type": "tram"} for x in r]), "unknown object_type 'tram'"),
+    "column": (lambda p: edit_each(p, lidar=1), "the unknown column lidar"),
+    "no column": (lambda p: edit_each(p, heading=None), "no column heading"),
+    "kind": (lambda p: edit_each(p, object_type="tram"), "unknown object_type 'tram'"),
     "mark": (lambda p: edit_map(p, lambda a, lane: lane.update(left_lane_mark_type="PINK")), "unknown lane mark 'PINK'"),
     "lane": (lambda p: edit_map(p, lambda a, lane: lane.update(lane_type="RAIL")), "unknown lane type 'RAIL'"),
     "part": (lambda p: edit_map(p, lambda a, lane: a.pop("drivable_areas")), "has no drivable_areas"),
     "text": (lambda p: next(p.glob("*.json")).write_text("{"), "it is no JSON text"),
-    "time": (lambda p: edit_rows(p, lambda r: [{**x, "end_timestamp": 3e17 + 1.2e10} for x in r]), "110 steps last 12"),
+    "time": (lambda p: edit_each(p, end_timestamp=3e17 + 1.2e10), "110 steps last 12"),
 }  # fmt: skip
 
 
@@ -389,7 +399,6 @@ def test_damaged_files_never_end_in_a_traceback(small_files, data):
         return  # no such file can be written
     try:
         scenario, _ = read_one(place)
-    except DataError as error:
-        assert str(error)
-    else:
-        scenario.refuse_not_finite()
+    except DataError:
+        return
+    scenario.refuse_not_finite()

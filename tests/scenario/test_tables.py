@@ -2,6 +2,7 @@
 
 import gzip
 import os
+import pickle
 import re
 import subprocess
 import sys
@@ -35,7 +36,9 @@ def car(object_id, x, y=0.0, *, speed=10.0, kind="vehicle", steps=range(91), ste
 
 
 def line(feature_id, kind, *points, scenario_id="one", **more):
-    return [{"scenario_id": scenario_id, "feature_id": feature_id, "type": kind, "x": x, "y": y, **more} for x, y in points]
+    return [
+        {"scenario_id": scenario_id, "feature_id": feature_id, "type": kind, "x": x, "y": y, **more} for x, y in points
+    ]
 
 
 MAP = [
@@ -119,7 +122,9 @@ def test_short_holes_are_filled_and_longer_ones_are_not(tmp_path):
 def test_lanes_lights_and_shared_maps(tmp_path):
     shared = [{"map_id": "m", **{k: v for k, v in row.items() if k != "scenario_id"}} for row in MAP]
     lanes = [{"map_id": "m", "lane_id": 1, "entry": [9], "exit": [4], "left": [4], "speed_limit_mph": 25.0}]
-    lights = [{"scenario_id": "one", "step": s, "lane_id": 1, "state": "stop" if s < 5 else "go"} for s in range(0, 91, 2)]
+    lights = [
+        {"scenario_id": "one", "step": s, "lane_id": 1, "state": "stop" if s < 5 else "go"} for s in range(0, 91, 2)
+    ]
     row = [{"scenario_id": "one", "ego_id": 7, "map_id": "m", "step_s": 0.1}]
     (scenario,) = read(write(tmp_path / "d", None, row, shared, lanes=lanes, lights=lights))
     topology = scenario.map_features.topology
@@ -146,8 +151,8 @@ BAD = {
     "NaN": ({"tracks": changed(TWO, 40, x=float("nan"))}, "tracks.parquet: row 40: x is nan"),
     "empty": ({"tracks": changed(TWO, 40, object_id=None)}, "tracks.parquet: row 40: object_id is empty"),
     "twice": ({"tracks": [*TWO, TWO[3]]}, r"tracks.parquet: row 182: object 7 has a second row for step 3"),
-    "jump": ({"tracks": changed(TWO, 95, x=40.0)}, "tracks.parquet: row 95: object 8 jumps 16.0 m in 0.10 s"),
-    "backwards": ({"tracks": [*car(7, 0.0), *car(8, 20.0, heading=3.1)]}, r"row \d+: object 8 moves against its heading"),
+    "jump": ({"tracks": changed(TWO, 95, x=40.0)}, "tracks.parquet: row 95: object 8 jumps 17.0 m in 0.10 s"),
+    "backwards": ({"tracks": [*car(7, 0.0), *car(8, 20.0, heading=3.1)]}, r"row \d+: object 8 moves against"),
     "type": ({"tracks": changed(TWO, 3, type="tram")}, "row 3: type 'tram' is none of unset, vehicle"),
     "second type": ({"tracks": changed(TWO, 3, type="cyclist")}, "object 7 has a second type"),
     "size": ({"tracks": [{**row, "width": 0.0} for row in TWO]}, "row 0: width is 0, it must be above zero"),
@@ -156,15 +161,15 @@ BAD = {
     "ego gone": ({"scenarios": [{**ROW, "first_step": -20}]}, "no ego: object 7 is not there 1 s after step -20"),
     "predict": ({"scenarios": [{**ROW, "predict": [5]}]}, "predict lists object 5"),
     "rate": ({"scenarios": [{**ROW, "step_s": 2.0}]}, "step_s is 2, it must lie between"),
-    "edge": ({"map_rows": [*MAP[:2], *MAP[3:1:-1], *MAP[4:]]}, "map.parquet: row 2: road edge 2 has the lanes on its right"),
+    "edge": ({"map_rows": [*MAP[:2], *MAP[3:1:-1], *MAP[4:]]}, "row 2: road edge 2 has the lanes on its right"),
     "feature": ({"map_rows": MAP[:3]}, "map.parquet: row 2: feature 2 has 1 points, it needs 2"),
     "map type": ({"map_rows": changed(MAP, 1, type="edge_median")}, "row 1: feature 1 has a second type"),
     "no heights": ({"tracks": [{**row, "z": 1.0} for row in TWO]}, "give both or neither"),
     "column": ({"tracks": drop(TWO, "vx")}, "tracks.parquet has no column vx"),
-    "kind": ({"tracks": [{**row, "x": "a"} for row in TWO]}, "tracks.parquet: column x is string, it must have numbers"),
+    "kind": ({"tracks": [{**row, "x": "a"} for row in TWO]}, "column x is string, it must have numbers"),
     "no map": ({"map_rows": drop(MAP, "scenario_id")}, "map.parquet has no column scenario_id or map_id"),
     "lane": ({"lanes": [{"scenario_id": "one", "lane_id": 2}]}, "lanes.parquet: row 0: lane 2 is no lane"),
-    "light": ({"lights": [{"scenario_id": "one", "step": 0, "lane_id": 1, "state": 77}]}, "lights.parquet: row 0: state 77"),
+    "light": ({"lights": [{"scenario_id": "one", "step": 0, "lane_id": 1, "state": 77}]}, "row 0: state 77"),
 }  # fmt: skip
 
 
@@ -200,8 +205,8 @@ def test_several_folders_are_several_shards_with_their_licenses(tmp_path):
 
 COMMONROAD = """<commonRoad benchmarkID="X" timeStepSize="0.1" tags="urban">
 <lanelet id="5"><leftBound>{left}</leftBound><rightBound>{right}</rightBound></lanelet>
-<obstacle id="1"><role>dynamic</role><type>car</type><shape><rectangle><length>4</length><width>2</width></rectangle></shape>
-{states}</obstacle>
+<obstacle id="1"><role>dynamic</role><type>car</type>
+<shape><rectangle><length>4</length><width>2</width></rectangle></shape>{states}</obstacle>
 <planningProblem><initialState><position><point><x>0</x><y>0</y></point></position></initialState></planningProblem>
 </commonRoad>"""
 
@@ -222,7 +227,9 @@ def test_the_commonroad_script_writes_the_tables(tmp_path):
             f"<time><exact>{step}</exact></time><velocity><exact>10</exact></velocity></{tag}>"
         )
 
-    states = state("initialState", 0) + "<trajectory>" + "".join(state("state", k) for k in range(1, 95)) + "</trajectory>"
+    states = (
+        state("initialState", 0) + "<trajectory>" + "".join(state("state", k) for k in range(1, 95)) + "</trajectory>"
+    )
     text = COMMONROAD.format(left=points((0, 2), (150, 2)), right=points((0, -2), (150, -2)), states=states)
     (tmp_path / "xml").mkdir()
     (tmp_path / "xml" / "x.xml.gz").write_bytes(gzip.compress(text.encode()))
@@ -246,3 +253,32 @@ def test_recorded_commonroad_scenarios_convert(shared, tmp_path):
     assert data.guessed == ("edges", "ego", "predict", "size", "z")
     assert verify_dataset(tmp_path / "data") == []
     assert all((scenario.tracks.object_type == ObjectType.VEHICLE).all() for scenario in data)
+
+
+def test_the_scenarionet_script_writes_the_tables(tmp_path):
+    def state(x, speed):
+        steps = np.arange(91)
+        place = np.stack([x + 0.1 * speed * steps, np.zeros(91), np.full(91, 1.0)], 1)
+        flat = np.ones((91, 1))
+        return {
+            "position": place, "heading": np.zeros(91), "velocity": np.tile([speed, 0.0], (91, 1)),
+            "valid": np.ones(91, bool), "length": 4.5 * flat, "width": 2 * flat, "height": 1.5 * flat,
+        }  # fmt: skip
+
+    line_points = np.array([[-50.0, 0, 0.25], [200, 0, 0.25]])
+    scenario = {
+        "id": "sn", "metadata": {"sdc_id": "ego", "ts": 0.1 * np.arange(91), "tracks_to_predict": {"12": {}}},
+        "tracks": {"ego": {"type": "VEHICLE", "state": state(0, 10)}, "12": {"type": "CYCLIST", "state": state(20, 5)}},
+        "map_features": {
+            "5": {"type": "LANE_SURFACE_STREET", "polyline": line_points},
+            "6": {"type": "ROAD_EDGE_BOUNDARY", "polyline": line_points - [0, 3, 0]},
+        },
+        "dynamic_map_states": {"5": {"lane": "5", "state": {"object_state": ["TRAFFIC_LIGHT_RED"] * 91}}},
+    }  # fmt: skip
+    (tmp_path / "sn").mkdir()
+    (tmp_path / "sn" / "sd_x_1.pkl").write_bytes(pickle.dumps(scenario))
+    command = [sys.executable, ROOT / "docs" / "scenarionet_to_tables.py", tmp_path / "sn", tmp_path / "tables"]
+    subprocess.run(command, check=True)
+    (found,) = read(tmp_path / "tables")
+    assert (found.guessed, found.num_steps, len(found.lights.step)) == (set(), 91, 91)
+    assert found.tracks.object_type[found.tracks_to_predict].tolist() == [ObjectType.CYCLIST]
