@@ -45,7 +45,8 @@ def main(source, destination):
             state, kind = track["state"], OBJECTS.get(track["type"], "other")
             for step in np.flatnonzero(state["valid"]).tolist():
                 row = {"scenario_id": name, "object_id": numbers[key], "type": kind, "step": step}
-                row |= {"heading": float(state["heading"][step]), **dict(zip("xyz", map(float, state["position"][step])))}
+                row |= dict(zip("xyz", map(float, state["position"][step])))
+                row["heading"] = float(state["heading"][step])
                 row |= dict(zip(("vx", "vy"), map(float, state["velocity"][step])))
                 row |= {size: float(np.ravel(state[size][step])[0]) for size in ("length", "width", "height")}
                 tables["tracks"].append(row)

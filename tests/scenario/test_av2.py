@@ -332,7 +332,7 @@ BAD = {
     "column": (lambda p: edit_each(p, lidar=1), "the unknown column lidar"),
     "no column": (lambda p: edit_each(p, heading=None), "no column heading"),
     "kind": (lambda p: edit_each(p, object_type="tram"), "unknown object_type 'tram'"),
-    "mark": (lambda p: edit_map(p, lambda a, lane: lane.update(left_lane_mark_type="PINK")), "unknown lane mark 'PINK'"),
+    "mark": (lambda p: edit_map(p, lambda a, lane: lane.update(left_lane_mark_type="PINK")), "lane mark 'PINK'"),
     "lane": (lambda p: edit_map(p, lambda a, lane: lane.update(lane_type="RAIL")), "unknown lane type 'RAIL'"),
     "part": (lambda p: edit_map(p, lambda a, lane: a.pop("drivable_areas")), "has no drivable_areas"),
     "text": (lambda p: next(p.glob("*.json")).write_text("{"), "it is no JSON text"),
