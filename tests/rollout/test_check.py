@@ -37,7 +37,7 @@ def test_constant_velocity_keeps_the_contract():
     report = check_policy(ConstantVelocity(), STRAIGHT)
     assert report.is_passed, str(report)
     skipped = [r.rule for r in report.results if r.outcome == "not applicable"]
-    assert len(skipped) == 7  # rules on weights and on random decisions
+    assert len(skipped) == 8  # rules on weights and on random decisions
 
 
 @pytest.mark.parametrize(

@@ -30,7 +30,8 @@ class RecipeVerb:
     starting_name: ClassVar[str]
     """Name of the recipe that the defaults are from. The parsed field `recipe` may turn out to be another."""
     recipe: str
-    processes: Processes
+    processes: Processes = None
+    """Processes that train; a flag of the verbs that do."""
 
     @property
     def settings(self) -> Recipe:

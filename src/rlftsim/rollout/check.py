@@ -23,7 +23,15 @@ from rlftsim.geometry import rotate, wrap_angle
 from rlftsim.goals.types import Goals
 from rlftsim.rollout.edge_scenes import EXACT_TURN_RAD, edge_scenes, move_scenario, place_on_grid
 from rlftsim.rollout.noise import draw_noise
-from rlftsim.rollout.policy import DecisionDistribution, Policy, Sampling, device_of
+from rlftsim.rollout.policy import (
+    DecisionDistribution,
+    Policy,
+    Sampling,
+    decision_statistics,
+    device_of,
+    encode_like,
+    score_both,
+)
 from rlftsim.rollout.simulate import simulate
 from rlftsim.rollout.types import AgentStates, Rollouts
 from rlftsim.scenario.batch import ScenarioBatch, collate
@@ -515,6 +523,25 @@ def freezing_weights_changes_no_score(subject: _Subject) -> str:
     return _within(_gap(*scores), SCORE_TOLERANCE, "largest gap")
 
 
+def shared_passes_change_no_number(subject: _Subject) -> str:
+    """Passes that share what they have in common, and statistics in one pass, give what each gives alone."""
+    frozen = copy.deepcopy(subject.module).requires_grad_(False)
+    assert isinstance(frozen, Policy)
+    twin, gaps = copy.deepcopy(frozen), []
+    for rollouts in (subject.rollouts, subject.with_goals):
+        alone, decision = subject.score(subject.batch, rollouts, frozen), rollouts.decision
+        for reference in (twin, subject.reference):
+            with torch.no_grad():
+                context = frozen.encode(subject.batch)
+                contexts = [encode_like(policy, subject.batch, context) for policy in (frozen, reference)]
+                dist, ref_dist = score_both(frozen, contexts[0], rollouts, reference, contexts[1], rollouts)
+                found = decision_statistics(dist, decision, ref_dist)
+            kl = alone.kl(subject.score(subject.batch, rollouts, reference))
+            gaps += [_gap(found.log_prob, alone.log_prob(decision)), _gap(found.kl, kl)]
+            gaps.append(_gap(found.entropy, alone.entropy()))
+    return _within(max(gaps), SCORE_TOLERANCE, "largest gap")
+
+
 # ---- rules: scenarios
 # ---------------------------------------------------------------------------------------------------
 
@@ -611,6 +638,7 @@ CHECKS: tuple[Check, ...] = (
     gradients_reach_all_trained_weights,
     zero_reward_gives_zero_gradient,
     freezing_weights_changes_no_score,
+    shared_passes_change_no_number,
     scores_are_invariant_to_rotation_and_translation,
     rollouts_are_independent_of_batch_composition,
     edge_cases_can_be_simulated_and_scored,
