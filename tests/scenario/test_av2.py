@@ -26,7 +26,14 @@ from rlftsim.scenario.convert import convert
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.inspect import verify_dataset
 from rlftsim.scenario.synthetic import pack_path
-from rlftsim.scenario.types import CURRENT_STEP, LANE_TYPES, ROAD_EDGE_TYPES, MapFeatureType, ObjectType
+from rlftsim.scenario.types import (
+    CURRENT_STEP,
+    LANE_TYPES,
+    MEDIAN_SIZE_M,
+    ROAD_EDGE_TYPES,
+    MapFeatureType,
+    ObjectType,
+)
 
 SAMPLE = "0a1e6f0a-1817-4a98-b02e-db8c9327d151"
 
@@ -160,6 +167,22 @@ def test_guessed_sizes_show_at_curbs_and_vehicles_leave_through_the_cuts(sample)
     assert min(near_curb.values()) == pytest.approx(0.16, abs=0.02)
     assert max(near_curb.values()) == pytest.approx(0.67, abs=0.02)
     assert near_curb[139344] == pytest.approx(0.34, abs=0.02)
+
+
+@pytest.mark.official
+def test_guessed_sizes_are_the_medians_of_womd(shared):
+    sizes = {kind: [] for kind in MEDIAN_SIZE_M}
+    for path in (shared / "data" / "womd_npz" / "scenarios").glob("*.npz"):
+        with np.load(path) as scenario:
+            kinds, found = scenario["agent_type"], scenario["agent_size"]
+        for kind, values in sizes.items():
+            values.append(found[kinds == kind])
+    merged = {kind: np.concatenate(values) for kind, values in sizes.items()}
+    assert [len(values) for values in merged.values()] == [18_631, 2_288, 127]
+    for kind, values in merged.items():
+        assert np.median(values, axis=0).tolist() == pytest.approx(MEDIAN_SIZE_M[kind], abs=0.006)
+    low, high = np.percentile(merged[ObjectType.VEHICLE], [5, 95], axis=0)
+    assert [*low[:2], *high[:2]] == pytest.approx([4.25, 1.93, 5.70, 2.40], abs=0.006)
 
 
 @pytest.mark.official
