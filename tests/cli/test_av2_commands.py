@@ -107,7 +107,8 @@ def test_the_log_scores_above_both_baselines(files, tmp_path, capsys):
         name: evaluate(policy, data, config=config, name=name, show_progress=False).mean_and_error("meta_metric").mean
         for name, policy in rows.items()
     }
-    assert means["log"] > means["velocity"] > means["parked"], means
+    # The two baselines are in no fixed order: where most road users stand, "nobody moves" is the better guess.
+    assert means["log"] > max(means["velocity"], means["parked"]) + 0.1, means
 
 
 def test_pictures_of_other_data_carry_no_note():

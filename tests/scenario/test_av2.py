@@ -26,7 +26,14 @@ from rlftsim.scenario.convert import convert
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.inspect import verify_dataset
 from rlftsim.scenario.synthetic import pack_path
-from rlftsim.scenario.types import CURRENT_STEP, LANE_TYPES, ROAD_EDGE_TYPES, MapFeatureType, ObjectType
+from rlftsim.scenario.types import (
+    CURRENT_STEP,
+    LANE_TYPES,
+    MEDIAN_SIZE_M,
+    ROAD_EDGE_TYPES,
+    MapFeatureType,
+    ObjectType,
+)
 
 SAMPLE = "0a1e6f0a-1817-4a98-b02e-db8c9327d151"
 
@@ -163,6 +170,22 @@ def test_guessed_sizes_show_at_curbs_and_vehicles_leave_through_the_cuts(sample)
 
 
 @pytest.mark.official
+def test_guessed_sizes_are_the_medians_of_womd(shared):
+    sizes = {kind: [] for kind in MEDIAN_SIZE_M}
+    for path in (shared / "data" / "womd_npz" / "scenarios").glob("*.npz"):
+        with np.load(path) as scenario:
+            kinds, found = scenario["agent_type"], scenario["agent_size"]
+        for kind, values in sizes.items():
+            values.append(found[kinds == kind])
+    merged = {kind: np.concatenate(values) for kind, values in sizes.items()}
+    assert [len(values) for values in merged.values()] == [18_631, 2_288, 127]
+    for kind, values in merged.items():
+        assert np.median(values, axis=0).tolist() == pytest.approx(MEDIAN_SIZE_M[kind], abs=0.006)
+    low, high = np.percentile(merged[ObjectType.VEHICLE], [5, 95], axis=0)
+    assert [*low[:2], *high[:2]] == pytest.approx([4.25, 1.93, 5.70, 2.40], abs=0.006)
+
+
+@pytest.mark.official
 def test_the_sample_fits_into_sixty_kilobytes(sample, tmp_path):
     report = convert(sample, tmp_path / "data", split="validation", jobs=1, show_progress=False)
     assert report.converted == 1
@@ -246,11 +269,9 @@ def test_resumed_and_parallel_conversions_give_the_same_bytes(files, tmp_path):
 
     convert(files, tmp_path / "one", jobs=1, show_progress=False)
     convert(files, tmp_path / "two", jobs=2, show_progress=False)
-    # interrupted: one shard is missing, the other has its receipt only in the manifest
+    # interrupted before the first of two shards was written
     (tmp_path / "two" / "INCOMPLETE").touch()
-    (tmp_path / "two" / "shards" / "val" / "aa.arrow").unlink(missing_ok=True)
-    for shard in list((tmp_path / "two").rglob("aa.arrow")):
-        shard.unlink()
+    next((tmp_path / "two").rglob("aa.arrow")).unlink()
     assert convert(files, tmp_path / "two", jobs=1, show_progress=False).shards_reused == 1
     assert contents(tmp_path / "one") == contents(tmp_path / "two")
 

@@ -325,12 +325,8 @@ def _read_tracks(
     if (counts > 1).any():
         track, when = divmod(int(cells[counts > 1][0]), num_steps)
         raise DataError(f"{file.name}: track {names[track]} has two rows for timestep {when}")
-    motion = np.column_stack(
-        [
-            columns[name].astype(np.float64)
-            for name in ("position_x", "position_y", "heading", "velocity_x", "velocity_y")
-        ]
-    )  # fmt: skip [rows, 5]
+    parts = ("position_x", "position_y", "heading", "velocity_x", "velocity_y")
+    motion = np.column_stack([columns[name].astype(np.float64) for name in parts])  # [rows, 5]
     wrong = np.flatnonzero(~(np.abs(motion) < 1e7).all(1))  # NaN is not, either
     if len(wrong):
         raise DataError(
@@ -350,7 +346,7 @@ def _read_tracks(
     states[owner, step], valid[owner, step] = motion, True
     size = np.array(
         [source.sizes[EGO if name == "AV" else kind if kind in KINDS else OTHER] for name, kind in zip(names, kinds)]
-    )  # fmt: skip [O, 3]
+    )  # [O, 3]
     z = np.zeros(shape)
     z[valid] = ground.heights.at(states[valid][:, :2])
     z += size[:, 2:] / 2  # centers of boxes that stand on the ground
@@ -376,6 +372,8 @@ def _object_ids(file: Path, names: np.ndarray) -> np.ndarray:
         raise DataError(f"{file.name}: track id {wrong[0]!r} is no number")
     ids = np.array([-1 if name == "AV" else int(name) for name in names], np.int64)
     ids[ids == -1] = ids.max() + 1 if (ids == 0).any() else 0
+    if len(np.unique(ids)) < len(ids):
+        raise DataError(f"{file.name}: two track ids are the same number")
     return ids
 
 

@@ -19,7 +19,7 @@ from rlftsim.goals.attainment import NEAR_M
 from rlftsim.scenario.types import CURRENT_STEP, Scenario
 from rlftsim.viewer.figure import DOTS_PER_INCH, INK, save_figure
 from rlftsim.viewer.page import Panel
-from rlftsim.viewer.picture import POINTS_PER_INCH, agent_shapes, draw_map, light_dots
+from rlftsim.viewer.picture import POINTS_PER_INCH, agent_shapes, draw_map, light_dots, write_notes
 from rlftsim.viewer.scene import SceneView, build_scene, logged_trajectories
 
 PANEL_INCHES = 4.2
@@ -88,8 +88,9 @@ def draw_goals(
     axes = figure.subplots(rows, columns, squeeze=False).ravel()
     for axis in axes:  # those that get no panel stay empty
         axis.set_axis_off()
-    for axis, panel in zip(axes, panels):
-        scene, log = build_scene(panel.scenario), logged_trajectories(panel.scenario)
+    scenes = [build_scene(panel.scenario) for panel in panels]
+    for axis, panel, scene in zip(axes, panels, scenes):
+        log = logged_trajectories(panel.scenario)
         # 1. The map around the goals, with the agents at the current step.
         x, y, radius = _focus(panel, scene)
         axis.set_axis_on()
@@ -106,6 +107,7 @@ def draw_goals(
         # 3. Goals with their paths, a color each, on top of everything else.
         for number, mark in enumerate(panel.marks):
             _draw_mark(axis, mark, panel.scenario.origin, GOAL_COLORS[number % len(GOAL_COLORS)])
+    write_notes(figure, scenes, panels_across=columns)
     save_figure(path, figure, dots_per_inch=dots_per_inch)
 
 

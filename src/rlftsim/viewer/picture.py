@@ -95,12 +95,22 @@ def draw_scene(animation: Animation) -> tuple[Figure, Sequence[Axes]]:
         if any(getattr(panel.trajectories, mark) is not None for panel in panels)
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False, fontsize=10)
-    if animation.scene.note:
-        width = NOTE_CHARACTERS * len(panels)
-        figure.suptitle(
-            "\n".join(wrap(animation.scene.note, width)), fontsize=7, color=COLORS["edge"], x=0.01, ha="left"
-        )
+    write_notes(figure, [animation.scene], panels_across=len(panels))
     return figure, list(axes)
+
+
+def write_notes(figure: Figure, scenes: Sequence[SceneView], *, panels_across: int) -> None:
+    """Write the notes of the scenes in small print on top of a figure, each once.
+
+    Args:
+        figure: with a constrained layout, which makes room.
+        scenes: those that the figure shows.
+        panels_across: number of panels side by side.
+    """
+    notes = " ".join(dict.fromkeys(scene.note for scene in scenes if scene.note))
+    if notes:
+        lines = "\n".join(wrap(notes, NOTE_CHARACTERS * panels_across))
+        figure.suptitle(lines, fontsize=7, color=COLORS["edge"], x=0.01, ha="left")
 
 
 def draw_map(axis: Axes, scene: SceneView, *, points_per_m: float) -> None:
