@@ -46,6 +46,14 @@ def exit_at_once(item, advance, is_stopped):
     os._exit(1)
 
 
+@pytest.mark.parametrize(("quota", "cores"), [("max 100000", 6), ("250000 100000", 3), ("10000 100000", 1), ("", 6)])
+def test_a_container_may_have_fewer_cores_than_the_machine(quota, cores, tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(6)), raising=False)
+    (tmp_path / "cpu.max").write_text(quota)
+    monkeypatch.setattr(rlftsim.workers, "CPU_QUOTA", tmp_path / "cpu.max")
+    assert rlftsim.workers.usable_cores() == cores
+
+
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_results_come_in_the_order_of_the_items(jobs):
     done = []

@@ -18,7 +18,7 @@ from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
 from rlftsim.training.alarms import AlarmConfig
 from rlftsim.training.catk import CatkConfig, catk_finetune
 from rlftsim.training.finetune import FinetuneConfig, finetune
-from rlftsim.training.parallel import DeviceConfig
+from rlftsim.training.parallel import DeviceConfig, is_first_process
 from rlftsim.training.pretrain import PretrainConfig, pretrain
 from rlftsim.training.reference import KlConfig
 from rlftsim.training.validation import ValidationConfig
@@ -98,17 +98,15 @@ def run(stage, out, *, updates=8, processes=1, batch_size=1, micro_batch_cost=No
     scenarios = pack_scenarios()
     policy = tiny_policy(small_vocabulary(scenarios), WITHOUT_CHANCE if batch_size > 1 else MODEL)
     changes = {
-        "device": replace(CPU, devices=processes), "batch_size": batch_size,
+        "device": replace(CPU, processes=processes), "batch_size": batch_size,
         "epochs": updates * batch_size / NUM_SCENARIOS, "gradient_clip": 1e9 if batch_size > 1 else 1.0,
     }  # fmt: skip
     if micro_batch_cost:
         validation = ValidationConfig(every=1, num_scenarios=3, num_rollouts=2)
         changes |= {"micro_batch_cost": micro_batch_cost, "validation": validation}
     train(stage, policy, scenarios, out, scenarios, **changes)
-    several = torch.distributed.is_initialized()
-    if not several or torch.distributed.get_rank() == 0:
+    if is_first_process():
         save_file(gradients_of(policy), out / "gradients.safetensors")
-        (out / "processes").write_text(str(torch.distributed.get_world_size() if several else 1))
     return policy
 
 

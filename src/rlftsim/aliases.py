@@ -21,6 +21,7 @@ RENAMED = {
     "goals.share": "goals.probability",
     "augmented_share": "augmented_probability",
     "goal_share": "goal_probability",
+    "device.devices": "device.processes",
     # data sets
     "licence": "license",
     "licence_note": "license_note",

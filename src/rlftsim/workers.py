@@ -2,6 +2,7 @@
 
 import ast
 import inspect
+import math
 import multiprocessing
 import os
 import pickle
@@ -25,9 +26,18 @@ Task = Callable[[Any, Advance, Callable[[], bool]], Any]
 """Called with an item, a function that reports progress, and one that returns True when the task should give up."""
 
 
+CPU_QUOTA = Path("/sys/fs/cgroup/cpu.max")
+"""Microseconds of processor time that a container has in a period, and the period; "max" = no limit."""
+
+
 def usable_cores() -> int:
-    """Cores this process may run on."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """Cores this process may run on, within the quota of its container."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    try:
+        quota, period = (int(number) for number in CPU_QUOTA.read_text().split())
+    except (OSError, ValueError):
+        return cores
+    return min(cores, max(math.ceil(quota / period), 1))
 
 
 def run_tasks(task: Task, items: Sequence[Any], *, jobs: int, advance: Advance) -> list[Any]:
@@ -118,13 +128,13 @@ def _start_worker(task: bytes, line: _Line) -> None:
     global _task, _line
     # Ctrl-C reaches the whole process group; only the parent reacts, and stops the workers by the event.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_exit_with_parent, daemon=True).start()
+    threading.Thread(target=exit_with_parent, daemon=True).start()
     keep_freed_memory()
     os.environ["OMP_NUM_THREADS"] = "1"  # read when torch is imported, which unpickling the task may do
     _task, _line = pickle.loads(task), line
 
 
-def _exit_with_parent() -> None:
+def exit_with_parent() -> None:
     """End this process when its parent is killed, so that no orphan writes beside the run that follows."""
     parent = multiprocessing.parent_process()
     if parent is not None:

@@ -268,7 +268,7 @@ def test_the_command_writes_its_files_and_prints_the_path(tmp_path, capsys):
         ("oracle --data somewhere", "recipe synthetic brings its own scenarios"),
         ("oracle --recipe smart-demo --data somewhere", "somewhere is no data set"),
         ("oracle --finetune.rate 1", "no flag --finetune.rate"),
-        ("oracle --finetune.device.devices 2", "experiments train in one process"),
+        ("oracle --processes 0", "--processes must be at least 1, got 0"),
         ("oracle --finetune.reward rloo", "--finetune.reward has no effect: experiments vary it"),
         ("oracle --catk.batch-size 2", "--catk.batch-size has no effect: experiments vary it"),
         ("oracle --seeds 0", "--seeds must be at least 1, got 0"),

@@ -93,6 +93,26 @@ def test_per_rollout_errors_and_rates_average_to_the_reported_ones(scenario):
     assert result.offroad_rate > 0
 
 
+def test_agents_that_leave_the_road_count_apart_where_their_log_stays_on_it():
+    staying = []
+    for seed in range(4):
+        scenario = draw_traffic(seed)
+        scenario.tracks.position[scenario.evaluated_indices[:seed], 60:, 1] += 20.0  # the street is 12 m wide
+        log, states = scenario_log(scenario), draw_rollouts(scenario, 4, seed=1, spread=4.0)
+        distance = compute_features(log, states).distance_to_road_edge.numpy()
+        logged, valid = log.features.distance_to_road_edge[0].numpy(), log.agents.future_valid.numpy()
+        left = [
+            any(distance[n, agent, step] > 0 and valid[agent, step] for step in range(80))
+            for agent in range(len(valid))
+            if not any(logged[agent, step] > 0 and valid[agent, step] for step in range(80))
+            for n in range(4)
+        ]
+        staying.append(len(left) / 4 / len(valid))
+        found = score(scenario, states).unlogged_offroad_rate
+        assert found == pytest.approx(np.mean(left), abs=1e-6) if left else found.isnan()
+    assert staying == pytest.approx([1, 2 / 3, 1 / 3, 0])
+
+
 def test_a_batch_is_its_scenarios_stacked():
     scenarios = [draw_traffic(seed, num_agents=4 + seed) for seed in range(3)]
     states = [draw_rollouts(scenario, 4, seed=7) for scenario in scenarios]

@@ -92,3 +92,15 @@ def test_a_rename_that_is_declared_keeps_the_fingerprint():
         probability: float = 0.5
 
     assert fingerprint_policy(Sized(New())) == fingerprint_policy(Sized(Old()))
+
+
+def test_a_field_that_is_added_counts_only_where_it_changes_something():
+    @dataclass(frozen=True)
+    class New:
+        fingerprint_name: ClassVar[str] = "cruise_package.Width"
+        added_fields: ClassVar[dict[str, object]] = {"shape": "box"}
+        width: int = 3
+        shape: str = "box"
+
+    assert fingerprint_policy(Sized(New())) == fingerprint_policy(Sized(Width()))
+    assert fingerprint_policy(Sized(New(shape="disk"))) != fingerprint_policy(Sized(Width()))

@@ -1,13 +1,17 @@
+import copy
 import math
+import shutil
 from dataclasses import replace
 from itertools import pairwise
 
 import pytest
 import torch
+from safetensors.torch import load_file
 
 import scenes
 import tiny
 from rlftsim.errors import ConfigError
+from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.scenario.batch import collate
 from rlftsim.tokens.smoothing import neighbor_weights
 from rlftsim.training.data import trained_agents
@@ -149,3 +153,69 @@ def test_smoothing_among_near_tokens_needs_a_vocabulary(drawn_scenarios, tmp_pat
             tmp_path,
             replace(tiny.PRETRAIN, label_smoothing=0.1, label_smoothing_kind="spatial"),
         )
+    with pytest.raises(ConfigError, match=r"Wordless has no vocabulary.*still_weight=1"):
+        pretrain(Wordless(1, 1), drawn_scenarios, tmp_path, replace(tiny.PRETRAIN, still_weight=0.1))
+
+
+def test_standing_tokens_count_less(vocabulary, drawn_scenarios):
+    batch = collate(drawn_scenarios)
+    dist = tiny.tiny_policy(vocabulary, tiny.WITHOUT_CHANCE).teacher_forced(batch, batch.agent_mask)
+    logits, target = dist.logits[dist.target_mask], dist.target[dist.target_mask]
+    losses = torch.nn.functional.cross_entropy(logits, target, reduction="none")
+    still = target == 0
+    assert 0 < int(still.sum()) < len(still)
+    for weight in (0.0, 0.25, 1.0):
+        found = summed_loss(dist, 0.0, still_weight=weight)
+        expected = losses[~still].sum() + weight * losses[still].sum()
+        assert float(found.loss.detach()) == pytest.approx(float(expected.detach()), rel=1e-5)
+        assert float(found.count) == pytest.approx(int((~still).sum()) + weight * int(still.sum()))
+    # Smoothed targets of standing tokens count less, too: the loss is linear in the weight.
+    for nearby in (None, vocabulary):
+        low, mean, high = (float(summed_loss(dist, 0.2, nearby, w).loss.detach()) for w in (0.0, 0.5, 1.0))
+        assert low < mean < high
+        assert mean == pytest.approx((low + high) / 2, rel=1e-5)
+
+
+def test_the_average_of_the_weights_is_saved_and_resumes(vocabulary, drawn_scenarios, tmp_path):
+    """Two runs: one in a piece, whose checkpoints are followed by hand, and one that is interrupted."""
+    config = replace(tiny.PRETRAIN, ema_decay=0.5, checkpoint_every=1, epochs=1.0)
+    weights = []
+
+    class Followed(SmartPolicy):
+        def teacher_forced(self, scenarios, trained):
+            weights.append({k: v.clone() for k, v in self.network.state_dict().items()})
+            return super().teacher_forced(scenarios, trained)
+
+    torch.manual_seed(0)
+    policy = Followed(tiny.MODEL, vocabulary)
+    start = copy.deepcopy(policy)
+    pretrain(policy, drawn_scenarios, tmp_path / "whole", config)
+    weights.append(policy.network.state_dict())  # the last weights themselves
+    saved = load_file(tmp_path / "whole" / "model" / "model.safetensors")
+    for name, value in saved.items():
+        mean = weights[0][name]
+        for update, later in enumerate(weights[1:], start=1):
+            decay = min(0.5, (1 + update) / (10 + update))
+            mean = decay * mean + (1 - decay) * later[name]
+        torch.testing.assert_close(value, mean, atol=1e-6, rtol=1e-5, msg=name)
+    # a run that was stopped after its second update ends with the same bits
+    shutil.copytree(tmp_path / "whole", tmp_path / "cut")
+    shutil.rmtree(tmp_path / "cut" / "model")
+    for path in sorted((tmp_path / "cut" / "checkpoints").iterdir())[1:]:
+        shutil.rmtree(path)
+    pretrain(start, drawn_scenarios, tmp_path / "cut", config)
+    again = load_file(tmp_path / "cut" / "model" / "model.safetensors")
+    assert all(torch.equal(value, again[name]) for name, value in saved.items())
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ({"still_weight": 1.5}, "still_weight is a weight"),
+        ({"ema_decay": 1.0}, "ema_decay is"),
+        ({"mirror_probability": -0.1}, "mirror_probability is a probability"),
+    ],
+)
+def test_impossible_weights_are_refused(setting, message):
+    with pytest.raises(ConfigError, match=message):
+        PretrainConfig(**setting)

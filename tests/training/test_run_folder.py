@@ -24,6 +24,19 @@ def test_the_same_settings_may_come_back(tmp_path):
     RunFolder(tmp_path, FinetuneConfig())
 
 
+def test_a_setting_that_a_stored_run_lacks_counts_as_its_default(tmp_path):
+    """As in a run that began before the setting was added."""
+    path, config = tmp_path / "config.json", replace(tiny.PRETRAIN, still_weight=0.5)
+    RunFolder(tmp_path, config)
+    whole = json.loads(path.read_text())
+    path.write_text(json.dumps({k: v for k, v in whole.items() if k not in ("ema_decay", "mirror_probability")}))
+    RunFolder(tmp_path, config)
+    assert json.loads(path.read_text()) == whole
+    path.write_text(json.dumps({k: v for k, v in whole.items() if k not in ("still_weight", "mirror_probability")}))
+    with pytest.raises(CheckpointError, match=r"other settings or inputs \(still_weight\)"):
+        RunFolder(tmp_path, config)
+
+
 def test_other_settings_are_refused_by_name(tmp_path):
     RunFolder(tmp_path, FinetuneConfig())
     with pytest.raises(CheckpointError, match=r"other settings or inputs \(kl.target, seed\): name another --out"):

@@ -33,6 +33,12 @@ EXPECTED = json.loads((STORED / "expected.json").read_text())
 TOLERANCE = 1e-5
 """Of weights. Torch and MKL round otherwise on other processors, also where both have AVX-512: 4e-6 in five updates."""
 
+ADDED_METRICS = {
+    "validation_unlogged_offroad_rate", "validation_loss", "validation_loss_turning", "validation_map_use",
+    "validation_map_use_turning",
+}  # fmt: skip
+"""Metrics of later versions."""
+
 MODEL = SmartConfig(
     dim=4, num_heads=2, head_dim=2, num_map_layers=1, num_decoder_layers=1, num_frequencies=1, history_tokens=2,
     max_map_neighbors=3, max_agent_map_neighbors=3, max_agent_neighbors=3,
@@ -115,10 +121,12 @@ def test_a_run_of_0_1_that_was_stopped_resumes_and_ends_as_it_would_have(name, s
     resume(name, out)
     expected = EXPECTED["metrics"][name]
     found = lines_of(out)
-    assert [line.keys() for line in found] == [line.keys() for line in expected]  # no metric has another name
+    # No metric has another name; validations log more than they did.
+    assert [line.keys() - ADDED_METRICS for line in found] == [line.keys() for line in expected]
     assert len(found) == 5
     for line, other in zip(found, expected):
-        assert line == pytest.approx(other, rel=1e-3, abs=1e-4, nan_ok=True)
+        own = {name: value for name, value in line.items() if name in other}
+        assert own == pytest.approx(other, rel=1e-3, abs=1e-4, nan_ok=True)
     weights, others = load_file(out / "model" / "model.safetensors"), load_file(f"models/{name}/model.safetensors")
     assert weights.keys() == others.keys()
     for key, value in others.items():

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import scenes
-from rlftsim.training.data import batch_with_futures, scenarios_of_update, within_reach
+from rlftsim.training.data import batch_with_futures, mirrored_of_update, scenarios_of_update, within_reach
 
 
 @given(num=st.integers(1, 40), size=st.integers(1, 16), epochs=st.integers(1, 4), seed=st.integers(0, 99))
@@ -57,3 +57,15 @@ def test_a_batch_leaves_out_what_is_far(drawn_scenarios):
     near = batch_with_futures(drawn_scenarios, range(4), context_radius_m=20.0)
     assert torch.equal(batch_with_futures(drawn_scenarios, range(4), context_radius_m=1e6).valid, whole.valid)
     assert 0 < int(near.valid.sum()) < int(whole.valid.sum())
+
+
+def test_the_given_fraction_of_scenarios_is_mirrored_anew_in_each_update():
+    drawn = [mirrored_of_update(update, range(200), 0.3, seed=1) for update in range(20)]
+    assert 0.26 < sum(map(len, drawn)) / 4000 < 0.34
+    assert len({frozenset(one) for one in drawn}) == 20
+    assert drawn[7] & set(range(50, 90)) == mirrored_of_update(7, range(50, 90), 0.3, seed=1)  # however it is cut
+    assert mirrored_of_update(0, range(9), 0.0, seed=1) == set()
+    assert mirrored_of_update(0, range(9), 1.0, seed=1) == set(range(9))
+    scenario = scenes.bend()
+    first, second = batch_with_futures([scenario, scenario], [0, 1], mirror={1}).position
+    assert torch.equal(first * torch.tensor([1.0, -1.0]), second)

@@ -12,8 +12,10 @@ import tiny
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.evaluate import EvaluateConfig, evaluate
 from rlftsim.policies.smart.policy import SmartPolicy
+from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
 from rlftsim.scenario.synthetic import pack_path
+from rlftsim.training.map_use import measure_map_use
 from rlftsim.training.run_folder import read_metrics
 from rlftsim.training.validation import ValidationConfig
 
@@ -66,6 +68,11 @@ def test_the_last_validation_is_what_an_evaluation_of_the_model_finds(vocabulary
     assert line["validation_rmm_high"] == pytest.approx(rmm.mean() + error, abs=1e-5)
     ade = np.array(found.values("min_average_displacement_error"))[rows]
     assert line["validation_min_ade_m"] == pytest.approx(ade.mean(), rel=1e-4)
+    leaves = np.nanmean(np.array(found.values("unlogged_offroad_rate"))[rows])
+    assert line["validation_unlogged_offroad_rate"] == pytest.approx(leaves, abs=1e-6)
+    batch = collate([held_out[i] for i in everything.choose(len(held_out))])
+    map_use = measure_map_use(model.eval(), batch).to_metrics("validation_")
+    assert {name: line[name] for name in map_use} == pytest.approx(map_use, abs=1e-4, nan_ok=True)
 
 
 def test_a_run_may_go_on_with_another_validation(vocabulary, drawn_scenarios, held_out, tmp_path):

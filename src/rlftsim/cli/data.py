@@ -25,27 +25,44 @@ class Convert:
     """
 
     source: Annotated[Positional[str], tyro.conf.arg(metavar="SOURCE")]
-    """For WOMD a tfrecord shard, a folder of shards, or a quoted glob such as 'training/*tfrecord*'."""
+    """For WOMD a tfrecord shard, a folder of shards, or a quoted glob such as 'training/*tfrecord*'. For av2 and tables
+    a folder."""
     destination: Annotated[Positional[Path], tyro.conf.arg(metavar="FOLDER")]
     """Folder of the data set."""
     reader: Annotated[str, tyro.conf.arg(name="from", metavar="NAME")] = "auto"
-    """Format of the source: womd, or the name of a data source of another package (docs/extending.md). auto:
-    recognized by the files."""
+    """Format of the source: womd, av2 (Argoverse 2 motion forecasting), tables (Parquet tables of your own
+    recordings), or the name of a data source of another package (docs/extending.md). auto: recognized by the files."""
     split: str | None = None
     """Split of all sources; left out, it is read off their folder or name."""
     on_error: Literal["skip", "stop"] = "skip"
     """What to do with a damaged record: leave it out and list it, or stop."""
     jobs: int | None = None
     """Processes, each with a shard of its own. Left out: one for each core."""
+    window: Literal["last", "first", "both", "av2"] | None = None
+    """av2 only: the 91 of 110 steps that are taken, last (the default), first, or both as two scenarios. av2: 71
+    steps around the data set's own current step, which cannot be scored."""
+    keep_other: bool = False
+    """av2 only: keep static objects, construction and the like as objects of no particular type."""
+    sizes: Path | None = None
+    """av2 only: JSON file with length, width and height in meters by kind, in place of the guessed ones."""
 
     def run(self) -> int:
         """Convert, and list the records that were left out."""
+        options = {"window": self.window, "keep_other": self.keep_other or None, "sizes": self.sizes}
         report = convert(
-            self.source, self.destination, reader=self.reader, split=self.split, on_error=self.on_error, jobs=self.jobs
+            self.source,
+            self.destination,
+            reader=self.reader,
+            split=self.split,
+            on_error=self.on_error,
+            jobs=self.jobs,
+            options={name: value for name, value in options.items() if value is not None},
         )
         by_split = ", ".join(f"{count} {split}" for split, count in report.counts.items())
         counts = f"{report.converted} scenarios converted, {len(report.skipped)} lost"
         print(f"{report.destination}: {counts}; in all {by_split}.")
+        for what, count in report.tallies.items():
+            print(f"  {count} {what}")
         # A damaged shard can lose thousands of records: the first ones are listed.
         for record in [*report.skipped, *report.duplicates][:MAX_LISTED]:
             print(f"  left out: {record.file}, record {record.record}: {record.cause}")
@@ -96,6 +113,8 @@ def _stats_rows(stats: DatasetStats) -> dict[str, str]:
     """Label -> value of a table of numbers."""
     rows = {
         "scenarios": f"{stats.num_scenarios} ({_counts(stats.by_split)})",
+        "data sources": _counts(stats.by_source),
+        "guessed in scenarios": _counts(stats.by_guessed) or "nothing",
         "logged steps": _counts(stats.by_num_steps),
         "ego does": _counts(stats.by_ego_maneuver),
         "agents at the current step": _counts(stats.agents_by_type),

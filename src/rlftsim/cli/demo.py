@@ -1,13 +1,14 @@
 """The verb that runs the whole pipeline: demo."""
 
-import os
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from rlftsim.evaluation.evaluate import EvaluateConfig
 from rlftsim.experiments.demo import DemoConfig, run_demo
 from rlftsim.recipes.smart import smart_demo_quick, smart_demo_rlftsim
 from rlftsim.scenario.synthetic import pack_path
+from rlftsim.workers import usable_cores
 
 
 @dataclass(frozen=True)
@@ -20,19 +21,21 @@ class Demo:
 
     out: Path | None = None
     """Folder for everything; the report is OUT/report.html. Left out: runs/demo or runs/demo-quick."""
+    processes: int | Literal["auto"] = "auto"
+    """Processes that train and that evaluate; auto = one for each core, up to 4. Another number rounds otherwise."""
     quick: bool = False
     """Run every stage at its smallest size. This shows that all stages work, not that fine-tuning helps."""
 
     def run(self) -> int:
         """Run the stages; print the table and the path of the report."""
         # More processes than this only compete for memory bandwidth on the machines that the demo is made for.
-        jobs = min(os.cpu_count() or 1, 4)
-        evaluation = EvaluateConfig(jobs=jobs)
-        config = DemoConfig(smart_demo_rlftsim(), pack_path(), evaluation)
-        if self.quick:
-            config = replace(
-                config, recipe=smart_demo_quick(), evaluate=replace(evaluation, num_rollouts=8, limit=8), num_scenes=2
-            )
+        jobs = min(usable_cores(), 4) if self.processes == "auto" else self.processes
+        config = DemoConfig(
+            (smart_demo_quick() if self.quick else smart_demo_rlftsim()).with_processes(self.processes),
+            pack_path(),
+            EvaluateConfig(num_rollouts=8, limit=8, jobs=jobs) if self.quick else EvaluateConfig(jobs=jobs),
+            num_scenes=2 if self.quick else 3,
+        )
         result = run_demo(config, self.out or Path("runs/demo-quick" if self.quick else "runs/demo"))
         print(f"report: {result.report}")
         return 0

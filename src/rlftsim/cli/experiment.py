@@ -8,7 +8,7 @@ from typing import Annotated, ClassVar
 import tyro
 from tyro.conf import Positional
 
-from rlftsim.cli.recipe_verb import RecipeVerb, value_of
+from rlftsim.cli.recipe_verb import Processes, RecipeVerb, value_of
 from rlftsim.errors import ConfigError
 from rlftsim.evaluation.evaluate import EvaluateConfig
 from rlftsim.experiments.model_specs import VARIED
@@ -54,6 +54,8 @@ class RunExperiment(RecipeVerb):
     """Evaluate on the first LIMIT held-out scenarios only."""
     jobs: int | None = None
     """Processes that evaluate, each with one thread. Left out: one for each core, or a single one on a GPU."""
+    processes: Processes = None
+    """Processes that train, in short for device.processes of each section."""
     device: Device = "auto"
     """Device of evaluations; training has its own, such as --finetune.device.accelerator."""
 

@@ -4,7 +4,9 @@ import dataclasses
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar, Literal
+
+import tyro
 
 from rlftsim.cli.mistakes import flags_of
 from rlftsim.errors import ConfigError
@@ -13,6 +15,7 @@ from rlftsim.recipes.settings import flags_of_file, sections_of
 
 DEFAULT_RECIPE = "smart-tiny"
 """Recipe whose values a help text shows where none is named."""
+Processes = Annotated[int | Literal["auto"] | None, tyro.conf.arg(metavar="INT|auto")]
 
 
 class RecipeVerb:
@@ -27,12 +30,14 @@ class RecipeVerb:
     starting_name: ClassVar[str]
     """Name of the recipe that the defaults are from. The parsed field `recipe` may turn out to be another."""
     recipe: str
+    processes: Processes
 
     @property
     def settings(self) -> Recipe:
         """The recipe with the values of the command line."""
         shown = [name for name in sections_of(self.starting_recipe) if name in self.sections]
-        return dataclasses.replace(self.starting_recipe, **{name: getattr(self, name) for name in shown})
+        recipe = dataclasses.replace(self.starting_recipe, **{name: getattr(self, name) for name in shown})
+        return recipe if self.processes is None else recipe.with_processes(self.processes)
 
     @classmethod
     def recipe_name_in(cls, words: Sequence[str]) -> str:

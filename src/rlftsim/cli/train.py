@@ -9,7 +9,7 @@ from typing import Annotated, ClassVar, Literal
 import tyro
 from tyro.conf import Positional
 
-from rlftsim.cli.recipe_verb import RecipeVerb, refuse_settings, value_of
+from rlftsim.cli.recipe_verb import Processes, RecipeVerb, refuse_settings, value_of
 from rlftsim.errors import ConfigError, RlftsimError
 from rlftsim.evaluation.learning_curve import write_learning_curve
 from rlftsim.experiments.stages import GoalConditioning, finetune_model, pretrain_policy
@@ -45,6 +45,8 @@ class Pretrain(RecipeVerb):
     """Folder of the run: configuration, metrics, checkpoints, model."""
     vocabulary: Path | None = None
     """File that `rlftsim tokens` wrote; needed by models with a vocabulary, such as SMART."""
+    processes: Processes = None
+    """Processes that train, in short for --pretrain.device.processes."""
     split: str = "training"
     """Split of the data set to train on."""
     validation_split: str | None = None
@@ -108,6 +110,8 @@ class Finetune(RecipeVerb):
     goal_logit_bias: Annotated[bool | None, tyro.conf.arg(metavar="/ --no-goal-logit-bias")] = None
     """With --goal: add a goal-progress bias to the token logits (ours, not the paper's). Left out: yes where
     goal conditioning is added, unchanged where the model has it."""
+    processes: Processes = None
+    """Processes that train, in short for the method's device.processes."""
     split: str = "training"
     """Split of the data set to train on."""
     validation_split: str | None = None

@@ -86,12 +86,16 @@ _MISSES = (
 )  # fmt: skip
 GOAL_COLUMNS = (*_MISSES, *SCORES[1:4], SCORES[0])
 """Shown in the table of goal conditioning, in the order of the paper's."""
-# The next two are on the command line only: reports and papers show neither.
+# The next three are on the command line only: reports and papers show neither.
 _LIGHT_ONE = Column(
     "meta_metric_light_one", "RMM, light = 1", "realism meta-metric with the traffic light term set to 1"
 )
+_LEAVES_ROAD = Column(
+    "unlogged_offroad_rate", "leaves road",
+    "evaluated agents that leave the road, of those whose log does not", "%", "leaves road",
+)  # fmt: skip
 _RED_LIGHT = Column("traffic_light_violation_rate", "red light", "evaluated agents that pass a red light", "%")
-TERMINAL_COLUMNS = (SCORES[0], _LIGHT_ONE, *SCORES[1:], _RED_LIGHT)
+TERMINAL_COLUMNS = (SCORES[0], _LIGHT_ONE, *SCORES[1:], _LEAVES_ROAD, _RED_LIGHT)
 """Shown on the command line; rates as fractions."""
 TERMINAL_GOAL_COLUMNS = (*TERMINAL_COLUMNS, *_MISSES)
 """Shown on the command line where agents had goals."""

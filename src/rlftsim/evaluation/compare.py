@@ -211,13 +211,13 @@ def format_table(*evaluations: Evaluation, columns: Sequence[Column] | None = No
     """
     columns = columns or columns_of(*evaluations)
     with_goals = [evaluation.name for evaluation in evaluations if evaluation.config.goals != "none"]
-    caption = (
-        f"{', '.join(with_goals)}: the goals of evaluated agents were their logged final positions; an agent that "
-        "never comes near its goal has missed it."
-        if with_goals
-        else None
-    )
-    table = Table(caption=caption, caption_justify="left")
+    notes = list(dict.fromkeys(evaluation.data_note for evaluation in evaluations))
+    if with_goals:
+        notes.append(
+            f"{', '.join(with_goals)}: the goals of evaluated agents were their logged final positions; an agent that "
+            "never comes near its goal has missed it."
+        )
+    table = Table(caption=" ".join(note for note in notes if note) or None, caption_justify="left")
     table.add_column("policy", no_wrap=True)
     table.add_column("scenarios", justify="right")
     for column in columns:
@@ -249,4 +249,6 @@ def format_comparison(comparison: Comparison, *, columns: Sequence[Column] = TER
 
 
 def _plus_minus(mean: float, error: float, sign: str = "") -> str:
+    if math.isnan(mean):  # no scenario has a value, as in a file of an earlier version
+        return "–"
     return f"{mean:{sign}.4f}" + ("" if math.isnan(error) else f" ± {error:.4f}")

@@ -87,6 +87,8 @@ def evaluate(
         policy_fingerprint=fingerprint,
         dataset=str(dataset.folder.resolve()),
         manifest_sha256=hash_manifest(dataset.folder),
+        sources=dataset.sources,
+        guessed=dataset.guessed,
     )
     return resume_evaluation(
         partial(_evaluate_scenario, _Job(frozen_copy(policy), dataset, config)),

@@ -24,6 +24,7 @@ from rlftsim.realism import FEATURE_NAMES, RealismResult, SimulatedStates, metri
 from rlftsim.realism.miss import compute_miss_rates
 from rlftsim.realism.official_names import LIGHT
 from rlftsim.rollout.policy import Sampling
+from rlftsim.scenario.sources import guessed_note
 from rlftsim.scenario.types import Scenario
 from rlftsim.statistics import MeanInterval, mean_interval
 
@@ -43,6 +44,7 @@ SCORE_COLUMNS = (
     "average_displacement_error",
     "collision_rate",
     "offroad_rate",
+    "unlogged_offroad_rate",
     "traffic_light_violation_rate",
     "miss_rate",
     "passing_miss_rate",
@@ -60,6 +62,9 @@ SCHEMA = pa.schema(
         *(pa.field(name, pa.float64()) for name in SCORE_COLUMNS),
     ]
 )
+
+ADDED_COLUMNS = ("unlogged_offroad_rate",)
+"""Columns that earlier evaluations lack; NaN when such a file is read."""
 
 GoalsGiven = Literal["none", "logged"]
 
@@ -135,7 +140,11 @@ class Provenance:
     rlftsim_version: str = NUMBERS_VERSION
     """Version of the numbers, see `NUMBERS_VERSION`."""
     package_version: str = rlftsim.__version__
-    """For information; not compared."""
+    """For information; not compared. Neither are the next two."""
+    sources: tuple[str, ...] = ()
+    """Data sources of the scenarios."""
+    guessed: tuple[str, ...] = ()
+    """Values of the log that are guessed, see `Scenario.guessed`."""
 
     @classmethod
     def from_plain(cls, values: dict[str, Any]) -> "Provenance":
@@ -143,7 +152,9 @@ class Provenance:
         values = current_names(values)
         # 0.1 had one version for both
         values.setdefault("package_version", values["rlftsim_version"])
-        return cls(**{**values, "config": EvaluateConfig(**values["config"])})
+        # JSON has no tuples
+        plain = {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
+        return cls(**{**plain, "config": EvaluateConfig(**values["config"])})
 
     def what_counts(self) -> dict[str, object]:
         """The values that results of the same work share. The data set may move: its manifest identifies it."""
@@ -202,6 +213,11 @@ class Evaluation:
         """Settings of the evaluation."""
         return self.provenance.config
 
+    @property
+    def data_note(self) -> str:
+        """A sentence on guessed values of the log; empty where none is."""
+        return guessed_note(self.provenance.sources, self.provenance.guessed)
+
     @cached_property
     def scenario_ids(self) -> list[str]:
         """Scored scenarios, in the order of the rows."""
@@ -257,6 +273,10 @@ class Evaluation:
             raise DataError(f"{path}: damaged evaluation ({error}): evaluate again.") from None
         # our part of the file's metadata; pandas and others may add theirs
         about = json.loads((table.schema.metadata or {}).get(b"rlftsim", b"{}"))
+        for name in ADDED_COLUMNS:
+            if name not in table.schema.names:
+                missing = pa.array(np.full(len(table), np.nan))
+                table = table.add_column(SCHEMA.get_field_index(name), SCHEMA.field(name), missing)
         if about.get("format") != FORMAT or table.schema.names != SCHEMA.names:
             raise DataError(f"{path}: not an evaluation of this version: evaluate again.")
         try:

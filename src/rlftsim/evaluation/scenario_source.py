@@ -31,6 +31,16 @@ class ScenarioSource(Protocol):
         """Hash of the contents."""
         ...
 
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """Names of the data sources."""
+        ...
+
+    @property
+    def guessed(self) -> tuple[str, ...]:
+        """Values that are guessed in some scenarios, see `Scenario.guessed`."""
+        ...
+
     def __contains__(self, scenario_id: object) -> bool: ...
 
     def __len__(self) -> int: ...
@@ -109,6 +119,7 @@ class ConvertedScenarios:
     def __init__(self, folder: Path) -> None:
         self._dataset = ScenarioDataset(folder, cache_size=_CACHED_SCENARIOS)
         self.fingerprint = hash_manifest(folder)
+        self.sources, self.guessed = self._dataset.sources, self._dataset.guessed
 
     def __contains__(self, scenario_id: object) -> bool:
         return scenario_id in self._dataset
@@ -136,6 +147,8 @@ class LoggedScenarios:
 
     places: dict[str, RecordPlace]
     fingerprint: str
+    sources: tuple[str, ...] = ("womd",)
+    guessed: tuple[str, ...] = ()
 
     def __contains__(self, scenario_id: object) -> bool:
         return scenario_id in self.places

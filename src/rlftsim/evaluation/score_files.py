@@ -110,6 +110,8 @@ def score_rollouts(
         policy_fingerprint=_fingerprint(entries),
         dataset=str(scenarios.absolute()),
         manifest_sha256=source.fingerprint,
+        sources=source.sources,
+        guessed=source.guessed,
     )
     name = name or rollouts.resolve().name.removesuffix(".npz").removesuffix(".binproto").removesuffix(".pb")
     result = resume_evaluation(
@@ -130,7 +132,8 @@ def score_rollouts(
 def to_json(evaluation: Evaluation) -> dict[str, Any]:
     """Plain values under the names of the official messages; None where there is no number.
 
-    `{"metric", "scenarios": [{"scenario_id", fields, "buckets"}], "mean": {fields, "buckets"}, "standard_error": ...}`.
+    `{"metric", "sources", "guessed", "scenarios": [{"scenario_id", fields, "buckets"}], "mean": {fields, "buckets"},
+    "standard_error": ...}`.
     Means are over the scenarios that have a number; the standard error needs two of them.
     """
     metric = metric_by_name(evaluation.config.metric)
@@ -138,6 +141,8 @@ def to_json(evaluation: Evaluation) -> dict[str, Any]:
     summary = {column: evaluation.mean_and_error(column) for column in SCORE_COLUMNS}
     return {
         "metric": metric.name,
+        "sources": list(evaluation.provenance.sources),
+        "guessed": list(evaluation.provenance.guessed),
         "scenarios": [{"scenario_id": row["scenario_id"], **_official_fields(row, metric)} for row in rows],
         "mean": _official_fields({column: value.mean for column, value in summary.items()}, metric),
         "standard_error": _official_fields({c: value.standard_error for c, value in summary.items()}, metric),
@@ -148,7 +153,7 @@ def format_scores(evaluation: Evaluation) -> Table:
     """Every mean ± standard error with the metric's version beside it; arrows say which way is better."""
     metric = metric_by_name(evaluation.config.metric)
     title = f"{evaluation.name}: {len(evaluation)} scenarios, {evaluation.config.num_rollouts} rollouts each"
-    table = Table(title=title, title_justify="left")
+    table = Table(title=title, title_justify="left", caption=evaluation.data_note or None, caption_justify="left")
     for heading in ("", "mean", "standard error", "scenarios", "metric"):
         table.add_column(heading, justify="left" if heading in ("", "metric") else "right", no_wrap=True)
     # all columns by their stored names, other than in tables of policies: the place to look a single score up

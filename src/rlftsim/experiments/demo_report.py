@@ -70,7 +70,8 @@ def build_report(
         ),
         rows=[ResultRow.of(e, SCORES, note=NOTES.get(e.name, ""), emphasized=e is tuned) for e in evaluations],
         table_note=(
-            f"{len(base)} held-out scenarios, {base.config.num_rollouts} rollouts each, metric {base.config.metric}."
+            f"{len(base)} held-out scenarios, {base.config.num_rollouts} rollouts each, metric {base.config.metric}. "
+            f"{base.data_note}".rstrip()
         ),
         comparison=PairedComparison(
             BASE,

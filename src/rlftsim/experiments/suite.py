@@ -51,7 +51,7 @@ class ExperimentSuite:
     Raises:
         CheckpointError: the folder belongs to other settings, data or base model.
         DataError: no such data set.
-        ConfigError: no seed, or training in several processes.
+        ConfigError: no seed, or training on several GPUs.
     """
 
     recipe: Recipe
@@ -71,9 +71,10 @@ class ExperimentSuite:
             raise ConfigError(f"an experiment needs at least one seed, got {self.num_seeds}.")
         recipe = self.recipe
         methods = (recipe.pretrain, recipe.finetune, recipe.catk, recipe.gcsl)
-        if any(one is not None and one.device.devices != 1 for one in methods):
+        devices = [one.device for one in methods if one is not None]
+        if any(one.uses_cuda and one.processes not in ("auto", 1) for one in devices):
             raise ConfigError(
-                "experiments train in one process: leave device.devices at 1, or train by `rlftsim finetune` and "
+                "experiments train on one GPU: leave device.processes at auto, or train by `rlftsim finetune` and "
                 "compare by `rlftsim evaluate`."
             )
         # A data set that is not there must not claim the folder, and one without the split to evaluate on must not be

@@ -59,8 +59,8 @@ def of_rows(title: str, rows: Iterable[Row], columns: Sequence[Column]) -> TextT
     cells = [(row.name, *(c.cell(row.mean.mean_and_error(c.source)) for c in columns)) for row in rows]
     note = (
         f"{len(first)} held-out scenarios, {first.config.num_rollouts} rollouts each, metric {first.config.metric}; "
-        f"mean ± standard error over scenarios{over_seeds}."
-    )
+        f"mean ± standard error over scenarios{over_seeds}. {first.data_note}"
+    ).rstrip()
     return TextTable(title, ("", *(c.label for c in columns)), tuple(cells), note)
 
 

@@ -1,17 +1,17 @@
 """A categorical distribution over motion tokens for every agent that decides."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from rlftsim.rollout.policy import Sampling
+from rlftsim.policies.token_rows import TokenRows, row_statistics
+from rlftsim.rollout.policy import DecisionStatistics, Sampling
 
 
-@dataclass(frozen=True, eq=False)
-class TokenDistribution:
+class CategoricalDistribution:
     """Distributions of the R elements whose mask is True, in the order of `mask.nonzero()`.
 
     All other elements (padding) decide 0 with probability 1.
@@ -20,8 +20,6 @@ class TokenDistribution:
     logits: Float[Tensor, "R V"]
     """float32; tokens that do not exist have a large negative logit."""
     mask: Bool[Tensor, "*batch"]
-    _likeliest: dict[int, Int64[Tensor, "R K"]] = field(default_factory=dict, init=False, repr=False)
-    """Ids of the K most likely tokens, by K: a memo for repeated calls."""
 
     @cached_property
     def log_probs(self) -> Float[Tensor, "R V"]:
@@ -68,13 +66,18 @@ class TokenDistribution:
             own = own.masked_fill((token_id != chosen).all(-1, keepdim=True), -torch.inf)
         return self._dense(own[:, 0] - logits.logsumexp(-1))
 
-    def kl(self, other: "TokenDistribution") -> Float[Tensor, "*batch"]:
+    def kl(self, other: "CategoricalDistribution") -> Float[Tensor, "*batch"]:
         """KL(self || other), nats."""
         return self._dense((self.log_probs.exp() * (self.log_probs - other.log_probs)).sum(-1))
 
     def entropy(self) -> Float[Tensor, "*batch"]:
         """Entropy, nats."""
         return self._dense(-(self.log_probs.exp() * self.log_probs).sum(-1))
+
+    @cached_property
+    def _likeliest(self) -> dict[int, Int64[Tensor, "R K"]]:
+        """Ids of the K most likely tokens, by K: a memo for repeated calls."""
+        return {}
 
     def _kept(self, sampling: Sampling) -> tuple[Float[Tensor, "R K"], Int64[Tensor, "R K"] | None]:
         """Logits that `sampling` keeps, at its temperature, and their token ids in increasing order (None = all)."""
@@ -89,3 +92,51 @@ class TokenDistribution:
     def _dense(self, values: Tensor) -> Tensor:
         """Values of the R elements at their places, zero elsewhere."""
         return values.new_zeros(self.mask.shape).masked_scatter(self.mask, values)
+
+
+@dataclass(frozen=True, eq=False)
+class TokenDistribution(CategoricalDistribution):
+    """Distributions whose logits are at hand."""
+
+    logits: Float[Tensor, "R V"]
+    mask: Bool[Tensor, "*batch"]
+
+
+@dataclass(frozen=True, eq=False)
+class LazyTokenDistribution(CategoricalDistribution):
+    """Distributions whose logits are computed when they are asked for, and not for the statistics of an update."""
+
+    rows: TokenRows
+    mask: Bool[Tensor, "*batch"]
+
+    @cached_property
+    def logits(self) -> Float[Tensor, "R V"]:
+        """float32; tokens that do not exist have a large negative logit."""
+        return self.rows.logits()
+
+    def log_prob(
+        self,
+        decision: Int64[Tensor, "*batch"],
+        sampling: Sampling = Sampling(),  # noqa: B008
+    ) -> Float[Tensor, "*batch"]:
+        """As of any `CategoricalDistribution`; without logits for the full distribution.
+
+        Args:
+            decision: token ids.
+            sampling: temperature and truncation they were drawn with.
+        """
+        if not sampling.is_full:
+            return super().log_prob(decision, sampling)
+        return self._dense(row_statistics(self.rows, decision[self.mask])[0])
+
+    def statistics(self, decision: Int64[Tensor, "*batch"], reference: CategoricalDistribution) -> DecisionStatistics:
+        """Log-probability, KL and entropy of all elements, without logits of all of them at once where both are lazy.
+
+        Args:
+            decision: token ids.
+            reference: of the same elements; no gradient flows into it.
+        """
+        if not isinstance(reference, LazyTokenDistribution):
+            return DecisionStatistics(self.log_prob(decision), self.kl(reference), self.entropy())
+        found = row_statistics(self.rows, decision[self.mask], reference.rows)
+        return DecisionStatistics(*(self._dense(values) for values in found))

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from rlftsim.realism.agents import SimulatedStates, mean_over_agents
+from rlftsim.realism.agents import SimulatedStates, mean_over_agents, sum_over_agents
 from rlftsim.realism.config import FEATURE_NAMES, METRIC_2025, SUB_SCORES, MetricConfig
 from rlftsim.realism.features import (
     DEFAULT_COMPUTE,
@@ -50,6 +50,8 @@ class RealismResult:
     collision_rate: Float[Tensor, "*B"]
     """Fraction of (rollout, evaluated agent) pairs that ever collide in simulation while the log is valid."""
     offroad_rate: Float[Tensor, "*B"]
+    unlogged_offroad_rate: Float[Tensor, "*B"]
+    """As `offroad_rate`, over the evaluated agents whose log never leaves the road; NaN if there is none."""
     traffic_light_violation_rate: Float[Tensor, "*B"]
     """Over all evaluated agents, while the likelihood counts vehicles only (as officially)."""
     leave_one_out_meta_metric: Float[Tensor, "*B N"]
@@ -161,6 +163,9 @@ def score_features(log: AnyLog, features: Features, config: MetricConfig = METRI
     displacement = _mean_per_rollout(features.displacement_error, log, repeat)
     collision = _any_rate(features.collision, log, repeat)
     offroad = _any_rate(features.offroad, log, repeat)
+    layout = log.agents.layout
+    stays = (~log_target(log, config).outcome[1]).float()  # [E], agents that stay on the road in the log
+    left = (features.offroad & log.agents.future_valid).any(-1) * stays  # [N, E]
     light = _any_rate(features.traffic_light_violation, log, repeat)
     return RealismResult(
         scenario_ids=log.scenario_ids,
@@ -174,6 +179,7 @@ def score_features(log: AnyLog, features: Features, config: MetricConfig = METRI
         min_average_displacement_error=displacement.amin(-1),
         collision_rate=collision.mean(-1),
         offroad_rate=offroad.mean(-1),
+        unlogged_offroad_rate=sum_over_agents(left, layout).sum(0) / sum_over_agents(stays * distinct, layout),
         traffic_light_violation_rate=light.mean(-1),
         leave_one_out_meta_metric=without_each,
         single_meta_metric=alone,

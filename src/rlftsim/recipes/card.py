@@ -3,7 +3,8 @@
 import sys
 from pathlib import Path
 
-from rlftsim.scenario.dataset import read_manifest
+from rlftsim.scenario.dataset import ScenarioDataset
+from rlftsim.scenario.sources import guessed_note
 from rlftsim.training.run_folder import describe_environment
 
 
@@ -15,11 +16,13 @@ def model_card(what: str, data: Path, num_scenarios: int) -> str:
         data: folder of the data set; its license note is passed on.
         num_scenarios: number of training scenarios.
     """
-    environment = describe_environment()
+    environment, dataset = describe_environment(), ScenarioDataset(data)
+    note = guessed_note(dataset.sources, dataset.guessed)
+    guessed = f"* {note}\n" if note else ""
     return f"""# Traffic model, {what}
 
 * trained on {num_scenarios} scenarios of {data.name}
-* terms of the data: {read_manifest(data).license_note}
-* command: rlftsim {" ".join(sys.argv[1:])}
+* terms of the data: {dataset.manifest.license_note}
+{guessed}* command: rlftsim {" ".join(sys.argv[1:])}
 * rlftsim {environment["packages"]["rlftsim"]}, commit {environment["commit"] or "unknown"}
 """

@@ -13,6 +13,7 @@ pyproject.toml of its package:
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, is_dataclass, replace
+from typing import Literal
 
 from torch import nn
 
@@ -74,6 +75,16 @@ class Recipe:
         catk = self.catk and replace(self.catk, goal_probability=1.0, trained="goals")
         return replace(self, finetune=finetune, catk=catk)
 
+    def with_processes(self, processes: int | Literal["auto"]) -> "Recipe":
+        """The same recipe, trained by so many processes on this machine, see `DeviceConfig.processes`."""
+        methods = {name: getattr(self, name) for name in ("pretrain", "finetune", "catk", "gcsl")}
+        changed = {
+            name: replace(method, device=replace(method.device, processes=processes))
+            for name, method in methods.items()
+            if method is not None
+        }
+        return replace(self, **changed)
+
 
 def section_names(recipe: Recipe) -> tuple[str, ...]:
     """Names of the sections of a recipe: the known ones in the order of their use, then its own."""
@@ -89,6 +100,7 @@ RECIPES: ExtensionPoint[Callable[[], Recipe]] = ExtensionPoint(
         "smart-mini": "rlftsim.recipes.smart:smart_mini_rlftsim",
         "smart-nano": "rlftsim.recipes.smart:smart_nano_rlftsim",
         "smart-demo": "rlftsim.recipes.smart:smart_demo_rlftsim",
+        "smart-demo-long": "rlftsim.recipes.smart:smart_demo_long",
         "synthetic": "rlftsim.recipes.smart:smart_synthetic",
     },
 )

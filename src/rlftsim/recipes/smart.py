@@ -62,17 +62,21 @@ class SmartRecipe(Recipe):
 
 def smart_tiny_rlftsim() -> SmartRecipe:
     """The paper: SMART-tiny (7 M), pre-trained on WOMD for 32 epochs, fine-tuned for one."""
-    return SmartRecipe(model=smart_tiny())
+    return SmartRecipe(model=replace(smart_tiny(), frequency_init="log_spaced"))
 
 
 def smart_mini_rlftsim() -> SmartRecipe:
     """SMART-mini (3 M)."""
-    return SmartRecipe(model=smart_mini())
+    return SmartRecipe(model=replace(smart_mini(), frequency_init="log_spaced"))
 
 
 def smart_nano_rlftsim() -> SmartRecipe:
     """SMART-nano (1 M): fits one small GPU."""
-    return SmartRecipe(model=smart_nano(), pretrain=PretrainConfig(batch_size=16), catk=CatkConfig(batch_size=16))
+    return SmartRecipe(
+        model=replace(smart_nano(), frequency_init="log_spaced"),
+        pretrain=PretrainConfig(batch_size=16),
+        catk=CatkConfig(batch_size=16),
+    )
 
 
 def smart_demo_rlftsim() -> SmartRecipe:
@@ -98,6 +102,18 @@ def smart_demo_rlftsim() -> SmartRecipe:
             epochs=1.0, batch_size=1, num_rollouts=4, warmup_updates=10, max_trained_agents=None, checkpoint_every=80,
         ),
     )  # fmt: skip
+
+
+def smart_demo_long() -> SmartRecipe:
+    """The demo's model, pre-trained for an hour of one core or more on thousands of scenarios."""
+    recipe = smart_demo_rlftsim()
+    return replace(
+        recipe,
+        # Scenarios that are seen a few times leave nothing to learn by heart, so the effort goes into reading the map:
+        # moving tokens, more map tokens, and a history that is often hidden.
+        model=replace(recipe.model, history_drop=0.2, max_agent_map_neighbors=32),
+        pretrain=replace(recipe.pretrain, epochs=6.0, still_weight=0.15, ema_decay=0.998, final_lr_ratio=0.0),
+    )
 
 
 def smart_demo_quick() -> SmartRecipe:

@@ -14,8 +14,9 @@ def fingerprint_policy(policy: object) -> str:
 
     Moving or renaming code must leave the fingerprints of stored models valid. So a class is hashed under the name
     that it declares itself, `fingerprint_name` or else `architecture`, and only without either under its module and
-    name. A dataclass whose fields were renamed declares in `first_names` the names they had at first. Classes of
-    nested settings count too. What a base class declares does not stand for a subclass, which is other code.
+    name. A dataclass whose fields were renamed declares in `first_names` the names they had at first, and one that got
+    further fields declares them in `added_fields`: they count only with another value than the one given there. Classes
+    of nested settings count too. What a base class declares does not stand for a subclass, which is other code.
 
     Returns:
         32 hexadecimal digits; for a policy without weights and settings they stand for its architecture alone.
@@ -56,8 +57,9 @@ def _feed_object(digest: "hashlib.blake2b", value: object) -> None:
     name = names[0] if names else f"{kind.__module__}.{kind.__qualname__}"
     digest.update(f"object {name}".encode())
     if is_dataclass(value) and not isinstance(value, type):
-        first_names = getattr(kind, "first_names", {})
-        _feed(digest, {first_names.get(field.name, field.name): getattr(value, field.name) for field in fields(value)})
+        first_names, added = getattr(kind, "first_names", {}), getattr(kind, "added_fields", {})
+        own = {field.name: getattr(value, field.name) for field in fields(value)}
+        _feed(digest, {first_names.get(k, k): v for k, v in own.items() if k not in added or v != added[k]})
         return
     own = (
         {name: item for name, item in vars(value).items() if not name.startswith("_")} if _keeps_settings(value) else {}

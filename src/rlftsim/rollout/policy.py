@@ -109,6 +109,47 @@ class DecisionDistribution(Protocol):
         ...
 
 
+@dataclass(frozen=True, eq=False)
+class DecisionStatistics:
+    """Three numbers of each element that an update of fine-tuning is made of, float32, nats; 0 for padding."""
+
+    log_prob: Float[Tensor, "..."]
+    """Of the decision."""
+    kl: Float[Tensor, "..."]
+    """From the policy's distribution to the reference's."""
+    entropy: Float[Tensor, "..."]
+
+
+@runtime_checkable
+class StatisticsDistribution(Protocol):
+    """A distribution that finds its statistics in one pass. Optional: it saves memory and time, and changes no number.
+
+    For any other `DecisionDistribution` they come from `log_prob`, `kl` and `entropy`.
+    """
+
+    def statistics(self, decision: Tensor, reference: Any) -> DecisionStatistics:
+        """Log-probability of a decision, KL(self || reference) and entropy, with gradient.
+
+        Args:
+            decision: [..., *event], from the full distribution.
+            reference: distribution of the same kind and elements; no gradient flows into it.
+        """
+        ...
+
+
+def decision_statistics(distribution: DecisionDistribution, decision: Tensor, reference: Any) -> DecisionStatistics:
+    """Statistics of any distribution, in one pass where it is a `StatisticsDistribution`.
+
+    Args:
+        distribution: of the policy.
+        decision: [..., *event], from the full distribution.
+        reference: distribution of the same kind and elements.
+    """
+    if isinstance(distribution, StatisticsDistribution):
+        return distribution.statistics(decision, reference)
+    return DecisionStatistics(distribution.log_prob(decision), distribution.kl(reference), distribution.entropy())
+
+
 @runtime_checkable
 class Policy(Protocol):
     """A model that decides for all agents of a scenario.
@@ -210,12 +251,14 @@ class LoadablePolicy(Protocol):
 
     Stored evaluations and runs know a policy by its fingerprint (`rollout.fingerprint`), a hash of its weights, its
     public settings and the name of its class. That name is `architecture` of the class itself, so the class may be
-    moved or renamed. Two more class attributes, both optional, keep stored fingerprints valid through other changes:
+    moved or renamed. Three more class attributes, all optional, keep stored fingerprints valid through other changes:
 
     * `fingerprint_name: ClassVar[str]`, to be declared by every class of nested settings, such as a dataclass in
       `self.config`; without it that class is known by its module and name, and cannot be moved. A policy needs it
       only where its `architecture` is to change.
     * `first_names: ClassVar[dict[str, str]]`, in a dataclass: present name -> first name of each renamed field.
+    * `added_fields: ClassVar[dict[str, Any]]`, in a dataclass: name of each field that was added after models had been
+      stored -> the value with which the model is as before.
     """
 
     architecture: ClassVar[str]

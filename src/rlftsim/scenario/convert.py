@@ -55,6 +55,8 @@ class ConvertReport:
     shards_reused: int
     counts: Mapping[str, int]
     """Scenarios of the whole data set by split."""
+    tallies: Mapping[str, int]
+    """Numbers of what the data source counted in these sources."""
 
 
 @dataclass(frozen=True)
@@ -89,6 +91,7 @@ def convert(
     on_error: OnError = "skip",
     jobs: int | None = None,
     license_note: str | None = None,
+    options: Mapping[str, object] | None = None,
     show_progress: bool = True,
 ) -> ConvertReport:
     """Convert files of a data source to a data set that does not need them any more.
@@ -106,12 +109,13 @@ def convert(
         on_error: "skip" leaves bad files and records out and reports them, "stop" raises at the first.
         jobs: processes that work at the same time; None = one per usable core.
         license_note: license of the data, for the manifest; None = that of the data source.
+        options: of the data source, such as {"window": "first"} for "av2": arguments of its class.
         show_progress: False shows no progress bar on stderr.
 
     Raises:
         DataError: nothing to read, nothing readable in it, a destination with something else in it, or one that cannot
             be written to; under "stop" also the first bad file or record.
-        ConfigError: an unknown data source, fewer than one process, or a split without a name.
+        ConfigError: an unknown data source or option of it, fewer than one process, or a split without a name.
     """
     if jobs is not None and jobs < 1:
         raise ConfigError(f"jobs must be at least 1, got {jobs}: leave it out for one per core.")
@@ -128,7 +132,7 @@ def convert(
             raise DataError(f"{folder} is not empty and not a data set: choose another destination")
 
     # 2. One task per unit of the source.
-    data_source = find_source(reader, source)
+    data_source = find_source(reader, source, options)
     tasks = []
     for unit in data_source.find(source):
         label = split or unit.split
@@ -222,7 +226,7 @@ def _convert_unit(
         _Stopped: `is_stopped` was true.
     """
     # 1. Take over the shard of an earlier run if it is whole and made from these very files.
-    size, digest = _fingerprint(task.unit.files)
+    size, digest = _fingerprint(task.unit.files, source.describe())
     known = task.known
     if (
         known is not None
@@ -235,6 +239,7 @@ def _convert_unit(
 
     # 2. Read and write record by record, so that memory does not grow with the file.
     skipped: list[SkippedRecord] = []
+    tallies: Counter[str] = Counter()
     bytes_left = size
 
     def count(num_bytes: int) -> None:
@@ -244,7 +249,14 @@ def _convert_unit(
 
     writer = ShardWriter(task.folder / task.shard)
     try:
-        scenarios = read_unit(source, task.unit, on_error=task.on_error, report=skipped.append, advance=count)
+        scenarios = read_unit(
+            source,
+            task.unit,
+            on_error=task.on_error,
+            report=skipped.append,
+            advance=count,
+            tally=lambda tally: tallies.update({tally.what: tally.count}),
+        )
         for record, scenario in scenarios:
             writer.add(scenario, task.split, record)
             if is_stopped():
@@ -268,18 +280,21 @@ def _convert_unit(
         source_bytes=size,
         source_sha256=digest,
         skipped=tuple(skipped),
+        tallies=dict(sorted(tallies.items())),
     )
     write_json(task.folder / f"{task.shard}.json", {**asdict(entry), "schema_version": SCHEMA_VERSION})
     return _Outcome(entry, reused=False)
 
 
-def _fingerprint(files: tuple[Path, ...]) -> tuple[int, str]:
-    """Bytes of some files and their SHA-256; of several files that of their checksums."""
+def _fingerprint(files: tuple[Path, ...], settings: Mapping[str, object]) -> tuple[int, str]:
+    """Bytes of some files and their SHA-256; of several files or with settings, that of all checksums and these."""
     try:
         size = sum(file.stat().st_size for file in files)
         digests = [hash_file(file) for file in files]
     except OSError as error:
         raise DataError(f"{error.filename}: cannot be read: {error.strerror}") from error
+    if settings:
+        digests.append(json.dumps(settings, sort_keys=True))
     return size, digests[0] if len(digests) == 1 else hashlib.sha256("".join(digests).encode()).hexdigest()
 
 
@@ -319,6 +334,9 @@ def _report(folder: Path, outcomes: list[_Outcome], manifest: Manifest) -> Conve
     entries = [outcome.entry for outcome in outcomes]
     sources = {entry.source for entry in entries}
     duplicates = tuple(record for record in manifest.duplicates if record.file in sources)
+    tallies: Counter[str] = Counter()
+    for entry in entries:
+        tallies.update(entry.tallies)
     return ConvertReport(
         destination=folder,
         converted=sum(entry.num_rows for entry in entries) - len(duplicates),
@@ -327,4 +345,5 @@ def _report(folder: Path, outcomes: list[_Outcome], manifest: Manifest) -> Conve
         shards_written=sum(not outcome.reused for outcome in outcomes),
         shards_reused=sum(outcome.reused for outcome in outcomes),
         counts=manifest.counts,
+        tallies=dict(sorted(tallies.items())),
     )

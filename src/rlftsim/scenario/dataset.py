@@ -17,7 +17,7 @@ import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from threading import Lock
 from types import TracebackType
@@ -31,7 +31,14 @@ import rlftsim
 from rlftsim.aliases import current_name, current_names
 from rlftsim.atomic_io import cannot_write, write_text, write_whole
 from rlftsim.errors import ConfigError, DataError, whole_number
-from rlftsim.scenario.shards import INDEX_FIELDS, SCHEMA_VERSION, ShardReader, ShardWriter, hash_file
+from rlftsim.scenario.shards import (
+    INDEX_FIELDS,
+    SCHEMA_VERSION,
+    ShardReader,
+    ShardWriter,
+    hash_file,
+    with_later_columns,
+)
 from rlftsim.scenario.synthetic.pack import pack_path
 from rlftsim.scenario.tfrecord import SkippedRecord
 from rlftsim.scenario.types import Scenario
@@ -59,7 +66,10 @@ class ShardEntry:
     """Name of the file it was converted from."""
     source_bytes: int | None = None
     source_sha256: str | None = None
+    """Of what it was made from: the bytes of the files, and the settings of the data source."""
     skipped: tuple[SkippedRecord, ...] = ()
+    tallies: Mapping[str, int] = field(default_factory=dict)
+    """Numbers of what the data source counted."""
 
 
 @dataclass(frozen=True)
@@ -119,6 +129,16 @@ class ScenarioDataset:
         self._decoded = lru_cache(cache_size)(
             lambda position: self._reader(self._shard_names[position]).read(self._rows[position])
         )
+
+    @cached_property
+    def sources(self) -> tuple[str, ...]:
+        """Names of the data sources of its scenarios, in alphabetical order."""
+        return tuple(sorted(set(self.index["source"].to_pylist())))
+
+    @cached_property
+    def guessed(self) -> tuple[str, ...]:
+        """Values that are guessed in at least one scenario, see `Scenario.guessed`, in alphabetical order."""
+        return tuple(sorted({word for words in set(self.index["guessed"].to_pylist()) for word in words.split()}))
 
     def __len__(self) -> int:
         return len(self.scenario_ids)
@@ -444,7 +464,9 @@ def load_index(folder: Path) -> pa.Table:
     except (OSError, pa.ArrowException) as error:
         cause = getattr(error, "strerror", None) or "it is not a whole Parquet file"
         raise DataError(f"{folder / INDEX} cannot be read ({cause}): convert again") from error
-    return index.rename_columns([current_name(name) for name in index.schema.names])
+    index = index.rename_columns([current_name(name) for name in index.schema.names])
+    # columns that do not belong there stay, so that a wrong file is noticed
+    return with_later_columns(index, INDEX_SCHEMA) if set(index.schema.names) <= set(INDEX_SCHEMA.names) else index
 
 
 def build_index(folder: Path, entries: Iterable[ShardEntry]) -> tuple[pa.Table, list[SkippedRecord]]:

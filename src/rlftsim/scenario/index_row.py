@@ -27,6 +27,9 @@ class IndexRow:
     num_map_points: int
     num_light_states: int
     ego_maneuver: str
+    source: str = Scenario.source
+    guessed: str = ""
+    """Words of `Scenario.guessed` in alphabetical order, with spaces between them."""
 
 
 def compute_index_row(scenario: Scenario, split: str) -> IndexRow:
@@ -51,6 +54,8 @@ def compute_index_row(scenario: Scenario, split: str) -> IndexRow:
         num_map_points=len(scenario.map_features.points),
         num_light_states=len(scenario.lights.step),
         ego_maneuver=classify_ego_maneuver(scenario).value,
+        source=scenario.source,
+        guessed=" ".join(sorted(scenario.guessed)),
     )
 
 

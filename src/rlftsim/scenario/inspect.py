@@ -90,6 +90,9 @@ class DatasetStats:
     speeds: Mapping[str, SpeedStats]
     """By type of agent, from `num_speed_scenarios` scenarios."""
     num_speed_scenarios: int
+    by_source: Mapping[str, int]
+    by_guessed: Mapping[str, int]
+    """Scenarios in which a value is guessed, by the word for it."""
 
 
 def verify_dataset(folder: str | os.PathLike[str]) -> list[Finding]:
@@ -160,6 +163,8 @@ def dataset_stats(
         kilobytes_per_scenario=total_bytes / total_rows / 1000.0,
         speeds=_compute_speeds(dataset, positions),
         num_speed_scenarios=len(positions),
+        by_source=_count(index["source"].to_pylist()),
+        by_guessed=_count([word for words in index["guessed"].to_pylist() for word in words.split()]),
     )
 
 

@@ -8,7 +8,7 @@ import hashlib
 import os
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import asdict, fields
+from dataclasses import MISSING, asdict, fields
 from pathlib import Path
 from typing import Any
 
@@ -68,10 +68,11 @@ _ARRAY_DTYPES: Mapping[str, str] = {
     "lights.stop_point.y": "float32",
     "lights.stop_point.z": "float32",
 }
-_ADDED_LATER = ("map.polygon_rest.x", "map.polygon_rest.y", "map.polygon_rest.z")
-"""Columns that shards of earlier versions lack: None there."""
 _INDEX_TYPES = {str: pa.string(), int: pa.int32()}
 INDEX_FIELDS = tuple(pa.field(field.name, _INDEX_TYPES[field.type]) for field in fields(IndexRow))
+_INDEX_DEFAULTS = {field.name: field.default for field in fields(IndexRow) if field.default is not MISSING}
+_ADDED_LATER = {"map.polygon_rest.x", "map.polygon_rest.y", "map.polygon_rest.z", *_INDEX_DEFAULTS}
+"""Columns that shards of earlier versions lack: None there, or the default of `IndexRow`."""
 _SCHEMA = pa.schema(
     [
         *INDEX_FIELDS,
@@ -193,8 +194,9 @@ class ShardReader:
         except (OSError, pa.ArrowException) as error:
             cause = "is damaged" if self.path.exists() else "is missing"
             raise DataError(f"shard {self.path} {cause}: {_WAY_OUT}") from error
-        earlier = [name for name in _SCHEMA.names if name not in _ADDED_LATER]
-        if self._table.schema.names not in (_SCHEMA.names, earlier):
+        known = self._table.schema.names
+        expected = [name for name in _SCHEMA.names if name in known or name not in _ADDED_LATER]
+        if known != expected:
             raise DataError(f"shard {self.path} was written with another schema version: convert again")
 
     def __len__(self) -> int:
@@ -202,12 +204,13 @@ class ShardReader:
 
     def index_rows(self) -> pa.Table:
         """Columns of `IndexRow` and `source_record`, one row per scenario; a copy in memory."""
-        names = [field.name for field in INDEX_FIELDS]
+        schema = pa.schema([*INDEX_FIELDS, pa.field("source_record", pa.int32())])
+        known = self._table.schema.names
         try:
-            columns = {name: self._table[name].to_pylist() for name in [*names, "source_record"]}
+            columns = {name: self._table[name].to_pylist() for name in schema.names if name in known}
         except (OSError, UnicodeDecodeError, pa.ArrowException) as error:
             raise DataError(f"shard {self.path} is damaged: {_WAY_OUT}") from error
-        return pa.table(columns, schema=pa.schema([*INDEX_FIELDS, pa.field("source_record", pa.int32())]))
+        return with_later_columns(pa.table(columns, schema=pa.schema([schema.field(name) for name in columns])), schema)
 
     def read(self, row: int) -> Scenario:
         """Decode a row.
@@ -225,8 +228,9 @@ class ShardReader:
             arrays: dict[str, Any] = {
                 name: None if data is None else decode_array(data) for name, data in encoded.items()
             }
-            scenario_id = self._table["scenario_id"][row].as_py()
-            return _from_arrays(scenario_id, self._table["ego_index"][row].as_py(), arrays)
+            names = [name for name in ("scenario_id", "ego_index", "source", "guessed") if name in known]
+            plain = {name: self._table[name][row].as_py() for name in names}
+            return _from_arrays({**_INDEX_DEFAULTS, **plain}, arrays)
         except (ValueError, OSError, pa.ArrowException) as error:
             cause = "it cannot be read" if isinstance(error, OSError | pa.ArrowException) else error
             raise DataError(f"shard {self.path}: row {row} is damaged ({cause}): {_WAY_OUT}") from error
@@ -239,6 +243,22 @@ def hash_file(path: str | os.PathLike[str]) -> str:
     """SHA-256 of a file's bytes in hexadecimal."""
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def with_later_columns(table: pa.Table, schema: pa.Schema) -> pa.Table:
+    """Rows of an index with the columns that earlier versions did not have, filled with their defaults.
+
+    Args:
+        table: columns of `IndexRow`, and others.
+        schema: columns in the order of today; the result has those that have a default or are in the table.
+    """
+    columns = {}
+    for column in schema:
+        if column.name in table.schema.names:
+            columns[column] = table[column.name]
+        elif column.name in _INDEX_DEFAULTS:
+            columns[column] = pa.array([_INDEX_DEFAULTS[column.name]] * len(table), column.type)
+    return pa.table(list(columns.values()), schema=pa.schema(list(columns)))
 
 
 def _checksum(encoded: Mapping[str, bytes | pa.Buffer | None]) -> int:
@@ -298,8 +318,8 @@ def _to_arrays(scenario: Scenario) -> dict[str, np.ndarray | None]:
     }
 
 
-def _from_arrays(scenario_id: str, ego_index: int, arrays: Mapping[str, np.ndarray]) -> Scenario:
-    """Inverse of `_to_arrays`."""
+def _from_arrays(plain: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Scenario:
+    """Inverse of `_to_arrays`, with the values of a row that are no arrays."""
 
     def _vector(name: str, components: str) -> np.ndarray:
         return np.stack([arrays[f"{name}.{component}"] for component in components.split()], axis=-1)
@@ -308,7 +328,7 @@ def _from_arrays(scenario_id: str, ego_index: int, arrays: Mapping[str, np.ndarr
         return np.ascontiguousarray(arrays[f"topology.{name}"].T)
 
     return Scenario(
-        scenario_id=scenario_id,
+        scenario_id=plain["scenario_id"],
         timestamps_s=arrays["timestamps_s"],
         tracks=Tracks(
             object_id=arrays["tracks.object_id"],
@@ -341,8 +361,10 @@ def _from_arrays(scenario_id: str, ego_index: int, arrays: Mapping[str, np.ndarr
             state=arrays["lights.state"],
             stop_point=_vector("lights.stop_point", "x y z"),
         ),
-        ego_index=ego_index,
+        ego_index=plain["ego_index"],
         tracks_to_predict=arrays["tracks_to_predict"],
         difficulty=arrays["difficulty"],
         objects_of_interest=arrays["objects_of_interest"],
+        source=plain["source"],
+        guessed=frozenset(plain["guessed"].split()),
     )

@@ -21,9 +21,10 @@ A source is an object (or a class without arguments) under a name in `SOURCES`. 
 Installed packages announce theirs by the entry-point group `rlftsim.sources`.
 """
 
+import inspect
 import os
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -54,8 +55,16 @@ class BytesRead(int):
     """Bytes of a unit that were read since the last report: moves the progress bar. Sources may leave them out."""
 
 
-Item = Scenario | SkippedRecord | BytesRead
-"""Yielded by a source: a scenario, the cause why a record is none, or progress."""
+@dataclass(frozen=True)
+class Tally:
+    """Something that happened in a unit and that its user should know the number of; sums are in the report."""
+
+    what: str
+    count: int
+
+
+Item = Scenario | SkippedRecord | BytesRead | Tally
+"""Yielded by a source: a scenario, the cause why a record is none, progress, or something to be counted."""
 
 
 @runtime_checkable
@@ -63,7 +72,7 @@ class DataSource(Protocol):
     """Reader of one kind of files.
 
     It may also have `detects(path) -> bool`, True for files of its kind, which `convert` calls when no source is named.
-    A source is pickled when several processes convert.
+    Arguments of a source's class are options of `convert`. A source is pickled when several processes convert.
     """
 
     license_note: str
@@ -86,36 +95,64 @@ class DataSource(Protocol):
         ...
 
     def describe(self) -> Mapping[str, object]:
-        """Plain JSON values for the provenance in the manifest, above all what had to be guessed."""
+        """Plain JSON values for the provenance in the manifest, above all what had to be guessed.
+
+        A unit is converted again when they change.
+        """
         ...
 
 
-SOURCES: ExtensionPoint[Any] = ExtensionPoint(
-    "data source", "rlftsim.sources", {DEFAULT_SOURCE: "rlftsim.scenario.womd:WomdSource"}
-)
+_SHIPPED = {
+    DEFAULT_SOURCE: "rlftsim.scenario.womd:WomdSource",
+    "av2": "rlftsim.scenario.av2:Av2Source",
+    "tables": "rlftsim.scenario.tables:TablesSource",
+}
+SOURCES: ExtensionPoint[Any] = ExtensionPoint("data source", "rlftsim.sources", _SHIPPED)
 
 
-def find_source(reader: str, path: str | os.PathLike[str]) -> DataSource:
+def find_source(reader: str, path: str | os.PathLike[str], options: Mapping[str, object] | None = None) -> DataSource:
     """Source of a name, or for "auto" the one that recognizes the files at a path.
 
     Args:
         reader: a name in `SOURCES`, or "auto".
         path: file, folder or glob to be converted.
+        options: arguments of the source's class.
 
     Raises:
-        ConfigError: the name is unknown, or "auto" and several sources recognize the files.
+        ConfigError: the name is unknown, "auto" and several sources recognize the files, or the source does not take an
+            option.
     """
     if reader != AUTO:
-        return _source(reader)
-    default = _source(DEFAULT_SOURCE)
-    # The default comes first: then packages of other people are not even imported.
-    if default.detects(path):  # type: ignore[attr-defined]
-        return default
-    others = [name for name in SOURCES.names() if name != DEFAULT_SOURCE]
-    found = [name for name in others if getattr(_source(name), "detects", lambda _: False)(path)]
+        return _source(reader, options)
+    # Those that ship come first: then packages of other people are not even imported.
+    found = _detecting(_SHIPPED, path) or _detecting(SOURCES.names(), path)
     if len(found) > 1:
         raise ConfigError(f"{path} could be read as {' or '.join(found)}: name the data source.")
-    return _source(found[0]) if found else default
+    return _source(found[0] if found else DEFAULT_SOURCE, options)
+
+
+def _detecting(names: Iterable[str], path: str | os.PathLike[str]) -> list[str]:
+    return [name for name in names if getattr(_source(name), "detects", lambda _: False)(path)]
+
+
+def attribution_of(source: str) -> str:
+    """Line that pictures of a data source's scenarios carry; empty for most, and for those of other packages."""
+    return getattr(SOURCES.find(source), "attribution", "") if source in _SHIPPED else ""
+
+
+def guessed_note(sources: Iterable[str], guessed: Iterable[str]) -> str:
+    """A sentence on the values that are guessed in some scenarios; empty where none is.
+
+    Args:
+        sources: names of the data sources.
+        guessed: words of `Scenario.guessed`.
+    """
+    words, names = sorted(set(guessed)), sorted(set(sources))
+    if not words:
+        return ""
+    return (
+        f"Data of {', '.join(names)} with guessed {', '.join(words)}: scores compare with others on the same data only."
+    )
 
 
 def read_unit(
@@ -125,6 +162,7 @@ def read_unit(
     on_error: OnError,
     report: Callable[[SkippedRecord], None],
     advance: Callable[[int], object] = lambda _: None,
+    tally: Callable[[Tally], object] = lambda _: None,
 ) -> Iterator[tuple[int, Scenario]]:
     """Read a unit; yields the number of the record, from 0, with its scenario.
 
@@ -134,6 +172,7 @@ def read_unit(
         on_error: "stop" raises at the first bad record, "skip" reports it and goes on.
         report: called with each skipped record, only under "skip".
         advance: called with the number of bytes read since its last call, if the source counts them.
+        tally: called with what the source counts.
 
     Raises:
         DataError: under "stop", a bad record: names file, record and cause. Always: a file cannot be read.
@@ -144,6 +183,9 @@ def read_unit(
         for item in source.read(unit):
             if isinstance(item, BytesRead):
                 advance(item)  # no record
+                continue
+            if isinstance(item, Tally):
+                tally(item)
                 continue
             if isinstance(item, Scenario):
                 yield record, item
@@ -179,14 +221,19 @@ def infer_split(path: Path) -> str:
     return "unknown"
 
 
-def _source(name: str) -> DataSource:
+def _source(name: str, options: Mapping[str, object] | None = None) -> DataSource:
     """Source of a name, made if it is a class.
 
     Raises:
-        ConfigError: the name is unknown, or not that of a data source.
+        ConfigError: the name is unknown, or not that of a data source, or it does not take an option.
     """
     found = SOURCES.get(name)
-    source = found() if isinstance(found, type) else found
+    taken = inspect.signature(found).parameters if isinstance(found, type) else {}
+    for option in options or {}:
+        if option not in taken:
+            known = f"it takes {', '.join(taken)}" if taken else "it takes none"
+            raise ConfigError(f"data source {name!r} has no option {option!r}: {known}.")
+    source = found(**(options or {})) if isinstance(found, type) else found
     missing = [part for part in ("license_note", "find", "read", "describe") if not hasattr(source, part)]
     if missing:
         raise ConfigError(f"data source {name!r} has no {', '.join(missing)}: see rlftsim.scenario.sources.")

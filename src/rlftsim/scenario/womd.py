@@ -189,6 +189,7 @@ def scenario_from_bytes(record: bytes) -> Scenario:
         tracks_to_predict=predicted,
         difficulty=np.array([item.difficulty for item in message.tracks_to_predict], np.int8),
         objects_of_interest=np.array(message.objects_of_interest, np.int64),
+        source="womd",
     )
     scenario.refuse_not_finite()
     return scenario

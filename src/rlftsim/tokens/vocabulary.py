@@ -21,6 +21,8 @@ from rlftsim.geometry import pose_of_corners
 from rlftsim.scenario.types import ObjectType
 
 STEPS_PER_TOKEN = 5
+STILL_TOKEN = 0
+"""Token of every class that stands exactly still."""
 CLASS_NAMES = ("vehicle", "pedestrian", "cyclist")
 CLASS_BOXES_M = ((4.8, 2.0), (1.0, 1.0), (2.0, 1.0))
 """Length and width of each class's box, which tokens are matched with."""
@@ -57,7 +59,7 @@ class Vocabulary:
     corners: Float[Tensor, "C V 6 4 2"]
     """Boxes at steps 0..5 in the frame of the start pose; rows past a class's own number of tokens are zero."""
     token_mask: Bool[Tensor, "C V"]
-    """True = the token exists. Token 0 of every class stands exactly still."""
+    """True = the token exists. `STILL_TOKEN` does in every class."""
     map_prototypes: Float[Tensor, "P 11 2"]
     """Pieces of 5 m, a point every 0.5 m, start at the origin with heading 0."""
     origin: str = ""

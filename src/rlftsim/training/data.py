@@ -1,6 +1,6 @@
 """Scenarios, agents and steps of an update: a function of seed and update alone, which resuming relies on."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +12,7 @@ from rlftsim.errors import DataError
 from rlftsim.rollout.noise import derive_seed
 from rlftsim.scenario.batch import ScenarioBatch, collate
 from rlftsim.scenario.derived import cached_on_scenario
+from rlftsim.scenario.mirror import mirrored
 from rlftsim.scenario.types import CURRENT_STEP, Scenario, Scenarios
 
 MIN_FUTURE_STEPS = 5
@@ -19,7 +20,11 @@ MIN_FUTURE_STEPS = 5
 
 
 def batch_with_futures(
-    scenarios: Scenarios, indices: Sequence[int], *, context_radius_m: float | None = None
+    scenarios: Scenarios,
+    indices: Sequence[int],
+    *,
+    context_radius_m: float | None = None,
+    mirror: Collection[int] = (),
 ) -> ScenarioBatch:
     """Batch of some scenarios.
 
@@ -27,11 +32,12 @@ def batch_with_futures(
         scenarios: to choose from.
         indices: of the chosen ones.
         context_radius_m: leave out steps farther from the ego, see `within_reach`; None = leave out nothing.
+        mirror: indices of those that are seen mirrored.
 
     Raises:
         DataError: one of them withholds its future, so nothing can be learned from it.
     """
-    chosen = [scenarios[i] for i in indices]
+    chosen = [mirrored(scenarios[i]) if i in mirror else scenarios[i] for i in indices]
     for scenario in chosen:
         if not scenario.has_future:
             raise DataError(
@@ -106,6 +112,18 @@ def trained_agents(
         row[:count] = torch.rand(count, generator=generator)
     rank = torch.where(others, u.to(batch.device), 2.0).argsort(-1).argsort(-1)  # 2 is behind every uniform number
     return first | (others & (rank < limit - first.sum(-1, keepdim=True)))
+
+
+def mirrored_of_update(update: int, indices: Sequence[int], probability: float, seed: int) -> set[int]:
+    """The scenarios of an update that are seen mirrored; each draws for itself, so processes need not agree.
+
+    Args:
+        update: counted from 0.
+        indices: of the scenarios.
+        probability: of each to be mirrored.
+        seed: of the run.
+    """
+    return {i for i in indices if np.random.default_rng(derive_seed(seed, "mirror", update, i)).random() < probability}
 
 
 def scenarios_of_update(update: int, batch_size: int, num_scenarios: int, seed: int) -> list[int]:

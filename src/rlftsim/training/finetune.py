@@ -29,10 +29,17 @@ from rlftsim.training.experience import (
 from rlftsim.training.freezing import TrainedParts, freeze_untrained, parameter_groups, set_learning_rate
 from rlftsim.training.goals import GoalConfig, StoredGoals, refuse_goals
 from rlftsim.training.hindsight import accumulate_hindsight, goal_terms
-from rlftsim.training.parallel import DeviceConfig, Fabric, all_reduce_gradients, start_fabric
+from rlftsim.training.parallel import DeviceConfig, Fabric, all_reduce_gradients, num_sharing_memory
 from rlftsim.training.policy_gradient import LossTerms, Reduction, accumulate_gradients
 from rlftsim.training.reference import KlConfig, RewardLearner, adapt_beta, sync_reference
-from rlftsim.training.run import TrainingRun, TrainingScenarios, UpdateReport, as_scenarios, require_trainable
+from rlftsim.training.run import (
+    TrainingRun,
+    TrainingScenarios,
+    UpdateReport,
+    as_scenarios,
+    require_trainable,
+    train_in_processes,
+)
 
 
 @dataclass(frozen=True)
@@ -46,7 +53,8 @@ class FinetuneConfig:
     num_rollouts: int = 4
     """Rollouts per scenario and update (N)."""
     micro_batch_size: int = 8
-    """Scenarios in memory at once, in each process; fewer need less memory, the update is the same."""
+    """Scenarios in memory at once, on each GPU or in all processes on a CPU together; fewer need less memory, the
+    update is the same."""
     rollouts_per_pass: int = 4
     """Rollouts of each that are scored with gradient at once; fewer need less memory, the update is the same."""
     reward: str = "mloo"
@@ -139,26 +147,29 @@ def finetune(
     model = require_trainable(policy, scenarios, "rewards")
     refuse_goals(policy, config.goals.probability)
     augmented = config.goals.open_augmented(scenarios)
-    fabric = start_fabric(config.device)
-    run = TrainingRun(
-        policy, scenarios, out, config, fabric,
-        inputs={"augmented_goals": augmented.fingerprint} if augmented else {},
-        skip_rule=f"KL above max_kl={config.max_kl} or not finite",
-        remedy="lower learning_rate or raise kl.initial_beta",
-    )  # fmt: skip
-    learner = prepare(model, config, fabric.device, augmented)
 
-    def make_update() -> UpdateReport:
-        batch = run.local_batch(learner.update).to(fabric.device)
-        values = update_policy(learner, batch, config, fabric)
-        levels, alarms = learner.alarms.watch(values, config.alarms)
-        cause = f"KL {values['kl']:.3g} nats per decision is above max_kl={config.max_kl:g}"
-        if not math.isfinite(values["gradient_norm"]):
-            cause = "its gradient is not finite"
-        note = f"RMM {values['rmm']:.3f}, KL {values['kl']:.4f}, beta {learner.beta:.3f}"
-        return UpdateReport({**values, **levels}, note, cause, alarms)
+    def train(config: FinetuneConfig, fabric: Fabric) -> Path:
+        run = TrainingRun(
+            policy, scenarios, out, config, fabric,
+            inputs={"augmented_goals": augmented.fingerprint} if augmented else {},
+            skip_rule=f"KL above max_kl={config.max_kl} or not finite",
+            remedy="lower learning_rate or raise kl.initial_beta",
+        )  # fmt: skip
+        learner = prepare(model, config, fabric.device, augmented)
 
-    return run.train(learner, make_update, title="fine-tune", card=card)
+        def make_update() -> UpdateReport:
+            batch = run.local_batch(learner.update).to(fabric.device)
+            values = update_policy(learner, batch, config, fabric)
+            levels, alarms = learner.alarms.watch(values, config.alarms)
+            cause = f"KL {values['kl']:.3g} nats per decision is above max_kl={config.max_kl:g}"
+            if not math.isfinite(values["gradient_norm"]):
+                cause = "its gradient is not finite"
+            note = f"RMM {values['rmm']:.3f}, KL {values['kl']:.4f}, beta {learner.beta:.3f}"
+            return UpdateReport({**values, **levels}, note, cause, alarms)
+
+        return run.train(learner, make_update, title="fine-tune", card=card)
+
+    return train_in_processes(train, config, len(scenarios), out)
 
 
 def prepare(
@@ -202,7 +213,7 @@ def update_policy(
     """
     clock = UpdateClock(fabric.device)
     experiences: list[Experience] = []
-    for part in batch.split(config.micro_batch_size):
+    for part in batch.split(max(config.micro_batch_size // num_sharing_memory(fabric), 1)):
         # 1. Sample N rollouts of each scenario under this update's goals, without gradient.
         rollouts = sample_rollouts(
             learner.policy, part, config.goals, learner.augmented_goals,

@@ -5,18 +5,20 @@ rollouts, or the policy's own rollouts. The loss is the cross-entropy of the tar
 brings (`ImitatedPolicy`); its sum over everything that an update sees is divided by the number of predictions.
 """
 
+import copy
 import math
 import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional
 
 from rlftsim.errors import ConfigError, given, require_finite, require_not_negative, require_positive, require_types
@@ -25,12 +27,12 @@ from rlftsim.rollout.policy import ImitationLoss, Prediction
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import Scenarios
 from rlftsim.tokens.smoothing import summed_log_prob_nearby
-from rlftsim.tokens.vocabulary import Vocabulary
+from rlftsim.tokens.vocabulary import STILL_TOKEN, Vocabulary
 from rlftsim.training.batches import micro_batches, scenario_costs
-from rlftsim.training.data import batch_with_futures, trained_agents
+from rlftsim.training.data import batch_with_futures, mirrored_of_update, trained_agents
 from rlftsim.training.freezing import parameter_groups, set_learning_rate
-from rlftsim.training.parallel import DeviceConfig, Fabric, all_reduce_gradients, all_reduce_sum, start_fabric
-from rlftsim.training.run import Learner, TrainingRun, UpdateReport
+from rlftsim.training.parallel import DeviceConfig, Fabric, all_reduce_gradients, all_reduce_sum, num_sharing_memory
+from rlftsim.training.run import Learner, TrainingRun, UpdateReport, train_in_processes
 from rlftsim.training.validation import ValidationConfig, refuse_to_validate, validate
 
 IMPOSSIBLE = -1e8
@@ -51,10 +53,11 @@ class ImitationConfig:
     batch_size: int = 80
     """Scenarios per update, over all processes."""
     micro_batch_size: int = 8
-    """Scenarios in memory at once, at most; gradients add up over the rest."""
+    """Scenarios in memory at once, at most, on each GPU or in all processes on a CPU together; gradients add up over
+    the rest."""
     micro_batch_cost: float | None = None
     """Thousands of map points in memory at once, at most, an agent counted as 200: large scenarios come in
-    smaller groups. None = no limit."""
+    smaller groups. Processes on a CPU share it. None = no limit."""
     learning_rate: float = 5e-4
     """At its highest, after the warm-up."""
     final_lr_ratio: float = 0.01
@@ -78,6 +81,15 @@ class ImitationConfig:
     """Agents farther from the ego at the current step are context only."""
     max_trained_agents: int | None = 32
     """Of a scenario; the evaluated ones always, the rest at random. None = all."""
+    mirror_probability: float = 0.0
+    """Probability of a scenario to be seen mirrored, left and right exchanged: twice the scenes, but half of them with
+    traffic on the other side of the road."""
+    still_weight: float = 1.0
+    """Weight of a prediction whose target stands still, in the loss and all metrics; others count 1. Three quarters of
+    all tokens stand and few turn, so a small weight teaches more per update. Needs a policy with a vocabulary."""
+    ema_decay: float | None = None
+    """Validate and save an exponential moving average of the weights, with this fraction of it kept at each update,
+    such as 0.999. Less is kept in the first updates. None = the weights themselves."""
     max_skipped_in_a_row: int = 5
     """An update whose gradient is not finite is skipped; after so many in a row the run stops."""
     checkpoint_every: int = 200
@@ -96,6 +108,12 @@ class ImitationConfig:
         require_finite(self, ("epochs", "learning_rate", "weight_decay"))
         if not 0 <= self.final_lr_ratio <= 1:
             raise ConfigError(f"final_lr_ratio is a fraction in [0, 1], got {self.final_lr_ratio}.")
+        if not 0 <= self.mirror_probability <= 1:
+            raise ConfigError(f"mirror_probability is a probability in [0, 1], got {self.mirror_probability}.")
+        if not 0 <= self.still_weight <= 1:
+            raise ConfigError(f"still_weight is a weight in [0, 1], got {self.still_weight}.")
+        if self.ema_decay is not None and not 0 < self.ema_decay < 1:
+            raise ConfigError(f"ema_decay is a fraction between 0 and 1, or None, got {self.ema_decay}.")
         if not 0 <= self.label_smoothing < 1:
             raise ConfigError(f"label_smoothing is a probability in [0, 1), got {self.label_smoothing}.")
         if self.label_smoothing_kind == "spatial" and not self.label_smoothing:
@@ -115,6 +133,29 @@ class _Imitator(Learner):
     costs: Float[np.ndarray, "n"]
     config: ImitationConfig
     fabric: Fabric
+    average: nn.Module | None = None
+    """Moving average of the weights, as a policy of its own."""
+
+    @property
+    def modules(self) -> dict[str, nn.Module]:
+        return super().modules | ({} if self.average is None else {"average": self.average})
+
+    @property
+    def result(self) -> Any:
+        return self.policy if self.average is None else self.average
+
+    def finish_update(self, *, is_good: bool) -> None:
+        super().finish_update(is_good=is_good)
+        if self.average is None or self.config.ema_decay is None or not is_good:
+            return
+        # Early weights are far off: as long as few updates are made, the average is over about a tenth of them.
+        decay = min(self.config.ema_decay, (1 + self.update) / (10 + self.update))
+        with torch.no_grad():
+            for mean, weight in zip(self.average.state_dict().values(), self.policy.state_dict().values()):
+                if mean.is_floating_point():
+                    mean.lerp_(weight, 1 - decay)
+                else:
+                    mean.copy_(weight)
 
 
 def imitate(
@@ -144,16 +185,37 @@ def imitate(
         The model folder, `out/model`.
 
     Raises:
-        ConfigError: the model cannot be validated, or has no vocabulary for spatial label smoothing.
+        ConfigError: the model cannot be validated, or has no vocabulary, which spatial label smoothing and a weight of
+            standing tokens need.
         CheckpointError: `out` holds another run, or the run diverged.
     """
-    if config.label_smoothing_kind == "spatial" and not isinstance(getattr(model, "vocabulary", None), Vocabulary):
-        raise ConfigError(
-            f"{type(model).__name__} has no vocabulary, so nothing is near a token: set label_smoothing_kind=uniform."
-        )
+    if not isinstance(getattr(model, "vocabulary", None), Vocabulary):
+        name = type(model).__name__
+        if config.label_smoothing_kind == "spatial":
+            raise ConfigError(
+                f"{name} has no vocabulary, so nothing is near a token: set label_smoothing_kind=uniform."
+            )
+        if config.still_weight != 1.0:
+            raise ConfigError(f"{name} has no vocabulary, so no token is known to stand still: set still_weight=1.")
     if held_out is not None and config.validation.every:
         refuse_to_validate(model, held_out)
-    fabric = start_fabric(config.device)
+    train = partial(_imitate, model, scenarios, out, predict, title=title, held_out=held_out, card=card)
+    return train_in_processes(train, config, len(scenarios), out)
+
+
+def _imitate(
+    model: Any,
+    scenarios: Scenarios,
+    out: str | os.PathLike[str],
+    predict: Predict,
+    config: ImitationConfig,
+    fabric: Fabric,
+    *,
+    title: str,
+    held_out: Scenarios | None,
+    card: str,
+) -> Path:
+    """Training in one of the processes of a run."""
     run = TrainingRun(model, scenarios, out, config, fabric)
     # Dropout is on: unlike fine-tuning with rewards, imitation has no sampled log-probabilities to reproduce.
     model.to(fabric.device).train()
@@ -166,6 +228,7 @@ def imitate(
         costs=scenario_costs(scenarios),
         config=config,
         fabric=fabric,
+        average=None if config.ema_decay is None else copy.deepcopy(model).requires_grad_(False),
     )
     validated = ""
 
@@ -175,7 +238,7 @@ def imitate(
         values = _update(learner, learner.update)
         values["seconds"] = time.perf_counter() - start
         if held_out is not None and config.validation.is_due(learner.update, run.total):
-            values |= validate(model, held_out, config.validation, fabric)
+            values |= validate(learner.result, held_out, config.validation, fabric)
             validated = f", RMM {values['validation_rmm']:.3f}"
         accuracy = f", accuracy {values['accuracy']:.0%}" if "accuracy" in values else ""
         note = f"loss {values['loss']:.3f}{accuracy}{validated}"
@@ -211,9 +274,13 @@ def _update(learner: _Imitator, update: int) -> dict[str, float]:
     # 1. Gradients of the summed loss add up over micro batches.
     names: list[str] = []  # of further metrics; every micro batch has the same
     sums = torch.zeros((), device=fabric.device)  # becomes [2 + names]: loss, further metrics, number of predictions
-    own = run.local_indices(update, learner.costs)
-    for micro in micro_batches(own, learner.costs, max_count=config.micro_batch_size, max_cost=config.micro_batch_cost):
-        batch = batch_with_futures(run.scenarios, micro, context_radius_m=config.context_radius_m).to(fabric.device)
+    own, sharing = run.local_indices(update, learner.costs), num_sharing_memory(fabric)
+    max_count = max(config.micro_batch_size // sharing, 1)
+    max_cost = None if config.micro_batch_cost is None else config.micro_batch_cost / sharing
+    mirror = mirrored_of_update(update, own, config.mirror_probability, config.seed)
+    for micro in micro_batches(own, learner.costs, max_count=max_count, max_cost=max_cost):
+        batch = batch_with_futures(run.scenarios, micro, context_radius_m=config.context_radius_m, mirror=mirror)
+        batch = batch.to(fabric.device)
         trained = trained_agents(
             batch, update, radius_m=config.trained_radius_m, limit=config.max_trained_agents, seed=config.seed
         )
@@ -221,7 +288,7 @@ def _update(learner: _Imitator, update: int) -> dict[str, float]:
             predicted = learner.predict(batch, trained, update)
         # Outside of autocast, where a cross-entropy is in full precision.
         if not isinstance(predicted, ImitationLoss):
-            predicted = summed_loss(predicted, config.label_smoothing, nearby)
+            predicted = summed_loss(predicted, config.label_smoothing, nearby, config.still_weight)
         fabric.backward(predicted.loss)
         names = list(predicted.sums)
         values = (predicted.loss, *predicted.sums.values(), predicted.count)
@@ -245,30 +312,36 @@ def _update(learner: _Imitator, update: int) -> dict[str, float]:
     }
 
 
-def summed_loss(prediction: Prediction, label_smoothing: float, nearby: Vocabulary | None = None) -> ImitationLoss:
+def summed_loss(
+    prediction: Prediction, label_smoothing: float, nearby: Vocabulary | None = None, still_weight: float = 1.0
+) -> ImitationLoss:
     """Cross-entropy of tokens summed over predictions, nats, with what its metrics are made of.
 
     Args:
         prediction: logits and targets; only what the target mask marks counts.
         label_smoothing: probability that the target gives to other tokens.
         nearby: vocabulary whose tokens near the target get it; None = all tokens that exist, the target among them.
+        still_weight: weight of predictions whose target is token 0, which stands still in a vocabulary; others count 1.
 
     Returns:
         The loss and the number of predictions; the top-1 hits, the top-5 hits and the entropy (nats) by the names of
-        their means. All are zero where nothing counts.
+        their means. All are sums over predictions times their weights, and zero where nothing counts.
     """
     logits, target = prediction.logits[prediction.target_mask], prediction.target[prediction.target_mask]  # [r, V], [r]
     log_probs = functional.log_softmax(logits, -1)
+    weight = torch.where(target == STILL_TOKEN, still_weight, 1.0)  # [r]
     if nearby is None:
         # Impossible tokens have log-probabilities of about -1e8, which would swamp the mean.
         exists = logits > IMPOSSIBLE
-        elsewhere = (torch.where(exists, log_probs, 0.0).sum(-1) / exists.sum(-1)).sum()
+        elsewhere = (weight * torch.where(exists, log_probs, 0.0).sum(-1) / exists.sum(-1)).sum()
     else:
-        elsewhere = summed_log_prob_nearby(log_probs, target, prediction.class_id[prediction.target_mask], nearby)
+        class_id = prediction.class_id[prediction.target_mask]
+        elsewhere = summed_log_prob_nearby(weight[:, None] * log_probs, target, class_id, nearby)
     # Uniform smoothing spreads over all existing tokens, the target included, as torch's cross_entropy does.
     of_target = log_probs.gather(-1, target[:, None])[:, 0]
-    loss = -((1 - label_smoothing) * of_target.sum() + label_smoothing * elsewhere)
+    loss = -((1 - label_smoothing) * (weight * of_target).sum() + label_smoothing * elsewhere)
     hits = logits.detach().topk(min(5, logits.shape[-1]), dim=-1).indices == target[:, None]  # [r, 5]
-    entropy = -(log_probs.detach().exp() * log_probs.detach()).sum()
-    sums = {"accuracy": hits[:, 0].sum(), "top5_accuracy": hits.any(-1).sum(), "entropy": entropy}
-    return ImitationLoss(loss, torch.tensor(len(target), device=target.device), sums)
+    entropy = -(log_probs.detach().exp() * log_probs.detach()).sum(-1)
+    measured = {"accuracy": hits[:, 0], "top5_accuracy": hits.any(-1), "entropy": entropy}  # [r] each
+    sums = {name: (weight * values).sum() for name, values in measured.items()}
+    return ImitationLoss(loss, weight.sum(), sums)

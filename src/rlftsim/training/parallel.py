@@ -1,11 +1,15 @@
-"""Devices and processes, by way of lightning-fabric.
+"""Devices and processes.
 
 Every process works on its part of the global batch and adds up *sums*; the sums are added over the processes and
 divided by global counts. So the estimator is that of one process with the same global batch, no matter how
 scenarios and agents are spread.
+
+On GPUs and under torchrun, lightning-fabric connects the processes; on a CPU see `training.processes`.
 """
 
+import multiprocessing
 import os
+import sys
 from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -16,6 +20,11 @@ from torch import Tensor, nn
 
 from rlftsim.errors import ConfigError, require_not_negative, require_positive, require_types
 from rlftsim.training.batches import balance_by_cost
+from rlftsim.workers import usable_cores
+
+MIN_SCENARIOS = 32
+"""Data sets of fewer scenarios are trained on by one process, unless another number is given. (A limit of the data
+set, not of the run's length: a run that is continued for more epochs keeps its processes.)"""
 
 
 @runtime_checkable
@@ -64,8 +73,11 @@ class DeviceConfig:
 
     accelerator: Literal["auto", "cpu", "cuda"] = "auto"
     """Kind of device; auto = CUDA if there is one."""
-    devices: int = 1
-    """Processes on this machine. Under torchrun this and `num_nodes` have no effect: torchrun decides."""
+    processes: int | Literal["auto"] = "auto"
+    """Processes on this machine, that is GPUs, or cores of a CPU. auto = one on a GPU, on a CPU one for each usable
+    core, but not more than scenarios in a batch or in memory at once, and one for a few scenarios. A run stores the
+    number in its config.json and is resumed with it: another one rounds otherwise. Under torchrun this and `num_nodes`
+    have no effect: torchrun decides."""
     num_nodes: int = 1
     """Machines."""
     precision: Literal["32-true", "bf16-mixed"] = "32-true"
@@ -76,12 +88,51 @@ class DeviceConfig:
 
     def __post_init__(self) -> None:
         require_types(self)
-        require_positive(self, ("devices", "num_nodes"))
+        require_positive(self, ("num_nodes", *(() if self.processes == "auto" else ("processes",))))
         require_not_negative(self, ("threads",))
+
+    @property
+    def uses_cuda(self) -> bool:
+        """True if a run with these settings is on GPUs."""
+        return self.accelerator == "cuda" or (self.accelerator == "auto" and torch.cuda.is_available())
+
+    @property
+    def forks(self) -> bool:
+        """True if `processes.in_processes` starts the processes of a run; else lightning-fabric or torchrun does."""
+        return not self.uses_cuda and self.num_nodes == 1 and not is_torchrun()
+
+    def num_processes(
+        self, num_scenarios: int, batch_size: int, micro_batch_size: int, begun_with: int | None = None
+    ) -> int:
+        """Processes of a run on this machine; the number that "auto" stands for.
+
+        Args:
+            num_scenarios: in the data set.
+            batch_size: scenarios of an update; each process needs one.
+            micro_batch_size: scenarios in memory at once, which the processes on a CPU share.
+            begun_with: number of a run that is resumed.
+        """
+        if is_torchrun():
+            return int(os.environ["LOCAL_WORLD_SIZE"])
+        if self.processes != "auto":
+            return self.processes
+        if not (self.forks and can_fork() and self.threads == 1):
+            return 1
+        if begun_with is not None:
+            return begun_with
+        return min(usable_cores(), batch_size, micro_batch_size) if num_scenarios >= MIN_SCENARIOS else 1
+
+
+def can_fork() -> bool:
+    """True where training may start processes by forking this one.
+
+    Elsewhere system libraries, or torch's threads for the backward pass on a GPU, do not survive it.
+    """
+    return sys.platform == "linux" and not torch.cuda.is_available() and not multiprocessing.current_process().daemon
 
 
 def start_fabric(config: DeviceConfig) -> Fabric:
-    """Join the processes of a run.
+    """Device and precision of a run, and its processes on GPUs or under torchrun; for a CPU's see `in_processes`.
 
     Raises:
         ConfigError: CUDA is requested, but there is none.
@@ -94,14 +145,14 @@ def start_fabric(config: DeviceConfig) -> Fabric:
         )
     if config.threads:
         torch.set_num_threads(config.threads)
-    devices, num_nodes = config.devices, config.num_nodes
-    if "TORCHELASTIC_RUN_ID" in os.environ:
+    devices, num_nodes = 1 if config.processes == "auto" or config.forks else config.processes, config.num_nodes
+    if is_torchrun():
         # torchrun has started the processes already and says how many there are.
         devices = int(os.environ["LOCAL_WORLD_SIZE"])
         num_nodes = int(os.environ["WORLD_SIZE"]) // devices
     # "ddp" for its process group only: models are not wrapped, gradients are summed by `all_reduce_gradients`.
     fabric = LightningFabric(
-        accelerator=config.accelerator,
+        accelerator="cuda" if config.uses_cuda else "cpu",
         devices=devices,
         num_nodes=num_nodes,
         strategy="ddp" if devices * num_nodes > 1 else "auto",
@@ -109,6 +160,11 @@ def start_fabric(config: DeviceConfig) -> Fabric:
     )
     fabric.launch()
     return fabric
+
+
+def is_torchrun() -> bool:
+    """True where torchrun has started this process."""
+    return "TORCHELASTIC_RUN_ID" in os.environ
 
 
 def is_first_process() -> bool:
@@ -130,10 +186,18 @@ def local_indices(items: list[int], fabric: Fabric, costs: Sequence[float] | Non
     """
     if len(items) < fabric.world_size:
         raise ConfigError(
-            f"a batch of {len(items)} scenarios cannot be spread over {fabric.world_size} processes: raise batch_size."
+            f"a batch of {len(items)} scenarios cannot be spread over {fabric.world_size} processes: raise batch_size, "
+            "or lower device.processes."
         )
     parts = balance_by_cost([1.0] * len(items) if costs is None else costs, fabric.world_size)
     return [items[place] for place in parts[fabric.global_rank]]
+
+
+def num_sharing_memory(fabric: Fabric) -> int:
+    """Number of processes that have one memory: all on a machine's CPU; each GPU has its own."""
+    if fabric.device.type != "cpu":
+        return 1
+    return int(os.environ["LOCAL_WORLD_SIZE"]) if is_torchrun() else fabric.world_size
 
 
 def all_reduce_sum(values: Tensor, fabric: Fabric) -> Tensor:

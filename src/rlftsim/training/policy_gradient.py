@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from rlftsim.rollout.policy import decision_statistics
 from rlftsim.training.experience import Experience
 from rlftsim.training.parallel import Fabric, all_reduce_sum
 
@@ -127,16 +128,17 @@ def accumulate_gradients(
                 with torch.no_grad():
                     conditioned = rollouts if terms.condition_reference else replace(rollouts, goals=None)
                     ref_dist = reference.score(reference_context, conditioned)
-            log_prob = dist.log_prob(rollouts.decision)  # [B, n, A, L]
-            kl, entropy = masked_sum(dist.kl(ref_dist), mask), masked_sum(dist.entropy(), mask)
-            by_agent = agent_log_prob(log_prob, mask, terms.reduction)  # [B, n, A]
+            found = decision_statistics(dist, rollouts.decision, ref_dist)  # [B, n, A, L] each
+            kl, entropy = masked_sum(found.kl, mask), masked_sum(found.entropy, mask)
+            by_agent = agent_log_prob(found.log_prob, mask, terms.reduction)  # [B, n, A]
             loss = policy_gradient_loss(reward, by_agent, terms.num_scenarios)
             loss = loss + (terms.beta * kl - terms.entropy_bonus * entropy) / num_decisions
             # Every slice adds its part; nothing is divided by the number of slices.
             fabric.backward(loss)
             sums += torch.stack([kl.detach(), entropy.detach()])
-            gaps.append(torch.where(mask, log_prob.detach() - rollouts.log_prob, 0.0).abs().max())
-            by_experience[-1].append(agent_log_prob(log_prob.detach(), mask, "sum"))
+            log_prob = found.log_prob.detach()
+            gaps.append(torch.where(mask, log_prob - rollouts.log_prob, 0.0).abs().max())
+            by_experience[-1].append(agent_log_prob(log_prob, mask, "sum"))
     kl_sum, entropy_sum = all_reduce_sum(sums, fabric).tolist()
     gap = float(torch.stack(gaps).max())
     return GradientSums(kl_sum / num_decisions, entropy_sum / num_decisions, gap, by_experience)

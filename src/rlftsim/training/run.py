@@ -7,7 +7,8 @@ does the rest, and leaves files through `training.run_folder` and `training.chec
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -22,8 +23,9 @@ from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import Scenario, Scenarios
 from rlftsim.training.checkpoint import Progress, newest_checkpoint, read_checkpoint, write_checkpoint
 from rlftsim.training.data import batch_with_futures, scenarios_of_update
-from rlftsim.training.parallel import Fabric, local_indices
-from rlftsim.training.run_folder import RunFolder, describe_inputs
+from rlftsim.training.parallel import DeviceConfig, Fabric, local_indices
+from rlftsim.training.processes import in_processes
+from rlftsim.training.run_folder import RunFolder, describe_inputs, flatten, stored_settings
 
 TrainingScenarios = Scenarios | Scenario
 """Scenarios that a training function takes: a data set, a list, or a single scenario."""
@@ -77,6 +79,11 @@ class Learner:
         """Modules that a checkpoint holds, by their file name."""
         return {"policy": self.policy}
 
+    @property
+    def result(self) -> Any:
+        """The policy that the run saves in the end."""
+        return self.policy
+
     def to_numbers(self) -> dict[str, float]:
         """Numbers that a checkpoint holds beside the weights."""
         return {}
@@ -122,6 +129,11 @@ class RunConfig(Protocol):
         ...
 
     @property
+    def micro_batch_size(self) -> int:
+        """Scenarios in memory at once."""
+        ...
+
+    @property
     def warmup_updates(self) -> int:
         """Updates over which the learning rate rises."""
         ...
@@ -141,9 +153,37 @@ class RunConfig(Protocol):
         """Seed of the run."""
         ...
 
+    @property
+    def device(self) -> DeviceConfig:
+        """Device and processes."""
+        ...
+
     def num_updates(self, num_scenarios: int) -> int:
         """Optimizer steps of the run."""
         ...
+
+
+def train_in_processes(
+    train: Callable[[Any, Fabric], Path], config: Any, num_scenarios: int, out: str | os.PathLike[str]
+) -> Path:
+    """Call a function in each process of a run; returns its result.
+
+    Args:
+        train: called with the settings and the processes.
+        config: a `RunConfig`. A run keeps the number of processes that it was begun with, which rounding depends on.
+        num_scenarios: in the data set.
+        out: the run's folder.
+
+    Raises:
+        CheckpointError: the folder holds a damaged run.
+        ConfigError: several processes cannot be started here.
+        DataError: a process died.
+    """
+    device: DeviceConfig = config.device
+    begun_with = flatten(stored_settings(Path(out))).get("device.processes")
+    processes = device.num_processes(num_scenarios, config.batch_size, config.micro_batch_size, begun_with)
+    device = replace(device, processes=processes)
+    return in_processes(partial(train, replace(config, device=device)), device)
 
 
 class TrainingRun:
@@ -227,7 +267,7 @@ class TrainingRun:
             learner.load_numbers(progress.numbers)
         # Metrics of updates behind the checkpoint would appear twice.
         self.folder.continue_from(learner.update)
-        with progress_bar(title, self.total, learner.update) as advance:
+        with progress_bar(title, self.total, learner.update, show=self._fabric.is_global_zero) as advance:
             while learner.update < self.total:
                 report = make_update()
                 # The line is written first, so that a run that ends here shows why.
@@ -243,7 +283,7 @@ class TrainingRun:
                 advance(note=report.note)
         self.folder.close()
         if self._fabric.is_global_zero:
-            learner.policy.eval().save_pretrained(self.folder.model, card=card)
+            learner.result.eval().save_pretrained(self.folder.model, card=card)
         return self.folder.model
 
     def _report(self, learner: Learner, report: UpdateReport) -> None:

@@ -36,7 +36,7 @@ PACKAGES = ("torch", "numpy", "pyarrow", "lightning-fabric", "safetensors")
 """Packages whose versions are stored with a run."""
 
 MAY_CHANGE = (
-    *("checkpoint_every", "device.accelerator", "device.devices", "device.num_nodes", "device.threads"),
+    *("checkpoint_every", "device.accelerator", "device.processes", "device.num_nodes", "device.threads"),
     *("micro_batch_size", "micro_batch_cost", "rollouts_per_pass", "validation", "goals.augmented"),
 )
 """Settings, or whole groups of them, that may have other values when a run is resumed: they change no estimate.
@@ -93,6 +93,21 @@ def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
+def stored_settings(path: Path) -> dict[str, Any]:
+    """Settings and inputs of the run in a folder, by the names of today; empty where no run has begun.
+
+    Raises:
+        CheckpointError: the file that holds them is damaged.
+    """
+    file = path / "config.json"
+    if not file.exists():
+        return {}
+    try:
+        return current_names(json.loads(file.read_text()))
+    except (ValueError, AttributeError) as error:
+        raise CheckpointError(f"{file}: damaged ({error}): remove the folder {path} to start anew.") from None
+
+
 def to_plain(config: Any) -> Any:
     """A configuration dataclass as values that JSON can hold."""
     if dataclasses.is_dataclass(config) and not isinstance(config, type):
@@ -102,6 +117,19 @@ def to_plain(config: Any) -> Any:
     if isinstance(config, list | tuple):
         return [to_plain(v) for v in config]
     return config if isinstance(config, str | int | float | bool | None) else str(config)
+
+
+def default_settings(config: Any) -> dict[str, Any]:
+    """The defaults of a configuration dataclass's fields and of those nested in it, plain; fields without one are left
+    out."""
+    defaults: dict[str, Any] = {}
+    for field in dataclasses.fields(config) if dataclasses.is_dataclass(config) else ():
+        value = getattr(config, field.name)
+        if dataclasses.is_dataclass(value):
+            defaults[field.name] = default_settings(value)
+        elif field.default is not dataclasses.MISSING:
+            defaults[field.name] = to_plain(field.default)
+    return defaults
 
 
 def describe_environment() -> dict[str, Any]:
@@ -142,26 +170,24 @@ class RunFolder:
         self._board: SummaryWriter | None = None
         # Settings and inputs stand in one file: both make a run what it is.
         plain = {**to_plain(config), **(inputs or {})}
-        self._refuse_other(plain)
+        self._refuse_other(plain, flatten(default_settings(config)))
         if writes:
             write_text(path / "config.json", json.dumps(plain, indent=1) + "\n")
             write_text(path / "environment.json", json.dumps(describe_environment(), indent=1) + "\n")
 
-    def _refuse_other(self, config: Any) -> None:
-        """Compare with the stored settings, which may have names of an earlier version."""
-        path = self.path / "config.json"
-        if not path.exists():
+    def _refuse_other(self, config: Any, defaults: Mapping[str, Any]) -> None:
+        """Compare with the stored settings of the run that was begun here, which may lack later ones."""
+        old, new = flatten(stored_settings(self.path)), flatten(config)
+        if not old:
             return
-        try:
-            old, new = flatten(current_names(json.loads(path.read_text()))), flatten(config)
-        except (ValueError, AttributeError) as error:
-            raise CheckpointError(f"{path}: damaged ({error}): remove the folder {self.path} to start anew.") from None
         # Two versions of one kind of run share most names, two kinds do not: a list of them all would explain nothing.
         if len(old.keys() ^ new.keys()) > len(old.keys() & new.keys()):
             raise CheckpointError(
                 f"{self.path} belongs to a run of another kind: name another --out, or remove the folder to start anew."
             )
-        # A setting that only one side has counts as different: None stands for it.
+        # A setting that was added after the run began has its default, with which runs are as before. Any other that
+        # only one side has counts as different: None stands for it.
+        old = {name: defaults.get(name) for name in new} | old
         differing = sorted(k for k in old.keys() | new.keys() if not may_change(k) and old.get(k) != new.get(k))
         if differing:
             most = 8  # settings named in one line

@@ -1,4 +1,4 @@
-"""Closed-loop realism of a model in training, on scenarios that it is not trained on.
+"""Closed-loop realism of a model in training, and its use of the map, on scenarios that it is not trained on.
 
 It draws from no random generator that the training uses, so a run ends with the same bits with and without it.
 """
@@ -19,6 +19,7 @@ from rlftsim.rollout.policy import Policy, Sampling
 from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.types import Scenarios
 from rlftsim.training.data import batch_with_futures
+from rlftsim.training.map_use import MapUse, measure_map_use, predicts_tokens
 from rlftsim.training.parallel import Fabric, all_reduce_sum
 
 WATCHED = {
@@ -27,6 +28,7 @@ WATCHED = {
     "validation_interactive": "interactive",
     "validation_map_based": "map_based",
     "validation_min_ade_m": "min_average_displacement_error",
+    "validation_unlogged_offroad_rate": "unlogged_offroad_rate",
 }
 """Logged metric -> field of `RealismResult`."""
 
@@ -91,7 +93,7 @@ def refuse_to_validate(model: object, scenarios: Scenarios) -> None:
 
 @torch.no_grad()
 def validate(model: nn.Module, scenarios: Scenarios, config: ValidationConfig, fabric: Fabric) -> dict[str, float]:
-    """Mean realism of a model's rollouts; each process simulates its part of the scenarios.
+    """Mean realism of a model's rollouts, and its use of the map; each process takes its part of the scenarios.
 
     Args:
         model: a policy; left as it is, training mode included.
@@ -100,8 +102,8 @@ def validate(model: nn.Module, scenarios: Scenarios, config: ValidationConfig, f
         fabric: the processes.
 
     Returns:
-        Means over scenarios (`WATCHED`), the 95 % interval of the meta-metric's mean (Student's t), and the seconds it
-        took.
+        Means over scenarios (`WATCHED`), the 95 % interval of the meta-metric's mean (Student's t), for a model that
+        predicts tokens its loss and map use on vehicles (`training.map_use`), and the seconds it took.
 
     Raises:
         DataError: a scenario withholds its future.
@@ -114,12 +116,15 @@ def validate(model: nn.Module, scenarios: Scenarios, config: ValidationConfig, f
     # Dealt out in turn: the same scenarios in total for any number of processes.
     own = config.choose(len(scenarios))[fabric.global_rank :: fabric.world_size]
     sums = torch.zeros(3, len(WATCHED), dtype=torch.float64, device=fabric.device)  # count, sum, sum of squares
+    map_use = MapUse.zero(fabric.device) if predicts_tokens(frozen) else None
     for first in range(0, len(own), config.scenarios_per_pass):
         batch = batch_with_futures(scenarios, own[first : first + config.scenarios_per_pass]).to(fabric.device)
         with fabric.autocast():
             rollouts = simulate(
                 frozen, batch, num_rollouts=config.num_rollouts, seed=config.seed, sampling=Sampling(top_k=config.top_k)
             )
+            if map_use is not None:
+                map_use += measure_map_use(frozen, batch)
         states = states_of_rollouts(batch, rollouts)
         realism = score_batch(batch.scenarios, states, metric_by_name(config.metric), missing_map="neutral")
         values = torch.stack([getattr(realism, name).double() for name in WATCHED.values()], -1)  # [B, metrics]
@@ -133,4 +138,6 @@ def validate(model: nn.Module, scenarios: Scenarios, config: ValidationConfig, f
     error = ((squares - count * mean.square()).clamp(min=0) / (count - 1) / count).sqrt()
     low, high = interval_around(float(mean[0]), float(error[0]), int(count[0])).interval
     logged = dict(zip(WATCHED, mean.tolist())) | {"validation_rmm_low": low, "validation_rmm_high": high}
+    if map_use is not None:
+        logged |= MapUse(all_reduce_sum(map_use.sums, fabric)).to_metrics("validation_")
     return {**logged, "seconds_validation": time.perf_counter() - start}

@@ -71,6 +71,7 @@ def animation_html(animation: Animation) -> str:
         for title in titles
     )
     caption = f'<p class="player-caption">{escape(animation.caption)}</p>' if animation.caption else ""
+    note = f'<p class="player-caption">{escape(animation.scene.note)}</p>' if animation.scene.note else ""
     return (
         f'<figure class="player" tabindex="0" aria-label="{escape(animation.title)}">'
         f'<figcaption><div class="player-title">{escape(animation.title)}</div>{caption}</figcaption>'
@@ -78,6 +79,7 @@ def animation_html(animation: Animation) -> str:
         f"{_controls_html()}{_legend_html(animation)}"
         '<p class="hint"><kbd>space</kbd> play or pause · <kbd>←</kbd> <kbd>→</kbd> one step · drag to move, wheel to '
         "zoom (after a click into the picture) · point at an agent to follow it in all panels</p>"
+        f"{note}"
         f'<script type="application/json">{embed_json(animation.to_payload())}</script></figure>'
     )
 

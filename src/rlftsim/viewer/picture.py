@@ -3,6 +3,7 @@
 import os
 from collections.abc import Sequence
 from pathlib import Path
+from textwrap import wrap
 
 import numpy as np
 from jaxtyping import Float
@@ -44,6 +45,8 @@ MARK_STYLES = {"collides": "-", "offroad": "--"}
 """Line styles of the frames around agents, by the field of `SceneMotion` that marks them."""
 FRAME_SCALE = {"collides": 1.25, "offroad": 1.6}
 MARK_WIDTH = 1.8
+NOTE_CHARACTERS = 90
+"""Of a line of small print across one panel."""
 
 
 def to_png(
@@ -92,6 +95,11 @@ def draw_scene(animation: Animation) -> tuple[Figure, Sequence[Axes]]:
         if any(getattr(panel.trajectories, mark) is not None for panel in panels)
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False, fontsize=10)
+    if animation.scene.note:
+        width = NOTE_CHARACTERS * len(panels)
+        figure.suptitle(
+            "\n".join(wrap(animation.scene.note, width)), fontsize=7, color=COLORS["edge"], x=0.01, ha="left"
+        )
     return figure, list(axes)
 
 

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from rlftsim.errors import DataError
 from rlftsim.rollout.types import Rollouts
+from rlftsim.scenario.sources import attribution_of
 from rlftsim.scenario.types import (
     CURRENT_STEP,
     HISTORY_STEPS,
@@ -100,6 +101,8 @@ class SceneView:
     agents: AgentBoxes
     focus: tuple[float, float, float]
     """View at the beginning: x and y of the center and half of the shown width, meters."""
+    note: str = ""
+    """Stands below every picture: origin and license of the log, and what is guessed in it."""
 
     def to_payload(self) -> dict[str, Any]:
         """Lists, numbers and text only, in the layout that `player.js` reads; centimeters, points as differences."""
@@ -229,6 +232,7 @@ def build_scene(scenario: Scenario) -> SceneView:
             evaluated_mask=np.isin(chosen, scenario.evaluated_indices),
         ),
         focus=_focus(scenario),
+        note=_note(scenario),
     )
 
 
@@ -321,6 +325,12 @@ def _lights(lights: LightStates, origin: np.ndarray, num_steps: int) -> tuple[Li
         if np.isfinite(stop_point).all():
             found.append(Light(stop_point, "".join(states)))
     return tuple(found)
+
+
+def _note(scenario: Scenario) -> str:
+    """What a picture of a scenario must say."""
+    guessed = f"Guessed, not logged: {', '.join(sorted(scenario.guessed))}." if scenario.guessed else ""
+    return f"{attribution_of(scenario.source)} {guessed}".strip()
 
 
 def _focus(scenario: Scenario) -> tuple[float, float, float]:

@@ -1,6 +1,7 @@
 """SMART learns: a real scenario by heart, and a synthetic one as fast as it always did."""
 
 import zlib
+from dataclasses import replace
 
 import pytest
 import torch
@@ -71,3 +72,19 @@ def test_a_synthetic_scenario_is_learnt_as_fast_as_ever():
     assert losses[-1] == pytest.approx(0.1187, rel=0.05)
     assert accuracies[3] == pytest.approx(0.821, abs=0.02)
     assert accuracies[-1] > 0.98
+
+
+def test_frequencies_are_drawn_as_in_the_public_code_or_log_spaced():
+    tables = {}
+    vocabulary, _ = build_vocabulary([scenes.straight_road()], TokensConfig(num_tokens=8, num_map_prototypes=4))
+    for init in ("normal", "log_spaced"):
+        torch.manual_seed(0)
+        policy = SmartPolicy(replace(SMALL, frequency_init=init), vocabulary)
+        tables[init] = {k: v for k, v in policy.network.state_dict().items() if k.endswith("frequencies.weight")}
+    assert len(tables["normal"]) == 5  # of the map, of motion, and of three relations of agents
+    for name, spaced in tables["log_spaced"].items():
+        assert float(tables["normal"][name].std()) == pytest.approx(0.02, rel=0.4)
+        torch.testing.assert_close(spaced[:, 0], torch.full((len(spaced),), 1 / 64))
+        torch.testing.assert_close(spaced[:, -1], torch.ones(len(spaced)))
+        ratio = spaced[:, 1:] / spaced[:, :-1]
+        torch.testing.assert_close(ratio, torch.full_like(ratio, 64 ** (1 / 15)))  # 16 of them

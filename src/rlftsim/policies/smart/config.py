@@ -1,12 +1,14 @@
 """Sizes and radii of a SMART model."""
 
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal, get_args
+from typing import Any, ClassVar, Literal, get_args
 
 from rlftsim.errors import ConfigError, given, require_finite, require_positive
 
 GoalEncoding = Literal["concat", "indication"]
 """Encoding of an agent's goal, see `goal_conditioning`."""
+FrequencyInit = Literal["normal", "log_spaced"]
+"""Initial frequencies of the Fourier embeddings, see `embeddings.initialize`."""
 
 
 @dataclass(frozen=True)
@@ -16,6 +18,8 @@ class SmartConfig:
     fingerprint_name: ClassVar[str] = "rlftsim.policies.smart.config.SmartConfig"
     first_names: ClassVar[dict[str, str]] = {"goal_logit_bias": "goal_aim", "catk_compat": "public_code_quirks"}
     """Fields that were renamed after models had been stored, and their names in fingerprints."""
+    added_fields: ClassVar[dict[str, Any]] = {"frequency_init": "normal"}
+    """Fields that were added after models had been stored, and the values with which a model is as before."""
 
     dim: int = 128
     """Width of all features (D)."""
@@ -25,6 +29,9 @@ class SmartConfig:
     num_decoder_layers: int = 6
     num_frequencies: int = 64
     """Learned frequencies per input of the Fourier embeddings."""
+    frequency_init: FrequencyInit = "normal"
+    """Their values in a fresh model. normal: N(0, 0.02), as in the public code, which is one period in 50 m and more.
+    log_spaced: from 1/64 to 1 per meter (and radian), with which a model learns to read the map far sooner."""
     map_radius_m: float = 10.0
     """Radius within which a map token attends to other map tokens."""
     agent_map_radius_m: float = 30.0
@@ -79,6 +86,9 @@ class SmartConfig:
         caps = ("max_map_neighbors", "max_agent_map_neighbors", "max_agent_neighbors")
         require_positive(self, (*sizes, *radii, *given(self, caps)))
         require_finite(self, radii)
+        if self.frequency_init not in get_args(FrequencyInit):
+            known = ", ".join(get_args(FrequencyInit))
+            raise ConfigError(f"frequency_init={self.frequency_init!r} is none of the known ones: {known}.")
         if self.goal is not None and self.goal not in get_args(GoalEncoding):
             raise ConfigError(f"goal={self.goal!r} is no goal encoding: known are {', '.join(get_args(GoalEncoding))}.")
         if self.goal_logit_bias and self.goal is None:
@@ -135,6 +145,6 @@ def smart_demo() -> SmartConfig:
     """A model small enough to train on two CPU cores in minutes."""
     return SmartConfig(
         dim=48, num_heads=4, head_dim=12, num_map_layers=1, num_decoder_layers=2, num_frequencies=8,
-        map_radius_m=11.0, agent_map_radius_m=30.0, agent_radius_m=30.0, history_tokens=4,
+        map_radius_m=11.0, agent_map_radius_m=30.0, agent_radius_m=30.0, history_tokens=4, frequency_init="log_spaced",
         max_map_neighbors=8, max_agent_map_neighbors=16, max_agent_neighbors=8, dropout=0.0, history_drop=0.0,
     )  # fmt: skip

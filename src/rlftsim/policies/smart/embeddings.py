@@ -1,7 +1,7 @@
 """Embeddings of continuous values: small networks over learned Fourier features, and tables of them.
 
 D width, n inputs, E rows (one per relation), F frequencies. Initialization: linear maps Xavier-uniform with zero bias,
-embedding tables N(0, 0.02).
+embedding tables N(0, 0.02); frequencies are such a table, or log-spaced.
 """
 
 import math
@@ -12,16 +12,27 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 from torch.nn import functional
 
+from rlftsim.policies.smart.config import FrequencyInit
+
 EPSILON = 1e-5
 """Added to variances before dividing by their root; the default of torch's layer norm."""
 DISTANCES_PER_ROOT_M = 768
 """Grid points of a distance table per square root of a meter: 3 mm apart at 1 m, 14 mm at 30 m."""
+LONGEST_PERIOD = 64.0
+"""Meters (or radians) of the slowest log-spaced frequency; the fastest has a period of 1."""
 NUM_ANGLES = 2049
 """Grid points of an angle table, from -pi to pi: 0.18 degrees apart."""
 
 
-def initialize(module: nn.Module) -> None:
-    """Draw the weights of all linear maps and embedding tables inside a module anew, in the order of `modules()`."""
+def initialize(module: nn.Module, frequency_init: FrequencyInit) -> None:
+    """Draw the weights of all linear maps and embedding tables inside a module anew, in the order of `modules()`.
+
+    Args:
+        module: the whole network.
+        frequency_init: "normal" draws the frequencies of Fourier embeddings like any other table. Almost all of these
+            have periods of tens of meters, which cannot tell a lane from the next one. "log_spaced" sets them to
+            periods from 64 down to 1, the same for every input.
+    """
     for part in module.modules():
         if isinstance(part, nn.Linear):
             nn.init.xavier_uniform_(part.weight)
@@ -29,6 +40,13 @@ def initialize(module: nn.Module) -> None:
                 nn.init.zeros_(part.bias)
         elif isinstance(part, nn.Embedding):
             nn.init.normal_(part.weight, std=0.02)
+    if frequency_init == "log_spaced":
+        for part in module.modules():
+            if isinstance(part, FourierEmbedding):
+                weight = part.frequencies.weight  # [n, F]
+                spaced = torch.logspace(-math.log10(LONGEST_PERIOD), 0.0, weight.shape[1])
+                with torch.no_grad():
+                    weight.copy_(spaced.expand_as(weight))
 
 
 def normalize(x: Float[Tensor, "... D"]) -> Float[Tensor, "... D"]:

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from rlftsim.geometry import rotate
 from rlftsim.goals.types import Goals
-from rlftsim.policies.distributions import TokenDistribution
+from rlftsim.policies.distributions import CategoricalDistribution, TokenDistribution
 from rlftsim.policies.smart.config import GoalEncoding
 from rlftsim.policies.smart.embeddings import FourierEmbedding, normalize
 from rlftsim.policies.smart.neighbors import Poses, relative_pose, within
@@ -195,7 +195,7 @@ class GoalLogitBias(nn.Module):
 
     def apply_to(
         self,
-        dist: TokenDistribution,
+        dist: CategoricalDistribution,
         goals: EncodedGoals,
         poses: Poses,
         num_left: Int64[Tensor, "*batch"],

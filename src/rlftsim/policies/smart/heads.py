@@ -5,9 +5,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor, nn
 
 from rlftsim.policies.smart.embeddings import MlpLayer
-
-NEVER = -1e9
-"""Logit of a token that does not exist."""
+from rlftsim.policies.token_rows import NEVER
 
 
 class ClassHeads(nn.ModuleList):

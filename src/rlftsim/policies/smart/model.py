@@ -16,12 +16,14 @@ from torch import Tensor, nn
 
 from rlftsim.errors import CheckpointError, ConfigError
 from rlftsim.policies.checkpoint import load_strictly, read_model, save_model
+from rlftsim.policies.distributions import CategoricalDistribution, LazyTokenDistribution, TokenDistribution
 from rlftsim.policies.smart.config import GoalEncoding, SmartConfig
 from rlftsim.policies.smart.embeddings import normalize
 from rlftsim.policies.smart.goal_conditioning import GoalEmbedding
-from rlftsim.policies.smart.heads import NEVER, ClassHeads
+from rlftsim.policies.smart.heads import ClassHeads
 from rlftsim.policies.smart.network import Scene, SmartNetwork
 from rlftsim.policies.smart.token_steps import TokenSteps, logged_steps
+from rlftsim.policies.token_rows import NEVER, TokenRows
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.tokens.agent_tokens import AgentTokens, tokenize_agents
 from rlftsim.tokens.map_tokens import tokenize_map
@@ -177,12 +179,15 @@ class SmartModel(nn.Module):
     def _logged_steps(self, tokens: AgentTokens, steps: slice) -> TokenSteps:
         return logged_steps(tokens, steps, catk_compat=self.config.catk_compat)
 
-    def _logits(
+    def _predict(
         self, features: Float[Tensor, "R D"], object_type: Int64[Tensor, "B A"], mask: Bool[Tensor, "B N A *L"]
-    ) -> Float[Tensor, "R V"]:
-        """Logits of the elements of a mask; tokens that a class lacks get `NEVER`."""
+    ) -> CategoricalDistribution:
+        """Distributions of the elements of a mask; tokens that a class lacks get the logit `NEVER`."""
         place = mask.nonzero(as_tuple=True)
         class_id = class_of_type(object_type)[place[0], place[2]]  # [R]
-        head = self.network.decoder.head
-        logits = head(features, class_id) if isinstance(head, ClassHeads) else head(features).float()
-        return logits.masked_fill(~self.vocabulary.token_mask[class_id], NEVER)
+        head, exists = self.network.decoder.head, self.vocabulary.token_mask
+        if isinstance(head, ClassHeads):
+            return TokenDistribution(head(features, class_id).masked_fill(~exists[class_id], NEVER), mask)
+        *first, last = head
+        assert isinstance(last, nn.Linear)
+        return LazyTokenDistribution(TokenRows(nn.Sequential(*first)(features), last, class_id, exists), mask)

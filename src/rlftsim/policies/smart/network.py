@@ -377,6 +377,6 @@ class SmartNetwork(nn.Module):
         super().__init__()
         self.map_encoder = MapEncoder(config)
         self.decoder = AgentDecoder(config, num_tokens, class_sizes)
-        initialize(self)
+        initialize(self, config.frequency_init)
         for part in self.decoder.goal_parts():
             part.zero_init()

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from rlftsim.goals.types import Goals
-from rlftsim.policies.distributions import TokenDistribution
+from rlftsim.policies.distributions import CategoricalDistribution, TokenDistribution
 from rlftsim.policies.smart.goal_conditioning import NUM_DECISIONS, encode_goals
 from rlftsim.policies.smart.model import SmartModel
 from rlftsim.policies.smart.neighbors import Poses
@@ -89,7 +89,8 @@ class SmartPolicy(SmartModel):
         mask = context.agent_mask[:, None].expand(state.heading.shape)
         num_left = torch.full_like(state.heading, NUM_DECISIONS - state.num_decisions, dtype=torch.int64)
         features = self._features(context, state)[mask]
-        return self._distribution(context, state, features, mask, Poses(state.position, state.heading), num_left)
+        dist = self._distribution(context, state, features, mask, Poses(state.position, state.heading), num_left)
+        return TokenDistribution(dist.logits, mask)
 
     def advance(
         self,
@@ -130,7 +131,7 @@ class SmartPolicy(SmartModel):
         num_decisions = state.num_decisions + 1
         return SmartState(position, heading, past, pending, poses, goals=state.goals, num_decisions=num_decisions)
 
-    def score(self, context: SmartContext, rollouts: Rollouts) -> TokenDistribution:
+    def score(self, context: SmartContext, rollouts: Rollouts) -> CategoricalDistribution:
         """Distributions [B, N, A, L] along rollouts: one pass of the decoder over all steps.
 
         Args:
@@ -182,7 +183,7 @@ class SmartPolicy(SmartModel):
         decides = steps.valid.clone()  # [B, 1, A, K]
         decides[..., : HISTORY_TOKENS - 1] = False
         counts = (tokens.valid[..., 1:] & trained[..., None])[:, None][decides]
-        logits = self._logits(rows[decides[steps.valid]], scenarios.object_type, decides)
+        logits = self._predict(rows[decides[steps.valid]], scenarios.object_type, decides).logits
         class_id = class_of_type(scenarios.object_type)[:, None, :, None].expand(decides.shape)[decides]
         return TeacherForced(logits, tokens.next_token_id[:, None, :, :-1][decides], counts, class_id)
 
@@ -207,9 +208,9 @@ class SmartPolicy(SmartModel):
         mask: Bool[Tensor, "*batch"],
         poses: Poses | None,
         num_left: Int64[Tensor, "*batch"],
-    ) -> TokenDistribution:
+    ) -> CategoricalDistribution:
         """Distributions of the elements of a mask. Poses before each decision are needed where agents have goals."""
-        dist = TokenDistribution(self._logits(features, context.object_type, mask), mask)
+        dist = self._predict(features, context.object_type, mask)
         bias = self.network.decoder.aim
         if bias is None or state.goals is None or poses is None:
             return dist

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rlftsim.errors import ConfigError
+from rlftsim.scenario.polylines import arc_length, resample_to
 from rlftsim.scenario.synthetic.network import Connector, Lane, Network
 from rlftsim.scenario.synthetic.street_plan import Street, offset_polyline
 from rlftsim.scenario.synthetic.sumo import INSTALL_HINT
@@ -59,10 +60,7 @@ def resample(points: Float[np.ndarray, "n 2"], spacing_m: float = POINT_SPACING_
         points: the polyline.
         spacing_m: largest distance between two points.
     """
-    along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
-    count = max(2, int(np.ceil(along[-1] / spacing_m)) + 1)
-    at = np.linspace(0.0, along[-1], count)
-    return np.stack([np.interp(at, along, points[:, k]) for k in range(2)], axis=1)
+    return resample_to(points, int(np.ceil(arc_length(points)[-1] / spacing_m)) + 1)
 
 
 def _shapely() -> tuple[Any, Any]:

@@ -315,6 +315,7 @@ def cut_scenario(world: World, start: int, ego: Body, rng: np.random.Generator) 
         tracks_to_predict=np.array(predicted, np.int32),
         difficulty=np.ones(len(predicted), np.int8),
         objects_of_interest=np.zeros(0, np.int64),
+        source="synthetic",
     )
 
 

@@ -1,29 +1,28 @@
-"""The public CAT-K code's part of `smart.py`: runs in that code's environment, one measurement a process.
+"""The public CAT-K code's part of `speed.py`: runs in that code's environment, by the protocol of `speed_jobs.py`.
 
-    PYTHONPATH=src VENV/bin/python benchmarks/smart_public.py request.json
+    PYTHONPATH=src VENV/bin/python benchmarks/speed_public.py '{"task": "rollouts", "checkout": "CHECKOUT", ...}'
 
-Nothing of the public code is here: its modules are imported from the checkout that the request names. The environment needs torch,
+Nothing of the public code is here: its modules are imported from the checkout that the job names. The environment needs torch,
 torch-geometric, torchmetrics, omegaconf, pandas, scipy, safetensors and protobuf; TensorFlow, Waymo's package, Lightning and Hydra are not
 needed, because metrics, videos and the training loop are left out. Where torch-cluster is not installed, exact brute-force searches stand in
 for its two functions, and the time inside them is reported.
 """
 
-import json
-import subprocess
+import pickle
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
 import torch
-from clock import Clock  # beside this file
+from speed_jobs import Job, Numbers, Repeat, now, serve, stands  # beside this file
 from torch import Tensor
 
 PREFIX = "encoder."
 GRADIENT_CLIP = 0.5
+NUM_CANDIDATES = 32
 search_s = 0.0
 """CPU seconds spent in the stand-ins of torch-cluster."""
 
@@ -79,8 +78,8 @@ def stand_in(name: str, **content: Any) -> ModuleType:
     return module
 
 
-def prepare_imports(checkout: Path) -> str:
-    """Make the public code importable; how its neighbor searches are done."""
+def prepare_imports(checkout: Path) -> None:
+    """Make the public code importable."""
     import torch_geometric  # noqa: F401  # pyright: ignore[reportMissingImports]  # looks for others before they are stood in for
 
     from rlftsim.scenario import womd_pb2
@@ -97,28 +96,26 @@ def prepare_imports(checkout: Path) -> str:
         import torch_cluster  # noqa: F401  # pyright: ignore[reportMissingImports]
     except ImportError:
         stand_in("torch_cluster", radius=radius, radius_graph=radius_graph)
-        return "exact brute force in torch"
-    return "torch-cluster"
+    import src.data_preprocess  # pyright: ignore[reportMissingImports]
+    import src.smart.modules.smart_decoder  # noqa: F401  # pyright: ignore[reportMissingImports]
 
 
 # ---- the public model and its data --------------------------------------------------------------------------------------
 
 
-def build_model(request: dict[str, Any]) -> tuple[Any, Any]:
-    """The public token processor and network, with the request's weights."""
+def build_model(job: Job) -> tuple[Any, Any]:
+    """The public token processor and network of SMART-tiny, with the golden weights."""
     from omegaconf import OmegaConf
     from safetensors.torch import load_file
     from src.smart.modules.smart_decoder import SMARTDecoder  # pyright: ignore[reportMissingImports]
     from src.smart.tokens.token_processor import TokenProcessor  # pyright: ignore[reportMissingImports]
 
-    configs = Path(request["checkout"]) / "configs" / "model"
-    name = {"nano": "smart_nano_1M", "mini": "smart_mini_3M", "tiny": "smart"}[request["size"]]
-    config: Any = OmegaConf.merge(*(OmegaConf.load(configs / f"{n}.yaml") for n in ("smart", name))).model_config
+    config: Any = OmegaConf.load(Path(job.checkout) / "configs" / "model" / "smart.yaml").model_config
     processor = TokenProcessor(**config.token_processor)
     network = SMARTDecoder(**config.decoder, n_token_agent=processor.n_token_agent)
-    weights = {key.removeprefix(PREFIX): value for key, value in load_file(request["weights"]).items()}
-    network.load_state_dict(weights, strict=True)
-    return processor.to(request["device"]).eval(), network.to(request["device"]).eval()
+    stored = load_file(Path(job.inputs) / "tiny.safetensors")
+    network.load_state_dict({key.removeprefix(PREFIX): value for key, value in stored.items()}, strict=True)
+    return processor.to(job.device).eval(), network.to(job.device).eval()
 
 
 def preprocess(record: Path) -> dict[str, Any]:
@@ -164,6 +161,13 @@ def copy_of(data: Data) -> Data:
     return Data({part: {k: v.clone() for k, v in values.items()} for part, values in data.items()}, data.num_graphs)
 
 
+def records(job: Job) -> list[dict[str, Any]]:
+    """Preprocessed scenarios; one that is named twice is read once."""
+    folder = Path(job.inputs) / "records"
+    read = {name: preprocess(folder / f"{name}.record") for name in dict.fromkeys(job.scenarios)}
+    return [read[name] for name in job.scenarios]
+
+
 # ---- measurements --------------------------------------------------------------------------------------------------------
 
 
@@ -172,48 +176,73 @@ def sampling(criterium: str, num_k: int, temp: float) -> SimpleNamespace:
     return SimpleNamespace(criterium=criterium, num_k=num_k, temp=temp)
 
 
-def measure_rollouts(request: dict[str, Any], scenarios: list[dict[str, Any]], clock: Clock) -> dict[str, Any]:
-    """Tokens once, then rollouts one after the other, as the public validation does."""
-    processor, network = build_model(request)
-    data = batch_of(scenarios, request["device"])
-    scheme = sampling("topk_prob", request["top_k"], 1.0)
-    torch.manual_seed(0)
-    with torch.no_grad():
-        tokens: list[Any] = []
-        tokenize_s = clock.time(lambda: tokens.append(processor(data)))
-        rollout_s = [
-            clock.time(lambda: network.inference(*tokens[0], sampling_scheme=scheme)) for _ in range(request["repeats"])
-        ]
-    return {"tokenize_s": tokenize_s, "rollout_s": rollout_s}
+def rollouts(job: Job) -> Repeat:
+    """Tokens once, then rollouts one after the other, as the public validation does. A few are timed, for all of them."""
+    processor, network = build_model(job)
+    scenarios, scheme = records(job), sampling("topk_prob", job.top_k, 1.0)
+    if job.held:
+        hold(scenarios)
+
+    @torch.no_grad()
+    def roll_out() -> Numbers:
+        began = now(job.device)
+        tokens = processor(batch_of(scenarios, job.device))
+        tokenized = now(job.device)
+        for _ in range(job.timed_rollouts):
+            network.inference(*tokens, sampling_scheme=scheme)
+        one_s = (now(job.device) - tokenized) / job.timed_rollouts
+        return {"seconds": tokenized - began + one_s * job.num_rollouts}
+
+    return roll_out
 
 
-def training_step(request: dict[str, Any]) -> Callable[[Data], Any]:
-    """One update: tokens, forward, loss, backward, clipping, AdamW. `task` is bc or catk."""
+def hold(scenarios: list[dict[str, Any]]) -> None:
+    """Keeps agents where they are while they stand in the log, by way of the motion that is handed to the public loop."""
+    from src.smart.modules import agent_decoder  # pyright: ignore[reportMissingImports]
+
+    agents = [scenario["agent"] for scenario in scenarios]
+    held = torch.cat(
+        [torch.from_numpy(stands(a["position"].numpy(), a["valid_mask"].numpy())) for a in agents]
+    )  # [A, 16]
+    sample, calls = agent_decoder.sample_next_token_traj, 0
+
+    def sample_or_stand(**inputs: Any) -> tuple[Tensor, Tensor]:
+        nonlocal calls
+        token, motion = sample(**inputs)  # [A], [A, 6, 4, 2]
+        at = held[:, calls % held.shape[1]].to(token.device)
+        calls += 1
+        start = inputs["token_traj_all"][:, :1, :1].squeeze(1).expand_as(motion)
+        return torch.where(at, 0, token), torch.where(at[:, None, None, None], start, motion)
+
+    agent_decoder.sample_next_token_traj = sample_or_stand
+
+
+def update(job: Job) -> Repeat:
+    """An update: tokens, forward or CAT-K rollout, loss, backward, clipping, AdamW."""
     from src.smart.metrics.cross_entropy import CrossEntropy  # pyright: ignore[reportMissingImports]
 
-    closed_loop = request["task"] == "catk"
-    processor, network = build_model(request)
+    closed_loop = job.task == "catk"
+    processor, network = build_model(job)
     loss_of = CrossEntropy(
         use_gt_raw=True, gt_thresh_scale_length=-1.0, label_smoothing=0.0 if closed_loop else 0.1, rollout_as_gt=False
-    ).to(request["device"])
+    ).to(job.device)
     for module in (processor, network, loss_of):
         module.train()
     agents = network.agent_encoder
     if closed_loop:
         network.requires_grad_(False)
-        for part in (
-            agents.t_attn_layers,
-            agents.pt2a_attn_layers,
-            agents.a2a_attn_layers,
-            agents.token_predict_head,
-        ):
+        trained = (agents.t_attn_layers, agents.pt2a_attn_layers, agents.a2a_attn_layers, agents.token_predict_head)
+        for part in trained:
             part.requires_grad_(True)
     optimizer = torch.optim.AdamW(network.parameters(), lr=5e-5 if closed_loop else 5e-4)
-    scheme = sampling("topk_prob_sampled_with_dist", request["num_candidates"], 1e-5)
+    scheme = sampling("topk_prob_sampled_with_dist", NUM_CANDIDATES, 1e-5)
+    torch.manual_seed(0)
+    data = batch_of([mark_trained(scenario) for scenario in records(job)], job.device)
 
-    def step(data: Data) -> None:
+    def step() -> None:
+        copy = copy_of(data)
         optimizer.zero_grad(set_to_none=True)
-        of_map, of_agents = processor(data)
+        of_map, of_agents = processor(copy)
         outputs = (
             network.inference(of_map, of_agents, sampling_scheme=scheme) if closed_loop else network(of_map, of_agents)
         )
@@ -221,7 +250,7 @@ def training_step(request: dict[str, Any]) -> Callable[[Data], Any]:
             **outputs,
             token_agent_shape=of_agents["token_agent_shape"],
             token_traj=of_agents["token_traj"],
-            train_mask=data["agent"]["train_mask"],
+            train_mask=copy["agent"]["train_mask"],
         )
         loss.backward()
         torch.nn.utils.clip_grad_norm_(network.parameters(), GRADIENT_CLIP)
@@ -230,37 +259,14 @@ def training_step(request: dict[str, Any]) -> Callable[[Data], Any]:
     return step
 
 
-def measure_step(request: dict[str, Any], scenarios: list[dict[str, Any]], clock: Clock) -> dict[str, Any]:
-    """A warm-up, then repeated updates on one batch."""
-    torch.manual_seed(0)
-    data, step = batch_of([mark_trained(s) for s in scenarios], request["device"]), training_step(request)
-    copies = [copy_of(data) for _ in range(request["repeats"] + 1)]
-    times = [clock.time(lambda: step(copies.pop())) for _ in range(request["repeats"] + 1)]
-    return {"first_s": times[0], "step_s": times[1:], "trained": int(data["agent"]["train_mask"].sum())}
-
-
-def largest_batch(request: dict[str, Any], scenarios: list[dict[str, Any]], clock: Clock) -> dict[str, Any]:
-    """Scenarios in the largest pre-training update that fits, by doubling."""
-    torch.manual_seed(0)
-    step, fits, marked = training_step({**request, "task": "bc"}), 0, [mark_trained(s) for s in scenarios]
-    while fits < request["max_batch"]:
-        count = max(2 * fits, 1)
-        try:
-            step(batch_of([marked[i % len(marked)] for i in range(count)], request["device"]))
-        except torch.OutOfMemoryError:
-            break
-        fits = count
-    return {"batch": fits}
-
-
-def check(request: dict[str, Any], scenarios: list[dict[str, Any]], clock: Clock) -> dict[str, Any]:
+def check(job: Job) -> Repeat:
     """Differences from golden numbers of the public code in absolute coordinates: is it the public function that is measured?"""
-    folder = Path(request["golden"])
-    processor, network = build_model(request)
-    data = batch_of(scenarios[:1], request["device"])
+    folder = Path(job.shared) / "golden" / "smart"
+    processor, network = build_model(job)
+    data = batch_of(records(job), job.device)
     preprocessed = np.load(folder / "scenario_A" / "preprocessed.npz")
-    forward = np.load(folder / request["size"] / "absolute_forward.npz")
-    greedy = np.load(folder / request["size"] / "absolute_rollouts.npz")
+    forward = np.load(folder / "tiny" / "absolute_forward.npz")
+    greedy = np.load(folder / "tiny" / "absolute_rollouts.npz")
     same_input = all(
         np.array_equal(data[part][key].numpy(), preprocessed[name])
         for part, key, name in (
@@ -274,42 +280,87 @@ def check(request: dict[str, Any], scenarios: list[dict[str, Any]], clock: Clock
             ("agent", "shape", "shape"),
         )
     )
-    with torch.no_grad():
-        of_map, of_agents = processor(data)
+
+    @torch.no_grad()
+    def compare() -> Numbers:
+        of_map, of_agents = processor(copy_of(data))
         logits = network(of_map, of_agents)["next_token_logits"].numpy()
         rolled = network.inference(of_map, of_agents, sampling_scheme=sampling("topk_prob", 1, 1.0))
-    valid = forward["valid"]
-    total = np.logaddexp.reduce(logits.astype(np.float64), axis=-1)
-    chosen = forward["agents"]
-    return {
-        "inputs_equal": bool(same_input),
-        "logits": float(np.abs(logits[chosen] - forward["logits"])[valid[chosen]].max()),
-        "logsumexp": float(np.abs(total - forward["logsumexp"])[valid].max()),
-        "greedy_tokens_equal": bool(np.array_equal(rolled["pred_idx"].numpy(), greedy["greedy/idx"])),
-        "greedy_m": float(np.abs(rolled["pred_traj_10hz"].numpy() - greedy["greedy/traj_10hz"]).max()),
-    }
+        chosen = forward["agents"]
+        return {
+            "inputs_equal": float(same_input),
+            "logits": float(np.abs(logits[chosen] - forward["logits"])[forward["valid"][chosen]].max()),
+            "greedy_tokens_equal": float(np.array_equal(rolled["pred_idx"].numpy(), greedy["greedy/idx"])),
+        }
+
+    return compare
 
 
-TASKS = {"rollouts": measure_rollouts, "bc": measure_step, "catk": measure_step, "check": check, "batch": largest_batch}
+# ---- a whole evaluation --------------------------------------------------------------------------------------------------
 
 
-def main() -> None:
-    request = json.loads(Path(sys.argv[1]).read_text())
+def prepare_evaluated(job: Job) -> None:
+    """Preprocessed scenarios as files, once, as the public code keeps them."""
+    for path in sorted((Path(job.inputs) / "evaluated").glob("*.record")):
+        path.with_suffix(".pkl").write_bytes(pickle.dumps(preprocess(path)))
+
+
+def evaluate(job: Job) -> None:
+    """All rollouts of each preprocessed scenario, written for the official evaluator's script."""
+    processor, network = build_model(job)
+    scheme = sampling("topk_prob", job.top_k, 1.0)
+    torch.manual_seed(0)
+    for path in sorted((Path(job.inputs) / "evaluated").glob("*.pkl")):
+        data = batch_of([pickle.loads(path.read_bytes())], job.device)
+        with torch.no_grad():
+            tokens = processor(data)
+            made = [network.inference(*tokens, sampling_scheme=scheme) for _ in range(job.num_rollouts)]
+        position, z, heading = (
+            torch.stack([rollout[f"pred_{name}_10hz"] for rollout in made]).cpu().numpy()  # [N, A, 80, ...]
+            for name in ("traj", "z", "head")
+        )
+        np.savez(
+            path.with_suffix(".npz"),
+            scenario_id=path.stem,
+            object_ids=data["agent"]["id"].numpy().astype(np.int32),
+            x=position[..., 0],
+            y=position[..., 1],
+            z=z,
+            heading=heading,
+        )
+
+
+MEASURED = {"rollouts": rollouts, "pretrain": update, "catk": update, "check": check}
+COMMANDS = {"prepare_evaluated": prepare_evaluated, "evaluate": evaluate}
+
+
+def with_search_share(repeat: Repeat) -> Repeat:
+    """Repetitions that also say how much of their time went into the stand-ins of torch-cluster."""
+
+    def measured() -> Numbers:
+        global search_s
+        search_s, began = 0.0, time.process_time()
+        numbers = repeat() or {}
+        return {**numbers, "search_share": search_s / (time.process_time() - began)}
+
+    return measured
+
+
+def start(job: Job) -> Repeat:
+    """The public code, imported, and a repetition of the job that has run once."""
     torch.set_num_threads(1)
     torch.set_float32_matmul_precision("high")
-    searches = prepare_imports(Path(request["checkout"]))
-    import src.data_preprocess  # pyright: ignore[reportMissingImports]
-    import src.smart.modules.smart_decoder  # noqa: F401  # pyright: ignore[reportMissingImports]
-
-    clock = Clock(request["device"])
-    distinct = {path: preprocess(Path(path)) for path in dict.fromkeys(request["records"])}
-    found = TASKS[request["task"]](request, [distinct[path] for path in request["records"]], clock)
-    checkout = ["git", "-C", request["checkout"], "rev-parse", "--short", "HEAD"]
-    commit = subprocess.run(checkout, capture_output=True, text=True).stdout.strip() or "unknown (no git checkout)"
-    found |= {"added_mib": clock.added_mib(), "search_s": search_s, "searches": searches, "commit": commit}
-    found |= {"torch": torch.__version__, "baseline_mib": clock.baseline_mib}
-    Path(sys.argv[2]).write_text(json.dumps(found))
+    prepare_imports(Path(job.checkout))
+    repeat = with_search_share(MEASURED[job.task](job))
+    repeat()
+    return repeat
 
 
 if __name__ == "__main__":
-    main()
+    given = Job.read(sys.argv[1])
+    if given.task in COMMANDS:
+        prepare_imports(Path(given.checkout))
+        torch.set_num_threads(1)
+        COMMANDS[given.task](given)
+    else:
+        serve(given.device, lambda: start(given))

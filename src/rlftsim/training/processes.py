@@ -1,0 +1,187 @@
+"""Several processes on a CPU: forked from the one that trains, and connected with it by pipes.
+
+Forked processes have whatever this one has in memory, and start in milliseconds. So a script needs no main guard, a
+notebook may train with the rewards and policies that its cells define, and scenarios that have been read are shared.
+"""
+
+import multiprocessing
+import os
+import pickle
+import signal
+import sys
+import threading
+import traceback
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, suppress
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, Pipe
+from multiprocessing.process import BaseProcess
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+from rlftsim.errors import ConfigError, DataError, RlftsimError
+from rlftsim.training.parallel import DeviceConfig, Fabric, can_fork, start_fabric
+from rlftsim.workers import exit_with_parent
+
+Result = TypeVar("Result")
+
+
+def in_processes(work: Callable[[Fabric], Result], config: DeviceConfig) -> Result:
+    """Call a function in each process of a run; returns its result in this one, which has rank 0.
+
+    On a CPU the other processes are forked here. They print nothing and write no files. They end with this call,
+    also with an error, Ctrl-C, or a kill of this process. An error of theirs is raised here.
+
+    Args:
+        work: called with the processes of the run, of which each sees itself as one.
+        config: has a number of processes, not "auto".
+
+    Raises:
+        ConfigError: several processes, but this one cannot be forked, or they should have several threads.
+        DataError: a process died.
+    """
+    fabric, processes = start_fabric(config), config.processes
+    if processes in ("auto", 1) or not config.forks:
+        return work(fabric)
+    if not can_fork():
+        raise ConfigError(
+            f"device.processes={processes}: a CPU is shared among processes on Linux only, without a GPU, and outside "
+            "of other workers: set device.processes=1, or start the command by torchrun."
+        )
+    if config.threads != 1:
+        raise ConfigError(
+            f"device.threads={config.threads} and device.processes={processes} cannot be combined: set one of them "
+            "to 1."
+        )
+    context = multiprocessing.get_context("fork")
+    links: list[Connection] = []
+    helpers: list[BaseProcess] = []
+    # Helpers inherit the blocked signal: Ctrl-C reaches all processes, but only this one reacts.
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        try:
+            for rank in range(1, processes):
+                link, theirs = Pipe()
+                links.append(link)
+                process = LinkedProcess(fabric, rank, processes, [theirs])
+                helpers.append(context.Process(target=_help, args=(work, process, links), daemon=True))
+                helpers[-1].start()
+                # Only the helper holds it from here on: its end is the end of the pipe.
+                theirs.close()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        return work(LinkedProcess(fabric, 0, processes, links))
+    finally:
+        for helper in helpers:
+            helper.kill()  # they write no files, so none is left half-written
+            helper.join()
+
+
+def _help(work: Callable[[Fabric], object], process: "LinkedProcess", inherited: Sequence[Connection]) -> None:
+    """Life of a forked process."""
+    threading.Thread(target=exit_with_parent, daemon=True).start()
+    # The parent's OpenMP threads do not exist here, and more than one thread would wait for them forever.
+    torch.set_num_threads(1)
+    sys.stdout = sys.stderr = open(os.devnull, "w")  # noqa: SIM115
+    for link in inherited:
+        link.close()
+    try:
+        work(process)
+    except LostProcessError:
+        pass  # rank 0 has ended and knows why
+    except Exception as error:
+        if not isinstance(error, RlftsimError):
+            error.add_note(f"in process {process.global_rank} of the run:\n{traceback.format_exc()}")
+        with suppress(OSError):
+            process.links[0].send(_picklable(error))
+
+
+def _picklable(error: Exception) -> Exception:
+    """The error, or its text where it cannot be handed to another process."""
+    try:
+        pickle.loads(pickle.dumps(error))
+    except Exception:
+        return RuntimeError("\n".join([f"{type(error).__name__}: {error}", *getattr(error, "__notes__", ())]))
+    return error
+
+
+class LostProcessError(DataError):
+    """A process of the run died."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            "a training process died (out of memory?): run the same command again, it resumes. If that happens again, "
+            "lower micro_batch_size or device.processes."
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class LinkedProcess:
+    """One of several processes on a CPU, as a `Fabric`."""
+
+    alone: Fabric
+    """Device and precision."""
+    global_rank: int
+    world_size: int
+    links: Sequence[Connection]
+    """Pipes to all other processes in rank 0, to rank 0 in the others."""
+
+    @property
+    def device(self) -> torch.device:
+        """The CPU."""
+        return self.alone.device
+
+    @property
+    def is_global_zero(self) -> bool:
+        """True for the process that forked the others."""
+        return self.global_rank == 0
+
+    def autocast(self) -> AbstractContextManager[Any]:
+        """Context in which operations run in the chosen precision."""
+        return self.alone.autocast()
+
+    def backward(self, tensor: Tensor) -> None:
+        """Add the gradient of a scalar to the parameters."""
+        self.alone.backward(tensor)
+
+    def all_reduce(self, data: Tensor, *, reduce_op: str) -> Tensor:
+        """Sum of a tensor over all processes, the same bits in each of them and in each run.
+
+        Args:
+            data: this process's summand.
+            reduce_op: "sum".
+
+        Raises:
+            LostProcessError: another process died.
+        """
+        assert reduce_op == "sum"
+        if not self.is_global_zero:
+            _send(self.links[0], data)
+            return _receive(self.links[0])
+        total = data.clone()
+        # In the order of ranks, not of arrival, which rounding would show.
+        for link in self.links:
+            total += _receive(link)
+        for link in self.links:
+            _send(link, total)
+        return total
+
+
+def _send(link: Connection, data: Tensor) -> None:
+    try:
+        link.send(data.numpy())
+    except ConnectionError:
+        _receive(link)  # a process that failed has sent its error before it ended
+        raise
+
+
+def _receive(link: Connection) -> Tensor:
+    try:
+        message = link.recv()
+    except (EOFError, ConnectionError):
+        raise LostProcessError from None
+    if isinstance(message, Exception):
+        raise message
+    return torch.from_numpy(message)

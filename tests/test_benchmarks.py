@@ -1,0 +1,26 @@
+"""The speed table prints what it measures, and says what it cannot."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+BENCHMARK = Path(__file__).parents[1] / "benchmarks" / "speed.py"
+
+
+@pytest.mark.official
+def test_the_speed_table_has_a_line_for_each_row_and_continues_where_it_was_stopped(shared, tmp_path):
+    words = ["--shared", shared, "--rows", "metric", "gpu", "--repeats", "1", "--out", tmp_path / "table.md"]
+    command = [str(word) for word in (sys.executable, BENCHMARK, tmp_path, *words)]
+
+    first = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    again = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+
+    rows = [line for line in first.splitlines() if line.startswith("| metric, 32 rollouts")]
+    assert len(rows) == 1
+    assert 0 < float(rows[0].split("|")[5]) < 60  # CPU seconds of this version
+    assert torch.cuda.is_available() or "| rollouts, tiny, A | no GPU |" in first
+    assert rows[0] in again  # to the last digit: kept, not measured again
+    assert rows[0] in (tmp_path / "table.md").read_text()
