@@ -23,8 +23,8 @@ import pyarrow.parquet as pq
 import shapely
 
 LICENSE = (
-    "NGSIM trajectories: U.S. Department of Transportation, open data. Maps: OpenStreetMap contributors, ODbL. The terms "
-    "of the CommonRoad scenario files apply."
+    "NGSIM trajectories: U.S. Department of Transportation, open data. Maps: OpenStreetMap contributors, ODbL. "
+    "The terms of the CommonRoad scenario files apply."
 )
 KINDS = {"car": "vehicle", "truck": "vehicle", "bus": "vehicle", "motorcycle": "cyclist", "bicycle": "cyclist",
          "pedestrian": "pedestrian"}  # fmt: skip

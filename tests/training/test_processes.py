@@ -244,13 +244,18 @@ def test_several_processes_are_refused_where_they_cannot_be_forked(monkeypatch):
         in_processes(lambda fabric: parallel.local_indices([4], fabric), TWO)
 
 
+UPDATES = 16
+
+
 def start(out):
     """A run of two processes as a command with a process group of its own."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(rlftsim.__file__).parents[1]), *sys.path])}
-    command = [sys.executable, tiny.__file__, "pretrain", str(out), "--processes", "2", "--batch-size", "2"]
+    words = ["pretrain", str(out), "--processes", "2", "--batch-size", "2", "--updates", str(UPDATES)]
     return subprocess.Popen(
-        [*command, "--updates", "200"], env=environment, stderr=subprocess.PIPE, text=True, start_new_session=True
-    )
+        [sys.executable, tiny.__file__, *words],
+        env=environment, stderr=subprocess.PIPE, text=True, start_new_session=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),  # jobs in the background ignore it
+    )  # fmt: skip
 
 
 def wait_for(condition, what, seconds=240.0):
@@ -275,10 +280,10 @@ def processes_of_group(group):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGKILL])
-def test_a_stopped_run_leaves_no_process_behind(kind, tmp_path):
-    process = start(tmp_path)
-    metrics = tmp_path / "metrics.jsonl"
-    wait_for(lambda: metrics.exists() or process.poll() is not None, "no update was made")
+def test_a_stopped_run_leaves_no_process_behind_and_is_resumed_bit_for_bit(kind, tmp_path):
+    out = tmp_path / "stopped"
+    process = start(out)
+    wait_for(lambda: len(read_metrics(out)) > 2 or process.poll() is not None, "no updates were made")
     assert len(processes_of_group(process.pid)) == 2
     # Ctrl-C goes to the whole group, a kill to the process that the user sees.
     os.killpg(process.pid, kind) if kind == signal.SIGINT else process.kill()
@@ -289,3 +294,8 @@ def test_a_stopped_run_leaves_no_process_behind(kind, tmp_path):
         # The traceback of a script that does not catch Ctrl-C, once: the other process prints nothing.
         assert error.count("Traceback") == 1
         assert error.rstrip().endswith("KeyboardInterrupt")
+    assert 2 < len(read_metrics(out)) < UPDATES
+    for folder in (out, tmp_path / "whole"):
+        tiny.run("pretrain", folder, updates=UPDATES, processes=2, batch_size=2)
+    assert same_weights(out, tmp_path / "whole")
+    assert timeless(out) == timeless(tmp_path / "whole")

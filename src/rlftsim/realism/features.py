@@ -131,6 +131,11 @@ class ScenarioLog:
         """The one scenario's id."""
         return (self.scenario_id,)
 
+    @property
+    def leaves_road(self) -> Bool[Tensor, "E"]:
+        """True = an evaluated agent that leaves the road at some logged step."""
+        return (self.features.offroad & self.agents.future_valid).any(-1)[0]
+
 
 @dataclass(frozen=True, eq=False)
 class JoinedLogs:
@@ -155,6 +160,11 @@ class JoinedLogs:
     def scenario_ids(self) -> tuple[str, ...]:
         """Ids of the scenarios."""
         return tuple(part.scenario_id for part in self.parts)
+
+    @property
+    def leaves_road(self) -> Bool[Tensor, "E"]:
+        """True = an evaluated agent that leaves the road at some logged step."""
+        return torch.cat([part.leaves_road for part in self.parts])
 
 
 AnyLog = ScenarioLog | JoinedLogs

@@ -8,6 +8,7 @@ it is optional and opens one more door:
 | `Policy` | simulated, scored, evaluated |
 | `TrainablePolicy` (an nn.Module) | fine-tuned with rewards, saved, loaded by folder |
 | `PartlyTrainedPolicy` | fine-tuned in chosen parts, with the rest frozen |
+| `SharingPolicy` | fine-tuned faster, because passes over the same scenarios share what they have in common |
 | `PretrainablePolicy` | pre-trained on logged tracks, token by token |
 | `ImitatedPolicy` | pre-trained on logged tracks with a loss of its own |
 | `TokenPolicy` | fine-tuned in closed loop on tokens (CAT-K, goal relabelling) |
@@ -277,6 +278,74 @@ class PartlyTrainedPolicy(Protocol):
     def fine_tuned_parts(self) -> tuple[nn.Module, ...]:
         """Submodules to be trained by default; the others are frozen unless `trained="all"`."""
         ...
+
+
+# ---- optional: passes over the same scenarios
+# ---------------------------------------------------------------------------
+
+
+@runtime_checkable
+class SharingPolicy(Policy, Protocol):
+    """A policy that does not compute twice what several passes over the same scenarios have in common.
+
+    An update of fine-tuning encodes its scenarios for the rollout, for the policy and for the reference, and scores the
+    rollouts under two of them. Whether parts are the same is for the policy to find out, by comparing weights.
+    Everything that comes back is what `encode` and `score` return.
+    """
+
+    def encode_like(self, scenarios: ScenarioBatch, context: Any) -> Any:
+        """`encode(scenarios)`, taking over from another context what this policy would compute alike.
+
+        Args:
+            scenarios: of the context.
+            context: of any policy, made by weights that have not been changed since; or None.
+        """
+        ...
+
+    def score_both(
+        self, context: Any, rollouts: Rollouts, reference: Any, ref_context: Any, ref_rollouts: Rollouts
+    ) -> tuple[DecisionDistribution, DecisionDistribution]:
+        """`score` of this policy, and without gradient of a reference.
+
+        Args:
+            context: of this policy.
+            rollouts: of the same scenarios.
+            reference: any policy.
+            ref_context: of the reference.
+            ref_rollouts: the same object, or the same rollouts under other goals.
+        """
+        ...
+
+
+def encode_like(policy: Policy, scenarios: ScenarioBatch, context: Any) -> Any:
+    """Context of scenarios that have been encoded before; parts are shared where the policy is a `SharingPolicy`.
+
+    Args:
+        policy: any.
+        scenarios: of the context.
+        context: of any policy, made by weights that have not been changed since; or None.
+    """
+    return policy.encode_like(scenarios, context) if isinstance(policy, SharingPolicy) else policy.encode(scenarios)
+
+
+def score_both(
+    policy: Policy, context: Any, rollouts: Rollouts, reference: Policy, ref_context: Any, ref_rollouts: Rollouts
+) -> tuple[DecisionDistribution, DecisionDistribution]:
+    """Distributions along rollouts under a policy and, without gradient, under a reference.
+
+    Args:
+        policy: any; parts are shared where it is a `SharingPolicy`.
+        context: of the policy.
+        rollouts: of the same scenarios.
+        reference: any policy.
+        ref_context: of the reference.
+        ref_rollouts: the same object, or the same rollouts under other goals.
+    """
+    if isinstance(policy, SharingPolicy):
+        return policy.score_both(context, rollouts, reference, ref_context, ref_rollouts)
+    dist = policy.score(context, rollouts)
+    with torch.no_grad():
+        return dist, reference.score(ref_context, ref_rollouts)
 
 
 # ---- optional: tokens

@@ -18,6 +18,7 @@ from rlftsim.rollout.simulate import simulate
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import CURRENT_STEP, STEP_S
+from rlftsim.threads import one_thread
 from rlftsim.training.goals import GoalConfig, StoredGoals, choose_goals
 from rlftsim.training.parallel import Fabric, all_reduce_sum
 
@@ -30,6 +31,8 @@ class Experience:
     rollouts: Rollouts
     realism: RealismResult
     rewards: Rewards
+    context: Any = None
+    """Of the batch, made without gradient by the policy that rolled out; None = there is none to share."""
 
     def slices(self, size: int) -> Iterator[tuple[Rollouts, Float[Tensor, "B n A"]]]:
         """Yield the rollouts of every scenario, `size` at a time, with what each agent earned in them."""
@@ -64,8 +67,8 @@ def sample_rollouts(
     seed: int,
     update: int,
     fabric: Fabric,
-) -> Rollouts:
-    """Rollouts of an update, without gradient. All rollouts of a scenario have the same goals.
+) -> tuple[Any, Rollouts]:
+    """Context and rollouts of an update, without gradient. All rollouts of a scenario have the same goals.
 
     Args:
         policy: decides for all agents.
@@ -78,10 +81,13 @@ def sample_rollouts(
         fabric: precision of the pass.
     """
     chosen = choose_goals(batch, goals, augmented, seed=derive_seed(seed, "goals", update))
-    with fabric.autocast():
-        return simulate(
-            policy, batch, num_rollouts=num_rollouts, seed=derive_seed(seed, "rollouts", update), goals=chosen
-        )
+    with fabric.autocast(), torch.no_grad(), one_thread():
+        context = policy.encode(batch)
+        rollouts = simulate(
+            policy, batch, num_rollouts=num_rollouts, seed=derive_seed(seed, "rollouts", update), context=context,
+            goals=chosen,
+        )  # fmt: skip
+    return context, rollouts
 
 
 @runtime_checkable

@@ -191,6 +191,7 @@ def prepare(
         lr=config.learning_rate,
         betas=config.betas,
         weight_decay=config.weight_decay,
+        fused=True,
     )
     reference = copy.deepcopy(policy).requires_grad_(False)
     beta = config.kl.initial_beta
@@ -215,14 +216,14 @@ def update_policy(
     experiences: list[Experience] = []
     for part in batch.split(max(config.micro_batch_size // num_sharing_memory(fabric), 1)):
         # 1. Sample N rollouts of each scenario under this update's goals, without gradient.
-        rollouts = sample_rollouts(
+        context, rollouts = sample_rollouts(
             learner.policy, part, config.goals, learner.augmented_goals,
             num_rollouts=config.num_rollouts, seed=config.seed, update=learner.update, fabric=fabric,
         )  # fmt: skip
         clock.lap("rollout")
         # 2. Measure their realism and the reward that each rollout, or each agent in it, earns.
         realism, rewards = compute_reward(part, rollouts, config)
-        experiences.append(Experience(part, rollouts, realism, rewards))
+        experiences.append(Experience(part, rollouts, realism, rewards, context))
         clock.lap("reward")
     # 3. Score them under policy and reference: gradient of the policy-gradient loss with its KL penalty.
     terms = LossTerms(

@@ -22,6 +22,7 @@ from rlftsim.goals.types import Goals
 from rlftsim.realism import RealismResult
 from rlftsim.rewards import Term
 from rlftsim.rewards.goal import goal_advantage
+from rlftsim.rollout.policy import encode_like
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.training.augment import ends_of, most_realistic
@@ -41,6 +42,8 @@ class Relabelled:
     rollouts: Rollouts
     earned: Float[Tensor, "B N A"]
     """By each agent for the new goals."""
+    context: Any = None
+    """See `Experience`."""
 
     def slices(self, size: int) -> Iterator[tuple[Rollouts, Float[Tensor, "B n A"]]]:
         """Yield the rollouts of every scenario, `size` at a time, with what each agent earned in them."""
@@ -70,7 +73,7 @@ def relabel_with_hindsight(experiences: Sequence[Experience], terms: Sequence[Te
         for term in goal_terms(terms):
             options: dict[str, Any] = dict(term.options)
             earned = earned + term.weight * goal_advantage(rollouts, batch, **options)
-        relabelled.append(Relabelled(batch, rollouts, earned))
+        relabelled.append(Relabelled(batch, rollouts, earned, experience.context))
     return relabelled
 
 
@@ -138,7 +141,7 @@ def accumulate_hindsight(
         for (rollouts, earned), old in zip(part.slices(rollouts_per_pass), old_log_probs):
             mask, decides = rollouts.decision_mask, rollouts.decision_mask.any(-1)  # [B, n, A, L], [B, n, A]
             with fabric.autocast():
-                dist = policy.score(policy.encode(part.batch), rollouts)
+                dist = policy.score(encode_like(policy, part.batch, part.context), rollouts)
             log_prob = dist.log_prob(rollouts.decision)  # [B, n, A, L]
             ratio = importance_ratio(agent_log_prob(log_prob, mask, "sum"), old)  # [B, n, A]
             by_agent = agent_log_prob(log_prob, mask, terms.reduction)

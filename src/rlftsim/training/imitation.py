@@ -15,9 +15,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -28,7 +27,7 @@ from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import Scenarios
 from rlftsim.tokens.smoothing import summed_log_prob_nearby
 from rlftsim.tokens.vocabulary import STILL_TOKEN, Vocabulary
-from rlftsim.training.batches import micro_batches, scenario_costs
+from rlftsim.training.batches import micro_batches
 from rlftsim.training.data import batch_with_futures, mirrored_of_update, trained_agents
 from rlftsim.training.freezing import parameter_groups, set_learning_rate
 from rlftsim.training.parallel import DeviceConfig, Fabric, all_reduce_gradients, all_reduce_sum, num_sharing_memory
@@ -130,7 +129,6 @@ class _Imitator(Learner):
 
     run: TrainingRun
     predict: Predict
-    costs: Float[np.ndarray, "n"]
     config: ImitationConfig
     fabric: Fabric
     average: nn.Module | None = None
@@ -222,10 +220,9 @@ def _imitate(
     groups = parameter_groups(model, config.goal_learning_rate_scale)
     learner = _Imitator(
         policy=model,
-        optimizer=torch.optim.AdamW(groups, lr=config.learning_rate, weight_decay=config.weight_decay),
+        optimizer=torch.optim.AdamW(groups, lr=config.learning_rate, weight_decay=config.weight_decay, fused=True),
         run=run,
         predict=predict,
-        costs=scenario_costs(scenarios),
         config=config,
         fabric=fabric,
         average=None if config.ema_decay is None else copy.deepcopy(model).requires_grad_(False),
@@ -274,11 +271,11 @@ def _update(learner: _Imitator, update: int) -> dict[str, float]:
     # 1. Gradients of the summed loss add up over micro batches.
     names: list[str] = []  # of further metrics; every micro batch has the same
     sums = torch.zeros((), device=fabric.device)  # becomes [2 + names]: loss, further metrics, number of predictions
-    own, sharing = run.local_indices(update, learner.costs), num_sharing_memory(fabric)
+    own, sharing = run.local_indices(update), num_sharing_memory(fabric)
     max_count = max(config.micro_batch_size // sharing, 1)
     max_cost = None if config.micro_batch_cost is None else config.micro_batch_cost / sharing
     mirror = mirrored_of_update(update, own, config.mirror_probability, config.seed)
-    for micro in micro_batches(own, learner.costs, max_count=max_count, max_cost=max_cost):
+    for micro in micro_batches(own, run.costs, max_count=max_count, max_cost=max_cost):
         batch = batch_with_futures(run.scenarios, micro, context_radius_m=config.context_radius_m, mirror=mirror)
         batch = batch.to(fabric.device)
         trained = trained_agents(

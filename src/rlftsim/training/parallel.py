@@ -190,7 +190,8 @@ def local_indices(items: list[int], fabric: Fabric, costs: Sequence[float] | Non
             "or lower device.processes."
         )
     parts = balance_by_cost([1.0] * len(items) if costs is None else costs, fabric.world_size)
-    return [items[place] for place in parts[fabric.global_rank]]
+    # The first part has the most expensive scenario, and rank 0 has more to do than others: it adds, logs and writes.
+    return [items[place] for place in parts[-1 - fabric.global_rank]]
 
 
 def num_sharing_memory(fabric: Fabric) -> int:

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from rlftsim.rollout.policy import decision_statistics
+from rlftsim.rollout.policy import decision_statistics, encode_like, score_both
 from rlftsim.training.experience import Experience
 from rlftsim.training.parallel import Fabric, all_reduce_sum
 
@@ -119,15 +119,14 @@ def accumulate_gradients(
     for experience in experiences:
         by_experience.append([])
         with fabric.autocast(), torch.no_grad():
-            reference_context = reference.encode(experience.batch)
+            ref_context = encode_like(reference, experience.batch, experience.context)
         for rollouts, reward in experience.slices(rollouts_per_pass):
             mask = rollouts.decision_mask  # [B, n, A, L]
+            ref_rollouts = rollouts if terms.condition_reference else replace(rollouts, goals=None)
             with fabric.autocast():
                 # Encoded anew for every slice: each slice's graph is freed by its own backward pass.
-                dist = policy.score(policy.encode(experience.batch), rollouts)
-                with torch.no_grad():
-                    conditioned = rollouts if terms.condition_reference else replace(rollouts, goals=None)
-                    ref_dist = reference.score(reference_context, conditioned)
+                context = encode_like(policy, experience.batch, experience.context)
+                dist, ref_dist = score_both(policy, context, rollouts, reference, ref_context, ref_rollouts)
             found = decision_statistics(dist, rollouts.decision, ref_dist)  # [B, n, A, L] each
             kl, entropy = masked_sum(found.kl, mask), masked_sum(found.entropy, mask)
             by_agent = agent_log_prob(found.log_prob, mask, terms.reduction)  # [B, n, A]

@@ -11,6 +11,7 @@ import signal
 import sys
 import threading
 import traceback
+import warnings
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
@@ -67,7 +68,10 @@ def in_processes(work: Callable[[Fabric], Result], config: DeviceConfig) -> Resu
                 links.append(link)
                 process = LinkedProcess(fabric, rank, processes, [theirs])
                 helpers.append(context.Process(target=_help, args=(work, process, links), daemon=True))
-                helpers[-1].start()
+                with warnings.catch_warnings():
+                    # Of forking beside threads, from Python 3.12 on. A helper uses none of the parent's.
+                    warnings.simplefilter("ignore", DeprecationWarning)
+                    helpers[-1].start()
                 # Only the helper holds it from here on: its end is the end of the pipe.
                 theirs.close()
         finally:

@@ -8,7 +8,7 @@ import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -21,6 +21,7 @@ from rlftsim.errors import ConfigError
 from rlftsim.progress import log, progress_bar
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import Scenario, Scenarios
+from rlftsim.training.batches import scenario_costs
 from rlftsim.training.checkpoint import Progress, newest_checkpoint, read_checkpoint, write_checkpoint
 from rlftsim.training.data import batch_with_futures, scenarios_of_update
 from rlftsim.training.parallel import DeviceConfig, Fabric, local_indices
@@ -235,15 +236,17 @@ class TrainingRun:
         """The scenarios that this process sees in an update (counted from 0), as one batch."""
         return batch_with_futures(self.scenarios, self.local_indices(update))
 
-    def local_indices(self, update: int, costs: Float[np.ndarray, "n"] | None = None) -> list[int]:
-        """Indices of the scenarios that this process sees in an update.
+    @cached_property
+    def costs(self) -> Float[np.ndarray, "n"]:
+        """About proportional to the time and memory that each scenario needs, see `scenario_costs`."""
+        return scenario_costs(self.scenarios)
 
-        Args:
-            update: counted from 0.
-            costs: of all scenarios; processes then get parts of about equal cost, else of equal number.
-        """
+    def local_indices(self, update: int) -> list[int]:
+        """Indices of the scenarios that this process sees in an update (counted from 0): a part of about equal cost."""
         chosen = scenarios_of_update(update, self._config.batch_size, len(self.scenarios), self._config.seed)
-        return local_indices(chosen, self._fabric, None if costs is None else costs[chosen].tolist())
+        # Costs of a list of scenarios are counted from the scenarios: not where nothing is divided.
+        costs = self.costs[chosen].tolist() if self._fabric.world_size > 1 else None
+        return local_indices(chosen, self._fabric, costs)
 
     def train(self, learner: Learner, make_update: Callable[[], UpdateReport], *, title: str, card: str = "") -> Path:
         """Make all updates that are left, and save the trained policy.

@@ -68,6 +68,21 @@ class SmartModel(nn.Module):
         """Goal encoder and goal logit bias; empty in a goal-free model."""
         return self.network.decoder.goal_parts()
 
+    def sees_as(self, other: nn.Module) -> bool:
+        """True if scenes, and the relations of rows to them, are the same for another model, without gradient in both.
+
+        So weights that they are made of are frozen in both models, and equal. The layers of the decoder, its head and
+        the goal parts may differ.
+        """
+        if not isinstance(other, SmartModel) or self.training or other.training:
+            return False
+        if (self.config, self.vocabulary) != (other.config, other.vocabulary):
+            return False
+        pairs = list(zip(self.network.seeing_weights(), other.network.seeing_weights(), strict=True))
+        if any(weight.requires_grad for pair in pairs for weight in pair):
+            return False
+        return all(own is others or torch.equal(own, others) for own, others in pairs)
+
     # ---- goals ----------------------------------------------------------------------------------------------------
 
     @property

@@ -6,7 +6,7 @@ decoder works on a block of steps given the past. So the history (once per scena
 all steps of a scoring pass go through the same code.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int64
@@ -107,6 +107,21 @@ class Past:
     def without_last_step(self) -> "Past":
         """The past before its last step. Rows of the sources that are no longer referred to stay."""
         return Past(self.position[..., :-1, :], self.heading[..., :-1], self.row[..., :-1], self.sources)
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """The rows of a block of steps, and their neighbors with the relations to them."""
+
+    rows: tuple[Tensor, ...]
+    """Scenario, rollout, agent and step [R] of each row."""
+    poses: Poses
+    """Poses [R]."""
+    past: Past
+    """Poses and rows of the past, followed by the block; no sources."""
+    own_history: Neighborhoods
+    map_tokens: Neighborhoods
+    agents: Neighborhoods
 
 
 class MapEncoder(nn.Module):
@@ -217,25 +232,22 @@ class AgentDecoder(nn.Module):
         """Embedding of every motion token of every class."""
         return torch.stack([embed(table.flatten(1)) for embed, table in zip(self.tokens, end_corners)])
 
-    def forward(
+    def look(
         self,
         scene: Scene,
         steps: TokenSteps,
         past: Past | None,
         hidden: Bool[Tensor, "B N A K"] | None = None,
-        goals: EncodedGoals | None = None,
-    ) -> tuple[Float[Tensor, "R D"], Past]:
-        """Features of the valid (agent, step) pairs of a block, and the new past.
+    ) -> View:
+        """The rows of a block and everything around them, which the layers only read.
+
+        No weight of a layer takes part, so where the other weights are frozen and equal two models share it.
 
         Args:
             scene: map and agents.
             steps: the block.
             past: of earlier blocks; None = the block begins the scenario.
             hidden: True = the pair takes no part in the attention over time.
-            goals: of all agents; None = all agents are goal-free.
-
-        Returns:
-            Features in the order of `steps.valid.nonzero()`; and the past, followed by the block.
         """
         # 1. rows, and the row of each element of the block (-1 = none)
         rows = steps.valid.nonzero(as_tuple=True)
@@ -244,32 +256,57 @@ class AgentDecoder(nn.Module):
         row_of[rows] = torch.arange(len(rows[0]), device=row_of.device)
         new_row = torch.where(row_of >= 0, row_of + first_row, -1)
         new_past = Past(steps.position, steps.heading, new_row, ()) if past is None else past.then(steps, new_row)
-
-        # 2. features of the rows, and their neighbors, which all layers share
+        # 2. their neighbors, which all layers share
         poses = Poses(steps.position, steps.heading)[rows]
-        x = self._embed_steps(scene, steps, rows, poses, goals)
-        before = self._own_history(scene, new_past, steps, rows, poses, hidden)
         near_map = within(
             poses.position, rows[0], nowhere_unless(scene.map_mask, scene.map_position), None,
             radius_m=self.config.agent_map_radius_m, limit=self.config.max_agent_map_neighbors,
         )  # fmt: skip
-        map_tokens = self._neighborhoods(
-            scene.relations.map, poses, scene.map_poses, near_map, features=scene.map_features
+        return View(
+            rows=rows,
+            poses=poses,
+            past=new_past,
+            own_history=self._own_history(scene, new_past, steps, rows, poses, hidden),
+            map_tokens=self._neighborhoods(
+                scene.relations.map, poses, scene.map_poses, near_map, features=scene.map_features
+            ),
+            agents=self._agent_neighbors(scene, steps, rows, poses, row_of),
         )
-        goal_edges = self._goal_edges(scene, rows, poses, goals)
-        others = self._agent_neighbors(scene, steps, rows, poses, row_of)
 
-        # 3. layers. Inputs of the attention over time are kept: later blocks attend to them
+    def forward(
+        self,
+        scene: Scene,
+        steps: TokenSteps,
+        past: Past | None,
+        view: View | None = None,
+        goals: EncodedGoals | None = None,
+    ) -> tuple[Float[Tensor, "R D"], Past]:
+        """Features of the valid (agent, step) pairs of a block, and the new past.
+
+        Args:
+            scene: map and agents.
+            steps: the block.
+            past: of earlier blocks; None = the block begins the scenario.
+            view: of the block, if it has been looked at already.
+            goals: of all agents; None = all agents are goal-free.
+
+        Returns:
+            Features in the order of `steps.valid.nonzero()`; and the past, followed by the block.
+        """
+        view = self.look(scene, steps, past) if view is None else view
+        x = self._embed_steps(scene, steps, view.rows, view.poses, goals)
+        goal_edges = self._goal_edges(scene, view.rows, view.poses, goals)
+        # inputs of the attention over time are kept: later blocks attend to them
         sources = []
         for index, layers in enumerate(zip(self.time_layers, self.map_layers, self.agent_layers)):
             time_layer, map_layer, agent_layer = layers
             own = normalize(x)
             source = own if past is None else torch.cat([past.sources[index], own])
             sources.append(source)
-            x = time_layer(x, source, before)
-            x = map_layer(x, None, map_tokens, goal_edges=goal_edges)
-            x = agent_layer(x, normalize(x), others)
-        return x, Past(new_past.position, new_past.heading, new_past.row, tuple(sources))
+            x = time_layer(x, source, view.own_history)
+            x = map_layer(x, None, view.map_tokens, goal_edges=goal_edges)
+            x = agent_layer(x, normalize(x), view.agents)
+        return x, replace(view.past, sources=tuple(sources))
 
     def _embed_steps(
         self, scene: Scene, steps: TokenSteps, rows: tuple[Tensor, ...], poses: Poses, goals: EncodedGoals | None
@@ -380,3 +417,10 @@ class SmartNetwork(nn.Module):
         initialize(self, config.frequency_init)
         for part in self.decoder.goal_parts():
             part.zero_init()
+
+    def seeing_weights(self) -> list[Tensor]:
+        """Weights that scenes and views are made of: all but those of the decoder's layers, head and goal parts."""
+        decoder = self.decoder
+        reading = (decoder.time_layers, decoder.map_layers, decoder.agent_layers, decoder.head, *decoder.goal_parts())
+        ids = {id(weight) for part in reading for weight in part.parameters()}
+        return [weight for weight in self.parameters() if id(weight) not in ids]

@@ -5,6 +5,9 @@ The five methods of `rollout.policy.Policy`, and pre-training; `SmartModel` has 
 B scenarios, N rollouts, A agents, L decisions, K token steps, D width, R selected elements, V tokens.
 """
 
+from dataclasses import replace
+from typing import Any
+
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
@@ -15,8 +18,9 @@ from rlftsim.policies.smart.goal_conditioning import NUM_DECISIONS, encode_goals
 from rlftsim.policies.smart.model import SmartModel
 from rlftsim.policies.smart.neighbors import Poses
 from rlftsim.policies.smart.network import nowhere_unless
-from rlftsim.policies.smart.state import SmartContext, SmartState, TeacherForced
+from rlftsim.policies.smart.state import Replay, SmartContext, SmartState, TeacherForced
 from rlftsim.policies.smart.token_steps import TokenSteps, match_imposed, place_tokens
+from rlftsim.rollout.policy import DecisionDistribution
 from rlftsim.rollout.types import AgentStates, Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.tokens.agent_tokens import HISTORY_TOKENS
@@ -41,16 +45,19 @@ class SmartPolicy(SmartModel):
         tokens = self._tokenize(scenarios)
         scene = self._scene(scenarios)
         history = self._logged_steps(tokens, slice(0, HISTORY_TOKENS))
-        rows, past = self.network.decoder(scene, history, None)
+        view = self.network.decoder.look(scene, history, None)
+        rows, past = self.network.decoder(scene, history, None, view)
         return SmartContext(
             scene=scene,
+            history=history,
+            view=view,
             past=past,
-            now=self._logged_steps(tokens, slice(HISTORY_TOKENS - 1, HISTORY_TOKENS)),
             features=_to_dense(rows, history.valid)[:, 0, :, -1],
             position=tokens.position[:, :, HISTORY_TOKENS - 1],
             heading=tokens.heading[:, :, HISTORY_TOKENS - 1],
             object_type=scenarios.object_type,
             agent_mask=scenarios.agent_mask,
+            model=self,
         )
 
     def begin(self, context: SmartContext, num_rollouts: int, goals: Goals | None, noise: Tensor) -> SmartState:
@@ -75,7 +82,7 @@ class SmartPolicy(SmartModel):
             position,
             heading,
             context.past.without_last_step().repeat(num_rollouts),
-            pending=context.now.repeat(num_rollouts),
+            pending=context.history.last.repeat(num_rollouts),
             goals=encode_goals(goals, nowhere_unless(context.scene.map_mask, context.scene.map_position)),
         )
 
@@ -138,30 +145,78 @@ class SmartPolicy(SmartModel):
             context: of `encode`.
             rollouts: of the same scenarios.
         """
-        # 1. replay the decisions without the decoder; the last one leads nowhere that is scored
+        return self._score(context, self._replay(context, rollouts))
+
+    def _replay(self, context: SmartContext, rollouts: Rollouts) -> Replay:
+        """Take the decisions of rollouts again, without the decoder, and look around at every step."""
         state = self.begin(context, rollouts.num_rollouts, rollouts.goals, rollouts.log_prob[..., :0])
-        num_decisions = rollouts.decision.shape[3]
-        for index in range(num_decisions - 1):
+        # the last decision leads nowhere that is scored
+        for index in range(rollouts.decision.shape[3] - 1):
             start = index * STEPS_PER_TOKEN
             forced = rollouts.forced and rollouts.forced.steps(start, start + STEPS_PER_TOKEN)
             state = self.advance(context, state, rollouts.decision[..., index], forced)
-        # 2. features [B, N, A, L, D]: of the current step, which goal-free agents have in the context, and of all
+        steps = state.pending
+        view = None if steps is None else self.network.decoder.look(context.scene, steps, state.past)
+        return Replay(state, view)
+
+    def _score(self, context: SmartContext, replay: Replay) -> CategoricalDistribution:
+        """Distributions along rollouts that have been replayed, by this model or by one that sees alike."""
+        state = replay.state
+        # 1. features [B, N, A, L, D]: of the current step, which goal-free agents have in the context, and of all
         # later ones
         parts = []
         if state.goals is None:
             parts.append(context.features[:, None, :, None].expand(*state.heading.shape, 1, -1))
         if state.pending is not None:
-            rows, _ = self.network.decoder(context.scene, state.pending, state.past, goals=state.goals)
+            past = replace(state.past, sources=context.past.sources)
+            rows, _ = self.network.decoder(context.scene, state.pending, past, replay.view, state.goals)
             parts.append(_to_dense(rows, state.pending.valid))
         features = torch.cat(parts, 3)
-        # 3. distributions of the agents; padding is left out
-        mask = context.agent_mask[:, None, :, None].expand(rollouts.decision.shape)
-        num_left = (NUM_DECISIONS - torch.arange(num_decisions, device=mask.device)).expand(mask.shape)
+        # 2. distributions of the agents; padding is left out
+        mask = context.agent_mask[:, None, :, None].expand(features.shape[:4])
+        num_left = (NUM_DECISIONS - torch.arange(mask.shape[3], device=mask.device)).expand(mask.shape)
         poses = None
         if state.goals is not None:
             assert state.pending is not None  # with goals even the current step was pending
             poses = Poses(state.pending.position, state.pending.heading)
         return self._distribution(context, state, features[mask], mask, poses, num_left)
+
+    # ---- passes that share what they have in common -----------------------------------------------------------------
+
+    def encode_like(self, scenarios: ScenarioBatch, context: Any) -> SmartContext:
+        """`encode(scenarios)`, with scene and history taken over from a context of a model that sees alike.
+
+        Args:
+            scenarios: of the context.
+            context: of any policy, whose weights are still those that made it.
+        """
+        if not isinstance(context, SmartContext) or not self.sees_as(context.model):
+            return self.encode(scenarios)
+        rows, past = self.network.decoder(context.scene, context.history, None, context.view)
+        features = _to_dense(rows, context.history.valid)[:, 0, :, -1]
+        return replace(context, past=past, features=features, model=self)
+
+    def score_both(
+        self, context: SmartContext, rollouts: Rollouts, reference: Any, ref_context: Any, ref_rollouts: Rollouts
+    ) -> tuple[CategoricalDistribution, DecisionDistribution]:
+        """Distributions along rollouts of this policy and, without gradient, of a reference.
+
+        Both look around once if they have a scene in common and the rollouts are the same.
+
+        Args:
+            context: of this policy.
+            rollouts: of the same scenarios.
+            reference: any policy.
+            ref_context: of the reference.
+            ref_rollouts: the same rollouts, maybe with other goals.
+        """
+        replay = self._replay(context, rollouts)
+        dist = self._score(context, replay)
+        with torch.no_grad():
+            is_shared = isinstance(ref_context, SmartContext) and ref_context.scene is context.scene
+            if is_shared and ref_rollouts is rollouts:
+                return dist, reference._score(ref_context, replay)
+            return dist, reference.score(ref_context, ref_rollouts)
 
     # ---- pre-training -------------------------------------------------------------------------------------------
 
@@ -178,7 +233,8 @@ class SmartPolicy(SmartModel):
         hidden = None
         if self.training and self.config.history_drop:
             hidden = torch.rand(steps.valid.shape, device=steps.valid.device) < self.config.history_drop
-        rows, _ = self.network.decoder(self._scene(scenarios), steps, None, hidden)
+        scene = self._scene(scenarios)
+        rows, _ = self.network.decoder(scene, steps, None, self.network.decoder.look(scene, steps, None, hidden))
         # predictions start at the current step, as in a simulation
         decides = steps.valid.clone()  # [B, 1, A, K]
         decides[..., : HISTORY_TOKENS - 1] = False

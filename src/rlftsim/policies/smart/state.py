@@ -6,10 +6,10 @@ B scenarios, N rollouts, A agents, D width, R selected elements, V tokens. Map f
 from dataclasses import dataclass, field
 
 from jaxtyping import Bool, Float, Int64
-from torch import Tensor
+from torch import Tensor, nn
 
 from rlftsim.policies.smart.goal_conditioning import EncodedGoals
-from rlftsim.policies.smart.network import Past, Scene
+from rlftsim.policies.smart.network import Past, Scene, View
 from rlftsim.policies.smart.token_steps import TokenSteps
 
 
@@ -18,10 +18,12 @@ class SmartContext:
     """Everything that does not depend on the agents' decisions, computed once per scenario."""
 
     scene: Scene
+    history: TokenSteps
+    """The two history tokens, the last of them at the current step; with a single rollout."""
+    view: View
+    """Of the history."""
     past: Past
-    """Of the two history tokens, with a single rollout."""
-    now: TokenSteps
-    """The last of them, at the current step: it goes through the decoder again where agents have goals."""
+    """Of the history."""
     features: Float[Tensor, "B A D"]
     """Decoder features at the current step of goal-free agents; zeros for padding."""
     position: Float[Tensor, "B A 2"]
@@ -29,6 +31,8 @@ class SmartContext:
     heading: Float[Tensor, "B A"]
     object_type: Int64[Tensor, "B A"]
     agent_mask: Bool[Tensor, "B A"]
+    model: nn.Module
+    """The model that made it."""
 
 
 @dataclass(eq=False)
@@ -59,6 +63,16 @@ class SmartState:
     num_decisions: int = 0
     """Decisions taken so far."""
     cache: DecoderCache = field(default_factory=DecoderCache)
+
+
+@dataclass(frozen=True, eq=False)
+class Replay:
+    """Rollouts ready to be scored: nothing in it depends on weights that fine-tuning trains, but for the past."""
+
+    state: SmartState
+    """Before the last decision, all steps that are to be scored pending."""
+    view: View | None
+    """Of the pending steps; None = there are none."""
 
 
 @dataclass(frozen=True, eq=False)

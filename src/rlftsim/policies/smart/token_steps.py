@@ -31,6 +31,11 @@ class TokenSteps:
         pairs = ((getattr(self, name), getattr(other, name)) for name in self.__dataclass_fields__)
         return TokenSteps(*(torch.cat(pair, 3) for pair in pairs))
 
+    @property
+    def last(self) -> "TokenSteps":
+        """The last step of the block."""
+        return TokenSteps(*(getattr(self, name)[:, :, :, -1:] for name in self.__dataclass_fields__))
+
     def repeat(self, num_rollouts: int) -> "TokenSteps":
         """The steps of a single rollout, shared by N of them; no copies."""
         fields = (getattr(self, name) for name in self.__dataclass_fields__)
