@@ -1,13 +1,22 @@
 """Attention along relations and tabulated embeddings against their plain definitions."""
 
 import math
+import weakref
+from dataclasses import replace
 
 import pytest
 import torch
 from torch.nn import functional
 
 from rlftsim.policies.smart import attention as module
-from rlftsim.policies.smart.attention import RelationAttention, build_neighborhoods
+from rlftsim.policies.smart.attention import (
+    EdgeGradients,
+    NeighborBlock,
+    Neighborhoods,
+    RelationAttention,
+    build_neighborhoods,
+    gather_edges,
+)
 from rlftsim.policies.smart.embeddings import FourierEmbedding, Grid, TabulatedEmbedding, initialize, normalize
 
 DIM, NUM_HEADS, HEAD_DIM, NUM_ROWS, NUM_SOURCES = 16, 2, 4, 60, 40
@@ -70,6 +79,101 @@ def test_messages_and_gradients_are_those_of_plain_attention(
     trained = [x, sources, *embedding.parameters(), attention.source_key.weight, attention.relation_value.bias]
     for a, b in zip(*(torch.autograd.grad(m.square().sum(), trained) for m in (ours, plain))):
         assert (a - b).abs().max() < 1e-10
+
+
+@pytest.fixture(params=[True, False], ids=["padded", "full"])
+def blocks(request, monkeypatch):
+    """Neighborhoods of 4 and 3 rows whose edge features are leaves, and features of sources; float64."""
+    generator = torch.Generator().manual_seed(3)
+    blocks, leaves = [], []
+    for num_rows, num_neighbors in ((4, 3), (3, 6)):
+        shape = (num_rows, num_neighbors)
+        edges = torch.randn(*shape, DIM, generator=generator, dtype=torch.float64, requires_grad=True)
+        count = torch.randint(1, num_neighbors + 1, (num_rows, 1), generator=generator)
+        is_padding = torch.arange(num_neighbors) >= count if request.param else torch.zeros(shape, dtype=torch.bool)
+        bias = torch.zeros(shape, dtype=torch.float64).masked_fill_(is_padding, module.IMPOSSIBLE)
+        blocks.append(NeighborBlock(torch.randint(0, 5, shape, generator=generator), bias[:, None], edges))
+        leaves.append(edges)
+    sources = torch.randn(5, DIM, generator=generator, dtype=torch.float64, requires_grad=True)
+    # a dropout that zeroes the same weights whenever it is called with the same shape
+    kept = {(s, NUM_HEADS, k): torch.rand(s, NUM_HEADS, k, generator=generator) >= 0.3 for s, k in ((4, 3), (3, 6))}
+    monkeypatch.setattr(module.functional, "dropout", lambda w, rate: w * kept[tuple(w.shape)] / (1 - rate))
+    return tuple(blocks), leaves, sources
+
+
+def plain_gather(queries, source, around, dropout):
+    """`gather_edges` in operations that autograd knows."""
+    sums, totals = [], []
+    query = torch.cat(queries, -1)
+    for block, block_query in zip(around.blocks, query.split(around.sizes)):
+        edges = block.edge_features if source is None else torch.cat([block.edge_features, source[block.neighbors]], -1)
+        weights = torch.softmax(torch.einsum("rhc,rkc->rhk", block_query, edges) + block.bias, -1)
+        weights = functional.dropout(weights, dropout) if dropout else weights
+        sums.append(torch.einsum("rhk,rkc->rhc", weights, edges))
+        totals.append(weights.sum(-1, keepdim=True))
+    return torch.cat(sums).split([q.shape[-1] for q in queries], -1), torch.cat(totals)
+
+
+def draw_queries(sources_are_shared):
+    generator = torch.Generator().manual_seed(4)
+    count = 1 if sources_are_shared else 2
+    return tuple(
+        torch.randn(7, NUM_HEADS, DIM, generator=generator, dtype=torch.float64, requires_grad=True)
+        for _ in range(count)
+    )
+
+
+@pytest.mark.parametrize("dropout", [0.0, 0.3])
+@pytest.mark.parametrize("sources_are_shared", [True, False])
+def test_layers_that_share_edges_have_the_gradients_of_plain_attention(sources_are_shared, dropout, blocks):
+    around = Neighborhoods(torch.arange(7), blocks[0], EdgeGradients.of(list(blocks[0])))
+    source = None if sources_are_shared else blocks[2]
+    queries = draw_queries(sources_are_shared)
+    trained = [*blocks[1], *queries, *([] if source is None else [source])]
+
+    def three_layers(gather):
+        """Each layer's sums are the next one's queries."""
+        total, current = torch.zeros((), dtype=torch.float64), queries
+        for layer in range(1, 4):
+            sums, weight = gather(current, source, around, dropout)
+            total = total + layer * (sum(part.square().sum() for part in sums) + (weight.square() * layer).sum())
+            current = tuple(query + part for query, part in zip(queries, sums))
+        return total
+
+    ours, plain = three_layers(gather_edges), three_layers(plain_gather)
+    assert (ours - plain).abs() < 1e-9 * plain.abs()
+    expected = torch.autograd.grad(plain, trained)
+    for _ in range(2):  # sums of gradients begin anew in each backward pass
+        for a, b in zip(torch.autograd.grad(ours, trained, retain_graph=True), expected):
+            assert (a - b).abs().max() < 1e-10 * b.abs().max()
+
+
+@pytest.mark.parametrize("sources_are_shared", [True, False])
+def test_gradients_of_gathered_edges_are_those_of_finite_differences(sources_are_shared, blocks):
+    source = None if sources_are_shared else blocks[2]
+
+    def gather(edges, other_edges, *tensors):
+        renewed = tuple(replace(b, edge_features=e) for b, e in zip(blocks[0], (edges, other_edges)))
+        around = Neighborhoods(torch.arange(7), renewed, EdgeGradients.of(list(renewed)))
+        queries, own = (tensors, None) if source is None else (tensors[:-1], tensors[-1])
+        sums, weight = gather_edges(queries, own, around, 0.3)
+        return *sums, weight
+
+    inputs = [*blocks[1], *draw_queries(sources_are_shared), *([] if source is None else [source])]
+    assert torch.autograd.gradcheck(gather, inputs, fast_mode=True)
+
+
+def test_edge_features_go_with_the_backward_pass(blocks):
+    edges = blocks[1][0] * 1  # not a leaf: nothing but the graph needs it later
+    first = replace(blocks[0][0], edge_features=edges)
+    around = Neighborhoods(torch.arange(4), (first,), EdgeGradients.of([first]))
+    memory = weakref.ref(edges.untyped_storage())
+    sums, _ = gather_edges(tuple(q[:4] for q in draw_queries(True)), None, around, 0.0)
+    loss = sums[0].sum()
+    del edges, first, around, sums
+    assert memory() is not None
+    loss.backward()
+    assert memory() is None  # although the loss is still there
 
 
 @pytest.mark.parametrize("sources_are_shared", [True, False])

@@ -7,12 +7,15 @@ relations.
 
 import itertools
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
+from torch.autograd.function import Function, once_differentiable
 from torch.nn import functional
 from torch.utils.checkpoint import checkpoint
 
@@ -50,6 +53,13 @@ class Neighborhoods:
     rows: Int64[Tensor, "n"]
     """The rows that have neighbors, block after block."""
     blocks: tuple[NeighborBlock, ...]
+    gradients: "EdgeGradients | None"
+    """Sums of the layers' gradients of the edge features; None where these are constants."""
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Of the edge features."""
+        return self.blocks[0].edge_features.dtype
 
     @property
     def sizes(self) -> list[int]:
@@ -104,7 +114,8 @@ def build_neighborhoods(
         edge_features = _embed_edges(embedding, values[part, kept], index, features)
         bias = torch.zeros_like(edge_features[..., 0]).masked_fill_(~mask[part, kept], IMPOSSIBLE)
         blocks.append(NeighborBlock(index, bias[:, None], edge_features))
-    return Neighborhoods(rows, tuple(blocks))
+    is_trained = any(block.edge_features.requires_grad for block in blocks)
+    return Neighborhoods(rows, tuple(blocks), EdgeGradients.of(blocks) if is_trained else None)
 
 
 def _embed_edges(
@@ -163,6 +174,163 @@ def _cut(widths: np.ndarray, pairs: int) -> list[slice]:
     block = (widths - 1) // step + widths.cumsum() // pairs
     cuts = [0, *(np.flatnonzero(np.diff(block)) + 1).tolist(), len(widths)]
     return [slice(a, b) for a, b in itertools.pairwise(cuts)]
+
+
+@dataclass(frozen=True, eq=False)
+class EdgeGradients:
+    """Gradients of all blocks' edge features, which the layers that attend along them add up in one buffer a block.
+
+    Autograd would make a tensor of that size in each layer and sum them. Instead each layer depends on a token and
+    adds to the buffers in its backward pass. The token's node comes after all of them and hands the buffers on.
+    """
+
+    buffers: list[Float[Tensor, "_ _ W"] | None]
+    """None = nothing was added."""
+    token: Float[Tensor, ""]
+    """A number without a meaning that depends on the edge features."""
+
+    @classmethod
+    def of(cls, blocks: list[NeighborBlock]) -> "EdgeGradients":
+        """No gradients yet, of these blocks' edge features."""
+        buffers: list[Tensor | None] = [None] * len(blocks)
+        token = _HandOver.apply(buffers, *(block.edge_features for block in blocks))
+        return cls(buffers, token)  # type: ignore[arg-type]
+
+
+class _HandOver(Function):
+    """A token that depends on tensors; its backward pass hands the gradients on that are in the buffers by then."""
+
+    @staticmethod
+    def forward(ctx: Any, buffers: list[Tensor | None], *tensors: Tensor) -> Tensor:
+        ctx.buffers = buffers
+        return tensors[0].new_zeros(())
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, _: Tensor) -> tuple[Tensor | None, ...]:
+        gradients = tuple(ctx.buffers)
+        ctx.buffers[:] = [None] * len(gradients)  # the graph may be gone through again
+        return None, *gradients
+
+
+def gather_edges(
+    queries: tuple[Float[Tensor, "n H _"], ...],
+    source: Float[Tensor, "S D"] | None,
+    neighborhoods: Neighborhoods,
+    dropout: float,
+) -> tuple[tuple[Float[Tensor, "n H _"], ...], Float[Tensor, "n H 1"]]:
+    """Attention-weighted sums of edge features, those of sources if there are any, and sums of the weights.
+
+    Args:
+        queries: in the space of edge features [n, H, W], and in that of sources [n, H, D].
+        source: features of all sources; None = they are in the edge features.
+        neighborhoods: of the n rows.
+        dropout: probability that a weight is zeroed.
+    """
+    if torch.is_grad_enabled() or dropout:
+        token = None if neighborhoods.gradients is None else neighborhoods.gradients.token
+        # autocast would copy the edge features in each layer: here reading them costs more than computing with them
+        with torch.autocast(queries[0].device.type, enabled=False):
+            tensors = (None if t is None else t.to(neighborhoods.dtype) for t in (source, *queries))
+            *sums, total = _GatherEdges.apply(neighborhoods, dropout, token, *tensors)  # type: ignore
+        return tuple(sums), total
+    # the fused kernel is faster, although relations and sources are copied together for it
+    query = queries[0] if source is None else torch.cat(queries, -1)
+    results = []
+    for block_query, block in zip(query.split(neighborhoods.sizes), neighborhoods.blocks):
+        parts = _parts(block.edge_features, block.neighbors, source)
+        edges = (parts[0] if source is None else torch.cat(parts, -1))[:, None]  # [r, 1, K, 2D]
+        bias = block.bias[:, None]
+        results.append(
+            functional.scaled_dot_product_attention(block_query[:, None], edges, edges, attn_mask=bias, scale=1.0)
+        )
+    gathered = torch.cat(results)[:, 0]  # [n, H, 2D]
+    return gathered.split([q.shape[-1] for q in queries], -1), torch.ones_like(gathered[..., :1])
+
+
+class _GatherEdges(Function):
+    """`gather_edges` with a backward pass of its own.
+
+    With edge features E, queries q and scores s = q E^T: the weights are A = dropout(P), P = softmax(s), and the sums
+    G = A E. Backward dA = dG E^T + d(sum of A), ds = A dA - P sum(A dA), dq = ds E and dE = A^T dG + ds^T q, which is
+    one product of factors that lie side by side. Of each block P and A are stored.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        neighborhoods: Neighborhoods,
+        dropout: float,
+        token: Tensor | None,
+        source: Tensor | None,
+        *queries: Tensor,
+    ) -> tuple[Tensor, ...]:
+        sums = [query.new_empty(query.shape) for query in queries]
+        total = queries[0].new_empty(*queries[0].shape[:2], 1)
+        saved, sizes = [], neighborhoods.sizes
+        per_block = zip(neighborhoods.blocks, _cut_all(queries, sizes), _cut_all(sums, sizes), total.split(sizes))
+        for block, block_queries, block_sums, block_total in per_block:
+            edges = block.edge_features.detach()
+            parts = _parts(edges, block.neighbors, source)
+            scores = block.bias.expand(-1, total.shape[1], -1)
+            for part, query in zip(parts, block_queries):
+                scores = torch.baddbmm(scores, query, part.mT)  # [r, H, K]
+            softmax = torch.softmax(scores, -1)
+            weights = functional.dropout(softmax, dropout) if dropout else softmax
+            for part, result in zip(parts, block_sums):
+                torch.bmm(weights, part, out=result)
+            torch.sum(weights, -1, keepdim=True, out=block_total)
+            saved.append((edges, block.neighbors, softmax, weights))
+        # saved in this way, edge features go as soon as the backward pass is through
+        ctx.save_for_backward(source, *queries, *itertools.chain(*saved))
+        ctx.sizes = sizes
+        ctx.buffers = None if neighborhoods.gradients is None else neighborhoods.gradients.buffers
+        return *sums, total
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        *sum_grads, total_grad = grads
+        source, *saved = ctx.saved_tensors
+        queries, saved = saved[: len(sum_grads)], saved[len(sum_grads) :]
+        _, _, edges_need_grad, source_needs_grad, *_ = ctx.needs_input_grad
+        source_grad = torch.zeros_like(source) if source_needs_grad else None
+        query_grads = [query.new_empty(query.shape) for query in queries]
+        factors = [torch.cat([grad, query], 1) for grad, query in zip(sum_grads, queries)]  # [n, 2H, W], [n, 2H, D]
+        num_heads = total_grad.shape[1]
+        per_block = zip(
+            zip(*[iter(saved)] * 4), _cut_all(factors, ctx.sizes), _cut_all(query_grads, ctx.sizes),
+            total_grad.split(ctx.sizes),
+        )  # fmt: skip
+        for index, (stored, block_factors, block_grads, block_total) in enumerate(per_block):
+            edges, neighbors, softmax, weights = stored
+            parts = _parts(edges, neighbors, source)
+            weight_grad = block_total.expand_as(weights)
+            for part, factor in zip(parts, block_factors):
+                weight_grad = torch.baddbmm(weight_grad, factor[:, :num_heads], part.mT)  # [r, H, K]
+            score_grad = weight_grad.mul_(weights)
+            score_grad = torch.addcmul(score_grad, softmax, score_grad.sum(-1, keepdim=True), value=-1)
+            for part, result in zip(parts, block_grads):
+                torch.bmm(score_grad, part, out=result)
+            left = torch.cat([weights, score_grad], 1).mT  # [r, K, 2H]
+            if edges_need_grad:
+                buffer = ctx.buffers[index]
+                added = torch.bmm(left, block_factors[0]) if buffer is None else buffer.baddbmm_(left, block_factors[0])
+                ctx.buffers[index] = added
+            if source_grad is not None:
+                source_grad.index_add_(0, neighbors.flatten(), (left @ block_factors[1]).flatten(0, 1))
+        token_grad = total_grad.new_zeros(()) if edges_need_grad else None
+        return None, None, token_grad, source_grad, *query_grads
+
+
+def _parts(edges: Tensor, neighbors: Tensor, source: Tensor | None) -> tuple[Tensor, ...]:
+    """Edge features, and the neighbors' features if these are not among them."""
+    return (edges,) if source is None else (edges, functional.embedding(neighbors, source))
+
+
+def _cut_all(tensors: Sequence[Tensor], sizes: list[int]) -> Iterator[tuple[Tensor, ...]]:
+    """The rows of each block, of all tensors."""
+    return zip(*(tensor.split(sizes) for tensor in tensors))
 
 
 class RelationAttention(nn.Module):
@@ -238,53 +406,18 @@ class RelationAttention(nn.Module):
         # 2. the part of a value that is the same for every neighbor [inner]: maps of the norms' biases, and the
         # maps' own
         constant = torch.stack([value(norm.bias) for value, norm in zip(values, norms)]).sum(0)
-        # 3. attend block by block
-        query = self.query(target[neighborhoods.rows]).unflatten(-1, (self.num_heads, self.head_dim))  # [n, H, d]
-        results = [
-            self._attend(block_query, block, to_key, to_value, source)
-            for block_query, block in zip(query.split(neighborhoods.sizes), neighborhoods.blocks)
-        ]
-        value = torch.cat([block_value for block_value, _ in results])
-        weight = torch.cat([block_weight for _, block_weight in results])
+        # 3. attend. The heads are the batch axis of both projections: [H, n, d] @ [H, d, 2D]
+        query = self.query(target[neighborhoods.rows]).unflatten(-1, (self.num_heads, self.head_dim)).transpose(0, 1)
+        spaces = 1 if source is None else 2
+        queries = tuple((query @ part).transpose(0, 1) for part in to_key.chunk(spaces, -1))
+        sums, weight = gather_edges(queries, source, neighborhoods, self.dropout if self.training else 0.0)
+        projected = [part.transpose(0, 1) @ to_part for part, to_part in zip(sums, to_value.chunk(spaces, 1))]
+        value = torch.stack(projected).sum(0).transpose(0, 1)  # [n, H, d]
         # weights sum to 1, unless dropout zeroed some
         value = value + weight * constant.unflatten(-1, (self.num_heads, self.head_dim))
         # 4. back to all rows
         message = target.new_zeros(len(target), self.num_heads * self.head_dim)
         return message.index_copy(0, neighborhoods.rows, value.flatten(-2))
-
-    def _attend(
-        self,
-        query: Float[Tensor, "r H d"],
-        block: NeighborBlock,
-        to_key: Float[Tensor, "H d W"],
-        to_value: Float[Tensor, "H W d"],
-        source: Float[Tensor, "S D"] | None,
-    ) -> tuple[Float[Tensor, "r H d"], Float[Tensor, "r H 1"]]:
-        """Weighted sums of the neighbors' values, without their constant part, and sums of the weights."""
-        # the heads are the batch axis of both products: [H, r, d] @ [H, d, W]
-        edge_query = (query.transpose(0, 1) @ to_key).transpose(0, 1)  # [r, H, W]
-        gathered, weight = self._gather(edge_query, block, source)
-        return (gathered.transpose(0, 1) @ to_value).transpose(0, 1), weight
-
-    def _gather(
-        self, query: Float[Tensor, "r H W"], block: NeighborBlock, source: Float[Tensor, "S D"] | None
-    ) -> tuple[Float[Tensor, "r H W"], Float[Tensor, "r H 1"]]:
-        """Weighted sums of edge features (relations, then sources), and sums of the weights."""
-        parts = (block.edge_features,)
-        if source is not None:
-            parts = (block.edge_features, functional.embedding(block.neighbors, source))
-        # without gradient and dropout the fused kernel is faster, although relations and sources are copied
-        # together for it
-        if not torch.is_grad_enabled() and not (self.training and self.dropout):
-            whole = (block.edge_features if source is None else torch.cat(parts, -1))[:, None]  # [r, 1, K, W]
-            bias = block.bias[:, None]
-            gathered = functional.scaled_dot_product_attention(query[:, None], whole, whole, attn_mask=bias, scale=1.0)
-            return gathered[:, 0], torch.ones_like(gathered[:, 0, :, :1])
-        scores = block.bias.expand(-1, self.num_heads, -1)
-        for part, part_query in zip(parts, query.chunk(len(parts), -1)):
-            scores = torch.baddbmm(scores, part_query, part.mT)  # [r, H, K]
-        weights = functional.dropout(torch.softmax(scores, -1), self.dropout, self.training)
-        return torch.cat([weights @ part for part in parts], -1), weights.sum(-1, keepdim=True)
 
     def _apply_goal_edges(
         self, message: Float[Tensor, "R inner"], target: Float[Tensor, "R D"], edges: GoalEdges
