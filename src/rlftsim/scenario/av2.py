@@ -402,4 +402,4 @@ def _read_sizes(path: Path) -> dict[str, tuple[float, float, float]]:
             raise ConfigError(
                 f"{path}: the size of {kind} is {size}: write length, width, height in meters, {example}."
             )
-    return {kind: tuple(map(float, size)) for kind, size in given.items()}
+    return {kind: (float(size[0]), float(size[1]), float(size[2])) for kind, size in given.items()}

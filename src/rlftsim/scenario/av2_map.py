@@ -246,7 +246,7 @@ def _topology(
     neighbors = []
     for lane in lanes:
         for side, other in enumerate(lane.neighbors):
-            if other in centers:
+            if other is not None and other in centers:
                 own, theirs = centers[lane.lane_id], centers[other]
                 same_way = np.linalg.norm(own[[0, -1], :2] - theirs[[0, -1], :2], axis=1).sum()
                 opposite = np.linalg.norm(own[[0, -1], :2] - theirs[[-1, 0], :2], axis=1).sum()
@@ -300,7 +300,7 @@ def _read_lane(where: str, value: Any) -> Lane:
 
 
 def _read_points(where: str, value: Any, name: str, *, at_least: int) -> Float[np.ndarray, "n 3"]:
-    points = value.get(name) if isinstance(value, dict) else None
+    points: Any = value.get(name) if isinstance(value, dict) else None
     try:
         found = np.array([(point["x"], point["y"], point["z"]) for point in points], np.float64).reshape(-1, 3)
     except (KeyError, TypeError, ValueError, OverflowError):

@@ -2,7 +2,7 @@
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 NEAREST_POINTS = 3
 """Map points whose mean height is taken for the ground."""
@@ -48,7 +48,7 @@ class Heights:
 
     def __init__(self, points: Float[np.ndarray, "n 3"]) -> None:
         self._z = points[:, 2]
-        self._tree = cKDTree(points[:, :2]) if len(points) else None
+        self._tree = KDTree(points[:, :2]) if len(points) else None
 
     def at(self, places: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "m"]:
         """Height at some places, world frame."""

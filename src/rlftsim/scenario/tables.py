@@ -18,10 +18,9 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from jaxtyping import Bool, Float, Int64
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from rlftsim.errors import DataError
 from rlftsim.geometry import wrapped
@@ -62,7 +61,7 @@ _MAX_COORDINATE_M = 1e7
 _EPSILON_S = 1e-6
 _WORDS, _NUMBERS, _WHOLE = "text", "numbers", "whole numbers"
 _LISTS, _EITHER, _TRUTH = "lists", "names or whole numbers", "True or False"
-_SCHEMAS: Mapping[str, tuple[Mapping[str, str], Mapping[str, str]]] = {
+_SCHEMAS: Mapping[str, tuple[dict[str, str], dict[str, str]]] = {
     TRACKS: (
         {"scenario_id": _WORDS, "object_id": _WHOLE, "type": _EITHER, "step": _WHOLE}
         | dict.fromkeys(("x", "y", "heading", "vx", "vy"), _NUMBERS),
@@ -413,7 +412,7 @@ def _refuse_edges_that_run_backwards(rows: _Rows, features: MapFeatures) -> None
     if not lanes:
         return
     lane_points = np.concatenate(lanes)
-    tree = cKDTree(lane_points)
+    tree = KDTree(lane_points)
     for index in features.indices_of(ROAD_EDGE_TYPES):
         edge = densify(features.polyline(index)[:, :2].astype(np.float64), 1.0)
         middle, along = (edge[1:] + edge[:-1]) / 2, np.diff(edge, axis=0)
@@ -532,7 +531,7 @@ def _read_column(table: str, name: str, column: pa.ChunkedArray, kind: str) -> n
         raise DataError(f"{table}: column {name} is {column.type}, it must have {kind}")
     # empty lists and licenses are allowed, empty numbers are NaN, which is refused where it matters
     if column.null_count and kind not in (_LISTS, _NUMBERS) and name != "license":
-        row = pc.index(pc.is_null(column), True).as_py()
+        row = np.flatnonzero(column.is_null().to_numpy())[0]
         raise DataError(f"{table}: row {row}: {name} is empty")
     try:
         if kind == _NUMBERS:
