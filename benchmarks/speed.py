@@ -116,6 +116,10 @@ def job_command(options: Options, side: Side, job: Job) -> list[str]:
     return [str(options.catk_python), str(HERE / "speed_public.py"), job.write()]
 
 
+def rlftsim(*words: object) -> list[str]:
+    return [sys.executable, "-m", "rlftsim", *map(str, words)]
+
+
 def run_job(options: Options, side: Side, job: Job) -> None:
     subprocess.run(
         job_command(options, side, job), check=True, env=environment(options, side), stdout=subprocess.DEVNULL
@@ -233,21 +237,9 @@ def evaluation(options: Options) -> Samples:
     samples: Samples = {}
     for side in options.sides(("old", "new")):
         with tempfile.TemporaryDirectory() as out:
-            words = [
-                "--data",
-                options.inputs / "real",
-                "--out",
-                out,
-                "--name",
-                "tiny",
-                "--limit",
-                NUM_EVALUATED,
-                "--top-k",
-                48,
-            ]
-            words += ["--num-rollouts", options.num_rollouts, "--jobs", 1]
-            command = [sys.executable, "-m", "rlftsim", "evaluate", options.inputs / "tiny", *words]
-            numbers = cpu_of_command([str(word) for word in command], environment(options, side))
+            size = ("--limit", NUM_EVALUATED, "--num-rollouts", options.num_rollouts, "--top-k", 48, "--jobs", 1)
+            files = (options.inputs / "tiny", "--data", options.inputs / "real", "--out", out, "--name", "tiny")
+            numbers = cpu_of_command(rlftsim("evaluate", *files, *size), environment(options, side))
             scores = pyarrow.parquet.read_table(Path(out) / "tiny.parquet")["meta_metric"].to_pylist()
         samples[side] = [numbers | {"meta_metric": statistics.mean(scores)}]
     if options.sides(("public",)) and options.official:
@@ -269,7 +261,7 @@ def demo(options: Options) -> Samples:
 
 def time_demo(options: Options, side: Side) -> Numbers:
     with tempfile.TemporaryDirectory() as out:
-        command = [sys.executable, "-m", "rlftsim", "demo", "--out", out] + ([] if options.full_demo else ["--quick"])
+        command = rlftsim("demo", "--out", out, *([] if options.full_demo else ["--quick"]))
         process = subprocess.Popen(
             command, env=environment(options, side), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
             start_new_session=True,
@@ -342,14 +334,7 @@ def prepare(options: Options, rows: Sequence[Row]) -> None:
 
     def convert() -> None:
         for split in ("training", "validation"):
-            words = [
-                sys.executable,
-                "-m",
-                "rlftsim",
-                "convert",
-                str(options.womd / split),
-                str(options.inputs / "real"),
-            ]
+            words = rlftsim("convert", options.womd / split, options.inputs / "real")
             subprocess.run(words, check=True, env=environment(options, side), stdout=subprocess.DEVNULL)
 
     options.inputs.mkdir(parents=True, exist_ok=True)
@@ -358,8 +343,7 @@ def prepare(options: Options, rows: Sequence[Row]) -> None:
     if options.womd and {"finetune", "evaluation"} & {*rows}:
         once("real", convert)
     if "finetune" in rows:
-        for data in ("synthetic", "real") if options.womd else ("synthetic",):
-            once(f"base_{data}", lambda: run_job(options, side, Job("prepare_base", data=data)))  # noqa: B023
+        once("base", lambda: run_job(options, side, Job("prepare_base")))
     if options.womd and "evaluation" in rows:
         records = Job("prepare_evaluated", shared=str(options.womd / "validation"))
         for one in options.sides(("new", "public")):
@@ -376,7 +360,7 @@ NOTES = f"""- Median (least to greatest) of the repetitions. The processes of a 
   agents never stand still. In "held as logged" an agent keeps its pose wherever it moves less than 5 cm in the half second of a decision in the log, on all sides.
 - The public code makes rollouts one after the other and encodes the map anew in each; a few were timed and all extrapolated. Where torch-cluster is not
   installed, an exact search stands in for it (`speed_public.py`). Before it is timed it is compared with its golden numbers.
-- The demo's base models for the fine-tuning updates were trained for two passes; the scenarios are the first four for training.
+- The fine-tuning updates begin with the demo's base model, also on real scenarios; the scenarios are the first four of the training split.
 - "slowest process": CPU seconds of the process that used most, in each stage, start-up included; `rlftsim demo --quick` unless it says otherwise.
 - The evaluation reads prepared files on both sides (a data set, pickles) and is the CPU time of whole processes; {NUM_EVALUATED} scenarios, one run.
 """
@@ -394,9 +378,10 @@ def describe(options: Options) -> str:
 
 
 def commit_of(checkout: Path) -> str:
-    git = ["git", "-C", str(checkout)]
-    head = subprocess.run([*git, "rev-parse", "--short", "HEAD"], capture_output=True, text=True).stdout.strip()
-    changes = subprocess.run([*git, "diff", "HEAD", "--", "src"], capture_output=True).stdout
+    """The last commit that changed the code, and a hash of changes that are not committed."""
+    git, code = ["git", "-C", str(checkout)], ["--", "src", "benchmarks/*.py"]
+    head = subprocess.run([*git, "log", "-1", "--format=%h", *code], capture_output=True, text=True).stdout.strip()
+    changes = subprocess.run([*git, "diff", "HEAD", *code], capture_output=True).stdout
     return head + (f" with changes {hashlib.sha256(changes).hexdigest()[:8]}" if changes else "")
 
 
@@ -431,7 +416,8 @@ class Results:
 
     def __init__(self, options: Options):
         self.path = options.work / "results.json"
-        self.setup = f"{describe(options)} {options.repeats} repetitions, {options.num_rollouts} rollouts"
+        size = f"Repetitions: {options.repeats}. Rollouts: {options.num_rollouts}, of the public code {options.public_rollouts} timed"
+        self.setup = f"{describe(options)} {size}. Demo: {'whole' if options.full_demo else 'at its smallest'}"
         kept = json.loads(self.path.read_text()) if self.path.exists() else {}
         self.samples: dict[str, Samples] = kept.get(self.setup, {})
         self.others = {setup: samples for setup, samples in kept.items() if setup != self.setup}

@@ -23,7 +23,6 @@ CONTEXT_RADIUS_M = 150.0
 """In updates a step of an agent farther from the ego than this is taken as not logged, by both sides."""
 SCENARIOS = {"637f20cafde22ff8": "A", "ee519cf571686d19": "B"}
 WEIGHTS_SEED = 1003
-BASE_EPOCHS = 2.0
 NUM_EVALUATED = 8
 CURRENT_STEP, STEPS_PER_DECISION, NUM_DECISIONS = 10, 5, 16
 
@@ -163,23 +162,18 @@ def tiny(job: Job) -> Any:
     return SmartPolicy.from_pretrained(Path(job.inputs) / "tiny").to(job.device)
 
 
-def data_folder(job: Job) -> Path:
-    from rlftsim.scenario.synthetic import pack_path
-
-    return pack_path() if job.data == "synthetic" else Path(job.inputs) / "real"
-
-
 def finetune(job: Job) -> Repeat:
     """An update of the demo's recipe: simulate, reward, score, step."""
     from rlftsim.policies.smart.policy import SmartPolicy
     from rlftsim.recipes.smart import smart_demo_rlftsim
     from rlftsim.scenario.dataset import ScenarioDataset
+    from rlftsim.scenario.synthetic import pack_path
     from rlftsim.training.finetune import prepare, update_policy
     from rlftsim.training.parallel import DeviceConfig, start_fabric
 
     config = replace(smart_demo_rlftsim().finetune, device=DeviceConfig(job.device, threads=1))
-    policy = SmartPolicy.from_pretrained(Path(job.inputs) / f"base_{job.data}" / "run" / "model")
-    dataset = ScenarioDataset(data_folder(job), "training")
+    policy = SmartPolicy.from_pretrained(Path(job.inputs) / "base" / "model")
+    dataset = ScenarioDataset(pack_path() if job.data == "synthetic" else Path(job.inputs) / "real", "training")
     fabric = start_fabric(config.device)
     scenarios = [dataset[i] for i in range(config.batch_size)]
     learner = prepare(policy, config, fabric.device)
@@ -368,18 +362,19 @@ def prepare_tiny(job: Job) -> None:
 
 
 def prepare_base(job: Job) -> None:
-    """The demo's vocabulary and base model on a data set, trained for fewer passes than in the demo."""
+    """The demo's vocabulary and base model, as `rlftsim demo` makes them."""
     import torch
 
     from rlftsim.experiments.stages import find_vocabulary, open_training
     from rlftsim.policies.smart.policy import SmartPolicy
     from rlftsim.recipes.smart import smart_demo_rlftsim
+    from rlftsim.scenario.synthetic import pack_path
     from rlftsim.training.pretrain import pretrain
 
-    recipe, training, out = smart_demo_rlftsim(), open_training(data_folder(job)), Path(job.inputs) / f"base_{job.data}"
+    recipe, training, out = smart_demo_rlftsim(), open_training(pack_path()), Path(job.inputs) / "base"
     vocabulary = find_vocabulary(training, recipe.tokens, out / "vocabulary.safetensors", origin="benchmarks/speed.py")
     torch.manual_seed(recipe.pretrain.seed)
-    pretrain(SmartPolicy(recipe.model, vocabulary), training, out / "run", replace(recipe.pretrain, epochs=BASE_EPOCHS))
+    pretrain(SmartPolicy(recipe.model, vocabulary), training, out, recipe.pretrain)
 
 
 def prepare_evaluated(job: Job) -> None:
