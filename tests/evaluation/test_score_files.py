@@ -111,10 +111,11 @@ def test_other_rollouts_under_the_same_name_are_scored_again(data, rollouts, tmp
     assert not same(first, second)
 
 
-def test_json_has_the_official_names_and_nothing_else(data, rollouts):
+def test_json_has_the_official_names_and_where_the_data_come_from(data, rollouts):
     result = score_rollouts(rollouts, data, None, CONFIG)
     values = to_json(result)
-    assert list(values) == ["metric", "scenarios", "mean", "standard_error"]
+    assert list(values) == ["metric", "sources", "guessed", "scenarios", "mean", "standard_error"]
+    assert (values["sources"], values["guessed"]) == (["unknown"], [])
     assert values["metric"] == "2025"
     row, fields = values["scenarios"][0], values["mean"]
     assert row.keys() == {"scenario_id", *fields}
