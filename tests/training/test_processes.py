@@ -17,12 +17,14 @@ import rlftsim
 import tiny
 from rlftsim.cli.main import main
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.scenario.dataset import write_dataset
+from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
+from rlftsim.scenario.synthetic import pack_path
 from rlftsim.training import finetune as finetune_module
 from rlftsim.training import imitation as imitation_module
 from rlftsim.training import parallel
 from rlftsim.training.parallel import DeviceConfig, all_reduce_sum
 from rlftsim.training.processes import in_processes
+from rlftsim.training.run import TrainingRun
 from rlftsim.training.run_folder import read_metrics
 
 TWO = replace(tiny.CPU, processes=2)
@@ -184,6 +186,47 @@ def test_processes_share_the_scenarios_in_memory(vocabulary, drawn_scenarios, tm
     train("finetune", vocabulary, drawn_scenarios, tmp_path / "one", tiny.CPU, **changes)
     train("finetune", vocabulary, drawn_scenarios, tmp_path / "two", TWO, **changes)
     assert sizes == [2, 2, 1, 1]  # of the two processes this one is seen
+
+
+def test_processes_share_out_the_cache_of_scenarios(vocabulary, tmp_path):
+    def caches(size):
+        data = ScenarioDataset(pack_path(), "training", cache_size=size)
+        run_in = lambda fabric: TrainingRun(tiny.tiny_policy(vocabulary), data, tmp_path, tiny.PRETRAIN, fabric)  # noqa: E731
+        return in_processes(run_in, TWO).scenarios.cache_size, in_processes(run_in, TWO).scenarios is data
+
+    assert caches(100) == (50, False)  # of 160
+    assert caches(400) == (400, True)  # each may keep all, and those at hand stay
+
+
+SCRIPT = """
+import sys
+sys.path += {path!r}
+import tiny
+from dataclasses import replace
+from pathlib import Path
+from rlftsim.rewards import register_reward
+from rlftsim.training.processes import in_processes
+
+@register_reward("of_this_script")
+def of_this_script(realism, rollouts, batch):
+    return realism.single_meta_metric
+
+scenarios = tiny.pack_scenarios(2)
+policy = tiny.tiny_policy(tiny.small_vocabulary(scenarios))
+tiny.train("finetune", policy, scenarios, Path({out!r}), reward="of_this_script", batch_size=2, epochs=1.0,
+           device=replace(tiny.CPU, processes=2))
+print("trained once")
+"""
+
+
+@pytest.mark.slow
+def test_a_plain_script_trains_in_processes_with_what_it_defines(tmp_path):
+    # No main guard, no file even: as a notebook or `python -c`.
+    script = SCRIPT.format(path=[str(Path(rlftsim.__file__).parents[1]), *sys.path], out=str(tmp_path))
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert done.stdout == "trained once\n"
+    assert json.loads((tmp_path / "config.json").read_text())["device"]["processes"] == 2
 
 
 # ---- ends ------------------------------------------------------------------------------------------------------------

@@ -167,13 +167,6 @@ def assert_same_gradients(first: Path, second: Path):
 
 
 @pytest.mark.slow
-def test_two_processes_find_the_gradient_of_one(tmp_path):
-    for processes in (1, 2):
-        train_in_processes("everything", tmp_path / str(processes), processes, batch_size=5)
-    assert_same_gradients(tmp_path / "1", tmp_path / "2")
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("stage", ["pretrain", "catk"])
 def test_torchrun_finds_the_gradient_of_one_process(stage, tmp_path):
     costs = scenario_costs(tiny.pack_scenarios())

@@ -20,11 +20,12 @@ from torch.optim import Optimizer
 from rlftsim.errors import ConfigError
 from rlftsim.progress import log, progress_bar
 from rlftsim.scenario.batch import ScenarioBatch
+from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.types import Scenario, Scenarios
 from rlftsim.training.batches import scenario_costs
 from rlftsim.training.checkpoint import Progress, newest_checkpoint, read_checkpoint, write_checkpoint
 from rlftsim.training.data import batch_with_futures, scenarios_of_update
-from rlftsim.training.parallel import DeviceConfig, Fabric, local_indices
+from rlftsim.training.parallel import DeviceConfig, Fabric, local_indices, num_sharing_memory
 from rlftsim.training.processes import in_processes
 from rlftsim.training.run_folder import RunFolder, describe_inputs, flatten, stored_settings
 
@@ -187,6 +188,13 @@ def train_in_processes(
     return in_processes(partial(train, replace(config, device=device)), device)
 
 
+def _with_shared_cache(scenarios: Scenarios, sharing: int) -> Scenarios:
+    """Scenarios of which each process keeps its part in memory, where it cannot keep all."""
+    if sharing == 1 or not isinstance(scenarios, ScenarioDataset) or len(scenarios) * sharing <= scenarios.cache_size:
+        return scenarios
+    return ScenarioDataset(scenarios.folder, scenarios.split, cache_size=max(scenarios.cache_size // sharing, 1))
+
+
 class TrainingRun:
     """A run in a folder, new or resumed.
 
@@ -216,7 +224,7 @@ class TrainingRun:
         skip_rule: str = "their gradients are not finite",
         remedy: str = "lower learning_rate",
     ):
-        self.scenarios = scenarios
+        self.scenarios = _with_shared_cache(scenarios, num_sharing_memory(fabric))
         self.total = config.num_updates(len(scenarios))
         # The identity of the run: another policy, data set or order of scenarios is refused.
         described = {**describe_inputs(policy, scenarios), **(inputs or {})}
