@@ -1,14 +1,16 @@
-"""The speed table: time, page faults and memory of training, rollouts, metric, demo and evaluation, beside an older version and the public code.
+"""The speed table: training, rollouts, metric, demo and evaluation, beside an older version and the public code.
 
-    python benchmarks/speed.py WORK --shared ../shared --old CHECKOUT --womd FOLDER --catk CHECKOUT --catk-python VENV/bin/python \\
-        --official VENV/bin/python --out benchmarks/speed_cpu_DATE.md
+    python benchmarks/speed.py WORK --shared ../shared --old CHECKOUT --womd FOLDER \\
+        --catk CHECKOUT --catk-python VENV/bin/python --official VENV/bin/python \\
+        --out benchmarks/speed_cpu_DATE.md
 
-Prints Markdown, each row when it is done; `--rows finetune rollouts` picks some. Results are kept in WORK, so the same command continues where
-it was stopped. What is left out (no older version, no public code, no real scenarios) leaves its cells or rows empty.
+Prints Markdown, each row when it is done; `--rows finetune rollouts` picks some. Results are kept in WORK, so the same
+command continues where it was stopped. What is not there (an older version, the public code, real scenarios, a GPU)
+leaves cells or rows empty.
 
-Every number comes from a process of its own with one thread (`speed_jobs.py`, `speed_public.py`). The processes of a row take turns, one
-repetition each. CHECKOUT of the older version is a git worktree, FOLDER holds real scenarios as WOMD tfrecords in training/ and validation/, the
-public code (NVlabs/catk) and the official evaluator run in environments of their own.
+Every number comes from a process of its own with one thread (`speed_jobs.py`, `speed_public.py`). The processes of a
+row take turns, one repetition each. The older version is a git worktree. FOLDER holds real scenarios as WOMD tfrecords
+in training/ and validation/. The public code (NVlabs/catk) and the official evaluator run in environments of their own.
 """
 
 import functools
@@ -231,7 +233,7 @@ def official_evaluator(options: Options, scenarios: Path, rollouts: Path) -> Num
 
 
 def evaluation(options: Options) -> Samples:
-    """A whole evaluation of real scenarios from prepared files to the scores: CPU time of all processes, start-up included."""
+    """A whole evaluation of real scenarios, from prepared files to the scores."""
     import pyarrow.parquet
 
     samples: Samples = {}
@@ -323,7 +325,7 @@ MEASUREMENTS = (
 
 
 def prepare(options: Options, rows: Sequence[Row]) -> None:
-    """Inputs that these rows need; made by the older version, because the newer one reads its files and not the other way round."""
+    """Make the inputs of these rows, by the older version, whose files the newer one reads."""
     side: Side = "old" if options.old else "new"
 
     def once(name: str, make: Callable[[], None]) -> None:
@@ -353,36 +355,49 @@ def prepare(options: Options, rows: Sequence[Row]) -> None:
 # ---- the report ----------------------------------------------------------------------------------------------------------
 
 HEADER = "| measurement | | public | old | new | old ÷ new | public ÷ new |\n|---|---|--:|--:|--:|--:|--:|"
-NOTES = f"""- Median (least to greatest) of the repetitions. The processes of a row take turns, so a ratio is of neighbors in time, and the median of those.
-- CPU time: user and system of the process, one thread, after a repetition that is not counted. Page faults are those of a repetition, memory is the peak
-  of the resident set of the whole process. Scenarios are as fresh from a file each time: tokens and the metric's own part of a scenario are made anew.
-- `A` is scenario 637f20cafde22ff8 (50 agents), `B` is ee519cf571686d19 (84 agents). SMART-tiny has the weights of the golden numbers, which are random, so its
-  agents never stand still. In "held as logged" an agent keeps its pose wherever it moves less than 5 cm in the half second of a decision in the log, on all sides.
-- The public code makes rollouts one after the other and encodes the map anew in each; a few were timed and all extrapolated. Where torch-cluster is not
-  installed, an exact search stands in for it (`speed_public.py`). Before it is timed it is compared with its golden numbers.
-- The fine-tuning updates begin with the demo's base model, also on real scenarios; the scenarios are the first four of the training split.
-- "slowest process": CPU seconds of the process that used most, in each stage, start-up included; `rlftsim demo --quick` unless it says otherwise.
-- The evaluation reads prepared files on both sides (a data set, pickles) and is the CPU time of whole processes; {NUM_EVALUATED} scenarios, one run.
+NOTES = f"""- Median (least to greatest) of the repetitions. The processes of a row take turns, one repetition each, and a ratio
+  is that of a turn, again median (least to greatest).
+- CPU time: user and system, one thread, after a repetition that is not counted. Page faults are those of a repetition,
+  memory is the peak of the process. Each repetition gets its scenarios as from a file, so tokens and the scenario's own
+  part of the metric are computed anew.
+- `A` is scenario 637f20cafde22ff8 (50 agents), `B` is ee519cf571686d19 (84 agents). SMART-tiny has the weights of the
+  golden numbers, which are random, so its agents never stand still. "Held as logged": on all sides an agent keeps its
+  pose in each decision in whose half second it moves less than 5 cm in the log.
+- The public code makes rollouts one after the other and encodes the map anew in each; a few are timed and all are
+  extrapolated. Where torch-cluster is not installed, an exact search stands in for it. The row "as it is timed" compares
+  it with its golden numbers.
+- The fine-tuning updates begin with the demo's base model, also on real scenarios; the scenarios are the first four of
+  the training split.
+- Demo: CPU seconds of the process that used most in each stage, start-up included, and their sum.
+- Evaluation: from prepared files (a data set, pickles) to the scores, the CPU time of whole processes, start-up
+  included; {NUM_EVALUATED} scenarios, one run.
 """
 
 
-def describe(options: Options) -> str:
-    """Date, hardware and versions."""
+def describe_machine() -> str:
     names = [line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name")]
     model = names[0].partition(":")[2].strip() if names else platform.processor()
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
-    checkouts = {"new": options.checkout("new"), "old": options.old, "public code": options.catk}
-    commits = ", ".join(f"{name} {commit_of(path)}" for name, path in checkouts.items() if path)
     python = f"Python {platform.python_version()}, torch {importlib.metadata.version('torch')}"
-    return f"{os.cpu_count()} cores of {model}, {memory:.0f} GiB, {platform.system()}, {python}. {commits}."
+    return f"{os.cpu_count()} cores of {model}, {memory:.0f} GiB, {platform.system()}, {python}"
 
 
-def commit_of(checkout: Path) -> str:
-    """The last commit that changed the code, and a hash of changes that are not committed."""
-    git, code = ["git", "-C", str(checkout)], ["--", "src", "benchmarks/*.py"]
-    head = subprocess.run([*git, "log", "-1", "--format=%h", *code], capture_output=True, text=True).stdout.strip()
-    changes = subprocess.run([*git, "diff", "HEAD", *code], capture_output=True).stdout
-    return head + (f" with changes {hashlib.sha256(changes).hexdigest()[:8]}" if changes else "")
+def describe_versions(options: Options, revision: str) -> str:
+    """Commits ("HEAD") or hashes of the code ("HEAD:src") of all sides, with those of changes that are not committed."""
+    found = []
+    for name, checkout in (("new", HERE.parent), ("old", options.old), ("public", options.catk)):
+        if checkout:
+            git = ["git", "-C", str(checkout)]
+            head = subprocess.run([*git, "rev-parse", "--short", revision], capture_output=True, text=True).stdout
+            changes = subprocess.run([*git, "diff", "HEAD", "--", "src"], capture_output=True).stdout
+            changed = f" with changes {hashlib.sha256(changes).hexdigest()[:8]}" if changes else ""
+            found.append(f"{name} {head.strip()}{changed}")
+    return ", ".join(found)
+
+
+def describe_size(options: Options) -> str:
+    rollouts = f"{options.num_rollouts} rollouts (of the public code {options.public_rollouts} are timed)"
+    return f"{options.repeats} repetitions, {rollouts}, {'the whole demo' if options.full_demo else 'demo --quick'}"
 
 
 def lines_of(measurement: Measurement, samples: Samples) -> str:
@@ -412,35 +427,34 @@ def spread(values: list[float], form: str) -> str:
 
 
 class Results:
-    """Samples by measurement, kept in a file for one setup."""
+    """Samples by measurement, kept in a file for each machine, code and size."""
 
     def __init__(self, options: Options):
         self.path = options.work / "results.json"
-        size = f"Repetitions: {options.repeats}. Rollouts: {options.num_rollouts}, of the public code {options.public_rollouts} timed"
-        self.setup = f"{describe(options)} {size}. Demo: {'whole' if options.full_demo else 'at its smallest'}"
-        kept = json.loads(self.path.read_text()) if self.path.exists() else {}
-        self.samples: dict[str, Samples] = kept.get(self.setup, {})
-        self.others = {setup: samples for setup, samples in kept.items() if setup != self.setup}
+        self.key = f"{describe_machine()}; {describe_versions(options, 'HEAD:src')}; {describe_size(options)}"
+        self.kept: dict[str, dict[str, Samples]] = json.loads(self.path.read_text()) if self.path.exists() else {}
 
     def of(self, measurement: Measurement, options: Options) -> Samples:
-        if measurement.name not in self.samples:
-            self.samples[measurement.name] = measurement.measure(options)
-            self.path.write_text(json.dumps(self.others | {self.setup: self.samples}, indent=1) + "\n")
-        return self.samples[measurement.name]
+        samples = self.kept.setdefault(self.key, {})
+        if measurement.name not in samples:
+            samples[measurement.name] = measurement.measure(options)
+            self.path.write_text(json.dumps(self.kept, indent=1) + "\n")
+        return samples[measurement.name]
 
 
 def main(options: Options) -> None:
     rows = options.rows or get_args(Row)
     prepare(options, rows)
     results = Results(options)
-    title = f"# Speed, {date.today()}\n\n{results.setup}.\nLoad at the beginning: {os.getloadavg()[0]:.1f}.\n\n{NOTES}\n{HEADER}"
-    print(title, flush=True)
-    table = [title]
+    versions, load = describe_versions(options, "HEAD"), f"load at the beginning {os.getloadavg()[0]:.1f}"
+    setup = f"{describe_machine()}, {load}. Commits: {versions}. {describe_size(options)}.".replace(". ", ".\n")
+    table = [f"# Speed, {date.today()}\n\n{setup}\n\n{NOTES}\n{HEADER}"]
+    print(table[0], flush=True)
     for measurement in MEASUREMENTS:
         if measurement.row in rows:
             missing = measurement.missing(options)
-            lines = f"| {measurement.name} | {missing} | | | | | |"
-            table.append(lines if missing else lines_of(measurement, results.of(measurement, options)))
+            empty = f"| {measurement.name} | {missing} | | | | | |"
+            table.append(empty if missing else lines_of(measurement, results.of(measurement, options)))
             print(table[-1], flush=True)
             if options.out:
                 options.out.write_text("\n".join(table) + "\n")

@@ -1,4 +1,4 @@
-"""The measured work of `speed.py`, one job a process: a line on stdin is one repetition, its numbers are a line of JSON on stdout.
+"""The measured work of `speed.py`, one job a process: a line on stdin is one repetition, a line of JSON its numbers.
 
     PYTHONPATH=CHECKOUT/src python benchmarks/speed_jobs.py '{"task": "rollouts", "inputs": "INPUTS", "scenarios": ["A"]}'
 
@@ -24,7 +24,7 @@ CONTEXT_RADIUS_M = 150.0
 SCENARIOS = {"637f20cafde22ff8": "A", "ee519cf571686d19": "B"}
 WEIGHTS_SEED = 1003
 NUM_EVALUATED = 8
-CURRENT_STEP, STEPS_PER_DECISION, NUM_DECISIONS = 10, 5, 16
+CURRENT_STEP, STEPS_PER_DECISION = 10, 5
 
 Numbers = dict[str, float]
 Repeat = Callable[[], Numbers | None]
@@ -62,7 +62,7 @@ class Job:
         return json.dumps({f.name: v for f in fields(self) if (v := getattr(self, f.name)) != f.default})
 
 
-# ---- the protocol, also of the public code's process ---------------------------------------------------------------------
+# ---- the protocol, also of the public code's process --------------------------------------------------------------
 
 
 def serve(device: str, start: Callable[[], Repeat]) -> None:
@@ -111,9 +111,7 @@ def stands(position: np.ndarray, valid: np.ndarray) -> np.ndarray:
         [A, 16].
     """
     ends = slice(CURRENT_STEP - STEPS_PER_DECISION, None, STEPS_PER_DECISION)
-    moved = np.linalg.norm(
-        np.diff(position[:, ends, :2], axis=1), axis=-1
-    )  # [A, 17], the first before the current step
+    moved = np.linalg.norm(np.diff(position[:, ends, :2], axis=1), axis=-1)  # [A, 17], one up to the current step
     logged = valid[:, ends][:, 1:] & valid[:, ends][:, :-1]
     still = [np.zeros(len(position), bool)]
     for column, known in zip((moved < STILL_M).T, logged.T):
@@ -138,7 +136,7 @@ def start(job: Job) -> Repeat:
 
 
 def fresh(scenarios: list[Any], device: str) -> Any:
-    """A batch of scenarios as they come from a file: what is cached on a scenario, such as its tokens, is computed anew."""
+    """A batch of scenarios as they come from a file: without what is cached on a scenario, such as its tokens."""
     from rlftsim.scenario.batch import collate
 
     return collate([replace(scenario) for scenario in scenarios]).to(device)
@@ -191,7 +189,7 @@ def pretrain(job: Job) -> Repeat:
 
     from rlftsim.training.pretrain import PretrainConfig
 
-    policy, scenarios, config = tiny(job).requires_grad_(True).train(), within_reach(job), PretrainConfig()
+    policy, scenarios, config = tiny(job).requires_grad_(True).train(), near_scenarios(job), PretrainConfig()
     optimizer = torch.optim.AdamW(policy.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay)
 
     def update() -> None:
@@ -215,7 +213,7 @@ def catk(job: Job) -> Repeat:
     from rlftsim.training.closed_loop import predict_along
     from rlftsim.training.freezing import freeze_untrained
 
-    policy, scenarios, config = tiny(job).requires_grad_(True).train(), within_reach(job), CatkConfig()
+    policy, scenarios, config = tiny(job).requires_grad_(True).train(), near_scenarios(job), CatkConfig()
     freeze_untrained(policy, "decoder")
     weights = [p for p in policy.parameters() if p.requires_grad]
     optimizer = torch.optim.AdamW(weights, lr=config.learning_rate, weight_decay=config.weight_decay)
@@ -234,7 +232,8 @@ def catk(job: Job) -> Repeat:
     return update
 
 
-def within_reach(job: Job) -> list[Any]:
+def near_scenarios(job: Job) -> list[Any]:
+    """Scenarios without what is far from the ego, as updates see them."""
     from rlftsim.training.data import within_reach
 
     return [within_reach(scenario, CONTEXT_RADIUS_M) for scenario in records(job)]
@@ -344,7 +343,7 @@ def metric(job: Job) -> Repeat:
 
 
 def prepare_tiny(job: Job) -> None:
-    """SMART-tiny with the weights of the golden numbers, as a model folder and as the public code reads it, and two scenarios."""
+    """Two scenarios, and SMART-tiny with the weights of the golden numbers, for this package and for the public code."""
     import runpy
 
     from safetensors.numpy import save_file

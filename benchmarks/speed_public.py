@@ -2,10 +2,10 @@
 
     PYTHONPATH=src VENV/bin/python benchmarks/speed_public.py '{"task": "rollouts", "checkout": "CHECKOUT", ...}'
 
-Nothing of the public code is here: its modules are imported from the checkout that the job names. The environment needs torch,
-torch-geometric, torchmetrics, omegaconf, pandas, scipy, safetensors and protobuf; TensorFlow, Waymo's package, Lightning and Hydra are not
-needed, because metrics, videos and the training loop are left out. Where torch-cluster is not installed, exact brute-force searches stand in
-for its two functions, and the time inside them is reported.
+Nothing of the public code is here: its modules are imported from the checkout that the job names. The environment needs
+torch, torch-geometric, torchmetrics, omegaconf, pandas, scipy, safetensors and protobuf. TensorFlow, Waymo's package,
+Lightning and Hydra are not needed, because metrics, videos and the training loop are left out. Where torch-cluster is
+not installed, exact brute-force searches stand in for its two functions, and their share of the time is reported.
 """
 
 import pickle
