@@ -4,13 +4,21 @@ Everything here needs the official material.
 """
 
 import json
-from dataclasses import dataclass
+import runpy
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from public_names import SMALL, golden_scene, our_weights
+from safetensors.numpy import load_file
 
+from rlftsim.policies.trafficbots.config import TrafficBotsConfig
+from rlftsim.policies.trafficbots.policy import TrafficBotsPolicy
+from rlftsim.policies.trafficbots.scene import Scene
 from rlftsim.scenario.types import Scenario
 from rlftsim.scenario.womd import read_scenarios
 
@@ -45,3 +53,34 @@ def records(shared):
         return next(iter(read_scenarios(shared / "data" / "womd" / FILES[name])))
 
     return read
+
+
+@pytest.fixture(scope="session")
+def scene(golden) -> Callable[..., Scene]:
+    """Scene "A" or "B" of the golden inputs, with its history or the whole log."""
+    return cache(lambda name, prefix="hist": golden_scene(golden.arrays(f"scenario_{name}/inputs"), prefix))
+
+
+@pytest.fixture(scope="session")
+def small(golden) -> TrafficBotsPolicy:
+    """The public code's `small` with the golden weights. Not to be changed: copy it."""
+    policy = TrafficBotsPolicy(replace(SMALL, steps_per_pass=20)).eval()
+    policy.network.load_state_dict(our_weights(load_file(golden.folder / "small_seed1003.safetensors")))
+    return policy
+
+
+@pytest.fixture(scope="session")
+def default(golden) -> TrafficBotsPolicy:
+    """The public code's default; its weights are drawn by the golden files' recipe."""
+    recipe = runpy.run_path(str(golden.folder / "make_weights.py"))
+    shapes = json.loads((golden.folder / "parameter_shapes.json").read_text())["default"]
+    policy = TrafficBotsPolicy(TrafficBotsConfig()).eval()
+    policy.network.load_state_dict(our_weights(recipe["make_weights"](shapes, "default", 1003)))
+    return policy
+
+
+@pytest.fixture(autouse=True)
+def _without_gradients_unless_asked():
+    """Nothing here needs gradients but the tests that switch them on."""
+    with torch.no_grad():
+        yield
