@@ -79,8 +79,8 @@ def default(golden) -> TrafficBotsPolicy:
     return policy
 
 
-@pytest.fixture(autouse=True)
-def _without_gradients_unless_asked():
-    """Nothing here needs gradients but the tests that switch them on."""
+@pytest.fixture
+def without_gradients():
+    """No gradients, but where a test switches them on."""
     with torch.no_grad():
         yield

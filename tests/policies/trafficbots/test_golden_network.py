@@ -15,7 +15,7 @@ from rlftsim.policies.trafficbots.poses import Neighbors, find_neighbors, pose_e
 from rlftsim.rollout.policy import Sampling
 
 both = pytest.mark.parametrize("name", ["A", "B"])
-pytestmark = pytest.mark.official
+pytestmark = [pytest.mark.official, pytest.mark.usefixtures("without_gradients")]
 
 FEATURE, LOG_PROB, ACTION, POSE_M = 1e-5, 3e-5, 1e-6, 5e-3
 

@@ -8,7 +8,7 @@ from public_names import UNUSED, our_name
 from rlftsim.policies.trafficbots.dynamics import max_action, move
 from rlftsim.policies.trafficbots.imitation import TrainingDraws, imitation_terms, loss_of_scene, personality_kl
 
-pytestmark = pytest.mark.official
+pytestmark = [pytest.mark.official, pytest.mark.usefixtures("without_gradients")]
 TERMS = ("imitation", "personality", "destination", "light")
 
 
