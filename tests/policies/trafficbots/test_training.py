@@ -70,6 +70,15 @@ def test_the_gradient_does_not_depend_on_the_number_of_decisions_in_memory(scena
     assert norms[0] == pytest.approx(norms[1], rel=1e-5)
 
 
+def test_mixed_precision_gives_nearly_the_same_loss(scenarios, tmp_path):
+    losses = []
+    for precision in ("32-true", "bf16-mixed"):
+        config = replace(PRETRAIN, epochs=1.0, device=replace(tiny.CPU, precision=precision))
+        pretrain(new_policy(dropout=0.0), scenarios, tmp_path / precision, config)
+        losses.append(read_metrics(tmp_path / precision)[0]["loss"])
+    assert losses[0] == pytest.approx(losses[1], rel=0.05)
+
+
 def test_rewards_train_what_decides_and_nothing_that_draws(scenarios, tmp_path):
     policy = new_policy()
     before = weights_of(policy)
