@@ -187,7 +187,7 @@ def test_the_text_of_a_recipe_has_every_field_and_its_documentation():
 def test_recipes_are_listed_with_a_summary_each(capsys):
     assert main(["recipe"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    ours = ["smart-demo", "smart-mini", "smart-nano", "smart-tiny", "synthetic", "trafficbots-demo", "trafficbots-v15"]
+    ours = ["smart-demo", "smart-mini", "smart-nano", "smart-tiny", "synthetic", "trafficbots", "trafficbots-demo"]
     assert [line.split()[0] for line in lines] == ours
     assert all(len(line.split()) > 2 for line in lines)
 

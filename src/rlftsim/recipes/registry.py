@@ -100,7 +100,7 @@ RECIPES: ExtensionPoint[Callable[[], Recipe]] = ExtensionPoint(
         "smart-nano": "rlftsim.recipes.smart:smart_nano_rlftsim",
         "smart-demo": "rlftsim.recipes.smart:smart_demo_rlftsim",
         "synthetic": "rlftsim.recipes.smart:smart_synthetic",
-        "trafficbots-v15": "rlftsim.recipes.trafficbots:trafficbots_v15_rlftsim",
+        "trafficbots": "rlftsim.recipes.trafficbots:trafficbots_v15_rlftsim",
         "trafficbots-demo": "rlftsim.recipes.trafficbots:trafficbots_demo_rlftsim",
     },
 )

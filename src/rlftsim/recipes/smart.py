@@ -35,7 +35,7 @@ class SmartRecipe(Recipe):
     @property
     def counterpart(self) -> str:
         """TrafficBots, in the small size for SMART models of fewer than 128 numbers a feature."""
-        return "trafficbots-v15" if self.model.dim >= 128 else "trafficbots-demo"
+        return "trafficbots" if self.model.dim >= 128 else "trafficbots-demo"
 
     def new_policy(self, vocabulary: Vocabulary | None) -> SmartPolicy:
         """A SMART policy with fresh weights, drawn with the seed of pre-training.

@@ -96,7 +96,7 @@ def test_goals_are_refused_in_words(scenarios, tmp_path):
         finetune(new_policy(), scenarios, tmp_path, config)
 
 
-@pytest.mark.parametrize("name", ["trafficbots-v15", "trafficbots-demo"])
+@pytest.mark.parametrize("name", ["trafficbots", "trafficbots-demo"])
 def test_recipes_make_their_policy_and_name_a_counterpart(name):
     recipe = recipe_by_name(name)
     policy = recipe.new_policy(None)
