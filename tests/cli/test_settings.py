@@ -187,8 +187,8 @@ def test_the_text_of_a_recipe_has_every_field_and_its_documentation():
 def test_recipes_are_listed_with_a_summary_each(capsys):
     assert main(["recipe"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    names = ["smart-demo", "smart-demo-long", "smart-mini", "smart-nano", "smart-tiny", "synthetic"]
-    assert [line.split()[0] for line in lines] == names
+    smart = ["smart-demo", "smart-demo-long", "smart-mini", "smart-nano", "smart-tiny"]
+    assert [line.split()[0] for line in lines] == [*smart, "synthetic", "trafficbots", "trafficbots-demo"]
     assert all(len(line.split()) > 2 for line in lines)
 
 

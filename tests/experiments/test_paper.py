@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from rlftsim.experiments.paper import (
     benchmark,
     credit,
     finetune_curve,
+    model_agnosticism,
     oracle,
     paired_ttest,
     qualitative,
@@ -28,6 +30,7 @@ from rlftsim.experiments.results import ExperimentResult, finite_or_none
 from rlftsim.experiments.rows import mean_of_seeds
 from rlftsim.experiments.stage_progress import StageProgress
 from rlftsim.experiments.suite import ExperimentSuite
+from rlftsim.recipes.registry import Recipe
 from rlftsim.rewards.base import leave_one_out
 from rlftsim.rewards.mloo import compute_mloo
 from rlftsim.scenario.dataset import write_dataset
@@ -83,6 +86,33 @@ def test_the_benchmark_says_how_much_of_the_gap_is_closed(suite):
     assert f"mean +0.1000, 95% interval over seeds [{low:+.4f}, {high:+.4f}]" in " ".join(found.verdicts)
     assert found.tables[1].title.startswith("The paper")
     assert "not comparable" in found.tables[1].note
+
+
+def test_two_architectures_are_in_one_table_with_a_gain_each(suite):
+    measured = {
+        "constant velocity": row("constant velocity", around(-0.3, 7)),
+        "SMART, base": row("SMART, base", around(0.0)),
+        "SMART, RLFTSim (MLOO)": row("SMART, RLFTSim (MLOO)", around(0.03, 1), around(0.05, 2)),
+        "TrafficBots V1.5, base": row("TrafficBots V1.5, base", around(-0.1, 3)),
+        "TrafficBots V1.5, RLFTSim (MLOO)": row("TrafficBots V1.5, RLFTSim (MLOO)", around(-0.06, 4)),
+        "TrafficBots V1.5, base, mean actions": row("TrafficBots V1.5, base, mean actions", around(-0.1, 5)),
+        "TrafficBots V1.5, RLFTSim (MLOO), mean actions": row(
+            "TrafficBots V1.5, RLFTSim (MLOO), mean actions", around(-0.05, 6)
+        ),
+    }
+    found = model_agnosticism.summarize(measured, suite)
+    assert len(found.tables[0].rows) == 7
+    assert found.numbers["gain_by_seed"]["SMART, RLFTSim (MLOO)"] == pytest.approx([0.03, 0.05], abs=0.01)
+    assert set(found.numbers["gain_by_seed"]) == {name for name in measured if "RLFTSim" in name}
+    gains = [v for v in found.verdicts if "RLFTSim" in v.partition(" against ")[0] and "for the better: +0.0" in v]
+    assert len(gains) == 3
+    assert "0.7231" in found.tables[1].markdown()
+    assert sum("updates of" in note for note in found.notes) == 2
+
+
+def test_a_recipe_without_a_counterpart_is_refused(suite):
+    with pytest.raises(ConfigError, match="names no recipe of another architecture"):
+        model_agnosticism.suites(replace(suite, recipe=Recipe(), out=suite.out.parent / "plain"))
 
 
 def test_no_gap_gives_no_fraction():

@@ -11,6 +11,7 @@ from rlftsim.plugins import ExtensionPoint
 
 PAPER = (
     *("benchmark", "reward-ablation", "paired-ttest", "variance-scaling", "finetune-curve", "oracle", "credit"),
+    "model-agnosticism",
     *("qualitative", "goal-conditioning", "kinematic-controllability", "maneuver-controllability"),
 )
 """Names of the paper's experiments."""

@@ -1,5 +1,6 @@
-"""A categorical distribution over motion tokens for every agent that decides."""
+"""Distributions of decisions: categorical over motion tokens, Gaussian over continuous actions."""
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -8,6 +9,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from rlftsim.policies.token_rows import TokenRows, row_statistics
+from rlftsim.rollout.baselines import refuse_top_k
 from rlftsim.rollout.policy import DecisionStatistics, Sampling
 
 
@@ -140,3 +142,59 @@ class LazyTokenDistribution(CategoricalDistribution):
             return DecisionStatistics(self.log_prob(decision), self.kl(reference), self.entropy())
         found = row_statistics(self.rows, decision[self.mask], reference.rows)
         return DecisionStatistics(*(self._dense(values) for values in found))
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianDistribution:
+    """Diagonal Gaussians, float32. Elements whose mask is False (padding) decide 0 with probability 1."""
+
+    mean: Float[Tensor, "*batch D"]
+    std: Float[Tensor, "*batch D"]
+    mask: Bool[Tensor, "*batch"]
+
+    @torch.no_grad()
+    def sample(self, sampling: Sampling, noise: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch D"]:
+        """Draws, by the inverse of the cumulative distribution at the noise.
+
+        Args:
+            sampling: temperature, which scales the variance: a density to the power 1/T; 0 = the mean.
+            noise: uniform in [0, 1).
+
+        Raises:
+            ConfigError: `sampling.top_k` is set, and there are no categories.
+        """
+        refuse_top_k(sampling)
+        # The noise is a multiple of 2^-24: kept from 0, where the inverse is infinite, by half of that.
+        drawn = math.sqrt(2 * sampling.temperature) * torch.erfinv(2 * noise.clamp(min=2**-25).double() - 1)
+        return self._masked(self.mean + self.std * drawn.to(self.mean.dtype))
+
+    def log_prob(
+        self,
+        decision: Float[Tensor, "*batch D"],
+        sampling: Sampling = Sampling(),  # noqa: B008
+    ) -> Float[Tensor, "*batch"]:
+        """Log-density under the distribution that `sampling` draws from, summed over the D numbers; 0 at the mode.
+
+        Args:
+            decision: as drawn.
+            sampling: temperature it was drawn with.
+        """
+        refuse_top_k(sampling)
+        if sampling.temperature == 0:
+            return torch.zeros_like(self.mean[..., 0])
+        std = self.std * math.sqrt(sampling.temperature)
+        log_density = -0.5 * ((decision - self.mean) / std).square() - std.log() - 0.5 * math.log(2 * math.pi)
+        return self._masked(log_density).sum(-1)
+
+    def kl(self, other: "GaussianDistribution") -> Float[Tensor, "*batch"]:
+        """KL(self || other), nats."""
+        ratio = (self.std / other.std).square()
+        off = ((self.mean - other.mean) / other.std).square()
+        return self._masked(0.5 * (ratio + off - 1 - ratio.log())).sum(-1)
+
+    def entropy(self) -> Float[Tensor, "*batch"]:
+        """Differential entropy, nats."""
+        return self._masked(self.std.log() + 0.5 * math.log(2 * math.pi * math.e)).sum(-1)
+
+    def _masked(self, values: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch D"]:
+        return torch.where(self.mask[..., None], values, 0.0)

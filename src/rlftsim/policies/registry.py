@@ -27,6 +27,7 @@ POLICIES: ExtensionPoint[Callable[..., Any]] = ExtensionPoint(
     "rlftsim.policies",
     {
         "smart": "rlftsim.policies.smart.policy:SmartPolicy",
+        "trafficbots": "rlftsim.policies.trafficbots.policy:TrafficBotsPolicy",
         "constant_velocity": "rlftsim.rollout.baselines:ConstantVelocity",
     },
 )

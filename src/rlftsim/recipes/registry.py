@@ -46,6 +46,16 @@ class Recipe:
     gcsl: GcslConfig | None = field(default_factory=GcslConfig)
     """None likewise."""
 
+    @property
+    def model_name(self) -> str:
+        """Name of the recipe's models in tables."""
+        return "model"
+
+    @property
+    def counterpart(self) -> str | None:
+        """Name of the recipe of another architecture to compare with, of about the same size; None = there is none."""
+        return None
+
     def new_policy(self, vocabulary: Vocabulary | None) -> nn.Module:
         """A policy with fresh weights, drawn with the seed of pre-training (`torch.manual_seed(self.pretrain.seed)`).
 
@@ -102,6 +112,8 @@ RECIPES: ExtensionPoint[Callable[[], Recipe]] = ExtensionPoint(
         "smart-demo": "rlftsim.recipes.smart:smart_demo_rlftsim",
         "smart-demo-long": "rlftsim.recipes.smart:smart_demo_long",
         "synthetic": "rlftsim.recipes.smart:smart_synthetic",
+        "trafficbots": "rlftsim.recipes.trafficbots:trafficbots_v15_rlftsim",
+        "trafficbots-demo": "rlftsim.recipes.trafficbots:trafficbots_demo_rlftsim",
     },
 )
 

@@ -27,6 +27,16 @@ class SmartRecipe(Recipe):
     tokens: TokensConfig = field(default_factory=TokensConfig)
     model: SmartConfig = field(default_factory=SmartConfig)
 
+    @property
+    def model_name(self) -> str:
+        """SMART."""
+        return "SMART"
+
+    @property
+    def counterpart(self) -> str:
+        """TrafficBots, in the small size for SMART models of fewer than 128 numbers a feature."""
+        return "trafficbots" if self.model.dim >= 128 else "trafficbots-demo"
+
     def new_policy(self, vocabulary: Vocabulary | None) -> SmartPolicy:
         """A SMART policy with fresh weights, drawn with the seed of pre-training.
 

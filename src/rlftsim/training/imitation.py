@@ -65,6 +65,8 @@ class ImitationConfig:
     """Updates over which the learning rate rises linearly."""
     goal_learning_rate_scale: float = 1.0
     """Learning rate of the goal encoder, if there is one, over that of all other weights."""
+    betas: tuple[float, float] = (0.9, 0.999)
+    """Decay rates of Adam's moments; None = 0.9 and 0.999."""
     weight_decay: float = 0.01
     """Decoupled, as in AdamW."""
     gradient_clip: float = 0.5
@@ -105,6 +107,8 @@ class ImitationConfig:
         require_positive(self, ("epochs", *sizes, *rates, *given(self, ("micro_batch_cost", "context_radius_m"))))
         require_not_negative(self, ("warmup_updates", "weight_decay", *given(self, ("max_trained_agents",))))
         require_finite(self, ("epochs", "learning_rate", "weight_decay"))
+        if not all(0 <= beta < 1 for beta in self.betas):
+            raise ConfigError(f"betas are decay rates in [0, 1), got {self.betas}.")
         if not 0 <= self.final_lr_ratio <= 1:
             raise ConfigError(f"final_lr_ratio is a fraction in [0, 1], got {self.final_lr_ratio}.")
         if not 0 <= self.mirror_probability <= 1:
@@ -220,7 +224,9 @@ def _imitate(
     groups = parameter_groups(model, config.goal_learning_rate_scale)
     learner = _Imitator(
         policy=model,
-        optimizer=torch.optim.AdamW(groups, lr=config.learning_rate, weight_decay=config.weight_decay, fused=True),
+        optimizer=torch.optim.AdamW(
+            groups, lr=config.learning_rate, betas=config.betas, weight_decay=config.weight_decay, fused=True
+        ),
         run=run,
         predict=predict,
         config=config,

@@ -25,6 +25,15 @@ BENCHMARK = _table(
     """,
     "Private test split, traffic light likelihood 1.",
 )
+AGNOSTICISM = _table(
+    "another architecture, TrafficBots V1.5",
+    SCORES,
+    """
+    TrafficBots V1.5, their reference model | 0.7174 | 0.4271 | 0.7317 | 0.8650
+    RLFTSim | 0.7231 | 0.4321 | 0.7377 | 0.8704
+    """,
+    "20 % of validation; this model has continuous actions and was pre-trained for one epoch.",
+)
 REWARDS = _table(
     "rewards (Tab. 2)",
     (*SCORES, "minADE [m] ↓"),

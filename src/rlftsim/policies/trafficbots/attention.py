@@ -1,0 +1,220 @@
+"""Attention to the K nearest tokens with relative poses (KNARPE), and the layers made of it.
+
+out_i = W_o sum_j a_ij (v_j + W_v e_ij),  a_ij = softmax_j(q_i (k_j + W_k e_ij) / sqrt(d))
+
+for the neighbors j of token i, whose pose in its frame has the embedding e_ij. Source: Zhang et al., "Real-Time Motion
+Prediction via Heterogeneous Polyline Transformer with Relative Pose Encoding", NeurIPS 2023.
+
+Shapes: S queries, M targets, K neighbors, H heads of width d, D = H d, E width of an embedding. `*g` are leading axes
+of the queries; those of the targets, `*h`, are the first ones of `*g`.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import cast
+
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor, nn
+from torch.nn import functional
+
+from rlftsim.policies.trafficbots.poses import Neighbors
+
+
+@dataclass(frozen=True, eq=False)
+class KeyValues:
+    """Projected targets, computed once for all queries that look at them."""
+
+    keys: Float[Tensor, "*h H M d"]
+    values: Float[Tensor, "*h H M d"]
+
+    def steps(self, start: int, stop: int) -> "KeyValues":
+        """Those of some steps, where the second axis is time."""
+        return KeyValues(self.keys[:, start:stop], self.values[:, start:stop])
+
+
+class PoseAttention(nn.Module):
+    """Multi-head attention to neighbors, whose relative poses add to keys and values."""
+
+    def __init__(self, dim: int, num_heads: int, dropout: float):
+        super().__init__()
+        self.num_heads = num_heads
+        self.query = nn.Linear(dim, dim)
+        self.key_value = nn.Linear(dim, 2 * dim)
+        self.relation = nn.Linear(dim, 2 * dim)
+        self.out = nn.Linear(dim, dim)
+        self.dropout = nn.Dropout(dropout)
+        # One matrix of 3 D rows would be drawn from a narrower range than its parts.
+        bound = math.sqrt(6 / (4 * dim))
+        for part in (self.query, self.key_value):
+            nn.init.uniform_(part.weight, -bound, bound)
+        nn.init.xavier_uniform_(self.out.weight)
+        for part in (self.query, self.key_value, self.out):
+            nn.init.zeros_(part.bias)
+
+    def project(self, targets: Float[Tensor, "*h M D"]) -> KeyValues:
+        """Keys and values of targets."""
+        split = self.key_value(targets).unflatten(-1, (2, self.num_heads, -1))  # [*h, M, 2, H, d]
+        keys, values = split.unbind(-3)
+        return KeyValues(keys.transpose(-2, -3), values.transpose(-2, -3))
+
+    def forward(
+        self, queries: Float[Tensor, "*g S D"], kinds: Sequence[tuple[KeyValues, Neighbors]]
+    ) -> Float[Tensor, "*g S D"]:
+        """Attention to neighbors of one or several kinds, in one softmax; 0 for a query without neighbors.
+
+        Args:
+            queries: normalized features.
+            kinds: targets of each kind, and the queries' neighbors among them.
+        """
+        heads, rows = self.num_heads, queries.shape[:-1]  # rows = [*g, S]
+        query = self.query(queries).unflatten(-1, (heads, -1)) / math.sqrt(queries.shape[-1] // heads)
+        key_relation, value_relation = self.relation.weight.unflatten(0, (2, heads, -1))  # [H, d, E] each
+        # Embeddings are never projected: q (W e) = (W^T q) e. The bias of W_k drops out of the softmax.
+        pose_query = torch.einsum("...hd,hde->...he", query, key_relation)  # [*g, S, H, E]
+        logits = []
+        for targets, neighbors in kinds:
+            # All pairs by one matrix product are cheaper than copies of each neighbor's key.
+            dense = _merge_rows(query, targets.keys) @ targets.keys.transpose(-1, -2)  # [*h, H, R, M]
+            chosen = dense.gather(-1, _merged_index(neighbors.index, dense))  # [*h, H, R, K]
+            content = chosen.transpose(-2, -3).reshape(*rows, heads, -1)  # [*g, S, H, K]
+            pose = pose_query @ neighbors.embedding.transpose(-1, -2)
+            logits.append((content + pose).masked_fill(~neighbors.valid[..., None, :], -torch.inf))
+        joined = torch.cat(logits, -1)  # [*g, S, H, all K]
+        is_alone = joined.isneginf().all(-1, keepdim=True)
+        weights = self.dropout(torch.softmax(joined.masked_fill(is_alone, 0.0), -1))
+        parts = weights.split([part.shape[-1] for part in logits], -1)
+        out = weights.sum(-1, keepdim=True) * self.relation.bias.unflatten(0, (2, heads, -1))[1]  # [*g, S, H, d]
+        for part, (targets, neighbors) in zip(parts, kinds):
+            pose_value = part @ neighbors.embedding.to(part.dtype)  # [*g, S, H, E]
+            out = out + torch.einsum("...he,hde->...hd", pose_value, value_relation)
+            merged = part.reshape(*targets.keys.shape[:-3], -1, heads, part.shape[-1]).transpose(-2, -3)
+            dense = merged.new_zeros(*merged.shape[:-1], targets.keys.shape[-2])
+            dense = dense.scatter(-1, _merged_index(neighbors.index, dense), merged)  # [*h, H, R, M]
+            out = out + (dense @ targets.values.to(dense.dtype)).transpose(-2, -3).reshape(out.shape)
+        out = self.out(out.masked_fill(is_alone, 0.0).flatten(-2))
+        return out.masked_fill(is_alone[..., 0, :], 0.0)
+
+
+def _merge_rows(query: Float[Tensor, "*g S H d"], keys: Float[Tensor, "*h H M d"]) -> Float[Tensor, "*h H R d"]:
+    """Queries with all axes that the keys do not have merged into one."""
+    return query.reshape(*keys.shape[:-3], -1, *query.shape[-2:]).transpose(-2, -3)
+
+
+def _merged_index(index: Int64[Tensor, "*g S K"], dense: Float[Tensor, "*h H R M"]) -> Int64[Tensor, "*h H R K"]:
+    """Neighbors of merged rows, without copies for the heads."""
+    *lead, heads, rows, _ = dense.shape
+    return index.reshape(*lead, 1, rows, index.shape[-1]).expand(*lead, heads, rows, index.shape[-1])
+
+
+class FeedForward(nn.Module):
+    """Two linear layers with ReLU between, pre-normalized, with residual."""
+
+    def __init__(self, dim: int, dropout: float):
+        super().__init__()
+        self.norm = nn.LayerNorm(dim)
+        self.wide = nn.Linear(dim, 4 * dim)
+        self.narrow = nn.Linear(4 * dim, dim)
+        self.dropout = nn.Dropout(dropout)
+
+    def forward(self, x: Float[Tensor, "*g D"]) -> Float[Tensor, "*g D"]:
+        """Features of the same tokens."""
+        hidden = self.dropout(functional.relu(self.wide(self.norm(x))))
+        return x + self.dropout(self.narrow(hidden))
+
+
+class SelfLayer(nn.Module):
+    """Tokens attend to neighbors of their own kind."""
+
+    def __init__(self, dim: int, num_heads: int, dropout: float):
+        super().__init__()
+        self.norm = nn.LayerNorm(dim)
+        self.attention = PoseAttention(dim, num_heads, dropout)
+        self.dropout = nn.Dropout(dropout)
+        self.feed_forward = FeedForward(dim, dropout)
+
+    def forward(
+        self, x: Float[Tensor, "*g S D"], mask: Bool[Tensor, "*g S"], neighbors: Neighbors
+    ) -> Float[Tensor, "*g S D"]:
+        """Features after the layer, 0 for tokens that do not exist.
+
+        Args:
+            x: features.
+            mask: True = the token exists.
+            neighbors: of each token.
+        """
+        normal = self.norm(x)
+        x = x + self.dropout(self.attention(normal, [(self.attention.project(normal), neighbors)]))
+        return torch.where(mask[..., None], self.feed_forward(x), 0.0)
+
+
+class DecoderLayer(nn.Module):
+    """Tokens attend to neighbors of their own kind, then to neighbors of other kinds."""
+
+    def __init__(self, dim: int, num_heads: int, dropout: float):
+        super().__init__()
+        self.own_norm = nn.LayerNorm(dim)
+        self.own_attention = PoseAttention(dim, num_heads, dropout)
+        self.norm = nn.LayerNorm(dim)
+        self.target_norm = nn.LayerNorm(dim)
+        self.attention = PoseAttention(dim, num_heads, dropout)
+        self.dropout = nn.Dropout(dropout)
+        self.feed_forward = FeedForward(dim, dropout)
+
+    def project(self, targets: Float[Tensor, "*h M D"]) -> KeyValues:
+        """Keys and values of tokens of another kind."""
+        return self.attention.project(self.target_norm(targets))
+
+    def forward(
+        self,
+        x: Float[Tensor, "*g S D"],
+        mask: Bool[Tensor, "*g S"],
+        own: Neighbors,
+        others: Sequence[tuple[KeyValues, Neighbors]],
+    ) -> Float[Tensor, "*g S D"]:
+        """Features after the layer, 0 for tokens that do not exist.
+
+        Args:
+            x: features.
+            mask: True = the token exists.
+            own: neighbors of the tokens' own kind.
+            others: of other kinds, with what this layer's `project` made of them.
+        """
+        normal = self.own_norm(x)
+        x = x + self.dropout(self.own_attention(normal, [(self.own_attention.project(normal), own)]))
+        x = x + self.dropout(self.attention(self.norm(x), others))
+        return torch.where(mask[..., None], self.feed_forward(x), 0.0)
+
+
+class PolylineEncoder(nn.Module):
+    """One feature of a sequence: three times, each element sees itself and the maximum over all."""
+
+    def __init__(self, dim: int, dropout: float):
+        super().__init__()
+        self.layers = nn.ModuleList(nn.Linear(dim, dim // 2) for _ in range(3))
+        self.dropout = nn.Dropout(dropout)
+
+    def forward(self, x: Float[Tensor, "*g P D"], mask: Bool[Tensor, "*g P"]) -> Float[Tensor, "*g D"]:
+        """Features of sequences; 0 for those without elements.
+
+        Args:
+            x: features of the elements.
+            mask: True = the element exists.
+        """
+        first, *rest = (cast(nn.Linear, layer) for layer in self.layers)
+        own = self.dropout(functional.relu(first(x)))  # [*g, P, D/2]
+        most = _masked_max(own, mask)
+        for layer in rest:
+            # The linear layer of [own, most] in two parts, so that the second is computed once for a sequence.
+            of_own, of_most = layer.weight.chunk(2, dim=-1)
+            hidden = functional.linear(own, of_own, layer.bias) + functional.linear(most, of_most)[..., None, :]
+            own = self.dropout(functional.relu(hidden))
+            most = _masked_max(own, mask)
+        # The maximum of [own, most] over the elements is most, twice.
+        return torch.cat([most, most], -1)
+
+
+def _masked_max(x: Float[Tensor, "*g P C"], mask: Bool[Tensor, "*g P"]) -> Float[Tensor, "*g C"]:
+    # Values are not negative after ReLU, so 0 in place of what does not exist changes no maximum.
+    return torch.where(mask[..., None], x, 0.0).amax(-2)

@@ -1,0 +1,96 @@
+"""Sizes, neighborhoods and training schedule of a TrafficBots model."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from rlftsim.errors import ConfigError, given, require_finite, require_positive
+
+WINDOW = 11
+"""Steps of 0.1 s that an agent or a light is seen for, the current one included."""
+LATENT_SIZE = 16
+"""Numbers of a personality."""
+
+
+@dataclass(frozen=True)
+class TrafficBotsConfig:
+    """TrafficBots' architecture. The defaults are TrafficBots V1.5 (7.9 M parameters without its unused ones)."""
+
+    fingerprint_name: ClassVar[str] = "rlftsim.policies.trafficbots.config.TrafficBotsConfig"
+
+    dim: int = 128
+    """Width of all features (D)."""
+    num_heads: int = 4
+    num_map_layers: int = 8
+    num_light_layers: int = 4
+    num_agent_layers: int = 4
+    max_map_tokens: int | None = 1024
+    """Map tokens of a scenario; those far from the evaluated agents are left out. None = all."""
+    map_neighbors: int = 32
+    """Map tokens that a map token attends to."""
+    light_neighbors: int = 24
+    """Lights, and map tokens, that a light attends to."""
+    agent_map_neighbors: int = 64
+    """Map tokens that an agent attends to."""
+    agent_light_neighbors: int = 25
+    """Lights that an agent attends to."""
+    agent_neighbors: int = 25
+    """Agents that an agent attends to."""
+    radius_m: float = 500.0
+    """Farthest neighbor of a map token or an agent."""
+    light_radius_m: float = 250.0
+    """Farthest neighbor of a light."""
+    noise_acceleration_mps2: float = 0.3
+    """Standard deviation of the acceleration in sampled rollouts. It is not trained: the kinematic terms of a reward
+    would only shrink it."""
+    noise_yaw_rate_radps: float = 0.03
+    """Standard deviation of the yaw rate in sampled rollouts."""
+    noise_correlation: float = 0.9
+    """Correlation of an agent's noise from one decision to the next; 0 = white."""
+    dropout: float = 0.1
+    """Dropout probability in training mode, in all parts but those that decide: their rollouts have to be repeated
+    exactly."""
+    input_drop: float = 0.1
+    """In pre-training: probability that a map node or a history step is hidden."""
+    prior_probability: float = 0.1
+    """In pre-training: probability that an update draws personalities from the prior instead of the posterior."""
+    free_nats: float = 1.0
+    """A personality's KL from the prior below which it is not pulled towards it."""
+    forced_fractions: tuple[float, ...] = (0.3, 0.2, 0.1, 0.0)
+    """In pre-training: fraction of the agents that follow the log throughout, one after the other."""
+    forcing_updates: int = 12_175
+    """Updates that each of these fractions lasts: 0.2 passes over WOMD with 8 scenarios each."""
+    steps_per_pass: int = 8
+    """Decisions that are scored with gradient at once; fewer need less memory, the result is the same."""
+
+    def __post_init__(self) -> None:
+        # A list in a stored config.json.
+        object.__setattr__(self, "forced_fractions", tuple(self.forced_fractions))
+        sizes = ("dim", "num_heads", "num_map_layers", "num_light_layers", "num_agent_layers")
+        neighbors = ("map_neighbors", "light_neighbors", "agent_map_neighbors", "agent_light_neighbors")
+        distances = ("radius_m", "light_radius_m", "noise_acceleration_mps2", "noise_yaw_rate_radps")
+        counts = ("agent_neighbors", "forcing_updates", "steps_per_pass", *given(self, ("max_map_tokens",)))
+        require_positive(self, (*sizes, *neighbors, *distances, *counts))
+        require_finite(self, (*distances, "free_nats"))
+        if self.dim % 16 or self.dim % self.num_heads:
+            raise ConfigError(f"dim={self.dim} must be a multiple of 16 and of num_heads={self.num_heads}.")
+        for name in ("dropout", "input_drop", "noise_correlation"):
+            if not 0 <= getattr(self, name) < 1:
+                raise ConfigError(f"{name} is in [0, 1), got {getattr(self, name)}.")
+        if not 0 <= self.prior_probability <= 1:
+            raise ConfigError(f"prior_probability is in [0, 1], got {self.prior_probability}.")
+        if not self.forced_fractions or not all(0 <= one <= 1 for one in self.forced_fractions):
+            raise ConfigError(f"forced_fractions are fractions in [0, 1], got {self.forced_fractions}.")
+
+
+def trafficbots_v15() -> TrafficBotsConfig:
+    """TrafficBots V1.5."""
+    return TrafficBotsConfig()
+
+
+def trafficbots_demo() -> TrafficBotsConfig:
+    """A model small enough to train on two CPU cores in minutes."""
+    return TrafficBotsConfig(
+        dim=48, num_heads=4, num_map_layers=2, num_light_layers=1, num_agent_layers=2,
+        map_neighbors=12, light_neighbors=8, agent_map_neighbors=24, agent_light_neighbors=4, agent_neighbors=8,
+        radius_m=100.0, light_radius_m=100.0, dropout=0.0, forcing_updates=60, steps_per_pass=16,
+    )  # fmt: skip

@@ -1,0 +1,100 @@
+"""TrafficBots' weights and files.
+
+B scenarios, A agents, L lights, M map tokens, D width.
+"""
+
+import os
+from dataclasses import asdict
+from typing import TypeVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from rlftsim.errors import CheckpointError
+from rlftsim.policies.checkpoint import load_strictly, read_model, save_model
+from rlftsim.policies.trafficbots.config import TrafficBotsConfig
+from rlftsim.policies.trafficbots.network import TrafficBotsNetwork
+from rlftsim.policies.trafficbots.scene import Scene
+from rlftsim.policies.trafficbots.state import TrafficBotsContext
+from rlftsim.scenario.types import FUTURE_STEPS
+
+Model = TypeVar("Model", bound="TrafficBotsModel")
+
+
+class TrafficBotsModel(nn.Module):
+    """TrafficBots' network; `TrafficBotsPolicy` adds the decisions."""
+
+    architecture = "trafficbots"
+
+    def __init__(self, config: TrafficBotsConfig):
+        super().__init__()
+        self.config = config
+        self.network = TrafficBotsNetwork(config)
+
+    def fine_tuned_parts(self) -> tuple[nn.Module, ...]:
+        """Everything that decides actions.
+
+        Map, lights, posterior and destination predictor stay as they are: personality and destination are drawn from
+        them once per rollout, and what is drawn must not depend on trained weights.
+        """
+        network = self.network
+        destination = (network.destination_map, network.destination_pose, network.add_destination)
+        return network.agents, *destination, network.add_personality, network.actions
+
+    def encode_scene(self, scene: Scene) -> TrafficBotsContext:
+        """Features of the map, and of the lights at all decisions.
+
+        Args:
+            scene: only its history is used.
+        """
+        map_features = self.network.map(scene, scene.node_mask)
+        lights = self._roll_lights(scene, map_features)
+        return TrafficBotsContext(scene, map_features, self.network.agents.surroundings(map_features, lights))
+
+    def _roll_lights(self, scene: Scene, map_features: Float[Tensor, "B M D"]) -> Float[Tensor, "B T L D"]:
+        """Features of the lights at all 80 decisions; each next state is the most likely one.
+
+        Lights do not see agents, so that they are the same in all rollouts of a scene.
+        """
+        encoder = self.network.lights
+        around = encoder.surroundings(scene, map_features)
+        window = scene.light_state[:, None, :, -encoder.window :]  # [B, 1, L, W]
+        features = []
+        for _ in range(FUTURE_STEPS):
+            features.append(encoder(window, around))
+            if not scene.light_mask.any():
+                return features[0].expand(-1, FUTURE_STEPS, -1, -1)
+            state = self.network.next_light_logits(features[-1]).argmax(-1)
+            window = torch.cat([window[..., 1:], state[..., None]], -1)
+        return torch.cat(features, 1)
+
+    # ---- files ----------------------------------------------------------------------------------------------------
+
+    def save_pretrained(self, folder: str | os.PathLike, *, card: str = "") -> None:
+        """Write config.json, model.safetensors and README.md.
+
+        Args:
+            folder: created where it is missing.
+            card: text of README.md.
+        """
+        card = card or "A TrafficBots traffic model. Origin unknown.\n"
+        save_model(folder, self, asdict(self.config), card=card, weights=self.network.state_dict())
+
+    @classmethod
+    def from_pretrained(cls: type[Model], folder: str | os.PathLike) -> Model:
+        """Model of a model folder as `save_pretrained` writes it, or of a run's folder, in training mode.
+
+        Raises:
+            ConfigError: there is no such folder, or its settings contradict each other.
+            CheckpointError: a missing or damaged file, another architecture, or keys and shapes that do not fit:
+                names them all.
+        """
+        stored = read_model(folder)
+        if stored.architecture != cls.architecture:
+            raise CheckpointError(
+                f"{stored.folder}: not a TrafficBots model, its architecture is {stored.architecture!r}."
+            )
+        policy = cls(stored.build(TrafficBotsConfig))
+        load_strictly(policy.network, stored.read_weights(), source=str(stored.folder))
+        return policy

@@ -1,0 +1,486 @@
+"""TrafficBots' networks: map, lights, agents, personality, destination, actions.
+
+Source: Zhang et al., "TrafficBots V1.5", 2024 (arXiv 2406.10898).
+
+Shapes: B scenarios, T decisions, N rollouts, A agents, W steps of a window, M map tokens, L lights, D width.
+"""
+
+from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
+from typing import cast
+
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor, nn
+from torch.nn import functional
+
+from rlftsim.policies.trafficbots.attention import DecoderLayer, KeyValues, PolylineEncoder, SelfLayer
+from rlftsim.policies.trafficbots.config import LATENT_SIZE, WINDOW, TrafficBotsConfig
+from rlftsim.policies.trafficbots.map_tokens import NUM_LIGHT_STATES, NUM_NODES, MapTokenType
+from rlftsim.policies.trafficbots.poses import Neighbors, find_neighbors, pose_embedding, relative_pose
+from rlftsim.policies.trafficbots.scene import Scene
+
+POSTERIOR_WINDOW = 19
+"""Steps 0, 5, ..., 90 of the log."""
+LIGHT_LOGIT_LIMIT = 3.0
+NUM_CLASSES, NUM_GEOMETRY, NUM_MOTION = 3, 7, 3
+RING_M = 1e-3
+"""A point of a token this near to the token's origin has no direction from there."""
+NEVER = -torch.inf
+
+
+def mlp(*sizes: int, dropout: float = 0.0, end_activation: bool = False, norm: bool = False) -> nn.Sequential:
+    """Linear layers with ReLU between them.
+
+    Args:
+        sizes: of the input and of each layer's output.
+        dropout: after each activation.
+        end_activation: also after the last layer.
+        norm: layer norm before each activation.
+    """
+    layers: list[nn.Module] = []
+    for k, (before, after) in enumerate(pairwise(sizes)):
+        layers.append(nn.Linear(before, after))
+        if k < len(sizes) - 2 or end_activation:
+            layers += [nn.LayerNorm(after)] if norm else []
+            layers += [nn.ReLU()]
+            layers += [nn.Dropout(dropout)] if dropout else []
+    return nn.Sequential(*layers)
+
+
+def decoder_layers(layers: nn.ModuleList) -> list[DecoderLayer]:
+    """The layers of a list, with their type."""
+    return [cast(DecoderLayer, layer) for layer in layers]
+
+
+class MapEncoder(nn.Module):
+    """Features of map tokens."""
+
+    def __init__(self, config: TrafficBotsConfig):
+        super().__init__()
+        width = config.dim - NUM_GEOMETRY
+        self.config = config
+        self.nodes = mlp(len(MapTokenType) + NUM_NODES, width, width, width)
+        self.polyline = PolylineEncoder(config.dim, config.dropout)
+        self.layers = nn.ModuleList(
+            SelfLayer(config.dim, config.num_heads, config.dropout) for _ in range(config.num_map_layers)
+        )
+
+    def forward(self, scene: Scene, node_mask: Bool[Tensor, "B M 20"]) -> Float[Tensor, "B M D"]:
+        """Features of all map tokens, 0 for padding.
+
+        Args:
+            scene: its map.
+            node_mask: True = the node is looked at.
+        """
+        config = self.config
+        kind = functional.one_hot(scene.map_type, len(MapTokenType)).float()[..., None, :]  # [B, M, 1, 11]
+        place = torch.eye(NUM_NODES, device=kind.device)
+        shape = scene.node_mask.shape
+        attributes = torch.cat([kind.expand(*shape, -1), place.expand(*shape, -1)], -1)  # [B, M, 20, 31]
+        geometry = segment_features(relative_pose(scene.node_pose, scene.map_pose[..., None, :]))
+        x = self.polyline(torch.cat([self.nodes(attributes), geometry], -1), node_mask)
+        neighbors = find_neighbors(
+            scene.map_pose, scene.map_pose, scene.map_mask,
+            count=config.map_neighbors, radius_m=config.radius_m, size=config.dim,
+        )  # fmt: skip
+        for layer in self.layers:
+            x = layer(x, scene.map_mask, neighbors)
+        return x
+
+
+def segment_features(pose: Float[Tensor, "*g 3"]) -> Float[Tensor, "*g 7"]:
+    """Seven numbers of a segment of 1 m: where it is seen from the origin, and where it leads.
+
+    Args:
+        pose: start and direction.
+    """
+    start, towards = pose[..., :2], torch.stack([pose[..., 2].cos(), pose[..., 2].sin()], -1)
+    along = -(start * towards).sum(-1, keepdim=True).clamp(-1, 0)  # [*g, 1] of the point nearest to the origin
+    nearest = start + along * towards
+    distance = nearest.norm(dim=-1, keepdim=True)
+    bearing = torch.where(distance < RING_M, 0.0, nearest / distance.clamp(min=RING_M))
+    rest = (start + towards - nearest).norm(dim=-1, keepdim=True)
+    return torch.cat([distance, bearing, towards, torch.ones_like(distance), rest], -1)
+
+
+@dataclass(frozen=True, eq=False)
+class LightSurroundings:
+    """Lights and their neighbors."""
+
+    base: Float[Tensor, "B L D"]
+    """Feature of each light's map token."""
+    mask: Bool[Tensor, "B L"]
+    own: Neighbors
+    map: Neighbors
+    map_tokens: tuple[KeyValues, ...]
+    """By layer."""
+
+
+class LightEncoder(nn.Module):
+    """Features of lights, given their states in a window and the map around them."""
+
+    def __init__(self, config: TrafficBotsConfig, window: int):
+        super().__init__()
+        dim = config.dim
+        self.config = config
+        self.window = window
+        self.states = mlp(NUM_LIGHT_STATES + window, dim, dim, dim)
+        self.polyline = PolylineEncoder(dim, config.dropout)
+        self.layers = nn.ModuleList(
+            DecoderLayer(dim, config.num_heads, config.dropout) for _ in range(config.num_light_layers)
+        )
+
+    def surroundings(self, scene: Scene, map_features: Float[Tensor, "B M D"]) -> LightSurroundings:
+        """What the states of lights do not change, computed once.
+
+        Args:
+            scene: its lights and map.
+            map_features: lights do not train them.
+        """
+        config, map_features = self.config, map_features.detach()
+        lights = scene.light_pose
+        find = partial(find_neighbors, count=config.light_neighbors, radius_m=config.light_radius_m, size=config.dim)
+        return LightSurroundings(
+            base=map_features.gather(1, scene.light_token[..., None].expand(-1, -1, config.dim)),
+            mask=scene.light_mask,
+            own=find(lights, lights, scene.light_mask),
+            map=find(lights, scene.map_pose, scene.map_mask),
+            map_tokens=tuple(layer.project(map_features) for layer in decoder_layers(self.layers)),
+        )
+
+    def forward(
+        self, state: Int64[Tensor, "B T L W"], around: LightSurroundings, known: Bool[Tensor, "T W"] | None = None
+    ) -> Float[Tensor, "B T L D"]:
+        """Features of all lights at T decisions, 0 for padding.
+
+        Args:
+            state: the window's states, the newest last.
+            around: of `surroundings`.
+            known: True = the step of the window exists; None = all do.
+        """
+        num_decisions = state.shape[1]
+        place = torch.eye(self.window, device=state.device).expand(*state.shape, -1)
+        attributes = torch.cat([functional.one_hot(state, NUM_LIGHT_STATES).float(), place], -1)
+        mask = around.mask[:, None].expand(state.shape[:3])  # [B, T, L]
+        x = self.states(attributes) + around.base[:, None, :, None]
+        steps = mask[..., None].expand(state.shape)
+        x = self.polyline(x, steps if known is None else steps & known[:, None])
+        own, around_map = around.own.over_time(num_decisions), around.map.over_time(num_decisions)
+        for layer, map_tokens in zip(self.layers, around.map_tokens):
+            x = layer(x, mask, own, [(map_tokens, around_map)])
+        return x
+
+
+@dataclass(frozen=True, eq=False)
+class Windows:
+    """What the network sees of agents at some decisions: their last steps, the newest last."""
+
+    valid: Bool[Tensor, "*g A W"]
+    pose: Float[Tensor, "*g A W 3"]
+    motion: Float[Tensor, "*g A W 3"]
+
+    def as_one_decision(self) -> "Windows":
+        """Windows [B, N, A, W] as those of a single decision [B, 1, N, A, W]."""
+        return Windows(self.valid[:, None], self.pose[:, None], self.motion[:, None])
+
+    @property
+    def token_mask(self) -> Bool[Tensor, "*g A"]:
+        """True = there is a valid step, so the agent is seen by the others."""
+        return self.valid.any(-1)
+
+    @property
+    def token_pose(self) -> Float[Tensor, "*g A 3"]:
+        """Pose at the last valid step."""
+        steps = torch.arange(1, self.valid.shape[-1] + 1, device=self.valid.device)
+        last = (self.valid * steps).argmax(-1)  # [*g, A]
+        return self.pose.gather(-2, last[..., None, None].expand(*last.shape, 1, 3))[..., 0, :]
+
+
+class WindowEncoder(nn.Module):
+    """One feature of each agent's window."""
+
+    def __init__(self, dim: int, window: int, dropout: float):
+        super().__init__()
+        self.window = window
+        self.steps = mlp(3 + NUM_CLASSES + NUM_MOTION + window, dim // 2, dim // 2, dim // 2)
+        self.polyline = PolylineEncoder(dim, dropout)
+
+    def forward(
+        self, windows: Windows, agents: Float[Tensor, "*#g A 6"], seen: Bool[Tensor, "*g A W"] | None = None
+    ) -> Float[Tensor, "*g A D"]:
+        """Features of windows, 0 for those without a valid step.
+
+        Args:
+            windows: of agents.
+            agents: size and class (one-hot) of each.
+            seen: steps to look at; None = all valid ones.
+        """
+        shape = windows.valid.shape
+        place = torch.eye(self.window, device=windows.pose.device).expand(*shape, -1)
+        attributes = torch.cat([agents[..., None, :].expand(*shape, -1), windows.motion, place], -1)
+        hidden = self.steps(attributes)  # [*g, A, W, D/2]
+        relative = relative_pose(windows.pose, windows.token_pose[..., None, :])
+        x = torch.cat([hidden, pose_embedding(relative, hidden.shape[-1]).to(hidden.dtype)], -1)
+        return self.polyline(x, windows.valid if seen is None else seen)
+
+
+def history_windows(scene: Scene) -> Windows:
+    """Windows [B, A, 11] of the agents up to the current step."""
+    return Windows(scene.valid[..., :WINDOW], scene.pose[..., :WINDOW, :], scene.motion[..., :WINDOW, :])
+
+
+def agent_attributes(scene: Scene) -> Float[Tensor, "B A 6"]:
+    """Size and class (one-hot) of each agent."""
+    return torch.cat([scene.size, functional.one_hot(scene.agent_class, NUM_CLASSES).float()], -1)
+
+
+@dataclass(frozen=True, eq=False)
+class AgentSurroundings:
+    """Map and lights as an agent encoder sees them, by layer."""
+
+    map_tokens: tuple[KeyValues, ...]
+    """[B, H, M, d] each."""
+    light_tokens: tuple[KeyValues, ...]
+    """[B, T, H, L, d] each."""
+
+    def steps(self, start: int, stop: int) -> "AgentSurroundings":
+        """The same with the lights of some decisions."""
+        return AgentSurroundings(self.map_tokens, tuple(one.steps(start, stop) for one in self.light_tokens))
+
+
+class AgentEncoder(nn.Module):
+    """Features of agents, given their windows, each other, the map and the lights."""
+
+    def __init__(self, config: TrafficBotsConfig, window: int, dropout: float):
+        super().__init__()
+        self.config = config
+        self.windows = WindowEncoder(config.dim, window, dropout)
+        self.layers = nn.ModuleList(
+            DecoderLayer(config.dim, config.num_heads, dropout) for _ in range(config.num_agent_layers)
+        )
+
+    def surroundings(
+        self, map_features: Float[Tensor, "B M D"], light_features: Float[Tensor, "B T L D"]
+    ) -> AgentSurroundings:
+        """Keys and values of map and lights for each layer, computed once for all rollouts.
+
+        Args:
+            map_features: of `MapEncoder`.
+            light_features: of `LightEncoder`.
+        """
+        return AgentSurroundings(
+            tuple(layer.project(map_features) for layer in decoder_layers(self.layers)),
+            tuple(layer.project(light_features) for layer in decoder_layers(self.layers)),
+        )
+
+    def forward(self, windows: Windows, scene: Scene, around: AgentSurroundings) -> Float[Tensor, "B T N A D"]:
+        """Features of all agents at T decisions of N rollouts, 0 for those without a valid step in their window.
+
+        Args:
+            windows: [B, T, N, A, W].
+            scene: poses of map and lights, sizes and classes of agents.
+            around: of `surroundings`, for the same decisions.
+        """
+        config, mask, pose = self.config, windows.token_mask, windows.token_pose
+        num_decisions = mask.shape[1]
+        find = partial(find_neighbors, pose, radius_m=config.radius_m, size=config.dim)
+        of_map = find(scene.map_pose, scene.map_mask, count=config.agent_map_neighbors)
+        lights = scene.light_pose[:, None].expand(-1, num_decisions, -1, -1)
+        light_mask = scene.light_mask[:, None].expand(-1, num_decisions, -1)
+        of_lights = find(lights, light_mask, count=config.agent_light_neighbors)
+        own = find(pose, mask, count=config.agent_neighbors)
+        x = self.windows(windows, agent_attributes(scene)[:, None, None])
+        for layer, map_tokens, light_tokens in zip(self.layers, around.map_tokens, around.light_tokens):
+            x = layer(x, mask, own, [(map_tokens, of_map), (light_tokens, of_lights)])
+        return x
+
+
+class Conditioning(nn.Module):
+    """Adds what an agent is given, its destination or its personality, to its feature."""
+
+    def __init__(self, size: int, dim: int):
+        super().__init__()
+        self.given = mlp(size, dim, dim, dim, end_activation=True)
+        self.joint = mlp(2 * dim, dim, dim, dim, end_activation=True)
+
+    def forward(
+        self, x: Float[Tensor, "*g D"], given: Float[Tensor, "*#g C"], mask: Bool[Tensor, "*#g"] | None = None
+    ) -> Float[Tensor, "*g D"]:
+        """Features after conditioning.
+
+        Args:
+            x: features.
+            given: what they are conditioned on.
+            mask: False = nothing is given, the feature passes unchanged; None = True for all.
+        """
+        hidden = self.given(given).expand_as(x)
+        more = self.joint(torch.cat([x, hidden.to(x.dtype)], -1))
+        return x + (more if mask is None else torch.where(mask[..., None], more, 0.0))
+
+
+class DestinationPredictor(nn.Module):
+    """Probabilities of the map tokens to be the destination of an agent."""
+
+    def __init__(self, config: TrafficBotsConfig):
+        super().__init__()
+        dim = config.dim
+        self.windows = WindowEncoder(dim, WINDOW, config.dropout)
+        self.pairs = mlp(3 * dim, dim, dim, 1, norm=True)
+
+    def forward(
+        self,
+        windows: Windows,
+        scene: Scene,
+        map_features: Float[Tensor, "B M D"],
+        seen: Bool[Tensor, "B A W"] | None = None,
+    ) -> Float[Tensor, "B A M"]:
+        """Log-probabilities; -inf for tokens that are no destination of the agent's class.
+
+        All are -inf for an agent that has no destination at all.
+
+        Args:
+            windows: history of the agents [B, A, W].
+            scene: its map and agents.
+            map_features: of `MapEncoder`; the predictor does not train them.
+            seen: steps to look at; None = all valid ones.
+        """
+        agents = self.windows(windows, agent_attributes(scene), seen)  # [B, A, D]
+        relative = relative_pose(scene.map_pose[:, None], windows.token_pose[:, :, None])  # [B, A, M, 3]
+        # The first layer of [agent, map token, relative pose] in three parts: only the last is one of pairs.
+        first, *rest = self.pairs
+        assert isinstance(first, nn.Linear)
+        of_agent, of_map, of_pose = first.weight.chunk(3, dim=-1)
+        x = functional.linear(pose_embedding(relative, agents.shape[-1]), of_pose, first.bias)
+        x = (
+            x
+            + functional.linear(agents, of_agent)[:, :, None]
+            + functional.linear(map_features.detach(), of_map)[:, None]
+        )
+        for layer in rest:
+            x = layer(x)
+        logits = x[..., 0].float().masked_fill(~admissible(scene), NEVER)
+        none = logits.isneginf().all(-1, keepdim=True)
+        return torch.log_softmax(logits.masked_fill(none, 0.0), -1).masked_fill(none, NEVER)
+
+
+def admissible(scene: Scene) -> Bool[Tensor, "B A M"]:
+    """True = a map token that agents of this class may be on their way to."""
+    kind = MapTokenType
+    edges, bikes = (kind.EDGE_BOUNDARY,), (kind.BIKE_LANE,)
+    lanes = (kind.FREEWAY, kind.STREET, kind.STOP_SIGN_LANE)
+    table = torch.zeros(NUM_CLASSES, len(kind), dtype=torch.bool, device=scene.map_type.device)
+    for row, types in zip(table, ((*lanes, *edges), edges, (*bikes, *edges))):
+        row[list(types)] = True
+    of_class = table[scene.agent_class]  # [B, A, 11]
+    index = scene.map_type[:, None].expand(-1, of_class.shape[1], -1)
+    return of_class.gather(-1, index) & scene.map_mask[:, None]
+
+
+class ActionHead(nn.Module):
+    """Means of the actions before tanh, by a network for each class."""
+
+    def __init__(self, dim: int):
+        super().__init__()
+        self.by_class = nn.ModuleList(mlp(dim, dim, dim, 2) for _ in range(NUM_CLASSES))
+
+    def forward(self, x: Float[Tensor, "*g A D"], agent_class: Int64[Tensor, "*#g A"]) -> Float[Tensor, "*g A 2"]:
+        """Means, float32.
+
+        Args:
+            x: features of agents.
+            agent_class: of each.
+        """
+        means = torch.stack([one(x).float() for one in self.by_class], -2)  # [*g, A, 3, 2]
+        index = agent_class.expand(x.shape[:-1])[..., None, None].expand(*x.shape[:-1], 1, 2)
+        return means.gather(-2, index)[..., 0, :]
+
+
+class Posterior(nn.Module):
+    """Personality of each agent, given its whole log; used in pre-training only."""
+
+    def __init__(self, config: TrafficBotsConfig):
+        super().__init__()
+        self.lights = LightEncoder(config, POSTERIOR_WINDOW)
+        self.agents = AgentEncoder(config, POSTERIOR_WINDOW, config.dropout)
+        self.mean = mlp(config.dim, config.dim, config.dim, LATENT_SIZE)
+        self.log_std = nn.Parameter(torch.zeros(LATENT_SIZE))
+
+    def forward(
+        self,
+        windows: Windows,
+        light_state: Int64[Tensor, "B 1 L W"],
+        scene: Scene,
+        map_features: Float[Tensor, "B M D"],
+    ) -> Float[Tensor, "B A 16"]:
+        """Means of a diagonal Gaussian whose log standard deviations are `log_std`.
+
+        Args:
+            windows: [B, 1, 1, A, 19], every fifth step of the log.
+            light_state: of the same steps.
+            scene: map, sizes and classes.
+            map_features: of `MapEncoder`; agents train them, lights do not.
+        """
+        lights = self.lights(light_state, self.lights.surroundings(scene, map_features))
+        around = self.agents.surroundings(map_features, lights)
+        return self.mean(self.agents(windows, scene, around)[:, 0, 0]).float()
+
+
+class TrafficBotsNetwork(nn.Module):
+    """All weights of a TrafficBots model."""
+
+    def __init__(self, config: TrafficBotsConfig):
+        super().__init__()
+        dim = config.dim
+        self.map = MapEncoder(config)
+        self.lights = LightEncoder(config, WINDOW)
+        self.light_state = mlp(dim, dim, dim, NUM_LIGHT_STATES)
+        # No dropout in the parts that decide: rollouts are scored again, and the same features must come out.
+        self.agents = AgentEncoder(config, WINDOW, dropout=0.0)
+        self.posterior = Posterior(config)
+        self.destination_map = nn.Linear(dim, dim)
+        self.destination_pose = nn.Linear(dim, dim)
+        self.destination_predictor = DestinationPredictor(config)
+        self.add_destination = Conditioning(dim, dim)
+        self.add_personality = Conditioning(LATENT_SIZE, dim)
+        self.actions = ActionHead(dim)
+
+    def next_light_logits(self, light_features: Float[Tensor, "*g D"]) -> Float[Tensor, "*g 5"]:
+        """Logits of a light's next state; they do not train the features."""
+        return self.light_state(light_features.detach()).float().clamp(-LIGHT_LOGIT_LIMIT, LIGHT_LOGIT_LIMIT)
+
+    def mean_actions(
+        self,
+        windows: Windows,
+        scene: Scene,
+        around: AgentSurroundings,
+        given: "Given",
+        active: Bool[Tensor, "B T N A"],
+    ) -> Float[Tensor, "B T N A 2"]:
+        """Means of the actions before tanh, float32: what an agent without exploration noise does.
+
+        Args:
+            windows: [B, T, N, A, 11].
+            scene: map, lights, sizes and classes.
+            around: map and lights at the same decisions.
+            given: personality and destination of each agent.
+            active: True = the agent is still on its way to its destination.
+        """
+        x = self.agents(windows, scene, around)
+        now = windows.pose[..., -1, :]
+        relative = relative_pose(given.destination_pose[:, None], now)  # [B, T, N, A, 3]
+        pose = self.destination_pose(pose_embedding(relative, x.shape[-1]))
+        x = self.add_destination(x, given.destination_feature[:, None] + pose, active)
+        x = self.add_personality(x, given.personality[:, None])
+        return self.actions(x, scene.agent_class[:, None, None])
+
+
+@dataclass(frozen=True, eq=False)
+class Given:
+    """What the agents of N rollouts are given once."""
+
+    personality: Float[Tensor, "B N A 16"]
+    destination_feature: Float[Tensor, "B N A D"]
+    """Projected feature of the destination's map token."""
+    destination_pose: Float[Tensor, "B N A 3"]

@@ -1,0 +1,219 @@
+"""TrafficBots as a policy: every agent chooses an acceleration and a yaw rate, eighty times.
+
+The network gives the mean mu_t of an action u_t (before tanh). The noise around it is correlated in time:
+
+    u_t | past ~ N(mu_t + rho (u_{t-1} - mu_{t-1}), (1 - rho^2) sigma^2),   at first N(mu_t, sigma^2)
+
+B scenarios, N rollouts, A agents, T decisions, M map tokens.
+"""
+
+import math
+from dataclasses import replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from rlftsim.goals.types import Goals
+from rlftsim.policies.distributions import GaussianDistribution
+from rlftsim.policies.trafficbots.config import LATENT_SIZE
+from rlftsim.policies.trafficbots.dynamics import max_action
+from rlftsim.policies.trafficbots.imitation import imitation_loss
+from rlftsim.policies.trafficbots.model import TrafficBotsModel
+from rlftsim.policies.trafficbots.network import Given, history_windows
+from rlftsim.policies.trafficbots.scene import build_scene
+from rlftsim.policies.trafficbots.scoring import mean_actions_over_time
+from rlftsim.policies.trafficbots.state import (
+    TrafficBotsContext,
+    TrafficBotsState,
+    imposed_after,
+    traffic_at_start,
+    whole_history,
+)
+from rlftsim.rollout.policy import ImitationLoss
+from rlftsim.rollout.types import AgentStates, Rollouts
+from rlftsim.scenario.batch import ScenarioBatch
+from rlftsim.scenario.types import HISTORY_STEPS
+
+
+class TrafficBotsPolicy(TrafficBotsModel):
+    """Continuous-action traffic model of all agents of a scenario.
+
+    It holds weights, and no state of a simulation. At temperature 0 it takes the mean action, as in the public code:
+    rollouts then differ by personality and destination alone.
+    """
+
+    steps_per_decision = 1
+    noise_size = 2
+    initial_noise_size = LATENT_SIZE + 1
+
+    # ---- the policy interface -------------------------------------------------------------------------------------
+
+    def encode(self, scenarios: ScenarioBatch) -> TrafficBotsContext:
+        """Features of the map, and of the lights at all decisions."""
+        return self.encode_scene(build_scene(scenarios, HISTORY_STEPS, self.config.max_map_tokens))
+
+    def begin(
+        self, context: TrafficBotsContext, num_rollouts: int, goals: Goals | None, noise: Float[Tensor, "B N A 17"]
+    ) -> TrafficBotsState:
+        """The current step, N times, with a personality and a destination for each agent.
+
+        Args:
+            context: of `encode`.
+            num_rollouts: N.
+            goals: ignored.
+            noise: uniform in [0, 1).
+        """
+        scene = context.scene
+        with torch.no_grad():
+            log_prob = self.network.destination_predictor(history_windows(scene), scene, context.map_features)
+            cumulative = log_prob.double().exp().cumsum(-1)[:, None]  # [B, 1, A, M]
+            total = cumulative[..., -1:]  # 1 up to rounding; 0 where there is no destination at all
+            level = noise[..., LATENT_SIZE:].double() * total  # [B, N, A, 1]
+            repeated = cumulative.expand(-1, num_rollouts, -1, -1).contiguous()
+            index = torch.searchsorted(repeated, level, right=True).clamp(max=log_prob.shape[-1] - 1)
+            index = torch.where(total > 0, index, -1)
+            uniform = noise[..., :LATENT_SIZE].clamp(min=2**-25).double()
+            personality = math.sqrt(2) * torch.erfinv(2 * uniform - 1)
+        return self.start(context, torch.cat([personality, index], -1).float())
+
+    def start(self, context: TrafficBotsContext, draws: Float[Tensor, "B N A 17"]) -> TrafficBotsState:
+        """The current step, with given personalities and destinations.
+
+        Args:
+            context: of `encode`.
+            draws: personality (16 numbers) and map token of the destination, -1 = none.
+        """
+        scene, features = context.scene, context.map_features.detach()
+        destination = draws[..., LATENT_SIZE].long()
+        token = destination.clamp(min=0)
+        batch = torch.arange(len(token), device=token.device)[:, None, None]
+        # Projected before it is gathered: a scene has fewer map tokens than rollouts have agents.
+        given = Given(
+            draws[..., :LATENT_SIZE], self.network.destination_map(features)[batch, token], scene.map_pose[batch, token]
+        )
+        return TrafficBotsState(traffic_at_start(scene, destination), given, draws)
+
+    def decide(self, context: TrafficBotsContext, state: TrafficBotsState) -> GaussianDistribution:
+        """Distributions [B, N, A] of the next action.
+
+        Args:
+            context: of `encode`.
+            state: before the decision. Its memo is filled.
+        """
+        mean, residual, continues = self._mean(context, state), None, state.continues
+        if state.before is not None and state.decision is not None:
+            residual = state.decision - self._mean(context, state.before)
+        return self._distribution(context, mean, residual, continues, state.traffic.alive)
+
+    def advance(
+        self,
+        context: TrafficBotsContext,
+        state: TrafficBotsState,
+        decision: Float[Tensor, "B N A 2"],
+        forced: AgentStates | None = None,
+    ) -> TrafficBotsState:
+        """State after 0.1 s of the chosen actions.
+
+        Args:
+            context: of `encode`.
+            state: before the decision.
+            decision: actions before tanh.
+            forced: states imposed from outside, of a single step.
+        """
+        scene, now = context.scene, state.traffic
+        imposed, continues = None, now.alive
+        if forced is not None:
+            mask = forced.valid[..., 0]
+            pose = torch.cat([forced.position[..., 0, :], forced.heading], -1)
+            imposed = imposed_after(now.windows, mask, scene.to_ego_frame(torch.where(mask[..., None], pose, 0.0)))
+            continues = continues & ~mask
+        traffic = now.after(decision, scene, imposed)
+        poses = scene.to_batch_frame(traffic.windows.pose[..., -1, :])
+        if forced is not None:
+            # Exactly where it says, not there and back.
+            poses = torch.where(mask[..., None], pose, poses)
+        return replace(
+            state,
+            traffic=traffic,
+            poses=poses[..., None, :],
+            num_decisions=state.num_decisions + 1,
+            before=replace(state, before=None, decision=None),
+            decision=decision,
+            continues=continues,
+            memo=type(state.memo)(),
+        )
+
+    def score(self, context: TrafficBotsContext, rollouts: Rollouts) -> GaussianDistribution:
+        """Distributions [B, N, A, T] along rollouts, in parallel over time.
+
+        Args:
+            context: of `encode`.
+            rollouts: of the same scenarios.
+        """
+        assert rollouts.draws is not None
+        # 1. Replay the decisions without the network.
+        state = self.start(context, rollouts.draws)
+        given, states = state.given, [state]
+        num_decisions = rollouts.decision.shape[3]
+        with torch.no_grad():
+            for index in range(num_decisions - 1):
+                forced = rollouts.forced and rollouts.forced.steps(index, index + 1)
+                state = self.advance(context, replace(state, before=None), rollouts.decision[:, :, :, index], forced)
+                states.append(state)
+        history = whole_history([one.traffic for one in states])
+        # 2. Mean actions of all decisions.
+        active = torch.stack([one.traffic.active for one in states], 3)
+        mean = mean_actions_over_time(
+            self.network, history, active, context.scene, context.around, given,
+            steps_per_pass=self.config.steps_per_pass,
+        )  # fmt: skip
+        # 3. Their noise, which the means of the decisions before are part of.
+        alive = torch.stack([one.traffic.alive for one in states], 3)  # [B, N, A, T]
+        residual = (rollouts.decision - mean)[:, :, :, :-1]
+        residual = torch.cat([torch.zeros_like(mean[:, :, :, :1]), residual], 3)
+        goes_on = [torch.zeros_like(alive[..., 0]), *(s.continues for s in states if s.continues is not None)]
+        continues = torch.stack(goes_on, 3)
+        return self._distribution(context, mean, residual, continues, alive)
+
+    # ---- pre-training -------------------------------------------------------------------------------------------
+
+    def imitation_loss(self, scenarios: ScenarioBatch, trained: Bool[Tensor, "B A"], update: int) -> ImitationLoss:
+        """Loss of closed-loop imitation.
+
+        Args:
+            scenarios: with their futures.
+            trained: True = the agent counts; the others are context.
+            update: counted from 0; the fraction of agents that follow the log falls with it.
+        """
+        return imitation_loss(self.network, self.config, scenarios, trained, update)
+
+    # ---- parts ----------------------------------------------------------------------------------------------------
+
+    def _mean(self, context: TrafficBotsContext, state: TrafficBotsState) -> Float[Tensor, "B N A 2"]:
+        """Mean actions in a state, from its memo after the first call."""
+        if state.memo.mean is None:
+            traffic, index = state.traffic, state.num_decisions
+            windows, around = traffic.windows.as_one_decision(), context.around.steps(index, index + 1)
+            mean = self.network.mean_actions(windows, context.scene, around, state.given, traffic.active[:, None])
+            state.memo.mean = mean[:, 0]
+        return state.memo.mean
+
+    def _distribution(
+        self,
+        context: TrafficBotsContext,
+        mean: Float[Tensor, "B N A *T 2"],
+        residual: Float[Tensor, "B N A *T 2"] | None,
+        continues: Bool[Tensor, "B N A *T"] | None,
+        alive: Bool[Tensor, "B N A *T"],
+    ) -> GaussianDistribution:
+        """Distributions around means; noise goes on from the residual of the decision before, where it continues."""
+        config = self.config
+        noise = torch.tensor([config.noise_acceleration_mps2, config.noise_yaw_rate_radps], device=mean.device)
+        std = noise / max_action(context.scene.agent_class)  # [B, A, 2]
+        std = std.view(std.shape[0], 1, std.shape[1], *[1] * (mean.dim() - 4), 2).expand_as(mean)
+        if residual is not None and continues is not None:
+            rho = config.noise_correlation
+            mean = mean + rho * torch.where(continues[..., None], residual, 0.0)
+            std = torch.where(continues[..., None], std * math.sqrt(1 - rho**2), std)
+        return GaussianDistribution(mean, std, alive)

@@ -1,0 +1,137 @@
+"""A batch of scenarios as padded tensors in their ego frames, float32: the network's input.
+
+Shapes: B scenarios, M map tokens, L light tokens, A agents, S steps of 0.1 s. There is always at least one map token
+and one light token, which may be padding.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+
+from rlftsim.geometry import rotate
+from rlftsim.policies.trafficbots.map_tokens import NUM_NODES, UNKNOWN_LIGHT, ego_pose, light_tokens, map_pieces
+from rlftsim.policies.trafficbots.tracks import agent_motions
+from rlftsim.scenario.batch import ScenarioBatch
+from rlftsim.scenario.types import Scenario
+from rlftsim.tokens.vocabulary import class_of_type
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Map, lights and logged agents of a batch, padded."""
+
+    node_pose: Float[Tensor, "B M 20 3"]
+    """Start and direction of each segment of each map token."""
+    node_mask: Bool[Tensor, "B M 20"]
+    map_type: Int64[Tensor, "B M"]
+    map_box: Float[Tensor, "B 4"]
+    """Smallest and largest x, smallest and largest y of the map; infinite without one."""
+    light_token: Int64[Tensor, "B L"]
+    """Map token of each light."""
+    light_mask: Bool[Tensor, "B L"]
+    light_state: Int64[Tensor, "B L S"]
+    agent_mask: Bool[Tensor, "B A"]
+    agent_class: Int64[Tensor, "B A"]
+    size: Float[Tensor, "B A 3"]
+    valid: Bool[Tensor, "B A S"]
+    pose: Float[Tensor, "B A S 3"]
+    motion: Float[Tensor, "B A S 3"]
+    """Speed, acceleration and yaw rate."""
+    origin: Float[Tensor, "B 3"]
+    """x, y and heading of the ego frame in the frame of the batch."""
+
+    @property
+    def map_mask(self) -> Bool[Tensor, "B M"]:
+        """True = the map token exists."""
+        return self.node_mask[..., 0]
+
+    @property
+    def map_pose(self) -> Float[Tensor, "B M 3"]:
+        """Pose of each map token, that of its first node."""
+        return self.node_pose[..., 0, :]
+
+    @property
+    def light_pose(self) -> Float[Tensor, "B L 3"]:
+        """Pose of each light, that of its map token."""
+        return self.map_pose.gather(1, self.light_token[..., None].expand(-1, -1, 3))
+
+    def to(self, device: torch.device) -> "Scene":
+        """The same scene on another device."""
+        return Scene(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
+
+    def to_batch_frame(self, pose: Float[Tensor, "B N A 3"]) -> Float[Tensor, "B N A 3"]:
+        """Poses of the ego frame in the frame of the batch, headings in [-pi, pi)."""
+        origin = self.origin[:, None, None]  # [B, 1, 1, 3]
+        position = rotate(pose[..., :2], origin[..., 2]) + origin[..., :2]
+        return torch.cat([position, _wrap(pose[..., 2] + origin[..., 2])[..., None]], -1)
+
+    def to_ego_frame(self, pose: Float[Tensor, "B N A 3"]) -> Float[Tensor, "B N A 3"]:
+        """Poses of the batch's frame in the ego frame."""
+        origin = self.origin[:, None, None]
+        position = rotate(pose[..., :2] - origin[..., :2], -origin[..., 2])
+        return torch.cat([position, (pose[..., 2] - origin[..., 2])[..., None]], -1)
+
+
+def _wrap(angle: Tensor) -> Tensor:
+    return torch.remainder(angle + torch.pi, 2 * torch.pi) - torch.pi
+
+
+def build_scene(batch: ScenarioBatch, num_steps: int, max_map_tokens: int | None) -> Scene:
+    """Scene of a batch, on its device.
+
+    Args:
+        batch: scenarios with at least `num_steps` logged steps.
+        num_steps: steps of agents and lights to look at: 11 = history, 91 = everything.
+        max_map_tokens: see `map_tokens.map_pieces`.
+    """
+    num_agents = batch.agent_mask.shape[1]
+    rows = [
+        _rows(scenario, num_steps, max_map_tokens, origin)
+        for scenario, origin in zip(batch.scenarios, batch.origin.cpu().numpy())
+    ]
+    pad = {name: max(1, *(len(row[name]) for row in rows)) for name in ("node_mask", "light_token")}
+    counts = {name: pad["node_mask"] for name in ("node_pose", "node_mask", "map_type")}
+    counts |= {name: pad["light_token"] for name in ("light_token", "light_mask", "light_state")}
+    counts |= {name: num_agents for name in ("size", "valid", "pose", "motion")}
+    stacked = {name: _stack([row[name] for row in rows], counts.get(name)) for name in rows[0]}
+    scene = Scene(**stacked, agent_mask=batch.agent_mask, agent_class=class_of_type(batch.object_type))
+    return scene.to(batch.device)
+
+
+def _stack(arrays: Sequence[np.ndarray], count: int | None) -> Tensor:
+    """Arrays along a new first axis, zeros appended up to `count` rows each."""
+    if count is not None:
+        arrays = [np.concatenate([a, np.zeros((count - len(a), *a.shape[1:]), a.dtype)]) for a in arrays]
+    stacked = torch.from_numpy(np.stack(arrays))
+    return stacked.float() if stacked.is_floating_point() else stacked
+
+
+def _rows(
+    scenario: Scenario, num_steps: int, max_map_tokens: int | None, batch_origin: Float[np.ndarray, "2"]
+) -> dict[str, np.ndarray]:
+    """One scenario's part of each field that `build_scene` pads, float64."""
+    pieces, lights = map_pieces(scenario, max_map_tokens), light_tokens(scenario, max_map_tokens)
+    motions, origin = agent_motions(scenario, num_steps), ego_pose(scenario)
+    heading = np.arctan2(pieces.direction[..., 1], pieces.direction[..., 0])  # [M, 20]
+    state = np.where(lights.observed, lights.state, UNKNOWN_LIGHT)[:, :num_steps]
+    nodes = pieces.position[pieces.node_mask]
+    low, high = (nodes.min(0), nodes.max(0)) if len(nodes) else (np.full(3, -np.inf), np.full(3, np.inf))
+    assert heading.shape[1] == NUM_NODES
+    return {
+        "node_pose": np.concatenate([pieces.position[..., :2], heading[..., None]], -1),
+        "node_mask": pieces.node_mask,
+        "map_type": pieces.type,
+        "map_box": np.array([low[0], high[0], low[1], high[1]]),
+        "light_token": lights.token,
+        "light_mask": np.ones(len(lights.token), bool),
+        "light_state": state,
+        "size": motions.size,
+        "valid": motions.valid,
+        "pose": np.concatenate([motions.position[..., :2], motions.heading[..., None]], -1),
+        "motion": motions.motion,
+        "origin": np.append(origin[:2] - batch_origin, origin[2]),
+    }

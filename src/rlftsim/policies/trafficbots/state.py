@@ -1,0 +1,159 @@
+"""Values that a TrafficBots policy hands around: the context of a scene and the state of running simulations.
+
+Shapes: B scenarios, N rollouts, A agents, T decisions, M map tokens, W = 11 steps of a window, D width.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+
+from rlftsim.geometry import heading_vector, wrap_angle
+from rlftsim.policies.trafficbots.dynamics import leaves_map, max_action, move, reaches_destination
+from rlftsim.policies.trafficbots.network import AgentSurroundings, Given, Windows, history_windows
+from rlftsim.policies.trafficbots.scene import Scene
+from rlftsim.scenario.types import STEP_S
+
+
+@dataclass(frozen=True, eq=False)
+class TrafficBotsContext:
+    """Everything about a scene that agents do not change."""
+
+    scene: Scene
+    map_features: Float[Tensor, "B M D"]
+    around: AgentSurroundings
+    """Map, and lights at all decisions."""
+
+
+@dataclass(frozen=True, eq=False)
+class Imposed:
+    """States that agents are put into whatever they decided, ego frame."""
+
+    mask: Bool[Tensor, "B N A"]
+    pose: Float[Tensor, "B N A 3"]
+    motion: Float[Tensor, "B N A 3"]
+
+
+def imposed_after(windows: Windows, mask: Bool[Tensor, "B N A"], pose: Float[Tensor, "B N A 3"]) -> Imposed:
+    """Imposed poses, with the motion that leads to them from the last ones.
+
+    Args:
+        windows: before.
+        mask: True = the agent is put there.
+        pose: 0.1 s later, ego frame.
+    """
+    last_pose, last_speed = windows.pose[..., -1, :], windows.motion[..., -1, 0]
+    way = pose[..., :2] - last_pose[..., :2]
+    speed = (way * heading_vector(pose[..., 2])).sum(-1) / STEP_S
+    yaw_rate = wrap_angle(pose[..., 2] - last_pose[..., 2]) / STEP_S
+    return Imposed(mask, pose, torch.stack([speed, (speed - last_speed) / STEP_S, yaw_rate], -1))
+
+
+@dataclass(frozen=True, eq=False)
+class Traffic:
+    """Agents of running simulations: their windows, and what has ended."""
+
+    windows: Windows
+    """[B, N, A, W]. An agent that has ended goes on in them, marked as not valid."""
+    alive: Bool[Tensor, "B N A"]
+    """False = padding, or has left the map: it decides nothing any more and keeps its speed and heading."""
+    destination: Int64[Tensor, "B N A"]
+    active: Bool[Tensor, "B N A"]
+    """False = there is no destination, or it has been reached."""
+
+    def after(
+        self,
+        action: Float[Tensor, "B N A 2"],
+        scene: Scene,
+        imposed: Imposed | None = None,
+        staying: Bool[Tensor, "B N A"] | None = None,
+    ) -> "Traffic":
+        """Agents after 0.1 s.
+
+        Args:
+            action: before tanh.
+            scene: map and classes.
+            imposed: agents that are put somewhere.
+            staying: agents that do not end where they leave the map, besides those that are put somewhere.
+        """
+        now = self.windows
+        action = torch.where(self.alive[..., None], action, 0.0)
+        pose, motion = move(
+            now.pose[..., -1, :], now.motion[..., -1, 0], action, max_action(scene.agent_class)[:, None]
+        )
+        # Both rules look at the pose that the action leads to, also where another one is imposed.
+        active = self.active & ~reaches_destination(pose, self.destination.clamp(min=0), scene)
+        ended = leaves_map(pose, scene)
+        for kept in (staying, None if imposed is None else imposed.mask):
+            ended = ended if kept is None else ended & ~kept
+        alive = self.alive & ~ended
+        if imposed is not None:
+            pose = torch.where(imposed.mask[..., None], imposed.pose, pose)
+            motion = torch.where(imposed.mask[..., None], imposed.motion, motion)
+        windows = Windows(
+            torch.cat([now.valid[..., 1:], alive[..., None]], -1),
+            torch.cat([now.pose[..., 1:, :], pose[..., None, :]], -2),
+            torch.cat([now.motion[..., 1:, :], motion[..., None, :]], -2),
+        )
+        return replace(self, windows=windows, alive=alive, active=active)
+
+
+def traffic_at_start(scene: Scene, destination: Int64[Tensor, "B N A"]) -> Traffic:
+    """Agents at the current step, after 10 steps of history.
+
+    Args:
+        scene: with its history.
+        destination: map token of each agent; negative = none.
+    """
+
+    def repeated(v: Tensor) -> Tensor:
+        return v[:, None].expand(-1, destination.shape[1], *v.shape[1:])
+
+    history = history_windows(scene)
+    windows = Windows(repeated(history.valid), repeated(history.pose), repeated(history.motion))
+    # A destination may have been reached in the history.
+    active = destination >= 0
+    for step in range(1, windows.valid.shape[-1]):
+        there = reaches_destination(windows.pose[..., step, :], destination.clamp(min=0), scene)
+        active = active & ~(there & windows.valid[..., step - 1] & windows.valid[..., step])
+    alive = scene.agent_mask[:, None] & windows.valid[..., -1]
+    return Traffic(windows, alive, destination, active)
+
+
+def whole_history(traffic: Sequence[Traffic]) -> Windows:
+    """Agents [B, N, A, 10 + T] over all steps of their windows at T decisions in a row."""
+    first, later = traffic[0].windows, [one.windows for one in traffic[1:]]
+    return Windows(
+        torch.cat([first.valid, *(w.valid[..., -1:] for w in later)], 3),
+        torch.cat([first.pose, *(w.pose[..., -1:, :] for w in later)], 3),
+        torch.cat([first.motion, *(w.motion[..., -1:, :] for w in later)], 3),
+    )
+
+
+@dataclass(eq=False)
+class Memo:
+    """The network's result in a state, so that it is computed once."""
+
+    mean: Float[Tensor, "B N A 2"] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class TrafficBotsState:
+    """State of N simulations of each scene."""
+
+    traffic: Traffic
+    given: Given
+    draws: Float[Tensor, "B N A 17"]
+    """Personality (16 numbers) and index of the destination, -1 where there is none."""
+    num_decisions: int = 0
+    poses: Float[Tensor, "B N A 1 3"] | None = None
+    """In the frame of the batch."""
+    before: "TrafficBotsState | None" = None
+    """State before the last decision: the noise of a decision depends on that of the one before."""
+    decision: Float[Tensor, "B N A 2"] | None = None
+    """The last one."""
+    continues: Bool[Tensor, "B N A"] | None = None
+    """True = the agent did what it decided, so that its noise goes on from there."""
+    memo: Memo = field(default_factory=Memo, repr=False)

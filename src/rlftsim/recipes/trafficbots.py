@@ -1,0 +1,86 @@
+"""TrafficBots models, each with the numbers it is trained by."""
+
+from dataclasses import dataclass, field, replace
+
+import torch
+
+from rlftsim.errors import ConfigError
+from rlftsim.policies.trafficbots.config import TrafficBotsConfig, trafficbots_demo, trafficbots_v15
+from rlftsim.policies.trafficbots.policy import TrafficBotsPolicy
+from rlftsim.recipes.registry import Recipe
+from rlftsim.rollout.policy import Policy
+from rlftsim.tokens.vocabulary import Vocabulary
+from rlftsim.training.catk import CatkConfig
+from rlftsim.training.finetune import FinetuneConfig
+from rlftsim.training.goal_relabeling import GcslConfig
+from rlftsim.training.pretrain import PretrainConfig
+from rlftsim.training.reference import KlConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrafficBotsRecipe(Recipe):
+    """Everything from fresh weights to the fine-tuned TrafficBots policy, which has neither tokens nor goals."""
+
+    model: TrafficBotsConfig = field(default_factory=TrafficBotsConfig)
+    catk: CatkConfig | None = None
+    gcsl: GcslConfig | None = None
+
+    @property
+    def model_name(self) -> str:
+        """TrafficBots V1.5."""
+        return "TrafficBots V1.5"
+
+    @property
+    def counterpart(self) -> str:
+        """SMART, in the small size for small TrafficBots models."""
+        return "smart-tiny" if self.model.dim >= 128 else "synthetic"
+
+    def new_policy(self, vocabulary: Vocabulary | None) -> TrafficBotsPolicy:
+        """A TrafficBots policy with fresh weights, drawn with the seed of pre-training.
+
+        Raises:
+            ConfigError: there is a vocabulary, and nothing that would use it.
+        """
+        if vocabulary is not None:
+            raise ConfigError("a TrafficBots model has no vocabulary: leave --vocabulary out.")
+        torch.manual_seed(self.pretrain.seed)
+        return TrafficBotsPolicy(self.model)
+
+    def like(self, policy: Policy) -> "TrafficBotsRecipe":
+        """The same recipe for TrafficBots policies of the sizes of an existing one.
+
+        Raises:
+            ConfigError: the policy is no TrafficBots policy.
+        """
+        if not isinstance(policy, TrafficBotsPolicy):
+            raise ConfigError(f"this recipe makes TrafficBots policies, none like a {type(policy).__name__}.")
+        return replace(self, model=policy.config)
+
+
+def trafficbots_v15_rlftsim() -> TrafficBotsRecipe:
+    """The paper: TrafficBots V1.5 (7.9 M), pre-trained on WOMD for one epoch, fine-tuned for 12 000 updates."""
+    return TrafficBotsRecipe(
+        model=trafficbots_v15(),
+        pretrain=PretrainConfig(
+            epochs=1.0, batch_size=8, micro_batch_size=2, learning_rate=2e-4, final_lr_ratio=1.0, betas=(0.9, 0.95),
+            weight_decay=0.1, gradient_clip=5.0, label_smoothing=0.0, context_radius_m=None,
+            trained_radius_m=1000.0, max_trained_agents=None, checkpoint_every=500,
+        ),
+        finetune=FinetuneConfig(epochs=0.197, micro_batch_size=2, rollouts_per_pass=2),
+    )  # fmt: skip
+
+
+def trafficbots_demo_rlftsim() -> TrafficBotsRecipe:
+    """A small model for two CPU cores and a few hundred scenarios: many small updates, large steps."""
+    return TrafficBotsRecipe(
+        model=trafficbots_demo(),
+        pretrain=PretrainConfig(
+            epochs=10.0, batch_size=2, micro_batch_size=2, learning_rate=1e-3, warmup_updates=40, betas=(0.9, 0.95),
+            weight_decay=0.1, gradient_clip=5.0, label_smoothing=0.0, context_radius_m=None,
+            trained_radius_m=1000.0, max_trained_agents=None, checkpoint_every=100,
+        ),
+        finetune=FinetuneConfig(
+            epochs=1.0, batch_size=4, num_rollouts=8, rollouts_per_pass=8, learning_rate=1e-4, warmup_updates=5,
+            checkpoint_every=20, kl=KlConfig(target=0.05, initial_beta=0.01),
+        ),
+    )  # fmt: skip

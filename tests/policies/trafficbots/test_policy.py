@@ -1,0 +1,208 @@
+"""TrafficBots as a policy: the contract, the noise, the draws, and scenes without one thing or another."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+import scenes
+from rlftsim.errors import CheckpointError, ConfigError
+from rlftsim.policies.distributions import GaussianDistribution
+from rlftsim.policies.registry import load_policy
+from rlftsim.policies.trafficbots.config import TrafficBotsConfig, trafficbots_demo
+from rlftsim.policies.trafficbots.dynamics import MAX_ACTION
+from rlftsim.policies.trafficbots.policy import TrafficBotsPolicy
+from rlftsim.rollout.check import check_policy
+from rlftsim.rollout.policy import ImitatedPolicy, PartlyTrainedPolicy, Sampling, TrainablePolicy
+from rlftsim.rollout.simulate import simulate
+from rlftsim.scenario.batch import collate
+from rlftsim.training.freezing import freeze_untrained
+
+TINY = TrafficBotsConfig(
+    dim=32, num_heads=2, num_map_layers=1, num_light_layers=1, num_agent_layers=1, map_neighbors=4,
+    light_neighbors=2, agent_map_neighbors=8, agent_light_neighbors=2, agent_neighbors=4, radius_m=100.0,
+    light_radius_m=100.0, steps_per_pass=40,
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def policy():
+    torch.manual_seed(0)
+    policy = TrafficBotsPolicy(TINY).eval()
+    freeze_untrained(policy, "decoder")
+    return policy
+
+
+@pytest.fixture(scope="module")
+def batch():
+    return collate([scenes.bend("one", 3), scenes.junction_with_light("two")])
+
+
+def scored(policy, batch, rollouts):
+    return policy.score(policy.encode(batch), rollouts)
+
+
+@pytest.mark.slow
+def test_the_contract_is_kept(policy):
+    """With wide noise: a pedestrian's own is so narrow that rounding of a turned scene is 1e-3 nats."""
+    wide = TrafficBotsPolicy(replace(TINY, noise_acceleration_mps2=3.0, noise_yaw_rate_radps=0.6)).eval()
+    wide.load_state_dict(policy.state_dict())
+    freeze_untrained(wide, "decoder")
+    report = check_policy(wide, [scenes.bend("one", 3), scenes.junction_with_light("two")])
+    assert report.is_passed, str(report)
+
+
+def test_it_is_a_policy_that_training_knows(policy):
+    assert isinstance(policy, TrainablePolicy)
+    assert isinstance(policy, PartlyTrainedPolicy)
+    assert isinstance(policy, ImitatedPolicy)
+
+
+@torch.no_grad()
+def test_all_eighty_decisions_are_scored_as_they_were_sampled(policy, batch):
+    rollouts = simulate(policy, batch, num_rollouts=2, seed=0)
+    gap = scored(policy, batch, rollouts).log_prob(rollouts.decision) - rollouts.log_prob
+    assert rollouts.decision.shape[3] == 80
+    assert float(gap.abs().max()) < 1e-4
+    # The number of decisions in memory changes nothing.
+    few = TrafficBotsPolicy(replace(TINY, steps_per_pass=7)).eval()
+    few.load_state_dict(policy.state_dict())
+    again = scored(few, batch, rollouts).log_prob(rollouts.decision)
+    assert float((again - rollouts.log_prob).abs().max()) < 1e-4
+
+
+def test_mean_actions_differ_by_draws_alone(policy, batch):
+    first, second = (
+        simulate(policy, batch, num_rollouts=2, seed=0, sampling=Sampling(temperature=0.0)) for _ in range(2)
+    )
+    assert torch.equal(first.position, second.position)
+    assert not torch.equal(first.position[:, 0], first.position[:, 1])
+    # Same draws: the same rollout again.
+    context, draws = policy.encode(batch), first.draws[:, :1]
+    state = policy.start(context, draws)
+    for step in range(5):
+        dist = policy.decide(context, state)
+        taken = first.decision[:, :1, :, step]
+        assert torch.allclose(dist.mean[dist.mask], taken[dist.mask], atol=1e-6)
+        state = policy.advance(context, state, taken)
+
+
+@torch.no_grad()
+def test_the_noise_has_its_size_and_correlation(policy, batch):
+    rollouts = simulate(policy, batch, num_rollouts=8, seed=1)
+    context = policy.encode(batch)
+    correlated = scored(policy, batch, rollouts)
+    white = TrafficBotsPolicy(replace(TINY, noise_correlation=0.0)).eval()
+    white.load_state_dict(policy.state_dict())
+    mean = white.score(context, rollouts).mean  # without the part of the last residual
+    stays = correlated.mask.all(-1)  # [B, N, A] agents that do not leave the map
+    unit = torch.tensor(MAX_ACTION)[context.scene.agent_class][:, None, :, None]  # m/s² and rad/s where tanh is linear
+    noise = ((rollouts.decision - mean) * unit)[stays]  # [agents, 80, 2]
+    assert len(noise) > 40
+    assert noise.std((0, 1)).tolist() == pytest.approx([0.3, 0.03], rel=0.1)
+    lag = (noise[:, 1:] * noise[:, :-1]).mean((0, 1)) / noise.square().mean((0, 1))
+    assert lag.tolist() == pytest.approx([0.9, 0.9], abs=0.03)
+    later, first = correlated.std[stays][:, 1:], correlated.std[stays][:, :1]
+    assert torch.allclose(later, first * math.sqrt(1 - 0.81), rtol=1e-5)
+
+
+def test_the_score_function_has_mean_zero():
+    """E[grad log pi] = 0: of many draws of two correlated decisions, within five standard errors."""
+    torch.manual_seed(0)
+    weight = torch.tensor(0.3, requires_grad=True)
+    count, rho, sigma = 20_000, 0.9, 0.1
+    mask = torch.ones(count, dtype=torch.bool)
+    first_mean = weight.expand(count, 1)
+    first = GaussianDistribution(first_mean, torch.full((count, 1), sigma), mask)
+    u0 = first.sample(Sampling(), torch.rand(count, 1))
+    second_mean = weight.square() * (1 + u0) + rho * (u0 - first_mean)
+    second = GaussianDistribution(second_mean, torch.full((count, 1), sigma * math.sqrt(1 - rho**2)), mask)
+    u1 = second.sample(Sampling(), torch.rand(count, 1))
+    # One gradient for each draw: of copies of the weight.
+    copies = weight.detach().expand(count).clone().requires_grad_(True)
+    mean0 = copies[:, None]
+    mean1 = copies.square()[:, None] * (1 + u0) + rho * (u0 - mean0)
+    log_prob = (
+        GaussianDistribution(mean0, first.std, mask).log_prob(u0)
+        + GaussianDistribution(mean1, second.std, mask).log_prob(u1)
+    ).sum()
+    (grad,) = torch.autograd.grad(log_prob, copies)
+    assert float(grad.mean().abs()) < 5 * float(grad.std()) / math.sqrt(count)
+    # The reward u0 + u1 has the gradient 1 + 2w(1 + w) + w² in expectation.
+    reward = (u0 + u1)[:, 0]
+    estimate = (reward - reward.mean()) * grad
+    expected = 1 + 2 * 0.3 * 1.3 + 0.3**2
+    assert float(estimate.mean()) == pytest.approx(expected, abs=5 * float(estimate.std()) / math.sqrt(count))
+
+
+@pytest.mark.parametrize(
+    "scenario",
+    [
+        scenes.lone_agent(),
+        scenes.without_map(),
+        scenes.build_scenario("walkers", [scenes.Mover(scenes.ObjectType.PEDESTRIAN, x_m=3.0 * k) for k in range(3)]),
+        scenes.without_road_edges(),
+    ],
+    ids=["one agent", "no map", "only pedestrians", "no edges"],
+)
+def test_scenes_without_something_are_simulated_scored_and_trained_on(policy, scenario):
+    batch = collate([scenario])
+    rollouts = simulate(policy, batch, num_rollouts=1, seed=0)
+    assert rollouts.position.isfinite().all()
+    assert float((scored(policy, batch, rollouts).log_prob(rollouts.decision) - rollouts.log_prob).abs().max()) < 1e-4
+    found = policy.imitation_loss(batch, batch.agent_mask, 0)
+    assert found.loss.isfinite()
+    found.loss.backward()
+    grads = [p.grad for p in policy.parameters() if p.grad is not None]
+    assert all(grad.isfinite().all() for grad in grads)
+    policy.zero_grad()
+
+
+def test_an_agent_that_leaves_the_map_goes_on_straight_and_decides_nothing(policy):
+    batch = collate([scenes.bend("leaving", 3)])
+    context = policy.encode(batch)
+    box = context.scene.map_box.clone()
+    box[:, 1] = 5.0  # x: the ego passes it soon
+    context = replace(context, scene=replace(context.scene, map_box=box))
+    state = policy.begin(context, 1, None, torch.full((1, 1, 3, 17), 0.5))
+    for _ in range(20):
+        dist = policy.decide(context, state)
+        state = policy.advance(context, state, dist.mean)
+    assert not state.traffic.alive[0, 0, 0]
+    dist = policy.decide(context, state)
+    assert float(dist.entropy()[0, 0, 0].detach()) == 0
+    after = policy.advance(context, state, dist.mean)
+    moved = (after.poses - state.poses)[0, 0, 0, 0]
+    assert float(moved[:2].norm().detach()) == pytest.approx(
+        0.1 * abs(float(state.traffic.windows.motion[0, 0, 0, -1, 0])), rel=1e-3
+    )
+    assert float(moved[2].detach()) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_it_is_saved_and_loaded_by_folder(policy, batch, tmp_path):
+    policy.save_pretrained(tmp_path / "model")
+    again = load_policy(tmp_path / "model")
+    assert again.config == TINY
+    assert all(torch.equal(v, again.state_dict()[k]) for k, v in policy.state_dict().items())
+    (tmp_path / "model" / "config.json").write_text('{"architecture": "trafficbots", "dim": 48}')
+    with pytest.raises(CheckpointError, match="weights do not fit this model"):
+        load_policy(tmp_path / "model")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"dim": 40}, "multiple of 16"),
+        ({"noise_correlation": 1.0}, r"noise_correlation is in \[0, 1\)"),
+        ({"forced_fractions": (1.5,)}, "forced_fractions are fractions"),
+    ],
+)
+def test_wrong_sizes_are_refused(changes, message):
+    with pytest.raises(ConfigError, match=message):
+        replace(trafficbots_demo(), **changes)
+
+
+def test_top_k_is_refused(policy, batch):
+    with pytest.raises(ConfigError, match="needs a policy with categories"):
+        simulate(policy, batch, num_rollouts=1, seed=0, sampling=Sampling(top_k=5))
