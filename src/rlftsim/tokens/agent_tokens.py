@@ -264,10 +264,10 @@ def nearest_tokens(
     """
     if class_id.device.type != "cpu":
         # All tokens of each row's class are compared: to select rows, the host would wait for their number.
-        chunks = zip(
-            *(v.split(_ROWS_PER_CHUNK_ELSEWHERE) for v in (local_corners.reshape(-1, 4, 2), class_id.flatten()))
-        )
-        return torch.cat([_nearest_of_class(*chunk, vocabulary) for chunk in chunks]).view_as(class_id) * valid
+        boxes = local_corners.reshape(-1, 4, 2).split(_ROWS_PER_CHUNK_ELSEWHERE)
+        classes = class_id.flatten().split(_ROWS_PER_CHUNK_ELSEWHERE)
+        tokens = [_nearest_of_class(*chunk, vocabulary=vocabulary) for chunk in zip(boxes, classes)]
+        return torch.cat(tokens).view_as(class_id) * valid
     out = torch.zeros_like(class_id)
     # Classes may have different numbers of tokens: rows are found among those that exist, then mapped to token ids.
     for index, (table, exists) in enumerate(zip(vocabulary.end_corners(), vocabulary.token_mask)):

@@ -66,7 +66,7 @@ class ImitationConfig:
     goal_learning_rate_scale: float = 1.0
     """Learning rate of the goal encoder, if there is one, over that of all other weights."""
     betas: tuple[float, float] = (0.9, 0.999)
-    """Decay rates of Adam's moments; None = 0.9 and 0.999."""
+    """Decay rates of Adam's moments."""
     weight_decay: float = 0.01
     """Decoupled, as in AdamW."""
     gradient_clip: float = 0.5

@@ -5,6 +5,7 @@ predicts them. Turning tokens tell. Vehicles only, as they are the ones that fol
 """
 
 from dataclasses import dataclass, replace
+from typing import Any, cast
 
 import torch
 from jaxtyping import Bool, Float
@@ -78,7 +79,7 @@ def measure_map_use(policy: PretrainablePolicy, batch: ScenarioBatch) -> MapUse:
 
 def _vehicle_losses(policy: PretrainablePolicy, batch: ScenarioBatch) -> tuple[Float[Tensor, "r"], Bool[Tensor, "r"]]:
     """Cross-entropy of each predicted vehicle token, nats; and True where the token turns."""
-    vocabulary: Vocabulary = policy.vocabulary  # type: ignore[attr-defined]
+    vocabulary: Vocabulary = cast(Any, policy).vocabulary
     predicted: Prediction = policy.teacher_forced(batch, batch.agent_mask)
     vehicle = CLASS_NAMES.index("vehicle")
     rows = predicted.target_mask & (predicted.class_id == vehicle)
