@@ -38,7 +38,7 @@ from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import Policy
 from rlftsim.scenario.dataset import MANIFEST, ScenarioDataset
 from rlftsim.scenario.shards import hash_file
-from rlftsim.training.run_folder import RunFolder, flatten, may_change, to_plain
+from rlftsim.training.run_folder import RunFolder, default_settings, flatten, may_change, to_plain
 
 GOALS_SUFFIX: Mapping[GoalsGiven, str] = {"none": "", "logged": "-recorded-goals"}
 """End of the names of evaluations; release 0.1 named them so, and its evaluations are found."""
@@ -81,7 +81,7 @@ class ExperimentSuite:
         # trained on: both are opened before anything is written.
         _ = self.training
         ScenarioDataset(self.data, self.evaluation.split)
-        RunFolder(self.out, self._what_counts())
+        RunFolder(self.out, self._what_counts(), defaults={"recipe": default_settings(self.recipe)})
 
     @cached_property
     def training(self) -> ScenarioDataset:

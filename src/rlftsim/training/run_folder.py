@@ -156,12 +156,21 @@ class RunFolder:
         config: a dataclass of settings.
         inputs: hashes of what the run starts from, see `describe_inputs`.
         writes: False in all processes but that of rank 0.
+        defaults: of settings that a stored run may lack, nested as the settings; None = those of the dataclass.
 
     Raises:
         CheckpointError: the folder belongs to a run with other settings or inputs.
     """
 
-    def __init__(self, path: Path, config: Any, inputs: Mapping[str, str] | None = None, *, writes: bool = True):
+    def __init__(
+        self,
+        path: Path,
+        config: Any,
+        inputs: Mapping[str, str] | None = None,
+        *,
+        writes: bool = True,
+        defaults: Mapping[str, Any] | None = None,
+    ):
         self.path = path
         self.checkpoints = path / "checkpoints"
         self.model = path / "model"
@@ -170,7 +179,7 @@ class RunFolder:
         self._board: SummaryWriter | None = None
         # Settings and inputs stand in one file: both make a run what it is.
         plain = {**to_plain(config), **(inputs or {})}
-        self._refuse_other(plain, flatten(default_settings(config)))
+        self._refuse_other(plain, flatten(default_settings(config) if defaults is None else defaults))
         if writes:
             write_text(path / "config.json", json.dumps(plain, indent=1) + "\n")
             write_text(path / "environment.json", json.dumps(describe_environment(), indent=1) + "\n")
