@@ -95,9 +95,9 @@ def blocks(request, monkeypatch):
         blocks.append(NeighborBlock(torch.randint(0, 5, shape, generator=generator), bias[:, None], edges))
         leaves.append(edges)
     sources = torch.randn(5, DIM, generator=generator, dtype=torch.float64, requires_grad=True)
-    # a dropout that zeroes the same weights whenever it is called with the same shape
+    # dropout zeroes the same weights whenever it is called with the same shape
     kept = {(s, NUM_HEADS, k): torch.rand(s, NUM_HEADS, k, generator=generator) >= 0.3 for s, k in ((4, 3), (3, 6))}
-    monkeypatch.setattr(module.functional, "dropout", lambda w, rate: w * kept[tuple(w.shape)] / (1 - rate))
+    monkeypatch.setattr(module, "draw_dropout", lambda w, probability: kept[tuple(w.shape)] / (1 - probability))
     return tuple(blocks), leaves, sources
 
 
@@ -108,7 +108,7 @@ def plain_gather(queries, source, around, dropout):
     for block, block_query in zip(around.blocks, query.split(around.sizes)):
         edges = block.edge_features if source is None else torch.cat([block.edge_features, source[block.neighbors]], -1)
         weights = torch.softmax(torch.einsum("rhc,rkc->rhk", block_query, edges) + block.bias, -1)
-        weights = functional.dropout(weights, dropout) if dropout else weights
+        weights = weights * module.draw_dropout(weights, dropout) if dropout else weights
         sums.append(torch.einsum("rhk,rkc->rhc", weights, edges))
         totals.append(weights.sum(-1, keepdim=True))
     return torch.cat(sums).split([q.shape[-1] for q in queries], -1), torch.cat(totals)

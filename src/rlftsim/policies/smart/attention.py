@@ -19,6 +19,7 @@ from torch.autograd.function import Function, once_differentiable
 from torch.nn import functional
 from torch.utils.checkpoint import checkpoint
 
+from rlftsim.policies.smart.dropout import Dropout, draw_dropout
 from rlftsim.policies.smart.embeddings import EPSILON, RelationEmbedding, normalize
 
 FLOATS_PER_BLOCK = {"cpu": 1 << 19}
@@ -276,7 +277,7 @@ class _GatherEdges(Function):
             for part, query in zip(parts, block_queries):
                 scores = torch.baddbmm(scores, query, part.mT)  # [r, H, K]
             softmax = torch.softmax(scores, -1)
-            weights = functional.dropout(softmax, dropout) if dropout else softmax
+            weights = softmax * draw_dropout(softmax, dropout) if dropout else softmax
             for part, result in zip(parts, block_sums):
                 torch.bmm(weights, part, out=result)
             torch.sum(weights, -1, keepdim=True, out=block_total)
@@ -362,7 +363,7 @@ class RelationAttention(nn.Module):
             nn.LayerNorm(dim),
             nn.Linear(dim, 4 * dim),
             nn.ReLU(),
-            nn.Dropout(dropout),
+            Dropout(dropout),
             nn.Linear(4 * dim, dim),
             nn.LayerNorm(dim),
         )
