@@ -158,7 +158,7 @@ def read_map(path: Path) -> tuple[MapFeatures, Ground]:
     return MapFeatures.of(features, topology), ground
 
 
-def find_cuts(ring: Float[np.ndarray, "n+1 2"]) -> Bool[np.ndarray, "n"]:
+def find_cuts(ring: Float[np.ndarray, "corners 2"]) -> Bool[np.ndarray, "lines"]:
     """Segments of an outline along which the map was cut out of the city's, True.
 
     They lie on a line of the 30 m grid, within a centimeter, and make a piece longer than a meter.

@@ -84,5 +84,5 @@ def _vehicle_losses(policy: PretrainablePolicy, batch: ScenarioBatch) -> tuple[F
     vehicle = CLASS_NAMES.index("vehicle")
     rows = predicted.target_mask & (predicted.class_id == vehicle)
     target = predicted.target[rows]
-    turn = vocabulary.poses()[vehicle, target, -1, 2]  # [r], heading at the end of the token, rad
+    turn = vocabulary.poses[vehicle, target, -1, 2]  # [r], heading at the end of the token, rad
     return functional.cross_entropy(predicted.logits[rows], target, reduction="none"), turn.abs() > TURNING_RAD

@@ -17,7 +17,8 @@ def test_the_share_of_zeros_is_the_probability_and_the_mean_is_one(probability):
     error = math.sqrt(probability * (1 - probability) / count)
     assert abs(dropped - probability) < 4 * error + 0.5 / (1 << 16)
     kept = factors[factors > 0]
-    assert (kept == kept[0]).all() and kept[0] == pytest.approx(1 / (1 - probability), rel=2e-5)
+    assert (kept == kept[0]).all()
+    assert kept[0] == pytest.approx(1 / (1 - probability), rel=2e-5)
     assert abs(float(factors.double().mean()) - 1) < 4 * error / (1 - probability)
 
 

@@ -1,6 +1,6 @@
 """Dropout with masks drawn from 16-bit integers.
 
-torch draws a random number for each element of a mask, four times as many. Masks are a tenth of a CAT-K update that way.
+torch draws a random number for each element of a mask, four times as many. Its masks are a tenth of a CAT-K update.
 """
 
 import torch
