@@ -12,6 +12,7 @@ from safetensors.torch import load_file
 
 import tiny
 from rlftsim.policies.registry import load_policy
+from rlftsim.policies.smart import attention, dropout
 from rlftsim.policies.smart.config import SmartConfig
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.rollout.baselines import ConstantVelocity
@@ -103,6 +104,11 @@ def resume(name, out):
             catk_finetune(load_policy("models/goals"), training, out, CATK)
 
 
+def draw_as_torch(x, probability):
+    """Dropout's factors from torch's random numbers, as in 0.1."""
+    return torch.nn.functional.dropout(torch.ones_like(x), probability)
+
+
 def lines_of(folder):
     """Metrics without times, which differ from run to run."""
     return [
@@ -112,7 +118,9 @@ def lines_of(folder):
 
 
 @pytest.mark.parametrize("name", ["base", "tuned", "goals", "gcsl", "catk"])
-def test_a_run_of_0_1_that_was_stopped_resumes_and_ends_as_it_would_have(name, stored, tmp_path):
+def test_a_run_of_0_1_that_was_stopped_resumes_and_ends_as_it_would_have(name, stored, tmp_path, monkeypatch):
+    for module in (attention, dropout):
+        monkeypatch.setattr(module, "draw_dropout", draw_as_torch)
     if name == "base" and torch.backends.cpu.get_cpu_capability() not in ("AVX2", "AVX512"):
         pytest.skip("this processor draws other fresh weights, so the run is another one")
     out = tmp_path / name

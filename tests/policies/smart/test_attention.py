@@ -32,7 +32,7 @@ def attention():
 def embedding():
     torch.manual_seed(1)
     embedding = FourierEmbedding(3, DIM, 8).double()
-    initialize(embedding)
+    initialize(embedding, "normal")
     return embedding
 
 
