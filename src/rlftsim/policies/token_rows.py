@@ -90,7 +90,9 @@ class _RowStatistics(torch.autograd.Function):
         *reference: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
         inputs = (hidden, weight, offset, class_id, chosen, *reference)
-        log_prob, kl, entropy = hidden.new_empty(3, len(hidden))
+        # At least float32, as the logits of `_logits`: hidden features are bfloat16 under autocast.
+        dtype = torch.promote_types(hidden.dtype, torch.float32)
+        log_prob, kl, entropy = hidden.new_empty(3, len(hidden), dtype=dtype)
         for rows, log_p, log_q in _blocks(*inputs):
             p = log_p.exp()
             log_prob[rows] = log_p.gather(-1, chosen[rows, None])[:, 0]
