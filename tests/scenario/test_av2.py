@@ -296,8 +296,6 @@ def test_a_file_of_sizes_replaces_guesses(tmp_path):
         (tmp_path / "sizes.json").write_text(text)
         with pytest.raises(ConfigError, match=cause):
             Av2Source(sizes=tmp_path / "sizes.json")
-    with pytest.raises(ConfigError, match="window must be one of last, first, both, av2"):
-        convert(tmp_path, tmp_path / "data", reader="av2", options={"window": "all"})
     with pytest.raises(ConfigError, match="data source 'womd' has no option 'window': it takes none"):
         convert(tmp_path, tmp_path / "data", reader="womd", options={"window": "last"})
 

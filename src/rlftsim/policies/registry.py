@@ -29,6 +29,7 @@ POLICIES: ExtensionPoint[Callable[..., Any]] = ExtensionPoint(
         "smart": "rlftsim.policies.smart.policy:SmartPolicy",
         "trafficbots": "rlftsim.policies.trafficbots.policy:TrafficBotsPolicy",
         "constant_velocity": "rlftsim.rollout.baselines:ConstantVelocity",
+        "demo-base": "rlftsim.policies.shipped:demo_base",
     },
 )
 """Architecture name -> policy class. A class that can be called without arguments is a policy by its name alone."""

@@ -303,23 +303,27 @@ class _GatherEdges(Function):
             zip(*[iter(saved)] * 4), _cut_all(factors, ctx.sizes), _cut_all(query_grads, ctx.sizes),
             total_grad.split(ctx.sizes),
         )  # fmt: skip
-        for index, (stored, block_factors, block_grads, block_total) in enumerate(per_block):
-            edges, neighbors, softmax, weights = stored
-            parts = _parts(edges, neighbors, source)
-            weight_grad = block_total.expand_as(weights)
-            for part, factor in zip(parts, block_factors):
-                weight_grad = torch.baddbmm(weight_grad, factor[:, :num_heads], part.mT)  # [r, H, K]
-            score_grad = weight_grad.mul_(weights)
-            score_grad = torch.addcmul(score_grad, softmax, score_grad.sum(-1, keepdim=True), value=-1)
-            for part, result in zip(parts, block_grads):
-                torch.bmm(score_grad, part, out=result)
-            left = torch.cat([weights, score_grad], 1).mT  # [r, K, 2H]
-            if edges_need_grad:
-                buffer = ctx.buffers[index]
-                added = torch.bmm(left, block_factors[0]) if buffer is None else buffer.baddbmm_(left, block_factors[0])
-                ctx.buffers[index] = added
-            if source_grad is not None:
-                source_grad.index_add_(0, neighbors.flatten(), (left @ block_factors[1]).flatten(0, 1))
+        # As in the forward pass: a backward pass may be called under autocast.
+        with torch.autocast(total_grad.device.type, enabled=False):
+            for index, (stored, block_factors, block_grads, block_total) in enumerate(per_block):
+                edges, neighbors, softmax, weights = stored
+                parts = _parts(edges, neighbors, source)
+                weight_grad = block_total.expand_as(weights)
+                for part, factor in zip(parts, block_factors):
+                    weight_grad = torch.baddbmm(weight_grad, factor[:, :num_heads], part.mT)  # [r, H, K]
+                score_grad = weight_grad.mul_(weights)
+                score_grad = torch.addcmul(score_grad, softmax, score_grad.sum(-1, keepdim=True), value=-1)
+                for part, result in zip(parts, block_grads):
+                    torch.bmm(score_grad, part, out=result)
+                left = torch.cat([weights, score_grad], 1).mT  # [r, K, 2H]
+                if edges_need_grad:
+                    buffer = ctx.buffers[index]
+                    added = (
+                        torch.bmm(left, block_factors[0]) if buffer is None else buffer.baddbmm_(left, block_factors[0])
+                    )
+                    ctx.buffers[index] = added
+                if source_grad is not None:
+                    source_grad.index_add_(0, neighbors.flatten(), (left @ block_factors[1]).flatten(0, 1))
         token_grad = total_grad.new_zeros(()) if edges_need_grad else None
         return None, None, token_grad, source_grad, *query_grads
 
