@@ -72,7 +72,8 @@ def data(tmp_path_factory):
 
 
 def same(a: Evaluation, b: Evaluation) -> bool:
-    return a.table.equals(b.table) and a.skipped == b.skipped
+    # By text, in which NaN is NaN: no evaluated agent of a scenario may stay on the road in the log.
+    return repr(a.table.to_pylist()) == repr(b.table.to_pylist()) and a.skipped == b.skipped
 
 
 def test_oracle_has_the_scores_of_the_log_itself(data, tmp_path):

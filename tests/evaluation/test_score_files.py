@@ -53,7 +53,8 @@ def rollouts(tmp_path_factory):
 
 
 def same(a: Evaluation, b: Evaluation) -> bool:
-    return a.table.equals(b.table) and a.skipped == b.skipped
+    # By text, in which NaN is NaN: no evaluated agent of a scenario may stay on the road in the log.
+    return repr(a.table.to_pylist()) == repr(b.table.to_pylist()) and a.skipped == b.skipped
 
 
 def test_every_scenario_with_rollouts_is_scored_in_the_order_of_the_files(data, rollouts, tmp_path):

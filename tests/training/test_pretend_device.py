@@ -19,7 +19,7 @@ from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import write_dataset
-from rlftsim.training import finetune, imitation
+from rlftsim.training import processes
 from rlftsim.training.goals import GoalConfig
 from rlftsim.training.run_folder import read_metrics
 from rlftsim.training.validation import ValidationConfig
@@ -45,8 +45,7 @@ class PretendFabric:
 
 @pytest.fixture
 def device(monkeypatch):
-    for module in (finetune, imitation):
-        monkeypatch.setattr(module, "start_fabric", lambda config: PretendFabric())
+    monkeypatch.setattr(processes, "start_fabric", lambda config: PretendFabric())
     with PretendDevice() as device:
         yield device
 

@@ -191,7 +191,6 @@ def prepare(
         lr=config.learning_rate,
         betas=config.betas,
         weight_decay=config.weight_decay,
-        fused=True,
     )
     reference = copy.deepcopy(policy).requires_grad_(False)
     beta = config.kl.initial_beta

@@ -225,7 +225,7 @@ def _imitate(
     learner = _Imitator(
         policy=model,
         optimizer=torch.optim.AdamW(
-            groups, lr=config.learning_rate, betas=config.betas, weight_decay=config.weight_decay, fused=True
+            groups, lr=config.learning_rate, betas=config.betas, weight_decay=config.weight_decay
         ),
         run=run,
         predict=predict,
