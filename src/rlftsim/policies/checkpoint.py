@@ -62,8 +62,10 @@ class StoredModel:
         Raises:
             CheckpointError: settings that it does not take, or takes in other types.
         """
+        # JSON has lists where settings have tuples.
+        settings = {name: tuple(v) if isinstance(v, list) else v for name, v in self.config.items()}
         try:
-            return make(**self.config)
+            return make(**settings)
         except TypeError as error:
             # a wrong call, not a damaged file: the folder may be of a newer version, or was edited
             cause = " ".join(str(error).split())
