@@ -284,7 +284,7 @@ class _GatherEdges(Function):
             saved.append((edges, block.neighbors, softmax, weights))
         # saved in this way, edge features go as soon as the backward pass is through
         ctx.save_for_backward(source, *queries, *itertools.chain(*saved))
-        ctx.sizes = sizes
+        ctx.sizes, ctx.device_type = sizes, total.device.type
         ctx.buffers = None if neighborhoods.gradients is None else neighborhoods.gradients.buffers
         return *sums, total
 
@@ -304,7 +304,7 @@ class _GatherEdges(Function):
             total_grad.split(ctx.sizes),
         )  # fmt: skip
         # As in the forward pass: a backward pass may be called under autocast.
-        with torch.autocast(total_grad.device.type, enabled=False):
+        with torch.autocast(ctx.device_type, enabled=False):
             for index, (stored, block_factors, block_grads, block_total) in enumerate(per_block):
                 edges, neighbors, softmax, weights = stored
                 parts = _parts(edges, neighbors, source)
