@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch.nn import functional
 
 import scenes
 import tiny
@@ -18,6 +19,7 @@ from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import collate
 from rlftsim.training import experience
 from rlftsim.training import finetune as module
+from rlftsim.training.data import trained_agents
 from rlftsim.training.finetune import FinetuneConfig, compute_reward, finetune, prepare, update_policy
 from rlftsim.training.parallel import start_fabric
 from rlftsim.training.policy_gradient import masked_sum
@@ -339,6 +341,43 @@ def test_the_entropy_bonus_pulls_towards_the_uniform_distribution(learner, batch
     assert values[0] < values[1] < values[2]
 
 
+def test_the_imitation_term_is_the_weighted_mean_of_the_pretraining_loss(learner, batch, fabric, reward_of):
+    config = replace(CONFIG, reward=reward_of(nothing), imitation_weight=2.0)
+    learner.beta = 0.0
+    first = snapshot(learner.policy)
+    trained = {name for name, weight in learner.policy.named_parameters() if weight.requires_grad}
+    prediction = learner.policy.teacher_forced(batch, trained_agents(batch, 0, radius_m=math.inf, limit=None, seed=0))
+    mask = prediction.target_mask
+    loss = functional.cross_entropy(prediction.logits[mask], prediction.target[mask])
+    loss.backward()
+    expected = {name: 2 * gradient for name, gradient in tiny.gradients_of(learner.policy).items() if name in trained}
+    for micro_batch_size in (2, 1):  # the mean is over predictions, however the scenarios are grouped
+        learner.policy.load_state_dict(first)
+        values = update_policy(learner, batch, replace(config, micro_batch_size=micro_batch_size), fabric)
+        assert values["imitation_loss"] == pytest.approx(float(loss.detach()), rel=1e-5)
+        found = tiny.gradients_of(learner.policy)
+        for name, gradient in expected.items():
+            torch.testing.assert_close(found[name], gradient, rtol=1e-3, atol=1e-6)
+
+
+def test_the_imitation_term_pulls_towards_the_log(learner, batch, fabric, reward_of):
+    config = replace(CONFIG, reward=reward_of(nothing), imitation_weight=1.0, learning_rate=1e-3, warmup_updates=1)
+    losses = [update_policy(learner, batch, config, fabric)["imitation_loss"] for _ in range(4)]
+    assert losses == sorted(losses, reverse=True)
+
+
+def test_a_policy_without_a_pretraining_loss_has_no_imitation_term(drawn_scenarios, tmp_path):
+    class Learned(ConstantVelocity, torch.nn.Module):
+        def __init__(self):
+            torch.nn.Module.__init__(self)
+
+        def save_pretrained(self, folder, *, card=""):
+            raise NotImplementedError
+
+    with pytest.raises(ConfigError, match="it has no teacher_forced and no imitation_loss"):
+        finetune(Learned(), drawn_scenarios, tmp_path, replace(tiny.FINETUNE, imitation_weight=0.1))
+
+
 def test_gradients_are_clipped_and_weights_decay(learner, batch, fabric, reward_of):
     update_policy(learner, batch, replace(CONFIG, gradient_clip=1e-3), fabric)
     norm = math.sqrt(sum(float(g.square().sum()) for g in tiny.gradients_of(learner.policy).values()))
@@ -401,6 +440,7 @@ def test_no_scenario_is_refused(vocabulary, tmp_path):
         ({"batch_size": 0}, "must be positive"),
         ({"reward": "joy"}, "unknown reward 'joy': known are .*mloo"),
         ({"metric": "1999"}, "known are 2025"),
+        ({"imitation_weight": -0.1}, "imitation_weight must not be negative"),
         ({"micro_batch_size": 0}, "micro_batch_size must be positive"),
     ],
 )

@@ -77,6 +77,9 @@ class FinetuneConfig:
     """Largest norm of the gradient."""
     entropy_bonus: float = 0.0
     """Weight of the policy's entropy in the objective."""
+    imitation_weight: float = 0.0
+    """Weight of the pre-training loss on the same scenarios in the objective: it holds speeds and kinematics near the
+    log while realism rises. 0 = the paper's objective."""
     log_prob_reduction: Reduction = "mean"
     """Over agents and decisions. The mean makes the size of an update independent of the number of agents."""
     trained: TrainedParts = "decoder"
@@ -102,8 +105,8 @@ class FinetuneConfig:
             )
         sizes = ("batch_size", "micro_batch_size", "rollouts_per_pass", "checkpoint_every", "max_skipped_in_a_row")
         require_positive(self, ("epochs", "learning_rate", "gradient_clip", "max_kl", *sizes))
-        require_not_negative(self, ("warmup_updates", "weight_decay"))
-        require_finite(self, ("epochs", "learning_rate", "weight_decay", "entropy_bonus"))
+        require_not_negative(self, ("warmup_updates", "weight_decay", "imitation_weight"))
+        require_finite(self, ("epochs", "learning_rate", "weight_decay", "entropy_bonus", "imitation_weight"))
         if not all(0 <= beta < 1 for beta in self.betas):
             raise ConfigError(f"betas are decay rates in [0, 1), got {self.betas}.")
         if not 0 <= self.credit_mixing <= 1:
@@ -144,7 +147,7 @@ def finetune(
         CheckpointError: `out` holds another run, or the run diverged (its last good checkpoint is named).
     """
     scenarios = as_scenarios(scenarios)
-    model = require_trainable(policy, scenarios, "rewards")
+    model = require_trainable(policy, scenarios, "rewards", imitated=config.imitation_weight > 0)
     refuse_goals(policy, config.goals.probability)
     augmented = config.goals.open_augmented(scenarios)
 
@@ -224,10 +227,11 @@ def update_policy(
         realism, rewards = compute_reward(part, rollouts, config)
         experiences.append(Experience(part, rollouts, realism, rewards, context))
         clock.lap("reward")
-    # 3. Score them under policy and reference: gradient of the policy-gradient loss with its KL penalty.
+    # 3. Score them under policy and reference: gradient of the policy-gradient loss with its KL penalty, and of the
+    # pre-training loss where it has a weight.
     terms = LossTerms(
         *count_decisions(experiences, fabric), learner.beta, config.entropy_bonus, config.log_prob_reduction,
-        config.kl.condition_reference,
+        config.kl.condition_reference, config.imitation_weight, learner.update,
     )  # fmt: skip
     learner.optimizer.zero_grad(set_to_none=True)
     sums = accumulate_gradients(
@@ -247,7 +251,7 @@ def update_policy(
     learner.finish_update(is_good=math.isfinite(norm) and sums.kl <= config.max_kl)
     values = {
         **describe(experiences, fabric), "kl": sums.kl, "entropy": sums.entropy, **hindsight,
-        "score_gap": sums.score_gap, "beta": learner.beta, "gradient_norm": norm,
+        **sums.imitation, "score_gap": sums.score_gap, "beta": learner.beta, "gradient_norm": norm,
         "skipped": float(learner.skipped_in_a_row),
     }  # fmt: skip
     # 6. Adapt the strength of the KL penalty to the KL of this update.

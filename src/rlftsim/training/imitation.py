@@ -9,7 +9,7 @@ import copy
 import math
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -313,6 +313,55 @@ def _update(learner: _Imitator, update: int) -> dict[str, float]:
         "predictions": predictions,
         "learning_rate": learner.optimizer.param_groups[0]["lr"],
     }
+
+
+def loss_along_log(
+    model: Any, batch: ScenarioBatch, trained: Bool[Tensor, "B A"], update: int
+) -> Prediction | ImitationLoss:
+    """The model's own imitation loss, or its predictions of the next token along logged tracks.
+
+    Args:
+        model: a PretrainablePolicy or an ImitatedPolicy; its own loss goes first.
+        batch: with its future.
+        trained: True = the agent's predictions count.
+        update: counted from 0; what an own loss draws depends on it.
+    """
+    own_loss = getattr(model, "imitation_loss", None)
+    return model.teacher_forced(batch, trained) if own_loss is None else own_loss(batch, trained, update)
+
+
+def accumulate_imitation(
+    model: Any, batches: Sequence[ScenarioBatch], weight: float, fabric: Fabric, *, update: int
+) -> float:
+    """Set the model's gradient to that of `weight` times the mean pre-training loss along the log.
+
+    Goes before anything else that adds to the gradient: the mean is over the predictions of all processes, whose number
+    is known only when all have been made, so what was accumulated is scaled at the end.
+
+    Args:
+        model: with zero gradients; see `loss_along_log`.
+        batches: this process's scenarios, with their futures; all agents with a future count.
+        weight: of the loss.
+        fabric: precision, and the processes that the mean is over.
+        update: counted from 0.
+
+    Returns:
+        The mean loss, nats per prediction for policies over tokens.
+    """
+    sums = torch.zeros(2, device=fabric.device, dtype=torch.float64)  # loss, number of predictions
+    for batch in batches:
+        all_agents = trained_agents(batch, update, radius_m=math.inf, limit=None, seed=0)
+        with fabric.autocast():
+            predicted = loss_along_log(model, batch, all_agents, update)
+        if not isinstance(predicted, ImitationLoss):
+            predicted = summed_loss(predicted, label_smoothing=0.0)
+        fabric.backward(predicted.loss)
+        sums += torch.stack([predicted.loss.detach().double(), predicted.count.double()])
+    total, count = all_reduce_sum(sums, fabric).tolist()
+    for parameter in model.parameters():
+        if parameter.grad is not None:
+            parameter.grad.mul_(weight / max(count, 1.0))
+    return total / max(count, 1.0)
 
 
 def summed_loss(

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from rlftsim.rollout.policy import decision_statistics, encode_like, score_both
 from rlftsim.training.experience import Experience
+from rlftsim.training.imitation import accumulate_imitation
 from rlftsim.training.parallel import Fabric, all_reduce_sum
 
 Reduction = Literal["mean", "sum"]
@@ -73,6 +74,10 @@ class LossTerms:
     reduction: Reduction
     condition_reference: bool
     """False = the reference is scored without goals."""
+    imitation_weight: float
+    """Of the pre-training loss on the same scenarios."""
+    update: int
+    """Counted from 0."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +90,9 @@ class GradientSums:
     """Nats per decision; mean over all processes."""
     score_gap: float
     """Largest difference between a log-probability as sampled and as scored, in this process."""
+    imitation: dict[str, float]
+    """Metric `imitation_loss`, the pre-training loss: nats per prediction, mean over all processes. Empty where it has
+    no weight."""
     agent_log_prob: list[list[Float[Tensor, "_ _ _"]]]
     """Summed log-probability of each agent's decisions, by experience and slice; no gradient."""
 
@@ -100,10 +108,11 @@ def accumulate_gradients(
 ) -> GradientSums:
     """Add this process's gradient of the loss to the policy's parameters.
 
-    The loss is  policy_gradient_loss + (beta * KL - entropy_bonus * entropy) / decisions.
+    The loss is
+    policy_gradient_loss + (beta * KL - entropy_bonus * entropy) / decisions + imitation_weight * pre-training loss.
 
     Args:
-        policy: scores the rollouts with gradient.
+        policy: scores the rollouts with gradient; its gradients are zero.
         reference: scores them without; under the same goals, unless `terms.condition_reference` is False. A reference
             whose goal encoder was added for this run is still goal-free; an already conditioned one anchors the policy
             to its goal-following.
@@ -116,6 +125,11 @@ def accumulate_gradients(
     gaps: list[Tensor] = []
     by_experience: list[list[Tensor]] = []
     num_decisions = max(terms.num_decisions, 1.0)
+    imitation: dict[str, float] = {}
+    if terms.imitation_weight:
+        batches = [experience.batch for experience in experiences]
+        loss = accumulate_imitation(policy, batches, terms.imitation_weight, fabric, update=terms.update)
+        imitation["imitation_loss"] = loss
     for experience in experiences:
         by_experience.append([])
         with fabric.autocast(), torch.no_grad():
@@ -140,4 +154,4 @@ def accumulate_gradients(
             by_experience[-1].append(agent_log_prob(log_prob, mask, "sum"))
     kl_sum, entropy_sum = all_reduce_sum(sums, fabric).tolist()
     gap = float(torch.stack(gaps).max())
-    return GradientSums(kl_sum / num_decisions, entropy_sum / num_decisions, gap, by_experience)
+    return GradientSums(kl_sum / num_decisions, entropy_sum / num_decisions, gap, imitation, by_experience)

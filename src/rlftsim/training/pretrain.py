@@ -2,14 +2,11 @@
 
 import os
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
-from jaxtyping import Bool
-from torch import Tensor
-
-from rlftsim.rollout.policy import ImitatedPolicy, ImitationLoss, Prediction, PretrainablePolicy
-from rlftsim.scenario.batch import ScenarioBatch
-from rlftsim.training.imitation import ImitationConfig, imitate
+from rlftsim.rollout.policy import ImitatedPolicy, PretrainablePolicy
+from rlftsim.training.imitation import ImitationConfig, imitate, loss_along_log
 from rlftsim.training.run import TrainingScenarios, as_scenarios, require_trainable
 
 
@@ -45,18 +42,8 @@ def pretrain(
         CheckpointError: `out` holds another run, or the run diverged.
     """
     scenarios = as_scenarios(scenarios)
-    own_loss = getattr(model, "imitation_loss", None)
-    # One of the two is enough; a policy with neither is refused with both names.
-    either = ("teacher_forced", "imitation_loss")
-    needs = () if any(hasattr(model, name) for name in either) else either
-    policy = require_trainable(model, scenarios, "pre-training", needs=needs)
-
-    def predict_along_log(
-        batch: ScenarioBatch, trained: Bool[Tensor, "B A"], update: int
-    ) -> Prediction | ImitationLoss:
-        return policy.teacher_forced(batch, trained) if own_loss is None else own_loss(batch, trained, update)
-
+    policy = require_trainable(model, scenarios, "pre-training", imitated=True)
     return imitate(
-        policy, scenarios, out, config, predict_along_log,
+        policy, scenarios, out, config, partial(loss_along_log, policy),
         title="pre-train", held_out=None if held_out is None else as_scenarios(held_out), card=card,
     )  # fmt: skip

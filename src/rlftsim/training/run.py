@@ -38,7 +38,9 @@ def as_scenarios(scenarios: TrainingScenarios) -> Scenarios:
     return [scenarios] if isinstance(scenarios, Scenario) else scenarios
 
 
-def require_trainable(policy: object, scenarios: Scenarios, method: str, *, needs: Sequence[str] = ()) -> Any:
+def require_trainable(
+    policy: object, scenarios: Scenarios, method: str, *, needs: Sequence[str] = (), imitated: bool = False
+) -> Any:
     """Return the policy if a method can train it on these scenarios.
 
     Args:
@@ -46,6 +48,7 @@ def require_trainable(policy: object, scenarios: Scenarios, method: str, *, need
         scenarios: at least one.
         method: name of the training method in messages, such as "CAT-K".
         needs: further attributes that the method uses, such as "vocabulary".
+        imitated: the method uses the pre-training loss; one of the two ways to it is enough.
 
     Raises:
         ConfigError: the policy has no weights or lacks an attribute, or there is no scenario.
@@ -53,6 +56,9 @@ def require_trainable(policy: object, scenarios: Scenarios, method: str, *, need
     name = type(policy).__name__
     if not isinstance(policy, nn.Module):
         raise ConfigError(f"{name} has no weights: there is nothing for {method} to train.")
+    losses = ("teacher_forced", "imitation_loss") if imitated else ()
+    if not any(hasattr(policy, loss) for loss in losses):
+        needs = (*needs, *losses)  # a refusal names both
     missing = [attribute for attribute in (*needs, "save_pretrained") if not hasattr(policy, attribute)]
     if missing:
         raise ConfigError(f"{name} cannot be trained with {method}: it has no {' and no '.join(missing)}.")
