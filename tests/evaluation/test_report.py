@@ -169,3 +169,14 @@ def test_terminal_table_has_the_same_numbers(report):
 
 def test_report_without_rows_prints_an_empty_table():
     Console(file=io.StringIO()).print(report_table(Report("Empty")))
+
+
+def test_drift_has_a_table_of_its_own_where_it_was_measured():
+    """Its numbers have units and no arrow, as the log's own are the best."""
+    rows = [ResultRow("tuned", {"speed_gap": measured(-1.25), "lane_heading_curved": measured(math.radians(3.0))})]
+    html = report_html(Report("demo", rows=rows))
+    assert "Drift from the log" in html and "<h2>Results</h2>" not in html
+    assert "speed − log [m/s]</abbr>" in html and ">−1.25<" in html and ">3.0<" in html
+    assert "Drift from the log" not in report_html(
+        Report("demo", rows=[ResultRow("a", {"meta_metric": measured(0.5)})])
+    )

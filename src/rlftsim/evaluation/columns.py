@@ -22,20 +22,24 @@ class Column:
     """Its name in an `Evaluation`."""
     heading: str
     meaning: str
-    unit: Literal["", "m", "%"] = ""
-    """Rates are stored as fractions and shown in percent."""
+    unit: Literal["", "m", "%", "m/s", "°"] = ""
+    """Rates are stored as fractions and shown in percent, angles in radians and shown in degrees."""
     rate_heading: str = ""
     """Heading where a rate is shown as a fraction; empty = the heading and the word rate."""
 
+    nearest_log: bool = False
+    """True = best where it is nearest to the log's own value, not where it is highest or lowest."""
+
     @property
-    def higher_is_better(self) -> bool:
-        """True for scores, False for errors and rates."""
-        return direction_of(self.source) == "higher"
+    def better(self) -> str:
+        """The better direction in words."""
+        return "best near the log's" if self.nearest_log else f"{direction_of(self.source)} is better"
 
     @property
     def label(self) -> str:
-        """Heading with the unit and an arrow in the better direction."""
-        return f"{self.heading}{f' [{self.unit}]' if self.unit else ''} {ARROWS[direction_of(self.source)]}"
+        """Heading with the unit and, where there is one, an arrow in the better direction."""
+        arrow = "" if self.nearest_log else f" {ARROWS[direction_of(self.source)]}"
+        return f"{self.heading}{f' [{self.unit}]' if self.unit else ''}{arrow}"
 
     @property
     def fraction_label(self) -> str:
@@ -47,7 +51,9 @@ class Column:
     def text(self, number: float) -> str:
         """A number in the column's unit and digits."""
         # rates are fractions in [0, 1] in an evaluation
-        factor, digits = {"": (1.0, 4), "m": (1.0, 2), "%": (100.0, 2)}[self.unit]
+        factor, digits = {
+            "": (1.0, 4), "m": (1.0, 2), "%": (100.0, 2), "m/s": (1.0, 2), "°": (math.degrees(1.0), 1),
+        }[self.unit]  # fmt: skip
         return format_number(factor * number, digits)
 
     def cell(self, estimate: MeanInterval | None) -> str:
@@ -99,6 +105,30 @@ TERMINAL_COLUMNS = (SCORES[0], _LIGHT_ONE, *SCORES[1:], _LEAVES_ROAD, _RED_LIGHT
 """Shown on the command line; rates as fractions."""
 TERMINAL_GOAL_COLUMNS = (*TERMINAL_COLUMNS, *_MISSES)
 """Shown on the command line where agents had goals."""
+
+DRIFT_COLUMNS = (
+    Column(
+        "speed_gap", "speed − log",
+        "mean speed of agents that move in the log, minus their logged one; negative = slower", "m/s", nearest_log=True,
+    ),
+    Column("speed_p10", "speed, 10 %", "10th percentile of the speed of moving agents", "m/s", nearest_log=True),
+    Column("speed_p50", "50 %", "median speed of moving agents", "m/s", nearest_log=True),
+    Column("speed_p90", "90 %", "90th percentile of the speed of moving agents", "m/s", nearest_log=True),
+    Column("unlogged_stop_rate", "stops", "moving agents that stop for a second, of those whose log does not", "%"),
+    Column(
+        "lane_offset_straight", "off the lane center, straight",
+        "mean distance of vehicles from the center of their lane where it is straight", "m", nearest_log=True,
+    ),
+    Column("lane_offset_curved", "curved", "the same where its radius is below 100 m", "m", nearest_log=True),
+    Column(
+        "lane_heading_straight", "turned from the lane, straight",
+        "mean angle between vehicles and their lane where it is straight", "°", nearest_log=True,
+    ),
+    Column("lane_heading_curved", "curved", "the same where its radius is below 100 m", "°", nearest_log=True),
+    Column("contact_speed", "speed at contact", "mean relative speed of agents that collide, at first contact", "m/s",
+           nearest_log=True),
+)  # fmt: skip
+"""Shown in a table of their own in reports: see `evaluation.drift`."""
 
 
 def format_number(value: float, digits: int) -> str:

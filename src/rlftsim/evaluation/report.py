@@ -11,7 +11,7 @@ import numpy as np
 from rich.table import Table
 
 from rlftsim.atomic_io import write_text
-from rlftsim.evaluation.columns import COLUMNS, Column, format_number
+from rlftsim.evaluation.columns import COLUMNS, DRIFT_COLUMNS, Column, format_number
 from rlftsim.evaluation.results import Evaluation
 from rlftsim.statistics import MeanInterval
 from rlftsim.viewer.chart import Chart, chart_html, format_tick, nice_ticks
@@ -134,8 +134,9 @@ def report_html(report: Report) -> str:
     sections = [
         f"<header><h1>{escape(report.title)}</h1>{lead}</header>",
         _tiles_html(report),
-        _table_html(report),
+        _table_html("Results", report.rows, COLUMNS, f"{report.table_note} {_ERRORS} {_ARROWS_MEAN}"),
         _comparison_html(report.comparison),
+        _table_html("Drift from the log", report.rows, DRIFT_COLUMNS, f"{_DRIFT_MEANS} {_ERRORS}"),
     ]
     # 2. Pictures of it, and of the runs behind it.
     if report.animations:
@@ -161,7 +162,7 @@ def report_table(report: Report) -> Table:
     caption = f"{report.table_note} Mean ± standard error over scenarios.".lstrip() if report.rows else None
     table = Table(title=report.title, caption=caption, title_justify="left", caption_justify="left")
     table.add_column("policy", no_wrap=True)
-    shown = _shown_columns(report.rows)
+    shown = _shown_columns(report.rows, COLUMNS)
     for column in shown:
         table.add_column(column.label, justify="right")
     for row in report.rows:
@@ -170,8 +171,8 @@ def report_table(report: Report) -> Table:
     return table
 
 
-def _shown_columns(rows: Sequence[ResultRow]) -> list[Column]:
-    return [column for column in COLUMNS if any(column.source in row.estimates for row in rows)]
+def _shown_columns(rows: Sequence[ResultRow], columns: Sequence[Column]) -> list[Column]:
+    return [column for column in columns if any(column.source in row.estimates for row in rows)]
 
 
 def _sentence(text: str) -> str:
@@ -214,28 +215,33 @@ def _interval_text(interval: tuple[float, float], digits: int) -> str:
     return f"{low} to {high}"
 
 
-def _table_html(report: Report) -> str:
-    if not report.rows:
+_ERRORS = "Mean ± standard error over scenarios; point at a number for its 95 % interval."
+_ARROWS_MEAN = "↑ higher is better, ↓ lower is better."
+_DRIFT_MEANS = (
+    "The meta-metric rewards slow traffic, which hits nothing and stays on the road; here slowness shows. Numbers "
+    "without an arrow are best near the log's own, the row of the oracle."
+)
+
+
+def _table_html(title: str, rows: Sequence[ResultRow], columns: Sequence[Column], note: str) -> str:
+    """A table with a heading and a note below; empty where no row has one of the columns."""
+    shown = _shown_columns(rows, columns)
+    if not shown:
         return ""
-    shown = _shown_columns(report.rows)
     headings = "".join(
-        f'<th scope="col"><abbr title="{escape(c.meaning)}; {"higher" if c.higher_is_better else "lower"} is better">'
-        f"{escape(c.label)}</abbr></th>"
-        for c in shown
+        f'<th scope="col"><abbr title="{escape(c.meaning)}; {c.better}">{escape(c.label)}</abbr></th>' for c in shown
     )
     body = []
-    for row in report.rows:
-        note = f'<span class="note">{escape(row.note)}</span>' if row.note else ""
+    for row in rows:
+        below = f'<span class="note">{escape(row.note)}</span>' if row.note else ""
         style = ' class="emphasized"' if row.emphasized else ""
         cells = "".join(_cell_html(column, row.estimates.get(column.source)) for column in shown)
-        body.append(f'<tr{style}><th scope="row">{escape(row.name)}{note}</th>{cells}</tr>')
-    note = f"{escape(report.table_note)} " if report.table_note else ""
+        body.append(f'<tr{style}><th scope="row">{escape(row.name)}{below}</th>{cells}</tr>')
     return (
-        '<h2>Results</h2><div class="card scroll"><table class="results"><thead><tr><th scope="col">policy</th>'
-        f"{headings}</tr></thead><tbody>{''.join(body)}</tbody></table></div>"
-        f'<p class="note" style="margin-top:10px">{note}'
-        "Mean ± standard error over scenarios; point at a number for its 95 % interval. ↑ higher is better, ↓ lower is "
-        "better.</p>"
+        f'<h2>{escape(title)}</h2><div class="card scroll"><table class="results"><thead><tr>'
+        f'<th scope="col">policy</th>{headings}</tr></thead>'
+        f"<tbody>{''.join(body)}</tbody></table></div>"
+        f'<p class="note" style="margin-top:10px">{escape(note.strip())}</p>'
     )
 
 

@@ -20,6 +20,7 @@ from rlftsim.aliases import RENAMED_VALUES, current_names
 from rlftsim.atomic_io import write_whole
 from rlftsim.errors import ConfigError, DataError, require_types
 from rlftsim.evaluation.columns import SCORES
+from rlftsim.evaluation.drift import Drift, measure_drift
 from rlftsim.realism import FEATURE_NAMES, RealismResult, SimulatedStates, metric_by_name
 from rlftsim.realism.miss import compute_miss_rates
 from rlftsim.realism.official_names import LIGHT
@@ -49,9 +50,11 @@ SCORE_COLUMNS = (
     "miss_rate",
     "passing_miss_rate",
     "min_passing_miss_rate",
+    *Drift._fields,
 )
 """`meta_metric_light_one` is the meta-metric with the traffic light likelihood set to 1, as published tables of models
-without a light feature have it; `meta_metric` is the official one. Miss rates: see `realism.miss`."""
+without a light feature have it; `meta_metric` is the official one. Miss rates: see `realism.miss`; drift:
+`evaluation.drift`."""
 LABELS = {"RMM": "meta_metric"}
 """Name in tables -> column."""
 SCHEMA = pa.schema(
@@ -63,7 +66,7 @@ SCHEMA = pa.schema(
     ]
 )
 
-ADDED_COLUMNS = ("unlogged_offroad_rate",)
+ADDED_COLUMNS = ("unlogged_offroad_rate", *Drift._fields)
 """Columns that earlier evaluations lack; NaN when such a file is read."""
 
 GoalsGiven = Literal["none", "logged"]
@@ -305,7 +308,7 @@ def row_of_result(result: RealismResult, scenario: Scenario, states: SimulatedSt
 
     Args:
         result: scores of the rollouts, one scenario.
-        scenario: the scenario, for its miss rates and numbers of agents.
+        scenario: the scenario, for its miss rates, its drift and numbers of agents.
         states: the rollouts.
     """
     # The meta-metric is a weighted sum of likelihoods: a light likelihood of 1 adds its weight times what it lacks.
@@ -318,6 +321,7 @@ def row_of_result(result: RealismResult, scenario: Scenario, states: SimulatedSt
         "miss_rate": misses.at_goal,
         "passing_miss_rate": misses.passing,
         "min_passing_miss_rate": misses.passing_in_all,
+        **measure_drift(scenario, states)._asdict(),
     }
     numbers = {name: float(scores[name] if name in scores else result.score_of(name)) for name in SCORE_COLUMNS}
     return {

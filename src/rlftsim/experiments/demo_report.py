@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rlftsim.evaluation.columns import SCORES
+from rlftsim.evaluation.columns import DRIFT_COLUMNS, SCORES
 from rlftsim.evaluation.compare import Comparison, paired_values
 from rlftsim.evaluation.evaluate import EvaluateConfig
 from rlftsim.evaluation.learning_curve import finetuning_charts, imitation_charts
@@ -68,7 +68,10 @@ def build_report(
             "closed-loop: it drives every agent itself, and the realism meta-metric of its own rollouts, left one "
             "out at a time (MLOO), is the reward.",
         ),
-        rows=[ResultRow.of(e, SCORES, note=NOTES.get(e.name, ""), emphasized=e is tuned) for e in evaluations],
+        rows=[
+            ResultRow.of(e, (*SCORES, *DRIFT_COLUMNS), note=NOTES.get(e.name, ""), emphasized=e is tuned)
+            for e in evaluations
+        ],
         table_note=(
             f"{len(base)} held-out scenarios, {base.config.num_rollouts} rollouts each, metric {base.config.metric}. "
             f"{base.data_note}".rstrip()

@@ -50,7 +50,7 @@ def _mark_rollout(
         if not len(other):
             continue
         row = other + agent + 1
-        hit = _boxes_overlap(gap[other, step], heading[agent, step], heading[row, step], half[agent], half[row])
+        hit = boxes_overlap(gap[other, step], heading[agent, step], heading[row, step], half[agent], half[row])
         if ignore_from is not None:
             # A stroller and its pusher overlap from the beginning, which is no collision.
             hit &= ~np.isin(row, row[hit & (step == ignore_from)])
@@ -58,14 +58,22 @@ def _mark_rollout(
         overlap[row[hit], step[hit]] = True
 
 
-def _boxes_overlap(
+def boxes_overlap(
     gap: Float[np.ndarray, "k 2"],
     heading: Float[np.ndarray, "k"],
     other_heading: Float[np.ndarray, "k"],
     half: Float[np.ndarray, "2"],
     other_half: Float[np.ndarray, "k 2"],
 ) -> Bool[np.ndarray, "k"]:
-    """True where no side of either box separates the two; `gap` is the vector from one center to the other."""
+    """True where no side of either of two boxes separates them.
+
+    Args:
+        gap: from the center of the first box to that of the other, meters.
+        heading: of the first box, radians.
+        other_heading: of the other.
+        half: half the length and half the width of the first box, meters.
+        other_half: of the other.
+    """
     # Two convex boxes are apart exactly if one of their four side directions separates them. Along each direction the
     # distance of the centers is compared with the sum of both half extents.
     turn = other_heading - heading
