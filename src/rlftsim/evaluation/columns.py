@@ -4,14 +4,18 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
+from rlftsim.evaluation.drift import Drift
 from rlftsim.statistics import MeanInterval
 
-ARROWS = {"higher": "↑", "lower": "↓"}
+ARROWS = {"higher": " ↑", "lower": " ↓", "log": ""}
 
 
-def direction_of(source: str) -> Literal["higher", "lower"]:
-    """The better direction of a column of an evaluation: errors and rates are better lower, all others higher."""
-    return "lower" if source.endswith(("_error", "_rate")) else "higher"
+def direction_of(source: str) -> Literal["higher", "lower", "log"]:
+    """The better direction of a column of an evaluation: errors and rates are better lower, what is measured as drift
+    is best where it is nearest to the log's own, all others are better higher."""
+    if source.endswith(("_error", "_rate")):
+        return "lower"
+    return "log" if source in Drift._fields else "higher"
 
 
 @dataclass(frozen=True)
@@ -27,26 +31,23 @@ class Column:
     rate_heading: str = ""
     """Heading where a rate is shown as a fraction; empty = the heading and the word rate."""
 
-    nearest_log: bool = False
-    """True = best where it is nearest to the log's own value, not where it is highest or lowest."""
-
     @property
     def better(self) -> str:
         """The better direction in words."""
-        return "best near the log's" if self.nearest_log else f"{direction_of(self.source)} is better"
+        direction = direction_of(self.source)
+        return "best near the log's" if direction == "log" else f"{direction} is better"
 
     @property
     def label(self) -> str:
         """Heading with the unit and, where there is one, an arrow in the better direction."""
-        arrow = "" if self.nearest_log else f" {ARROWS[direction_of(self.source)]}"
-        return f"{self.heading}{f' [{self.unit}]' if self.unit else ''}{arrow}"
+        return f"{self.heading}{f' [{self.unit}]' if self.unit else ''}{ARROWS[direction_of(self.source)]}"
 
     @property
     def fraction_label(self) -> str:
         """As `label`, for tables that show rates as fractions."""
         if self.unit != "%":
             return self.label
-        return f"{self.rate_heading or f'{self.heading} rate'} {ARROWS[direction_of(self.source)]}"
+        return f"{self.rate_heading or f'{self.heading} rate'}{ARROWS[direction_of(self.source)]}"
 
     def text(self, number: float) -> str:
         """A number in the column's unit and digits."""
@@ -109,24 +110,23 @@ TERMINAL_GOAL_COLUMNS = (*TERMINAL_COLUMNS, *_MISSES)
 DRIFT_COLUMNS = (
     Column(
         "speed_gap", "speed − log",
-        "mean speed of agents that move in the log, minus their logged one; negative = slower", "m/s", nearest_log=True,
+        "mean speed of agents that move in the log, minus their logged one; negative = slower", "m/s",
     ),
-    Column("speed_p10", "speed, 10 %", "10th percentile of the speed of moving agents", "m/s", nearest_log=True),
-    Column("speed_p50", "50 %", "median speed of moving agents", "m/s", nearest_log=True),
-    Column("speed_p90", "90 %", "90th percentile of the speed of moving agents", "m/s", nearest_log=True),
+    Column("speed_p10", "speed, 10 %", "10th percentile of the speed of moving agents", "m/s"),
+    Column("speed_p50", "50 %", "median speed of moving agents", "m/s"),
+    Column("speed_p90", "90 %", "90th percentile of the speed of moving agents", "m/s"),
     Column("unlogged_stop_rate", "stops", "moving agents that stop for a second, of those whose log does not", "%"),
     Column(
         "lane_offset_straight", "off the lane center, straight",
-        "mean distance of vehicles from the center of their lane where it is straight", "m", nearest_log=True,
+        "mean distance of vehicles from the center of their lane where it is straight", "m",
     ),
-    Column("lane_offset_curved", "curved", "the same where its radius is below 100 m", "m", nearest_log=True),
+    Column("lane_offset_curved", "curved", "the same where its radius is below 100 m", "m"),
     Column(
         "lane_heading_straight", "turned from the lane, straight",
-        "mean angle between vehicles and their lane where it is straight", "°", nearest_log=True,
+        "mean angle between vehicles and their lane where it is straight", "°",
     ),
-    Column("lane_heading_curved", "curved", "the same where its radius is below 100 m", "°", nearest_log=True),
-    Column("contact_speed", "speed at contact", "mean relative speed of agents that collide, at first contact", "m/s",
-           nearest_log=True),
+    Column("lane_heading_curved", "curved", "the same where its radius is below 100 m", "°"),
+    Column("contact_speed", "speed at contact", "mean relative speed of agents that collide, at first contact", "m/s"),
 )  # fmt: skip
 """Shown in a table of their own in reports: see `evaluation.drift`."""
 

@@ -59,7 +59,10 @@ class PairedDifference:
         numbers = f"{self.difference:+.4f}, {level:g}% interval [{low:+.4f}, {high:+.4f}], p = {self.p_value:.2g}"
         if not self.is_difference:
             return f"no difference at the {100 * self.alpha:g}% level: {numbers}."
-        is_better = (self.difference > 0) == (direction_of(self.column) == "higher")
+        direction = direction_of(self.column)
+        if direction == "log":  # neither more nor less is better
+            return f"difference: {numbers}."
+        is_better = (self.difference > 0) == (direction == "higher")
         return f"difference, for the {'better' if is_better else 'worse'}: {numbers}."
 
 

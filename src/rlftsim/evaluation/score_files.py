@@ -164,7 +164,7 @@ def format_scores(evaluation: Evaluation) -> Table:
         label = "meta_metric, traffic light term set to 1" if column == "meta_metric_light_one" else column
         spread = "" if math.isnan(found.standard_error) else f"± {found.standard_error:.4f}"
         table.add_row(
-            f"{label} {ARROWS[direction_of(column)]}", f"{found.mean:.4f}", spread, str(found.count), metric.name
+            f"{label}{ARROWS[direction_of(column)]}", f"{found.mean:.4f}", spread, str(found.count), metric.name
         )
     return table
 
