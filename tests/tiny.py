@@ -16,7 +16,7 @@ from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.synthetic import pack_path
 from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
 from rlftsim.training.alarms import AlarmConfig
-from rlftsim.training.catk import CatkConfig, catk_finetune
+from rlftsim.training.catk import CatkConfig, RoadConfig, catk_finetune
 from rlftsim.training.finetune import FinetuneConfig, finetune
 from rlftsim.training.parallel import DeviceConfig, is_first_process
 from rlftsim.training.pretrain import PretrainConfig, pretrain
@@ -34,6 +34,7 @@ PRETRAIN = PretrainConfig(
     epochs=1.6, batch_size=1, learning_rate=1e-3, label_smoothing=0.0, checkpoint_every=2, device=CPU
 )
 CATK = CatkConfig(epochs=1.6, batch_size=1, learning_rate=1e-3, num_candidates=8, checkpoint_every=2, device=CPU)
+ROAD = RoadConfig(epochs=1.6, batch_size=1, learning_rate=1e-3, num_candidates=8, checkpoint_every=2, device=CPU)
 FINETUNE = FinetuneConfig(
     epochs=1.6,
     batch_size=1,
@@ -88,8 +89,9 @@ def train(stage, policy, scenarios, out, held_out=None, **changes):
     """Run a stage with other values for some of its fields."""
     if stage == "pretrain":
         return pretrain(policy, scenarios, out, replace(PRETRAIN, **changes), held_out=held_out)
-    if stage == "catk":
-        return catk_finetune(policy, scenarios, out, replace(CATK, **changes), held_out=held_out)
+    if stage in ("catk", "road"):
+        config = CATK if stage == "catk" else ROAD
+        return catk_finetune(policy, scenarios, out, replace(config, **changes), held_out=held_out)
     return finetune(policy, scenarios, out, replace(OF_EVERYTHING if stage == "everything" else FINETUNE, **changes))
 
 

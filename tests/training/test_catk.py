@@ -68,6 +68,33 @@ def test_more_candidates_keep_nearer_to_the_log_than_chance(policy, batch):
     assert off[3] < off[2]
 
 
+def test_road_imitates_the_nearest_of_its_own_samples(policy, batch):
+    """More samples keep nearer to the log, and what was taken is what is learned."""
+    found = {}
+    for count in (1, 4, 64):
+        targeted = roll_out_closest(policy, batch, num_candidates=count, choice="sampled", targets="taken", seed=3)
+        assert torch.equal(targeted.target, targeted.rollouts.decision)
+        again = roll_out_closest(policy, batch, num_candidates=count, choice="sampled", targets="taken", seed=3)
+        assert torch.equal(again.target, targeted.target)
+        found[count] = float(distance_from_log(batch, targeted.rollouts))
+    assert found[1] > found[4] > found[64]
+
+
+def test_a_single_sample_has_the_policys_probabilities(policy, batch):
+    """Without the log's guidance the first tokens of many rollouts are distributed as the policy says."""
+    context = policy.encode(batch)
+    rollouts = [
+        roll_out_closest(policy, batch, num_candidates=1, choice="sampled", seed=seed, context=context).rollouts
+        for seed in range(300)
+    ]
+    agent = int(batch.agent_mask[0].nonzero()[0])
+    first = torch.stack([one.decision[0, 0, agent, 0] for one in rollouts])  # [300]
+    drawn = simulate(policy, batch, num_rollouts=300, seed=1, context=context).decision[0, :, agent, 0]
+    common = drawn.mode().values
+    p, q = ((tokens == common).double().mean() for tokens in (first, drawn))
+    assert abs(p - q) < 4 * float((q * (1 - q) / 150).sqrt())
+
+
 def test_what_has_strayed_does_not_count_with_max_distance_lengths(policy, batch):
     targeted = roll_out_closest(policy, batch, num_candidates=4, choice="top_k", seed=3)
     strict = roll_out_closest(policy, batch, num_candidates=4, choice="top_k", seed=3, max_distance_lengths=1.0)

@@ -23,7 +23,7 @@ from rlftsim.training.parallel import is_first_process
 
 VALIDATION = "validation"
 """Split that is validated on where none is named."""
-SECTION_OF_METHOD = {"rlft": "finetune", "catk": "catk", "gcsl": "gcsl"}
+SECTION_OF_METHOD = {"rlft": "finetune", "catk": "catk", "road": "road", "gcsl": "gcsl"}
 RecipeArgument = Annotated[Positional[str], tyro.conf.arg(metavar="RECIPE")]
 
 
@@ -79,7 +79,7 @@ class Pretrain(RecipeVerb):
 
 @dataclass(frozen=True)
 class Finetune(RecipeVerb):
-    """Fine-tune a model in closed loop: by policy gradient on a realism reward (RLFTSim), or with the baseline CAT-K.
+    """Fine-tune a model in closed loop: by policy gradient on a realism reward (RLFTSim), by CAT-K or by RoaD.
 
     Example: rlftsim finetune smart-tiny --model runs/base --data data/womd --out runs/tuned --finetune.epochs 0.5
 
@@ -87,7 +87,7 @@ class Finetune(RecipeVerb):
     command is repeated.
     """
 
-    sections: ClassVar[tuple[str, ...]] = ("finetune", "catk", "gcsl")
+    sections: ClassVar[tuple[str, ...]] = ("finetune", "catk", "road", "gcsl")
 
     recipe: RecipeArgument
     """Settings to start from; `rlftsim recipe` lists all recipes. The flags below change single fields. The
@@ -98,9 +98,10 @@ class Finetune(RecipeVerb):
     """Folder of a data set, or "synthetic" for the scenarios that ship with the package."""
     out: Path
     """Folder of the run: configuration, metrics, checkpoints, model."""
-    method: Literal["rlft", "catk", "gcsl"] = "rlft"
+    method: Literal["rlft", "catk", "road", "gcsl"] = "rlft"
     """rlft: policy gradient on a realism reward, fields finetune.*. catk: supervised fine-tuning along rollouts
-    that choose the token closest to the log among the top K, fields catk.*. gcsl: train the goal-conditioned
+    that choose the token closest to the log among the top K, fields catk.*. road: supervised
+    fine-tuning on the model's own rollouts, guided by the log, fields road.*. gcsl: train the goal-conditioned
     weights on the model's own rollouts, relabelled with their endpoints, as a start for rlft with goals
     (--model OUT), fields gcsl.*."""
     goal: Literal["concat", "indication"] | None = None
@@ -115,7 +116,7 @@ class Finetune(RecipeVerb):
     split: str = "training"
     """Split of the data set to train on."""
     validation_split: str | None = None
-    """With catk: split to validate on in closed loop, see --catk.validation.every. Left out: "validation", if
+    """With catk and road: split to validate on in closed loop, see --catk.validation.every. Left out: "validation", if
     the data set has it."""
     config: Path | None = None
     """JSON file of settings: the output of `rlftsim recipe NAME --json`, or the config.json of an earlier run
@@ -161,8 +162,8 @@ class Finetune(RecipeVerb):
         if config is None:
             raise ConfigError(f"recipe {self.recipe} has no section {self.method}: its models cannot be trained so.")
         scenarios = open_dataset(self.data, self.split)
-        # Of the methods of fine-tuning only CAT-K validates.
-        every = config.validation.every if self.method == "catk" else 0
+        # Of the methods of fine-tuning only CAT-K and RoaD validate.
+        every = config.validation.every if self.method in ("catk", "road") else 0
         held_out = _held_out(self.data, self.validation_split, every)
         goals = None if self.goal is None else GoalConditioning(self.goal, self.goal_logit_bias)
         with _learning_curve(self.out):

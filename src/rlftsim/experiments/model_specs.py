@@ -63,7 +63,7 @@ class FineTuned:
     """A base model after fine-tuning. All other settings are the recipe's, so all of them have the same budget."""
 
     method: str = "mloo"
-    """Name of a reward, or "catk" or "gcsl"."""
+    """Name of a reward, or "catk", "road" or "gcsl"."""
     credit: CreditTo = "rollout"
     """Credit assignment: one reward per rollout, or one per agent."""
     seed: int = 0
@@ -89,11 +89,12 @@ class FineTuned:
         Raises:
             ConfigError: there is no such reward, or the recipe has no section for the method.
         """
-        if self.method == CATK and recipe.catk is not None:
-            return catk_config(self, recipe.catk, recipe.finetune)
+        closed_loop = {CATK: recipe.catk, ROAD: recipe.road}.get(self.method)
+        if closed_loop is not None:
+            return catk_config(self, closed_loop, recipe.finetune)
         if self.method == GCSL and recipe.gcsl is not None:
             return gcsl_config(self, recipe.gcsl)
-        if self.method in (CATK, GCSL):
+        if self.method in (CATK, ROAD, GCSL):
             raise ConfigError(f"the recipe has no section {self.method}: its policies cannot be trained so.")
         return finetune_config(self, recipe.finetune)
 
@@ -114,10 +115,10 @@ class Guided:
 
 ModelSpec = Baseline | Base | FineTuned | Guided
 ORACLE, CONSTANT_VELOCITY, BASE = Baseline("oracle"), Baseline("constant_velocity"), Base()
-CATK, GCFT, GCSL = "catk", "gcft", "gcsl"
+CATK, ROAD, GCFT, GCSL = "catk", "road", "gcft", "gcsl"
 VARIED = (
     *("finetune.reward", "finetune.credit", "finetune.seed"),
-    *("catk.seed", "catk.epochs", "catk.batch_size", "gcsl.seed"),
+    *("catk.seed", "catk.epochs", "catk.batch_size", "road.seed", "road.epochs", "road.batch_size", "gcsl.seed"),
 )
 """Fields of a recipe that specs set for themselves."""
 
@@ -177,7 +178,7 @@ def catk_config(spec: FineTuned, catk: CatkConfig, finetune: FinetuneConfig) -> 
 
     Args:
         spec: the seed and the fraction of the epochs.
-        catk: the recipe's settings of CAT-K.
+        catk: the recipe's settings of CAT-K or RoaD.
         finetune: the recipe's settings of fine-tuning with a reward, which have the budget.
     """
     epochs = finetune.epochs * spec.epochs_fraction

@@ -20,7 +20,7 @@ from typing import Any
 
 from rlftsim.errors import ConfigError
 from rlftsim.evaluation.evaluate import EvaluateConfig, GoalsGiven, evaluate
-from rlftsim.experiments.model_specs import BASE, CATK, GCSL, Base, Baseline, Budget, FineTuned, Guided, ModelSpec
+from rlftsim.experiments.model_specs import BASE, CATK, GCSL, ROAD, Base, Baseline, Budget, FineTuned, Guided, ModelSpec
 from rlftsim.experiments.rows import Row
 from rlftsim.experiments.stage_progress import StageProgress
 from rlftsim.experiments.stages import (
@@ -70,7 +70,7 @@ class ExperimentSuite:
         if self.num_seeds < 1:
             raise ConfigError(f"an experiment needs at least one seed, got {self.num_seeds}.")
         recipe = self.recipe
-        methods = (recipe.pretrain, recipe.finetune, recipe.catk, recipe.gcsl)
+        methods = (recipe.pretrain, recipe.finetune, recipe.catk, recipe.road, recipe.gcsl)
         devices = [one.device for one in methods if one is not None]
         if any(one.uses_cuda and one.processes not in ("auto", 1) for one in devices):
             raise ConfigError(
@@ -124,7 +124,7 @@ class ExperimentSuite:
             has_tokens = self.recipe.tokens is not None
         else:
             has_tokens = hasattr(load_policy(self.base_model), "vocabulary")
-        sections = {CATK: self.recipe.catk, GCSL: self.recipe.gcsl}
+        sections = {CATK: self.recipe.catk, ROAD: self.recipe.road, GCSL: self.recipe.gcsl}
         refused = {method for method, section in sections.items() if section is None or not has_tokens}
 
         def is_feasible(spec: ModelSpec) -> bool:
@@ -251,7 +251,7 @@ class ExperimentSuite:
         out, conditioning = self.model_folder(spec), None
         if spec.goals is not None:
             conditioning = GoalConditioning(spec.goals.encoding)
-        if spec.method not in (CATK, GCSL):
+        if spec.method not in (CATK, ROAD, GCSL):
             # Only runs with a reward continue shorter ones. The learning rate of the other methods decays over the
             # whole run, so that a shorter run is no part of a longer one.
             start_from_shorter_run(out, self._epochs(spec))

@@ -22,13 +22,13 @@ from rlftsim.plugins import ExtensionPoint
 from rlftsim.rollout.policy import Policy
 from rlftsim.tokens.clustering import TokensConfig
 from rlftsim.tokens.vocabulary import Vocabulary
-from rlftsim.training.catk import CatkConfig
+from rlftsim.training.catk import CatkConfig, RoadConfig
 from rlftsim.training.finetune import FinetuneConfig
 from rlftsim.training.goal_relabeling import GcslConfig
 from rlftsim.training.goals import with_goals
 from rlftsim.training.pretrain import PretrainConfig
 
-SECTIONS = ("tokens", "model", "pretrain", "finetune", "catk", "gcsl")
+SECTIONS = ("tokens", "model", "pretrain", "finetune", "catk", "road", "gcsl")
 """Sections that the verbs of the command line know, in the order of their use; see `section_names`."""
 
 
@@ -43,6 +43,8 @@ class Recipe:
     finetune: FinetuneConfig = field(default_factory=FinetuneConfig)
     catk: CatkConfig | None = field(default_factory=CatkConfig)
     """None for policies without tokens, which CAT-K cannot train."""
+    road: RoadConfig | None = field(default_factory=RoadConfig)
+    """None likewise."""
     gcsl: GcslConfig | None = field(default_factory=GcslConfig)
     """None likewise."""
 
@@ -78,16 +80,18 @@ class Recipe:
         """The same recipe for goal-conditioned fine-tuning: every agent's goal is its logged endpoint, the
         reward is `gcft`.
 
-        CAT-K, if the recipe has it, then trains the goal-conditioned weights alone.
+        CAT-K and RoaD, if the recipe has them, then train the goal-conditioned weights alone.
         """
         # Goals that the recipe has chosen already stay: `with_goals` fills in what is off.
         finetune = replace(self.finetune, goals=with_goals(self.finetune.goals), reward="gcft")
-        catk = self.catk and replace(self.catk, goal_probability=1.0, trained="goals")
-        return replace(self, finetune=finetune, catk=catk)
+        catk, road = (
+            method and replace(method, goal_probability=1.0, trained="goals") for method in (self.catk, self.road)
+        )
+        return replace(self, finetune=finetune, catk=catk, road=road)
 
     def with_processes(self, processes: int | Literal["auto"]) -> "Recipe":
         """The same recipe, trained by so many processes on this machine, see `DeviceConfig.processes`."""
-        methods = {name: getattr(self, name) for name in ("pretrain", "finetune", "catk", "gcsl")}
+        methods = {name: getattr(self, name) for name in ("pretrain", "finetune", "catk", "road", "gcsl")}
         changed = {
             name: replace(method, device=replace(method.device, processes=processes))
             for name, method in methods.items()

@@ -12,7 +12,7 @@ from rlftsim.recipes.registry import Recipe
 from rlftsim.rollout.policy import Policy
 from rlftsim.tokens.clustering import TokensConfig
 from rlftsim.tokens.vocabulary import Vocabulary
-from rlftsim.training.catk import CatkConfig
+from rlftsim.training.catk import CatkConfig, RoadConfig
 from rlftsim.training.finetune import FinetuneConfig
 from rlftsim.training.goal_relabeling import GcslConfig
 from rlftsim.training.goals import GoalConfig
@@ -86,6 +86,7 @@ def smart_nano_rlftsim() -> SmartRecipe:
         model=replace(smart_nano(), frequency_init="log_spaced"),
         pretrain=PretrainConfig(batch_size=16),
         catk=CatkConfig(batch_size=16),
+        road=RoadConfig(batch_size=16),
     )
 
 
@@ -105,6 +106,10 @@ def smart_demo_rlftsim() -> SmartRecipe:
             checkpoint_every=20, kl=KlConfig(target=0.05, initial_beta=0.01), goals=GoalConfig(learning_rate_scale=5.0),
         ),
         catk=CatkConfig(
+            epochs=3.0, batch_size=8, learning_rate=3e-4, warmup_updates=5, gradient_clip=1.0, max_trained_agents=None,
+            checkpoint_every=20,
+        ),
+        road=RoadConfig(
             epochs=3.0, batch_size=8, learning_rate=3e-4, warmup_updates=5, gradient_clip=1.0, max_trained_agents=None,
             checkpoint_every=20,
         ),
@@ -135,6 +140,7 @@ def smart_demo_quick() -> SmartRecipe:
         pretrain=replace(recipe.pretrain, epochs=1.0),
         finetune=replace(recipe.finetune, epochs=0.25, num_rollouts=4),
         catk=recipe.catk and replace(recipe.catk, epochs=0.25, batch_size=4),
+        road=recipe.road and replace(recipe.road, epochs=0.25, batch_size=4),
         gcsl=recipe.gcsl and replace(recipe.gcsl, epochs=0.25),
     )
 

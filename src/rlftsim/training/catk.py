@@ -1,12 +1,20 @@
-"""CAT-K ("closest among top-K"): rollouts that keep near the log, and learning along them.
+"""CAT-K ("closest among top-K") and RoaD ("rollouts as demonstrations"): learning along rollouts near the log.
 
 In a CAT-K rollout each agent takes, among its K most likely tokens, the one that leads nearest to its next logged
 state; where that is not valid, its most likely token. The loss is the cross-entropy of the token that leads
 nearest of the whole vocabulary, from the state that the rollout has reached.
 
-Source: Zhang et al., "Closed-Loop Supervised Fine-Tuning of Tokenized Traffic Models", 2025.
+In a RoaD rollout each agent takes, among K tokens sampled from the policy, the one that leads nearest to its next
+logged state. The loss is the cross-entropy of the tokens of the rollout itself: CAT-K teaches to come back to the log
+at once, RoaD teaches those of the policy's own decisions that led near it. The rollouts of an epoch are those of the
+policy at its start.
+
+Sources: Zhang et al., "Closed-Loop Supervised Fine-Tuning of Tokenized Traffic Models", 2025; Garcia-Cobo et al.,
+"RoaD: Rollouts as Demonstrations for Closed-Loop Supervised Fine-Tuning of Autonomous Driving Policies", 2025
+(arXiv 2512.01993).
 """
 
+import copy
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -41,10 +49,13 @@ from rlftsim.training.run import TrainingScenarios, as_scenarios, require_traina
 
 DEFAULT_NUM_CANDIDATES = 32
 
-Choice = Literal["closest", "top_k", "trajeglish"]
+Choice = Literal["closest", "top_k", "trajeglish", "sampled"]
 """closest: of the K most likely tokens the one that leads nearest to the log. top_k: sampled from the K most likely.
-trajeglish: sampled, by the model's probabilities, from the K that lead nearest. Where the next logged state is
-not valid: the most likely token, and samples from the K most likely ones."""
+trajeglish: sampled, by the model's probabilities, from the K that lead nearest. sampled: of K samples from the
+policy the one that leads nearest. Where the next logged state is not valid: the most likely token, samples from the K
+most likely ones, and with "sampled" a sample."""
+Targets = Literal["nearest", "taken"]
+"""nearest: the token of the whole vocabulary that leads nearest to the log. taken: the token of the rollout itself."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +71,11 @@ class CatkConfig(ImitationConfig):
     """K."""
     choice: Choice = "closest"
     """Choice of the rollouts: closest among the K most likely, top_k sampled from them, trajeglish sampled from the K
-    nearest."""
+    nearest, sampled the closest of K samples."""
+    targets: Targets = "nearest"
+    """Tokens to learn along the rollouts: the nearest to the log, or the ones taken."""
+    rollouts_of: Literal["update", "epoch"] = "update"
+    """Policy that rolls out: the present one, or as it was when the epoch began."""
     max_distance_lengths: float | None = None
     """A decision from farther off the log than so many lengths of its class's box does not count. None = all count."""
     trained: TrainedParts = "decoder"
@@ -73,6 +88,16 @@ class CatkConfig(ImitationConfig):
         require_positive(self, ("num_candidates", *given(self, ("max_distance_lengths",))))
         if not 0 <= self.goal_probability <= 1:
             raise ConfigError(f"goal_probability is a probability in [0, 1], got {self.goal_probability}.")
+
+
+@dataclass(frozen=True)
+class RoadConfig(CatkConfig):
+    """Fine-tuning with RoaD: CAT-K's settings with RoaD's rollouts and targets."""
+
+    num_candidates: int = 64
+    choice: Choice = "sampled"
+    targets: Targets = "taken"
+    rollouts_of: Literal["update", "epoch"] = "epoch"
 
 
 def catk_finetune(
@@ -109,13 +134,21 @@ def catk_finetune(
     refuse_goals(model, config.goal_probability)
     freeze_untrained(model, config.trained)
     goal_config = GoalConfig(probability=config.goal_probability)
+    # Without dropout, as a policy that simulates.
+    frozen = copy.deepcopy(model).eval().requires_grad_(False) if config.rollouts_of == "epoch" else None
 
     def predict_along_catk(batch: ScenarioBatch, trained: Bool[Tensor, "B A"], update: int) -> Prediction:
-        context = model.encode(batch)
+        context = rollout_context = model.encode(batch)
+        if frozen is not None:
+            before, now = (places * config.batch_size // len(scenarios) for places in (update - 1, update))
+            if now > before:
+                frozen.to(batch.device).load_state_dict(model.state_dict())
+            rollout_context = frozen.encode(batch)
         goals = choose_goals(batch, goal_config, None, seed=derive_seed(config.seed, "goals", update))
         targeted = roll_out_closest(
-            model, batch, num_candidates=config.num_candidates, choice=config.choice, context=context, goals=goals,
-            max_distance_lengths=config.max_distance_lengths, seed=derive_seed(config.seed, "rollouts", update),
+            frozen or model, batch, num_candidates=config.num_candidates, choice=config.choice, targets=config.targets,
+            context=rollout_context, goals=goals, max_distance_lengths=config.max_distance_lengths,
+            seed=derive_seed(config.seed, "rollouts", update),
         )  # fmt: skip
         # Autocast keeps weights that it has cast, and those cast in the rollout have no gradient.
         torch.clear_autocast_cache()
@@ -123,7 +156,8 @@ def catk_finetune(
 
     return imitate(
         model, scenarios, out, config, predict_along_catk,
-        title="CAT-K", held_out=None if held_out is None else as_scenarios(held_out), card=card,
+        title="RoaD" if isinstance(config, RoadConfig) else "CAT-K", card=card,
+        held_out=None if held_out is None else as_scenarios(held_out), kept={"frozen": frozen} if frozen else {},
     )  # fmt: skip
 
 
@@ -136,6 +170,7 @@ def roll_out_closest(
     *,
     num_candidates: int = DEFAULT_NUM_CANDIDATES,
     choice: Choice = "closest",
+    targets: Targets = "nearest",
     max_distance_lengths: float | None = None,
     num_rollouts: int = 1,
     seed: int = 0,
@@ -153,6 +188,7 @@ def roll_out_closest(
         batch: scenarios with their future.
         num_candidates: K.
         choice: see `Choice`.
+        targets: see `Targets`.
         max_distance_lengths: see `CatkConfig`.
         num_rollouts: N.
         seed: of what else is random in the policy, and of samples.
@@ -161,8 +197,8 @@ def roll_out_closest(
         catk_compat: round where the public code rounds, see `tokens.catk_compat`.
 
     Returns:
-        The rollouts with their targets: the token that leads nearest to the log, where the next logged state is
-        valid and the present state is not too far off the log.
+        The rollouts with their targets, where the next logged state is valid and the present state is not too far off
+        the log.
 
     Raises:
         ConfigError: no candidates.
@@ -172,16 +208,21 @@ def roll_out_closest(
     # The log in steps of one token, 0.5 s: poses and validity, [B, A, tokens].
     tokens = tokenize_agents(batch, policy.vocabulary, catk_compat=catk_compat)
     found: list[tuple[Tensor, Tensor]] = []  # target token and its mask of each decision, [B, N, A]
-    targets = _targets(batch, tokens, policy.vocabulary, catk_compat)
+    logged = _targets(batch, tokens, policy.vocabulary, catk_compat)
     take = _CHOICES[choice]
+    draws = torch.Generator().manual_seed(derive_seed(seed, "candidates") % 2**63)
 
     def choose(
         distribution: DecisionDistribution, state: Any, sampling: Sampling, noise: Tensor
     ) -> Int64[Tensor, "B N A"]:
         # `simulate` decides in the order of time, so the next target is that of this decision.
-        target = next(targets)((state.position, state.heading))
-        found.append((target.best_token(), target.logged_valid & target.is_near_log(max_distance_lengths)))
-        return take(distribution, target, num_candidates, noise)  # type: ignore[arg-type]
+        target = next(logged)((state.position, state.heading))
+        if choice == "sampled":  # K numbers for each agent instead of one
+            noise = torch.rand((*noise.shape[:-1], num_candidates), generator=draws).to(noise)
+        taken = take(distribution, target, num_candidates, noise)  # type: ignore[arg-type]
+        best = taken if targets == "taken" else target.best_token()
+        found.append((best, target.logged_valid & target.is_near_log(max_distance_lengths)))
+        return taken
 
     rollouts = simulate(
         policy, batch, num_rollouts=num_rollouts, seed=seed, context=context, goals=goals, choose=choose
@@ -284,4 +325,19 @@ def _draw_near(distribution: Any, target: _Target, count: int, noise: Tensor) ->
     return torch.where(target.logged_valid, among_near, _draw_likely(distribution, target, count, noise))
 
 
-_CHOICES = {"closest": _take_closest, "top_k": _draw_likely, "trajeglish": _draw_near}
+def _take_nearest_sample(
+    distribution: TokenLogits, target: _Target, count: int, noise: Tensor
+) -> Int64[Tensor, "B N A"]:
+    logits, mask = distribution.logits, distribution.mask  # [R, V], [B, N, A]
+    cumulative = logits.softmax(-1).cumsum(-1)  # [R, V]
+    # Its last entry is 1 up to rounding: scaled by it, no number lies beyond the last token.
+    ids = torch.searchsorted(cumulative, noise[mask] * cumulative[:, -1:], right=True)  # [R, K]
+    ids = ids.clamp(max=logits.shape[-1] - 1)
+    nearest = target.distances(ids, mask).argmin(-1, keepdim=True)
+    chosen = torch.where(target.logged_valid[mask], ids.gather(-1, nearest)[:, 0], ids[:, 0])
+    return torch.zeros_like(target.class_id).masked_scatter(mask, chosen)
+
+
+_CHOICES = {
+    "closest": _take_closest, "top_k": _draw_likely, "trajeglish": _draw_near, "sampled": _take_nearest_sample,
+}  # fmt: skip

@@ -9,7 +9,7 @@ import copy
 import math
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -137,10 +137,12 @@ class _Imitator(Learner):
     fabric: Fabric
     average: nn.Module | None = None
     """Moving average of the weights, as a policy of its own."""
+    kept: Mapping[str, nn.Module] = field(default_factory=dict)
+    """Further modules of the method that change during the run."""
 
     @property
     def modules(self) -> dict[str, nn.Module]:
-        return super().modules | ({} if self.average is None else {"average": self.average})
+        return {**super().modules, **({} if self.average is None else {"average": self.average}), **self.kept}
 
     @property
     def result(self) -> Any:
@@ -169,6 +171,7 @@ def imitate(
     *,
     title: str,
     held_out: Scenarios | None = None,
+    kept: Mapping[str, nn.Module] | None = None,
     card: str = "",
 ) -> Path:
     """Train the parameters of a model that require a gradient; resumes where a run in `out` was stopped.
@@ -181,6 +184,7 @@ def imitate(
         predict: the model's predictions, or their loss.
         title: label of the progress bar.
         held_out: scenarios to validate on; None = no validation.
+        kept: further modules that `predict` changes, by name, for the run's checkpoints.
         card: README of the resulting model folder.
 
     Returns:
@@ -201,7 +205,9 @@ def imitate(
             raise ConfigError(f"{name} has no vocabulary, so no token is known to stand still: set still_weight=1.")
     if held_out is not None and config.validation.every:
         refuse_to_validate(model, held_out)
-    train = partial(_imitate, model, scenarios, out, predict, title=title, held_out=held_out, card=card)
+    train = partial(
+        _imitate, model, scenarios, out, predict, title=title, held_out=held_out, kept=kept or {}, card=card
+    )
     return train_in_processes(train, config, len(scenarios), out)
 
 
@@ -215,6 +221,7 @@ def _imitate(
     *,
     title: str,
     held_out: Scenarios | None,
+    kept: Mapping[str, nn.Module],
     card: str,
 ) -> Path:
     """Training in one of the processes of a run."""
@@ -232,6 +239,7 @@ def _imitate(
         config=config,
         fabric=fabric,
         average=None if config.ema_decay is None else copy.deepcopy(model).requires_grad_(False),
+        kept=kept,
     )
     validated = ""
 

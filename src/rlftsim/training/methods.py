@@ -5,13 +5,14 @@ from pathlib import Path
 
 from rlftsim.errors import ConfigError
 from rlftsim.rollout.policy import Policy
-from rlftsim.training.catk import CatkConfig, catk_finetune
+from rlftsim.training.catk import CatkConfig, RoadConfig, catk_finetune
 from rlftsim.training.finetune import FinetuneConfig, finetune
 from rlftsim.training.goal_relabeling import GcslConfig, gcsl_finetune
 from rlftsim.training.run import TrainingScenarios
 
 FinetuningConfig = FinetuneConfig | CatkConfig | GcslConfig
-"""Settings of a fine-tuning; the type says which method: a reward, CAT-K, or goal-conditioned supervised learning."""
+"""Settings of a fine-tuning; the type says which method: a reward, CAT-K (RoaD with a
+`RoadConfig`), or goal-conditioned supervised learning."""
 
 
 def finetune_policy(
@@ -30,7 +31,7 @@ def finetune_policy(
         scenarios: a data set, a list or one scenario, with their futures.
         out: the run's folder.
         config: settings, whose type is that of the method.
-        held_out: scenarios for validation; CAT-K only, see `config.validation`.
+        held_out: scenarios for validation; CAT-K and RoaD only, see `config.validation`.
         card: README of the resulting model folder.
 
     Returns:
@@ -41,7 +42,7 @@ def finetune_policy(
         CheckpointError: `out` holds another run, or the run diverged.
     """
     if held_out is not None and not isinstance(config, CatkConfig):
-        raise ConfigError("held_out has no effect: of the methods of fine-tuning only CAT-K validates.")
+        raise ConfigError("held_out has no effect: of the methods of fine-tuning only CAT-K and RoaD validate.")
     match config:
         case FinetuneConfig():
             return finetune(policy, scenarios, out, config, card=card)
@@ -56,6 +57,8 @@ def describe_method(config: FinetuningConfig) -> str:
     match config:
         case FinetuneConfig():
             return config.reward
+        case RoadConfig():
+            return "RoaD"
         case CatkConfig():
             return f"CAT-K, {config.choice}"
         case GcslConfig():

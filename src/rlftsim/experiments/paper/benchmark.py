@@ -1,4 +1,4 @@
-"""Table 1, extended: base model, CAT-K and RLFTSim, between constant velocity and the log itself (the oracle)."""
+"""Table 1, extended: base model, CAT-K, RoaD and RLFTSim, between constant velocity and the log itself (the oracle)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,21 +9,23 @@ from rlftsim.evaluation.columns import SCORES
 from rlftsim.evaluation.compare import paired_values
 from rlftsim.evaluation.results import Evaluation
 from rlftsim.experiments import tables
-from rlftsim.experiments.model_specs import BASE, CATK, CONSTANT_VELOCITY, ORACLE, FineTuned, over_seeds
+from rlftsim.experiments.model_specs import BASE, CATK, CONSTANT_VELOCITY, ORACLE, ROAD, FineTuned, over_seeds
 from rlftsim.experiments.paper import published
 from rlftsim.experiments.results import Experiment, ExperimentResult
 from rlftsim.experiments.rows import RMM, Row
 from rlftsim.experiments.suite import ExperimentSuite
 
-REFERENCE, IMITATION, TUNED, CEILING, FLOOR = "base", "CAT-K", "RLFTSim (MLOO)", "oracle", "constant velocity"
+REFERENCE, TUNED, CEILING, FLOOR = "base", "RLFTSim (MLOO)", "oracle", "constant velocity"
+IMITATIONS = {"CAT-K": CATK, "RoaD": ROAD}
+"""Methods of closed-loop imitation by the name of their row."""
 NUM_RESAMPLES = 10_000
 
 
 def run(suite: ExperimentSuite) -> dict[str, Row]:
-    """Rows of the table, without CAT-K for a policy that it cannot train."""
+    """Rows of the table, without closed-loop imitation for a policy that it cannot train."""
     rows = {
         REFERENCE: (BASE,),
-        IMITATION: over_seeds(FineTuned(CATK), suite.num_seeds),
+        **{name: over_seeds(FineTuned(method), suite.num_seeds) for name, method in IMITATIONS.items()},
         TUNED: over_seeds(FineTuned("mloo"), suite.num_seeds),
         CEILING: (ORACLE,),
         FLOOR: (CONSTANT_VELOCITY,),
@@ -34,11 +36,10 @@ def run(suite: ExperimentSuite) -> dict[str, Row]:
 def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResult:
     """The table, the differences, and the part of the gap to the oracle that fine-tuning closes."""
     base, tuned = rows[REFERENCE], rows[TUNED]
-    # None or one row, so that everything about CAT-K appears with it.
-    imitations = [rows[IMITATION]] if IMITATION in rows else []
+    imitations = [rows[name] for name in IMITATIONS if name in rows]
     closed = {row.name: gap_closed(base.mean, row.mean, rows[CEILING].mean) for row in (*imitations, tuned)}
     return ExperimentResult(
-        title="Benchmark: realism of the base model, CAT-K and RLFTSim",
+        title="Benchmark: realism of the base model, closed-loop imitation and RLFTSim",
         tables=(tables.of_rows("Ours", rows.values(), SCORES), published.BENCHMARK),
         verdicts=(
             *(tuned.against(base), tuned.seeds_against(base)),
@@ -111,7 +112,8 @@ def gap_closed(base: Evaluation, tuned: Evaluation, ceiling: Evaluation) -> GapC
 
 
 EXPERIMENT = Experiment(
-    "Does closed-loop fine-tuning make the simulation more realistic, and more so than CAT-K with the same budget?",
+    "Does closed-loop fine-tuning make the simulation more realistic, and more so than CAT-K and RoaD with the same "
+    "budget?",
     run,
     summarize,
     default_seeds=3,
