@@ -43,8 +43,8 @@ class Recipe:
     finetune: FinetuneConfig = field(default_factory=FinetuneConfig)
     catk: CatkConfig | None = field(default_factory=CatkConfig)
     """None for policies without tokens, which CAT-K cannot train."""
-    road: RoadConfig | None = field(default_factory=RoadConfig)
-    """None likewise."""
+    road: RoadConfig | None = None
+    """None where there is no RoaD."""
     gcsl: GcslConfig | None = field(default_factory=GcslConfig)
     """None likewise."""
 

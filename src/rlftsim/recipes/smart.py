@@ -26,6 +26,7 @@ class SmartRecipe(Recipe):
 
     tokens: TokensConfig = field(default_factory=TokensConfig)
     model: SmartConfig = field(default_factory=SmartConfig)
+    road: RoadConfig | None = field(default_factory=RoadConfig)
 
     @property
     def model_name(self) -> str:

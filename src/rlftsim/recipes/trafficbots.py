@@ -10,7 +10,7 @@ from rlftsim.policies.trafficbots.policy import TrafficBotsPolicy
 from rlftsim.recipes.registry import Recipe
 from rlftsim.rollout.policy import Policy
 from rlftsim.tokens.vocabulary import Vocabulary
-from rlftsim.training.catk import CatkConfig, RoadConfig
+from rlftsim.training.catk import CatkConfig
 from rlftsim.training.finetune import FinetuneConfig
 from rlftsim.training.goal_relabeling import GcslConfig
 from rlftsim.training.pretrain import PretrainConfig
@@ -23,7 +23,6 @@ class TrafficBotsRecipe(Recipe):
 
     model: TrafficBotsConfig = field(default_factory=TrafficBotsConfig)
     catk: CatkConfig | None = None
-    road: RoadConfig | None = None
     gcsl: GcslConfig | None = None
 
     @property
