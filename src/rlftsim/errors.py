@@ -4,16 +4,25 @@ import math
 import operator
 from dataclasses import fields, is_dataclass
 from types import UnionType
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Any, ClassVar, Literal, Union, get_args, get_origin, get_type_hints
 
 
 class RlftsimError(Exception):
     """Base of every error that this package raises on purpose; the command line prints it as one line without a
     traceback."""
 
+    exit_status: ClassVar[int] = 2
+    """Of a command line that it ends: 2 = the command has to be changed."""
+
 
 class DataError(RlftsimError):
     """A file, record or scenario that cannot be used; the message names the file, the record and the reason."""
+
+
+class BadRecordError(DataError):
+    """A damaged record in a conversion that stops at the first one; the message names file, record and cause."""
+
+    exit_status = 1
 
 
 class ConfigError(RlftsimError, ValueError):

@@ -14,6 +14,7 @@ import scenes
 import tiny
 from rlftsim.cli.main import main
 from rlftsim.evaluation.evaluate import EvaluateConfig, evaluate
+from rlftsim.policies.registry import load_policy
 from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.scenario.dataset import ScenarioDataset
 
@@ -109,6 +110,23 @@ def test_the_log_scores_above_both_baselines(files, tmp_path, capsys):
     }
     # The two baselines are in no fixed order: where most road users stand, "nobody moves" is the better guess.
     assert means["log"] > max(means["velocity"], means["parked"]) + 0.1, means
+
+
+@pytest.mark.official
+@pytest.mark.slow
+def test_the_shipped_model_scores_between_the_log_and_both_baselines_on_the_sample(shared, tmp_path, capsys):
+    run(capsys, "convert", shared / "data" / "av2", tmp_path / "data", "--split", "validation", "--jobs", 1)
+    data = ScenarioDataset(tmp_path / "data")
+
+    def rmm(policy, name, temperature=1.0):
+        config = EvaluateConfig(temperature=temperature)
+        found = evaluate(policy, data, config=config, name=name, show_progress=False)
+        return found.mean_and_error("meta_metric").mean
+
+    model = rmm(load_policy("demo-base"), "model", temperature=0.5)
+    assert rmm("oracle", "log") == pytest.approx(0.899, abs=0.002)
+    # In this scenario most vehicles stand, so the second baseline is the stronger one.
+    assert rmm(ConstantVelocity(), "velocity") < rmm(Parked(), "parked") < model < 0.85
 
 
 def test_pictures_of_other_data_carry_no_note():

@@ -376,7 +376,7 @@ def test_the_command_stops_with_an_exit_code(tmp_path, capsys):
     place = write_small(tmp_path / "val", "aa")
     next(place.glob("*.json")).unlink()
     line = ["convert", str(tmp_path / "val"), str(tmp_path / "data"), "--from", "av2", "--jobs", "1"]
-    assert main([*line, "--on-error", "stop"]) != 0
+    assert main([*line, "--on-error", "stop"]) == 1
     assert "no log_map_archive_aa.json" in capsys.readouterr().err
 
 

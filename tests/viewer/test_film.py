@@ -1,12 +1,16 @@
 """Scenes as films."""
 
+from dataclasses import replace
+
 import imageio_ffmpeg
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 
 from rlftsim.errors import ConfigError
 from rlftsim.viewer.film import to_film
+from rlftsim.viewer.picture import draw_scene
 
 
 def read_mp4(path):
@@ -47,3 +51,13 @@ def test_other_endings_are_refused_by_name(animation, tmp_path):
     with pytest.raises(ConfigError, match=r"film.avi: a film is .mp4 or .webp"):
         to_film(tmp_path / "film.avi", animation)
     assert not list(tmp_path.iterdir())
+
+
+def test_legend_and_small_print_of_a_single_panel_stay_inside_the_picture(animation):
+    noted = replace(animation.scene, note="Made from the recordings of a city (example.org), license. " * 2)
+    figure, _ = draw_scene(replace(animation, scene=noted, panels=animation.panels[:1]))
+    FigureCanvasAgg(figure).draw()
+    for part in (figure.legends[0], figure.texts[-1]):
+        box = part.get_window_extent()
+        assert figure.bbox.x0 <= box.x0
+        assert box.x1 <= figure.bbox.x1

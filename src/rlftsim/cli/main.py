@@ -86,7 +86,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return parse(words).run()
     except RlftsimError as error:
         print(f"rlftsim: {error}", file=sys.stderr)
-        return USER_MISTAKE
+        return error.exit_status
     except KeyboardInterrupt:
         what_next = "starts anew" if words[0] in STARTS_ANEW else "continues where this one stopped"
         print(f"\nrlftsim: stopped. The same command {what_next}.", file=sys.stderr)

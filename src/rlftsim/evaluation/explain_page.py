@@ -49,6 +49,11 @@ _CSS = """
 .strip .amount { text-align: right; }
 .strip .clock { display: flex; justify-content: space-between; color: var(--muted); font-size: 12px; min-width: 0; }
 .swatch { width: 12px; height: 12px; border-radius: 3px; }
+@media (max-width: 640px) {
+  /* Strips go below their labels; amounts fill up the labels' rows. */
+  .strip { grid-template-columns: minmax(0, 1fr) 70px; grid-auto-flow: dense; }
+  .strip svg, .strip .clock { grid-column: 1 / -1; }
+}
 """
 
 

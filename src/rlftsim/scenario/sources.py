@@ -29,7 +29,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
-from rlftsim.errors import ConfigError, DataError
+from rlftsim.errors import BadRecordError, ConfigError, DataError
 from rlftsim.plugins import ExtensionPoint
 from rlftsim.scenario.tfrecord import OnError, SkippedRecord
 from rlftsim.scenario.types import Scenario
@@ -175,7 +175,8 @@ def read_unit(
         tally: called with what the source counts.
 
     Raises:
-        DataError: under "stop", a bad record: names file, record and cause. Always: a file cannot be read.
+        BadRecordError: under "stop", a bad record: names file, record and cause.
+        DataError: a file cannot be read.
     """
     # Errors of the code that consumes the scenarios do not pass through here: only reading is inside the `try`.
     record = 0
@@ -196,7 +197,7 @@ def read_unit(
             record += 1
     except DataError as error:
         if on_error == "stop":
-            raise
+            raise BadRecordError(str(error)) from error
         report(SkippedRecord(unit.name, record, str(error)))
     except OSError as error:
         raise DataError(f"{error.filename or unit.name}: cannot be read: {error.strerror or error}") from error

@@ -45,7 +45,7 @@ MARK_STYLES = {"collides": "-", "offroad": "--"}
 """Line styles of the frames around agents, by the field of `SceneMotion` that marks them."""
 FRAME_SCALE = {"collides": 1.25, "offroad": 1.6}
 MARK_WIDTH = 1.8
-NOTE_CHARACTERS = 90
+NOTE_CHARACTERS = 75
 """Of a line of small print across one panel."""
 
 
@@ -94,7 +94,10 @@ def draw_scene(animation: Animation) -> tuple[Figure, Sequence[Axes]]:
         for mark, label in marks.items()
         if any(getattr(panel.trajectories, mark) is not None for panel in panels)
     ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False, fontsize=10)
+    # A single panel is too narrow for all of them in a row.
+    columns = min(len(handles), 3 * len(panels))
+    spacing = {"handlelength": 1.5, "columnspacing": 1.2}
+    figure.legend(handles=handles, loc="outside lower center", ncols=columns, frameon=False, fontsize=9, **spacing)
     write_notes(figure, [animation.scene], panels_across=len(panels))
     return figure, list(axes)
 
