@@ -9,7 +9,7 @@ from rlftsim.scenario.types import CURRENT_STEP, LaneTopology, LightStates, MapF
 
 EXACT_TURN_RAD = float(np.arctan2(4.0, 3.0))
 """53.13 degrees: sine 4/5 and cosine 3/5 are short fractions, so rotated grid points stay exact in float32."""
-_GRID_M = 5 / 4096
+GRID_M = 5 / 4096
 _NO_LIGHTS = LightStates(
     np.zeros(0, np.int32), np.zeros(0, np.int64), np.zeros(0, np.int8), np.zeros((0, 3), np.float32)
 )
@@ -56,7 +56,7 @@ def place_on_grid(scenario: Scenario) -> Scenario:
 
     # multiples of 5/4096 times 3/5 or 4/5 are multiples of 1/4096, which float32 has exactly below 4 km
     def rounded(points: np.ndarray) -> np.ndarray:
-        return (np.round(points / _GRID_M) * _GRID_M).astype(np.float32)
+        return (np.round(points / GRID_M) * GRID_M).astype(np.float32)
 
     return replace(
         central,

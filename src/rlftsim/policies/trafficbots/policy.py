@@ -124,15 +124,15 @@ class TrafficBotsPolicy(TrafficBotsModel):
         scene, now = context.scene, state.traffic
         imposed, continues = None, now.alive
         if forced is not None:
-            mask = forced.valid[..., 0]
-            pose = torch.cat([forced.position[..., 0, :], forced.heading], -1)
-            imposed = imposed_after(now.windows, mask, scene.to_ego_frame(torch.where(mask[..., None], pose, 0.0)))
-            continues = continues & ~mask
+            last = scene.to_batch_frame(now.windows.pose[..., -1, :]) if state.poses is None else state.poses[..., 0, :]
+            imposed = imposed_after(last, now.windows.motion[..., -1, 0], forced, scene)
+            continues = continues & ~imposed.mask
         traffic = now.after(decision, scene, imposed)
         poses = scene.to_batch_frame(traffic.windows.pose[..., -1, :])
         if forced is not None:
             # Exactly where it says, not there and back.
-            poses = torch.where(mask[..., None], pose, poses)
+            pose = torch.cat([forced.position[..., 0, :], forced.heading], -1)
+            poses = torch.where(forced.valid, pose, poses)
         return replace(
             state,
             traffic=traffic,

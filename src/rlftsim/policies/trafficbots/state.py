@@ -14,6 +14,7 @@ from rlftsim.geometry import heading_vector, wrap_angle
 from rlftsim.policies.trafficbots.dynamics import leaves_map, max_action, move, reaches_destination
 from rlftsim.policies.trafficbots.network import AgentSurroundings, Given, Windows, history_windows
 from rlftsim.policies.trafficbots.scene import Scene
+from rlftsim.rollout.types import AgentStates
 from rlftsim.scenario.types import STEP_S
 
 
@@ -36,19 +37,25 @@ class Imposed:
     motion: Float[Tensor, "B N A 3"]
 
 
-def imposed_after(windows: Windows, mask: Bool[Tensor, "B N A"], pose: Float[Tensor, "B N A 3"]) -> Imposed:
-    """Imposed poses, with the motion that leads to them from the last ones.
+def imposed_after(
+    last: Float[Tensor, "B N A 3"], last_speed: Float[Tensor, "B N A"], forced: AgentStates, scene: Scene
+) -> Imposed:
+    """Forced poses, with the motion that leads to them from the last ones.
 
     Args:
-        windows: before.
-        mask: True = the agent is put there.
-        pose: 0.1 s later, ego frame.
+        last: poses before, frame of the batch.
+        last_speed: m/s.
+        forced: states 0.1 s later, of a single step, frame of the batch.
+        scene: has the ego frame.
     """
-    last_pose, last_speed = windows.pose[..., -1, :], windows.motion[..., -1, 0]
-    way = pose[..., :2] - last_pose[..., :2]
+    mask = forced.valid[..., 0]
+    pose = torch.where(mask[..., None], torch.cat([forced.position[..., 0, :], forced.heading], -1), last)
+    # In the frame of the batch: a tenth of a millimeter of rounding would be 0.01 m/s².
+    way = pose[..., :2] - last[..., :2]
     speed = (way * heading_vector(pose[..., 2])).sum(-1) / STEP_S
-    yaw_rate = wrap_angle(pose[..., 2] - last_pose[..., 2]) / STEP_S
-    return Imposed(mask, pose, torch.stack([speed, (speed - last_speed) / STEP_S, yaw_rate], -1))
+    yaw_rate = wrap_angle(pose[..., 2] - last[..., 2]) / STEP_S
+    motion = torch.stack([speed, (speed - last_speed) / STEP_S, yaw_rate], -1)
+    return Imposed(mask, scene.to_ego_frame(pose), motion)
 
 
 @dataclass(frozen=True, eq=False)
