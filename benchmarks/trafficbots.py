@@ -1,19 +1,22 @@
 """CPU time and memory of TrafficBots V1.5 at its default size, one thread, on a scene of random tensors.
 
-    OMP_NUM_THREADS=1 python benchmarks/trafficbots.py [--quick]
+    OMP_NUM_THREADS=1 python benchmarks/trafficbots.py [--quick] [--public FOLDER]
 
-The sizes are those at which the public code (zhejz/TrafficBotsV1.5 at c87329d) was measured: 40 agents, 700 map tokens,
-24 lights. Its numbers are printed beside; they were taken on another machine (one thread of an EPYC core), so the ratio
-of two machines is in the ratio of the two columns.
+The sizes are 40 agents, 700 map tokens, 24 lights. FOLDER is a checkout of zhejz/TrafficBotsV1.5 (c87329d; its model
+needs omegaconf and transforms3d): its network is then measured in turns with ours, padded to the 64, 1024 and 128 slots of its loader.
+The rules that it checks at every step, its reward and its dynamics are left out.
 """
 
 import argparse
 import resource
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from rlftsim.policies.trafficbots.config import TrafficBotsConfig
 from rlftsim.policies.trafficbots.imitation import draw_training, loss_of_scene
@@ -21,8 +24,8 @@ from rlftsim.policies.trafficbots.policy import TrafficBotsPolicy
 from rlftsim.policies.trafficbots.scene import Scene
 
 NUM_AGENTS, NUM_MAP_TOKENS, NUM_LIGHTS, NUM_STEPS = 40, 700, 24, 91
-PUBLIC_S = {"map, once": 1.0, "decision, one rollout": 0.14, "decision, four rollouts": 0.56, "training step": 70.0}
-PUBLIC_TRAINING_GIB = 17.0
+PUBLIC_TRAINING_STEPS = 6
+"""Of 90: all of them take more than a minute and 17 GiB. Time and memory are those of one, times 90."""
 
 
 def random_scene() -> Scene:
@@ -55,41 +58,126 @@ def random_scene() -> Scene:
     )
 
 
-def cpu_seconds(call: Callable[[], object], repeats: int) -> float:
-    """Least CPU time of several calls."""
-    taken = []
-    for _ in range(repeats):
-        start = time.process_time()
-        call()
-        taken.append(time.process_time() - start)
-    return min(taken)
+class PublicCode:
+    """The public model on the same scene, padded to the slots that its data loader fills."""
+
+    AGENTS, MAP_TOKENS, LIGHTS = 64, 1024, 128
+
+    def __init__(self, folder: Path, scene: Scene):
+        sys.path.insert(0, str(folder / "src"))
+        from models.traffic_bots import TrafficBots
+        from omegaconf import OmegaConf
+
+        config = OmegaConf.load(folder / "configs" / "model" / "sim_agent.yaml")
+        settings = {name: value for name, value in config.model.items() if name != "_target_"}
+        torch.manual_seed(0)
+        self.model = TrafficBots(
+            **settings, time_step_gt=90, action_dim=2, tl_mode="lane", navi_mode="dest", navi_dim=-1,
+            n_mp_pl_node=20, mp_attr_dim=11, tl_state_dim=5, ag_motion_dim=3, ag_attr_dim=6,
+        ).eval()  # fmt: skip
+        self.latents = self.model.latent_encoder.out_dim
+
+        def padded(values: Tensor, count: int) -> Tensor:
+            return torch.cat([values, values.new_zeros(1, count - values.shape[1], *values.shape[2:])], 1)
+
+        one_hot = torch.nn.functional.one_hot
+        self.nodes = padded(scene.node_mask, self.MAP_TOKENS), padded(scene.node_pose, self.MAP_TOKENS)
+        self.map_type = padded(one_hot(scene.map_type, 11), self.MAP_TOKENS)
+        self.light_token = padded(scene.light_token, self.LIGHTS)
+        self.light_mask, self.light_pose = padded(scene.light_mask, self.LIGHTS), padded(scene.light_pose, self.LIGHTS)
+        self.light_state = padded(one_hot(scene.light_state, 5).float(), self.LIGHTS)  # [1, L, 91, 5]
+        self.valid, self.pose = padded(scene.valid, self.AGENTS), padded(scene.pose, self.AGENTS)
+        self.motion = padded(scene.motion, self.AGENTS)
+        self.agent_type = padded(one_hot(scene.agent_class, 3).bool(), self.AGENTS)
+        self.attributes = padded(torch.cat([scene.size, one_hot(scene.agent_class, 3).float()], -1), self.AGENTS)
+
+    def encode_map(self) -> dict[str, Tensor]:
+        """Map tokens."""
+        mask, pose = self.nodes
+        return self.model.mp_encoder(mask, self.map_type.float(), pose, self.map_type.bool())
+
+    def begin(self, map_tokens: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Light tokens, and an empty history."""
+        self.model.init()
+        return self.model.tl_encoder.pre_compute(
+            tl_valid=self.light_mask, tl_attr=self.light_token, tl_pose=self.light_pose, **map_tokens
+        )
+
+    def decide(self, step: int, map_tokens: dict[str, Tensor], light_tokens: dict[str, Tensor], latent: Tensor):
+        """Distributions of actions and of the lights' next states, as in the closed loop."""
+        exists = self.valid[:, :, step]
+        destination = torch.zeros(exists.shape, dtype=torch.long)
+        return self.model(
+            exists, self.pose[:, :, step], self.motion[:, :, step], self.attributes, self.agent_type, latent, exists,
+            destination, exists, True, self.light_state[:, :, step], light_tokens, map_tokens,
+        )  # fmt: skip
+
+    def train(self, num_steps: int) -> None:
+        """Map, posterior and some steps of the closed loop, forward and backward; the reward is left out."""
+        map_tokens = self.encode_map()
+        light_tokens = self.begin(map_tokens)
+        posterior = self.model.latent_encoder(
+            ag_valid=self.valid, ag_attr=self.attributes, ag_motion=self.motion, ag_pose=self.pose,
+            ag_type=self.agent_type, tl_state=self.light_state, mp_tokens=map_tokens, tl_tokens=light_tokens,
+            posterior=True,
+        )  # fmt: skip
+        latent = posterior.distribution.rsample()
+        loss = latent.square().mean()
+        for step in range(num_steps):
+            action, light = self.decide(step, map_tokens, light_tokens, latent)
+            loss = loss + action.mean.square().mean() + light.logits.square().mean()
+        loss.backward()
+
+
+def peak_gib() -> float:
+    """Largest resident memory of this process so far."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
 
 
 def main() -> None:
     """Measure, and print a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="leave the training step out")
-    quick = parser.parse_args().quick
+    parser.add_argument("--public", type=Path, help="checkout of the public code, measured in turns with ours")
+    arguments = parser.parse_args()
     torch.set_num_threads(1)
     scene = random_scene()
     history = replace(scene, light_state=scene.light_state[..., :11])
     policy = TrafficBotsPolicy(TrafficBotsConfig()).eval()
-    found = {}
+    public = PublicCode(arguments.public, scene) if arguments.public else None
+    ours: dict[str, float] = {}
+    theirs: dict[str, float] = {}
     with torch.no_grad():
-        found["map, once"] = cpu_seconds(lambda: policy.network.map(scene, scene.node_mask), 3)
-        start = time.process_time()
         context = policy.encode_scene(history)
-        encoding = time.process_time() - start
-        for num_rollouts, name in ((1, "one rollout"), (4, "four rollouts")):
-            state = policy.begin(context, num_rollouts, None, torch.rand(1, num_rollouts, NUM_AGENTS, 17))
+        if public:
+            map_tokens = public.encode_map()
+            light_tokens = public.begin(map_tokens)
+            latent = torch.randn(1, public.AGENTS, public.latents)
+            for step in range(10):  # a full history
+                public.decide(step, map_tokens, light_tokens, latent)
+        for _ in range(3):  # in turns: other work on the machine meets both
+            least(ours, "map, once", lambda: policy.network.map(scene, scene.node_mask))
+            least(ours, "map, and lights of all 80 decisions", lambda: policy.encode_scene(history))
+            for num_rollouts in (1, 4):
+                state = policy.begin(context, num_rollouts, None, torch.rand(1, num_rollouts, NUM_AGENTS, 17))
 
-            def decide(state=state) -> None:
-                # A fresh memo, so that the network runs.
-                fresh = replace(state, memo=type(state.memo)())
-                policy.advance(context, fresh, policy.decide(context, fresh).mean)
+                def decide(state=state) -> None:
+                    # A fresh memo, so that the network runs.
+                    fresh = replace(state, memo=type(state.memo)())
+                    policy.advance(context, fresh, policy.decide(context, fresh).mean)
 
-            found[f"decision, {name}"] = cpu_seconds(decide, 5)
-    if not quick:
+                for _ in range(3):
+                    least(ours, f"decision, {num_rollouts} rollouts", decide)
+            if public:
+                least(theirs, "map, once", public.encode_map)
+                for step in range(10, 13):
+                    least(
+                        theirs,
+                        "decision, 1 rollouts",
+                        lambda step=step: public.decide(step, map_tokens, light_tokens, latent),
+                    )
+    memory = {}
+    if not arguments.quick:
         policy.train()
         labels = torch.randint(0, NUM_MAP_TOKENS, (1, NUM_AGENTS))
         labels = torch.where(scene.map_type.gather(1, labels) == 4, labels, -1)
@@ -98,13 +186,31 @@ def main() -> None:
         def train() -> None:
             loss_of_scene(policy.network, policy.config, scene, labels, scene.agent_mask, draws).loss.backward()
 
-        found["training step"] = cpu_seconds(train, 1)
-    print(f"map and lights of all 80 decisions, once: {encoding:.2f} s")
-    print("| | ours (CPU s) | public code, other machine (CPU s) | ratio |\n|---|--:|--:|--:|")
-    for name, seconds in found.items():
-        print(f"| {name} | {seconds:.3f} | {PUBLIC_S[name]:g} | {seconds / PUBLIC_S[name]:.2f} |")
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-    print(f"peak memory {peak:.2f} GiB; the public code's training step {PUBLIC_TRAINING_GIB:g} GiB")
+        before = peak_gib()
+        least(ours, "training step", train)
+        memory["ours"] = peak_gib() - before
+        if public:
+            public.model.train()
+            times = {}
+            for steps in (2, PUBLIC_TRAINING_STEPS):
+                before = peak_gib()
+                least(times, str(steps), lambda steps=steps: public.train(steps))
+                memory[f"public code, {steps} steps"] = peak_gib() - before
+            one = (times[str(PUBLIC_TRAINING_STEPS)] - times["2"]) / (PUBLIC_TRAINING_STEPS - 2)
+            theirs["training step"] = times["2"] + 88 * one
+    print("| | ours (CPU s) | public code (CPU s) | ratio |\n|---|--:|--:|--:|")
+    for name, seconds in ours.items():
+        other = theirs.get(name)
+        print(f"| {name} | {seconds:.3f} |" + (f" {other:.3f} | {seconds / other:.2f} |" if other else " | |"))
+    print("memory on top of what was used before, GiB:", {name: round(value, 2) for name, value in memory.items()})
+
+
+def least(found: dict[str, float], name: str, call: Callable[[], object]) -> None:
+    """Keep the least CPU time of a call under its name."""
+    start = time.process_time()
+    call()
+    taken = time.process_time() - start
+    found[name] = min(taken, found.get(name, taken))
 
 
 if __name__ == "__main__":

@@ -42,8 +42,8 @@ SEED = 0
 SCORE_TOLERANCE = 1e-4
 """Nats, between sampled and scored log-probabilities."""
 PADDING_TOLERANCE = 1e-5
-ROUNDING = 2.0**-22
-"""Of a continuous decision of about 1: two units in the last place of float32."""
+ROUNDING = 1e-6
+"""Of a continuous decision: what float32 leaves of its mean after some tens of layers."""
 POSE_TOLERANCE_M = 1e-3
 MONTE_CARLO_DRAWS = 4096
 MONTE_CARLO_ERRORS = 5.0
