@@ -139,8 +139,10 @@ def test_the_score_function_has_mean_zero():
         scenes.without_map(),
         scenes.build_scenario("walkers", [scenes.Mover(scenes.ObjectType.PEDESTRIAN, x_m=3.0 * k) for k in range(3)]),
         scenes.without_road_edges(),
+        scenes.straight_road("unlit"),
+        scenes.crowd(num_agents=128),
     ],
-    ids=["one agent", "no map", "only pedestrians", "no edges"],
+    ids=["one agent", "no map", "only pedestrians", "no edges", "no lights", "128 agents"],
 )
 def test_scenes_without_something_are_simulated_scored_and_trained_on(policy, scenario):
     batch = collate([scenario])
