@@ -1,0 +1,201 @@
+"""Rollouts of one scenario as a serialized `ScenarioRollouts` message, and back, by copying arrays.
+
+A packed float field is the bytes of its array, so a message is a header of a few bytes per array and the arrays
+themselves. Building Python lists of 340 000 numbers for each scenario would take a hundred times as long.
+
+Shapes: N rollouts (scenes), A agents, T = 80 steps.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from google.protobuf.message import DecodeError
+from jaxtyping import Float32
+
+from rlftsim.errors import DataError
+from rlftsim.evaluation import submission_pb2
+from rlftsim.evaluation.rollout_files import AXES
+from rlftsim.realism import SimulatedStates
+from rlftsim.scenario.types import FUTURE_STEPS
+
+NUM_SCENES = 32
+TRAJECTORY_BYTES = 1297
+"""Of one agent in one scene: four arrays of 80 floats and 17 bytes around them, for an object id below 128."""
+_ARRAY_BYTES = 4 * FUTURE_STEPS
+_AXIS_KEYS = b"\x12\x1a\x22\x2a"
+"""Keys of center_x, center_y, center_z and heading: field numbers 2 to 5, wire type 2."""
+_ID_KEY, _FIRST_KEY, _SECOND_KEY = b"\x30", b"\x0a", b"\x12"
+
+
+def encode_varint(number: int) -> bytes:
+    """A whole number in protobuf's base 128; negative ones take ten bytes, as in an int32 field."""
+    number &= (1 << 64) - 1
+    digits = bytearray()
+    while number >= 0x80:
+        digits.append(number & 0x7F | 0x80)
+        number >>= 7
+    digits.append(number)
+    return bytes(digits)
+
+
+def encode_rollouts(scenario_id: str, states: SimulatedStates) -> bytes:
+    """Serialized `ScenarioRollouts`, equal to what protobuf writes.
+
+    Args:
+        scenario_id: of the scenario.
+        states: of its N rollouts; those that stand for several are written several times.
+    """
+    arrays = [getattr(states, axis).cpu().numpy() for axis in AXES]  # each [N, A, T]
+    as_bytes = [np.ascontiguousarray(a, np.dtype("<f4")).view(np.uint8) for a in arrays]  # each [N, A, 4 T]
+    array_size = encode_varint(_ARRAY_BYTES)
+    # Headers are the same in all scenes, so each is written into a column of all of them at once.
+    columns: list[bytes | np.ndarray] = []
+    for agent, object_id in enumerate(states.object_id.tolist()):
+        tail = _ID_KEY + encode_varint(object_id)
+        size = len(AXES) * (1 + len(array_size) + _ARRAY_BYTES) + len(tail)
+        columns.append(_FIRST_KEY + encode_varint(size))
+        for key, values in zip(_AXIS_KEYS, as_bytes):
+            columns += [bytes([key]) + array_size, values[:, agent]]
+        columns.append(tail)
+    scene_size = sum(c.shape[1] if isinstance(c, np.ndarray) else len(c) for c in columns)
+    head = _SECOND_KEY + encode_varint(scene_size)
+    scenes = np.empty((len(arrays[0]), len(head) + scene_size), np.uint8)  # [N, bytes]
+    at = 0
+    for column in (head, *columns):
+        part = column if isinstance(column, np.ndarray) else np.frombuffer(column, np.uint8)
+        scenes[:, at : at + part.shape[-1]] = part
+        at += part.shape[-1]
+    name = scenario_id.encode()
+    return _FIRST_KEY + encode_varint(len(name)) + name + scenes.tobytes() * states.repeat
+
+
+@dataclass(frozen=True)
+class WrongLength:
+    """An agent of a scene with arrays of another length than 80."""
+
+    scene: int
+    object_id: int
+    lengths: tuple[int, ...]
+    """Of x, y, z and heading."""
+
+
+@dataclass(frozen=True, eq=False)
+class DecodedRollouts:
+    """Contents of a `ScenarioRollouts` message, however wrong."""
+
+    scenario_id: str
+    object_ids: tuple[tuple[int, ...], ...]
+    """Of each scene, in its order."""
+    wrong_lengths: tuple[WrongLength, ...]
+    values: Float32[np.ndarray, "N A 4 T"] | None
+    """x, y, z, heading, agents in the order of the first scene; None where scenes differ in agents or lengths."""
+
+
+def decode_rollouts(data: bytes) -> DecodedRollouts:
+    """Contents of a serialized `ScenarioRollouts`, from any writer; fast for scenes that are laid out alike.
+
+    Raises:
+        DataError: the bytes are no such message, or name no scenario.
+    """
+    decoded = _decode_alike(data)
+    if decoded is None:
+        decoded = _decode_any(data)
+    return decoded
+
+
+def _decode_alike(data: bytes) -> DecodedRollouts | None:
+    """Contents where all scenes have the layout of the first one and nothing else is in the message; None if not."""
+    try:
+        name, at = _payload(data, 0, _FIRST_KEY)
+        first, stop = _payload(data, at, _SECOND_KEY)
+        stride = stop - at
+        num_scenes, rest = divmod(len(data) - at, stride)
+        if rest:
+            return None
+        rows = np.frombuffer(data, np.uint8, offset=at).reshape(num_scenes, stride)
+        # 1. the first scene: ids, and where in a row the arrays begin
+        ids, starts = [], []  # [A], [A][4]
+        position = first.start
+        while position < first.stop:
+            agent, position = _payload(data, position, _FIRST_KEY)
+            inside, own = agent.start, []
+            for key in _AXIS_KEYS:
+                array, inside = _payload(data, inside, bytes([key]))
+                if len(array) != _ARRAY_BYTES:
+                    return None
+                own.append(array.start - at)
+            object_id, inside = _varint(data, inside + 1) if data[inside : inside + 1] == _ID_KEY else (-1, -1)
+            if inside != agent.stop:
+                return None
+            ids.append(_as_int32(object_id))
+            starts.append(own)
+    except (IndexError, ValueError):
+        return None
+    # 2. all other bytes must be equal in all scenes
+    is_number = np.zeros(stride, bool)
+    for own in starts:
+        for start in own:
+            is_number[start : start + _ARRAY_BYTES] = True
+    around = rows[:, ~is_number]
+    if not ids or not (around == around[0]).all():
+        return None
+    values = np.empty((num_scenes, len(ids), len(AXES), FUTURE_STEPS), np.dtype("<f4"))
+    as_bytes = values.view(np.uint8)  # [N, A, 4, 4 T]
+    for agent, own in enumerate(starts):
+        for axis, start in enumerate(own):
+            as_bytes[:, agent, axis] = rows[:, start : start + _ARRAY_BYTES]
+    scenario_id = data[name.start : name.stop].decode("utf-8", "replace")
+    return DecodedRollouts(scenario_id, (tuple(ids),) * num_scenes, (), values)
+
+
+def _payload(data: bytes, position: int, key: bytes) -> tuple[range, int]:
+    """Bytes of a field of wire type 2 at a position, and the position after it."""
+    if data[position : position + 1] != key:
+        raise ValueError
+    size, start = _varint(data, position + 1)
+    if start + size > len(data):
+        raise ValueError
+    return range(start, start + size), start + size
+
+
+def _varint(data: bytes, position: int) -> tuple[int, int]:
+    """The number at a position, and the position after it."""
+    value = shift = 0
+    while True:
+        byte = data[position]
+        value |= (byte & 0x7F) << shift
+        position, shift = position + 1, shift + 7
+        if byte < 0x80:
+            return value, position
+
+
+def _as_int32(number: int) -> int:
+    return (number + (1 << 31)) % (1 << 32) - (1 << 31)
+
+
+def _decode_any(data: bytes) -> DecodedRollouts:
+    """Contents through protobuf's parser."""
+    try:
+        message = submission_pb2.ScenarioRollouts.FromString(data)
+    except DecodeError as error:
+        raise DataError(f"not a ScenarioRollouts message ({error})") from error
+    if not message.HasField("scenario_id"):
+        raise DataError("rollouts that name no scenario")
+    scenes, ids, wrong = [], [], []
+    for number, scene in enumerate(message.joint_scenes):
+        arrays = {}
+        ids.append(tuple(trajectory.object_id for trajectory in scene.simulated_trajectories))
+        for trajectory in scene.simulated_trajectories:
+            own = (trajectory.center_x, trajectory.center_y, trajectory.center_z, trajectory.heading)
+            lengths = tuple(len(values) for values in own)
+            if any(length != FUTURE_STEPS for length in lengths):
+                wrong.append(WrongLength(number, trajectory.object_id, lengths))
+            else:
+                arrays[trajectory.object_id] = np.array(own, np.float32)  # [4, T]
+        scenes.append(arrays)
+    values = None
+    # An id that is listed twice has one array: then the numbers of ids and of arrays differ.
+    alike = all(len(arrays) == len(own) and arrays.keys() == scenes[0].keys() for arrays, own in zip(scenes, ids))
+    if scenes and scenes[0] and alike:
+        values = np.array([[arrays[object_id] for object_id in ids[0]] for arrays in scenes], np.float32)
+    return DecodedRollouts(message.scenario_id, tuple(ids), tuple(wrong), values)
