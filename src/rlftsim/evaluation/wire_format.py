@@ -7,7 +7,7 @@ A submission file holds the rollouts of hundreds of scenarios: listing them must
 
 from collections.abc import Iterator
 from io import BufferedIOBase
-from typing import NamedTuple
+from typing import BinaryIO, NamedTuple
 
 from rlftsim.errors import DataError
 
@@ -23,6 +23,48 @@ class WireField(NamedTuple):
     wire_type: int
     start: int
     stop: int
+
+
+class WholeField(NamedTuple):
+    """One field of a message with its bytes."""
+
+    number: int
+    wire_type: int
+    head: bytes
+    """Key, and length where there is one."""
+    payload: bytes
+
+
+def read_fields(file: BinaryIO, size: int) -> Iterator[WholeField]:
+    """Fields of a message, read front to back: for a file that cannot be sought, and messages that do not fit in memory.
+
+    Args:
+        file: at the message's first byte.
+        size: of the message in bytes.
+
+    Raises:
+        DataError: the bytes are no protobuf message, or end too early; names the byte.
+    """
+    position = 0
+    while position < size:
+        head = _read_varint_bytes(file, position)
+        number, wire_type = _to_number(head) >> 3, head[0] & 7
+        length = _FIXED_SIZE.get(wire_type, size + 1)
+        payload = b""
+        if wire_type == BYTES:
+            digits = _read_varint_bytes(file, position)
+            head, length = head + digits, _to_number(digits)
+        elif wire_type == VARINT:
+            payload = _read_varint_bytes(file, position)
+            length = len(payload)
+        # checked before the payload is read: a damaged length may be of any size
+        if number == 0 or position + len(head) + length > size:
+            raise DataError(f"not a protobuf message, or cut off: the field at byte {position} cannot be")
+        payload = payload or file.read(length)
+        if len(payload) < length:
+            raise DataError(f"cut off: the field at byte {position} does not end")
+        yield WholeField(number, wire_type, head, payload)
+        position += len(head) + length
 
 
 def iterate_fields(file: BufferedIOBase, start: int, stop: int) -> Iterator[WireField]:
@@ -65,13 +107,29 @@ def iterate_fields(file: BufferedIOBase, start: int, stop: int) -> Iterator[Wire
 
 def _read_varint(file: BufferedIOBase, stop: int) -> int:
     begin = file.tell()
-    value = 0
+    digits = _read_varint_bytes(file, begin)
+    if begin + len(digits) > stop:
+        raise _endless(begin)
+    return _to_number(digits)
+
+
+def _read_varint_bytes(file: BufferedIOBase | BinaryIO, position: int) -> bytes:
+    """The bytes of a number; `position` is for the message of an error."""
+    digits = b""
     # seven bits a byte, the lowest first; the high bit says that another byte follows
-    for shift in range(_MAX_VARINT_BYTES):
+    for _ in range(_MAX_VARINT_BYTES):
         byte = file.read(1)
-        if not byte or file.tell() > stop:
+        digits += byte
+        if not byte or byte[0] < 0x80:
             break
-        value |= (byte[0] & 0x7F) << (7 * shift)
-        if byte[0] < 0x80:
-            return value
-    raise DataError(f"not a protobuf message, or cut off: the number at byte {begin} does not end")
+    if not digits or digits[-1] >= 0x80:
+        raise _endless(position)
+    return digits
+
+
+def _to_number(digits: bytes) -> int:
+    return sum((byte & 0x7F) << (7 * place) for place, byte in enumerate(digits))
+
+
+def _endless(position: int) -> DataError:
+    return DataError(f"not a protobuf message, or cut off: the number at byte {position} does not end")

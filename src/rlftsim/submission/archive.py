@@ -7,11 +7,13 @@ concatenated, too, but Python's tarfile in mode "r|gz" reads the first of them o
 
 import hashlib
 import os
+import shutil
 import struct
 import tarfile
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import chain, takewhile
 from pathlib import Path
 from typing import BinaryIO
 
@@ -60,22 +62,19 @@ def write_piece(source: Path, name: str, destination: Path) -> Piece:
     deflate = zlib.compressobj(LEVEL, zlib.DEFLATED, -zlib.MAX_WBITS)
     temporary = destination.with_name(f".{destination.name}.tmp")
     raw_size = raw_crc = size = piece_crc = 0
-    with errors_name(destination), source.open("rb") as contents, temporary.open("wb") as out:
-        chunk = header
-        while chunk:
-            raw_size, raw_crc = raw_size + len(chunk), zlib.crc32(chunk, raw_crc)
-            packed = deflate.compress(chunk)
-            size, piece_crc = size + len(packed), zlib.crc32(packed, piece_crc)
-            out.write(packed)
-            chunk = contents.read(_CHUNK)
-            if not chunk:
-                chunk, padding = padding, b""
-        packed = deflate.flush(zlib.Z_FULL_FLUSH)
-        size, piece_crc = size + len(packed), zlib.crc32(packed, piece_crc)
-        out.write(packed)
-        out.flush()
-        os.fsync(out.fileno())
-        temporary.replace(destination)
+    try:
+        with errors_name(destination), source.open("rb") as contents, temporary.open("wb") as out:
+            for chunk in chain([header], iter(lambda: contents.read(_CHUNK), b""), [padding, None]):
+                if chunk is not None:
+                    raw_size, raw_crc = raw_size + len(chunk), zlib.crc32(chunk, raw_crc)
+                packed = deflate.flush(zlib.Z_FULL_FLUSH) if chunk is None else deflate.compress(chunk)
+                size, piece_crc = size + len(packed), zlib.crc32(packed, piece_crc)
+                out.write(packed)
+            out.flush()
+            os.fsync(out.fileno())
+            temporary.replace(destination)
+    finally:
+        temporary.unlink(missing_ok=True)
     return Piece(destination.name, size, piece_crc, raw_size, raw_crc)
 
 
@@ -91,19 +90,19 @@ def join_pieces(archive: Path, folder: Path, pieces: Sequence[Piece], *, delete:
     Raises:
         DataError: a piece is damaged or missing, or the archive cannot be written.
     """
-    partial = archive.with_name(f".{archive.name}.partial")
-    # Pieces that an earlier call deleted are in the unfinished archive, in which later ones may have been begun.
-    left = next((n for n, piece in enumerate(pieces) if (folder / piece.file).exists()), len(pieces))
-    start = len(_GZIP_HEADER) + sum(piece.size for piece in pieces[:left]) if left else 0
-    if start and (not partial.exists() or partial.stat().st_size < start):
-        raise DataError(f"{folder / pieces[0].file} is missing: remove {folder} and run the same command again.")
-    with errors_name(archive), partial.open("r+b" if start else "wb") as out:
-        out.truncate(start)
-        out.seek(start)
-        if not start:
+    partial = _partial(archive)
+    num_joined = count_joined(archive, folder, pieces)
+    start = len(_GZIP_HEADER) + sum(piece.size for piece in pieces[:num_joined])
+    with errors_name(archive), partial.open("r+b" if num_joined else "wb") as out:
+        if num_joined:
+            out.truncate(start)
+            out.seek(start)
+        else:
             out.write(_GZIP_HEADER)
-        for piece in pieces[left:]:
-            _append(folder / piece.file, piece, out)
+        for piece in pieces[num_joined:]:
+            _refuse_damaged(folder / piece.file, piece)
+            with (folder / piece.file).open("rb") as file:
+                shutil.copyfileobj(file, out, _CHUNK)
             if delete:
                 out.flush()
                 os.fsync(out.fileno())
@@ -122,14 +121,31 @@ def join_pieces(archive: Path, folder: Path, pieces: Sequence[Piece], *, delete:
         partial.replace(archive)
 
 
-def _append(path: Path, piece: Piece, out: BinaryIO) -> None:
-    """Copy a piece, checking it on the way."""
+def count_joined(archive: Path, folder: Path, pieces: Sequence[Piece | None]) -> int:
+    """Leading pieces that are in the unfinished archive and were deleted; later ones may have been begun there.
+
+    Args:
+        archive: the finished one.
+        folder: with the pieces that are left.
+        pieces: in the order of the archive; None = not made yet.
+    """
+    gone = list(takewhile(lambda piece: piece is not None and not (folder / piece.file).exists(), pieces))
+    needed = len(_GZIP_HEADER) + sum(piece.size for piece in gone if piece is not None)
+    partial = _partial(archive)
+    return len(gone) if partial.exists() and partial.stat().st_size >= needed else 0
+
+
+def _partial(archive: Path) -> Path:
+    return archive.with_name(f".{archive.name}.partial")
+
+
+def _refuse_damaged(path: Path, piece: Piece) -> None:
+    """Compare a piece with its receipt before any of it is in the archive; a damaged one is removed."""
     crc = size = 0
     if path.exists():
         with path.open("rb") as file:
             while chunk := file.read(_CHUNK):
                 crc, size = zlib.crc32(chunk, crc), size + len(chunk)
-                out.write(chunk)
     if (crc, size) != (piece.piece_crc, piece.size):
         path.unlink(missing_ok=True)
         raise DataError(f"{path} was damaged or missing: run the same command again, which simulates it once more.")
@@ -220,6 +236,11 @@ class GzipReader:
             raise DataError(
                 f"{what} behind the first gzip member: Python's tarfile reads the first one only, pack it again as one"
             )
+
+    def read_to_end(self) -> None:
+        """Read the rest of the file for its checksum, whatever it is."""
+        while self._read_packed():
+            pass
 
     def _read_packed(self) -> bytes:
         chunk = self._file.read(_CHUNK)

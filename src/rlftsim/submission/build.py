@@ -1,0 +1,221 @@
+"""Archives for the Sim Agents challenge: simulate a split shard by shard, pack, check.
+
+    OUT/plan.json                what the shards depend on; another plan is refused
+    OUT/shards/00003.part        a finished shard, compressed (`submission.archive`)
+    OUT/shards/00003.json        its receipt, written after it
+    OUT/submission.tar.gz        appears when it is whole
+
+A build that was interrupted in any way goes on with the shards that have no receipt. The bytes of the archive depend on
+the plan alone, not on processes or interruptions.
+"""
+
+import json
+import math
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import torch
+
+from rlftsim.atomic_io import errors_name, write_text
+from rlftsim.errors import ConfigError, DataError
+from rlftsim.evaluation.evaluate import check_jobs, simulate_states
+from rlftsim.evaluation.results import EvaluateConfig
+from rlftsim.progress import log, progress_bar
+from rlftsim.realism import SimulatedStates
+from rlftsim.rollout.policy import Policy, device_of
+from rlftsim.scenario.dataset import ScenarioDataset
+from rlftsim.scenario.types import Scenario
+from rlftsim.submission.archive import Piece, count_joined, join_pieces, write_piece
+from rlftsim.submission.messages import decode_rollouts, encode_rollouts, encode_varint
+from rlftsim.submission.plan import GZIP_RATIO, Plan
+from rlftsim.submission.scenario_checks import check_rollouts
+from rlftsim.threads import one_thread
+from rlftsim.workers import run_tasks
+
+ARCHIVE = "submission.tar.gz"
+_SHARDS, _LOCK = "shards", ".lock"
+_HEADING_FINER = 8
+"""Headings are rounded to this fraction of the positions' step, in radians: the corner of a box 8 m away moves as far."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """Input of the work on a shard; is handed to other processes."""
+
+    policy: Policy
+    data: ScenarioDataset
+    plan: Plan
+    metadata: bytes
+    """Fields that each shard repeats, see `submission.entry`."""
+    config: EvaluateConfig
+    round_m: float | None
+    folder: Path
+
+    def piece_path(self, number: int) -> Path:
+        """File of a finished shard."""
+        return self.folder / _SHARDS / f"{number:05d}.part"
+
+    def receipt_path(self, number: int) -> Path:
+        """Receipt of a finished shard."""
+        return self.folder / _SHARDS / f"{number:05d}.json"
+
+    def receipt(self, number: int) -> Piece | None:
+        """A finished shard; None if there is none. Its file may be in the archive already."""
+        try:
+            return Piece(**json.loads(self.receipt_path(number).read_text(encoding="utf-8")))
+        except (OSError, ValueError, TypeError):
+            return None
+
+
+def build_archive(job: Job, *, delete_parts: bool = False, show_progress: bool = True) -> Path:
+    """Simulate what is missing and write the archive; returns its path. Interrupted in any way, the same call goes on.
+
+    Args:
+        job: policy, data, plan and settings.
+        delete_parts: remove each compressed shard as soon as it is in the archive. Halves the disk space.
+        show_progress: False = no progress bar.
+
+    Raises:
+        ConfigError: several processes for a policy on a GPU, or a folder with work on another plan.
+        DataError: rollouts that the server would refuse, or a disk that is full.
+    """
+    check_jobs(job.config, device_of(job.policy))
+    archive = job.folder / ARCHIVE
+    with _only_one(job.folder):
+        job.plan.claim(job.folder)
+        if archive.exists():
+            return archive
+        shards = job.folder / _SHARDS
+        shards.mkdir(exist_ok=True)
+        # What a killed process was writing; nobody else writes here now.
+        for stray in shards.glob(".*"):
+            stray.unlink()
+        numbers = range(len(job.plan.shards))
+        receipts = [job.receipt(n) for n in numbers]
+        num_joined = count_joined(archive, shards, receipts)
+        missing = [n for n in numbers[num_joined:] if receipts[n] is None or not job.piece_path(n).exists()]
+        total = sum(len(shard) for shard in job.plan.shards)
+        left = sum(len(job.plan.shards[n]) for n in missing)
+        _forecast(job, len(missing))
+        with progress_bar("submit", total, total - left, show=show_progress) as advance, one_thread():
+            run_tasks(partial(_build_shard, job), missing, jobs=job.config.jobs, advance=advance)
+        pieces = [piece for piece in map(job.receipt, numbers) if piece is not None]
+        if len(pieces) < len(numbers):
+            raise DataError(f"{shards}: finished shards vanished meanwhile: run the same command again.")
+        join_pieces(archive, shards, pieces, delete=delete_parts)
+    return archive
+
+
+def delete_parts(folder: Path) -> None:
+    """Remove the compressed shards of a finished archive."""
+    shutil.rmtree(folder / _SHARDS, ignore_errors=True)
+
+
+def _forecast(job: Job, num_missing: int) -> None:
+    """Say how large the archive will be, and if the disk has too little room."""
+    low, high = (ratio * job.plan.message_bytes / 1e9 for ratio in GZIP_RATIO)
+    free = shutil.disk_usage(job.folder).free / 1e9
+    log.info(
+        f"{sum(len(s) for s in job.plan.shards)} scenarios, {sum(job.plan.num_agents)} agents, {len(job.plan.shards)} "
+        f"shards, {num_missing} to simulate: {job.plan.message_bytes / 1e9:.3g} GB of messages, an archive of about "
+        f"{low:.3g} to {high:.3g} GB; {free:.3g} GB free in {job.folder}."
+    )
+    needed = 2 * high * num_missing / len(job.plan.shards)
+    if needed > free:
+        log.warning(f"  parts and archive need up to {needed:.3g} GB: make room, or halve that with --delete-parts.")
+
+
+def _build_shard(job: Job, number: int, advance: Callable[[int], None], is_stopped: Callable[[], bool]) -> None:
+    """Simulate the scenarios of a shard, write it, compress it, sign for it."""
+    name = job.plan.shard_name(number)
+    raw = job.folder / _SHARDS / f".{name}.tmp"
+    try:
+        with errors_name(raw), raw.open("wb") as file:
+            file.write(job.metadata)
+            for position in job.plan.shards[number]:
+                if is_stopped():
+                    return
+                message = _simulate_message(job, job.data[position], name)
+                file.write(b"\x0a" + encode_varint(len(message)) + message)
+                advance(1)
+        piece = write_piece(raw, name, job.piece_path(number))
+    finally:
+        raw.unlink(missing_ok=True)
+    is_first = not any(job.receipt_path(n).exists() for n in range(len(job.plan.shards)))
+    write_text(job.receipt_path(number), json.dumps(asdict(piece)) + "\n")
+    if is_first:
+        size = forecast_size(job.plan, number, piece)
+        log.info(f"  first shard: compressed to {piece.size / piece.raw_size:.3f}, so the archive will have "
+                 f"about {size / 1e9:.3g} GB.")
+
+
+def _simulate_message(job: Job, scenario: Scenario, shard: str) -> bytes:
+    """Rollouts of a scenario as they are written, checked."""
+    states = simulate_states(job.policy, scenario, job.config, device_of(job.policy))
+    message = encode_rollouts(scenario.scenario_id, round_states(states, job.round_m))
+    for finding in check_rollouts(decode_rollouts(message), scenario, shard).findings:
+        if finding.severity == "error":
+            raise DataError(f"check {finding.check}: {finding}. Nothing of this shard is kept.")
+    return message
+
+
+def forecast_size(plan: Plan, number: int, piece: Piece) -> float:
+    """Bytes that the archive will have, from one finished shard.
+
+    Args:
+        plan: of the archive.
+        number: of the shard.
+        piece: the shard.
+    """
+    return piece.size / plan.num_agents[number] * sum(plan.num_agents)
+
+
+def round_states(states: SimulatedStates, round_m: float | None) -> SimulatedStates:
+    """Positions rounded to a power of two of at most `round_m`, headings to an eighth of it; themselves at None.
+
+    Powers of two leave zeros in the last bits of a float, which compress to nothing.
+
+    Args:
+        states: of a scenario.
+        round_m: largest step in meters, such as 0.001.
+
+    Raises:
+        ConfigError: not above zero.
+    """
+    if round_m is None:
+        return states
+    if not 0 < round_m < 1:
+        raise ConfigError(f"round={round_m:g} must be above 0 and below 1 m, such as 0.001.")
+    step = 2.0 ** math.floor(math.log2(round_m))
+
+    def rounded(values: torch.Tensor, unit: float) -> torch.Tensor:
+        return (values.double() / unit).round().mul(unit).float()
+
+    x, y, heading = rounded(states.x, step), rounded(states.y, step), rounded(states.heading, step / _HEADING_FINER)
+    return replace(states, x=x, y=y, heading=heading)
+
+
+@contextmanager
+def _only_one(folder: Path) -> Iterator[None]:
+    """Hold a folder for the time of the block.
+
+    Raises:
+        DataError: another process builds in it, or it cannot be written to.
+    """
+    with errors_name(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = open(folder / _LOCK, "w", encoding="utf-8")  # noqa: SIM115 (the with follows)
+    with lock:
+        try:
+            import fcntl
+
+            fcntl.flock(lock.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except ImportError:  # no such locks on this platform
+            pass
+        except OSError:
+            raise DataError(f"another process builds in {folder}: wait for it, or name another --out.") from None
+        yield

@@ -1,0 +1,74 @@
+"""The challenge's rule about closed loop: the statement an entry makes, and policies that cannot make it."""
+
+import torch
+from torch import Tensor
+
+from rlftsim.errors import ConfigError
+from rlftsim.rollout.noise import draw_noise
+from rlftsim.rollout.policy import Policy, Sampling, device_of
+from rlftsim.scenario.batch import collate
+from rlftsim.scenario.types import FUTURE_STEPS, STEP_S, Scenario
+
+MAX_STEPS_PER_DECISION = 10
+"""Inference may be called as rarely as once a second, with interpolation to 10 Hz."""
+
+
+def statement(policy: Policy, sampling: Sampling) -> str:
+    """What an entry declares with the closed-loop flag, as far as this code can vouch for it.
+
+    Args:
+        policy: that is simulated.
+        sampling: temperature and truncation.
+    """
+    stride = policy.steps_per_decision
+    truncated = "" if sampling.top_k is None else f", top {sampling.top_k}"
+    return f"""Closed loop. The challenge takes outputs of "individual next-state prediction inference calls", each conditioned on the
+preceding states, made at least once a second; and the ego's next state must be independent of the others' given the past.
+How these rollouts are made:
+* the policy decides every {stride * STEP_S:g} s, {FUTURE_STEPS // stride} times in 8 s, from the simulated states so far;
+* every agent's decision is drawn independently given the common past (temperature {sampling.temperature:g}{truncated});
+* it sees the log up to the current step only: no future, no goals;
+* nothing drawn at the start of a rollout is shared by the ego and other agents;
+* every rollout that is drawn is submitted: none is selected, repaired or drawn again by its outcome.
+The first and the last three points hold for all policies in this code; that the network itself keeps them is for you to know."""
+
+
+def refuse_open_loop(policy: Policy, scenario: Scenario) -> None:
+    """Refuse a policy that cannot make the statement.
+
+    Args:
+        policy: to be simulated.
+        scenario: any, to try the policy on.
+
+    Raises:
+        ConfigError: it decides less than once a second, or the ego's draws at the start of a rollout depend on other
+            agents' noise, or theirs on the ego's.
+    """
+    stride = policy.steps_per_decision
+    if stride > MAX_STEPS_PER_DECISION:
+        raise ConfigError(
+            f"the policy decides every {stride * STEP_S:g} s: the challenge wants an inference call at least once a second."
+        )
+    if not policy.initial_noise_size:
+        return
+    batch = collate([scenario]).to(device_of(policy))
+    noise = draw_noise(batch, range(1), seed=0, purpose="begin", per_agent=policy.initial_noise_size)
+    is_ego = torch.from_numpy(scenario.simulated_indices == scenario.ego_index).to(batch.device)  # [A]
+    with torch.no_grad():
+        context = policy.encode(batch)
+        before, after = (
+            policy.begin(context, 1, None, given).draws
+            for given in (noise, torch.where(is_ego[:, None], 1 - noise, noise))
+        )
+    if before is not None and not _is_ego_alone(before, after, is_ego):
+        raise ConfigError(
+            "the policy draws something at the start of a rollout that the ego shares with other agents: the challenge "
+            "wants the ego to be independent of them, because a planner will take its place."
+        )
+
+
+def _is_ego_alone(before: Tensor, after: Tensor, is_ego: Tensor) -> bool:
+    """True if draws have an agent axis along which only the ego's changed."""
+    if before.dim() < 3 or before.shape[2] != len(is_ego):
+        return False
+    return bool((before[:, :, ~is_ego] == after[:, :, ~is_ego]).all())

@@ -1,0 +1,158 @@
+"""Description of an entry: account, method and authors from `submission.toml`, and the message that each shard repeats."""
+
+import re
+import tomllib
+from dataclasses import dataclass, fields
+from os import PathLike
+from pathlib import Path
+
+from torch import nn
+
+from rlftsim.errors import ConfigError
+from rlftsim.evaluation.submission_pb2 import SimAgentsChallengeSubmission
+
+MAX_METHOD_LENGTH = 40
+PARAMETERS = re.compile(r"\d+[KMBT]?")
+REQUIRED_FIELDS = (
+    "submission_type", "account_name", "unique_method_name", "uses_lidar_data", "uses_camera_data",
+    "uses_public_model_pretraining", "num_model_parameters", "acknowledge_complies_with_closed_loop_requirement",
+)  # fmt: skip
+_EMAIL = re.compile(r"[^@\s]+@[^@\s]+\.[^@\s.]+")
+_PLACEHOLDERS = ("test", "todo", "none", "method", "example", "your name", "your affiliation")
+_PLACEHOLDER_PARTS = ("your_account", "your.account", "@test.", "@example.", "<", ">")
+
+
+@dataclass(frozen=True)
+class Entry:
+    """What `submission.toml` says. All texts are required, because the server has refused empty ones."""
+
+    account: str
+    """E-mail address of the account that uploads."""
+    method: str
+    """Name on the leaderboard, at most 40 characters; only the latest result of an account's method is shown."""
+    authors: tuple[str, ...]
+    affiliation: str
+    description: str
+    link: str
+    uses_lidar: bool = False
+    uses_camera: bool = False
+    uses_public_models: bool = False
+    public_models: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in ("account", "method", "affiliation", "description", "link"):
+            value = getattr(self, name)
+            if not isinstance(value, str) or not value.strip() or _is_placeholder(value):
+                raise ConfigError(f"{name} = {value!r} is no entry's: write your own, the server refuses such texts.")
+        for name in ("authors", "public_models"):
+            value = getattr(self, name)
+            if not isinstance(value, list | tuple) or not all(isinstance(one, str) and one.strip() for one in value):
+                raise ConfigError(f"{name} must be a list of texts, got {value!r}.")
+            object.__setattr__(self, name, tuple(value))
+        for name in ("uses_lidar", "uses_camera", "uses_public_models"):
+            if not isinstance(getattr(self, name), bool):
+                raise ConfigError(f"{name} must be true or false, got {getattr(self, name)!r}.")
+        if not self.authors or any(_is_placeholder(author) for author in self.authors):
+            raise ConfigError(f"authors = {list(self.authors)} are no entry's: name at least one author.")
+        if not _EMAIL.fullmatch(self.account):
+            raise ConfigError(f"account = {self.account!r} is no e-mail address: give the one you registered with.")
+        if len(self.method) > MAX_METHOD_LENGTH or not (self.method.isascii() and self.method.isprintable()):
+            raise ConfigError(
+                f"method = {self.method!r} must be 1 to {MAX_METHOD_LENGTH} printable ASCII characters, "
+                f"it has {len(self.method)}."
+            )
+        if self.uses_public_models != bool(self.public_models):
+            raise ConfigError(
+                f"uses_public_models is {str(self.uses_public_models).lower()} and public_models names "
+                f"{len(self.public_models)}: name the models, or neither."
+            )
+
+
+def read_entry(path: str | PathLike[str], *, account: str | None = None, method: str | None = None) -> Entry:
+    """The entry that a TOML file describes.
+
+    Args:
+        path: of the file.
+        account: in place of the file's.
+        method: in place of the file's.
+
+    Raises:
+        ConfigError: no such file, unknown, missing or placeholder values; the message names the file.
+    """
+    try:
+        values = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}: write one as docs/submission.md shows.") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: not a TOML file ({error}).") from None
+    values |= {name: value for name, value in (("account", account), ("method", method)) if value is not None}
+    known = {field.name for field in fields(Entry)}
+    missing = [f.name for f in fields(Entry) if f.name not in values and f.name not in _optional()]
+    unknown = sorted(values.keys() - known)
+    if missing or unknown:
+        problem = f"{', '.join(missing)} missing" if missing else f"{', '.join(unknown)} unknown"
+        raise ConfigError(f"{path}: {problem}; known are {', '.join(sorted(known))}.")
+    try:
+        return Entry(**values)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
+
+
+def count_parameters(policy: object) -> str:
+    """Number of a policy's weights as the form of the challenge wants it: 7 123 456 is "7M", 512 000 is "512K"."""
+    count = sum(weight.numel() for weight in policy.parameters()) if isinstance(policy, nn.Module) else 0
+    for factor, suffix in ((10**12, "T"), (10**9, "B"), (10**6, "M"), (10**3, "K")):
+        if count >= factor:
+            return f"{round(count / factor)}{suffix}"
+    return str(count)
+
+
+def describe_entry(entry: Entry, num_parameters: str) -> bytes:
+    """Serialized fields of `SimAgentsChallengeSubmission` other than the rollouts.
+
+    The closed-loop flag is set: `submission.build` asks for it before it comes here.
+
+    Args:
+        entry: description of the entry.
+        num_parameters: of `count_parameters`.
+    """
+    message = SimAgentsChallengeSubmission(
+        submission_type=SimAgentsChallengeSubmission.SIM_AGENTS_SUBMISSION,
+        account_name=entry.account,
+        unique_method_name=entry.method,
+        authors=entry.authors,
+        affiliation=entry.affiliation,
+        description=entry.description,
+        method_link=entry.link,
+        uses_lidar_data=entry.uses_lidar,
+        uses_camera_data=entry.uses_camera,
+        uses_public_model_pretraining=entry.uses_public_models,
+        num_model_parameters=num_parameters,
+        public_model_names=entry.public_models,
+        acknowledge_complies_with_closed_loop_requirement=True,
+    )
+    return message.SerializeToString(deterministic=True)
+
+
+def problems_of(message: SimAgentsChallengeSubmission) -> list[str]:
+    """Required fields that a shard lacks, or has with values that the server refuses."""
+    problems = [f"{name} is missing" for name in REQUIRED_FIELDS if not message.HasField(name)]
+    if message.HasField("submission_type") and message.submission_type != message.SIM_AGENTS_SUBMISSION:
+        problems.append("submission_type is not SIM_AGENTS_SUBMISSION")
+    if message.HasField("num_model_parameters") and not PARAMETERS.fullmatch(message.num_model_parameters):
+        problems.append(f'num_model_parameters is "{message.num_model_parameters}", not a whole number and K, M, B or T')
+    closed_loop = "acknowledge_complies_with_closed_loop_requirement"
+    if message.HasField(closed_loop) and not getattr(message, closed_loop):
+        problems.append(f"{closed_loop} is false")
+    if message.HasField("account_name") and not _EMAIL.fullmatch(message.account_name):
+        problems.append("account_name is no e-mail address")
+    return problems
+
+
+def _optional() -> tuple[str, ...]:
+    return ("uses_lidar", "uses_camera", "uses_public_models", "public_models")
+
+
+def _is_placeholder(text: str) -> bool:
+    lower = text.strip().lower()
+    return lower in _PLACEHOLDERS or any(part in lower for part in _PLACEHOLDER_PARTS)

@@ -1,0 +1,88 @@
+"""Problems that are found in an archive, by the number of the check that found them."""
+
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import Literal
+
+Severity = Literal["error", "warning"]
+
+CHECKS = {
+    1: "agents of every scene are those valid at step 10",
+    2: "scenarios are those of the split",
+    3: "32 scenes per scenario",
+    4: "80 steps per agent",
+    5: "required fields, the same in every shard",
+    6: "names and numbers of the shards",
+    7: "a whole .tar.gz that Python's tarfile reads",
+    8: "no scenario twice, no agent twice",
+    9: "no scenario of another split",
+    10: "finite positions, possible distances",
+    11: "headings in one convention",
+    12: "heights of the log",
+    13: "the first step continues the log",
+    14: "scenes that differ",
+    15: "object ids of this version of the data",
+    16: "sizes of shards and archive",
+    17: "the file that was built, unbroken",
+}
+"""Title of each check. The last of the list in docs/submission.md, a server error without a reason, cannot be checked."""
+MAX_KEPT = 10
+"""Findings of a check that are kept; further ones are counted."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One problem and its place."""
+
+    check: int
+    """Key of `CHECKS`."""
+    severity: Severity
+    text: str
+    file: str | None = None
+    """Shard, or the archive."""
+    scenario_id: str | None = None
+    object_id: int | None = None
+
+    def __str__(self) -> str:
+        places = (
+            self.file,
+            self.scenario_id and f"scenario {self.scenario_id}",
+            None if self.object_id is None else f"object {self.object_id}",
+        )
+        return f"{', '.join(place for place in places if place)}: {self.text}"
+
+
+@dataclass
+class Findings:
+    """The first findings of each check, and how many there are."""
+
+    kept: list[Finding] = field(default_factory=list)
+    counts: Counter[int] = field(default_factory=Counter)
+
+    def add(self, finding: Finding) -> None:
+        """Count a finding, and keep it if it is among the first of its check."""
+        self.counts[finding.check] += 1
+        if self.counts[finding.check] <= MAX_KEPT:
+            self.kept.append(finding)
+
+    def drop(self, check: int) -> list[Finding]:
+        """Forget the findings of a check; returns those that were kept."""
+        dropped = [finding for finding in self.kept if finding.check == check]
+        self.kept = [finding for finding in self.kept if finding.check != check]
+        self.counts.pop(check, None)
+        return dropped
+
+    @property
+    def has_errors(self) -> bool:
+        """True if the server would refuse the archive."""
+        return any(finding.severity == "error" for finding in self.kept)
+
+    def lines(self) -> list[str]:
+        """A line for each kept finding, and one for the others of each check."""
+        lines = []
+        for check in sorted(self.counts):
+            own = [finding for finding in self.kept if finding.check == check]
+            lines += [f"{finding.severity}, check {check}: {finding}" for finding in own]
+            if self.counts[check] > len(own):
+                lines.append(f"check {check}: {self.counts[check] - len(own)} more of this kind")
+        return lines

@@ -1,0 +1,137 @@
+"""Plan of a submission: which scenarios go into which shard, and what all of it depends on."""
+
+import hashlib
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rlftsim.atomic_io import write_text
+from rlftsim.errors import ConfigError, DataError
+from rlftsim.evaluation.results import NUMBERS_VERSION, EvaluateConfig
+from rlftsim.scenario.dataset import ScenarioDataset
+from rlftsim.submission.messages import NUM_SCENES, TRAJECTORY_BYTES
+
+FORMAT = "rlftsim-submission-1"
+PLAN = "plan.json"
+GZIP_RATIO = (0.56, 0.64)
+"""Compressed size of sampled rollouts, lowest and highest of five models."""
+_NUMBERED = re.compile(r"(.*)-(\d{5})-of-(\d{5})")
+_AGENT_COLUMNS = ("num_vehicles", "num_pedestrians", "num_cyclists", "num_others")
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Shards as ranges of positions in the split, and the identity of the work."""
+
+    shards: tuple[range, ...]
+    num_agents: tuple[int, ...]
+    """Simulated agents of each shard."""
+    identity: Mapping[str, object]
+    """Plain values that a folder's earlier work must agree with to be continued."""
+
+    def shard_name(self, number: int) -> str:
+        """Name of a shard in the archive, in the challenge's form."""
+        return f"submission.binproto-{number:05d}-of-{len(self.shards):05d}"
+
+    @property
+    def message_bytes(self) -> int:
+        """Forecast of the uncompressed size."""
+        return sum(self.num_agents) * NUM_SCENES * TRAJECTORY_BYTES
+
+    def claim(self, folder: Path) -> None:
+        """Write the plan into a folder, or compare it with the one that is there.
+
+        Raises:
+            ConfigError: the folder holds work on another plan.
+        """
+        path = folder / PLAN
+        values = {**self.identity, "shards": [[shard.start, shard.stop] for shard in self.shards]}
+        try:
+            old: dict[str, Any] = json.loads(path.read_text(encoding="utf-8")) if path.exists() else dict(values)
+            differing = [name for name in {**values, **old} if old.get(name) != values.get(name)]
+        except (ValueError, AttributeError) as error:
+            raise DataError(f"{path}: damaged ({error}): name another --out, or remove the folder.") from None
+        if differing:
+            raise ConfigError(
+                f"{folder} holds a submission of another {', '.join(differing)}: name another --out, or remove it."
+            )
+        write_text(path, json.dumps(values, indent=1) + "\n")
+
+
+def make_plan(
+    data: ScenarioDataset,
+    policy_fingerprint: str,
+    metadata: bytes,
+    config: EvaluateConfig,
+    *,
+    num_shards: int,
+    round_m: float | None,
+) -> Plan:
+    """Cut a split into shards of about equal numbers of agents, in its order.
+
+    Args:
+        data: the split.
+        policy_fingerprint: of the policy.
+        metadata: serialized fields that each shard repeats.
+        config: settings of the simulation.
+        num_shards: files of the archive; fewer where there are fewer scenarios.
+        round_m: positions are rounded to this; None = not.
+    """
+    agents = np.sum([data.index[name].to_numpy() for name in _AGENT_COLUMNS], axis=0, dtype=np.int64)
+    num_shards = min(num_shards, len(agents))
+    # Borders where the running number of agents passes multiples of its share; each shard keeps at least one scenario.
+    total = np.concatenate([[0], np.cumsum(agents)])
+    borders = [int(np.searchsorted(total, total[-1] * n / num_shards)) for n in range(num_shards + 1)]
+    for n in range(1, num_shards):
+        borders[n] = min(max(borders[n], borders[n - 1] + 1), len(agents) - (num_shards - n))
+    borders[-1] = len(agents)
+    shards = tuple(range(first, stop) for first, stop in zip(borders, borders[1:]))
+    identity = {
+        "format": FORMAT,
+        "policy": policy_fingerprint,
+        "data": data.manifest.index_sha256,
+        "split": data.split,
+        # hashed: the plan does not show the account
+        "entry": hashlib.sha256(metadata).hexdigest(),
+        "seed": config.seed,
+        "temperature": config.temperature,
+        "top_k": config.top_k,
+        "round": round_m,
+        "numbers": NUMBERS_VERSION,
+    }
+    return Plan(shards, tuple(int(agents[shard.start : shard.stop].sum()) for shard in shards), identity)
+
+
+def refuse_incomplete(data: ScenarioDataset) -> None:
+    """Refuse a split that lacks files, before anything is simulated: the server wants every scenario of it.
+
+    Raises:
+        DataError: a shard of the data set is missing, a source file was not converted, or records were lost.
+    """
+    missing = [name for name in sorted(set(data.index["shard"].to_pylist())) if not (data.folder / name).is_file()]
+    if missing:
+        raise DataError(f"{data.folder / missing[0]} is missing, and {len(missing) - 1} more: convert again.")
+    entries = [entry for entry in data.manifest.shards if entry.split == data.split]
+    lost = sum(len(entry.skipped) for entry in entries)
+    if lost:
+        first = next(entry for entry in entries if entry.skipped).skipped[0]
+        raise DataError(
+            f"{data.folder}: {lost} records of split {data.split} were lost in the conversion, the first in {first.file}: "
+            "get the file again and convert it; a submission without them is refused."
+        )
+    numbers: dict[tuple[str, int], set[int]] = {}
+    for match in (_NUMBERED.fullmatch(entry.source or "") for entry in entries):
+        if match:
+            numbers.setdefault((match[1], int(match[3])), set()).add(int(match[2]))
+    for (name, count), found in numbers.items():
+        absent = sorted(set(range(count)) - found)
+        if absent:
+            raise DataError(
+                f"{data.folder}: split {data.split} was converted from {len(found)} of {count} files, "
+                f"{name}-{absent[0]:05d}-of-{count:05d} is missing: convert it, too; a submission without it is refused."
+            )
