@@ -21,7 +21,7 @@ FLOORS = (
     ("training",),
     ("recipes",),
     ("evaluation",),
-    ("experiments",),
+    ("submission", "experiments"),
     ("_api",),
     ("cli",),
 )

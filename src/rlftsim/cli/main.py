@@ -31,6 +31,7 @@ VERBS = {
     "score": ("rlftsim.cli.results", "Score"),
     "evaluate": ("rlftsim.cli.results", "Evaluate"),
     "compare": ("rlftsim.cli.results", "Compare"),
+    "submit": ("rlftsim.cli.submit", "Submit"),
     "experiment": ("rlftsim.cli.experiment", "RunExperiment"),
 }
 """Module and class of each verb, in the order in which a newcomer needs them."""
@@ -58,6 +59,7 @@ usage: rlftsim VERB ...      rlftsim VERB --help explains a verb
   score        score rollouts of any simulator with the official realism meta-metric
   evaluate     evaluate a model with the official realism meta-metric
   compare      compare two evaluations scenario by scenario
+  submit       build an archive for the Sim Agents leaderboard, or check one before it is uploaded
   experiment   repeat an experiment of the paper: a table, verdicts and a figure
 """
 

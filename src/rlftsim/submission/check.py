@@ -62,7 +62,7 @@ class ArchiveCheck:
 
 def check_archive(
     archive: str | PathLike[str],
-    data: ScenarioDataset,
+    data: ScenarioDataset | None,
     *,
     sample: float = 1.0,
     expected_sha256: str | None = None,
@@ -73,7 +73,7 @@ def check_archive(
 
     Args:
         archive: a .tar.gz, from any writer.
-        data: scenarios of the split that the archive is for.
+        data: scenarios of the split that the archive is for; None makes only the checks that need none.
         sample: fraction of the scenarios whose trajectories are looked at; names, fields and sets are checked for all.
         expected_sha256: of the file that was built; None = not known.
         see: called with each scenario whose trajectories have no error, and its rollouts.
@@ -112,7 +112,7 @@ class _Pass:
     """State of one pass over an archive."""
 
     found: ArchiveCheck
-    data: ScenarioDataset
+    data: ScenarioDataset | None
     sample: float
     see: SeeRollouts | None
     seen: set[str] = field(default_factory=set)
@@ -188,11 +188,11 @@ class _Pass:
         if name in self.seen:
             self._add(8, "the scenario is in the archive twice", file, name)
             return
-        if name not in self.data:
-            self._add_foreign(name, file)
+        if self.data is not None and name not in self.data:
+            self._add_foreign(self.data, name, file)
             return
         self.seen.add(name)
-        if self.sample < 1 and _place(name) >= self.sample:
+        if self.data is None or (self.sample < 1 and _place(name) >= self.sample):
             return
         scenario = self.data.by_id(name)
         checked = check_rollouts(decoded, scenario, file)
@@ -204,15 +204,15 @@ class _Pass:
         if self.see is not None and not any(finding.severity == "error" for finding in checked.findings):
             self.see(scenario, decoded)
 
-    def _add_foreign(self, name: str, file: str) -> None:
+    def _add_foreign(self, data: ScenarioDataset, name: str, file: str) -> None:
         """A scenario that is not of the split: of another one, or unknown."""
         if self.whole_data is None:
-            self.whole_data = ScenarioDataset(self.data.folder)
+            self.whole_data = ScenarioDataset(data.folder)
         if name in self.whole_data:
             split = self.whole_data.index["split"][self.whole_data.scenario_ids.index(name)].as_py()
-            self._add(9, f"of split {split}, not {self.data.split}", file, name)
+            self._add(9, f"of split {split}, not {data.split}", file, name)
         else:
-            self._add(2, f"unknown to {self.data.folder}, split {self.data.split}", file, name)
+            self._add(2, f"unknown to {data.folder}, split {data.split}", file, name)
 
     def judge(self, is_whole: bool) -> None:
         """Findings about the archive as a whole."""
@@ -229,6 +229,8 @@ class _Pass:
             ):
                 text = f"{len(self.numbers)} shards whose names do not count from 0 to {total - 1} of {total}"
                 self._add(6, text, found.archive)
+        if self.data is None:
+            return
         missing = [name for name in self.data.scenario_ids if name not in self.seen]
         if missing:
             some = ", ".join(missing[:MAX_KEPT])

@@ -81,8 +81,13 @@ def make_plan(
         config: settings of the simulation.
         num_shards: files of the archive; fewer where there are fewer scenarios.
         round_m: positions are rounded to this; None = not.
+
+    Raises:
+        ConfigError: no shards.
     """
     agents = np.sum([data.index[name].to_numpy() for name in _AGENT_COLUMNS], axis=0, dtype=np.int64)
+    if num_shards < 1:
+        raise ConfigError(f"num_shards must be at least 1, got {num_shards}.")
     num_shards = min(num_shards, len(agents))
     # Borders where the running number of agents passes multiples of its share; each shard keeps at least one scenario.
     total = np.concatenate([[0], np.cumsum(agents)])

@@ -1,0 +1,180 @@
+"""Report of a built archive, for its authors: what is in it, how it was made and checked, what to expect of it.
+
+It names the method and not the account, so that it may be shared.
+"""
+
+import json
+from dataclasses import asdict, dataclass, replace
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+from rlftsim.atomic_io import write_text
+from rlftsim.errors import DataError
+from rlftsim.evaluation.results import EvaluateConfig, Evaluation
+from rlftsim.submission.check import ArchiveCheck
+from rlftsim.submission.findings import CHECKS, Finding
+
+BOARD = {"SMART-tiny": 0.7824, "UniMM": 0.7839, "SMART-tiny CAT-K": 0.7856, "TrajTok": 0.7861, "RLFTSim": 0.7867}
+"""RMM on the test split with the weights of 2025, from the table of RLFTSim (CVPR 2026), without a traffic light term."""
+SERVER_ERRORS = """If the server answers with an error and no reason, or not for days, nothing in the file has to be wrong: entries
+wait up to several days, and others have met unexplained errors. Open an issue at waymo-research/waymo-open-dataset with the
+submission key that the page shows, the size and the SHA-256 above, and this report."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Realism to be expected of an entry: that of the same model and settings on the validation split."""
+
+    evaluation: str
+    """File of the evaluation."""
+    scenarios: int
+    rmm: float
+    interval: tuple[float, float]
+    """95 %."""
+    rmm_light_one: float
+    """With the traffic light term set to 1, as in tables of models without one."""
+
+
+def estimate_realism(
+    path: str | PathLike[str], policy_fingerprint: str, config: EvaluateConfig
+) -> Estimate | str:
+    """Realism of an earlier evaluation, or why it says nothing about an entry.
+
+    Args:
+        path: of the evaluation, as `rlftsim evaluate` wrote it.
+        policy_fingerprint: of the entry's policy.
+        config: settings of the entry's simulation.
+    """
+    try:
+        evaluation = Evaluation.read(path)
+    except DataError as error:
+        return str(error)
+    about = evaluation.provenance
+    if about.policy_fingerprint != policy_fingerprint:
+        return f"{path} is of another model."
+    mine, theirs = config.what_counts(), replace(about.config, split=config.split).what_counts()
+    differing = [name for name in mine if mine[name] != theirs.get(name)]
+    if differing:
+        return f"{path} was evaluated with another {', '.join(differing)}."
+    found = evaluation.mean_and_error("meta_metric")
+    light_one = evaluation.mean_and_error("meta_metric_light_one").mean
+    return Estimate(str(path), found.count, found.mean, found.interval, light_one)
+
+
+@dataclass(frozen=True)
+class Report:
+    """Everything that is known about an archive."""
+
+    archive: str
+    bytes: int
+    sha256: str
+    method: str
+    num_parameters: str
+    shards: int
+    scenarios: int
+    trajectories: int
+    message_bytes: int
+    findings: tuple[Finding, ...]
+    counts: dict[int, int]
+    """Findings by check."""
+    closed_loop: str
+    """Statement that the entry makes."""
+    work: dict[str, Any]
+    """Model, data and settings that the archive depends on."""
+    seconds: float
+    estimate: Estimate | str
+
+    def write(self, archive: Path) -> list[Path]:
+        """Write `submission.report.md` and `.json` beside the archive; returns both paths."""
+        json_path, text_path = (report_path(archive, ending) for ending in ("json", "md"))
+        write_text(text_path, self.as_text())
+        write_text(json_path, json.dumps(asdict(self), indent=1) + "\n")
+        return [text_path, json_path]
+
+    def as_text(self) -> str:
+        """The report in Markdown."""
+        checks = [
+            f"| {number} | {title} | {f'**{self.counts[number]} findings**' if self.counts.get(number) else 'passed'} |"
+            for number, title in CHECKS.items()
+        ]
+        findings = [f"* {finding.severity}, check {finding.check}: {finding}" for finding in self.findings]
+        work = [f"* {name}: {value}" for name, value in self.work.items()]
+        return "\n".join(
+            [
+                f"# Submission {self.archive}: {self.method}",
+                "",
+                f"* {self.bytes} bytes ({self.bytes / 1e9:.3g} GB), SHA-256 `{self.sha256}`",
+                f"* {self.scenarios} scenarios in {self.shards} shards, {self.trajectories} trajectories, "
+                f"{self.message_bytes / 1e9:.3g} GB of messages",
+                f"* {self.num_parameters} parameters; built and checked in {self.seconds:.0f} s",
+                *work,
+                "",
+                "## Checks",
+                "",
+                "| | check | result |",
+                "|---|---|---|",
+                *checks,
+                "",
+                *findings,
+                "",
+                "## Realism to expect",
+                "",
+                *_estimate_lines(self.estimate),
+                "",
+                "## Closed loop",
+                "",
+                self.closed_loop,
+                "",
+                "## After the upload",
+                "",
+                SERVER_ERRORS,
+                "",
+            ]
+        )
+
+
+def report_path(archive: Path, ending: str) -> Path:
+    """Path of an archive's report.
+
+    Args:
+        archive: the .tar.gz.
+        ending: "md" or "json".
+    """
+    return archive.with_name(f"{archive.name.removesuffix('.tar.gz')}.report.{ending}")
+
+
+def reported_sha256(archive: Path) -> str | None:
+    """Checksum in the report beside an archive; None without a report."""
+    try:
+        return str(json.loads(report_path(archive, "json").read_text(encoding="utf-8"))["sha256"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def findings_of(check: ArchiveCheck) -> tuple[tuple[Finding, ...], dict[int, int]]:
+    """The findings of a check as a report has them, and how many there are of each number."""
+    return tuple(check.findings.kept), dict(sorted(check.findings.counts.items()))
+
+
+def _estimate_lines(estimate: Estimate | str) -> list[str]:
+    if isinstance(estimate, str):
+        return [
+            f"Not known: {estimate} `rlftsim evaluate` of the same model, seed and sampling on the validation split "
+            "gives an estimate."
+        ]
+    low, high = estimate.interval
+    half = (high - low) / 2
+    lines = [
+        f"RMM {estimate.rmm:.4f}, 95 % interval {low:.4f} to {high:.4f} (sampling of scenarios), over "
+        f"{estimate.scenarios} scenarios of `{estimate.evaluation}`; with the traffic light term set to 1 "
+        f"{estimate.rmm_light_one:.4f}. Validation and test split differ.",
+        "",
+        "| published, test split | RMM | this entry, light = 1, minus it |",
+        "|---|---|---|",
+    ]
+    for name, value in BOARD.items():
+        difference = estimate.rmm_light_one - value
+        noise = " (within noise)" if abs(difference) <= half else ""
+        lines.append(f"| {name} | {value:.4f} | {difference:+.4f}{noise} |")
+    return lines
