@@ -7,7 +7,7 @@ A submission file holds the rollouts of hundreds of scenarios: listing them must
 
 from collections.abc import Iterator
 from io import BufferedIOBase
-from typing import BinaryIO, NamedTuple
+from typing import NamedTuple
 
 from rlftsim.errors import DataError
 
@@ -35,7 +35,7 @@ class WholeField(NamedTuple):
     payload: bytes
 
 
-def read_fields(file: BinaryIO, size: int) -> Iterator[WholeField]:
+def read_fields(file: BufferedIOBase, size: int) -> Iterator[WholeField]:
     """Fields of a message, read front to back: for a file that cannot be sought, and messages that do not fit in memory.
 
     Args:
@@ -113,7 +113,7 @@ def _read_varint(file: BufferedIOBase, stop: int) -> int:
     return _to_number(digits)
 
 
-def _read_varint_bytes(file: BufferedIOBase | BinaryIO, position: int) -> bytes:
+def _read_varint_bytes(file: BufferedIOBase, position: int) -> bytes:
     """The bytes of a number; `position` is for the message of an error."""
     digits = b""
     # seven bits a byte, the lowest first; the high bit says that another byte follows

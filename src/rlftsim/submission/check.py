@@ -1,6 +1,7 @@
 """Checks of a finished archive, in one pass from its first to its last byte."""
 
 import hashlib
+import io
 import re
 import tarfile
 from collections import Counter
@@ -131,7 +132,8 @@ class _Pass:
                 raise DataError("not compressed with gzip: pack it as .tar.gz")
             with tarfile.open(fileobj=reader, mode="r|", bufsize=_TAR_BUFFER) as tar:  # pyright: ignore
                 for member in tar:
-                    self._read_shard(member, tar.extractfile(member))
+                    contents = tar.extractfile(member)
+                    self._read_shard(member, contents if isinstance(contents, io.BufferedReader) else None)
                     advance(reader.packed_size - done)
                     done = reader.packed_size
             reader.finish()
@@ -141,7 +143,7 @@ class _Pass:
             return False
         return True
 
-    def _read_shard(self, member: tarfile.TarInfo, contents: BinaryIO | None) -> None:
+    def _read_shard(self, member: tarfile.TarInfo, contents: io.BufferedReader | None) -> None:
         """Check the name of a file, its fields and its scenarios."""
         match = SHARD_NAME.fullmatch(member.name)
         if contents is None or match is None or "/" in member.name:
@@ -238,7 +240,7 @@ class _Pass:
             self._add(2, text, found.archive)
         if found.num_trajectories and found.num_jumps > MAX_JUMPS * found.num_trajectories:
             percent = 100 * found.num_jumps / found.num_trajectories
-            text = f"{percent:.2g} % of agents jump away from the log at the first step: another frame, or off by one"
+            text = f"{percent:.3g} % of agents jump away from the log at the first step: another frame, or off by one"
             found.findings.add(Finding(13, "warning", text, found.archive))
         others = found.findings.counts[1]
         if others >= max(MIN_OTHER_AGENTS, MAX_OTHER_AGENTS * found.num_checked):

@@ -2,9 +2,10 @@
 
 import re
 import tomllib
-from dataclasses import dataclass, fields
+from dataclasses import MISSING, dataclass, fields
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 from torch import nn
 
@@ -17,6 +18,7 @@ REQUIRED_FIELDS = (
     "submission_type", "account_name", "unique_method_name", "uses_lidar_data", "uses_camera_data",
     "uses_public_model_pretraining", "num_model_parameters", "acknowledge_complies_with_closed_loop_requirement",
 )  # fmt: skip
+_LISTS, _SWITCHES = ("authors", "public_models"), ("uses_lidar", "uses_camera", "uses_public_models")
 _EMAIL = re.compile(r"[^@\s]+@[^@\s]+\.[^@\s.]+")
 _PLACEHOLDERS = ("test", "todo", "none", "method", "example", "your name", "your affiliation")
 _PLACEHOLDER_PARTS = ("your_account", "your.account", "@test.", "@example.", "<", ">")
@@ -42,16 +44,8 @@ class Entry:
     def __post_init__(self) -> None:
         for name in ("account", "method", "affiliation", "description", "link"):
             value = getattr(self, name)
-            if not isinstance(value, str) or not value.strip() or _is_placeholder(value):
+            if not value.strip() or _is_placeholder(value):
                 raise ConfigError(f"{name} = {value!r} is no entry's: write your own, the server refuses such texts.")
-        for name in ("authors", "public_models"):
-            value = getattr(self, name)
-            if not isinstance(value, list | tuple) or not all(isinstance(one, str) and one.strip() for one in value):
-                raise ConfigError(f"{name} must be a list of texts, got {value!r}.")
-            object.__setattr__(self, name, tuple(value))
-        for name in ("uses_lidar", "uses_camera", "uses_public_models"):
-            if not isinstance(getattr(self, name), bool):
-                raise ConfigError(f"{name} must be true or false, got {getattr(self, name)!r}.")
         if not self.authors or any(_is_placeholder(author) for author in self.authors):
             raise ConfigError(f"authors = {list(self.authors)} are no entry's: name at least one author.")
         if not _EMAIL.fullmatch(self.account):
@@ -87,13 +81,13 @@ def read_entry(path: str | PathLike[str], *, account: str | None = None, method:
         raise ConfigError(f"{path}: not a TOML file ({error}).") from None
     values |= {name: value for name, value in (("account", account), ("method", method)) if value is not None}
     known = {field.name for field in fields(Entry)}
-    missing = [f.name for f in fields(Entry) if f.name not in values and f.name not in _optional()]
+    missing = [f.name for f in fields(Entry) if f.name not in values and f.default is MISSING]
     unknown = sorted(values.keys() - known)
     if missing or unknown:
         problem = f"{', '.join(missing)} missing" if missing else f"{', '.join(unknown)} unknown"
         raise ConfigError(f"{path}: {problem}; known are {', '.join(sorted(known))}.")
     try:
-        return Entry(**values)
+        return Entry(**{name: _fitted(name, value) for name, value in values.items()})
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
 
@@ -149,8 +143,16 @@ def problems_of(message: SimAgentsChallengeSubmission) -> list[str]:
     return problems
 
 
-def _optional() -> tuple[str, ...]:
-    return ("uses_lidar", "uses_camera", "uses_public_models", "public_models")
+def _fitted(name: str, value: Any) -> Any:
+    """A value of the file as a field of `Entry` has it."""
+    if name in _LISTS:
+        if not isinstance(value, list) or not all(isinstance(one, str) and one.strip() for one in value):
+            raise ConfigError(f"{name} must be a list of texts, got {value!r}.")
+        return tuple(value)
+    kind, words = (bool, "true or false") if name in _SWITCHES else (str, "text in quotes")
+    if not isinstance(value, kind):
+        raise ConfigError(f"{name} must be {words}, got {value!r}.")
+    return value
 
 
 def _is_placeholder(text: str) -> bool:
