@@ -3,9 +3,9 @@
 import gzip
 import re
 
+import entries
 import pytest
 
-import entries
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.submission_pb2 import SimAgentsChallengeSubmission
 from rlftsim.submission import check
@@ -191,10 +191,9 @@ def test_a_good_archive_has_no_finding(good, data, tmp_path):
     assert found.num_trajectories == 32 * sum(len(s.simulated_indices) for s in data)
 
 
-@pytest.mark.parametrize(
-    ("number", "damage", "severity", "text", "file", "scenario", "object_id"), DAMAGES, ids=[d[1].__name__ for d in DAMAGES]
-)
-def test_a_damage_is_found_as_what_it_is(number, damage, severity, text, file, scenario, object_id, shards, data, tmp_path):
+@pytest.mark.parametrize("case", DAMAGES, ids=[case[1].__name__ for case in DAMAGES])
+def test_a_damage_is_found_as_what_it_is(case, shards, data, tmp_path):
+    number, damage, severity, text, file, scenario, object_id = case
     damage(shards)
     found = check_archive(entries.pack(tmp_path / "a.tar.gz", shards), data, show_progress=False).findings
     assert set(found.counts) == {number}

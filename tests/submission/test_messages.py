@@ -67,5 +67,5 @@ def test_nothing_of_a_message_is_unknown():
 
 @pytest.mark.parametrize("data", [b"", b"\x12\x00", b"\xff" * 20, encode_rollouts("a", states([1], 2))[:-7]])
 def test_bytes_that_are_no_rollouts_are_refused(data):
-    with pytest.raises(DataError, match="rollouts that name no scenario|not a ScenarioRollouts message"):
+    with pytest.raises(DataError, match=r"rollouts that name no scenario|not a ScenarioRollouts message"):
         decode_rollouts(data)

@@ -103,9 +103,7 @@ class Build:
         parameters = count_parameters(policy)
         metadata = describe_entry(entry, parameters)
         fingerprint = fingerprint_policy(policy)
-        plan = make_plan(
-            data, fingerprint, metadata, config, num_shards=self.num_shards, round_m=self.round
-        )
+        plan = make_plan(data, fingerprint, metadata, config, num_shards=self.num_shards, round_m=self.round)
         archive = build_archive(
             Job(policy, data, plan, metadata, config, self.round, self.out), delete_parts=self.delete_parts
         )

@@ -36,7 +36,7 @@ class WholeField(NamedTuple):
 
 
 def read_fields(file: BufferedIOBase, size: int) -> Iterator[WholeField]:
-    """Fields of a message, read front to back: for a file that cannot be sought, and messages that do not fit in memory.
+    """Fields of a message, read front to back: for files that cannot be sought and messages larger than memory.
 
     Args:
         file: at the message's first byte.

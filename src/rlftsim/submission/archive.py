@@ -1,7 +1,7 @@
 """A .tar.gz that is written in pieces, by several processes, and read front to back.
 
-Each piece is the tar entry of one file (header, contents, padding), deflated by itself and ended by a full flush, so that
-pieces can be concatenated. Together with an end block they are a single gzip member. (Whole gzip members may be
+Each piece is the tar entry of one file (header, contents, padding), deflated by itself and ended by a full flush, so
+that pieces can be concatenated. Together with an end block they are a single gzip member. (Whole gzip members may be
 concatenated, too, but Python's tarfile in mode "r|gz" reads the first of them only.)
 """
 
@@ -185,8 +185,8 @@ def _times(matrix: Sequence[int], vector: int) -> int:
 class GzipReader:
     """Contents of a gzip file, front to back, with its checksums: the file object of `tarfile.open(mode="r|")`.
 
-    Both of Python's ways to read a .tar.gz, "r:gz" and "r|gz", see what this reader sees, because it insists on a single
-    gzip member that ends with the file.
+    Both of Python's ways to read a .tar.gz, "r:gz" and "r|gz", see what this reader sees, because it insists on a
+    single gzip member that ends with the file.
     """
 
     def __init__(self, file: BinaryIO) -> None:

@@ -39,7 +39,7 @@ from rlftsim.workers import run_tasks
 ARCHIVE = "submission.tar.gz"
 _SHARDS, _LOCK = "shards", ".lock"
 _HEADING_FINER = 8
-"""Headings are rounded to this fraction of the positions' step, in radians: the corner of a box 8 m away moves as far."""
+"""Headings are rounded to this fraction of the positions' step, in radians; at 8 m from the center they are equal."""
 
 
 @dataclass(frozen=True)
@@ -149,8 +149,10 @@ def _build_shard(job: Job, number: int, advance: Callable[[int], None], is_stopp
     write_text(job.receipt_path(number), json.dumps(asdict(piece)) + "\n")
     if is_first:
         size = forecast_size(job.plan, number, piece)
-        log.info(f"  first shard: compressed to {piece.size / piece.raw_size:.3f}, so the archive will have "
-                 f"about {size / 1e9:.3g} GB.")
+        log.info(
+            f"  first shard: compressed to {piece.size / piece.raw_size:.3f}, so the archive will have "
+            f"about {size / 1e9:.3g} GB."
+        )
 
 
 def _simulate_message(job: Job, scenario: Scenario, shard: str) -> bytes:

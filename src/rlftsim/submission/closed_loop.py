@@ -22,15 +22,16 @@ def statement(policy: Policy, sampling: Sampling) -> str:
     """
     stride = policy.steps_per_decision
     truncated = "" if sampling.top_k is None else f", top {sampling.top_k}"
-    return f"""Closed loop. The challenge takes outputs of "individual next-state prediction inference calls", each conditioned on the
-preceding states, made at least once a second; and the ego's next state must be independent of the others' given the past.
-How these rollouts are made:
-* the policy decides every {stride * STEP_S:g} s, {FUTURE_STEPS // stride} times in 8 s, from the simulated states so far;
+    return f"""The challenge takes outputs of "individual next-state prediction inference calls", each conditioned on
+the preceding states, made at least once a second. The ego's next state must be independent of the others'
+given the past. How these rollouts are made:
+* the policy decides every {stride * STEP_S:g} s, {FUTURE_STEPS // stride} times in 8 s, from the states so far;
 * every agent's decision is drawn independently given the common past (temperature {sampling.temperature:g}{truncated});
 * it sees the log up to the current step only: no future, no goals;
 * nothing drawn at the start of a rollout is shared by the ego and other agents;
 * every rollout that is drawn is submitted: none is selected, repaired or drawn again by its outcome.
-The first and the last three points hold for all policies in this code; that the network itself keeps them is for you to know."""
+The code makes sure of the first and the last three points. That the policy itself draws agents independently is
+for you to know."""
 
 
 def refuse_open_loop(policy: Policy, scenario: Scenario) -> None:
@@ -47,7 +48,8 @@ def refuse_open_loop(policy: Policy, scenario: Scenario) -> None:
     stride = policy.steps_per_decision
     if stride > MAX_STEPS_PER_DECISION:
         raise ConfigError(
-            f"the policy decides every {stride * STEP_S:g} s: the challenge wants an inference call at least once a second."
+            f"the policy decides every {stride * STEP_S:g} s: the challenge wants an inference call at least once "
+            "a second."
         )
     if not policy.initial_noise_size:
         return

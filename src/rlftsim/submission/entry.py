@@ -1,4 +1,4 @@
-"""Description of an entry: account, method and authors from `submission.toml`, and the message that each shard repeats."""
+"""Description of an entry: account, method and authors from a TOML file, and the message that each shard repeats."""
 
 import re
 import tomllib
@@ -134,7 +134,9 @@ def problems_of(message: SimAgentsChallengeSubmission) -> list[str]:
     if message.HasField("submission_type") and message.submission_type != message.SIM_AGENTS_SUBMISSION:
         problems.append("submission_type is not SIM_AGENTS_SUBMISSION")
     if message.HasField("num_model_parameters") and not PARAMETERS.fullmatch(message.num_model_parameters):
-        problems.append(f'num_model_parameters is "{message.num_model_parameters}", not a whole number and K, M, B or T')
+        problems.append(
+            f'num_model_parameters is "{message.num_model_parameters}", not a whole number and K, M, B or T'
+        )
     closed_loop = "acknowledge_complies_with_closed_loop_requirement"
     if message.HasField(closed_loop) and not getattr(message, closed_loop):
         problems.append(f"{closed_loop} is false")

@@ -25,7 +25,7 @@ CHECKS = {
     16: "sizes of shards and archive",
     17: "the file that was built, unbroken",
 }
-"""Title of each check. The last of the list in docs/submission.md, a server error without a reason, cannot be checked."""
+"""Title of each check. The 18th of docs/submission.md, a server error without a reason, cannot be checked."""
 MAX_KEPT = 10
 """Findings of a check that are kept; further ones are counted."""
 

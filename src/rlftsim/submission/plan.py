@@ -5,6 +5,7 @@ import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -85,7 +86,7 @@ def make_plan(
     Raises:
         ConfigError: no shards.
     """
-    agents = np.sum([data.index[name].to_numpy() for name in _AGENT_COLUMNS], axis=0, dtype=np.int64)
+    agents = np.stack([data.index[name].to_numpy() for name in _AGENT_COLUMNS]).sum(0)  # [scenarios]
     if num_shards < 1:
         raise ConfigError(f"num_shards must be at least 1, got {num_shards}.")
     num_shards = min(num_shards, len(agents))
@@ -95,7 +96,7 @@ def make_plan(
     for n in range(1, num_shards):
         borders[n] = min(max(borders[n], borders[n - 1] + 1), len(agents) - (num_shards - n))
     borders[-1] = len(agents)
-    shards = tuple(range(first, stop) for first, stop in zip(borders, borders[1:]))
+    shards = tuple(range(first, stop) for first, stop in pairwise(borders))
     identity = {
         "format": FORMAT,
         "policy": policy_fingerprint,
@@ -126,8 +127,8 @@ def refuse_incomplete(data: ScenarioDataset) -> None:
     if lost:
         first = next(entry for entry in entries if entry.skipped).skipped[0]
         raise DataError(
-            f"{data.folder}: {lost} records of split {data.split} were lost in the conversion, the first in {first.file}: "
-            "get the file again and convert it; a submission without them is refused."
+            f"{data.folder}: {lost} records of split {data.split} were lost in the conversion, the first in "
+            f"{first.file}: get the file again and convert it; a submission without them is refused."
         )
     numbers: dict[tuple[str, int], set[int]] = {}
     for match in (_NUMBERED.fullmatch(entry.source or "") for entry in entries):
@@ -138,5 +139,6 @@ def refuse_incomplete(data: ScenarioDataset) -> None:
         if absent:
             raise DataError(
                 f"{data.folder}: split {data.split} was converted from {len(found)} of {count} files, "
-                f"{name}-{absent[0]:05d}-of-{count:05d} is missing: convert it, too; a submission without it is refused."
+                f"{name}-{absent[0]:05d}-of-{count:05d} is missing: convert it, too, or try things out with --partial; "
+                "the server refuses a submission without it."
             )

@@ -16,10 +16,11 @@ from rlftsim.submission.check import ArchiveCheck
 from rlftsim.submission.findings import CHECKS, Finding
 
 BOARD = {"SMART-tiny": 0.7824, "UniMM": 0.7839, "SMART-tiny CAT-K": 0.7856, "TrajTok": 0.7861, "RLFTSim": 0.7867}
-"""RMM on the test split with the weights of 2025, from the table of RLFTSim (CVPR 2026), without a traffic light term."""
-SERVER_ERRORS = """If the server answers with an error and no reason, or not for days, nothing in the file has to be wrong: entries
-wait up to several days, and others have met unexplained errors. Open an issue at waymo-research/waymo-open-dataset with the
-submission key that the page shows, the size and the SHA-256 above, and this report."""
+"""RMM on the test split with the weights of 2025, no traffic light term; from the table of RLFTSim (CVPR 2026)."""
+SERVER_ERRORS = """If the server answers with an error and no reason, or not for days, nothing in the file has to be
+wrong: entries wait up to several days, and others have met unexplained errors. Open an issue at
+waymo-research/waymo-open-dataset with the submission key that the page shows, the size and the SHA-256 above, and this
+report."""
 
 
 @dataclass(frozen=True)
@@ -36,9 +37,7 @@ class Estimate:
     """With the traffic light term set to 1, as in tables of models without one."""
 
 
-def estimate_realism(
-    path: str | PathLike[str], policy_fingerprint: str, config: EvaluateConfig
-) -> Estimate | str:
+def estimate_realism(path: str | PathLike[str], policy_fingerprint: str, config: EvaluateConfig) -> Estimate | str:
     """Realism of an earlier evaluation, or why it says nothing about an entry.
 
     Args:

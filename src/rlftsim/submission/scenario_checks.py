@@ -77,9 +77,9 @@ def check_rollouts(decoded: DecodedRollouts, scenario: Scenario, file: str) -> S
         text = f"a step of {step.value:.1f} m in 0.1 s in scene {step.scene}"
         findings.append(finding(10, step.agent, text, "error" if step.value > MAX_STEP_M else "warning"))
     # 11. headings. Either all within a turn, where a step through pi jumps by a turn, or turned continuously
-    is_wrapped = (np.abs(turned) <= math.pi + 1e-4).all(-1)  # [N, A]
-    change = np.abs(np.diff(turned, prepend=np.broadcast_to(heading[:, None], turned.shape[:2] + (1,))))
-    doubtful = _largest(np.where(is_wrapped[..., None], 0.0, change))
+    is_wrapped = (np.abs(turned) <= math.pi + 1e-4).all(-1, keepdims=True)  # [N, A, 1]
+    change = np.abs(np.diff(turned, prepend=np.broadcast_to(heading[:, None], (*turned.shape[:2], 1))))
+    doubtful = _largest(np.where(is_wrapped, np.float32(0), change))
     if doubtful.value > math.pi:
         text = f"heading changes by {doubtful.value:.2f} rad in 0.1 s in scene {doubtful.scene}, over half a turn"
         findings.append(finding(11, doubtful.agent, text))

@@ -33,8 +33,8 @@ class ArchiveScores:
             self._skipped.append(Skipped(scenario.scenario_id, reason))
             return
         assert decoded.values is not None
-        arrays = (torch.from_numpy(np.ascontiguousarray(decoded.values[:, :, axis])) for axis in range(len(AXES)))
-        states = SimulatedStates(np.array(decoded.object_ids[0], np.int64), *arrays)
+        x, y, z, heading = (torch.from_numpy(decoded.values[:, :, axis].copy()) for axis in range(len(AXES)))
+        states = SimulatedStates(np.array(decoded.object_ids[0], np.int64), x, y, z, heading)
         result = score(scenario_log(scenario), states, self._metric)
         self._rows.append(row_of_result(result, scenario, states))
 
