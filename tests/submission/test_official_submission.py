@@ -5,9 +5,9 @@ import os
 import subprocess
 from pathlib import Path
 
+import entries
 import pytest
 
-import entries
 from rlftsim.evaluation.score_files import ScoreConfig, score_rollouts, to_json
 from rlftsim.scenario import womd_pb2
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
@@ -57,7 +57,7 @@ def test_the_official_package_accepts_the_archive_and_scores_it_alike(shared, tm
     (row,) = (row for row in ours["scenarios"] if row["scenario_id"] == SCORED)
     scores = official["scores"][SCORED]
     assert "metametric" in scores
-    assert {name: row[name] for name in scores} == pytest.approx(scores, abs=1e-6)
+    assert {name: row[name] for name in scores} == pytest.approx(scores, abs=1e-6, rel=1e-6)
 
 
 def as_message(scenario):

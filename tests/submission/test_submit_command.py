@@ -1,0 +1,111 @@
+"""The command line of submissions, and the report."""
+
+import json
+
+import entries
+import pytest
+
+import made_up
+from rlftsim.cli.main import main
+from rlftsim.evaluation.results import EvaluateConfig
+from rlftsim.submission.report import estimate_realism
+
+TOML = """
+account = "jane.doe@university.edu"
+method = "A method"
+authors = ["Jane Doe"]
+affiliation = "A university"
+description = "A model."
+link = "https://doe.edu/a"
+"""
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    entries.write_data(tmp_path / "set", num_scenarios=4)
+    (tmp_path / "submission.toml").write_text(TOML)
+    return tmp_path
+
+
+BUILD = (
+    "submit", "build", "constant_velocity", "--data", "set", "--config", "submission.toml", "--out", "out",
+    "--num-shards", "2", "--device", "cpu",
+)  # fmt: skip
+CHECK = ("submit", "check", "out/submission.tar.gz", "--data", "set")
+
+
+def test_a_build_is_declared_checked_and_reported(place, capsys):
+    # 1. without the declaration nothing is simulated
+    assert main(BUILD) == 2
+    printed = capsys.readouterr()
+    assert "decides every 0.1 s, 80 times in 8 s" in printed.out
+    assert "add --i-comply" in printed.err
+    assert not (place / "out").exists()
+    # 2. with it there is an archive, a report, and no parts
+    assert main([*BUILD, "--i-comply"]) == 0
+    assert "all 32 scenes are equal" in capsys.readouterr().out
+    assert {path.name for path in (place / "out").iterdir()} == {
+        ".lock", "plan.json", "submission.report.json", "submission.report.md", "submission.tar.gz"
+    }  # fmt: skip
+    report = json.loads((place / "out" / "submission.report.json").read_text())
+    assert report["bytes"] == (place / "out" / "submission.tar.gz").stat().st_size
+    assert report["counts"] == {"14": 4}
+    assert (report["scenarios"], report["shards"], report["num_parameters"]) == (4, 2, "0")
+    text = (place / "out" / "submission.report.md").read_text()
+    assert report["sha256"] in text
+    assert "submission key" in text  # what to write about a server error without a reason
+    assert "Not known: runs/evaluations/constant_velocity.parquet" in text
+    assert all("jane.doe" not in (place / "out" / name).read_text() for name in
+               ("plan.json", "submission.report.json", "submission.report.md"))  # fmt: skip
+    # 3. the same again changes nothing
+    assert main([*BUILD, "--i-comply"]) == 0
+    assert json.loads((place / "out" / "submission.report.json").read_text())["sha256"] == report["sha256"]
+
+
+def test_an_archive_is_checked_described_cut_and_joined(place, capsys):
+    main([*BUILD, "--i-comply"])
+    archive = place / "out" / "submission.tar.gz"
+    assert main([*CHECK, "--json", "found.json", "--sample", "0.5"]) == 0
+    assert json.loads((place / "found.json").read_text())["scenarios"] == 4
+    assert main(["submit", "info", str(archive), "--split-gb", "0.00001"]) == 0
+    assert "unique_method_name: A method" in capsys.readouterr().out
+    parts = sorted((place / "out").glob("*.tar.gz.0*"))
+    assert b"".join(part.read_bytes() for part in parts) == archive.read_bytes()
+    assert max(part.stat().st_size for part in parts) == 10_000
+    archive.write_bytes(archive.read_bytes()[:-50])  # copied in part
+    assert main(CHECK) == 1
+    printed = capsys.readouterr().out
+    assert "error, check 7: submission.tar.gz: cut off" in printed
+    assert "error, check 17: submission.tar.gz: not the file that its report describes" in printed
+
+
+def test_the_rollouts_of_an_archive_score_as_its_unpacked_files(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    data = entries.write_data(tmp_path / "set", num_scenarios=5)
+    shards = entries.draw_shards(data)
+    entries.pack(tmp_path / "a.tar.gz", shards)
+    (tmp_path / "unpacked").mkdir()
+    for name, message in shards.items():
+        (tmp_path / "unpacked" / name).write_bytes(message.SerializeToString())
+    assert main(["submit", "check", "a.tar.gz", "--data", "set", "--score"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    skip = ("--missing-map", "skip", "--jobs", "1")
+    assert main(["score", "unpacked", "--scenarios", "set", "--name", "a", *skip]) == 0
+    expected = capsys.readouterr().out.splitlines()
+    of_tables = [[line.split() for line in some if "0." in line and "likelihood" in line] for some in (lines, expected)]
+    assert len(of_tables[0]) > 8
+    assert of_tables[0] == of_tables[1]
+
+
+def test_an_estimate_is_of_the_same_model_and_settings(tmp_path):
+    path = tmp_path / "a.parquet"
+    made_up.evaluation("a", [0.78, 0.79, 0.77], columns={"meta_metric_light_one": [0.79, 0.8, 0.78]}).write(path)
+    estimate = estimate_realism(path, "f" * 32, EvaluateConfig(split="testing"))
+    assert (estimate.scenarios, estimate.rmm) == (3, pytest.approx(0.78))
+    assert estimate.rmm_light_one == pytest.approx(0.79)
+    low, high = estimate.interval
+    assert low < 0.77 < 0.79 < high
+    assert "of another model" in estimate_realism(path, "e" * 32, EvaluateConfig())
+    assert "another seed, temperature." in estimate_realism(path, "f" * 32, EvaluateConfig(seed=1, temperature=0.5))
+    assert "no such evaluation" in estimate_realism(tmp_path / "b.parquet", "f" * 32, EvaluateConfig())
