@@ -22,9 +22,10 @@ from rlftsim.evaluation.evaluate import simulate_states
 from rlftsim.evaluation.rollout_files import find_rollouts, read_states
 from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
-from rlftsim.submission.build import build_archive, forecast_size, round_states
+from rlftsim.submission.build import build_archive, forecast_size
 from rlftsim.submission.check import check_archive
 from rlftsim.submission.closed_loop import refuse_open_loop, statement
+from rlftsim.submission.messages import round_states
 from rlftsim.submission.plan import refuse_incomplete
 
 NUM_SHARDS = 6

@@ -11,7 +11,6 @@ from tyro.conf import Positional
 
 from rlftsim.errors import ConfigError
 from rlftsim.evaluation.evaluate import EvaluateConfig, evaluation_name, frozen_copy
-from rlftsim.evaluation.score_files import format_scores
 from rlftsim.policies.registry import Device, load_policy
 from rlftsim.progress import print_wide
 from rlftsim.rollout.fingerprint import fingerprint_policy
@@ -20,7 +19,6 @@ from rlftsim.submission.build import Job, build_archive, delete_parts
 from rlftsim.submission.check import ArchiveCheck, check_archive
 from rlftsim.submission.closed_loop import refuse_open_loop, statement
 from rlftsim.submission.entry import count_parameters, describe_entry, read_entry
-from rlftsim.submission.messages import NUM_SCENES
 from rlftsim.submission.plan import make_plan, refuse_incomplete
 from rlftsim.submission.report import Report, estimate_realism, findings_of, reported_sha256
 from rlftsim.submission.scores import ArchiveScores
@@ -89,7 +87,7 @@ class Build:
         policy = frozen_copy(load_policy(self.model, self.device))
         data = open_dataset(self.data, self.split, cache_size=CACHED_SCENARIOS)
         config = EvaluateConfig(
-            num_rollouts=NUM_SCENES, seed=self.seed, temperature=self.temperature, top_k=self.top_k,
+            seed=self.seed, temperature=self.temperature, top_k=self.top_k,
             split=self.split, rollouts_per_pass=self.rollouts_per_pass, jobs=self.jobs,
         )  # fmt: skip
         if not self.partial:
@@ -159,7 +157,7 @@ class Check:
             }  # fmt: skip
             self.json.write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
         if scores is not None:
-            print_wide(format_scores(scores.evaluation(check.archive, data, check.sha256)))
+            print_wide(scores.table(check.archive, data, check.sha256))
         return int(check.findings.has_errors)
 
 

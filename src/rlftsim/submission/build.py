@@ -10,27 +10,23 @@ the plan alone, not on processes or interruptions.
 """
 
 import json
-import math
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 
-import torch
-
 from rlftsim.atomic_io import errors_name, write_text
-from rlftsim.errors import ConfigError, DataError
+from rlftsim.errors import DataError
 from rlftsim.evaluation.evaluate import check_jobs, simulate_states
 from rlftsim.evaluation.results import EvaluateConfig
 from rlftsim.progress import log, progress_bar
-from rlftsim.realism import SimulatedStates
 from rlftsim.rollout.policy import Policy, device_of
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.types import Scenario
 from rlftsim.submission.archive import Piece, count_joined, join_pieces, write_piece
-from rlftsim.submission.messages import decode_rollouts, encode_rollouts, encode_varint
+from rlftsim.submission.messages import decode_rollouts, encode_rollouts, encode_varint, round_states
 from rlftsim.submission.plan import GZIP_RATIO, Plan
 from rlftsim.submission.scenario_checks import check_rollouts
 from rlftsim.threads import one_thread
@@ -38,8 +34,6 @@ from rlftsim.workers import run_tasks
 
 ARCHIVE = "submission.tar.gz"
 _SHARDS, _LOCK = "shards", ".lock"
-_HEADING_FINER = 8
-"""Headings are rounded to this fraction of the positions' step, in radians; at 8 m from the center they are equal."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +85,7 @@ def build_archive(job: Job, *, delete_parts: bool = False, show_progress: bool =
             return archive
         shards = job.folder / _SHARDS
         shards.mkdir(exist_ok=True)
-        # What a killed process was writing; nobody else writes here now.
+        # Left by a killed process; no other process writes here now.
         for stray in shards.glob(".*"):
             stray.unlink()
         numbers = range(len(job.plan.shards))
@@ -174,31 +168,6 @@ def forecast_size(plan: Plan, number: int, piece: Piece) -> float:
         piece: the shard.
     """
     return piece.size / plan.num_agents[number] * sum(plan.num_agents)
-
-
-def round_states(states: SimulatedStates, round_m: float | None) -> SimulatedStates:
-    """Positions rounded to a power of two of at most `round_m`, headings to an eighth of it; themselves at None.
-
-    Powers of two leave zeros in the last bits of a float, which compress to nothing.
-
-    Args:
-        states: of a scenario.
-        round_m: largest step in meters, such as 0.001.
-
-    Raises:
-        ConfigError: not above zero.
-    """
-    if round_m is None:
-        return states
-    if not 0 < round_m < 1:
-        raise ConfigError(f"round={round_m:g} must be above 0 and below 1 m, such as 0.001.")
-    step = 2.0 ** math.floor(math.log2(round_m))
-
-    def rounded(values: torch.Tensor, unit: float) -> torch.Tensor:
-        return (values.double() / unit).round().mul(unit).float()
-
-    x, y, heading = rounded(states.x, step), rounded(states.y, step), rounded(states.heading, step / _HEADING_FINER)
-    return replace(states, x=x, y=y, heading=heading)
 
 
 @contextmanager

@@ -14,7 +14,7 @@ MAX_STEPS_PER_DECISION = 10
 
 
 def statement(policy: Policy, sampling: Sampling) -> str:
-    """What an entry declares with the closed-loop flag, as far as this code can vouch for it.
+    """Statement that an entry makes with the closed-loop flag, as far as this code can vouch for it.
 
     Args:
         policy: that is simulated.

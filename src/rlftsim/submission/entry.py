@@ -26,7 +26,10 @@ _PLACEHOLDER_PARTS = ("your_account", "your.account", "@test.", "@example.", "<"
 
 @dataclass(frozen=True)
 class Entry:
-    """What `submission.toml` says. All texts are required, because the server has refused empty ones."""
+    """Account, method and authors, as `submission.toml` has them.
+
+    All texts are required, because the server has refused empty ones.
+    """
 
     account: str
     """E-mail address of the account that uploads."""

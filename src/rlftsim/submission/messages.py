@@ -6,13 +6,15 @@ themselves. Building Python lists of 340 000 numbers for each scenario would tak
 Shapes: N rollouts (scenes), A agents, T = 80 steps.
 """
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 from google.protobuf.message import DecodeError
 from jaxtyping import Float32
 
-from rlftsim.errors import DataError
+from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation import submission_pb2
 from rlftsim.evaluation.rollout_files import AXES
 from rlftsim.realism import SimulatedStates
@@ -24,7 +26,34 @@ TRAJECTORY_BYTES = 1297
 _ARRAY_BYTES = 4 * FUTURE_STEPS
 _AXIS_KEYS = b"\x12\x1a\x22\x2a"
 """Keys of center_x, center_y, center_z and heading: field numbers 2 to 5, wire type 2."""
+_HEADING_FINER = 8
+"""Headings are rounded to this fraction of the positions' step, in radians; at 8 m from the center they are equal."""
 _ID_KEY, _FIRST_KEY, _SECOND_KEY = b"\x30", b"\x0a", b"\x12"
+
+
+def round_states(states: SimulatedStates, round_m: float | None) -> SimulatedStates:
+    """Positions rounded to a power of two of at most `round_m`, headings to an eighth of it; themselves at None.
+
+    Powers of two leave zeros in the last bits of a float, which compress to nothing.
+
+    Args:
+        states: of a scenario.
+        round_m: largest step in meters, such as 0.001.
+
+    Raises:
+        ConfigError: not above zero.
+    """
+    if round_m is None:
+        return states
+    if not 0 < round_m < 1:
+        raise ConfigError(f"round={round_m:g} must be above 0 and below 1 m, such as 0.001.")
+    step = 2.0 ** math.floor(math.log2(round_m))
+
+    def rounded(values: torch.Tensor, unit: float) -> torch.Tensor:
+        return (values.double() / unit).round().mul(unit).float()
+
+    x, y, heading = rounded(states.x, step), rounded(states.y, step), rounded(states.heading, step / _HEADING_FINER)
+    return replace(states, x=x, y=y, heading=heading)
 
 
 def encode_varint(number: int) -> bytes:

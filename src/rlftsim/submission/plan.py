@@ -84,11 +84,13 @@ def make_plan(
         round_m: positions are rounded to this; None = not.
 
     Raises:
-        ConfigError: no shards.
+        ConfigError: no shards, or another number of rollouts than the challenge wants.
     """
     agents = np.stack([data.index[name].to_numpy() for name in _AGENT_COLUMNS]).sum(0)  # [scenarios]
     if num_shards < 1:
         raise ConfigError(f"num_shards must be at least 1, got {num_shards}.")
+    if config.num_rollouts != NUM_SCENES:
+        raise ConfigError(f"an entry has {NUM_SCENES} rollouts of each scenario, not {config.num_rollouts}.")
     num_shards = min(num_shards, len(agents))
     # Borders where the running number of agents passes multiples of its share; each shard keeps at least one scenario.
     total = np.concatenate([[0], np.cumsum(agents)])
