@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rlftsim.errors import DataError
-from rlftsim.submission.archive import GzipReader, combine_crc32, join_pieces, write_piece
+from rlftsim.submission.archive import GzipReader, combine_crc32, count_joined, join_pieces, write_piece
 
 
 @given(st.binary(max_size=300), st.binary(max_size=300))
@@ -62,6 +62,21 @@ def test_a_stopped_join_goes_on_without_the_pieces_that_are_gone(contents, tmp_p
     join_pieces(archive, tmp_path, pieces, delete=True)
     assert archive.read_bytes() == whole.read_bytes()
     assert not list(tmp_path.glob("*.part"))
+
+
+def test_pieces_before_a_damaged_one_stay_joined(contents, tmp_path):
+    pieces = make_pieces(tmp_path, contents)
+    whole, archive = tmp_path / "whole.tar.gz", tmp_path / "a.tar.gz"
+    join_pieces(whole, tmp_path, pieces, delete=False)
+    third = (tmp_path / "c.part").read_bytes()
+    (tmp_path / "c.part").write_bytes(third[:-1])
+    with pytest.raises(DataError, match=r"c\.part was damaged"):
+        join_pieces(archive, tmp_path, pieces, delete=True)
+    assert not (tmp_path / "a.part").exists()
+    assert count_joined(archive, tmp_path, pieces) == 2
+    (tmp_path / "c.part").write_bytes(third)  # simulated once more
+    join_pieces(archive, tmp_path, pieces, delete=True)
+    assert archive.read_bytes() == whole.read_bytes()
 
 
 def test_a_damaged_piece_is_named_and_removed(contents, tmp_path):

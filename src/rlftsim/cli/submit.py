@@ -1,8 +1,7 @@
 """The verb for entries of the Sim Agents challenge: submit build, check, info."""
 
-import json
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -20,7 +19,7 @@ from rlftsim.submission.check import ArchiveCheck, check_archive
 from rlftsim.submission.closed_loop import refuse_open_loop, statement
 from rlftsim.submission.entry import count_parameters, describe_entry, read_entry
 from rlftsim.submission.plan import make_plan, refuse_incomplete
-from rlftsim.submission.report import Report, estimate_realism, findings_of, reported_sha256
+from rlftsim.submission.report import Report, estimate_realism, findings_of, reported_sha256, write_findings
 from rlftsim.submission.scores import ArchiveScores
 from rlftsim.submission.transfer import split_file
 
@@ -149,13 +148,7 @@ class Check:
         )
         _print_findings(check)
         if self.json is not None:
-            findings, counts = findings_of(check)
-            values = {
-                "archive": check.archive, "bytes": check.size, "sha256": check.sha256, "shards": len(check.shards),
-                "scenarios": check.num_scenarios, "checked": check.num_checked, "counts": counts,
-                "findings": [asdict(finding) for finding in findings],
-            }  # fmt: skip
-            self.json.write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
+            write_findings(check, self.json)
         if scores is not None:
             print_wide(scores.table(check.archive, data, check.sha256))
         return int(check.findings.has_errors)

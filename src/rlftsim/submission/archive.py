@@ -13,7 +13,7 @@ import tarfile
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import chain, takewhile
+from itertools import chain
 from pathlib import Path
 from typing import BinaryIO
 
@@ -129,10 +129,14 @@ def count_joined(archive: Path, folder: Path, pieces: Sequence[Piece | None]) ->
         folder: with the pieces that are left.
         pieces: in the order of the archive; None = not made yet.
     """
-    gone = list(takewhile(lambda piece: piece is not None and not (folder / piece.file).exists(), pieces))
-    needed = len(_GZIP_HEADER) + sum(piece.size for piece in gone if piece is not None)
     partial = _partial(archive)
-    return len(gone) if partial.exists() and partial.stat().st_size >= needed else 0
+    size = partial.stat().st_size if partial.exists() else 0
+    count, end = 0, len(_GZIP_HEADER)
+    for piece in pieces:
+        if piece is None or (folder / piece.file).exists() or end + piece.size > size:
+            break
+        count, end = count + 1, end + piece.size
+    return count
 
 
 def _partial(archive: Path) -> Path:

@@ -156,6 +156,27 @@ def findings_of(check: ArchiveCheck) -> tuple[tuple[Finding, ...], dict[int, int
     return tuple(check.findings.kept), dict(sorted(check.findings.counts.items()))
 
 
+def write_findings(check: ArchiveCheck, path: Path) -> None:
+    """Write the findings of a check as JSON.
+
+    Args:
+        check: of any archive.
+        path: of the file.
+    """
+    findings, counts = findings_of(check)
+    values = {
+        "archive": check.archive,
+        "bytes": check.size,
+        "sha256": check.sha256,
+        "shards": len(check.shards),
+        "scenarios": check.num_scenarios,
+        "checked": check.num_checked,
+        "counts": counts,
+        "findings": [asdict(finding) for finding in findings],
+    }
+    write_text(path, json.dumps(values, indent=1) + "\n")
+
+
 def _estimate_lines(estimate: Estimate | str) -> list[str]:
     if isinstance(estimate, str):
         return [
