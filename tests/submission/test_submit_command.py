@@ -8,7 +8,8 @@ import pytest
 import made_up
 from rlftsim.cli.main import main
 from rlftsim.evaluation.results import EvaluateConfig
-from rlftsim.submission.report import estimate_realism
+from rlftsim.policies.checkpoint import save_model
+from rlftsim.submission.report import estimate_realism, model_card
 
 TOML = """
 account = "jane.doe@university.edu"
@@ -55,6 +56,7 @@ def test_a_build_is_declared_checked_and_reported(place, capsys):
     text = (place / "out" / "submission.report.md").read_text()
     assert report["sha256"] in text
     assert "submission key" in text  # what to write about a server error without a reason
+    assert "constant_velocity is no model folder" in text
     assert "Not known: runs/evaluations/constant_velocity.parquet" in text
     assert all("jane.doe" not in (place / "out" / name).read_text() for name in
                ("plan.json", "submission.report.json", "submission.report.md"))  # fmt: skip
@@ -96,6 +98,12 @@ def test_the_rollouts_of_an_archive_score_as_its_unpacked_files(tmp_path, monkey
     of_tables = [[line.split() for line in some if "0." in line and "likelihood" in line] for some in (lines, expected)]
     assert len(of_tables[0]) > 8
     assert of_tables[0] == of_tables[1]
+
+
+def test_the_card_of_a_model_is_part_of_the_report(tmp_path):
+    save_model(tmp_path / "m", entries.Wanderer(), {}, card="# A model\n\ntrained on nothing\n")
+    assert model_card(str(tmp_path / "m")) == "### A model\n\ntrained on nothing"
+    assert model_card("demo-base") == "demo-base is no model folder, so it has no card."
 
 
 def test_an_estimate_is_of_the_same_model_and_settings(tmp_path):

@@ -4,14 +4,16 @@ It names the method and not the account, so that it may be shared.
 """
 
 import json
+import re
 from dataclasses import asdict, dataclass, replace
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
 from rlftsim.atomic_io import write_text
-from rlftsim.errors import DataError
+from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.results import EvaluateConfig, Evaluation
+from rlftsim.policies.checkpoint import CARD, find_model
 from rlftsim.submission.check import ArchiveCheck
 from rlftsim.submission.findings import CHECKS, Finding
 
@@ -79,6 +81,8 @@ class Report:
     """Findings by check."""
     closed_loop: str
     """Statement that the entry makes."""
+    card: str
+    """Card of the model, see `model_card`."""
     work: dict[str, Any]
     """Model, data and settings that the archive depends on."""
     seconds: float
@@ -125,12 +129,25 @@ class Report:
                 "",
                 self.closed_loop,
                 "",
+                "## Model",
+                "",
+                self.card,
+                "",
                 "## After the upload",
                 "",
                 SERVER_ERRORS,
                 "",
             ]
         )
+
+
+def model_card(name: str) -> str:
+    """Card in a model's folder, with its headings two levels down; a sentence where there is none."""
+    try:
+        text = (find_model(name) / CARD).read_text(encoding="utf-8")
+    except (ConfigError, OSError):
+        return f"{name} is no model folder, so it has no card."
+    return re.sub(r"^#", "###", text.strip(), flags=re.MULTILINE)
 
 
 def report_path(archive: Path, ending: str) -> Path:
