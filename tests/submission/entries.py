@@ -25,6 +25,15 @@ ENTRY = Entry(
     "jane.doe@university.edu", "A method", ("Jane Doe", "John Roe"), "A university", "A model.", "https://doe.edu/a"
 )
 METADATA = describe_entry(ENTRY, "7M")
+TOML = """
+account = "jane.doe@university.edu"
+method = "A method"
+authors = ["Jane Doe"]
+affiliation = "A university"
+description = "A model."
+link = "https://doe.edu/a"
+"""
+"""A file that describes an entry."""
 
 
 @dataclass(frozen=True, eq=False)

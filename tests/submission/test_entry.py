@@ -2,20 +2,12 @@
 
 import pytest
 import torch
+from entries import TOML
 from torch import nn
 
 from rlftsim.errors import ConfigError
 from rlftsim.evaluation.submission_pb2 import SimAgentsChallengeSubmission
 from rlftsim.submission.entry import REQUIRED_FIELDS, count_parameters, describe_entry, problems_of, read_entry
-
-TEXT = """
-account = "jane.doe@university.edu"
-method = "A method"
-authors = ["Jane Doe"]
-affiliation = "A university"
-description = "A model."
-link = "https://doe.edu/a"
-"""
 
 
 @pytest.fixture
@@ -28,7 +20,7 @@ def read(tmp_path):
 
 
 def test_a_file_becomes_all_required_fields(read):
-    entry = read(TEXT, method="Another")
+    entry = read(TOML, method="Another")
     message = SimAgentsChallengeSubmission.FromString(describe_entry(entry, "7M"))
     assert problems_of(message) == []
     assert all(message.HasField(name) for name in REQUIRED_FIELDS)
@@ -54,7 +46,7 @@ def test_a_file_becomes_all_required_fields(read):
 )
 def test_mistakes_are_named_with_the_file(read, old, new, message):
     with pytest.raises(ConfigError, match=message) as caught:
-        read(TEXT.replace(old, new))
+        read(TOML.replace(old, new))
     assert str(caught.value).count("entry.toml") == 1
     assert "\n" not in str(caught.value).replace("(at", "")
 

@@ -11,21 +11,12 @@ from rlftsim.evaluation.results import EvaluateConfig
 from rlftsim.policies.checkpoint import save_model
 from rlftsim.submission.report import estimate_realism, model_card
 
-TOML = """
-account = "jane.doe@university.edu"
-method = "A method"
-authors = ["Jane Doe"]
-affiliation = "A university"
-description = "A model."
-link = "https://doe.edu/a"
-"""
-
 
 @pytest.fixture
 def place(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     entries.write_data(tmp_path / "set", num_scenarios=4)
-    (tmp_path / "submission.toml").write_text(TOML)
+    (tmp_path / "submission.toml").write_text(entries.TOML)
     return tmp_path
 
 
