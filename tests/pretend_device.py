@@ -51,6 +51,8 @@ class Counts:
     launches: Counter[str] = field(default_factory=Counter)
     waits: Counter[str] = field(default_factory=Counter)
     copies: Counter[str] = field(default_factory=Counter)
+    operations: list[tuple[str, tuple[torch.Size, ...]]] = field(default_factory=list)
+    """Every operation on the device with the shapes that it reads: what a CUDA graph would repeat."""
 
     @property
     def totals(self) -> tuple[int, int, int]:
@@ -146,6 +148,8 @@ class PretendDevice:
         result = func(*on_cpu[0], **on_cpu[1])
         if (on_device or is_there) and has_kernel(func):
             self.add("launches")
+            for counts in self._counts:
+                counts.operations.append((name, tuple(value.shape for value in on_device)))
         if not is_there and name != "copy_":
             return result
         return each_tensor(result, lambda v: wrappers[id(v)] if id(v) in wrappers else DeviceTensor(v))

@@ -5,21 +5,29 @@ There is no GPU here, see `pretend_device`.
 
 import copy
 from contextlib import nullcontext
+from dataclasses import replace
 
 import pytest
 import torch
 
+import scenes
 import tiny
 from pretend_device import DEVICE, PretendDevice
 from rlftsim.evaluation.evaluate import evaluate
 from rlftsim.evaluation.results import SCORE_COLUMNS, EvaluateConfig
 from rlftsim.goals.logged import logged_goals
+from rlftsim.goals.types import Goals
+from rlftsim.policies.smart.config import smart_demo, smart_tiny
+from rlftsim.realism import score_batch
+from rlftsim.realism.from_rollouts import states_of_rollouts
 from rlftsim.rollout import simulate as simulate_module
 from rlftsim.rollout.fingerprint import fingerprint_policy
+from rlftsim.rollout.policy import Sampling
 from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import write_dataset
-from rlftsim.training import processes
+from rlftsim.training import finetune, processes
+from rlftsim.training.catk import roll_out_closest
 from rlftsim.training.goals import GoalConfig
 from rlftsim.training.run_folder import read_metrics
 from rlftsim.training.validation import ValidationConfig
@@ -137,18 +145,29 @@ def test_a_missing_copy_to_the_host_is_found(device, policy, batch, monkeypatch)
 # ---- the same results as on the CPU --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("goal", [None, "concat", "indication"])
-def test_rollouts_are_those_of_the_cpu(device, policy, batch, goal):
-    goals = logged_goals(batch) if goal else None
-    if goal:
-        policy = policy.with_goal_conditioning(goal)
-        with torch.no_grad():
-            for part in policy.goal_parts():
-                for weight in part.parameters():
-                    weight.add_(0.1)
+MODELS = {
+    "goal-free": tiny.WITHOUT_CHANCE,
+    "all neighbors, a head per class": replace(
+        tiny.WITHOUT_CHANCE, head_per_class=True,
+        max_map_neighbors=None, max_agent_map_neighbors=None, max_agent_neighbors=None,
+    ),
+    "concat": replace(tiny.WITHOUT_CHANCE, goal="concat", goal_logit_bias=True),
+    "indication": replace(tiny.WITHOUT_CHANCE, goal="indication", goal_logit_bias=True),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_rollouts_are_those_of_the_cpu(device, vocabulary, drawn_scenarios, model):
+    policy = tiny.tiny_policy(vocabulary, MODELS[model]).eval().requires_grad_(False)
+    for part in policy.goal_parts():
+        for weight in part.parameters():
+            weight.add_(0.1)  # else goals would have no effect
+    # scenarios with more and fewer agents, without a map, with an agent that nobody is near
+    batch = collate([drawn_scenarios[1], scenes.lone_agent(), scenes.without_map(), drawn_scenarios[2]])
+    goals = logged_goals(batch).only(batch.object_id[:, None] % 2 == 0) if policy.is_goal_conditioned else None
     expected = simulate(policy, batch, num_rollouts=2, seed=1, goals=goals)
-    policy, batch = policy.to(DEVICE), batch.to(DEVICE)
-    found = simulate(policy, batch, num_rollouts=2, seed=1, goals=logged_goals(batch) if goal else None)
+    there = None if goals is None else Goals(goals.position.to(DEVICE), goals.goal_mask.to(DEVICE))
+    found = simulate(policy.to(DEVICE), batch.to(DEVICE), num_rollouts=2, seed=1, goals=there)
     assert found.position.device == DEVICE
     assert found.decision.cpu().equal(expected.decision)
     torch.testing.assert_close(found.position.cpu(), expected.position)
@@ -197,3 +216,59 @@ def test_scores_are_those_of_the_cpu(device, policy, drawn_scenarios, tmp_path):
     found = evaluate(policy.to(DEVICE), tmp_path / "data", config=config, show_progress=False).table
     for column in SCORE_COLUMNS:
         assert found[column].to_pylist() == pytest.approx(expected[column].to_pylist(), abs=1e-6, nan_ok=True), column
+
+
+# ---- what the host waits for ---------------------------------------------------------------------------------------
+
+LAUNCHES = {"demo": (smart_demo(), 650), "tiny": (smart_tiny(), 1250)}
+"""Models and upper bounds of the launches of a decision."""
+
+
+@pytest.mark.parametrize("name", LAUNCHES)
+def test_decisions_never_wait_and_are_all_alike(device, vocabulary, batch, name):
+    config, most = LAUNCHES[name]
+    policy, batch = tiny.tiny_policy(vocabulary, config).eval().requires_grad_(False).to(DEVICE), batch.to(DEVICE)
+    noise = torch.rand(2, 3, batch.agent_mask.shape[1], 1, device=DEVICE)
+    decisions = []
+    with torch.no_grad():
+        context = policy.encode(batch)
+        state = policy.begin(context, 3, None, noise[..., :0])
+        for _ in range(4):
+            with device.count() as counts:
+                dist = policy.decide(context, state)
+                decision = dist.sample(Sampling(), noise)
+                dist.log_prob(decision)
+                state = policy.advance(context, state, decision)
+            decisions.append(counts)
+    for counts in decisions:
+        assert not counts.waits
+        assert not counts.copies
+        assert counts.launches.total() <= most
+    # the first decision is in the context, the second one begins a past of fixed size
+    assert decisions[2].operations == decisions[3].operations
+
+
+def test_counts_of_larger_pieces_are_bounded(device, vocabulary, batch):
+    """Launches, waits and copies, whatever the number of rollouts; each bound is some percent above what was counted."""
+    config = replace(tiny.FINETUNE, num_rollouts=4)
+    learner = finetune.prepare(tiny.tiny_policy(vocabulary, smart_demo()), config, DEVICE)
+    policy, batch = learner.policy, batch.to(DEVICE)
+    with torch.no_grad():
+        context = policy.encode(batch)
+    with device.count() as counts:
+        targeted = roll_out_closest(policy, batch, context=context)
+    assert_below(counts, launches=12_500, waits=0, copies=12)
+    states = states_of_rollouts(batch, targeted.rollouts)
+    score_batch(batch.scenarios, states)  # the logs are computed once
+    with device.count() as counts:
+        score_batch(batch.scenarios, states)
+    assert_below(counts, launches=1_350, waits=10, copies=10)
+    with device.count() as counts:
+        finetune.update_policy(learner, batch, config, PretendFabric())
+    assert_below(counts, launches=18_000, waits=60, copies=50)
+
+
+def assert_below(counts, launches, waits, copies):
+    assert counts.launches.total() <= launches
+    assert counts.waits.total() <= waits, counts.waits
+    assert counts.copies.total() <= copies, counts.copies

@@ -11,12 +11,13 @@ from torch import Tensor
 from rlftsim.policies.token_rows import TokenRows, row_statistics
 from rlftsim.rollout.baselines import refuse_top_k
 from rlftsim.rollout.policy import DecisionStatistics, Sampling
+from rlftsim.rollout.rows import pick_rows, place_rows
 
 
 class CategoricalDistribution:
     """Distributions of the R elements whose mask is True, in the order of `mask.nonzero()`.
 
-    All other elements (padding) decide 0 with probability 1.
+    All other elements (padding) decide 0 with probability 1. Off the CPU padding may have rows of its own that say so.
     """
 
     logits: Float[Tensor, "R V"]
@@ -41,7 +42,7 @@ class CategoricalDistribution:
         logits, token_id = self._kept(sampling)
         cumulative = torch.softmax(logits, -1).cumsum(-1)
         # the sum of float32 probabilities is 1 up to rounding: scaled by it, no noise lies beyond the last token
-        level = noise[self.mask] * cumulative[:, -1:]  # [R, 1]
+        level = self._rows(noise) * cumulative[:, -1:]  # [R, 1]
         chosen = torch.searchsorted(cumulative, level, right=True).clamp(max=logits.shape[-1] - 1)
         return self._dense((chosen if token_id is None else token_id.gather(-1, chosen))[:, 0])
 
@@ -58,7 +59,7 @@ class CategoricalDistribution:
         """
         if sampling.temperature == 0:
             return self._dense(torch.zeros_like(self.logits[:, 0]))
-        chosen = decision[self.mask][:, None]  # [R, 1]
+        chosen = self._rows(decision)[:, None]  # [R, 1]
         if sampling.is_full:
             return self._dense(self.log_probs.gather(-1, chosen)[:, 0])
         logits, token_id = self._kept(sampling)
@@ -91,9 +92,17 @@ class CategoricalDistribution:
         token_id = self._likeliest[sampling.top_k]
         return self.logits.gather(-1, token_id) / sampling.temperature, token_id
 
+    @property
+    def _num_rows(self) -> int:
+        return len(self.logits)
+
+    def _rows(self, values: Tensor) -> Tensor:
+        """Values of the R elements."""
+        return pick_rows(values, self.mask, has_all=self._num_rows == self.mask.numel())
+
     def _dense(self, values: Tensor) -> Tensor:
         """Values of the R elements at their places, zero elsewhere."""
-        return values.new_zeros(self.mask.shape).masked_scatter(self.mask, values)
+        return place_rows(values, self.mask)
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,6 +125,10 @@ class LazyTokenDistribution(CategoricalDistribution):
         """float32; tokens that do not exist have a large negative logit."""
         return self.rows.logits()
 
+    @property
+    def _num_rows(self) -> int:
+        return len(self.rows.hidden)
+
     def log_prob(
         self,
         decision: Int64[Tensor, "*batch"],
@@ -129,7 +142,7 @@ class LazyTokenDistribution(CategoricalDistribution):
         """
         if not sampling.is_full:
             return super().log_prob(decision, sampling)
-        return self._dense(row_statistics(self.rows, decision[self.mask])[0])
+        return self._dense(row_statistics(self.rows, self._rows(decision))[0])
 
     def statistics(self, decision: Int64[Tensor, "*batch"], reference: CategoricalDistribution) -> DecisionStatistics:
         """Log-probability, KL and entropy of all elements, without logits of all of them at once where both are lazy.
@@ -140,7 +153,7 @@ class LazyTokenDistribution(CategoricalDistribution):
         """
         if not isinstance(reference, LazyTokenDistribution):
             return DecisionStatistics(self.log_prob(decision), self.kl(reference), self.entropy())
-        found = row_statistics(self.rows, decision[self.mask], reference.rows)
+        found = row_statistics(self.rows, self._rows(decision), reference.rows)
         return DecisionStatistics(*(self._dense(values) for values in found))
 
 

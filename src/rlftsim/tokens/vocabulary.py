@@ -27,6 +27,9 @@ CLASS_NAMES = ("vehicle", "pedestrian", "cyclist")
 CLASS_BOXES_M = ((4.8, 2.0), (1.0, 1.0), (2.0, 1.0))
 """Length and width of each class's box, which tokens are matched with."""
 
+PADDING_CLASS = len(CLASS_NAMES)
+"""Class of rows that are no agent, where there are such rows."""
+
 _CLASS_OF_TYPE = (0, 0, 1, 2, 0)
 FORMAT = "rlftsim-vocabulary-1"
 
@@ -73,6 +76,13 @@ class Vocabulary:
     def num_tokens(self) -> int:
         """V."""
         return self.corners.shape[1]
+
+    @cached_property
+    def class_tokens(self) -> Bool[Tensor, "C1 V"]:
+        """`token_mask` with a row more for `PADDING_CLASS`, which has token 0 alone."""
+        stands = torch.zeros_like(self.token_mask[:1])
+        stands[:, 0] = True
+        return torch.cat([self.token_mask, stands])
 
     def end_corners(self) -> Float[Tensor, "C V 4 2"]:
         """Box at the end of each token."""

@@ -18,6 +18,7 @@ import copy
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -29,6 +30,7 @@ from rlftsim.errors import ConfigError, given, require_positive
 from rlftsim.goals.types import Goals
 from rlftsim.rollout.noise import derive_seed
 from rlftsim.rollout.policy import DecisionDistribution, Policy, Sampling, TokenPolicy
+from rlftsim.rollout.rows import pick_rows, place_rows
 from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.tokens import catk_compat
@@ -265,9 +267,10 @@ class _Target:
             ids: K candidate tokens of each agent.
             mask: True = one of the R agents.
         """
-        class_id = self.class_id[mask]  # [R]
+        pick = partial(pick_rows, mask=mask, has_all=len(ids) == mask.numel())
+        class_id = pick(self.class_id)  # [R]
         ends = self.vocabulary.end_corners()[class_id[:, None], ids]  # [R, K, 4, 2], in the agents' frames
-        logged, pose = ((position[mask], heading[mask]) for position, heading in (self.logged, self.pose))
+        logged, pose = ((pick(position), pick(heading)) for position, heading in (self.logged, self.pose))
         if not self.catk_compat:
             return (ends - local_boxes(logged, pose, class_id)[:, None]).norm(dim=-1).mean(-1)
         # The public code compares in the map frame, where float32 rounds coarser: another candidate may win.
@@ -303,8 +306,8 @@ def _take_closest(distribution: TokenLogits, target: _Target, count: int, noise:
     likely = logits.topk(min(count, logits.shape[-1]), dim=-1).indices  # [R, K]
     nearest = target.distances(likely, mask).argmin(-1, keepdim=True)
     # topk sorts, so the first candidate is the most likely token.
-    chosen = torch.where(target.logged_valid[mask], likely.gather(-1, nearest)[:, 0], likely[:, 0])
-    return torch.zeros_like(target.class_id).masked_scatter(mask, chosen)
+    is_logged = pick_rows(target.logged_valid, mask, has_all=len(logits) == mask.numel())
+    return place_rows(torch.where(is_logged, likely.gather(-1, nearest)[:, 0], likely[:, 0]), mask)
 
 
 def _draw_likely(distribution: Any, target: _Target, count: int, noise: Tensor) -> Int64[Tensor, "B N A"]:
@@ -314,9 +317,8 @@ def _draw_likely(distribution: Any, target: _Target, count: int, noise: Tensor) 
 def _draw_near(distribution: Any, target: _Target, count: int, noise: Tensor) -> Int64[Tensor, "B N A"]:
     logits, mask = distribution.logits, distribution.mask  # [R, V], [B, N, A]
     ids = torch.arange(logits.shape[-1], device=logits.device).expand_as(logits)
-    exists = target.vocabulary.token_mask[
-        target.class_id[mask]
-    ]  # a class may have fewer tokens than the table has rows
+    # a class may have fewer tokens than the table has rows
+    exists = target.vocabulary.token_mask[pick_rows(target.class_id, mask, has_all=len(logits) == mask.numel())]
     near = target.distances(ids, mask).masked_fill(~exists, torch.inf)
     near = near.topk(min(count, logits.shape[-1]), dim=-1, largest=False).indices  # [R, K]
     kept = torch.zeros_like(logits, dtype=torch.bool).scatter(-1, near, True)

@@ -4,7 +4,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rlftsim.policies.smart.neighbors import within
+from pretend_device import DEVICE, PretendDevice
+from rlftsim.policies.smart.neighbors import most_within, within
 
 PLACES = torch.tensor([[[1.0, 0.0], [1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [3.0, 0.0], [torch.inf, torch.inf]]])
 HERE = torch.zeros(1, 2)
@@ -50,3 +51,44 @@ def test_the_same_are_found_however_many_there_are_to_choose_among(seed, limit, 
     for row, (away, p) in enumerate(zip(distance, place)):
         expected = away.argsort(stable=True)[: int((away < 30.0).sum())][:limit] + p * num_candidates
         assert sorted(found.index[row, found.mask[row]].tolist()) == sorted(expected.tolist())
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.integers(0, 10_000), st.sampled_from([None, 7]), st.integers(1, 400), st.booleans())
+def test_off_the_cpu_the_same_are_found_in_lists_of_a_fixed_width(seed, limit, num_candidates, knows_itself):
+    draw = torch.Generator().manual_seed(seed)
+    candidates = torch.rand(3, num_candidates, 2, generator=draw) * 200 - 100
+    candidates[:, 300:] = torch.inf
+    place = torch.randint(0, 3, (60,), generator=draw)
+    own = torch.randint(0, num_candidates, (60,), generator=draw) if knows_itself else None
+    position = torch.rand(60, 2, generator=draw) * 250 - 125
+    expected = within(position, place, candidates, own, radius_m=30.0, limit=limit)
+    most = most_within(candidates, 30.0)
+    with PretendDevice() as device, device.count() as counts:
+        there = (position.to(DEVICE), place.to(DEVICE), candidates.to(DEVICE), None if own is None else own.to(DEVICE))
+        found = within(*there, radius_m=30.0, limit=limit, most=most)
+        index, mask = found.index.cpu(), found.mask.cpu()
+    assert counts.waits.total() == 2, "the copies of index and mask at the end"
+    assert mask.shape[1] % 8 == 0
+    for row, kept, expected_row, expected_mask in zip(index, mask, expected.index, expected.mask):
+        assert row[kept].tolist() == expected_row[expected_mask].tolist()
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.integers(0, 10_000), st.sampled_from([3.0, 10.0, 30.0]), st.sampled_from([0.3, 20.0, 300.0, 9000.0]))
+def test_no_point_has_more_candidates_near_than_the_bound(seed, radius_m, size_m):
+    draw = torch.Generator().manual_seed(seed)
+    candidates = torch.rand(2, 200, 2, generator=draw) * size_m - size_m / 2
+    candidates[1, 150:] = torch.inf
+    points = torch.cat([candidates[0], torch.rand(300, 2, generator=draw) * size_m - size_m / 2])
+    near = (points[:, None, None] - candidates).norm(dim=-1) < radius_m  # [points, 2, 200]
+    assert near.sum(-1).max() <= most_within(candidates, radius_m)
+
+
+def test_the_bound_is_not_far_above_what_is_near():
+    side = torch.arange(-100.0, 100.0, 2.5)
+    candidates = torch.stack(torch.meshgrid(side, side, indexing="ij"), -1).view(1, -1, 2)
+    near = (candidates[0].norm(dim=-1) < 30.0).sum().item()
+    assert near <= most_within(candidates, 30.0) <= 1.5 * near
+    street = torch.stack([side, torch.zeros_like(side)], -1)[None]
+    assert most_within(street, 30.0) <= 30

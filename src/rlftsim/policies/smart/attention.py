@@ -25,6 +25,8 @@ from rlftsim.policies.smart.embeddings import EPSILON, RelationEmbedding, normal
 FLOATS_PER_BLOCK = {"cpu": 1 << 19}
 """Floats of the relations that are processed together: on a processor they fit its cache."""
 FLOATS_PER_BLOCK_ELSEWHERE = 1 << 26
+MOST_ROWS_PER_BLOCK = 65535
+"""Largest grid of the fused attention on CUDA (pytorch#142228)."""
 WIDTHS, LEAST_WIDTH_STEP = 8, 8
 """Rows share a block if their numbers of neighbors differ by less than an eighth of the largest, or by less than
 eight."""
@@ -48,14 +50,17 @@ class NeighborBlock:
 class Neighborhoods:
     """The neighbors of all rows, shared by all layers.
 
-    Rows are sorted by their number of neighbors, so little is padded.
+    Rows are sorted by their number of neighbors, so little is padded. Off the CPU, in closed loop, they are not: all
+    rows are there in their order, padded to the same width.
     """
 
-    rows: Int64[Tensor, "n"]
-    """The rows that have neighbors, block after block."""
+    rows: Int64[Tensor, "n"] | None
+    """The rows that have neighbors, block after block; None = all rows in their order."""
     blocks: tuple[NeighborBlock, ...]
     gradients: "EdgeGradients | None"
     """Sums of the layers' gradients of the edge features; None where these are constants."""
+    has_any: Bool[Tensor, "R"] | None = None
+    """True = the row has a neighbor, where all rows are there."""
 
     @property
     def dtype(self) -> torch.dtype:
@@ -89,6 +94,7 @@ def build_neighborhoods(
     mask: Bool[Tensor, "R K"],
     *,
     dim: int,
+    padded: bool = False,
     features: Float[Tensor, "S D"] | None = None,
 ) -> Neighborhoods:
     """Embed relations and cut the rows into blocks.
@@ -99,24 +105,31 @@ def build_neighborhoods(
         neighbors: rows of the sources; any valid row where the mask is False.
         mask: True = a neighbor.
         dim: D.
+        padded: keep all rows, their order and their width, so that blocks depend on shapes alone.
         features: normalized features of the sources, if they are the same in all layers.
     """
-    # a row's width is the place of its last neighbor; rows without any are left out
-    columns = torch.arange(1, mask.shape[1] + 1, device=mask.device)
-    width, order = (mask * columns).amax(-1).sort()
-    widths = width.cpu().numpy()
-    empty = int(np.searchsorted(widths, 1))
-    rows, widths = order[empty:], widths[empty:]
-    blocks = []
     pairs = FLOATS_PER_BLOCK.get(mask.device.type, FLOATS_PER_BLOCK_ELSEWHERE) // dim
-    for cut in _cut(widths, pairs):
-        part, kept = rows[cut], slice(widths[cut].max(initial=1))
-        index = neighbors[part, kept]  # [r, K]
-        edge_features = _embed_edges(embedding, values[part, kept], index, features)
-        bias = torch.zeros_like(edge_features[..., 0]).masked_fill_(~mask[part, kept], IMPOSSIBLE)
+    rows, has_any = None, None
+    if padded:
+        has_any = mask.any(-1)
+        size = min(max(pairs // mask.shape[1], 1), MOST_ROWS_PER_BLOCK)
+        parts = zip(*(tensor.split(size) for tensor in (values, neighbors, mask)))
+    else:
+        # a row's width is the place of its last neighbor; rows without any are left out
+        columns = torch.arange(1, mask.shape[1] + 1, device=mask.device)
+        width, order = (mask * columns).amax(-1).sort()
+        widths = width.cpu().numpy()
+        empty = int(np.searchsorted(widths, 1))
+        rows, widths = order[empty:], widths[empty:]
+        places = ((rows[cut], slice(widths[cut].max(initial=1))) for cut in _cut(widths, pairs))
+        parts = ((values[place], neighbors[place], mask[place]) for place in places)
+    blocks = []
+    for block_values, index, block_mask in parts:  # [r, K, n], [r, K], [r, K]
+        edge_features = _embed_edges(embedding, block_values, index, features)
+        bias = torch.zeros_like(edge_features[..., 0]).masked_fill_(~block_mask, IMPOSSIBLE)
         blocks.append(NeighborBlock(index, bias[:, None], edge_features))
     is_trained = any(block.edge_features.requires_grad for block in blocks)
-    return Neighborhoods(rows, tuple(blocks), EdgeGradients.of(blocks) if is_trained else None)
+    return Neighborhoods(rows, tuple(blocks), EdgeGradients.of(blocks) if is_trained else None, has_any)
 
 
 def _embed_edges(
@@ -338,6 +351,17 @@ def _cut_all(tensors: Sequence[Tensor], sizes: list[int]) -> Iterator[tuple[Tens
     return zip(*(tensor.split(sizes) for tensor in tensors))
 
 
+@dataclass(frozen=True, eq=False)
+class AttentionMaps:
+    """A layer's maps between its heads and the spaces of relations and sources (2D), with the norms' weights inside."""
+
+    to_key: Float[Tensor, "H d W"]
+    """Divided by sqrt(d)."""
+    to_value: Float[Tensor, "H W d"]
+    constant: Float[Tensor, "H d"]
+    """The part of a value that is the same for every neighbor: maps of the norms' biases, and the maps' own."""
+
+
 class RelationAttention(nn.Module):
     """Attention of rows to their neighbors along relations, with a gate and a feed-forward part.
 
@@ -379,6 +403,7 @@ class RelationAttention(nn.Module):
         neighborhoods: Neighborhoods,
         *,
         goal_edges: GoalEdges | None = None,
+        maps: AttentionMaps | None = None,
     ) -> Float[Tensor, "R D"]:
         """New features of the rows.
 
@@ -388,41 +413,50 @@ class RelationAttention(nn.Module):
                 features.
             neighborhoods: the neighbors of each row. A row without any receives a message of exactly zero.
             goal_edges: of goal-conditioned rows.
+            maps: `fold()`, where it has been computed already.
         """
         target = self.target_norm(x)
-        message = self._message(target, source, neighborhoods)
+        message = self._message(target, source, neighborhoods, self.fold() if maps is None else maps)
         if goal_edges is not None:
             message = self._apply_goal_edges(message, target, goal_edges)
         gate = torch.sigmoid(self.gate(torch.cat([message, target], -1)))
         x = x + self.out_norm(self.out(message + gate * (self.skip(target) - message)))
         return x + self.feed_forward(x)
 
-    def _message(
-        self, target: Float[Tensor, "R D"], source: Float[Tensor, "S D"] | None, neighborhoods: Neighborhoods
-    ) -> Float[Tensor, "R inner"]:
-        """Attention-weighted values of the neighbors, heads concatenated."""
-        source_norm = self.source_norm or self.target_norm
-        norms = (self.relation_norm, source_norm)
+    def fold(self) -> AttentionMaps:
+        """The maps of the attention, which depend on weights alone."""
+        norms = (self.relation_norm, self.source_norm or self.target_norm)
         values = (self.relation_value, self.source_value)
-        # 1. projections of edge features (relation, source) [H, d, 2D] and [H, 2D, d], norm weights and 1 / sqrt(d)
-        # inside
         to_key = self._by_head((self.relation_key, self.source_key), norms) / math.sqrt(self.head_dim)
         to_value = self._by_head(values, norms).mT
-        # 2. the part of a value that is the same for every neighbor [inner]: maps of the norms' biases, and the
-        # maps' own
         constant = torch.stack([value(norm.bias) for value, norm in zip(values, norms)]).sum(0)
-        # 3. attend. The heads are the batch axis of both projections: [H, n, d] @ [H, d, 2D]
-        query = self.query(target[neighborhoods.rows]).unflatten(-1, (self.num_heads, self.head_dim)).transpose(0, 1)
+        return AttentionMaps(to_key, to_value, constant.unflatten(-1, (self.num_heads, self.head_dim)))
+
+    def _message(
+        self,
+        target: Float[Tensor, "R D"],
+        source: Float[Tensor, "S D"] | None,
+        neighborhoods: Neighborhoods,
+        maps: AttentionMaps,
+    ) -> Float[Tensor, "R inner"]:
+        """Attention-weighted values of the neighbors, heads concatenated."""
+        # 1. attend. The heads are the batch axis of both projections: [H, n, d] @ [H, d, 2D]
+        rows = neighborhoods.rows
+        query = self.query(target if rows is None else target[rows])
+        query = query.unflatten(-1, (self.num_heads, self.head_dim)).transpose(0, 1)
         spaces = 1 if source is None else 2
-        queries = tuple((query @ part).transpose(0, 1) for part in to_key.chunk(spaces, -1))
+        queries = tuple((query @ part).transpose(0, 1) for part in maps.to_key.chunk(spaces, -1))
         sums, weight = gather_edges(queries, source, neighborhoods, self.dropout if self.training else 0.0)
-        projected = [part.transpose(0, 1) @ to_part for part, to_part in zip(sums, to_value.chunk(spaces, 1))]
+        projected = [part.transpose(0, 1) @ to_part for part, to_part in zip(sums, maps.to_value.chunk(spaces, 1))]
         value = torch.stack(projected).sum(0).transpose(0, 1)  # [n, H, d]
         # weights sum to 1, unless dropout zeroed some
-        value = value + weight * constant.unflatten(-1, (self.num_heads, self.head_dim))
-        # 4. back to all rows
+        value = value + weight * maps.constant
+        # 2. back to all rows
+        if rows is None:
+            assert neighborhoods.has_any is not None
+            return torch.where(neighborhoods.has_any[:, None], value.flatten(-2), 0.0)
         message = target.new_zeros(len(target), self.num_heads * self.head_dim)
-        return message.index_copy(0, neighborhoods.rows, value.flatten(-2))
+        return message.index_copy(0, rows, value.flatten(-2))
 
     def _apply_goal_edges(
         self, message: Float[Tensor, "R inner"], target: Float[Tensor, "R D"], edges: GoalEdges

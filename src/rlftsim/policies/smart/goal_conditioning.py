@@ -12,6 +12,7 @@ Source: RLFTSim, section 4.2 and its appendix on goal conditioning; docs/decisio
 B scenarios, N rollouts, A agents, M map tokens, g goal-conditioned rows, C classes, V tokens, D width.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -24,6 +25,7 @@ from rlftsim.policies.distributions import CategoricalDistribution, TokenDistrib
 from rlftsim.policies.smart.config import GoalEncoding
 from rlftsim.policies.smart.embeddings import FourierEmbedding, normalize
 from rlftsim.policies.smart.neighbors import Poses, relative_pose, within
+from rlftsim.rollout.rows import row_places
 from rlftsim.scenario.types import FUTURE_STEPS, STEP_S
 from rlftsim.tokens.vocabulary import CLASS_NAMES, STEPS_PER_TOKEN, Vocabulary
 
@@ -36,7 +38,7 @@ ROUNDING_MPS = 0.5
 BIAS_GAIN = 8.0
 """Factor on the weights of the logit bias, so that the other weights' learning rate suits them: they are few and
 have far to go."""
-ROWS_PER_BLOCK = {"cpu": 128}
+ROWS_PER_BLOCK = 128
 """Rows whose tokens are processed together: on a processor they fit its cache."""
 ROWS_PER_BLOCK_ELSEWHERE = 1 << 12
 
@@ -66,6 +68,11 @@ def encode_goals(goals: Goals, map_position: Float[Tensor, "B M 2"]) -> EncodedG
     polyline = torch.full(goals.goal_mask.shape, -1, device=goals.position.device)
     polyline[place] = torch.where(nearest.mask, nearest.index, -1)[:, 0]
     return EncodedGoals(goals.position, goals.goal_mask, polyline)
+
+
+def rows_where(mask: Bool[Tensor, "R"]) -> Int64[Tensor, "g"]:
+    """Rows where a mask is True. Off the CPU all rows: to leave some out, the host would wait for their number."""
+    return mask.nonzero()[:, 0] if mask.device.type == "cpu" else torch.arange(len(mask), device=mask.device)
 
 
 class GoalEmbedding(FourierEmbedding):
@@ -100,14 +107,15 @@ class GoalEmbedding(FourierEmbedding):
             seam_rad: see `relative_pose`.
 
         Returns:
-            The rows whose agents have goals, and the embeddings of these.
+            The rows whose agents have goals (or all), and their embeddings, which are zero where there is no goal.
         """
         place = rows[:3]
-        conditioned = goals.goal_mask[place].nonzero()[:, 0]  # [g]
+        has_goal = goals.goal_mask[place]
+        conditioned = rows_where(has_goal)  # [g]
         goal = goals.position[place][conditioned, None]  # [g, 1, 2]
         # a goal has no heading; the difference of headings is computed and dropped
         values = relative_pose(poses[conditioned], Poses(goal, torch.zeros_like(goal[..., 0])), seam_rad=seam_rad)
-        return conditioned, self(values[:, 0, :2])
+        return conditioned, torch.where(has_goal[conditioned, None], self(values[:, 0, :2]), 0.0)
 
 
 class GoalEdgeEmbedding(nn.Embedding):
@@ -212,16 +220,18 @@ class GoalLogitBias(nn.Module):
             class_id: of the agents.
             vocabulary: of the tokens.
         """
-        place = dist.mask.nonzero(as_tuple=True)
-        conditioned = goals.goal_mask[place[:3]].nonzero()[:, 0]  # [g] of the R rows of dist
+        place = row_places(dist.mask, len(dist.logits) == dist.mask.numel())
+        has_goal = goals.goal_mask[place[:3]]
+        conditioned = rows_where(has_goal)  # [g] of the R rows of dist
         rows = tuple(index[conditioned] for index in place)
         here = poses[rows]
         goal = rotate(goals.position[rows[:3]] - here.position, -here.heading)  # [g, 2], agent's frame
         row_class = class_id[rows[0], rows[2]]
         # a token's displacement is the mean of the four corners of its last box
         bias = self(goal, num_left[rows], row_class, vocabulary.end_corners().mean(-2))  # [g, V]
-        bias = bias.masked_fill(~vocabulary.token_mask[row_class], 0.0)  # tokens of other classes stay impossible
-        return TokenDistribution(dist.logits.index_add(0, conditioned, bias), dist.mask)
+        # tokens of other classes stay impossible
+        is_biased = vocabulary.token_mask[row_class] & has_goal[conditioned, None]
+        return TokenDistribution(dist.logits.index_add(0, conditioned, bias.masked_fill(~is_biased, 0.0)), dist.mask)
 
 
 @torch.no_grad()
@@ -241,23 +251,33 @@ def suitability(
     """
     features = goal.new_empty(len(goal), 3, moves.shape[1])
     left_s = (num_left[:, None] - 1).to(goal.dtype) * TOKEN_S  # [g, 1]
-    size = ROWS_PER_BLOCK.get(goal.device.type, ROWS_PER_BLOCK_ELSEWHERE)
-    for own in range(len(moves)):
-        x, y = moves[own].unbind(-1)  # [V]
-        speed = moves[own].norm(dim=-1) / TOKEN_S
-        # in blocks, and in place where possible: at 2048 tokens these [r, V] tensors dominate a rollout's time
-        for rows in (class_id == own).nonzero()[:, 0].split(size):
-            (goal_x, goal_y), time_s = goal[rows].split(1, dim=-1), left_s[rows]  # [r, 1]
-            rest = _length_in_place(goal_x - x, goal_y - y)  # [r, V] distance to the goal after the token
-            reach = 1 + time_s / TOKEN_S
-            miss = _length_in_place(
-                torch.addcmul(goal_x, reach, x, value=-1), torch.addcmul(goal_y, reach, y, value=-1)
-            )
-            progress = _length_in_place(goal_x.clone(), goal_y.clone()) - rest
-            pace = torch.addcmul(rest, time_s, speed, value=-1)
-            found = progress, _misfit_in_place(pace.div_(1 + time_s)), _misfit_in_place(miss.div_(1 + time_s))
-            features[rows] = torch.stack(found, dim=1)
+    # in blocks, and in place where possible: at 2048 tokens these [r, V] tensors dominate a rollout's time
+    for rows, move in _row_blocks(class_id, moves):
+        x, y = move.unbind(-1)  # [V] or [r, V]
+        speed = move.norm(dim=-1) / TOKEN_S
+        (goal_x, goal_y), time_s = goal[rows].split(1, dim=-1), left_s[rows]  # [r, 1]
+        rest = _length_in_place(goal_x - x, goal_y - y)  # [r, V] distance to the goal after the token
+        reach = 1 + time_s / TOKEN_S
+        miss = _length_in_place(torch.addcmul(goal_x, reach, x, value=-1), torch.addcmul(goal_y, reach, y, value=-1))
+        progress = _length_in_place(goal_x.clone(), goal_y.clone()) - rest
+        pace = torch.addcmul(rest, time_s, speed, value=-1)
+        found = progress, _misfit_in_place(pace.div_(1 + time_s)), _misfit_in_place(miss.div_(1 + time_s))
+        features[rows] = torch.stack(found, dim=1)
     return features
+
+
+def _row_blocks(
+    class_id: Int64[Tensor, "g"], moves: Float[Tensor, "C V 2"]
+) -> Iterator[tuple[Int64[Tensor, "r"] | slice, Float[Tensor, "*r V 2"]]]:
+    """Yield some rows and the moves of their class: on the CPU class by class, elsewhere without looking at classes."""
+    if class_id.device.type == "cpu":
+        for own, move in enumerate(moves):
+            for rows in (class_id == own).nonzero()[:, 0].split(ROWS_PER_BLOCK):
+                yield rows, move
+        return
+    for start in range(0, len(class_id), ROWS_PER_BLOCK_ELSEWHERE):
+        rows = slice(start, start + ROWS_PER_BLOCK_ELSEWHERE)
+        yield rows, moves[class_id[rows]]
 
 
 def _length_in_place(x: Tensor, y: Tensor) -> Tensor:

@@ -3,6 +3,7 @@
 import torch
 from jaxtyping import Float, Int64
 from torch import Tensor, nn
+from torch.nn import functional
 
 from rlftsim.policies.smart.embeddings import MlpLayer
 from rlftsim.policies.token_rows import NEVER
@@ -24,6 +25,13 @@ class ClassHeads(nn.ModuleList):
             class_id: of the agents.
         """
         logits = torch.full((len(features), self.num_tokens), NEVER, device=features.device)
+        if features.device.type != "cpu":
+            # each head sees all rows: to leave some out, the host would wait for their number
+            for index, (head, size) in enumerate(zip(self, self.class_sizes)):
+                own = functional.pad(head(features).float(), (0, self.num_tokens - size), value=NEVER)
+                # those of padding, whose class has no head, are arbitrary
+                logits = torch.where((class_id >= index)[:, None], own, logits)
+            return logits
         for index, (head, size) in enumerate(zip(self, self.class_sizes)):
             # each head sees the rows of its class only
             rows = (class_id == index).nonzero()[:, 0]

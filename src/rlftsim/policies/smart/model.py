@@ -21,12 +21,14 @@ from rlftsim.policies.smart.config import GoalEncoding, SmartConfig
 from rlftsim.policies.smart.embeddings import normalize
 from rlftsim.policies.smart.goal_conditioning import GoalEmbedding
 from rlftsim.policies.smart.heads import ClassHeads
-from rlftsim.policies.smart.network import Scene, SmartNetwork
+from rlftsim.policies.smart.neighbors import most_within
+from rlftsim.policies.smart.network import Scene, SmartNetwork, nowhere_unless
 from rlftsim.policies.smart.token_steps import TokenSteps, logged_steps
 from rlftsim.policies.token_rows import NEVER, TokenRows
+from rlftsim.rollout.rows import row_places
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.tokens.agent_tokens import AgentTokens, tokenize_agents
-from rlftsim.tokens.map_tokens import tokenize_map
+from rlftsim.tokens.map_tokens import MapTokens, tokenize_map
 from rlftsim.tokens.vocabulary import Vocabulary, class_of_type
 
 VOCABULARY = "vocabulary.safetensors"
@@ -81,7 +83,9 @@ class SmartModel(nn.Module):
         pairs = list(zip(self.network.seeing_weights(), other.network.seeing_weights(), strict=True))
         if any(weight.requires_grad for pair in pairs for weight in pair):
             return False
-        return all(own is others or torch.equal(own, others) for own, others in pairs)
+        # one answer, which the host waits for once
+        differs = [(own != others).any() for own, others in pairs if own is not others]
+        return not differs or not torch.stack(differs).any()
 
     # ---- goals ----------------------------------------------------------------------------------------------------
 
@@ -186,7 +190,14 @@ class SmartModel(nn.Module):
             agent_features=decoder.embed_agents(class_id, scenarios.size),
             token_features=decoder.embed_tokens(self.vocabulary.end_corners()),
             relations=decoder.relations(),
+            most_map_tokens=self._most_map_tokens(tokens),
         )
+
+    def _most_map_tokens(self, tokens: MapTokens) -> int | None:
+        """See `Scene.most_map_tokens`. Off the CPU the host waits for it once, and not at every decision."""
+        if self.config.max_agent_map_neighbors is not None or tokens.position.device.type == "cpu":
+            return None
+        return most_within(nowhere_unless(tokens.token_mask, tokens.position), self.config.agent_map_radius_m)
 
     def _tokenize(self, scenarios: ScenarioBatch) -> AgentTokens:
         return tokenize_agents(scenarios, self.vocabulary, catk_compat=self.config.catk_compat)
@@ -195,12 +206,12 @@ class SmartModel(nn.Module):
         return logged_steps(tokens, steps, catk_compat=self.config.catk_compat)
 
     def _predict(
-        self, features: Float[Tensor, "R D"], object_type: Int64[Tensor, "B A"], mask: Bool[Tensor, "B N A *L"]
+        self, features: Float[Tensor, "R D"], token_class: Int64[Tensor, "B A"], mask: Bool[Tensor, "B N A *L"]
     ) -> CategoricalDistribution:
         """Distributions of the elements of a mask; tokens that a class lacks get the logit `NEVER`."""
-        place = mask.nonzero(as_tuple=True)
-        class_id = class_of_type(object_type)[place[0], place[2]]  # [R]
-        head, exists = self.network.decoder.head, self.vocabulary.token_mask
+        place = row_places(mask, has_all=len(features) == mask.numel())
+        class_id = token_class[place[0], place[2]]  # [R]
+        head, exists = self.network.decoder.head, self.vocabulary.class_tokens
         if isinstance(head, ClassHeads):
             return TokenDistribution(head(features, class_id).masked_fill(~exists[class_id], NEVER), mask)
         *first, last = head

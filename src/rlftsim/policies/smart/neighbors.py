@@ -14,17 +14,22 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
+from torch.nn import functional
 
 from rlftsim.geometry import angle_between, heading_vector, wrap_angle
 
 PAIRS_PER_BLOCK = {"cpu": 1 << 18}
 """Distances that are computed together: on a processor they fit its cache."""
 PAIRS_PER_BLOCK_ELSEWHERE = 1 << 26
+WIDTH_STEP = 8
+"""Off the CPU widths of lists are multiples of it: fused attention wants masks that are aligned."""
 MANY_CANDIDATES, ROWS_PER_PATCH = 256, 64
 """On a processor, rows that choose among so many candidates are sorted by where they are, and so many rows beside
 each other look only at what lies around them."""
 MARGIN_M = 0.01
 """Added to the bounds of a patch, so that rounding excludes no candidate that is within the radius."""
+CELLS_PER_RADIUS, CELLS_PER_SIDE = 8, 256
+"""Cells of the grid on which candidates are counted to bound the number of neighbors."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +60,7 @@ def within(
     *,
     radius_m: float,
     limit: int | None,
+    most: int | None = None,
 ) -> Neighbors:
     """Candidates nearer than a radius (strictly), or the nearest of them where a limit binds.
 
@@ -67,16 +73,16 @@ def within(
         own: the candidate of its place that is the row itself, and is no neighbor; None = rows are no candidates.
         radius_m: of the circle around a row.
         limit: most neighbors of a row; None = all.
+        most: no row has more candidates within the radius, see `most_within`. Off the CPU lists are then as wide, and
+            the host need not wait for their width.
     """
-    on_processor, (_, num_candidates, _) = position.device.type == "cpu", candidates.shape
-    cut = _patches if on_processor and num_candidates >= MANY_CANDIDATES else _blocks
+    if position.device.type != "cpu":
+        return _within_fixed(position, place, candidates, own, radius_m, limit, most)
+    _, num_candidates, _ = candidates.shape
+    cut = _patches if num_candidates >= MANY_CANDIDATES else _blocks
     found = []
     for view in cut(position, place, candidates, radius_m):
-        # plain differences: torch.cdist goes through a matrix product, which loses digits far from the origin
-        squared = (view.x - position[view.rows, :1]).square_()  # [r, c]
-        squared += (view.y - position[view.rows, 1:]).square_()
-        if own is not None:
-            squared.masked_fill_(view.columns == own[view.rows, None], torch.inf)
+        squared = _squared_distances(view, position, own)
         near = _all_near(squared, radius_m) if limit is None else _nearest(squared, radius_m, limit)
         found.append((view.rows, view.columns[near.index] if len(view.columns) else near.index, near.mask))
     # lists of all views, padded to the longest [R, K]
@@ -88,6 +94,57 @@ def within(
     return Neighbors(index + place[:, None] * num_candidates, is_near)
 
 
+def _within_fixed(
+    position: Float[Tensor, "R 2"],
+    place: Int64[Tensor, "R"],
+    candidates: Float[Tensor, "P C 2"],
+    own: Int64[Tensor, "R"] | None,
+    radius_m: float,
+    limit: int | None,
+    most: int | None,
+) -> Neighbors:
+    """`within` in lists of a width that depends on no position, if `limit` or `most` is given."""
+    found = []
+    for view in _blocks(position, place, candidates, radius_m):
+        squared = _squared_distances(view, position, own)
+        if limit is not None:
+            near = _nearest(squared, radius_m, limit)
+        else:
+            near = _first_near(squared, radius_m, most)
+        found.append((near.index, near.mask))
+    index, mask = (torch.cat(values) if len(values) > 1 else values[0] for values in zip(*found))
+    index = index.masked_fill(~mask, 0) + place[:, None] * candidates.shape[1]
+    padding = (0, -mask.shape[1] % WIDTH_STEP)
+    return (
+        Neighbors(functional.pad(index, padding), functional.pad(mask, padding))
+        if padding[1]
+        else Neighbors(index, mask)
+    )
+
+
+def most_within(candidates: Float[Tensor, "P C 2"], radius_m: float) -> int:
+    """A number that no point has more candidates of a place than within the radius: the most in a disc of cells.
+
+    It exceeds the largest number by about a third, where candidates lie everywhere.
+
+    Args:
+        candidates: positions, infinite for padding.
+        radius_m: of the circle around a point.
+    """
+    # 1. Candidates of each cell. Cells repeat after CELLS_PER_SIDE, which can only raise a sum.
+    cell_m = radius_m / CELLS_PER_RADIUS
+    exists = candidates.isfinite().all(-1)  # [P, C]
+    cell = (torch.where(exists[..., None], candidates, 0.0) / cell_m).floor().long() % CELLS_PER_SIDE
+    counts = candidates.new_zeros(len(candidates), CELLS_PER_SIDE**2)
+    counts.scatter_add_(1, cell[..., 0] * CELLS_PER_SIDE + cell[..., 1], exists.to(counts.dtype))
+    # 2. Sums over the cells that the circle around a point of the middle one may touch.
+    farthest, reach = CELLS_PER_RADIUS + 1, CELLS_PER_RADIUS * (1 + MARGIN_M / radius_m)
+    gap = (torch.arange(-farthest, farthest + 1, device=counts.device).abs() - 1).clamp(min=0)  # in cells, between two
+    disc = (gap[:, None].square() + gap.square() < reach**2).to(counts.dtype)
+    padded = functional.pad(counts.view(-1, 1, CELLS_PER_SIDE, CELLS_PER_SIDE), (farthest,) * 4, mode="circular")
+    return int(functional.conv2d(padded, disc[None, None]).max())
+
+
 @dataclass(frozen=True, eq=False)
 class View:
     """Rows that are searched together, and their candidates: positions [r, c], or [1, c] if shared by all rows."""
@@ -96,6 +153,18 @@ class View:
     columns: Int64[Tensor, "c"]
     x: Float[Tensor, "_ c"]
     y: Float[Tensor, "_ c"]
+
+
+def _squared_distances(
+    view: View, position: Float[Tensor, "R 2"], own: Int64[Tensor, "R"] | None
+) -> Float[Tensor, "r c"]:
+    """Squared distances of a view's rows to its candidates, infinite to a row's own."""
+    # plain differences: torch.cdist goes through a matrix product, which loses digits far from the origin
+    squared = (view.x - position[view.rows, :1]).square_()
+    squared += (view.y - position[view.rows, 1:]).square_()
+    if own is not None:
+        squared.masked_fill_(view.columns == own[view.rows, None], torch.inf)
+    return squared
 
 
 def _blocks(
@@ -155,6 +224,20 @@ def _all_near(squared: Float[Tensor, "r C"], radius_m: float) -> Neighbors:
     entry = (count.cumsum(0) - count + columns).clamp(max=max(len(column) - 1, 0))
     index = column[entry] if len(column) else torch.zeros_like(entry)
     return Neighbors(index.masked_fill_(~mask, 0), mask)
+
+
+def _first_near(squared: Float[Tensor, "r C"], radius_m: float, most: int | None) -> Neighbors:
+    """As `_all_near`, in lists of `most` entries; the host waits only where that is not known."""
+    near = squared < radius_m**2
+    columns = torch.arange(squared.shape[1], device=near.device).expand(near.shape)
+    most = int(near.sum(-1).max()) if most is None else most
+    if most >= squared.shape[1]:
+        return Neighbors(columns, near)
+    place = near.cumsum(-1)
+    # the first neighbor goes to the first entry, and so on; all others to one more entry, which is cut off
+    index = columns.new_zeros(len(near), most + 1)
+    index.scatter_(1, torch.where(near, place - 1, most), columns)
+    return Neighbors(index[:, :most], columns[:, :most] < place[:, -1:])
 
 
 def relative_pose(row: Poses, other: Poses, *, seam_rad: float) -> Float[Tensor, "R K 3"]:

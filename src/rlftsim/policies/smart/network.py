@@ -4,16 +4,29 @@ B scenarios, N rollouts, A agents, K token steps of a block, P of the past, M ma
 tokens. Everything that attends is a *row*: one valid (scenario, rollout, agent, step), flattened, R in all. The
 decoder works on a block of steps given the past. So the history (once per scenario), a single step of a rollout and
 all steps of a scoring pass go through the same code.
+
+In closed loop off the CPU all elements of a block are rows, padding too. Then no shape depends on a value: the host
+never waits inside a decision, and all decisions of a rollout are one CUDA graph.
 """
 
+import itertools
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
+from torch.nn import functional
 
 from rlftsim.geometry import angle_between, heading_vector
-from rlftsim.policies.smart.attention import GoalEdges, Neighborhoods, RelationAttention, build_neighborhoods
+from rlftsim.policies.smart.attention import (
+    AttentionMaps,
+    GoalEdges,
+    Neighborhoods,
+    RelationAttention,
+    build_neighborhoods,
+)
 from rlftsim.policies.smart.config import SmartConfig
 from rlftsim.policies.smart.embeddings import (
     FourierEmbedding,
@@ -31,10 +44,12 @@ from rlftsim.policies.smart.goal_conditioning import (
     GoalEmbedding,
     GoalLogitBias,
     goal_encoder,
+    rows_where,
 )
 from rlftsim.policies.smart.heads import ClassHeads
 from rlftsim.policies.smart.neighbors import Neighbors, Poses, relative_pose, within
 from rlftsim.policies.smart.token_steps import TokenSteps
+from rlftsim.rollout.rows import place_rows, row_places
 from rlftsim.tokens.map_tokens import NUM_KINDS, NUM_LIGHTS, NUM_TYPES, MapTokens
 from rlftsim.tokens.vocabulary import CLASS_NAMES
 
@@ -57,6 +72,8 @@ class Scene:
     token_features: Float[Tensor, "C V D"]
     """Embedding of every motion token."""
     relations: "Relations"
+    most_map_tokens: int | None
+    """No agent has more map tokens within reach, wherever it goes. None on the CPU, which counts them at every step."""
 
     @property
     def map_poses(self) -> Poses:
@@ -107,6 +124,21 @@ class Past:
     def without_last_step(self) -> "Past":
         """The past before its last step. Rows of the sources that are no longer referred to stay."""
         return Past(self.position[..., :-1, :], self.heading[..., :-1], self.row[..., :-1], self.sources)
+
+    def last(self, num_steps: int) -> "Past":
+        """The last steps, with padding where there are fewer, and as many sources for every agent.
+
+        So a past that grows at every decision keeps its shapes.
+        """
+        ahead = num_steps - self.row.shape[-1]  # steps to add in front, or minus those to drop
+        row = functional.pad(self.row, (ahead, 0), value=-1)
+        kept = row.flatten().clamp(min=0)
+        return Past(
+            functional.pad(self.position, (0, 0, ahead, 0)),
+            functional.pad(self.heading, (ahead, 0)),
+            torch.where(row >= 0, torch.arange(len(kept), device=row.device).view_as(row), -1),
+            tuple(source.index_select(0, kept) for source in self.sources),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,12 +264,19 @@ class AgentDecoder(nn.Module):
         """Embedding of every motion token of every class."""
         return torch.stack([embed(table.flatten(1)) for embed, table in zip(self.tokens, end_corners)])
 
+    def fold(self) -> tuple[AttentionMaps, ...]:
+        """Maps of the layers' attention, in the order in which the layers are applied."""
+        layers = zip(self.time_layers, self.map_layers, self.agent_layers)
+        return tuple(layer.fold() for block in layers for layer in block)
+
     def look(
         self,
         scene: Scene,
         steps: TokenSteps,
         past: Past | None,
         hidden: Bool[Tensor, "B N A K"] | None = None,
+        *,
+        padded: bool = False,
     ) -> View:
         """The rows of a block and everything around them, which the layers only read.
 
@@ -248,12 +287,13 @@ class AgentDecoder(nn.Module):
             steps: the block.
             past: of earlier blocks; None = the block begins the scenario.
             hidden: True = the pair takes no part in the attention over time.
+            padded: padding has rows, too, which nothing attends to, and lists of neighbors have fixed widths.
         """
         # 1. rows, and the row of each element of the block (-1 = none)
-        rows = steps.valid.nonzero(as_tuple=True)
+        rows = row_places(steps.valid, padded)
         first_row = 0 if past is None else past.sources[0].shape[0]
-        row_of = torch.full(steps.valid.shape, -1, device=steps.valid.device)  # [B, N, A, K]
-        row_of[rows] = torch.arange(len(rows[0]), device=row_of.device)
+        index = torch.arange(len(rows[0]), device=steps.valid.device)
+        row_of = torch.where(steps.valid, place_rows(index, steps.valid), -1)  # [B, N, A, K]
         new_row = torch.where(row_of >= 0, row_of + first_row, -1)
         new_past = Past(steps.position, steps.heading, new_row, ()) if past is None else past.then(steps, new_row)
         # 2. their neighbors, which all layers share
@@ -261,17 +301,20 @@ class AgentDecoder(nn.Module):
         near_map = within(
             poses.position, rows[0], nowhere_unless(scene.map_mask, scene.map_position), None,
             radius_m=self.config.agent_map_radius_m, limit=self.config.max_agent_map_neighbors,
+            most=scene.most_map_tokens,
         )  # fmt: skip
+        build = partial(build_neighborhoods, dim=self.config.dim, padded=padded)
         return View(
             rows=rows,
             poses=poses,
             past=new_past,
-            own_history=self._own_history(scene, new_past, steps, rows, poses, hidden),
-            map_tokens=self._neighborhoods(
-                scene.relations.map, poses, scene.map_poses, near_map, features=scene.map_features
+            own_history=self._own_history(scene, new_past, steps, rows, poses, hidden, build),
+            map_tokens=build(
+                scene.relations.map, self._relative(poses, scene.map_poses, near_map), near_map.index, near_map.mask,
+                features=scene.map_features,
             ),
-            agents=self._agent_neighbors(scene, steps, rows, poses, row_of),
-        )
+            agents=self._agent_neighbors(scene, steps, rows, poses, row_of, build),
+        )  # fmt: skip
 
     def forward(
         self,
@@ -280,6 +323,7 @@ class AgentDecoder(nn.Module):
         past: Past | None,
         view: View | None = None,
         goals: EncodedGoals | None = None,
+        maps: tuple[AttentionMaps, ...] | None = None,
     ) -> tuple[Float[Tensor, "R D"], Past]:
         """Features of the valid (agent, step) pairs of a block, and the new past.
 
@@ -289,6 +333,7 @@ class AgentDecoder(nn.Module):
             past: of earlier blocks; None = the block begins the scenario.
             view: of the block, if it has been looked at already.
             goals: of all agents; None = all agents are goal-free.
+            maps: `fold()` of weights that get no gradient, computed once for many blocks.
 
         Returns:
             Features in the order of `steps.valid.nonzero()`; and the past, followed by the block.
@@ -297,15 +342,15 @@ class AgentDecoder(nn.Module):
         x = self._embed_steps(scene, steps, view.rows, view.poses, goals)
         goal_edges = self._goal_edges(scene, view.rows, view.poses, goals)
         # inputs of the attention over time are kept: later blocks attend to them
-        sources = []
+        sources, folded = [], itertools.repeat(None) if maps is None else iter(maps)
         for index, layers in enumerate(zip(self.time_layers, self.map_layers, self.agent_layers)):
             time_layer, map_layer, agent_layer = layers
             own = normalize(x)
             source = own if past is None else torch.cat([past.sources[index], own])
             sources.append(source)
-            x = time_layer(x, source, view.own_history)
-            x = map_layer(x, None, view.map_tokens, goal_edges=goal_edges)
-            x = agent_layer(x, normalize(x), view.agents)
+            x = time_layer(x, source, view.own_history, maps=next(folded))
+            x = map_layer(x, None, view.map_tokens, goal_edges=goal_edges, maps=next(folded))
+            x = agent_layer(x, normalize(x), view.agents, maps=next(folded))
         return x, replace(view.past, sources=tuple(sources))
 
     def _embed_steps(
@@ -332,6 +377,7 @@ class AgentDecoder(nn.Module):
         rows: tuple[Tensor, ...],
         poses: Poses,
         hidden: Bool[Tensor, "B N A K"] | None,
+        build: Callable[..., Neighborhoods],
     ) -> Neighborhoods:
         """Up to `history_tokens` earlier steps of the same agent."""
         scenario, rollout, agent, step = rows
@@ -350,7 +396,7 @@ class AgentDecoder(nn.Module):
         values = relative_pose(poses, Poses(past.position, past.heading)[place], seam_rad=self.config.seam_rad)
         # the time between, in tokens, is the fourth value of the relation
         values = torch.cat([values, -lag[:, None].expand(len(step), -1, 1).to(values.dtype)], -1)
-        return build_neighborhoods(scene.relations.time, values, row.clamp(min=0), mask, dim=self.config.dim)
+        return build(scene.relations.time, values, row.clamp(min=0), mask)
 
     def _goal_edges(
         self, scene: Scene, rows: tuple[Tensor, ...], poses: Poses, goals: EncodedGoals | None
@@ -359,11 +405,15 @@ class AgentDecoder(nn.Module):
         if goals is None or not isinstance(self.goal, GoalEdgeEmbedding):
             return None
         polyline = goals.polyline[rows[:3]]
-        conditioned = (polyline >= 0).nonzero()[:, 0]  # [g]
-        token = polyline[conditioned]
+        has_goal = polyline >= 0
+        conditioned = rows_where(has_goal)  # [g]
+        token = polyline[conditioned].clamp(min=0)
         values = relative_pose(poses[conditioned], scene.map_poses[token[:, None]], seam_rad=self.config.seam_rad)[:, 0]
         # not the table of the embedding, which ends at the radius of ordinary relations
-        return GoalEdges(conditioned, *self.goal.embed(self.map_relation, values), scene.map_features[token])
+        relation, goal_relation = self.goal.embed(self.map_relation, values)
+        # where all rows are conditioned, those without a goal get a relation that changes nothing
+        goal_relation = torch.where(has_goal[conditioned, None], goal_relation, relation)
+        return GoalEdges(conditioned, relation, goal_relation, scene.map_features[token])
 
     def _agent_neighbors(
         self,
@@ -372,6 +422,7 @@ class AgentDecoder(nn.Module):
         rows: tuple[Tensor, ...],
         poses: Poses,
         row_of: Int64[Tensor, "B N A K"],
+        build: Callable[..., Neighborhoods],
     ) -> Neighborhoods:
         """Other agents of the same scenario, rollout and step within reach."""
         scenario, rollout, agent, step = rows
@@ -380,25 +431,15 @@ class AgentDecoder(nn.Module):
         _, num_rollouts, num_steps, _, _ = candidates.shape
         neighbors = within(
             poses.position, (scenario * num_rollouts + rollout) * num_steps + step, candidates.flatten(0, 2), agent,
-            radius_m=self.config.agent_radius_m, limit=self.config.max_agent_neighbors,
+            radius_m=self.config.agent_radius_m, limit=self.config.max_agent_neighbors, most=candidates.shape[3],
         )  # fmt: skip
         # from places among candidates to rows; padding is clamped to any row, its mask is False
         row = row_of.transpose(2, 3).flatten()[neighbors.index].clamp(min=0)
-        return self._neighborhoods(scene.relations.agent, poses, poses, Neighbors(row, neighbors.mask))
+        neighbors = Neighbors(row, neighbors.mask)
+        return build(scene.relations.agent, self._relative(poses, poses, neighbors), neighbors.index, neighbors.mask)
 
-    def _neighborhoods(
-        self,
-        embedding: RelationEmbedding,
-        poses: Poses,
-        sources: Poses,
-        neighbors: Neighbors,
-        *,
-        features: Float[Tensor, "S D"] | None = None,
-    ) -> Neighborhoods:
-        values = relative_pose(poses, sources[neighbors.index], seam_rad=self.config.seam_rad)
-        return build_neighborhoods(
-            embedding, values, neighbors.index, neighbors.mask, dim=self.config.dim, features=features
-        )
+    def _relative(self, poses: Poses, sources: Poses, neighbors: Neighbors) -> Float[Tensor, "R K 3"]:
+        return relative_pose(poses, sources[neighbors.index], seam_rad=self.config.seam_rad)
 
 
 class SmartNetwork(nn.Module):

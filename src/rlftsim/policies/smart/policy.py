@@ -21,10 +21,11 @@ from rlftsim.policies.smart.network import nowhere_unless
 from rlftsim.policies.smart.state import Replay, SmartContext, SmartState, TeacherForced
 from rlftsim.policies.smart.token_steps import TokenSteps, match_imposed, place_tokens
 from rlftsim.rollout.policy import DecisionDistribution
+from rlftsim.rollout.rows import pick_rows, place_rows
 from rlftsim.rollout.types import AgentStates, Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.tokens.agent_tokens import HISTORY_TOKENS
-from rlftsim.tokens.vocabulary import STEPS_PER_TOKEN, class_of_type
+from rlftsim.tokens.vocabulary import PADDING_CLASS, STEPS_PER_TOKEN, class_of_type
 
 
 class SmartPolicy(SmartModel):
@@ -52,10 +53,11 @@ class SmartPolicy(SmartModel):
             history=history,
             view=view,
             past=past,
-            features=_to_dense(rows, history.valid)[:, 0, :, -1],
+            features=place_rows(rows, history.valid)[:, 0, :, -1],
             position=tokens.position[:, :, HISTORY_TOKENS - 1],
             heading=tokens.heading[:, :, HISTORY_TOKENS - 1],
             object_type=scenarios.object_type,
+            token_class=torch.where(scenarios.agent_mask, scene.class_id, PADDING_CLASS),
             agent_mask=scenarios.agent_mask,
             model=self,
         )
@@ -95,7 +97,9 @@ class SmartPolicy(SmartModel):
         """
         mask = context.agent_mask[:, None].expand(state.heading.shape)
         num_left = torch.full_like(state.heading, NUM_DECISIONS - state.num_decisions, dtype=torch.int64)
-        features = self._features(context, state)[mask]
+        if context.is_padded:
+            mask = torch.ones_like(mask)
+        features = pick_rows(self._features(context, state), mask, has_all=context.is_padded)
         dist = self._distribution(context, state, features, mask, Poses(state.position, state.heading), num_left)
         return TokenDistribution(dist.logits, mask)
 
@@ -170,7 +174,7 @@ class SmartPolicy(SmartModel):
         if state.pending is not None:
             past = replace(state.past, sources=context.past.sources)
             rows, _ = self.network.decoder(context.scene, state.pending, past, replay.view, state.goals)
-            parts.append(_to_dense(rows, state.pending.valid))
+            parts.append(place_rows(rows, state.pending.valid))
         features = torch.cat(parts, 3)
         # 2. distributions of the agents; padding is left out
         mask = context.agent_mask[:, None, :, None].expand(features.shape[:4])
@@ -193,7 +197,7 @@ class SmartPolicy(SmartModel):
         if not isinstance(context, SmartContext) or not self.sees_as(context.model):
             return self.encode(scenarios)
         rows, past = self.network.decoder(context.scene, context.history, None, context.view)
-        features = _to_dense(rows, context.history.valid)[:, 0, :, -1]
+        features = place_rows(rows, context.history.valid)[:, 0, :, -1]
         return replace(context, past=past, features=features, model=self)
 
     def score_both(
@@ -239,8 +243,9 @@ class SmartPolicy(SmartModel):
         decides = steps.valid.clone()  # [B, 1, A, K]
         decides[..., : HISTORY_TOKENS - 1] = False
         counts = (tokens.valid[..., 1:] & trained[..., None])[:, None][decides]
-        logits = self._predict(rows[decides[steps.valid]], scenarios.object_type, decides).logits
-        class_id = class_of_type(scenarios.object_type)[:, None, :, None].expand(decides.shape)[decides]
+        class_id = class_of_type(scenarios.object_type)
+        logits = self._predict(rows[decides[steps.valid]], class_id, decides).logits
+        class_id = class_id[:, None, :, None].expand(decides.shape)[decides]
         return TeacherForced(logits, tokens.next_token_id[:, None, :, :-1][decides], counts, class_id)
 
     # ---- parts ----------------------------------------------------------------------------------------------------
@@ -249,11 +254,15 @@ class SmartPolicy(SmartModel):
         """Decoder features at the state's last step, from its cache after the first call."""
         cache = state.cache
         if cache.features is None:
+            decoder, past = self.network.decoder, state.past
             if state.pending is None:
-                cache.features, cache.past = context.features[:, None].expand(*state.heading.shape, -1), state.past
+                cache.features, cache.past = context.features[:, None].expand(*state.heading.shape, -1), past
             else:
-                rows, cache.past = self.network.decoder(context.scene, state.pending, state.past, goals=state.goals)
-                cache.features = _to_dense(rows, state.pending.valid)[..., -1, :]
+                past = past.last(self.config.history_tokens) if context.is_padded else past
+                view = decoder.look(context.scene, state.pending, past, padded=context.is_padded)
+                maps = None if torch.is_grad_enabled() else context.maps
+                rows, cache.past = decoder(context.scene, state.pending, past, view, state.goals, maps)
+                cache.features = place_rows(rows, state.pending.valid)[..., -1, :]
         return cache.features
 
     def _distribution(
@@ -266,13 +275,8 @@ class SmartPolicy(SmartModel):
         num_left: Int64[Tensor, "*batch"],
     ) -> CategoricalDistribution:
         """Distributions of the elements of a mask. Poses before each decision are needed where agents have goals."""
-        dist = self._predict(features, context.object_type, mask)
+        dist = self._predict(features, context.token_class, mask)
         bias = self.network.decoder.aim
         if bias is None or state.goals is None or poses is None:
             return dist
         return bias.apply_to(dist, state.goals, poses, num_left, class_of_type(context.object_type), self.vocabulary)
-
-
-def _to_dense(rows: Float[Tensor, "R D"], valid: Bool[Tensor, "*batch"]) -> Float[Tensor, "*batch D"]:
-    """Rows at the places of a mask, zeros elsewhere."""
-    return rows.new_zeros(*valid.shape, rows.shape[-1]).masked_scatter(valid[..., None], rows)

@@ -4,10 +4,12 @@ B scenarios, N rollouts, A agents, D width, R selected elements, V tokens. Map f
 """
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 
+from rlftsim.policies.smart.attention import AttentionMaps
 from rlftsim.policies.smart.goal_conditioning import EncodedGoals
 from rlftsim.policies.smart.network import Past, Scene, View
 from rlftsim.policies.smart.token_steps import TokenSteps
@@ -30,9 +32,21 @@ class SmartContext:
     """End of the last history token, which is near the logged position, not at it."""
     heading: Float[Tensor, "B A"]
     object_type: Int64[Tensor, "B A"]
+    token_class: Int64[Tensor, "B A"]
+    """Class that an agent's token ids refer to."""
     agent_mask: Bool[Tensor, "B A"]
     model: nn.Module
     """The model that made it."""
+
+    @cached_property
+    def maps(self) -> tuple[AttentionMaps, ...]:
+        """Maps of the decoder's attention, folded once for all decisions."""
+        return self.model.network.decoder.fold()  # type: ignore[union-attr, operator]
+
+    @property
+    def is_padded(self) -> bool:
+        """True off the CPU: in closed loop padding is simulated, too. To leave it out, the host would wait for it."""
+        return self.agent_mask.device.type != "cpu"
 
 
 @dataclass(eq=False)
