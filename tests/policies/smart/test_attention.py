@@ -65,14 +65,15 @@ def plain_message(layer, embedding, values, neighbors, mask, x, sources):
 
 @pytest.mark.parametrize("sources_are_shared", [True, False])
 @pytest.mark.parametrize("floats_per_block", [1 << 19, 1 << 10])
+@pytest.mark.parametrize("padded", [True, False])
 def test_messages_and_gradients_are_those_of_plain_attention(
-    floats_per_block, sources_are_shared, attention, embedding, scene, monkeypatch
+    padded, floats_per_block, sources_are_shared, attention, embedding, scene, monkeypatch
 ):
     monkeypatch.setitem(module.FLOATS_PER_BLOCK, "cpu", floats_per_block)
     values, neighbors, mask, x, sources = scene
     shared, own = (normalize(sources), None) if sources_are_shared else (None, normalize(sources))
-    around = build_neighborhoods(embedding, values, neighbors, mask, dim=DIM, features=shared)
-    ours = attention._message(attention.target_norm(x), own, around)
+    around = build_neighborhoods(embedding, values, neighbors, mask, dim=DIM, padded=padded, features=shared)
+    ours = attention._message(attention.target_norm(x), own, around, attention.fold())
     plain = plain_message(attention, embedding, values, neighbors, mask, x, sources)
     assert (ours - plain).abs().max() < 1e-10
     assert (ours[:3] == 0).all()  # nobody around
@@ -187,7 +188,7 @@ def test_messages_without_gradient_are_those_with_one(is_tabulated, sources_are_
 
     def message():
         around = build_neighborhoods(embedding, values, neighbors, mask, dim=DIM, features=shared)
-        return attention._message(attention.target_norm(x), own, around)
+        return attention._message(attention.target_norm(x), own, around, attention.fold())
 
     with torch.no_grad():
         found = message()
@@ -206,7 +207,7 @@ def test_a_frozen_embedding_may_have_been_tabulated_without_gradient(attention, 
         embedding.requires_grad_(not frozen)
         around = build_neighborhoods(table, values, neighbors, mask, dim=DIM)
         assert around.blocks[0].edge_features.requires_grad != frozen
-        message = attention._message(attention.target_norm(x), normalize(sources), around)
+        message = attention._message(attention.target_norm(x), normalize(sources), around, attention.fold())
         gradients.append(torch.autograd.grad(message.square().sum(), (x, sources, attention.query.weight)))
     for a, b in zip(*gradients):
         assert (a - b).abs().max() < 1e-10
