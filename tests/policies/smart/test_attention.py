@@ -18,6 +18,7 @@ from rlftsim.policies.smart.attention import (
     gather_edges,
 )
 from rlftsim.policies.smart.embeddings import FourierEmbedding, Grid, TabulatedEmbedding, initialize, normalize
+from rlftsim.policies.smart.neighbors import RowGroups
 
 DIM, NUM_HEADS, HEAD_DIM, NUM_ROWS, NUM_SOURCES = 16, 2, 4, 60, 40
 
@@ -80,6 +81,34 @@ def test_messages_and_gradients_are_those_of_plain_attention(
     trained = [x, sources, *embedding.parameters(), attention.source_key.weight, attention.relation_value.bias]
     for a, b in zip(*(torch.autograd.grad(m.square().sum(), trained) for m in (ours, plain))):
         assert (a - b).abs().max() < 1e-10
+
+
+@pytest.mark.parametrize("sources_are_shared", [True, False])
+@pytest.mark.parametrize("floats_per_block", [1 << 19, 1 << 10])
+def test_rows_that_share_a_list_get_what_lists_of_their_own_give(
+    floats_per_block, sources_are_shared, attention, embedding, scene, monkeypatch
+):
+    monkeypatch.setitem(module.FLOATS_PER_BLOCK, "cpu", floats_per_block)
+    values, neighbors, mask, _, sources = scene
+    generator = torch.Generator().manual_seed(6)
+    sizes = torch.randint(1, 8, (NUM_ROWS,), generator=generator)
+    groups = RowGroups(torch.randperm(int(sizes.sum()), generator=generator), sizes.numpy())
+    list_of = torch.empty_like(groups.rows)
+    list_of[groups.rows] = torch.arange(NUM_ROWS).repeat_interleave(sizes)  # list of each row
+    x = torch.randn(len(list_of), DIM, generator=generator, dtype=torch.float64, requires_grad=True)
+    shared, own = (normalize(sources), None) if sources_are_shared else (None, normalize(sources))
+    together = build_neighborhoods(embedding, values, neighbors, mask, dim=DIM, features=shared, groups=groups)
+    alone = build_neighborhoods(embedding, values[list_of], neighbors[list_of], mask[list_of], dim=DIM, features=shared)
+    num_lists = [sum(len(block.neighbors) for block in around.blocks) for around in (together, alone)]
+    assert num_lists[0] < num_lists[1] / 2
+    trained = [x, sources, *embedding.parameters(), attention.source_key.weight, attention.relation_value.bias]
+    messages = [attention._message(attention.target_norm(x), own, a, attention.fold()) for a in (together, alone)]
+    assert (messages[0] - messages[1]).abs().max() < 1e-10
+    for a, b in zip(*(torch.autograd.grad(m.square().sum(), trained, retain_graph=True) for m in messages)):
+        assert (a - b).abs().max() < 1e-9
+    with torch.no_grad():
+        found = attention._message(attention.target_norm(x), own, together, attention.fold())
+    assert (found - messages[1]).abs().max() < 1e-10
 
 
 @pytest.fixture(params=[True, False], ids=["padded", "full"])

@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pretend_device import DEVICE, PretendDevice
-from rlftsim.policies.smart.neighbors import most_within, within
+from rlftsim.policies.smart.neighbors import Poses, group_rows, most_within, within
 
 PLACES = torch.tensor([[[1.0, 0.0], [1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [3.0, 0.0], [torch.inf, torch.inf]]])
 HERE = torch.zeros(1, 2)
@@ -92,3 +92,16 @@ def test_the_bound_is_not_far_above_what_is_near():
     assert near <= most_within(candidates, 30.0) <= 1.5 * near
     street = torch.stack([side, torch.zeros_like(side)], -1)[None]
     assert most_within(street, 30.0) <= 30
+
+
+def test_rows_share_a_list_if_place_and_pose_are_equal_to_the_last_bit():
+    place = torch.tensor([1, 0, 1, 1, 0, 1])
+    position = torch.tensor([[3.0, 4.0]]).repeat(6, 1)
+    heading = torch.tensor([0.5, 0.5, 0.5, 0.5 + 2.0**-24, 0.5, 0.5])
+    position[5, 0] = torch.nextafter(position[5, 0], torch.tensor(9.0))
+    groups = group_rows(place, Poses(position, heading))
+    found = [rows.tolist() for rows in groups.rows.split(groups.sizes.tolist())]
+    assert sorted(found) == [[0, 2], [1, 4], [3], [5]]
+    assert groups.first.tolist() == [rows[0] for rows in found]
+    nothing = group_rows(place[:0], Poses(position[:0], heading[:0]))
+    assert len(nothing.rows) == len(nothing.sizes) == 0

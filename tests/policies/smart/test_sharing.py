@@ -173,3 +173,21 @@ def test_an_update_is_that_of_a_policy_that_shares_nothing(vocabulary, batch, tr
     for name in ("kl", "entropy", "score_gap", "gradient_norm"):
         assert values[name] == pytest.approx(plain_values[name], rel=1e-5, abs=1e-6), name
     assert values["kl"] > 1e-3
+
+
+def test_agents_that_stand_share_a_list_in_all_rollouts_and_decisions(policy, batch):
+    corners = policy.vocabulary.corners.clone()
+    corners[:, 0] = corners[:, 0, :1]  # token 0 does not move
+    policy.vocabulary = replace(policy.vocabulary, corners=corners)
+    noise = torch.rand(*batch.agent_mask.shape, 1)[:, None].expand(-1, 4, -1, -1)
+    with torch.no_grad():
+        context = policy.encode(batch)
+        state = policy.begin(context, 4, None, noise[..., :0])
+        for _ in range(3):
+            policy.decide(context, state)
+            state = policy.advance(context, state, torch.zeros(state.heading.shape, dtype=torch.long))
+    view = policy.network.decoder.look(context.scene, state.pending, state.past)
+    num_agents = int(batch.agent_mask.sum())
+    assert len(view.rows[0]) == 4 * num_agents
+    assert sum(len(block.neighbors) for block in view.map_tokens.blocks) <= num_agents
+    assert torch.equal(state.heading, context.heading[:, None].expand_as(state.heading))

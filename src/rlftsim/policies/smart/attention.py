@@ -21,6 +21,7 @@ from torch.utils.checkpoint import checkpoint
 
 from rlftsim.policies.smart.dropout import Dropout, draw_dropout
 from rlftsim.policies.smart.embeddings import EPSILON, RelationEmbedding, normalize
+from rlftsim.policies.smart.neighbors import RowGroups
 
 FLOATS_PER_BLOCK = {"cpu": 1 << 19}
 """Floats of the relations that are processed together: on a processor they fit its cache."""
@@ -35,7 +36,7 @@ IMPOSSIBLE = -1e9
 
 @dataclass(frozen=True, eq=False)
 class NeighborBlock:
-    """r rows with similar numbers of neighbors, padded to K."""
+    """r lists of similar numbers of neighbors, padded to K."""
 
     neighbors: Int64[Tensor, "r K"]
     """Rows of the sources; any valid row where the mask is False."""
@@ -44,6 +45,13 @@ class NeighborBlock:
     edge_features: Float[Tensor, "r K W"]
     """Normalized embedding of each row's relation to each neighbor, followed by the neighbor's normalized features
     if W = 2 D. Arbitrary finite numbers for padding."""
+    num_sharing: int = 1
+    """m: so many rows share each list and attend as one row with m H heads."""
+
+    @property
+    def num_rows(self) -> int:
+        """Rows that attend, r m."""
+        return len(self.neighbors) * self.num_sharing
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +78,7 @@ class Neighborhoods:
     @property
     def sizes(self) -> list[int]:
         """Rows of each block."""
-        return [len(block.bias) for block in self.blocks]
+        return [block.num_rows for block in self.blocks]
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,8 +104,9 @@ def build_neighborhoods(
     dim: int,
     padded: bool = False,
     features: Float[Tensor, "S D"] | None = None,
+    groups: RowGroups | None = None,
 ) -> Neighborhoods:
-    """Embed relations and cut the rows into blocks.
+    """Embed relations and cut the lists into blocks.
 
     Args:
         embedding: of the n values of a relation.
@@ -107,29 +116,51 @@ def build_neighborhoods(
         dim: D.
         padded: keep all rows, their order and their width, so that blocks depend on shapes alone.
         features: normalized features of the sources, if they are the same in all layers.
+        groups: rows that share a list; None = each of the R lists is that of a row.
     """
     pairs = FLOATS_PER_BLOCK.get(mask.device.type, FLOATS_PER_BLOCK_ELSEWHERE) // dim
-    rows, has_any = None, None
     if padded:
-        has_any = mask.any(-1)
         size = min(max(pairs // mask.shape[1], 1), MOST_ROWS_PER_BLOCK)
-        parts = zip(*(tensor.split(size) for tensor in (values, neighbors, mask)))
+        rows, has_any = None, mask.any(-1)
+        parts = [(slice(start, start + size), slice(None), 1) for start in range(0, len(mask), size)]
     else:
-        # a row's width is the place of its last neighbor; rows without any are left out
-        columns = torch.arange(1, mask.shape[1] + 1, device=mask.device)
-        width, order = (mask * columns).amax(-1).sort()
-        widths = width.cpu().numpy()
-        empty = int(np.searchsorted(widths, 1))
-        rows, widths = order[empty:], widths[empty:]
-        places = ((rows[cut], slice(widths[cut].max(initial=1))) for cut in _cut(widths, pairs))
-        parts = ((values[place], neighbors[place], mask[place]) for place in places)
+        rows, parts = _sort(mask, pairs, groups)
+        has_any = None
     blocks = []
-    for block_values, index, block_mask in parts:  # [r, K, n], [r, K], [r, K]
-        edge_features = _embed_edges(embedding, block_values, index, features)
-        bias = torch.zeros_like(edge_features[..., 0]).masked_fill_(~block_mask, IMPOSSIBLE)
-        blocks.append(NeighborBlock(index, bias[:, None], edge_features))
+    for lists, kept, num_sharing in parts:
+        index = neighbors[lists, kept]  # [r, K]
+        edge_features = _embed_edges(embedding, values[lists, kept], index, features)
+        bias = torch.zeros_like(edge_features[..., 0]).masked_fill_(~mask[lists, kept], IMPOSSIBLE)
+        blocks.append(NeighborBlock(index, bias[:, None], edge_features, num_sharing))
     is_trained = any(block.edge_features.requires_grad for block in blocks)
     return Neighborhoods(rows, tuple(blocks), EdgeGradients.of(blocks) if is_trained else None, has_any)
+
+
+def _sort(
+    mask: Bool[Tensor, "R K"], pairs: int, groups: RowGroups | None
+) -> tuple[Int64[Tensor, "n"], list[tuple[Int64[Tensor, "_"], slice, int]]]:
+    """Rows that have neighbors, block after block, and each block's lists, width and rows of a list.
+
+    A group whose size is no power of two is taken apart into those that are.
+    """
+    # 1. a list's width is the place of its last neighbor
+    columns = torch.arange(1, mask.shape[1] + 1, device=mask.device)
+    widths = (mask * columns).amax(-1).cpu().numpy()
+    sizes = np.ones_like(widths) if groups is None else groups.sizes
+    starts, rows, parts = sizes.cumsum() - sizes, [], []
+    for power in range(int(sizes.max(initial=1)).bit_length()):
+        # 2. lists of as many rows; those without neighbors are left out
+        count = 1 << power
+        lists = np.flatnonzero((sizes & count > 0) & (widths > 0))
+        lists = lists[widths[lists].argsort(kind="stable")]
+        for cut in _cut(widths[lists], pairs) if len(lists) or not power else ():
+            part = lists[cut]
+            # smaller powers come first in a group
+            rows.append(((starts + (sizes & (count - 1)))[part, None] + np.arange(count)).flatten())
+            width = slice(int(widths[part].max(initial=1)))
+            parts.append((torch.from_numpy(part).to(mask.device), width, count))
+    place = torch.from_numpy(np.concatenate(rows)).to(mask.device)
+    return place if groups is None else groups.rows[place], parts
 
 
 def _embed_edges(
@@ -249,16 +280,15 @@ def gather_edges(
             *sums, total = _GatherEdges.apply(neighborhoods, dropout, token, *tensors)  # type: ignore
         return tuple(sums), total
     # the fused kernel is faster, although relations and sources are copied together for it
-    query = queries[0] if source is None else torch.cat(queries, -1)
     results = []
-    for block_query, block in zip(query.split(neighborhoods.sizes), neighborhoods.blocks):
+    for block_query, block in zip(torch.cat(queries, -1).split(neighborhoods.sizes), neighborhoods.blocks):
         parts = _parts(block.edge_features, block.neighbors, source)
         edges = (parts[0] if source is None else torch.cat(parts, -1))[:, None]  # [r, 1, K, 2D]
         bias = block.bias[:, None]
-        results.append(
-            functional.scaled_dot_product_attention(block_query[:, None], edges, edges, attn_mask=bias, scale=1.0)
-        )
-    gathered = torch.cat(results)[:, 0]  # [n, H, 2D]
+        query = _by_list(block_query, block.num_sharing * block_query.shape[1])[:, None]  # [r, 1, m H, 2D]
+        result = functional.scaled_dot_product_attention(query, edges, edges, attn_mask=bias, scale=1.0)
+        results.append(result.view(block_query.shape))
+    gathered = torch.cat(results)  # [n, H, 2D]
     return gathered.split([q.shape[-1] for q in queries], -1), torch.ones_like(gathered[..., :1])
 
 
@@ -286,14 +316,15 @@ class _GatherEdges(Function):
         for block, block_queries, block_sums, block_total in per_block:
             edges = block.edge_features.detach()
             parts = _parts(edges, block.neighbors, source)
-            scores = block.bias.expand(-1, total.shape[1], -1)
+            num_heads = block.num_sharing * total.shape[1]
+            scores = block.bias.expand(-1, num_heads, -1)
             for part, query in zip(parts, block_queries):
-                scores = torch.baddbmm(scores, query, part.mT)  # [r, H, K]
+                scores = torch.baddbmm(scores, _by_list(query, num_heads), part.mT)  # [r, m H, K]
             softmax = torch.softmax(scores, -1)
             weights = softmax * draw_dropout(softmax, dropout) if dropout else softmax
             for part, result in zip(parts, block_sums):
-                torch.bmm(weights, part, out=result)
-            torch.sum(weights, -1, keepdim=True, out=block_total)
+                torch.bmm(weights, part, out=_by_list(result, num_heads))
+            torch.sum(weights, -1, keepdim=True, out=_by_list(block_total, num_heads))
             saved.append((edges, block.neighbors, softmax, weights))
         # saved in this way, edge features go as soon as the backward pass is through
         ctx.save_for_backward(source, *queries, *itertools.chain(*saved))
@@ -310,33 +341,30 @@ class _GatherEdges(Function):
         _, _, edges_need_grad, source_needs_grad, *_ = ctx.needs_input_grad
         source_grad = torch.zeros_like(source) if source_needs_grad else None
         query_grads = [query.new_empty(query.shape) for query in queries]
-        factors = [torch.cat([grad, query], 1) for grad, query in zip(sum_grads, queries)]  # [n, 2H, W], [n, 2H, D]
-        num_heads = total_grad.shape[1]
-        per_block = zip(
-            zip(*[iter(saved)] * 4), _cut_all(factors, ctx.sizes), _cut_all(query_grads, ctx.sizes),
-            total_grad.split(ctx.sizes),
-        )  # fmt: skip
+        rows_of_blocks = (_cut_all(rows, ctx.sizes) for rows in (sum_grads, queries, query_grads))
+        per_block = zip(zip(*[iter(saved)] * 4), *rows_of_blocks, total_grad.split(ctx.sizes))
         # As in the forward pass: a backward pass may be called under autocast.
         with torch.autocast(ctx.device_type, enabled=False):
-            for index, (stored, block_factors, block_grads, block_total) in enumerate(per_block):
+            for index, (stored, block_sums, block_queries, block_grads, block_total) in enumerate(per_block):
                 edges, neighbors, softmax, weights = stored
-                parts = _parts(edges, neighbors, source)
-                weight_grad = block_total.expand_as(weights)
-                for part, factor in zip(parts, block_factors):
-                    weight_grad = torch.baddbmm(weight_grad, factor[:, :num_heads], part.mT)  # [r, H, K]
+                parts, num_heads = _parts(edges, neighbors, source), weights.shape[1]
+                # factors of gradients of the edges [r, 2 m H, W] and of the sources [r, 2 m H, D]
+                pairs = ([_by_list(rows, num_heads) for rows in pair] for pair in zip(block_sums, block_queries))
+                factors = [torch.cat(pair, 1) for pair in pairs]
+                weight_grad = _by_list(block_total, num_heads).expand_as(weights)
+                for part, factor in zip(parts, factors):
+                    weight_grad = torch.baddbmm(weight_grad, factor[:, :num_heads], part.mT)  # [r, m H, K]
                 score_grad = weight_grad.mul_(weights)
                 score_grad = torch.addcmul(score_grad, softmax, score_grad.sum(-1, keepdim=True), value=-1)
                 for part, result in zip(parts, block_grads):
-                    torch.bmm(score_grad, part, out=result)
-                left = torch.cat([weights, score_grad], 1).mT  # [r, K, 2H]
+                    torch.bmm(score_grad, part, out=_by_list(result, num_heads))
+                left = torch.cat([weights, score_grad], 1).mT  # [r, K, 2 m H]
                 if edges_need_grad:
                     buffer = ctx.buffers[index]
-                    added = (
-                        torch.bmm(left, block_factors[0]) if buffer is None else buffer.baddbmm_(left, block_factors[0])
-                    )
+                    added = torch.bmm(left, factors[0]) if buffer is None else buffer.baddbmm_(left, factors[0])
                     ctx.buffers[index] = added
                 if source_grad is not None:
-                    source_grad.index_add_(0, neighbors.flatten(), (left @ block_factors[1]).flatten(0, 1))
+                    source_grad.index_add_(0, neighbors.flatten(), (left @ factors[1]).flatten(0, 1))
         token_grad = total_grad.new_zeros(()) if edges_need_grad else None
         return None, None, token_grad, source_grad, *query_grads
 
@@ -344,6 +372,11 @@ class _GatherEdges(Function):
 def _parts(edges: Tensor, neighbors: Tensor, source: Tensor | None) -> tuple[Tensor, ...]:
     """Edge features, and the neighbors' features if these are not among them."""
     return (edges,) if source is None else (edges, functional.embedding(neighbors, source))
+
+
+def _by_list(rows: Tensor, num_heads: int) -> Tensor:
+    """Rows of a block [r m, H, _] as those of its lists [r, m H, _], which have m H heads; a view if it can be."""
+    return rows.reshape(-1, num_heads, rows.shape[-1])
 
 
 def _cut_all(tensors: Sequence[Tensor], sizes: list[int]) -> Iterator[tuple[Tensor, ...]]:

@@ -52,6 +52,35 @@ class Poses:
         return Poses(self.position[index], self.heading[index])
 
 
+@dataclass(frozen=True, eq=False)
+class RowGroups:
+    """Rows in groups that share a list of neighbors."""
+
+    rows: Int64[Tensor, "R"]
+    """Group after group."""
+    sizes: np.ndarray
+    """Rows of each group [G], at least one."""
+
+    @property
+    def first(self) -> Int64[Tensor, "G"]:
+        """The first row of each group."""
+        return self.rows[torch.from_numpy(self.sizes.cumsum() - self.sizes)]
+
+
+def group_rows(place: Int64[Tensor, "R"], poses: Poses) -> RowGroups:
+    """Groups of rows whose place and pose are equal to the last bit; on the CPU.
+
+    Args:
+        place: of the rows.
+        poses: [R].
+    """
+    values = (place, *poses.position.unbind(-1), poses.heading)
+    keys = np.stack([v.numpy().view(f"i{v.itemsize}").astype(np.int64) for v in values])  # [4, R]
+    order = np.lexsort(keys)
+    starts = np.flatnonzero((np.diff(keys[:, order], prepend=-1) != 0).any(0) | (np.arange(len(order)) == 0))
+    return RowGroups(torch.from_numpy(order), np.diff(starts, append=len(order)))
+
+
 def within(
     position: Float[Tensor, "R 2"],
     place: Int64[Tensor, "R"],

@@ -47,7 +47,7 @@ from rlftsim.policies.smart.goal_conditioning import (
     rows_where,
 )
 from rlftsim.policies.smart.heads import ClassHeads
-from rlftsim.policies.smart.neighbors import Neighbors, Poses, relative_pose, within
+from rlftsim.policies.smart.neighbors import Neighbors, Poses, group_rows, relative_pose, within
 from rlftsim.policies.smart.token_steps import TokenSteps
 from rlftsim.rollout.rows import place_rows, row_places
 from rlftsim.tokens.map_tokens import NUM_KINDS, NUM_LIGHTS, NUM_TYPES, MapTokens
@@ -267,7 +267,7 @@ class AgentDecoder(nn.Module):
     def fold(self) -> tuple[AttentionMaps, ...]:
         """Maps of the layers' attention, in the order in which the layers are applied."""
         layers = zip(self.time_layers, self.map_layers, self.agent_layers)
-        return tuple(layer.fold() for block in layers for layer in block)
+        return tuple(layer.fold() for block in layers for layer in block)  # type: ignore[operator]
 
     def look(
         self,
@@ -298,11 +298,15 @@ class AgentDecoder(nn.Module):
         new_past = Past(steps.position, steps.heading, new_row, ()) if past is None else past.then(steps, new_row)
         # 2. their neighbors, which all layers share
         poses = Poses(steps.position, steps.heading)[rows]
+        # agents that stand are at the same pose in many steps and rollouts; to find out a device would be waited for
+        groups = None if padded or row_of.device.type != "cpu" else group_rows(rows[0], poses)
+        first = slice(None) if groups is None else groups.first
         near_map = within(
-            poses.position, rows[0], nowhere_unless(scene.map_mask, scene.map_position), None,
+            poses.position[first], rows[0][first], nowhere_unless(scene.map_mask, scene.map_position), None,
             radius_m=self.config.agent_map_radius_m, limit=self.config.max_agent_map_neighbors,
             most=scene.most_map_tokens,
         )  # fmt: skip
+        map_relation = self._relative(poses[first], scene.map_poses, near_map)
         build = partial(build_neighborhoods, dim=self.config.dim, padded=padded)
         return View(
             rows=rows,
@@ -310,8 +314,8 @@ class AgentDecoder(nn.Module):
             past=new_past,
             own_history=self._own_history(scene, new_past, steps, rows, poses, hidden, build),
             map_tokens=build(
-                scene.relations.map, self._relative(poses, scene.map_poses, near_map), near_map.index, near_map.mask,
-                features=scene.map_features,
+                scene.relations.map, map_relation, near_map.index, near_map.mask, features=scene.map_features,
+                groups=groups,
             ),
             agents=self._agent_neighbors(scene, steps, rows, poses, row_of, build),
         )  # fmt: skip

@@ -89,7 +89,9 @@ def place_tokens(
     else:
         local = vocabulary.poses[class_id, decision]  # [B, N, A, 5, 3], agent's frame
         new_position = position[..., None, :] + rotate(local[..., :2], heading[..., None])
-        new_heading = wrap_angle(heading[..., None] + local[..., 2])
+        # without a turn the heading keeps its bits: agents at the same pose share a list of neighbors
+        turn, before = local[..., 2], heading[..., None]
+        new_heading = torch.where(turn == 0, before, wrap_angle(before + turn))
     return torch.cat([new_position, new_heading[..., None]], -1)
 
 
