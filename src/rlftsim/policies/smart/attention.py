@@ -139,28 +139,28 @@ def build_neighborhoods(
 def _sort(
     mask: Bool[Tensor, "R K"], pairs: int, groups: RowGroups | None
 ) -> tuple[Int64[Tensor, "n"], list[tuple[Int64[Tensor, "_"], slice, int]]]:
-    """Rows that have neighbors, block after block, and each block's lists, width and rows of a list.
+    """Rows that have neighbors, block after block, and each block's lists, their width and the rows of each.
 
-    A group whose size is no power of two is taken apart into those that are.
+    A group whose size is no power of two is taken apart into parts that are.
     """
-    # 1. a list's width is the place of its last neighbor
+    # 1. a list's width is the place of its last neighbor; lists without any are left out
     columns = torch.arange(1, mask.shape[1] + 1, device=mask.device)
     widths = (mask * columns).amax(-1).cpu().numpy()
     sizes = np.ones_like(widths) if groups is None else groups.sizes
-    starts, rows, parts = sizes.cumsum() - sizes, [], []
-    for power in range(int(sizes.max(initial=1)).bit_length()):
-        # 2. lists of as many rows; those without neighbors are left out
-        count = 1 << power
-        lists = np.flatnonzero((sizes & count > 0) & (widths > 0))
-        lists = lists[widths[lists].argsort(kind="stable")]
-        for cut in _cut(widths[lists], pairs) if len(lists) or not power else ():
-            part = lists[cut]
-            # smaller powers come first in a group
-            rows.append(((starts + (sizes & (count - 1)))[part, None] + np.arange(count)).flatten())
-            width = slice(int(widths[part].max(initial=1)))
-            parts.append((torch.from_numpy(part).to(mask.device), width, count))
-    place = torch.from_numpy(np.concatenate(rows)).to(mask.device)
-    return place if groups is None else groups.rows[place], parts
+    # 2. blocks of lists with as many rows, from the narrowest to the widest; in a group the smaller parts come first
+    lists, rows, shapes = [], [], []
+    for count in (1 << power for power in range(int(sizes.max(initial=1)).bit_length())):
+        found = np.flatnonzero((sizes & count > 0) & (widths > 0))
+        found = found[widths[found].argsort(kind="stable")]
+        starts = (sizes.cumsum() - sizes + (sizes & (count - 1)))[found]
+        lists.append(found)
+        rows.append((starts[:, None] + np.arange(count)).flatten())
+        cuts = _cut(widths[found], pairs) if len(found) or count == 1 else []
+        shapes += [(cut.stop - cut.start, slice(int(widths[found[cut]].max(initial=1))), count) for cut in cuts]
+    sorted_lists = torch.from_numpy(np.concatenate(lists)).to(mask.device)
+    blocks = sorted_lists.split([num_lists for num_lists, _, _ in shapes])
+    parts = [(block, width, count) for block, (_, width, count) in zip(blocks, shapes)]
+    return sorted_lists if groups is None else groups.rows[np.concatenate(rows)], parts
 
 
 def _embed_edges(

@@ -72,7 +72,7 @@ class Scene:
     token_features: Float[Tensor, "C V D"]
     """Embedding of every motion token."""
     relations: "Relations"
-    most_map_tokens: int | None
+    most_map_tokens: int | None = None
     """No agent has more map tokens within reach, wherever it goes. None on the CPU, which counts them at every step."""
 
     @property
