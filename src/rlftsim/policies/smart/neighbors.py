@@ -141,7 +141,7 @@ def _within_fixed(
         else:
             near = _first_near(squared, radius_m, most)
         found.append((near.index, near.mask))
-    index, mask = (torch.cat(values) if len(values) > 1 else values[0] for values in zip(*found))
+    index, mask = (torch.cat(values) for values in zip(*found))
     index = index.masked_fill(~mask, 0) + place[:, None] * candidates.shape[1]
     padding = (0, -mask.shape[1] % WIDTH_STEP)
     return (
