@@ -130,7 +130,7 @@ def test_who_has_no_goal_is_asked_nothing(encoding, base):
     ]
     gap = (dists[0] - dists[1]).abs().amax(-1).view(2, 12)
     assert (gap[:, 0] > 1e-4).all()
-    assert (gap[:, 1:] < 1e-6).all()
+    assert (gap[:, 1:] < 1e-5).all()
 
 
 @each_encoding
