@@ -1,0 +1,388 @@
+"""Actions of planners: what a number means, and the motion it leads to.
+
+M agents, h steps of 0.1 s. Motion: x, y, heading, vx, vy; meters, seconds, radians. An agent's own frame has its origin
+in the center of the box and x ahead.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int64
+
+from rlftsim.errors import ConfigError
+from rlftsim.geometry import wrapped
+from rlftsim.rollout.policy import Policy, TokenPolicy
+from rlftsim.scenario.types import STEP_S, ObjectType
+from rlftsim.tokens.vocabulary import CLASS_NAMES, STEPS_PER_TOKEN, class_of_type
+
+ActionKind = Literal["bicycle", "bicycle_discrete", "pose", "trajectory", "token"]
+Tracker = Literal["perfect", "bicycle"]
+
+STEERING_RAD = 0.55
+ACCELERATION_MPS2 = 4.0
+HARDEST_BRAKING_MPS2 = 8.0
+WHEELBASE_PER_LENGTH = 0.6
+ACCELERATIONS, STEERINGS = 7, 13
+"""Levels of the discrete bicycle; actions count steering fastest."""
+POSE_LIMITS = np.array([4.0, 1.5, 0.35])
+"""Largest |dx|, |dy| (m) and |dheading| (rad) of a step."""
+TRAJECTORY_LIMITS = np.array([400.0, 400.0, math.pi])
+LEAST_HORIZON, MOST_HORIZON = 5, 80
+PURSUIT_S, LEAST_PURSUIT_M = 0.8, 3.0
+"""The bicycle that tracks a trajectory steers for the point so far ahead in time, at least so far away."""
+
+
+@dataclass(frozen=True, eq=False)
+class Actors:
+    """Planner-driven agents before an action."""
+
+    name_of: Callable[[int], str]
+    """Name of an agent in messages: object id and scenario."""
+    motion: Float[np.ndarray, "M 5"]
+    size: Float[np.ndarray, "M 2"]
+    object_type: Int64[np.ndarray, "M"]
+
+
+@dataclass(frozen=True, eq=False)
+class Moves:
+    """Motion that actions lead to."""
+
+    motion: Float[np.ndarray, "M h 5"]
+    clipped: Bool[np.ndarray, "M"]
+    """True = the action was out of its bounds and has been cut to them."""
+
+
+class Controls(Protocol):
+    """One way to act."""
+
+    steps: int
+    """Steps of 0.1 s that an action lasts."""
+    num_choices: int
+    """Number of discrete actions; 0 where actions are numbers."""
+    limits: np.ndarray
+    """Largest absolute values of an action, in its shape; empty for discrete ones."""
+
+    def move(self, action: np.ndarray, actors: Actors) -> Moves:
+        """Motion that one action of each agent leads to.
+
+        Args:
+            action: [M, *shape], or [M] whole numbers.
+            actors: before the action.
+        """
+        ...
+
+
+def controls_of(
+    kind: ActionKind,
+    policy: Policy | None = None,
+    *,
+    horizon: int = LEAST_HORIZON,
+    tracker: Tracker = "perfect",
+    reverse: bool = False,
+    hard_braking: bool = False,
+) -> Controls:
+    """Controls of a name.
+
+    Args:
+        kind: of the action.
+        policy: the traffic model, whose vocabulary "token" chooses from.
+        horizon: number of poses of a "trajectory".
+        tracker: of a trajectory: "perfect" puts the agent there, "bicycle" steers for it.
+        reverse: True = a bicycle may drive backwards.
+        hard_braking: True = a bicycle's lowest action brakes with 8 m/s² in place of 4.
+
+    Raises:
+        ConfigError: no such action, or one that the policy has no tokens for.
+    """
+    bicycle = Bicycle(reverse=reverse, hardest=HARDEST_BRAKING_MPS2 if hard_braking else ACCELERATION_MPS2)
+    if kind == "bicycle":
+        return bicycle
+    if kind == "bicycle_discrete":
+        return DiscreteBicycle(bicycle)
+    if kind == "pose":
+        return PoseControls()
+    if kind == "trajectory":
+        if not LEAST_HORIZON <= horizon <= MOST_HORIZON or tracker not in ("perfect", "bicycle"):
+            raise ConfigError(
+                f"a trajectory has {LEAST_HORIZON} to {MOST_HORIZON} poses and the tracker perfect or bicycle, got "
+                f"{horizon} and {tracker!r}."
+            )
+        return TrajectoryControls(horizon, bicycle if tracker == "bicycle" else None)
+    if kind == "token":
+        if not isinstance(policy, TokenPolicy):
+            raise ConfigError("action 'token' needs a traffic model with motion tokens: take another action or model.")
+        return TokenControls(policy)
+    raise ConfigError(f"action {kind!r}: known are bicycle, bicycle_discrete, pose, trajectory, token.")
+
+
+def checked(action: np.ndarray, controls: Controls, actors: Actors) -> np.ndarray:
+    """Actions of M agents as an array of the right shape.
+
+    Args:
+        action: [M, *shape] numbers, or [M] whole numbers.
+        controls: of the action.
+        actors: that it is for.
+
+    Raises:
+        ConfigError: another shape, a NaN, or no such discrete action; names agent and entry.
+    """
+    shape = (len(actors.motion), *controls.limits.shape)
+    array = np.asarray(action, np.int64 if controls.num_choices else np.float64)
+    if array.shape != shape:
+        raise ConfigError(f"action of {actors.name_of(0)} has shape {array.shape[1:]}, it must have {shape[1:]}.")
+    if controls.num_choices:
+        wrong = (array < 0) | (array >= controls.num_choices)
+    else:
+        wrong = ~np.isfinite(array)
+    if wrong.any():
+        agent, *entry = np.argwhere(wrong)[0].tolist()
+        where = f" at entry {', '.join(map(str, entry))}" if entry else ""
+        known = f"a number below {controls.num_choices}" if controls.num_choices else "finite"
+        raise ConfigError(f"action of {actors.name_of(agent)}{where} is {array[(agent, *entry)]}, it must be {known}.")
+    return array
+
+
+@dataclass(frozen=True)
+class Bicycle:
+    """Kinematic bicycle about the center of the box: acceleration × 4 m/s², steering × 0.55 rad."""
+
+    reverse: bool = False
+    hardest: float = ACCELERATION_MPS2
+    steps: int = 1
+    num_choices: int = 0
+
+    @property
+    def limits(self) -> np.ndarray:
+        """Two numbers in [-1, 1]."""
+        return np.ones(2)
+
+    def move(self, action: np.ndarray, actors: Actors) -> Moves:
+        """Motion after 0.1 s.
+
+        Args:
+            action: [M, 2].
+            actors: vehicles.
+        """
+        _only_vehicles(actors, "bicycle")
+        kept = np.clip(action, -1.0, 1.0)
+        acceleration = kept[:, 0] * np.where(kept[:, 0] < 0, self.hardest, ACCELERATION_MPS2)
+        motion = self.drive(actors.motion, acceleration, kept[:, 1] * STEERING_RAD, actors.size[:, 0])
+        return Moves(motion[:, None], (kept != action).any(1))
+
+    def drive(
+        self,
+        motion: Float[np.ndarray, "*m 5"],
+        acceleration: Float[np.ndarray, "*m"],
+        steering: Float[np.ndarray, "*m"],
+        length: Float[np.ndarray, "*#m"],
+    ) -> Float[np.ndarray, "*m 5"]:
+        """Motion after 0.1 s at constant acceleration and steering; the turn is integrated exactly.
+
+        Args:
+            motion: before.
+            acceleration: m/s².
+            steering: rad, positive to the left.
+            length: of the vehicles, m.
+        """
+        x, y, heading = motion[..., 0], motion[..., 1], motion[..., 2]
+        speed = signed_speed(motion)
+        new_speed = speed + acceleration * STEP_S
+        if not self.reverse:
+            new_speed = np.maximum(new_speed, 0.0)
+        mean_speed = (speed + new_speed) / 2
+        # the center lies between the axles, so it moves at an angle to the heading
+        slip = np.arctan(np.tan(steering) / 2)
+        turn = mean_speed * np.cos(slip) * np.tan(steering) / (WHEELBASE_PER_LENGTH * length) * STEP_S
+        chord = mean_speed * STEP_S * np.sinc(turn / 2 / math.pi)  # of the arc
+        towards = heading + slip + turn / 2
+        new_heading = wrapped(heading + turn)
+        along = new_heading + slip
+        return np.stack([
+            x + chord * np.cos(towards), y + chord * np.sin(towards), new_heading,
+            new_speed * np.cos(along), new_speed * np.sin(along),
+        ], -1)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class DiscreteBicycle:
+    """7 accelerations from -4 to 4 m/s² times 13 steering angles."""
+
+    bicycle: Bicycle
+    steps: int = 1
+    num_choices: int = ACCELERATIONS * STEERINGS
+
+    @property
+    def limits(self) -> np.ndarray:
+        """A single whole number has no limits of this kind."""
+        return np.zeros(())
+
+    def move(self, action: np.ndarray, actors: Actors) -> Moves:
+        """Motion after 0.1 s.
+
+        Args:
+            action: [M] numbers below 91.
+            actors: vehicles.
+        """
+        levels = [np.linspace(-1, 1, count)[part] for count, part in zip((ACCELERATIONS, STEERINGS), levels_of(action))]
+        return self.bicycle.move(np.stack(levels, -1), actors)
+
+
+def levels_of(action: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Levels of acceleration and of steering of discrete actions."""
+    return action // STEERINGS, action % STEERINGS
+
+
+@dataclass(frozen=True)
+class PoseControls:
+    """dx, dy, dheading in the agent's own frame, cut to 4 m, 1.5 m, 0.35 rad."""
+
+    steps: int = 1
+    num_choices: int = 0
+
+    @property
+    def limits(self) -> np.ndarray:
+        """Largest |dx|, |dy| and |dheading|."""
+        return POSE_LIMITS
+
+    def move(self, action: np.ndarray, actors: Actors) -> Moves:
+        """Motion after 0.1 s.
+
+        Args:
+            action: [M, 3].
+            actors: of any kind.
+        """
+        kept = np.clip(action, -POSE_LIMITS, POSE_LIMITS)
+        # a float32 action rounds its bounds
+        clipped = (np.abs(action) > POSE_LIMITS + 1e-6).any(1)
+        return Moves(with_velocity(placed(kept[:, None], actors.motion), actors.motion), clipped)
+
+
+@dataclass(frozen=True)
+class TrajectoryControls:
+    """H future poses in the agent's own frame, of which the first is carried out."""
+
+    horizon: int
+    tracker: Bicycle | None
+    """None = the agent is put there."""
+    steps: int = 1
+    num_choices: int = 0
+
+    @property
+    def limits(self) -> np.ndarray:
+        """Of H poses."""
+        return np.tile(TRAJECTORY_LIMITS, (self.horizon, 1))
+
+    def move(self, action: np.ndarray, actors: Actors) -> Moves:
+        """Motion after 0.1 s.
+
+        Args:
+            action: [M, H, 3].
+            actors: of any kind; vehicles for the bicycle.
+        """
+        kept = np.clip(action, -TRAJECTORY_LIMITS, TRAJECTORY_LIMITS)
+        clipped = (kept != action).any((1, 2))
+        if self.tracker is None:
+            first = np.clip(kept[:, :1], -POSE_LIMITS, POSE_LIMITS)
+            return Moves(
+                with_velocity(placed(first, actors.motion), actors.motion), clipped | (first != kept[:, :1]).any((1, 2))
+            )
+        _only_vehicles(actors, "trajectory with the bicycle")
+        # Pure pursuit (Coulter, 1992) of the point ahead; speed of the first pose, so that errors along do not remain.
+        speed = signed_speed(actors.motion)
+        away = np.linalg.norm(kept[..., :2], axis=-1)  # [M, H]
+        wanted = np.maximum(LEAST_PURSUIT_M, PURSUIT_S * speed)[:, None]
+        target = np.where((away >= wanted).any(1), (away >= wanted).argmax(1), self.horizon - 1)
+        point = kept[np.arange(len(kept)), target]
+        distance = np.maximum(np.linalg.norm(point[:, :2], axis=-1), 0.1)
+        wheelbase = WHEELBASE_PER_LENGTH * actors.size[:, 0]
+        steering = np.arctan(2 * wheelbase * point[:, 1] / distance**2)
+        needed = 2 * (kept[:, 0, 0] - speed * STEP_S) / STEP_S**2
+        acceleration = np.clip(needed, -self.tracker.hardest, ACCELERATION_MPS2)
+        motion = self.tracker.drive(
+            actors.motion, acceleration, np.clip(steering, -STEERING_RAD, STEERING_RAD), actors.size[:, 0]
+        )
+        return Moves(motion[:, None], clipped)
+
+
+@dataclass(frozen=True, eq=False)
+class TokenControls:
+    """A motion token of the traffic model, carried out for half a second."""
+
+    policy: TokenPolicy
+    steps: int = STEPS_PER_TOKEN
+
+    @property
+    def num_choices(self) -> int:
+        """Size of the vocabulary."""
+        return self.policy.vocabulary.num_tokens
+
+    @property
+    def limits(self) -> np.ndarray:
+        """A single whole number has no limits of this kind."""
+        return np.zeros(())
+
+    def move(self, action: np.ndarray, actors: Actors) -> Moves:
+        """Motion over half a second.
+
+        Args:
+            action: [M] token ids.
+            actors: of any kind.
+
+        Raises:
+            ConfigError: the agent's class has no such token.
+        """
+        vocabulary = self.policy.vocabulary
+        classes = class_of_type(torch.from_numpy(actors.object_type))
+        ids = torch.from_numpy(action)
+        known = vocabulary.token_mask.cpu()[classes, ids].numpy()
+        if not known.all():
+            agent = int((~known).argmax())
+            name = CLASS_NAMES[int(classes[agent])]
+            count = int(vocabulary.token_mask[classes[agent]].sum())
+            raise ConfigError(f"action of {actors.name_of(agent)}: class {name} has {count} tokens, none is {ids[agent]}.")
+        poses = vocabulary.poses.cpu()[classes, ids].numpy().astype(np.float64)
+        return Moves(with_velocity(placed(poses, actors.motion), actors.motion), np.zeros(len(action), bool))
+
+
+def signed_speed(motion: Float[np.ndarray, "*m 5"]) -> Float[np.ndarray, "*m"]:
+    """Speed, negative for an agent that moves backwards, m/s."""
+    vx, vy = motion[..., 3], motion[..., 4]
+    ahead = vx * np.cos(motion[..., 2]) + vy * np.sin(motion[..., 2])
+    return np.where(ahead < 0, -1.0, 1.0) * np.hypot(vx, vy)
+
+
+def placed(poses: Float[np.ndarray, "M h 3"], motion: Float[np.ndarray, "M 5"]) -> Float[np.ndarray, "M h 3"]:
+    """Poses of the agents' own frames in the map frame.
+
+    Args:
+        poses: x, y, heading.
+        motion: of the agents.
+    """
+    cos, sin = np.cos(motion[:, 2])[:, None], np.sin(motion[:, 2])[:, None]
+    x, y = poses[..., 0], poses[..., 1]
+    position = np.stack([cos * x - sin * y, sin * x + cos * y], -1) + motion[:, None, :2]
+    heading = wrapped(motion[:, None, 2] + poses[..., 2])
+    return np.concatenate([position, heading[..., None]], -1)
+
+
+def with_velocity(poses: Float[np.ndarray, "M h 3"], before: Float[np.ndarray, "M 5"]) -> Float[np.ndarray, "M h 5"]:
+    """Motion of poses, with the velocities that lead to them.
+
+    Args:
+        poses: map frame.
+        before: motion one step before the first pose.
+    """
+    position = np.concatenate([before[:, None, :2], poses[..., :2]], 1)
+    return np.concatenate([poses, np.diff(position, axis=1) / STEP_S], -1)
+
+
+def _only_vehicles(actors: Actors, what: str) -> None:
+    others = actors.object_type != ObjectType.VEHICLE
+    if others.any():
+        row = int(others.argmax())
+        kind = ObjectType(int(actors.object_type[row])).name.lower()
+        raise ConfigError(f"{actors.name_of(row)} is a {kind}, which does not act by {what}: take pose or trajectory.")

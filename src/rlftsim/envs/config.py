@@ -1,0 +1,83 @@
+"""Settings of the environments."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal, get_args
+
+from rlftsim.envs.actions import ActionKind, Tracker
+from rlftsim.envs.drivers import TRAFFIC, Rules
+from rlftsim.envs.observations import Frame
+from rlftsim.envs.route import RouteChoice
+from rlftsim.errors import ConfigError, in_short
+from rlftsim.policies.registry import Device
+from rlftsim.rollout.policy import Sampling
+from rlftsim.scenario.types import FUTURE_STEPS
+
+StopReason = Literal["collision", "offroad", "goal"]
+ObservationKind = Literal["dict", "flat", "arrays"]
+RenderMode = Literal["rgb_array", "html"]
+
+
+@dataclass(frozen=True)
+class EnvConfig:
+    """Settings of an environment; each is an argument of `gymnasium.make` by the same name."""
+
+    data: str = "synthetic"
+    """Data set by name or folder."""
+    split: str | None = "validation"
+    """Split of the data set; None = all scenarios."""
+    model: str = "demo-base"
+    """Traffic model: a run, a model folder or a registered name."""
+    traffic: str = "policy"
+    """Driver of all agents but the ego: policy, replay, constant_velocity or idm."""
+    drivers: Rules = field(default_factory=dict)
+    """Drivers of some agents, the first match wins; see `drivers_of`. They come before `traffic`."""
+    action: ActionKind = "bicycle"
+    horizon: int = 5
+    """Number of poses of a trajectory."""
+    tracker: Tracker = "perfect"
+    """Of a trajectory: puts the agent there, or steers a bicycle for it."""
+    reverse: bool = False
+    """True = a bicycle may drive backwards."""
+    hard_braking: bool = False
+    """True = a bicycle brakes with up to 8 m/s² in place of 4."""
+    observation: ObservationKind = "dict"
+    """Named arrays; all numbers in one row; or the `Observation` itself."""
+    frame: Frame = "ego"
+    reward: str = "progress - 5*at_fault - 5*offroad"
+    """Sum of terms, see `rewards.TERMS`; "none" for evaluation."""
+    stop_on: tuple[StopReason, ...] = ("collision",)
+    """Events of the planner's agent that end its episode."""
+    max_steps: int = FUTURE_STEPS
+    """Length of an episode, at most 80 steps of 0.1 s."""
+    route: RouteChoice = "logged"
+    """"logged" (the lanes that the logged ego drove), "none", a maneuver, or lane ids."""
+    vanish: bool = False
+    """True = replayed agents are gone where their log has no state; else they hold their last pose."""
+    temperature: float = 1.0
+    top_k: int | None = None
+    device: Device = "cpu"
+    """Of the traffic model."""
+    render_mode: RenderMode | None = None
+
+    def __post_init__(self) -> None:
+        if self.traffic not in TRAFFIC:
+            raise ConfigError(f"traffic must be one of {', '.join(TRAFFIC)}, got {in_short(self.traffic)}.")
+        if not isinstance(self.drivers, Mapping):
+            raise ConfigError(f"drivers must be {{who: driver}}, got {in_short(self.drivers)}.")
+        if not 1 <= self.max_steps <= FUTURE_STEPS:
+            raise ConfigError(f"max_steps must lie between 1 and {FUTURE_STEPS}, got {self.max_steps}.")
+        object.__setattr__(self, "stop_on", tuple(self.stop_on))
+        for name, known in (
+            ("stop_on", get_args(StopReason)), ("observation", get_args(ObservationKind)), ("frame", get_args(Frame)),
+            ("render_mode", (None, *get_args(RenderMode))),
+        ):  # fmt: skip
+            value = getattr(self, name)
+            for one in value if isinstance(value, tuple) else (value,):
+                if one not in known:
+                    raise ConfigError(f"{name} must be one of {', '.join(map(str, known))}, got {in_short(one)}.")
+
+    @property
+    def sampling(self) -> Sampling:
+        """Temperature and truncation of the traffic model's decisions."""
+        return Sampling(self.temperature, self.top_k)

@@ -1,0 +1,196 @@
+"""Collisions of a planner's agent, their type and their fault, after nuPlan's definition; lanes that a box is in.
+
+Boxes have sharp corners, as nuPlan's. Motion: x, y, heading, vx, vy; map frame, meters, seconds.
+"""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from jaxtyping import Bool, Float, Int64
+from scipy.spatial import KDTree
+
+from rlftsim.envs.scene import PIECE_POINTS, Scene, build_env_scene
+from rlftsim.scenario.derived import cached_on_scenario
+from rlftsim.scenario.types import Scenario
+
+STANDS_MPS = 0.05
+"""At most this fast an agent counts as stopped."""
+BEHIND_RAD = np.radians(150.0)
+"""A track at a greater bearing is behind."""
+HALF_LANE_M = 1.85
+"""Half of the width that is assumed for every lane, as logs have center lines and few boundaries."""
+DENSE = 3
+"""Points that lanes are searched by, between two points of a piece."""
+
+
+class CollisionType(StrEnum):
+    """Types of collisions, in the order in which they are tested."""
+
+    STOPPED_EGO = "stopped_ego"
+    STOPPED_TRACK = "stopped_track"
+    ACTIVE_REAR = "active_rear"
+    """The track is behind."""
+    ACTIVE_FRONT = "active_front"
+    """The ego's front bumper meets the track."""
+    ACTIVE_LATERAL = "active_lateral"
+
+
+@dataclass(frozen=True)
+class Collision:
+    """The first contact with one track."""
+
+    step: int
+    """Of the episode, 1 = after the first action."""
+    agent: int
+    """Row of the track."""
+    kind: CollisionType
+    at_fault: bool
+    """Of the planner's agent: it hit a stopped track, or another one with its front, or one beside it out of its lane."""
+    speed_change_mps: float
+    """Length of the difference of both velocities."""
+
+
+def boxes_overlap(
+    motion: Float[np.ndarray, "*m c"],
+    size: Float[np.ndarray, "*#m 2"],
+    others: Float[np.ndarray, "*#m k c"],
+    other_size: Float[np.ndarray, "*#m k 2"],
+) -> Bool[np.ndarray, "*m k"]:
+    """True where boxes overlap, by the separating axis theorem.
+
+    Args:
+        motion: x, y, heading of boxes.
+        size: their length and width.
+        others: boxes that each of them may meet.
+        other_size: length and width of these.
+    """
+    offset = others[..., :2] - motion[..., None, :2]
+    turn = others[..., 2] - motion[..., None, 2]
+    cos, sin = np.abs(np.cos(turn)), np.abs(np.sin(turn))
+    half, other_half = size[..., None, :] / 2, other_size / 2
+    apart = np.zeros(offset.shape[:-1], bool)
+    # The axes of both boxes; on each the offset is compared with the sum of both half extents.
+    for heading, own, reach in ((motion[..., None, 2], half, other_half), (others[..., 2], other_half, half)):
+        c, s = np.cos(heading), np.sin(heading)
+        along, across = offset[..., 0] * c + offset[..., 1] * s, offset[..., 1] * c - offset[..., 0] * s
+        apart |= np.abs(along) > own[..., 0] + reach[..., 0] * cos + reach[..., 1] * sin
+        apart |= np.abs(across) > own[..., 1] + reach[..., 0] * sin + reach[..., 1] * cos
+    return ~apart
+
+
+def collision_of(
+    scene: Scene,
+    step: int,
+    agent: int,
+    ego: Float[np.ndarray, "5"],
+    ego_size: Float[np.ndarray, "2"],
+    track: Float[np.ndarray, "5"],
+    track_size: Float[np.ndarray, "2"],
+) -> Collision:
+    """Type and fault of a contact.
+
+    Args:
+        scene: the map.
+        step: of the contact.
+        agent: row of the track.
+        ego: motion of the planner's agent.
+        ego_size: its length and width.
+        track: motion of the other one.
+        track_size: its length and width.
+    """
+    bearing = np.arctan2(track[1] - ego[1], track[0] - ego[0]) - ego[2]
+    ahead = np.array([np.cos(ego[2]), np.sin(ego[2])])
+    bumper = np.append(ego[:2] + ego_size[0] / 2 * ahead, ego[2])
+    if np.hypot(*ego[3:]) <= STANDS_MPS:
+        kind = CollisionType.STOPPED_EGO
+    elif np.hypot(*track[3:]) <= STANDS_MPS:
+        kind = CollisionType.STOPPED_TRACK
+    elif np.cos(bearing) < np.cos(BEHIND_RAD):
+        kind = CollisionType.ACTIVE_REAR
+    elif boxes_overlap(bumper, np.array([0.0, ego_size[1]]), track[None, :3], track_size[None])[0]:
+        kind = CollisionType.ACTIVE_FRONT
+    else:
+        kind = CollisionType.ACTIVE_LATERAL
+    at_fault = kind in (CollisionType.STOPPED_TRACK, CollisionType.ACTIVE_FRONT) or (
+        kind == CollisionType.ACTIVE_LATERAL and not bool(in_one_lane(scene, ego[None], ego_size)[0])
+    )
+    return Collision(step, agent, kind, at_fault, float(np.hypot(*(ego[3:] - track[3:]))))
+
+
+def corners_of(motion: Float[np.ndarray, "n c"], size: Float[np.ndarray, "*#n 2"]) -> Float[np.ndarray, "n 4 2"]:
+    """Corners of boxes: left-front, right-front, right-back, left-back.
+
+    Args:
+        motion: x, y, heading.
+        size: length and width, of all or of each.
+    """
+    local = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) * size[..., None, :] / 2  # [n, 4, 2] or [4, 2]
+    cos, sin = np.cos(motion[:, 2, None]), np.sin(motion[:, 2, None])
+    turned = np.stack([cos * local[..., 0] - sin * local[..., 1], sin * local[..., 0] + cos * local[..., 1]], -1)
+    return motion[:, None, :2] + turned
+
+
+@dataclass(frozen=True, eq=False)
+class LaneSearch:
+    """The lanes of a scenario as a search tree; without lanes there is none."""
+
+    tree: KDTree
+    lane: Int64[np.ndarray, "p"]
+    """Lane of each point, as an index of the scene's `graph`."""
+    heading: Float[np.ndarray, "p"]
+    joined: tuple[frozenset[int], ...]
+    """Each lane with its predecessors and successors."""
+    is_junction: Bool[np.ndarray, "n"]
+    """True = the lane joins two others inside a junction."""
+
+
+@cached_on_scenario
+def lane_search(scenario: Scenario) -> LaneSearch | None:
+    """The lanes of a scenario to be searched by place; None without lanes."""
+    scene = build_env_scene(scenario)
+    graph, pieces = scene.graph, scene.lanes
+    if not len(graph):
+        return None
+    # points between those of the pieces, about every 0.4 m
+    part = np.arange(DENSE * (PIECE_POINTS - 1)) / DENSE
+    low, rest = part.astype(int), (part % 1)[:, None]
+    points = (1 - rest) * pieces.points[:, low] + rest * pieces.points[:, low + 1]
+    along = np.diff(pieces.points, axis=1)[:, low]
+    joined: list[set[int]] = [{lane, *graph.successors[lane]} for lane in range(len(graph))]
+    for lane, successors in enumerate(graph.successors):
+        for successor in successors:
+            joined[successor].add(lane)
+    topology = scenario.map_features.topology
+    inside = topology.interpolating
+    ids = scenario.map_features.feature_id[inside] if inside is not None else np.zeros(0, np.int64)
+    return LaneSearch(
+        tree=KDTree(points.reshape(-1, 2)),
+        lane=np.repeat(pieces.lane, len(part)),
+        heading=np.arctan2(along[..., 1], along[..., 0]).ravel(),
+        joined=tuple(frozenset(lanes) for lanes in joined),
+        is_junction=np.isin(graph.lane_id, ids),
+    )
+
+
+def in_one_lane(scene: Scene, motion: Float[np.ndarray, "n c"], size: Float[np.ndarray, "2"]) -> Bool[np.ndarray, "n"]:
+    """True where all corners of a box are within the half width of one lane, or of lanes that merge or follow.
+
+    Without lanes a box is in none.
+
+    Args:
+        scene: the map.
+        motion: x, y, heading of a box over time.
+        size: its length and width.
+    """
+    search = lane_search(scene.scenario)
+    if search is None:
+        return np.zeros(len(motion), bool)
+    near = search.tree.query_ball_point(corners_of(motion, size).reshape(-1, 2), HALF_LANE_M)
+    lanes = [frozenset(search.lane[rows].tolist()) for rows in near]
+    inside = np.zeros(len(motion), bool)
+    for step in range(len(motion)):
+        corners = lanes[4 * step : 4 * step + 4]
+        candidates = frozenset().union(*(search.joined[lane] for lane in corners[0]))
+        inside[step] = any(all(search.joined[lane] & corner for corner in corners) for lane in candidates)
+    return inside

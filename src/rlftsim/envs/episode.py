@@ -1,0 +1,295 @@
+"""Episodes: a world whose agents are driven by actions, with events, rewards and ends.
+
+B scenes in step, M planner-driven agents over all of them. An `Episode` does not change, an `EpisodeState` is a value.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int64
+
+from rlftsim.envs.actions import Actors, Controls, checked
+from rlftsim.envs.config import EnvConfig
+from rlftsim.envs.contact import Collision, boxes_overlap, collision_of, corners_of
+from rlftsim.envs.observations import Atlas, Observation, build_atlas, observe
+from rlftsim.envs.rewards import WeightedTerm
+from rlftsim.envs.route import route_of
+from rlftsim.envs.world import Dice, World, WorldState, begin, step_world
+from rlftsim.geometry import wrapped
+from rlftsim.realism.map_based import (
+    RoadEdges,
+    build_road_edges,
+    compute_point_distance_to_road_edge,
+    join_road_edges,
+)
+from rlftsim.scenario.derived import cached_on_scenario
+from rlftsim.scenario.types import Scenario
+
+OUTSIDE_M = 0.3
+"""A corner this far off the road leaves the drivable area, as in nuPlan."""
+AT_GOAL_M = 2.0
+MAX_PAIRS = 1 << 22
+"""Bounds the memory of the search for road edges."""
+
+
+@dataclass(frozen=True, eq=False)
+class Episode:
+    """What does not change in an episode."""
+
+    world: World
+    atlas: Atlas
+    controls: Controls
+    terms: tuple[WeightedTerm, ...]
+    config: EnvConfig
+    edges: RoadEdges | None
+    bottom_z: Float[np.ndarray, "M"]
+    """Height of the agents' boxes above the world's zero, m."""
+
+    @property
+    def num_agents(self) -> int:
+        """M."""
+        return len(self.world.actors)
+
+    def name_of(self, row: int) -> str:
+        """Scenario and object id of a planner-driven agent."""
+        scene, agent = self.world.actors[row]
+        view = self.world.scenes[scene]
+        return f"agent {view.object_id[agent]} in scenario {view.scenario.scenario_id}"
+
+
+@dataclass(frozen=True, eq=False)
+class EpisodeState:
+    """One moment of an episode."""
+
+    world: WorldState
+    touched: Bool[np.ndarray, "M A"]
+    """Tracks that have been in contact: each counts once. Those that overlap at the start never count."""
+    collisions: tuple[tuple[Collision, ...], ...]
+    """Of each planner-driven agent."""
+    outside: Bool[np.ndarray, "M"]
+    """True = has left the road."""
+    at_goal: Bool[np.ndarray, "M"]
+    clear_m: Float[np.ndarray, "M"]
+    """Distance that no corner can be off the road before it has moved by, as a distance changes no faster than that."""
+    progress: Float[np.ndarray, "M"]
+    """Along the route, m."""
+    ended: Bool[np.ndarray, "M"]
+    """True = the agent's own episode is over; it stands where it was."""
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What an action led to."""
+
+    reward: Float[np.ndarray, "M"]
+    terms: dict[str, Float[np.ndarray, "M"]]
+    """Every term of `rewards.TERMS`, unweighted."""
+    terminated: Bool[np.ndarray, "M"]
+    truncated: Bool[np.ndarray, "M"]
+    clipped: Bool[np.ndarray, "M"]
+
+
+def build_episode(
+    world: World, controls: Controls, terms: tuple[WeightedTerm, ...], config: EnvConfig
+) -> Episode:
+    """Episode in a world.
+
+    Args:
+        world: the scenes.
+        controls: of the actions.
+        terms: of the reward.
+        config: settings.
+    """
+    routes = tuple(
+        route_of(world.scenes[scene].scenario, int(agent), config.route if agent == world.scenes[scene].ego else "logged")
+        for scene, agent in world.actors
+    )
+    bottom = [world.scenes[scene].z[agent] - world.scenes[scene].size[agent, 2] / 2 for scene, agent in world.actors]
+    edges = join_road_edges([road_edges(scene.scenario) for scene in world.scenes])
+    return Episode(world, build_atlas(world, routes), controls, terms, config, edges, np.array(bottom))
+
+
+@cached_on_scenario
+def road_edges(scenario: Scenario) -> RoadEdges | None:
+    """Road edges of a scenario; None without any."""
+    return build_road_edges(scenario.map_features, torch.device("cpu"))
+
+
+def start(episode: Episode, dice: tuple[Dice, ...]) -> EpisodeState:
+    """The first state.
+
+    Args:
+        episode: the scenes.
+        dice: of each.
+    """
+    world = begin(episode.world, dice)
+    motion = own_motion(episode, world)
+    never = np.zeros(episode.num_agents, bool)
+    off = off_road_m(episode, motion, np.arange(episode.num_agents))
+    return EpisodeState(
+        world=world,
+        touched=_contacts(episode, world, motion),
+        collisions=((),) * episode.num_agents,
+        outside=off >= OUTSIDE_M,
+        clear_m=OUTSIDE_M - off,
+        at_goal=never,
+        progress=_progress(episode, motion),
+        ended=never,
+    )
+
+
+def advance(episode: Episode, state: EpisodeState, action: np.ndarray) -> tuple[EpisodeState, Outcome]:
+    """State and outcome after one action of every planner-driven agent.
+
+    Args:
+        episode: the scenes.
+        state: before.
+        action: [M, *shape]; those of agents whose episode is over are ignored.
+
+    Raises:
+        ConfigError: a NaN, another shape, or an action that an agent cannot take.
+    """
+    motion = own_motion(episode, state.world)
+    scene, agent = episode.world.actors.T
+    actors = Actors(
+        episode.name_of, motion, episode.world.size[scene, agent], episode.world.object_type[scene, agent]
+    )
+    moves = episode.controls.move(checked(action, episode.controls, actors), actors)
+    terms = {}
+    for step in range(episode.controls.steps):
+        # an agent whose episode is over stands still
+        stands = np.concatenate([motion[:, :3], np.zeros((len(motion), 2))], -1)
+        moved = np.where(state.ended[:, None], stands, moves.motion[:, step])
+        state, now = _step(episode, state, moved)
+        terms = {name: terms.get(name, 0.0) + value for name, value in now.items()}
+    is_over = state.world.step >= episode.config.max_steps
+    ends = np.zeros(episode.num_agents, bool)
+    for reason, happened in (
+        ("collision", np.array([bool(found) for found in state.collisions], bool)),
+        ("offroad", state.outside), ("goal", state.at_goal),
+    ):  # fmt: skip
+        if reason in episode.config.stop_on:
+            ends |= happened
+    reward = sum((term.weight * terms[term.name] for term in episode.terms), np.zeros(episode.num_agents))
+    alive = ~state.ended
+    outcome = Outcome(
+        reward=np.where(alive, reward, 0.0),
+        terms=terms,
+        terminated=ends & alive,
+        truncated=np.full(episode.num_agents, is_over) & alive & ~ends,
+        clipped=moves.clipped,
+    )
+    return replace(state, ended=state.ended | ends | is_over), outcome
+
+
+def _step(
+    episode: Episode, state: EpisodeState, moved: Float[np.ndarray, "M 5"]
+) -> tuple[EpisodeState, dict[str, Float[np.ndarray, "M"]]]:
+    """State 0.1 s later, and the terms of this step."""
+    before = own_motion(episode, state.world)
+    world = step_world(episode.world, state.world, moved)
+    # 1. contacts with tracks that have not been touched
+    contacts = _contacts(episode, world, moved) & ~state.touched
+    found = [list(known) for known in state.collisions]
+    for row, agent in np.argwhere(contacts & ~state.ended[:, None]):
+        scene, own = episode.world.actors[row]
+        found[row].append(
+            collision_of(
+                episode.world.scenes[scene], world.step, int(agent), moved[row], episode.world.size[scene, own],
+                world.now[scene, agent], episode.world.size[scene, agent],
+            )
+        )  # fmt: skip
+    new = [known[len(before):] for known, before in zip(found, state.collisions)]
+    # 2. road and route
+    scene, agent = episode.world.actors.T
+    half_diagonal = np.hypot(*episode.world.size[scene, agent].T) / 2
+    turned = np.abs(wrapped(moved[:, 2] - before[:, 2])) * half_diagonal
+    clear = state.clear_m - np.hypot(*(moved[:, :2] - before[:, :2]).T) - turned
+    unclear = np.flatnonzero((clear <= 0) & ~state.outside)
+    clear[unclear] = OUTSIDE_M - off_road_m(episode, moved, unclear)
+    outside = state.outside.copy()
+    outside[unclear] = clear[unclear] <= 0
+    progress = _progress(episode, moved)
+    gained = progress - state.progress
+    routeless = episode.atlas.route_length == 0
+    step = moved[:, :2] - before[:, :2]
+    ahead = np.cos(moved[:, 2]) * step[:, 0] + np.sin(moved[:, 2]) * step[:, 1]
+    ends = episode.atlas.route_points[
+        np.arange(episode.num_agents), np.maximum(episode.atlas.route_length - 1, 0)
+    ]
+    near_end = np.linalg.norm(moved[:, :2] - ends, axis=-1) <= AT_GOAL_M
+    at_goal = state.at_goal | (near_end & ~routeless)
+    terms = {
+        "progress": np.where(routeless, ahead, gained) / 10.0,
+        "collision": np.array([float(len(own)) for own in new]),
+        "at_fault": np.array([float(sum(one.at_fault for one in own)) for own in new]),
+        "offroad": (outside & ~state.outside).astype(float),
+        "goal": (at_goal & ~state.at_goal).astype(float),
+    }
+    following = EpisodeState(
+        world, state.touched | contacts, tuple(map(tuple, found)), outside, at_goal, clear, progress, state.ended
+    )
+    return following, terms
+
+
+def own_motion(episode: Episode, world: WorldState) -> Float[np.ndarray, "M 5"]:
+    """Present motion of the planner-driven agents.
+
+    Args:
+        episode: the scenes.
+        world: a state of theirs.
+    """
+    scene, agent = episode.world.actors.T
+    return world.now[scene, agent]
+
+
+def look(episode: Episode, state: EpisodeState) -> Observation:
+    """Observations of all planner-driven agents.
+
+    Args:
+        episode: the scenes.
+        state: the present one.
+    """
+    config = episode.config
+    return observe(episode.world, episode.atlas, state.world, frame=config.frame, steps=config.max_steps)
+
+
+def off_road_m(
+    episode: Episode, motion: Float[np.ndarray, "M 5"], rows: Int64[np.ndarray, "m"]
+) -> Float[np.ndarray, "m"]:
+    """Signed distance of the corner farthest off the road, negative on it; that of the official metric.
+
+    Args:
+        episode: the scenes.
+        motion: of the planner-driven agents.
+        rows: those that are measured.
+    """
+    scene, agent = episode.world.actors[rows].T
+    if episode.edges is None or not len(rows):
+        return np.full(len(rows), -np.inf)
+    corners = corners_of(motion[rows], episode.world.size[scene, agent])
+    origin = np.stack([episode.world.scenes[b].scenario.origin for b in scene])
+    z = np.repeat(episode.bottom_z[rows, None, None], 4, 1)
+    groups = torch.from_numpy(np.concatenate([corners + origin[:, None], z], -1)).float()
+    of_scene = torch.from_numpy(scene) if len(episode.world.scenes) > 1 else None
+    distance = compute_point_distance_to_road_edge(groups, episode.edges, max_pairs=MAX_PAIRS, scenario=of_scene)
+    farthest = distance.amax(-1).double().numpy()
+    if episode.edges.is_known is None:
+        return farthest
+    return np.where(episode.edges.is_known.numpy()[scene], farthest, -np.inf)
+
+
+def _contacts(episode: Episode, world: WorldState, motion: Float[np.ndarray, "M 5"]) -> Bool[np.ndarray, "M A"]:
+    """Tracks that each planner-driven agent overlaps now."""
+    scene, agent = episode.world.actors.T
+    size = episode.world.size
+    there = episode.world.there[scene, :, len(world.track) - 1]
+    there[np.arange(len(scene)), agent] = False
+    return boxes_overlap(motion[:, :3], size[scene, agent], world.now[scene, :, :3], size[scene]) & there
+
+
+def _progress(episode: Episode, motion: Float[np.ndarray, "M 5"]) -> Float[np.ndarray, "M"]:
+    return np.array([
+        float(route.progress(row[None, :2])[0]) for route, row in zip(episode.atlas.routes, motion)
+    ])  # fmt: skip

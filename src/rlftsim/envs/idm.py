@@ -1,0 +1,204 @@
+"""The intelligent driver model (Treiber, Hennecke, Helbing, 2000) along lines: for planners and for traffic.
+
+M agents with a line of W points each, one every meter from the agent's center on; K other boxes. Meters, seconds.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from rlftsim.envs.route import points_every
+from rlftsim.envs.scene import RED, YELLOW, Scene
+from rlftsim.scenario.types import CURRENT_STEP, STEP_S, TOTAL_STEPS
+
+LOOKAHEAD_M = 40
+"""Leaders are searched so far ahead, as nuPlan's planner does."""
+ON_LINE_M = 2.0
+"""A light whose stop point is within this distance of a line is on the line."""
+BEYOND_M = 60.0
+"""A line goes straight on so far beyond the logged way."""
+STANDS_M = 2.0
+"""A logged way shorter than this has no direction of its own."""
+
+
+@dataclass(frozen=True)
+class IdmConfig:
+    """Parameters; the defaults are those of nuPlan's planner."""
+
+    speed_mps: float = 10.0
+    """Wanted where no limit is known."""
+    gap_m: float = 1.0
+    headway_s: float = 1.5
+    acceleration_mps2: float = 1.0
+    braking_mps2: float = 3.0
+    exponent: float = 4.0
+    hardest_braking_mps2: float = 8.0
+
+
+def idm_acceleration(
+    speed: Float[np.ndarray, "*m"],
+    wanted: Float[np.ndarray, "*#m"],
+    gap: Float[np.ndarray, "*m"],
+    lead_speed: Float[np.ndarray, "*m"],
+    config: IdmConfig,
+) -> Float[np.ndarray, "*m"]:
+    """Acceleration, m/s².
+
+    Args:
+        speed: of the agent, m/s.
+        wanted: its speed on a free road.
+        gap: from bumper to bumper; infinite without a leader.
+        lead_speed: of the leader.
+        config: parameters.
+    """
+    closing = speed * (speed - lead_speed) / (2 * np.sqrt(config.acceleration_mps2 * config.braking_mps2))
+    wanted_gap = config.gap_m + np.maximum(0.0, speed * config.headway_s + closing)
+    free = (speed / np.maximum(wanted, 0.1)) ** config.exponent
+    acceleration = config.acceleration_mps2 * (1 - free - (wanted_gap / np.maximum(gap, 0.1)) ** 2)
+    return np.maximum(acceleration, -config.hardest_braking_mps2)
+
+
+def find_leaders(
+    line: Float[np.ndarray, "M W 2"],
+    heading: Float[np.ndarray, "M W"],
+    size: Float[np.ndarray, "M 2"],
+    others: Float[np.ndarray, "M K 5"],
+    other_size: Float[np.ndarray, "M K 2"],
+    mask: Bool[np.ndarray, "M K"],
+) -> tuple[Float[np.ndarray, "M"], Float[np.ndarray, "M"]]:
+    """Gap to the first box that meets the swept line and its speed along the line; infinite and 0 without one.
+
+    Args:
+        line: points ahead of each agent, one every meter.
+        heading: direction of the line there, rad.
+        size: length and width of the agents.
+        others: x, y, heading, vx, vy of the boxes that each agent may meet.
+        other_size: their length and width.
+        mask: True = such a box.
+    """
+    # 1. Every point of the line in the frame of every box [M, K, W].
+    offset = line[:, None] - others[:, :, None, :2]  # [M, K, W, 2]
+    cos, sin = np.cos(others[..., 2])[..., None], np.sin(others[..., 2])[..., None]
+    ahead = np.abs(offset[..., 0] * cos + offset[..., 1] * sin)
+    aside = np.abs(offset[..., 1] * cos - offset[..., 0] * sin)
+    # 2. It meets the box if the agent's width across the line does.
+    turn = heading[:, None] - others[..., 2:3]
+    half = size[:, None, 1:2] / 2
+    meets = (ahead <= other_size[..., :1] / 2 + half * np.abs(np.sin(turn))) & mask[..., None]
+    meets &= aside <= other_size[..., 1:] / 2 + half * np.abs(np.cos(turn))
+    # 3. The first point and its box.
+    any_box = meets.any(1)  # [M, W]
+    first, found, row = any_box.argmax(1), any_box.any(1), np.arange(len(line))
+    box = meets[row, :, first].argmax(1)
+    velocity, at = others[row, box, 3:], heading[row, first]
+    speed = np.maximum(velocity[:, 0] * np.cos(at) + velocity[:, 1] * np.sin(at), 0.0)
+    gap = np.maximum(first - size[:, 0] / 2, 0.0)
+    return np.where(found, gap, np.inf), np.where(found, speed, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class IdmLines:
+    """The ways of the IDM-driven agents of one scenario: logged ways, from their current poses on."""
+
+    agents: np.ndarray
+    """Their rows, [M]."""
+    points: Float[np.ndarray, "M P 2"]
+    """One every meter; the last one repeated."""
+    heading: Float[np.ndarray, "M P"]
+    stop_m: Float[np.ndarray, "M T"]
+    """Distance along the line to the stop point of each light; infinite where the light is on another way."""
+    wanted_mps: Float[np.ndarray, "M"]
+    """The fastest logged speed, at least that of `IdmConfig` where the agent drives at all."""
+
+
+def idm_lines(scene: Scene, agents: np.ndarray, config: IdmConfig) -> IdmLines:
+    """Lines of some agents.
+
+    Args:
+        scene: the scenario.
+        agents: rows of vehicles.
+        config: parameters.
+    """
+    lines = [_line(scene, int(agent)) for agent in agents]
+    longest = max((len(line) for line in lines), default=1)
+    points = np.stack([np.pad(line, ((0, longest - len(line)), (0, 0)), mode="edge") for line in lines] or [
+        np.zeros((1, 2))
+    ])[: len(agents)]  # fmt: skip
+    heading = np.stack([np.pad(_heading(line), (0, longest - len(line)), mode="edge") for line in lines] or [
+        np.zeros(1)
+    ])[: len(agents)]  # fmt: skip
+    offset = np.linalg.norm(points[:, :, None] - scene.lights.point, axis=-1)  # [M, P, T]
+    stop = np.where(offset.min(1) <= ON_LINE_M, offset.argmin(1), np.inf)
+    future = scene.logged[agents, CURRENT_STEP:]
+    fastest = np.linalg.norm(future[..., 3:], axis=-1).max(1)
+    # parked vehicles stay parked
+    wanted = np.where(fastest < 0.5, 0.0, np.maximum(fastest, config.speed_mps))
+    return IdmLines(agents, points, heading, stop, wanted)
+
+
+def _line(scene: Scene, agent: int) -> Float[np.ndarray, "p 2"]:
+    """The logged way of an agent, and straight on."""
+    way = scene.logged[agent, CURRENT_STEP:TOTAL_STEPS, :2]
+    step = np.linalg.norm(np.diff(way, axis=0), axis=1)
+    kept = way[np.append(True, step > 0.05)]
+    heading = scene.logged[agent, CURRENT_STEP, 2]
+    if len(kept) > 1 and np.linalg.norm(kept[-1] - kept[0]) > STANDS_M:
+        last = kept[-1] - kept[max(len(kept) - 5, 0)]
+        heading = np.arctan2(last[1], last[0])
+    else:
+        kept = way[:1]
+    return points_every(np.vstack([kept, kept[-1] + BEYOND_M * np.array([np.cos(heading), np.sin(heading)])]), 1.0)
+
+
+def _heading(line: Float[np.ndarray, "p 2"]) -> Float[np.ndarray, "p"]:
+    ahead = np.diff(line, axis=0, append=2 * line[-1:] - line[-2:-1])
+    return np.arctan2(ahead[:, 1], ahead[:, 0])
+
+
+def advance_idm(
+    lines: IdmLines,
+    place: Float[np.ndarray, "M 2"],
+    motion: Float[np.ndarray, "A 5"],
+    present: Bool[np.ndarray, "A"],
+    scene: Scene,
+    step: int,
+    config: IdmConfig,
+) -> tuple[Float[np.ndarray, "M 2"], Float[np.ndarray, "M 5"]]:
+    """Places and states of the IDM-driven agents of a scenario after 0.1 s.
+
+    Args:
+        lines: their ways.
+        place: distance along the line, and speed.
+        motion: x, y, heading, vx, vy of all agents.
+        present: False = the agent is not there.
+        scene: the scenario.
+        step: of the log, for the lights.
+        config: parameters.
+    """
+    way, speed = place.T
+    rows, size = np.arange(len(lines.agents)), scene.size[:, :2]
+    # 1. The next 40 m of each line; the agent's own box is no leader.
+    window = np.minimum(way.astype(int)[:, None] + np.arange(LOOKAHEAD_M), lines.points.shape[1] - 1)
+    mask = np.repeat(present[None], len(rows), 0)
+    mask[rows, lines.agents] = False
+    others = np.broadcast_to(motion, (len(rows), *motion.shape))
+    sizes = np.broadcast_to(size, (len(rows), *size.shape))
+    line, heading = lines.points[rows[:, None], window], lines.heading[rows[:, None], window]
+    gap, lead = find_leaders(line, heading, size[lines.agents], others, sizes, mask)
+    # 2. A red or yellow light ahead is a standing leader.
+    front = way + size[lines.agents, 0] / 2
+    waits = np.isin(scene.lights.state[min(step, TOTAL_STEPS - 1)], (RED, YELLOW))
+    to_stop = np.where(waits & (lines.stop_m >= front[:, None]), lines.stop_m - front[:, None], np.inf)
+    to_stop = to_stop.min(1, initial=np.inf)
+    lead, gap = np.where(to_stop < gap, 0.0, lead), np.minimum(gap, to_stop)
+    # 3. Along the line by the mean speed of the step.
+    acceleration = idm_acceleration(speed, lines.wanted_mps, gap, lead, config)
+    new_speed = np.where(lines.wanted_mps > 0, np.maximum(speed + acceleration * STEP_S, 0.0), 0.0)
+    way = np.minimum(way + (speed + new_speed) / 2 * STEP_S, lines.points.shape[1] - 1.001)
+    low = way.astype(int)
+    part = (way - low)[:, None]
+    position = (1 - part) * lines.points[rows, low] + part * lines.points[rows, low + 1]
+    angle = lines.heading[rows, low]
+    velocity = new_speed[:, None] * np.stack([np.cos(angle), np.sin(angle)], -1)
+    return np.stack([way, new_speed], -1), np.concatenate([position, angle[:, None], velocity], -1)

@@ -1,0 +1,169 @@
+"""Routes: the middle of the lanes that a planner is to follow. Frame: map, m.
+
+A log has no route, so the default is the lanes that the logged agent drove, without its timing. It tells a planner
+*where* the logged driver went. `Route.source` says where a route comes from.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int64
+
+from rlftsim.envs.scene import Scene, build_env_scene
+from rlftsim.errors import ConfigError
+from rlftsim.geometry import wrapped
+from rlftsim.goals.maneuvers.lane_paths import LanePath, lanes_for
+from rlftsim.goals.maneuvers.proposals import Driver, own_paths, propose_from_lanes
+from rlftsim.goals.maneuvers.side_paths import lane_change_paths
+from rlftsim.scenario.derived import cached_on_scenario
+from rlftsim.scenario.polylines import arc_length
+from rlftsim.scenario.types import CURRENT_STEP, Scenario
+
+SPACING_M = 2.0
+BEYOND_M = 50.0
+"""Length of a route beyond the end of the logged way."""
+LEAST_M = 100.0
+"""Least length of a route, where the lanes go on so far."""
+NEAR_LANE_M, ALONG_RAD = 4.0, np.radians(60.0)
+"""A point of a route is on the nearest lane within this distance that runs its way."""
+TURN_PENALTY = 0.02
+"""Meters of misfit that a radian of turning counts as, so that an agent that stands gets the straightest path."""
+
+RouteChoice = str | tuple[int, ...]
+"""Either "logged", "none", the name of a maneuver ("left"), or lane ids."""
+
+
+@dataclass(frozen=True, eq=False)
+class Route:
+    """A line to follow, a point every 2 m; R = 0 where there is none."""
+
+    points: Float[np.ndarray, "R 2"]
+    heading: Float[np.ndarray, "R"]
+    limit_mps: Float[np.ndarray, "R"]
+    """Speed limit; 0 = unknown."""
+    lanes: Int64[np.ndarray, "l"]
+    """Lanes along it, as indices of the scene's `graph`."""
+    source: str
+    """One of "logged lanes", "logged way" (no lane there), "maneuver", "lanes" and "none"."""
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def progress(self, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
+        """Distance along the route to the place nearest to each point, m; beyond the ends straight on."""
+        if not len(self):
+            return np.zeros(len(points))
+        dx, dy = (points[:, k, None] - self.points[:, k] for k in range(2))
+        nearest = (dx * dx + dy * dy).argmin(1)
+        direction = np.stack([np.cos(self.heading[nearest]), np.sin(self.heading[nearest])], -1)
+        return SPACING_M * nearest + ((points - self.points[nearest]) * direction).sum(-1)
+
+
+NO_ROUTE = Route(np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros(0, np.int64), "none")
+
+
+@cached_on_scenario
+def route_of(scenario: Scenario, agent: int, choice: RouteChoice) -> Route:
+    """Route of an agent; without lanes there is none.
+
+    Args:
+        scenario: the scenario.
+        agent: row of the agent among the simulated ones.
+        choice: "logged" for the lanes that it drove, "none", a maneuver that the lanes allow, or lane ids.
+
+    Raises:
+        ConfigError: no such lane or maneuver.
+    """
+    scene = build_env_scene(scenario)
+    if choice == "none" or not len(scene.graph):
+        return NO_ROUTE
+    if isinstance(choice, tuple):
+        return _of_points(scene, _along_lanes(scene, agent, choice), "lanes")
+    if choice == "logged":
+        return _logged_route(scene, agent)
+    proposals = propose_from_lanes(scenario, int(scenario.simulated_indices[agent]))
+    for proposal in proposals:
+        if proposal.maneuver.value == choice:
+            return _of_points(scene, proposal.way[:, :2] - scenario.origin, "maneuver")
+    known = ", ".join(proposal.maneuver.value for proposal in proposals) or "no maneuver"
+    raise ConfigError(
+        f"route {choice!r}: in scenario {scenario.scenario_id} the lanes of agent {scene.object_id[agent]} allow "
+        f"{known}; routes are also 'logged', 'none' and lane ids."
+    )
+
+
+def _logged_route(scene: Scene, agent: int) -> Route:
+    """The path along the lanes that fits the logged way best."""
+    way = scene.logged[agent, CURRENT_STEP:, :2][scene.valid[agent, CURRENT_STEP:]]
+    travelled = float(arc_length(way)[-1])
+    paths = _paths(scene.scenario, agent, max(travelled + BEYOND_M, LEAST_M))
+    if not paths:
+        heading = scene.logged[agent, CURRENT_STEP:, 2][scene.valid[agent, CURRENT_STEP:]][-1]
+        beyond = np.arange(1.0, LEAST_M)[:, None] * [np.cos(heading), np.sin(heading)]
+        return _of_points(scene, np.concatenate([way, way[-1] + beyond]), "logged way")
+    world = way + scene.scenario.origin
+    misfit = [
+        float(np.linalg.norm(world[:, None] - path.points[:, :2], axis=-1).min(1).mean())
+        + TURN_PENALTY * abs(float(path.turn[-1]))
+        for path in paths
+    ]
+    return _of_points(scene, paths[int(np.argmin(misfit))].points[:, :2] - scene.scenario.origin, "logged lanes")
+
+
+def _paths(scenario: Scenario, agent: int, length_m: float) -> list[LanePath]:
+    """Paths along the lanes from an agent's pose, with a lane change and without."""
+    driver = Driver.of(scenario, int(scenario.simulated_indices[agent]))
+    lanes = lanes_for(build_env_scene(scenario).graph, driver.kind)
+    own = own_paths(driver, lanes, length_m=length_m)
+    speed = max(driver.speed_mps, 5.0)
+    changing = [
+        path
+        for start in own
+        for side in (1, -1)
+        for path, _ in lane_change_paths(lanes, start, side=side, speed_mps=speed, length_m=length_m)
+    ]
+    return own + changing
+
+
+def _along_lanes(scene: Scene, agent: int, lane_ids: tuple[int, ...]) -> Float[np.ndarray, "n 2"]:
+    """The middle of lanes one after the other, from the point nearest to an agent on."""
+    row_of_id = {int(lane_id): row for row, lane_id in enumerate(scene.graph.lane_id)}
+    unknown = [lane_id for lane_id in lane_ids if lane_id not in row_of_id]
+    if unknown or not lane_ids:
+        raise ConfigError(
+            f"route {lane_ids}: scenario {scene.scenario.scenario_id} has no lane {unknown[0] if unknown else 'here'}: "
+            f"its lanes are {', '.join(map(str, list(row_of_id)[:12]))}, ..."
+        )
+    line = np.concatenate([scene.graph.lines[row_of_id[i]][:, :2] for i in lane_ids]) - scene.scenario.origin
+    nearest = int(((line - scene.logged[agent, CURRENT_STEP, :2]) ** 2).sum(-1).argmin())
+    return line[nearest:]
+
+
+def _of_points(scene: Scene, line: Float[np.ndarray, "n 2"], source: str) -> Route:
+    """Route along a polyline, with the lanes and limits there."""
+    if float(arc_length(line)[-1]) < SPACING_M:
+        return NO_ROUTE
+    points = points_every(line, SPACING_M)
+    ahead = np.diff(points, axis=0, append=2 * points[-1:] - points[-2:-1])
+    heading = np.arctan2(ahead[:, 1], ahead[:, 0])
+    # lanes and limits: of the nearest lane point that runs the same way
+    graph = scene.graph
+    offset = np.linalg.norm(points[:, None] - (graph.points[:, :2] - scene.scenario.origin), axis=-1)  # [R, P]
+    offset[np.abs(wrapped(graph.heading - heading[:, None])) > ALONG_RAD] = np.inf
+    nearest = offset.argmin(1)
+    on_lane = offset[np.arange(len(points)), nearest] <= NEAR_LANE_M
+    owner = graph.owner[nearest]
+    limit = np.where(on_lane, graph.speed_limit_mps[owner], 0.0)
+    return Route(points, heading, limit, np.unique(owner[on_lane]), source)
+
+
+def points_every(line: Float[np.ndarray, "n 2"], spacing_m: float) -> Float[np.ndarray, "m 2"]:
+    """Points along a polyline from its start on.
+
+    Args:
+        line: the polyline.
+        spacing_m: distance from point to point.
+    """
+    along = arc_length(line)
+    at = np.arange(0.0, along[-1] + 1e-6, spacing_m)
+    return np.stack([np.interp(at, along, line[:, k]) for k in range(2)], axis=1)

@@ -1,0 +1,117 @@
+"""Scenarios and the traffic model of an environment, loaded once and shared by all of its episodes."""
+
+from collections import OrderedDict
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+
+from rlftsim.envs.actions import Controls, controls_of
+from rlftsim.envs.config import EnvConfig
+from rlftsim.envs.episode import Episode, build_episode
+from rlftsim.envs.rewards import WeightedTerm, parse_terms
+from rlftsim.envs.world import build_world
+from rlftsim.errors import ConfigError
+from rlftsim.policies.registry import load_policy
+from rlftsim.rollout.fingerprint import fingerprint_policy
+from rlftsim.rollout.policy import Policy, device_of, is_goal_conditioned
+from rlftsim.scenario.any_form import AnyScenarios, scenarios_of
+from rlftsim.scenario.batch import collate
+from rlftsim.scenario.open import open_dataset
+from rlftsim.scenario.types import Scenario, Scenarios, scenario_ids_of
+from rlftsim.threads import one_thread
+
+KEPT_CONTEXTS = 16
+"""Encoded scenarios that are kept: encoding is most of the cost of a reset."""
+
+PointGoals = Mapping[int, Any]
+"""Object id -> (x, y), world frame, m."""
+
+
+class Source:
+    """Scenarios, traffic model and settings of an environment.
+
+    Args:
+        config: settings.
+        scenarios: in place of the data set that the settings name.
+        policy: in place of the model that the settings name.
+        controlled: rules of the planner-driven agents, which come first.
+
+    Raises:
+        ConfigError: settings that do not fit each other.
+        DataError: no such data set or split.
+    """
+
+    def __init__(
+        self,
+        config: EnvConfig,
+        scenarios: AnyScenarios | None = None,
+        policy: Policy | None = None,
+        controlled: Mapping[str | int, str] | None = None,
+    ):
+        self.config = config
+        self.scenarios: Scenarios = (
+            scenarios_of(scenarios) if scenarios is not None else open_dataset(config.data, config.split)
+        )
+        self.scenario_ids = list(scenario_ids_of(self.scenarios))
+        self.rules = {**(controlled or {"ego": "planner"}), **config.drivers, "*": config.traffic}
+        # IDM leaves pedestrians and cyclists to the policy
+        needs_policy = "policy" in self.rules.values() or "idm" in self.rules.values() or config.action == "token"
+        self.policy = policy if policy is not None else load_policy(config.model, config.device) if needs_policy else None
+        self.fingerprint = fingerprint_policy(self.policy) if self.policy is not None else "none"
+        self.controls: Controls = controls_of(
+            config.action, self.policy, horizon=config.horizon, tracker=config.tracker, reverse=config.reverse,
+            hard_braking=config.hard_braking,
+        )  # fmt: skip
+        self.terms: tuple[WeightedTerm, ...] = parse_terms(config.reward)
+        self._contexts: OrderedDict[str, Any] = OrderedDict()
+
+    def scenario(self, scenario_id: str) -> Scenario:
+        """A scenario by its id.
+
+        Raises:
+            ConfigError: there is none.
+        """
+        try:
+            return self.scenarios[self.scenario_ids.index(scenario_id)]
+        except ValueError:
+            some = ", ".join(self.scenario_ids[:3])
+            raise ConfigError(
+                f"no scenario {scenario_id!r}: this environment has {len(self.scenario_ids)}, such as {some}."
+            ) from None
+
+    def episode(self, scenarios: list[Scenario], goals: Mapping[str, PointGoals] | None = None) -> Episode:
+        """An episode in some scenarios, which step together.
+
+        Args:
+            scenarios: at least one.
+            goals: scenario id to object id to (x, y) of agents that follow the policy.
+
+        Raises:
+            ConfigError: drivers that do not fit, or goals for a policy that does not follow any.
+            DataError: a goal of an agent that is not simulated.
+        """
+        if goals and (self.policy is None or not is_goal_conditioned(self.policy)):
+            raise ConfigError("goals have no effect: the traffic model is not goal-conditioned.")
+        world = build_world(
+            scenarios, self.policy, rules=self.rules, goals=goals, sampling=self.config.sampling,
+            vanish=self.config.vanish, context=self._context(scenarios),
+        )  # fmt: skip
+        if not len(world.actors):
+            raise ConfigError(
+                f"scenario {scenarios[0].scenario_id}: the planner drives no agent: its ego or ids are not simulated."
+            )
+        return build_episode(world, self.controls, self.terms, self.config)
+
+    def _context(self, scenarios: list[Scenario]) -> Any:
+        """Context of a single scenario, from the last ones if it is among them; None leaves it to the world."""
+        if self.policy is None or len(scenarios) != 1 or "policy" not in self.rules.values():
+            return None
+        key = scenarios[0].scenario_id
+        if key not in self._contexts:
+            with one_thread(), torch.no_grad():
+                self._contexts[key] = self.policy.encode(collate(scenarios).to(device_of(self.policy)))
+        self._contexts.move_to_end(key)
+        while len(self._contexts) > KEPT_CONTEXTS:
+            self._contexts.popitem(last=False)
+        return self._contexts[key]

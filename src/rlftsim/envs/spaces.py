@@ -1,0 +1,45 @@
+"""Spaces of Gymnasium for actions and observations."""
+
+import math
+
+import numpy as np
+from gymnasium import spaces
+
+from rlftsim.envs.actions import Controls
+from rlftsim.envs.config import ObservationKind
+from rlftsim.envs.observations import BOUND, SHAPES, Observation
+
+
+def action_space(controls: Controls) -> spaces.Space:
+    """Space of one agent's actions."""
+    if controls.num_choices:
+        return spaces.Discrete(controls.num_choices)
+    limits = controls.limits.astype(np.float32)
+    return spaces.Box(-limits, limits, dtype=np.float32)
+
+
+def observation_space(kind: ObservationKind) -> spaces.Space:
+    """Space of one agent's observations; "arrays" has the space of "dict"."""
+    if kind == "flat":
+        return spaces.Box(-BOUND, BOUND, (sum(math.prod(shape) for shape in SHAPES.values()),), np.float32)
+    return spaces.Dict({
+        name: spaces.Box(0, 1, shape, np.int8)
+        if name.endswith("_mask")
+        else spaces.Box(-BOUND, BOUND, shape, np.float32)
+        for name, shape in SHAPES.items()
+    })  # fmt: skip
+
+
+def shown(observation: Observation, kind: ObservationKind, row: int | None = None):
+    """An observation in the form of its space.
+
+    Args:
+        observation: of M agents.
+        kind: of the space.
+        row: one of them; None = all.
+    """
+    if kind == "arrays":
+        return observation
+    if kind == "flat":
+        return observation.flat() if row is None else observation.flat()[row]
+    return observation.by_name() if row is None else observation.of_agent(row)

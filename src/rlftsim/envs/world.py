@@ -1,0 +1,322 @@
+"""The world: B scenes that step together at 10 Hz, with traffic that decides every half second.
+
+A `World` holds what does not change in an episode, a `WorldState` is a value: stepping returns a new one and changes
+nothing, so a fork is the same state used twice. With a policy that decides for k steps, a block of k steps runs so:
+
+1. Before its first step the policy decides for all agents and `advance` gives their k poses. The noise depends on seed,
+   scenario, rollout and decision alone, as in `rollout.simulate`: whatever a planner does, it meets the same dice.
+2. Each step moves the planner's agents by one step and reveals one pose of the others.
+3. After the last step `advance` is called again from the same state, with the poses of all agents that the policy did
+   not drive imposed. So the policy sees what the planner really did, 0.1 to 0.5 s later.
+
+Shapes: B scenes, A agents (padded), M agents that a planner drives, over all scenes. Frame: map of each scene, meters,
+seconds. Motion: x, y, heading, vx, vy.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+
+from rlftsim.envs.drivers import Driver, Rules, drivers_of
+from rlftsim.envs.idm import IdmConfig, IdmLines, advance_idm, idm_lines
+from rlftsim.envs.scene import Scene, build_env_scene
+from rlftsim.errors import ConfigError
+from rlftsim.goals.types import Goals
+from rlftsim.rollout.noise import draw_noise
+from rlftsim.rollout.policy import Policy, Sampling, device_of
+from rlftsim.rollout.types import AgentStates
+from rlftsim.scenario.batch import ScenarioBatch, collate
+from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, STEP_S, Scenario
+from rlftsim.threads import one_thread
+
+IDM = IdmConfig()
+Noise = Literal["same", "new"]
+
+
+@dataclass(frozen=True)
+class Dice:
+    """Randomness of one scene: the same numbers give the same traffic, as `simulate(seed=..., num_rollouts=...)`."""
+
+    seed: int
+    rollout: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """B scenes that step together, and who drives whom."""
+
+    scenes: tuple[Scene, ...]
+    batch: ScenarioBatch
+    mask: Bool[np.ndarray, "B A"]
+    """False = padding."""
+    drivers: Int64[np.ndarray, "B A"]
+    """Numbers of `Driver`; -1 for padding."""
+    actors: Int64[np.ndarray, "M 2"]
+    """Scene and agent of each planner-driven agent."""
+    size: Float[np.ndarray, "B A 2"]
+    """Length and width."""
+    object_type: Int64[np.ndarray, "B A"]
+    logged: Float[np.ndarray, "B A 91 5"]
+    valid: Bool[np.ndarray, "B A 91"]
+    policy: Policy | None
+    """None where no agent follows a policy."""
+    context: Any
+    goals: Goals | None
+    sampling: Sampling
+    lines: tuple[IdmLines, ...]
+    """Of the IDM-driven agents of each scene."""
+
+    there: Bool[np.ndarray, "B A 91"]
+    """True = the agent is there at a step of the log's time (10 is the current one)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Decisions of the policy that are being carried out."""
+
+    before: Any
+    """State of the policy before them."""
+    decision: Tensor | None
+    """None before the first block."""
+    poses: Float[np.ndarray, "B A k 3"] | None
+    """The poses they lead to."""
+
+
+@dataclass(frozen=True, eq=False)
+class WorldState:
+    """B scenes at one step."""
+
+    track: tuple[Float[np.ndarray, "B A 5"], ...]
+    """Motion at every step of the log's time from 0 to the present one."""
+    block: Block | None
+    """None where no agent follows a policy."""
+    noise: Float[Tensor, "B 1 A L n"] | None
+    """Of all decisions of the episode."""
+    dice: tuple[tuple[Dice, ...], ...]
+    """Dice of each scene, at each decision taken so far and for all that follow (the last entry)."""
+    places: tuple[Float[np.ndarray, "_ 2"], ...]
+    """Distance along the line, and speed, of the IDM-driven agents of each scene."""
+
+    @property
+    def step(self) -> int:
+        """Steps taken, 0..80."""
+        return len(self.track) - 1 - CURRENT_STEP
+
+    @property
+    def now(self) -> Float[np.ndarray, "B A 5"]:
+        """Present motion."""
+        return self.track[-1]
+
+
+def build_world(
+    scenarios: Sequence[Scenario],
+    policy: Policy | None,
+    *,
+    rules: Rules,
+    goals: Mapping[str, Mapping[int, Any]] | None = None,
+    sampling: Sampling = Sampling(),  # noqa: B008
+    vanish: bool = False,
+    context: Any = None,
+) -> World:
+    """The world of some scenarios, which step together.
+
+    Args:
+        scenarios: at least one.
+        policy: the traffic model; it is left out where the rules give it no agent.
+        rules: agents to driver, see `drivers_of`.
+        goals: of agents that follow the policy, scenario id to object id to (x, y), world frame.
+        sampling: temperature and truncation of its decisions.
+        vanish: True = replayed agents are gone where their log has no state.
+        context: `policy.encode` of these scenarios, if it is known.
+
+    Raises:
+        ConfigError: a rule that does not fit, or agents that follow a policy where there is none.
+    """
+    scenes = tuple(build_env_scene(scenario) for scenario in scenarios)
+    batch = collate(scenarios)
+    shape = tuple(batch.agent_mask.shape)
+    drivers = _padded([drivers_of(scene, rules) for scene in scenes], shape, -1)
+    followers = bool((drivers == Driver.POLICY).any())
+    if followers and policy is None:
+        raise ConfigError("some agents follow the policy, but there is no model: name one, or give them other drivers.")
+    batch = batch.to(device_of(policy)) if followers else batch
+    if followers and context is None:
+        assert policy is not None
+        with one_thread(), torch.no_grad():
+            context = policy.encode(batch)
+    mask = batch.agent_mask.cpu().numpy()
+    valid = _padded([scene.valid for scene in scenes], (*shape, 91), False)
+    # from the current step on everybody exists, but replayed agents may vanish with their log
+    there = valid | mask[..., None]
+    there[..., : CURRENT_STEP + 1] = valid[..., : CURRENT_STEP + 1]
+    if vanish:
+        there &= valid | (drivers != Driver.REPLAY)[..., None]
+    idm_rows = [np.flatnonzero(row[: len(scene.object_id)] == Driver.IDM) for row, scene in zip(drivers, scenes)]
+    return World(
+        scenes=scenes,
+        batch=batch,
+        mask=mask,
+        drivers=drivers,
+        actors=np.argwhere(drivers == Driver.PLANNER),
+        size=_padded([scene.size[:, :2] for scene in scenes], (*shape, 2)),
+        object_type=_padded([scene.object_type for scene in scenes], shape, 0),
+        logged=_padded([scene.logged for scene in scenes], (*shape, 91, 5)),
+        valid=valid,
+        there=there,
+        policy=policy if followers else None,
+        context=context if followers else None,
+        goals=Goals.from_points(batch, goals) if goals and followers else None,
+        sampling=sampling,
+        lines=tuple(idm_lines(scene, rows, IDM) for scene, rows in zip(scenes, idm_rows)),
+    )
+
+
+def _padded(parts: list[np.ndarray], shape: tuple[int, ...], fill: float = 0.0) -> np.ndarray:
+    out = np.full((len(parts), *shape[1:]), fill, parts[0].dtype)
+    for row, part in zip(out, parts):
+        row[: len(part)] = part
+    return out
+
+
+def begin(world: World, dice: Sequence[Dice]) -> WorldState:
+    """The world at the current step of its logs.
+
+    Args:
+        world: the scenes.
+        dice: of each scene.
+    """
+    block = noise = None
+    if world.policy is not None:
+        initial = _noise(world, dice, "begin", world.policy.initial_noise_size)
+        with one_thread(), torch.no_grad():
+            block = Block(world.policy.begin(world.context, 1, world.goals, initial), None, None)
+        noise = _decision_noise(world, dice)
+    speed = [np.linalg.norm(scene.logged[lines.agents, CURRENT_STEP, 3:], axis=-1) for scene, lines in _idm(world)]
+    places = tuple(np.stack([np.zeros_like(v), v], -1) for v in speed)
+    track = tuple(np.moveaxis(world.logged[:, :, : CURRENT_STEP + 1], 2, 0).copy())
+    return WorldState(track, block, noise, (tuple(dice),), places)
+
+
+def step_world(world: World, state: WorldState, moved: Float[np.ndarray, "M 5"]) -> WorldState:
+    """The state 0.1 s later.
+
+    Args:
+        world: the scenes.
+        state: before the step.
+        moved: motion of the planner-driven agents after the step, in the order of `world.actors`.
+    """
+    block, dice = state.block, state.dice
+    following = len(state.track)  # step of the log's time that is being computed
+    motion = world.logged[:, :, min(following, world.logged.shape[2] - 1)].copy()  # replayed agents
+    before = state.now
+    # 1. agents of the policy, and those that keep their velocity
+    if block is not None:
+        assert world.policy is not None
+        if state.step % world.policy.steps_per_decision == 0:
+            block = _decide(world, state)
+            dice = (*dice, dice[-1])
+        assert block.poses is not None
+        poses = block.poses[:, :, state.step % world.policy.steps_per_decision]
+        velocity = (poses[..., :2] - before[..., :2]) / STEP_S
+        follows = world.drivers == Driver.POLICY
+        motion[follows] = np.concatenate([poses, velocity], -1)[follows]
+    coasts = world.drivers == Driver.CONSTANT_VELOCITY
+    if coasts.any():
+        motion[coasts] = before[coasts]
+        motion[coasts, :2] += STEP_S * before[coasts, 3:]
+    # 2. IDM-driven vehicles
+    places = state.places
+    if any(len(lines.agents) for lines in world.lines):
+        present = world.there[:, :, following - 1]
+        moves = [
+            advance_idm(lines, place, before[b, :count], present[b, :count], scene, following - 1, IDM)
+            for b, ((scene, lines), place) in enumerate(zip(_idm(world), places))
+            for count in [len(scene.object_id)]
+        ]
+        places = tuple(place for place, _ in moves)
+        for b, (lines, (_, driven)) in enumerate(zip(world.lines, moves)):
+            motion[b, lines.agents] = driven
+    # 3. the planner's agents; padding stays at zero
+    motion[world.actors[:, 0], world.actors[:, 1]] = moved
+    return WorldState((*state.track, motion), block, state.noise, dice, places)
+
+
+def fork(world: World, state: WorldState, number: int, noise: Noise = "same") -> tuple[WorldState, ...]:
+    """States that go on from the same one: nothing is copied but the noise of the decisions to come.
+
+    Args:
+        world: the scenes.
+        state: where the branches begin.
+        number: of branches.
+        noise: "same" = all meet the dice of `state`; "new" = branch i meets those of rollout + 1 + i, from the next
+            decision on.
+    """
+    if noise == "same" or state.noise is None:
+        return (state,) * number
+    return tuple(
+        with_dice(world, state, [Dice(d.seed, d.rollout + 1 + branch) for d in state.dice[-1]])
+        for branch in range(number)
+    )
+
+
+def with_dice(world: World, state: WorldState, dice: Sequence[Dice]) -> WorldState:
+    """The same state with other dice from the next decision on.
+
+    Args:
+        world: the scenes.
+        state: of these.
+        dice: of each scene.
+    """
+    noise = None if state.noise is None else _decision_noise(world, dice)
+    return replace(state, noise=noise, dice=(*state.dice[:-1], tuple(dice)))
+
+
+def _decide(world: World, state: WorldState) -> Block:
+    """Decisions of the next block: the last one is finished with what really happened, then the policy decides."""
+    policy, block = world.policy, state.block
+    assert policy is not None and block is not None and state.noise is not None
+    with one_thread(), torch.no_grad():
+        before = block.before
+        if block.decision is not None:
+            before = policy.advance(world.context, before, block.decision, _forced(world, state))
+        distribution = policy.decide(world.context, before)
+        index = state.step // policy.steps_per_decision
+        decision = distribution.sample(world.sampling, state.noise[..., index, :])
+        poses = policy.advance(world.context, before, decision).poses
+    return Block(before, decision, poses[:, 0].cpu().numpy().astype(np.float64))
+
+
+def _forced(world: World, state: WorldState) -> AgentStates | None:
+    """What the agents that the policy does not drive did in the last block; None where it drives all."""
+    assert world.policy is not None
+    imposed = world.mask & (world.drivers != Driver.POLICY)
+    if not imposed.any():
+        return None
+    steps = world.policy.steps_per_decision
+    done = torch.from_numpy(np.stack(state.track[-steps:], 2)).float().to(world.batch.device)[:, None]  # [B 1 A k 5]
+    valid = torch.from_numpy(imposed).to(done.device)[:, None, :, None].expand(done.shape[:-1])
+    return AgentStates(done[..., :2], done[..., 2], valid)
+
+
+def _decision_noise(world: World, dice: Sequence[Dice]) -> Tensor:
+    assert world.policy is not None
+    num_decisions = FUTURE_STEPS // world.policy.steps_per_decision
+    noise = _noise(world, dice, "decide", num_decisions * world.policy.noise_size)
+    return noise.unflatten(-1, (num_decisions, -1))
+
+
+def _noise(world: World, dice: Sequence[Dice], purpose: str, per_agent: int) -> Float[Tensor, "B 1 A k"]:
+    """Noise of scenes with dice of their own, as `simulate` draws it for each of them."""
+    return torch.cat([
+        draw_noise(one, range(d.rollout, d.rollout + 1), seed=d.seed, purpose=purpose, per_agent=per_agent)
+        for one, d in zip(world.batch.split(1), dice)
+    ])  # fmt: skip
+
+
+def _idm(world: World) -> list[tuple[Scene, IdmLines]]:
+    return list(zip(world.scenes, world.lines))
