@@ -28,6 +28,7 @@ VERBS = {
     "model": ("rlftsim.cli.model", "Model"),
     "goals": ("rlftsim.cli.goals", "GoalsVerb"),
     "simulate": ("rlftsim.cli.simulate", "Simulate"),
+    "drive": ("rlftsim.cli.drive", "Drive"),
     "score": ("rlftsim.cli.results", "Score"),
     "evaluate": ("rlftsim.cli.results", "Evaluate"),
     "compare": ("rlftsim.cli.results", "Compare"),
@@ -55,6 +56,7 @@ usage: rlftsim VERB ...      rlftsim VERB --help explains a verb
   model        import a checkpoint of the public CAT-K code, or export one
   goals        propose goals for agents and write a goals file, or check one
   simulate     roll out scenarios with a model
+  drive        let a planner drive among simulated traffic, and score both
 
   score        score rollouts of any simulator with the official realism meta-metric
   evaluate     evaluate a model with the official realism meta-metric
@@ -63,7 +65,7 @@ usage: rlftsim VERB ...      rlftsim VERB --help explains a verb
   experiment   repeat an experiment of the paper: a table, verdicts and a figure
 """
 
-STARTS_ANEW = ("doctor", "data", "recipe", "tokens", "model", "goals", "compare")
+STARTS_ANEW = ("doctor", "data", "recipe", "tokens", "model", "goals", "drive", "compare")
 """Verbs that keep nothing of an interrupted run."""
 INTERRUPTED = 130
 USER_MISTAKE = 2

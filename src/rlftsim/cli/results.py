@@ -11,6 +11,7 @@ from tyro.conf import Positional
 
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.compare import columns_of, compare, format_comparison, format_table
+from rlftsim.evaluation.drive_results import DriveResult, format_drive_comparison, format_drives, is_drive_result
 from rlftsim.evaluation.evaluate import EvaluateConfig, evaluate, evaluation_name
 from rlftsim.evaluation.explain_page import explain_rollouts
 from rlftsim.evaluation.results import Evaluation
@@ -122,7 +123,7 @@ class Compare:
     """Compare two evaluations scenario by scenario: mean differences with 95 % intervals and a verdict."""
 
     first: Positional[Path]
-    """A parquet file that `rlftsim evaluate` wrote."""
+    """A parquet file that `rlftsim evaluate` or `rlftsim drive` wrote."""
     second: Positional[Path]
     """Another one, on the same scenarios. Differences are second minus first."""
     alpha: float = 0.05
@@ -130,6 +131,10 @@ class Compare:
 
     def run(self) -> int:
         """Print both tables."""
+        if is_drive_result(self.first) and is_drive_result(self.second):
+            drives = DriveResult.read(self.first), DriveResult.read(self.second)
+            print_wide(format_drives(*drives), format_drive_comparison(*drives, alpha=self.alpha))
+            return 0
         a, b = Evaluation.read(self.first), Evaluation.read(self.second)
         comparison = compare(a, b, alpha=self.alpha)
         print_wide(format_table(a, b), format_comparison(comparison, columns=columns_of(a, b)))

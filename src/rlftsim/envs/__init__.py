@@ -10,12 +10,21 @@ from rlftsim.errors import ConfigError
 
 try:
     import gymnasium
-except ImportError:
-    raise ConfigError("rlftsim.envs needs gymnasium and pettingzoo: pip install 'rlftsim[env]'.") from None
+    import pettingzoo  # noqa: F401
+except ImportError as error:
+    raise ConfigError(f"rlftsim.envs needs gymnasium and pettingzoo ({error}): pip install 'rlftsim[env]'.") from None
 
+from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.ego_env import EgoEnv
+from rlftsim.envs.parallel import TrafficParallelEnv, parallel_env
+from rlftsim.envs.result import Result
+from rlftsim.envs.vector_env import EgoVectorEnv
 
-__all__ = ["EgoEnv"]
+__all__ = ["EgoEnv", "EgoVectorEnv", "EnvConfig", "Result", "TrafficParallelEnv", "parallel_env"]
 
 if "rlftsim/Ego-v0" not in gymnasium.registry:
-    gymnasium.register("rlftsim/Ego-v0", entry_point="rlftsim.envs.ego_env:EgoEnv")
+    gymnasium.register(
+        "rlftsim/Ego-v0",
+        entry_point="rlftsim.envs.ego_env:EgoEnv",
+        vector_entry_point="rlftsim.envs.vector_env:EgoVectorEnv",
+    )

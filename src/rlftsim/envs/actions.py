@@ -7,7 +7,7 @@ in the center of the box and x ahead.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -56,6 +56,7 @@ class Moves:
     """True = the action was out of its bounds and has been cut to them."""
 
 
+@runtime_checkable
 class Controls(Protocol):
     """One way to act."""
 
@@ -343,7 +344,9 @@ class TokenControls:
             agent = int((~known).argmax())
             name = CLASS_NAMES[int(classes[agent])]
             count = int(vocabulary.token_mask[classes[agent]].sum())
-            raise ConfigError(f"action of {actors.name_of(agent)}: class {name} has {count} tokens, none is {ids[agent]}.")
+            raise ConfigError(
+                f"action of {actors.name_of(agent)}: class {name} has {count} tokens, none is {ids[agent]}."
+            )
         poses = vocabulary.poses.cpu()[classes, ids].numpy().astype(np.float64)
         return Moves(with_velocity(placed(poses, actors.motion), actors.motion), np.zeros(len(action), bool))
 

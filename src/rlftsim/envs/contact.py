@@ -46,7 +46,7 @@ class Collision:
     """Row of the track."""
     kind: CollisionType
     at_fault: bool
-    """Of the planner's agent: it hit a stopped track, or another one with its front, or one beside it out of its lane."""
+    """Of the planner's agent: a stopped track, its own front, or a track beside it while it is not in one lane."""
     speed_change_mps: float
     """Length of the difference of both velocities."""
 

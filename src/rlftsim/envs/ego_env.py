@@ -1,20 +1,29 @@
 """The Gymnasium environment: a planner drives the ego of a scenario, a traffic model everybody else."""
 
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
-from jaxtyping import Float
 
-from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.episode import Episode, EpisodeState, advance, look, start
+from rlftsim.envs.record import record_of
+from rlftsim.envs.resets import about, chosen, config_of, lights_are_held
+from rlftsim.envs.result import Result, animation_of, page_of
+from rlftsim.envs.snapshot import read_snapshot, write_snapshot
 from rlftsim.envs.source import Source
 from rlftsim.envs.spaces import action_space, observation_space, shown
-from rlftsim.envs.world import Dice, Noise
-from rlftsim.errors import ConfigError, whole_number
+from rlftsim.envs.world import Noise, fork
+from rlftsim.errors import ConfigError
 from rlftsim.rollout.policy import Policy
 from rlftsim.scenario.any_form import AnyScenarios
-from rlftsim.scenario.types import CURRENT_STEP
+from rlftsim.viewer.film import Camera
+from rlftsim.viewer.page import Panel
+from rlftsim.viewer.scene import SceneMotion
+
+RENDER_DOTS_PER_INCH = 100
+"""Makes pictures 400 pixels wide."""
+
 
 class EgoEnv(gymnasium.Env):
     """One scenario at a time; `gymnasium.make("rlftsim.envs:rlftsim/Ego-v0", ...)` makes it.
@@ -43,6 +52,7 @@ class EgoEnv(gymnasium.Env):
         self.observation_space = observation_space(self.config.observation)
         self._begun: tuple[Episode, EpisodeState] | None = None
         self._seed, self._count = 0, 0
+        self._camera: Camera | None = None
 
     @property
     def episode(self) -> Episode:
@@ -64,9 +74,7 @@ class EgoEnv(gymnasium.Env):
             raise ConfigError("this environment has no episode yet: call reset() first.")
         return self._begun
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode.
 
         Args:
@@ -80,7 +88,7 @@ class EgoEnv(gymnasium.Env):
         super().reset(seed=seed)
         if seed is not None or self._begun is None:
             self._seed, self._count = int(self.np_random_seed or 0), 0
-        scenario_id, dice, goals = chosen(self, self.source, options or {}, self._seed, self._count)
+        scenario_id, dice, goals = chosen(self.np_random, self.source, options or {}, self._seed, self._count)
         self._count += 1
         scenario = self.source.scenario(scenario_id)
         episode = self.source.episode([scenario], {scenario_id: goals} if goals else None)
@@ -113,6 +121,8 @@ class EgoEnv(gymnasium.Env):
             "lights_held": lights_are_held(episode, state, 0),
         }
         terminated, truncated = bool(outcome.terminated[0]), bool(outcome.truncated[0])
+        if terminated or truncated:
+            info["result"] = self.result()
         return self._look(), float(outcome.reward[0]), terminated, truncated, info
 
     def fork(self, number: int, noise: Noise = "same") -> list["EgoEnv"]:
@@ -122,99 +132,48 @@ class EgoEnv(gymnasium.Env):
             number: of branches.
             noise: "same" = they meet the same dice; "new" = other ones from the next decision of the traffic on.
         """
-        from rlftsim.envs.world import fork
-
         episode, state = self._running
         branches = []
         for world in fork(episode.world, state.world, number, noise):
             branch = EgoEnv(source=self.source)
-            branch._begun = episode, EpisodeState(**{**vars(state), "world": world})
+            branch._begun = episode, replace(state, world=world)
             branch._seed, branch._count = self._seed, self._count
             branches.append(branch)
         return branches
 
+    def result(self) -> Result:
+        """Scores of the episode so far."""
+        return Result(record_of(self.episode, self.state))
+
+    def render(self) -> Any:
+        """Picture of the scene [height, width, 3], or a page that plays the episode so far, by `render_mode`."""
+        if self.render_mode is None:
+            return None
+        record = record_of(self.episode, self.state)
+        if self.render_mode == "html":
+            return page_of({"planner": record})
+        if self._camera is None or self._camera.animation.scene.scenario_id != record.scene.scenario.scenario_id:
+            self._camera = Camera(animation_of({"planner": record}), RENDER_DOTS_PER_INCH)
+        present = record.motion[None, :, -1:].astype(np.float32)  # [1, A, 1, 5]
+        motion = SceneMotion(present[..., :2], present[..., 2], record.there[None, :, -1:])
+        return self._camera.frame([Panel("planner", motion)], 0, len(self.state.world.track) - 1)
+
+    def snapshot(self) -> bytes:
+        """The running episode as bytes, to be restored in this or another process with the same data and model."""
+        return write_snapshot(self.episode, self.state, self.source.fingerprint)
+
+    def restore(self, saved: bytes) -> tuple[Any, dict[str, Any]]:
+        """Go on from a snapshot: the episode is run again with the planner's stored motion, which gives equal bits.
+
+        Args:
+            saved: of `snapshot`.
+
+        Raises:
+            ConfigError: of another model, or of other settings.
+            DataError: no snapshot.
+        """
+        self._begun = read_snapshot(saved, self.source)
+        return self._look(), about(self.episode, self.state, 0, self.source)
+
     def _look(self) -> Any:
         return shown(look(self.episode, self.state), self.config.observation, 0)
-
-
-def config_of(settings: dict[str, Any]) -> EnvConfig:
-    """Settings by name.
-
-    Raises:
-        ConfigError: one that there is not.
-    """
-    unknown = [name for name in settings if name not in EnvConfig.__dataclass_fields__]
-    if unknown:
-        raise ConfigError(f"no setting {unknown[0]!r}: known are {', '.join(EnvConfig.__dataclass_fields__)}.")
-    return EnvConfig(**settings)
-
-
-def chosen(env: Any, source: Source, options: dict[str, Any], seed: int, count: int) -> tuple[str, Dice, Any]:
-    """Scenario, dice and goals of a reset.
-
-    Args:
-        env: supplies the random numbers.
-        source: supplies the scenarios.
-        options: of the reset.
-        seed: of the traffic.
-        count: episodes since the seed, the number of the rollout.
-
-    Raises:
-        ConfigError: an option that there is not.
-    """
-    unknown = [name for name in options if name not in ("scenario", "rollout", "goals")]
-    if unknown:
-        raise ConfigError(f"reset has no option {unknown[0]!r}: known are scenario, rollout, goals.")
-    drawn = int(env.np_random.integers(len(source.scenario_ids)))
-    scenario_id = options.get("scenario", source.scenario_ids[drawn])
-    rollout = whole_number("rollout", options.get("rollout", count), 0)
-    return scenario_id, Dice(seed, rollout), options.get("goals")
-
-
-def about(episode: Episode, state: EpisodeState, row: int, source: Source) -> dict[str, Any]:
-    """Information at the beginning of an episode.
-
-    Args:
-        episode: of the agent.
-        state: its first.
-        row: of the agent.
-        source: of the environment.
-    """
-    scene_row, agent = episode.world.actors[row]
-    scene, dice = episode.world.scenes[scene_row], state.world.dice[-1][scene_row]
-    return {
-        "scenario": scene.scenario.scenario_id,
-        "agent": int(scene.object_id[agent]),
-        "seed": dice.seed,
-        "rollout": dice.rollout,
-        "step": 0,
-        "route": episode.atlas.routes[row].source,
-        "model": source.fingerprint,
-        "lights_held": lights_are_held(episode, state, row),
-        "logged": logged_poses(episode, row),
-    }
-
-
-def logged_poses(episode: Episode, row: int) -> Float[np.ndarray, "81 3"]:
-    """Logged poses of an agent from the current step on, map frame; NaN where there is no state.
-
-    Args:
-        episode: of the agent.
-        row: of the agent.
-    """
-    scene, agent = episode.world.actors[row]
-    poses = episode.world.logged[scene, agent, CURRENT_STEP:, :3].copy()
-    poses[~episode.world.valid[scene, agent, CURRENT_STEP:]] = np.nan
-    return poses
-
-
-def lights_are_held(episode: Episode, state: EpisodeState, row: int) -> bool:
-    """True where lights keep their last state as the log has no further ones.
-
-    Args:
-        episode: of the agent.
-        state: the present one.
-        row: of the agent.
-    """
-    lights = episode.world.scenes[episode.world.actors[row][0]].lights
-    return 0 <= lights.last_observed < len(state.world.track) - 1

@@ -3,7 +3,9 @@
 B scenes in step, M planner-driven agents over all of them. An `Episode` does not change, an `EpisodeState` is a value.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,7 +17,7 @@ from rlftsim.envs.contact import Collision, boxes_overlap, collision_of, corners
 from rlftsim.envs.observations import Atlas, Observation, build_atlas, observe
 from rlftsim.envs.rewards import WeightedTerm
 from rlftsim.envs.route import route_of
-from rlftsim.envs.world import Dice, World, WorldState, begin, step_world
+from rlftsim.envs.world import Dice, World, WorldState, begin, step_world, with_dice
 from rlftsim.geometry import wrapped
 from rlftsim.realism.map_based import (
     RoadEdges,
@@ -29,6 +31,8 @@ from rlftsim.scenario.types import Scenario
 OUTSIDE_M = 0.3
 """A corner this far off the road leaves the drivable area, as in nuPlan."""
 AT_GOAL_M = 2.0
+ScenarioGoals = Mapping[str, Mapping[int, Any]]
+"""Scenario id -> object id -> (x, y), world frame, m."""
 MAX_PAIRS = 1 << 22
 """Bounds the memory of the search for road edges."""
 
@@ -45,6 +49,8 @@ class Episode:
     edges: RoadEdges | None
     bottom_z: Float[np.ndarray, "M"]
     """Height of the agents' boxes above the world's zero, m."""
+    goals: ScenarioGoals | None
+    """Of agents that follow the policy."""
 
     @property
     def num_agents(self) -> int:
@@ -91,7 +97,11 @@ class Outcome:
 
 
 def build_episode(
-    world: World, controls: Controls, terms: tuple[WeightedTerm, ...], config: EnvConfig
+    world: World,
+    controls: Controls,
+    terms: tuple[WeightedTerm, ...],
+    config: EnvConfig,
+    goals: ScenarioGoals | None = None,
 ) -> Episode:
     """Episode in a world.
 
@@ -100,14 +110,17 @@ def build_episode(
         controls: of the actions.
         terms: of the reward.
         config: settings.
+        goals: that the world was built with.
     """
     routes = tuple(
-        route_of(world.scenes[scene].scenario, int(agent), config.route if agent == world.scenes[scene].ego else "logged")
+        route_of(
+            world.scenes[scene].scenario, int(agent), config.route if agent == world.scenes[scene].ego else "logged"
+        )
         for scene, agent in world.actors
     )
     bottom = [world.scenes[scene].z[agent] - world.scenes[scene].size[agent, 2] / 2 for scene, agent in world.actors]
     edges = join_road_edges([road_edges(scene.scenario) for scene in world.scenes])
-    return Episode(world, build_atlas(world, routes), controls, terms, config, edges, np.array(bottom))
+    return Episode(world, build_atlas(world, routes), controls, terms, config, edges, np.array(bottom), goals)
 
 
 @cached_on_scenario
@@ -152,9 +165,7 @@ def advance(episode: Episode, state: EpisodeState, action: np.ndarray) -> tuple[
     """
     motion = own_motion(episode, state.world)
     scene, agent = episode.world.actors.T
-    actors = Actors(
-        episode.name_of, motion, episode.world.size[scene, agent], episode.world.object_type[scene, agent]
-    )
+    actors = Actors(episode.name_of, motion, episode.world.size[scene, agent], episode.world.object_type[scene, agent])
     moves = episode.controls.move(checked(action, episode.controls, actors), actors)
     terms = {}
     for step in range(episode.controls.steps):
@@ -163,24 +174,64 @@ def advance(episode: Episode, state: EpisodeState, action: np.ndarray) -> tuple[
         moved = np.where(state.ended[:, None], stands, moves.motion[:, step])
         state, now = _step(episode, state, moved)
         terms = {name: terms.get(name, 0.0) + value for name, value in now.items()}
+    following = _with_ends(episode, state)
+    ends = following.ended & ~state.ended
     is_over = state.world.step >= episode.config.max_steps
-    ends = np.zeros(episode.num_agents, bool)
-    for reason, happened in (
-        ("collision", np.array([bool(found) for found in state.collisions], bool)),
-        ("offroad", state.outside), ("goal", state.at_goal),
-    ):  # fmt: skip
-        if reason in episode.config.stop_on:
-            ends |= happened
+    terminated = ends & _stopped(episode, state)
     reward = sum((term.weight * terms[term.name] for term in episode.terms), np.zeros(episode.num_agents))
-    alive = ~state.ended
-    outcome = Outcome(
-        reward=np.where(alive, reward, 0.0),
+    return following, Outcome(
+        reward=np.where(state.ended, 0.0, reward),
         terms=terms,
-        terminated=ends & alive,
-        truncated=np.full(episode.num_agents, is_over) & alive & ~ends,
+        terminated=terminated,
+        truncated=ends & ~terminated & is_over,
         clipped=moves.clipped,
     )
-    return replace(state, ended=state.ended | ends | is_over), outcome
+
+
+def repeat(
+    episode: Episode,
+    state: EpisodeState,
+    motion: Float[np.ndarray, "T M 5"],
+    dice: Sequence[tuple[Dice, ...]],
+) -> EpisodeState:
+    """The state after steps whose motion is known.
+
+    Args:
+        episode: the scenes.
+        state: the first.
+        motion: of the planner-driven agents.
+        dice: of each decision of the traffic, and of those that follow.
+    """
+    policy = episode.world.policy
+    for step, moved in enumerate(motion):
+        if policy is not None and step % policy.steps_per_decision == 0:
+            state = _with_dice(episode, state, dice[step // policy.steps_per_decision])
+        state, _ = _step(episode, state, moved)
+        if (step + 1) % episode.controls.steps == 0:
+            state = _with_ends(episode, state)
+    return _with_dice(episode, state, dice[-1])
+
+
+def _with_dice(episode: Episode, state: EpisodeState, dice: tuple[Dice, ...]) -> EpisodeState:
+    if state.world.dice[-1] == dice:
+        return state
+    return replace(state, world=with_dice(episode.world, state.world, dice))
+
+
+def _stopped(episode: Episode, state: EpisodeState) -> Bool[np.ndarray, "M"]:
+    """True = an event of `stop_on` has happened to the agent."""
+    events = {
+        "collision": np.array([bool(found) for found in state.collisions], bool),
+        "offroad": state.outside,
+        "goal": state.at_goal,
+    }
+    return np.any([events[name] for name in episode.config.stop_on] or [np.zeros(episode.num_agents, bool)], axis=0)
+
+
+def _with_ends(episode: Episode, state: EpisodeState) -> EpisodeState:
+    """The same state, with the agents marked whose episode ends here."""
+    is_over = state.world.step >= episode.config.max_steps
+    return replace(state, ended=state.ended | _stopped(episode, state) | is_over)
 
 
 def _step(
@@ -200,7 +251,7 @@ def _step(
                 world.now[scene, agent], episode.world.size[scene, agent],
             )
         )  # fmt: skip
-    new = [known[len(before):] for known, before in zip(found, state.collisions)]
+    new = [known[len(earlier) :] for known, earlier in zip(found, state.collisions)]
     # 2. road and route
     scene, agent = episode.world.actors.T
     half_diagonal = np.hypot(*episode.world.size[scene, agent].T) / 2
@@ -215,9 +266,7 @@ def _step(
     routeless = episode.atlas.route_length == 0
     step = moved[:, :2] - before[:, :2]
     ahead = np.cos(moved[:, 2]) * step[:, 0] + np.sin(moved[:, 2]) * step[:, 1]
-    ends = episode.atlas.route_points[
-        np.arange(episode.num_agents), np.maximum(episode.atlas.route_length - 1, 0)
-    ]
+    ends = episode.atlas.route_points[np.arange(episode.num_agents), np.maximum(episode.atlas.route_length - 1, 0)]
     near_end = np.linalg.norm(moved[:, :2] - ends, axis=-1) <= AT_GOAL_M
     at_goal = state.at_goal | (near_end & ~routeless)
     terms = {

@@ -169,7 +169,7 @@ def build_atlas(world: World, routes: tuple[Route, ...]) -> Atlas:
     )
 
 
-def _stack(parts: list[np.ndarray], fill: float) -> np.ndarray:
+def _stack(parts: list[np.ndarray], fill: float | int) -> np.ndarray:
     """Arrays of different lengths, padded to the longest, at least to one row."""
     longest = max(1, *(len(part) for part in parts))
     out = np.full((len(parts), longest, *parts[0].shape[1:]), fill, parts[0].dtype)
@@ -228,7 +228,9 @@ def observe(world: World, atlas: Atlas, state: WorldState, *, frame: Frame = "eg
     age = STEP_S * (log_step - atlas.last_logged[scene[:, None], chosen, log_step])
     held = world.drivers[scene[:, None], chosen] == Driver.REPLAY  # they alone have a log to go by
     facts = [world.size[scene[:, None], chosen], world.object_type[scene[:, None], chosen][..., None]]
-    neighbors = np.concatenate([poses[:, -1], turned(seen[:, -1, :, 3:]), *facts, np.where(held, age, 0)[..., None]], -1)
+    neighbors = np.concatenate(
+        [poses[:, -1], turned(seen[:, -1, :, 3:]), *facts, np.where(held, age, 0)[..., None]], -1
+    )
     history = np.where(seen_there[:, :-1, :, None], poses[:, :-1], 0.0)  # [M, 10, K, 4]
     # 3. The map.
     lane, lane_near = _nearest(distance(atlas.lane_middle[scene]), LANES)
@@ -307,7 +309,9 @@ def observe(world: World, atlas: Atlas, state: WorldState, *, frame: Frame = "eg
     )
 
 
-def _nearest(distance: Float[np.ndarray, "M n"], count: int) -> tuple[Int64[np.ndarray, "M k"], Bool[np.ndarray, "M k"]]:
+def _nearest(
+    distance: Float[np.ndarray, "M n"], count: int
+) -> tuple[Int64[np.ndarray, "M k"], Bool[np.ndarray, "M k"]]:
     """Indices of the nearest `count` columns of each row in order, and True where they are within sight."""
     row = np.arange(len(distance))[:, None]
     if distance.shape[1] > count:

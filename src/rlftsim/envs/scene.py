@@ -4,6 +4,7 @@ Frame: map (centered on the scenario, meters), float64. Built once per scenario 
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Bool, Float, Int64
@@ -181,7 +182,7 @@ def _edges(scenario: Scenario) -> Float[np.ndarray, "e 4"]:
     for index in features.indices_of(ROAD_EDGE_TYPES):
         line = features.polyline(index)[:, :2].astype(np.float64) - scenario.origin
         corners = simplify(line[np.isfinite(line).all(1)])
-        for start, end in zip(corners, corners[1:]):
+        for start, end in pairwise(corners):
             count = max(1, int(np.ceil(np.linalg.norm(end - start) / PIECE_M)))
             cuts = start + np.linspace(0, 1, count + 1)[:, None] * (end - start)
             found.append(np.concatenate([cuts[:-1], cuts[1:]], axis=1))

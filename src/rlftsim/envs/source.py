@@ -8,8 +8,10 @@ import torch
 
 from rlftsim.envs.actions import Controls, controls_of
 from rlftsim.envs.config import EnvConfig
-from rlftsim.envs.episode import Episode, build_episode
+from rlftsim.envs.drivers import Driver, drivers_of
+from rlftsim.envs.episode import Episode, ScenarioGoals, build_episode
 from rlftsim.envs.rewards import WeightedTerm, parse_terms
+from rlftsim.envs.scene import build_env_scene
 from rlftsim.envs.world import build_world
 from rlftsim.errors import ConfigError
 from rlftsim.policies.registry import load_policy
@@ -23,9 +25,6 @@ from rlftsim.threads import one_thread
 
 KEPT_CONTEXTS = 16
 """Encoded scenarios that are kept: encoding is most of the cost of a reset."""
-
-PointGoals = Mapping[int, Any]
-"""Object id -> (x, y), world frame, m."""
 
 
 class Source:
@@ -57,7 +56,9 @@ class Source:
         self.rules = {**(controlled or {"ego": "planner"}), **config.drivers, "*": config.traffic}
         # IDM leaves pedestrians and cyclists to the policy
         needs_policy = "policy" in self.rules.values() or "idm" in self.rules.values() or config.action == "token"
-        self.policy = policy if policy is not None else load_policy(config.model, config.device) if needs_policy else None
+        self.policy = (
+            policy if policy is not None else load_policy(config.model, config.device) if needs_policy else None
+        )
         self.fingerprint = fingerprint_policy(self.policy) if self.policy is not None else "none"
         self.controls: Controls = controls_of(
             config.action, self.policy, horizon=config.horizon, tracker=config.tracker, reverse=config.reverse,
@@ -80,7 +81,12 @@ class Source:
                 f"no scenario {scenario_id!r}: this environment has {len(self.scenario_ids)}, such as {some}."
             ) from None
 
-    def episode(self, scenarios: list[Scenario], goals: Mapping[str, PointGoals] | None = None) -> Episode:
+    def planned_agents(self, scenario: Scenario) -> list[int]:
+        """Object ids of the planner-driven agents of a scenario, in track order."""
+        scene = build_env_scene(scenario)
+        return scene.object_id[drivers_of(scene, self.rules) == Driver.PLANNER].tolist()
+
+    def episode(self, scenarios: list[Scenario], goals: ScenarioGoals | None = None) -> Episode:
         """An episode in some scenarios, which step together.
 
         Args:
@@ -101,7 +107,7 @@ class Source:
             raise ConfigError(
                 f"scenario {scenarios[0].scenario_id}: the planner drives no agent: its ego or ids are not simulated."
             )
-        return build_episode(world, self.controls, self.terms, self.config)
+        return build_episode(world, self.controls, self.terms, self.config, goals)
 
     def _context(self, scenarios: list[Scenario]) -> Any:
         """Context of a single scenario, from the last ones if it is among them; None leaves it to the world."""

@@ -176,7 +176,7 @@ def build_world(
     )
 
 
-def _padded(parts: list[np.ndarray], shape: tuple[int, ...], fill: float = 0.0) -> np.ndarray:
+def _padded(parts: list[np.ndarray], shape: tuple[int, ...], fill: float | int | bool = 0.0) -> np.ndarray:
     out = np.full((len(parts), *shape[1:]), fill, parts[0].dtype)
     for row, part in zip(out, parts):
         row[: len(part)] = part
@@ -279,7 +279,9 @@ def with_dice(world: World, state: WorldState, dice: Sequence[Dice]) -> WorldSta
 def _decide(world: World, state: WorldState) -> Block:
     """Decisions of the next block: the last one is finished with what really happened, then the policy decides."""
     policy, block = world.policy, state.block
-    assert policy is not None and block is not None and state.noise is not None
+    assert policy is not None
+    assert block is not None
+    assert state.noise is not None
     with one_thread(), torch.no_grad():
         before = block.before
         if block.decision is not None:

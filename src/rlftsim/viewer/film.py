@@ -1,7 +1,7 @@
 """Films of scenes: the panels of an animation side by side, step by step, in a file that plays anywhere."""
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import imageio_ffmpeg
@@ -13,11 +13,13 @@ from PIL import Image
 from rlftsim.atomic_io import write_whole
 from rlftsim.errors import ConfigError
 from rlftsim.scenario.types import CURRENT_STEP
-from rlftsim.viewer.page import Animation
+from rlftsim.viewer.page import Animation, Panel
 from rlftsim.viewer.picture import agent_shapes, draw_scene, light_dots
 
 STEPS_PER_SECOND = 10
 HOLD_AT_END_S = 1.0
+
+Frame = UInt8[np.ndarray, "height width 3"]
 
 
 def to_film(path: str | os.PathLike[str], animation: Animation, *, every: int = 1, dots_per_inch: int = 110) -> None:
@@ -43,30 +45,51 @@ def to_film(path: str | os.PathLike[str], animation: Animation, *, every: int = 
     write_whole(path, lambda temporary: WRITERS[path.suffix](temporary, films, STEPS_PER_SECOND / every))
 
 
-Frame = UInt8[np.ndarray, "height width 3"]
+class Camera:
+    """Draws single frames of a scene.
+
+    Args:
+        animation: scene and panels.
+        dots_per_inch: 110 makes a panel 440 pixels wide.
+    """
+
+    def __init__(self, animation: Animation, dots_per_inch: int):
+        self.animation = animation
+        self._figure, self._axes = draw_scene(animation)
+        self._figure.set_dpi(dots_per_inch)
+        self._canvas = FigureCanvasAgg(self._figure)
+        self._canvas.draw()
+        # The map is drawn once and copied under every frame, because it takes most of the time.
+        self._ground = self._canvas.copy_from_bbox(self._figure.bbox)
+
+    def frame(self, panels: Sequence[Panel], step: int, light_step: int | None = None) -> Frame:
+        """Picture of the agents at one step.
+
+        Args:
+            panels: motion, one for each panel of the animation.
+            step: of the motion.
+            light_step: of the log, for traffic lights; None = `step`.
+        """
+        scene, lights_at = self.animation.scene, step if light_step is None else light_step
+        self._canvas.restore_region(self._ground)
+        for axis, panel in zip(self._axes, panels):
+            shapes = agent_shapes(scene.agents, panel, step)
+            for shape in shapes:
+                axis.add_collection(shape, autolim=False)
+            for shape in (*shapes, light_dots(axis, scene, lights_at)):
+                axis.draw_artist(shape)
+                shape.remove()
+        drawn = np.asarray(self._canvas.buffer_rgba())[..., :3]
+        # H.264 wants even sizes. The copy is needed because the canvas reuses its buffer.
+        return drawn[: len(drawn) // 2 * 2, : drawn.shape[1] // 2 * 2].copy()
 
 
 def _frames(animation: Animation, every: int, dots_per_inch: int) -> Iterator[Frame]:
     """Frames of a film, one every so many steps."""
-    figure, axes = draw_scene(animation)
-    figure.set_dpi(dots_per_inch)
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    # The map is drawn once and copied under every frame, because it takes most of the time.
-    ground = canvas.copy_from_bbox(figure.bbox)
+    camera = Camera(animation, dots_per_inch)
     num_steps = max(panel.trajectories.num_steps for panel in animation.panels)
     for step in range(CURRENT_STEP, num_steps, every):
-        canvas.restore_region(ground)
-        for axis, panel in zip(axes, animation.panels):
-            shapes = agent_shapes(animation.scene.agents, panel, step)
-            for shape in shapes:
-                axis.add_collection(shape, autolim=False)
-            for shape in (*shapes, light_dots(axis, animation.scene, step)):
-                axis.draw_artist(shape)
-                shape.remove()
-        drawn = np.asarray(canvas.buffer_rgba())[..., :3]
-        # H.264 wants even sizes. The copy is needed because the canvas reuses its buffer.
-        yield drawn[: len(drawn) // 2 * 2, : drawn.shape[1] // 2 * 2].copy()
+        yield camera.frame(animation.panels, step)
 
 
 def _write_mp4(path: Path, frames: list[Frame], frames_per_second: float) -> None:

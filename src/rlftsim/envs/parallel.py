@@ -1,0 +1,162 @@
+"""The PettingZoo environment: a planner for each of several agents, in one scene."""
+
+from typing import Any, ClassVar
+
+import numpy as np
+from gymnasium.spaces import Space
+from gymnasium.utils import seeding
+from pettingzoo import ParallelEnv
+
+from rlftsim.envs.config import EnvConfig
+from rlftsim.envs.episode import Episode, EpisodeState, advance, look, start
+from rlftsim.envs.record import record_of
+from rlftsim.envs.resets import about, chosen, config_of, lights_are_held
+from rlftsim.envs.result import Result
+from rlftsim.envs.source import Source
+from rlftsim.envs.spaces import action_space, observation_space, shown
+from rlftsim.errors import ConfigError
+from rlftsim.rollout.policy import Policy
+from rlftsim.scenario.any_form import AnyScenarios
+
+Controlled = str | list[int]
+
+
+def parallel_env(
+    *,
+    controlled: Controlled = "ego",
+    scenarios: AnyScenarios | None = None,
+    policy: Policy | None = None,
+    **settings: Any,
+) -> "TrafficParallelEnv":
+    """A PettingZoo parallel environment.
+
+    Args:
+        controlled: planner-driven agents: "ego", "tracks_to_predict", "vehicles", or object ids.
+        scenarios: in place of the data set `data`.
+        policy: in place of the traffic model `model`.
+        settings: fields of `EnvConfig` by name.
+
+    Raises:
+        ConfigError: settings that do not fit each other.
+    """
+    return TrafficParallelEnv(controlled, Source(config_of(settings), scenarios, policy, _rules(controlled)))
+
+
+def _rules(controlled: Controlled) -> dict[str | int, str]:
+    names = [controlled] if isinstance(controlled, str) else controlled
+    return dict.fromkeys(names, "planner")
+
+
+class TrafficParallelEnv(ParallelEnv):
+    """Planner-driven agents of one scene, named by their object ids.
+
+    Args:
+        controlled: planner-driven agents.
+        source: scenarios, model and settings.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"name": "rlftsim/Traffic-v0", "render_modes": [], "is_parallelizable": True}
+
+    def __init__(self, controlled: Controlled, source: Source):
+        config: EnvConfig = source.config
+        if config.render_mode is not None or config.observation == "arrays":
+            raise ConfigError("this environment renders nothing and observes 'dict' or 'flat': change these.")
+        self.source, self.render_mode = source, None
+        self._spaces = observation_space(config.observation), action_space(source.controls)
+        self._random, self._seed = seeding.np_random()
+        self._count = 0
+        self._begun: tuple[Episode, EpisodeState] | None = None
+        self.agents: list[str] = []
+        self._names: list[str] = []
+        # all agents that there may be: PettingZoo wants to know them before the first reset
+        self.possible_agents = self._all_agents(controlled)
+
+    def _all_agents(self, controlled: Controlled) -> list[str]:
+        if isinstance(controlled, list):
+            return [str(object_id) for object_id in controlled]
+        found: dict[str, None] = {}
+        for scenario_id in self.source.scenario_ids:
+            episode_rows = self.source.planned_agents(self.source.scenario(scenario_id))
+            found.update(dict.fromkeys(str(object_id) for object_id in episode_rows))
+        return list(found)
+
+    def observation_space(self, agent: str) -> Space:
+        """Space of an agent's observations, the same for all."""
+        return self._spaces[0]
+
+    def action_space(self, agent: str) -> Space:
+        """Space of an agent's actions, the same for all."""
+        return self._spaces[1]
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict, dict]:
+        """Begin an episode.
+
+        Args:
+            seed: of the choice of scenarios and of the traffic.
+            options: "scenario", "rollout" and "goals", as of `EgoEnv`.
+
+        Raises:
+            ConfigError: an unknown option or scenario, or no planner-driven agent in it.
+        """
+        if seed is not None:
+            self._random, self._seed = seeding.np_random(seed)
+            self._count = 0
+        scenario_id, dice, goals = chosen(self._random, self.source, options or {}, int(self._seed), self._count)
+        self._count += 1
+        scenario = self.source.scenario(scenario_id)
+        episode = self.source.episode([scenario], {scenario_id: goals} if goals else None)
+        state = start(episode, (dice,))
+        self._begun = episode, state
+        scene = episode.world.scenes[0]
+        self._names = [str(scene.object_id[agent]) for _, agent in episode.world.actors]
+        self.agents = list(self._names)
+        infos = {name: about(episode, state, row, self.source) for row, name in enumerate(self._names)}
+        return self._observe(self.agents), infos
+
+    def step(self, actions: dict[str, Any]) -> tuple[dict, dict, dict, dict, dict]:
+        """Carry out one action of every agent that is left; those whose episode is over stand still.
+
+        Args:
+            actions: by agent.
+
+        Raises:
+            ConfigError: before `reset`, an agent without an action, or one with a NaN or of another shape.
+        """
+        if self._begun is None:
+            raise ConfigError("this environment has no episode yet: call reset() first.")
+        episode, state = self._begun
+        acting, shape = self.agents, self.source.controls.limits.shape
+        missing = [name for name in acting if name not in actions]
+        if missing:
+            raise ConfigError(f"agent {missing[0]} has no action: every agent in env.agents needs one.")
+        dtype = np.int64 if self.source.controls.num_choices else np.float64
+        array = np.zeros((len(self._names), *shape), dtype)
+        for row, name in enumerate(self._names):
+            if name in acting:
+                given = np.asarray(actions[name], dtype)
+                if given.shape != shape:
+                    raise ConfigError(f"action of agent {name} has shape {given.shape}, it must have {shape}.")
+                array[row] = given
+        state, outcome = advance(episode, state, array)
+        self._begun = episode, state
+        rows = {name: self._names.index(name) for name in acting}
+        terminated = {name: bool(outcome.terminated[row]) for name, row in rows.items()}
+        truncated = {name: bool(outcome.truncated[row]) for name, row in rows.items()}
+        infos: dict[str, dict[str, Any]] = {}
+        for name, row in rows.items():
+            infos[name] = {
+                "step": state.world.step,
+                "terms": {term: float(value[row]) for term, value in outcome.terms.items()},
+                "clipped": bool(outcome.clipped[row]),
+                "lights_held": lights_are_held(episode, state, row),
+            }
+            if terminated[name] or truncated[name]:
+                infos[name]["result"] = Result(record_of(episode, state, row))
+        self.agents = [name for name in acting if not (terminated[name] or truncated[name])]
+        rewards = {name: float(outcome.reward[row]) for name, row in rows.items()}
+        return self._observe(acting), rewards, terminated, truncated, infos
+
+    def _observe(self, names: list[str]) -> dict[str, Any]:
+        assert self._begun is not None
+        seen, kind = look(*self._begun), self.source.config.observation
+        return {name: shown(seen, kind, self._names.index(name)) for name in names}

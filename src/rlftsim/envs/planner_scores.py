@@ -1,0 +1,342 @@
+"""Scores of a planner: nuPlan's closed-loop score and NAVSIM's PDMS as far as a log's map allows, and raw numbers.
+
+Sources: the metric code and weights of motional/nuplan-devkit at e924167, and docs/metrics.md of navsim. Logs have road
+edges and center lines but no lane polygons, hence the suffix `_style`: "inside one lane" and the drivable area are ours
+(`contact.in_one_lane`, the official metric's distance to the road edge). Meters, seconds, radians.
+"""
+
+import math
+from dataclasses import dataclass, fields
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from scipy.signal import savgol_filter
+
+from rlftsim.envs.contact import BEHIND_RAD, boxes_overlap, corners_of, in_one_lane, lane_search
+from rlftsim.envs.episode import MAX_PAIRS, OUTSIDE_M, road_edges
+from rlftsim.envs.record import Record
+from rlftsim.geometry import wrapped
+from rlftsim.realism.map_based import compute_point_distance_to_road_edge
+from rlftsim.realism.traffic_lights import build_signals, compute_traffic_light_violation
+from rlftsim.scenario.derived import cached_on_scenario
+from rlftsim.scenario.types import CURRENT_STEP, STEP_S, ObjectType, Scenario
+
+PROGRESS_M = 2.0
+"""Least progress that counts as one: 2 m in nuPlan's code and configuration, 0.1 m in the text of its documents."""
+MAKING_PROGRESS = 0.2
+WRONG_WAY_M, WRONG_WAY_STEPS = (2.0, 6.0), 10
+"""Meters against the lane within 1 s: below the first 1, below the second 0.5, else 0."""
+TTC_LEAST_S, TTC_HORIZON_S, TTC_MOVING_MPS = 0.95, 3.0, 0.005
+AHEAD_RAD, CROSSING_RAD = np.radians(30.0), np.radians(45.0)
+OVER_SPEED_MPS = 2.23
+LANE_M = 4.0
+"""Lanes farther than this from an agent say nothing about it."""
+ACCELERATION = (-4.05, 2.40)
+LATERAL, YAW_RATE, YAW_ACCELERATION, LONGITUDINAL_JERK, JERK = 4.89, 0.95, 1.93, 4.13, 8.37
+"""Bounds of comfort, m/s², rad/s, rad/s², m/s³, m/s³."""
+SMOOTH_STEPS, SMOOTH_JERK_STEPS = 7, 15
+"""Windows of the Savitzky-Golay filter. nuPlan takes 8 for acceleration, which newer versions of SciPy refuse."""
+PDMS_STEPS = 40
+WEIGHTS = {"progress": 5.0, "time_to_collision": 5.0, "speed_limit": 4.0, "comfort": 2.0}
+PDMS_WEIGHTS = {"time_to_collision": 5.0, "progress": 5.0, "comfort": 2.0}
+VULNERABLE = (ObjectType.PEDESTRIAN, ObjectType.CYCLIST)
+
+
+@dataclass(frozen=True)
+class PlannerScores:
+    """Scores of one episode: higher is better, NaN = not measurable here. Names ending in _rate or _error: lower."""
+
+    nuplan_style: float
+    pdms_style: float
+    """Over the first 4 s."""
+    no_at_fault_collision: float
+    drivable_area: float
+    making_progress: float
+    driving_direction: float
+    progress: float
+    time_to_collision: float
+    speed_limit: float
+    comfort: float
+    collision_rate: float
+    """1 = in contact with at least one track."""
+    at_fault_collision_rate: float
+    hit_rate: float
+    """1 = at least one contact was not the planner's fault."""
+    red_light_rate: float
+    """1 = passed a red light, as the official metric defines it."""
+    least_ttc_s: float
+    off_road_m: float
+    """Largest distance of a corner off the road; 0 = never off."""
+    route_completion: float
+    speed_change_mps: float
+    """Of the hardest contact; 0 = none."""
+    mean_jerk_mps3: float
+    jerk_95_mps3: float
+    displacement_error: float
+    """Mean distance to the log, m."""
+
+
+def score_planner(record: Record) -> PlannerScores:
+    """All scores of one episode.
+
+    Args:
+        record: of the episode; one that ended early is scored for as long as it lasted.
+    """
+    parts = _parts(record)
+    early = _parts(record.first(PDMS_STEPS))
+    multiplied = ("no_at_fault_collision", "drivable_area", "making_progress", "driving_direction")
+    nuplan = math.prod(parts[name] for name in multiplied if math.isfinite(parts[name]))
+    # NAVSIM: a collision with a standing object costs half, and the driving direction has weight 0
+    pdms = early["no_at_fault_collision"] * (1.0 if math.isnan(early["drivable_area"]) else early["drivable_area"])
+    jerk = _kinematics(record).jerk
+    found, faults = record.collisions, [one.at_fault for one in record.collisions]
+    whole = float(record.route.progress(record.route.points[-1:])[0]) if len(record.route) else math.nan
+    return PlannerScores(
+        nuplan_style=nuplan * _weighted(parts, WEIGHTS),
+        pdms_style=pdms * _weighted(early, PDMS_WEIGHTS),
+        **parts,
+        collision_rate=float(bool(found)),
+        at_fault_collision_rate=float(any(faults)),
+        hit_rate=float(not all(faults)),
+        red_light_rate=_red_light(record),
+        least_ttc_s=least_time_to_collision(record),
+        off_road_m=max(0.0, float(off_road(record).max())),
+        route_completion=_gained(record.route, record.own) / whole if whole else math.nan,
+        speed_change_mps=max((one.speed_change_mps for one in found), default=0.0),
+        mean_jerk_mps3=float(jerk.mean()) if len(jerk) else math.nan,
+        jerk_95_mps3=float(np.quantile(jerk, 0.95)) if len(jerk) else math.nan,
+        displacement_error=_displacement(record),
+    )
+
+
+def missing_scores(record: Record) -> dict[str, str]:
+    """Scores that cannot be measured in a record's scenario, and why."""
+    found = {}
+    if not record.scene.scenario.has_future:
+        why = "the log's future is withheld, as in a test split"
+        found |= dict.fromkeys(("progress", "making_progress", "displacement_error"), why)
+    elif not len(record.logged_route):
+        found |= dict.fromkeys(("progress", "making_progress"), "there is no lane to measure progress along")
+    if lane_search(record.scene.scenario) is None:
+        found |= dict.fromkeys(("driving_direction", "speed_limit"), "the map has no lanes")
+    if not len(record.route):
+        found["route_completion"] = "there is no route"
+    if road_edges(record.scene.scenario) is None:
+        found["drivable_area"] = "the map has no road edges"
+    return found
+
+
+def _parts(record: Record) -> dict[str, float]:
+    """The eight parts of the score."""
+    missing = missing_scores(record)
+    ratio = math.nan if "progress" in missing else _progress_ratio(record)
+    parts = {
+        "no_at_fault_collision": _collision_score(record),
+        "drivable_area": float((off_road(record) < OUTSIDE_M).all()),
+        "making_progress": math.nan if math.isnan(ratio) else float(ratio >= MAKING_PROGRESS),
+        "driving_direction": _direction_score(record),
+        "progress": ratio,
+        "time_to_collision": float(least_time_to_collision(record) >= TTC_LEAST_S),
+        "speed_limit": _speed_score(record),
+        "comfort": _comfort(record),
+    }
+    return {name: math.nan if name in missing else value for name, value in parts.items()}
+
+
+def _weighted(parts: dict[str, float], weights: dict[str, float]) -> float:
+    """Weighted mean of the parts that there are."""
+    known = [name for name in weights if math.isfinite(parts[name])]
+    return sum(weights[name] * parts[name] for name in known) / sum(weights[name] for name in known)
+
+
+def _collision_score(record: Record) -> float:
+    """Product over vulnerable road users, vehicles and objects: 0 after one collision at fault, with objects 0.5."""
+    kinds = [int(record.scene.object_type[one.agent]) for one in record.collisions if one.at_fault]
+    vulnerable = sum(kind in VULNERABLE for kind in kinds)
+    vehicles = sum(kind == ObjectType.VEHICLE for kind in kinds)
+    objects = len(kinds) - vulnerable - vehicles
+    return max(0.0, 1.0 - vulnerable) * max(0.0, 1.0 - vehicles) * max(0.0, 1.0 - objects / 2)
+
+
+def off_road(record: Record) -> Float[np.ndarray, "T1"]:
+    """Signed distance of the corner farthest off the road at each step; without road edges -inf.
+
+    The agent keeps the height of the current step, as in the metric.
+    """
+    scene, edges = record.scene, road_edges(record.scene.scenario)
+    if edges is None:
+        return np.full(record.steps + 1, -np.inf)
+    corners = corners_of(record.own, scene.size[record.agent, :2]) + scene.scenario.origin  # [T + 1, 4, 2]
+    z = np.full((*corners.shape[:2], 1), scene.z[record.agent] - scene.size[record.agent, 2] / 2)
+    groups = torch.from_numpy(np.concatenate([corners, z], -1)).float()
+    return compute_point_distance_to_road_edge(groups, edges, max_pairs=MAX_PAIRS).amax(-1).double().numpy()
+
+
+def _gained(route, own: Float[np.ndarray, "T1 5"]) -> float:
+    """Meters along a route between the first and the last step."""
+    first, last = route.progress(own[[0, -1], :2])
+    return float(last - first)
+
+
+def _progress_ratio(record: Record) -> float:
+    ego = _gained(record.logged_route, record.own)
+    logged = record.scene.logged[record.agent, CURRENT_STEP : CURRENT_STEP + record.steps + 1]
+    if ego < -PROGRESS_M:
+        return 0.0
+    return min(1.0, max(ego, PROGRESS_M) / max(_gained(record.logged_route, logged), PROGRESS_M))
+
+
+def _lane_headings(record: Record) -> tuple[Float[np.ndarray, "T1"], Float[np.ndarray, "T1"], Bool[np.ndarray, "T1"]]:
+    """Of the lane that fits each step best: its angle to the agent's heading, its limit, and True in a junction.
+
+    NaN, 0 and False where there is no lane. Among the lanes that an agent's center is in, that which runs its way.
+    """
+    search = lane_search(record.scene.scenario)
+    angle, limit = np.full(record.steps + 1, math.nan), np.zeros(record.steps + 1)
+    junction = np.zeros(record.steps + 1, bool)
+    if search is None:
+        return angle, limit, junction
+    near = search.tree.query_ball_point(record.own[:, :2], LANE_M / 2)
+    for step, points in enumerate(near):
+        if points:
+            turn = np.abs(wrapped(search.heading[points] - record.own[step, 2]))
+            best = points[int(turn.argmin())]
+            angle[step] = turn.min()
+            limit[step] = record.scene.graph.speed_limit_mps[search.lane[best]]
+            junction[step] = search.is_junction[search.lane[best]]
+    return angle, limit, junction
+
+
+def _direction_score(record: Record) -> float:
+    angle, _, _ = _lane_headings(record)
+    step = np.linalg.norm(np.diff(record.own[:, :2], axis=0), axis=1)
+    against = np.where(np.nan_to_num(angle[1:]) > np.pi / 2, step, 0.0)
+    window = min(WRONG_WAY_STEPS, len(against))
+    most = np.convolve(against, np.ones(window), "valid").max() if window else 0.0
+    return 1.0 if most < WRONG_WAY_M[0] else 0.5 if most < WRONG_WAY_M[1] else 0.0
+
+
+def _speed_score(record: Record) -> float:
+    _, limit, _ = _lane_headings(record)
+    speed = np.linalg.norm(record.own[:, 3:], axis=1)
+    over = np.where(limit > 0, np.maximum(speed - limit, 0.0), 0.0)[1:]
+    return max(0.0, 1.0 - float(over.mean()) / OVER_SPEED_MPS) if len(over) else 1.0
+
+
+def least_time_to_collision(record: Record) -> float:
+    """Least time until a box is met if all keep their speed and heading, s; infinite if none is within 3 s.
+
+    Tracks ahead and crossing ones count. Those beside the agent do only while it is not in one lane, or in a junction;
+    those behind, and those it has touched already, never do.
+    """
+    own, others = record.own, record.motion
+    size = record.scene.size[:, :2]
+    speed, other_speed = (np.linalg.norm(motion[..., 3:], axis=-1) for motion in (own, others))
+    offset = others[..., :2] - own[:, :2]  # [A, T + 1, 2]
+    bearing = np.abs(wrapped(np.arctan2(offset[..., 1], offset[..., 0]) - own[:, 2]))
+    crossing = np.abs(np.sin(others[..., 2] - own[:, 2])) > np.sin(CROSSING_RAD)
+    _, _, junction = _lane_headings(record)
+    beside = ~in_one_lane(record.scene, own, size[record.agent]) | junction
+    counts = record.there & (bearing < BEHIND_RAD) & ((bearing < AHEAD_RAD) | crossing | beside)
+    counts[record.agent] = False
+    counts &= speed > TTC_MOVING_MPS
+    for one in record.collisions:
+        counts[one.agent, one.step :] = False
+    diagonal = np.linalg.norm(size, axis=1)
+    reach = TTC_HORIZON_S * (speed + other_speed) + (diagonal[:, None] + diagonal[record.agent]) / 2
+    agents, steps = np.nonzero(counts & (np.linalg.norm(offset, axis=-1) <= reach))
+    time = STEP_S * np.arange(round(TTC_HORIZON_S / STEP_S) + 1)
+    ahead = _coasting(own[steps], time), _coasting(others[agents, steps], time)  # [P, 31, 3] each
+    meets = boxes_overlap(
+        ahead[0], np.broadcast_to(size[record.agent], (*ahead[0].shape[:2], 2)), ahead[1][:, :, None],
+        np.broadcast_to(size[agents, None, None], (*ahead[1].shape[:2], 1, 2)),
+    )[..., 0]  # fmt: skip
+    # tracks that overlap at the start of the episode, such as a stroller and its pusher, are in no danger of it
+    overlapping = np.isin(agents, agents[(steps == 0) & meets[:, 0]])
+    meets &= ~overlapping[:, None]
+    return float(time[meets.argmax(1)[meets.any(1)]].min()) if meets.any() else math.inf
+
+
+def _coasting(motion: Float[np.ndarray, "P 5"], time: Float[np.ndarray, "t"]) -> Float[np.ndarray, "P t 3"]:
+    """Poses at present velocity and heading."""
+    position = motion[:, None, :2] + time[:, None] * motion[:, None, 3:]
+    return np.concatenate([position, np.broadcast_to(motion[:, None, 2:3], (*position.shape[:2], 1))], -1)
+
+
+@dataclass(frozen=True, eq=False)
+class _Kinematics:
+    """Smoothed derivatives over the steps."""
+
+    longitudinal: Float[np.ndarray, "t"]
+    lateral: Float[np.ndarray, "t"]
+    yaw_rate: Float[np.ndarray, "t"]
+    yaw_acceleration: Float[np.ndarray, "t"]
+    longitudinal_jerk: Float[np.ndarray, "t"]
+    jerk: Float[np.ndarray, "t"]
+
+
+def _kinematics(record: Record) -> _Kinematics:
+    own = record.own
+    if len(own) < 5:  # too short for any derivative
+        return _Kinematics(*[np.zeros(0)] * 6)
+    # odd windows that fit a short record
+    short, long = (min(window, len(own) - 1 + len(own) % 2) for window in (SMOOTH_STEPS, SMOOTH_JERK_STEPS))
+    cos, sin = np.cos(own[:, 2]), np.sin(own[:, 2])
+    acceleration = savgol_filter(own[:, 3:], short, 2, deriv=1, delta=STEP_S, axis=0)
+    longitudinal = acceleration[:, 0] * cos + acceleration[:, 1] * sin
+    heading = np.unwrap(own[:, 2])
+    jerk = savgol_filter(acceleration, long, 2, deriv=1, delta=STEP_S, axis=0)
+    return _Kinematics(
+        longitudinal=longitudinal,
+        lateral=acceleration[:, 1] * cos - acceleration[:, 0] * sin,
+        yaw_rate=savgol_filter(heading, long, 2, deriv=1, delta=STEP_S),
+        yaw_acceleration=savgol_filter(heading, long, 3, deriv=2, delta=STEP_S),
+        longitudinal_jerk=savgol_filter(longitudinal, long, 2, deriv=1, delta=STEP_S),
+        jerk=np.linalg.norm(jerk, axis=1),
+    )
+
+
+def _comfort(record: Record) -> float:
+    motion = _kinematics(record)
+    if not len(motion.jerk):
+        return math.nan
+    low, high = ACCELERATION
+    holds = (
+        (motion.longitudinal >= low).all()
+        and (motion.longitudinal <= high).all()
+        and (np.abs(motion.lateral) <= LATERAL).all()
+        and (np.abs(motion.yaw_rate) <= YAW_RATE).all()
+        and (np.abs(motion.yaw_acceleration) <= YAW_ACCELERATION).all()
+        and (np.abs(motion.longitudinal_jerk) <= LONGITUDINAL_JERK).all()
+        and (motion.jerk <= JERK).all()
+    )
+    return float(holds)
+
+
+@cached_on_scenario
+def _signals(scenario: Scenario):
+    return build_signals(scenario.map_features, scenario.lights, torch.device("cpu"))
+
+
+def _red_light(record: Record) -> float:
+    signals = _signals(record.scene.scenario)
+    if signals is None:
+        return 0.0
+    x, y = torch.from_numpy(record.own[:, :2] + record.scene.scenario.origin).float().T[:, None, None]
+    passed = compute_traffic_light_violation(
+        x, y, torch.ones(1, 1, record.steps, dtype=torch.bool), signals, first_step=CURRENT_STEP, max_pairs=MAX_PAIRS
+    )
+    return float(passed.any())
+
+
+def _displacement(record: Record) -> float:
+    steps = slice(CURRENT_STEP + 1, CURRENT_STEP + 1 + record.steps)
+    known = record.scene.valid[record.agent, steps]
+    if not known.any():
+        return math.nan
+    offset = record.own[1:, :2] - record.scene.logged[record.agent, steps, :2]
+    return float(np.linalg.norm(offset[known], axis=1).mean())
+
+
+PLANNER_SCORES = tuple(field.name for field in fields(PlannerScores))

@@ -1,0 +1,1 @@
+"""Planners that ship: the log, constant velocity, the intelligent driver model, and proposals after PDM."""

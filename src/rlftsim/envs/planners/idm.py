@@ -1,0 +1,65 @@
+"""A planner that follows its route and keeps its distance, with nuPlan's parameters."""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from rlftsim.envs.actions import (
+    ACCELERATION_MPS2,
+    LEAST_PURSUIT_M,
+    PURSUIT_S,
+    STEERING_RAD,
+    WHEELBASE_PER_LENGTH,
+    ActionKind,
+)
+from rlftsim.envs.idm import LOOKAHEAD_M, IdmConfig, find_leaders, idm_acceleration
+from rlftsim.envs.planners.view import View, read_view
+
+
+class IdmPlanner:
+    """The intelligent driver model along the route, steered by pure pursuit.
+
+    Args:
+        config: parameters; the wanted speed holds where no limit is known.
+    """
+
+    action: ActionKind = "bicycle"
+
+    def __init__(self, config: IdmConfig | None = None):
+        self.config = config or IdmConfig()
+
+    def reset(self, info: dict[str, Any]) -> None:
+        """Nothing: it has no memory."""
+
+    def act(self, observation: dict[str, Any]) -> Float[np.ndarray, "2"]:
+        """Acceleration behind the leader, steering for the route."""
+        view = read_view(observation)
+        window = slice(0, LOOKAHEAD_M)
+        others = np.ones((1, len(view.others)), bool)
+        gap, lead = find_leaders(
+            view.line[None, window], view.heading[None, window], view.size[None], view.others[None],
+            view.other_size[None], others,
+        )  # fmt: skip
+        to_stop = np.maximum(view.stop_m - view.size[0] / 2, 0.0)
+        gap, lead = np.minimum(gap, to_stop), np.where(to_stop < gap, 0.0, lead)
+        wanted = np.array([view.limit_mps or self.config.speed_mps])
+        acceleration = idm_acceleration(np.array([max(view.speed, 0.0)]), wanted, gap, lead, self.config)
+        steering = pursue(view, np.zeros(1))
+        return np.clip([acceleration[0] / ACCELERATION_MPS2, steering[0] / STEERING_RAD], -1, 1).astype(np.float32)
+
+
+def pursue(view: View, offset_m: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    """Steering angles that lead to the route, by pure pursuit (Coulter, 1992), rad.
+
+    Args:
+        view: of the agent.
+        offset_m: to the left of the route, one for each angle.
+    """
+    away = np.linalg.norm(view.line, axis=1)
+    far = np.flatnonzero(away >= max(LEAST_PURSUIT_M, PURSUIT_S * view.speed))
+    target = int(far[0]) if len(far) else len(away) - 1
+    heading = view.heading[target]
+    points = view.line[target] + offset_m[:, None] * np.array([-np.sin(heading), np.cos(heading)])
+    squared = np.maximum((points**2).sum(1), 0.01)
+    return np.arctan(2 * WHEELBASE_PER_LENGTH * view.size[0] * points[:, 1] / squared)

@@ -1,0 +1,202 @@
+"""A planner that simulates fifteen proposals and takes the one that scores best, in the style of PDM-Closed.
+
+After Dauner et al., "Parting with Misconceptions about Learning-based Vehicle Motion Planning" (2023), as configured in
+tuplan_garage. Differences: it reads observations of this package, plans every half second, and measures the drivable
+area by road edges. n proposals, T steps, K other boxes; frame: the agent's at the time of planning.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from rlftsim.envs.actions import (
+    ACCELERATION_MPS2,
+    HARDEST_BRAKING_MPS2,
+    LEAST_PURSUIT_M,
+    PURSUIT_S,
+    STEERING_RAD,
+    WHEELBASE_PER_LENGTH,
+    ActionKind,
+    Bicycle,
+    signed_speed,
+)
+from rlftsim.envs.contact import boxes_overlap, corners_of
+from rlftsim.envs.idm import LOOKAHEAD_M, IdmConfig, find_leaders, idm_acceleration
+from rlftsim.envs.planners.view import View, read_view
+from rlftsim.geometry import wrapped
+from rlftsim.scenario.types import STEP_S
+
+SPEED_FRACTIONS = (0.2, 0.4, 0.6, 0.8, 1.0)
+OFFSETS_M = (-1.0, 0.0, 1.0)
+CONFIG = IdmConfig(speed_mps=15.0, acceleration_mps2=1.5, braking_mps2=3.0, exponent=10.0)
+STEPS = 40
+REPLAN_STEPS = 5
+BRAKE_IF_WITHIN_S = 2.0
+TTC_S = (0.3, 0.6, 0.9)
+SPARSE = 5
+"""Every so many steps the drivable area and the time to collision are looked at."""
+OUTSIDE_M = 0.3
+LEAST_PROGRESS_M = 0.1
+COMFORT_ACCELERATION, COMFORT_LATERAL, COMFORT_JERK = (-4.05, 2.40), 4.89, 8.37
+
+
+@dataclass(frozen=True, eq=False)
+class Proposals:
+    """Motions that were simulated, and the controls that lead to them."""
+
+    motion: Float[np.ndarray, "n T1 5"]
+    controls: Float[np.ndarray, "n T 2"]
+    """Acceleration (m/s²) and steering (rad)."""
+
+
+class PdmPlanner:
+    """The best of 15 proposals: 5 fractions of the wanted speed times 3 offsets from the route."""
+
+    action: ActionKind = "bicycle"
+
+    def __init__(self) -> None:
+        self._plan = np.zeros((0, 2), np.float32)
+
+    def reset(self, info: dict[str, Any]) -> None:
+        """Forget the last plan."""
+        self._plan = self._plan[:0]
+
+    def act(self, observation: dict[str, Any]) -> Float[np.ndarray, "2"]:
+        """The next control of the plan, which is made anew every half second."""
+        if not len(self._plan):
+            view = read_view(observation)
+            proposals = simulate_proposals(view)
+            collides = collisions(view, proposals.motion)
+            best = int(score_proposals(view, proposals.motion, collides).argmax())
+            controls = proposals.controls[best, :REPLAN_STEPS].copy()
+            if collides[best, : round(BRAKE_IF_WITHIN_S / STEP_S) + 1].any():
+                controls[:, 0] = -HARDEST_BRAKING_MPS2
+            scale = np.array([ACCELERATION_MPS2, STEERING_RAD])
+            self._plan = np.clip(controls / scale, -1, 1).astype(np.float32)
+        control, self._plan = self._plan[0], self._plan[1:]
+        return control
+
+
+def simulate_proposals(view: View) -> Proposals:
+    """Drive along the route at several speeds and offsets for 4 s; the others keep their velocity."""
+    fraction, offset = (v.ravel() for v in np.meshgrid(SPEED_FRACTIONS, OFFSETS_M))
+    wanted = fraction * (view.limit_mps or CONFIG.speed_mps)
+    n, bicycle = len(wanted), Bicycle(hardest=HARDEST_BRAKING_MPS2)
+    normal = np.stack([-np.sin(view.heading), np.cos(view.heading)], -1)
+    lines = view.line + offset[:, None, None] * normal  # [n, P, 2]
+    motion = np.tile([0.0, 0.0, 0.0, view.speed, 0.0], (n, 1))
+    row, size = np.arange(n), np.tile(view.size, (n, 1))
+    mask, other_size = np.ones((n, len(view.others)), bool), np.tile(view.other_size, (n, 1, 1))
+    states, controls = [motion], []
+    for step in range(STEPS):
+        others = np.tile(_coasted(view.others, step * STEP_S), (n, 1, 1))
+        # 1. place on the line, and the leader from there on
+        place = np.linalg.norm(lines - motion[:, None, :2], axis=-1).argmin(1)
+        window = np.minimum(place[:, None] + np.arange(LOOKAHEAD_M), lines.shape[1] - 1)
+        gap, lead = find_leaders(lines[row[:, None], window], view.heading[window], size, others, other_size, mask)
+        to_stop = view.stop_m - place - view.size[0] / 2
+        to_stop = np.where(to_stop > -1.0, np.maximum(to_stop, 0.0), np.inf)
+        gap, lead = np.minimum(gap, to_stop), np.where(to_stop < gap, 0.0, lead)
+        speed = np.maximum(signed_speed(motion), 0.0)
+        acceleration = np.clip(idm_acceleration(speed, wanted, gap, lead, CONFIG), -8.0, ACCELERATION_MPS2)
+        # 2. pure pursuit of the line
+        ahead = np.maximum(LEAST_PURSUIT_M, PURSUIT_S * speed)
+        target = lines[row, np.minimum(place + ahead.astype(int), lines.shape[1] - 1)] - motion[:, :2]
+        bearing = np.arctan2(target[:, 1], target[:, 0]) - motion[:, 2]
+        distance = np.maximum(np.linalg.norm(target, axis=1), 0.5)
+        steering = np.arctan(2 * WHEELBASE_PER_LENGTH * view.size[0] * np.sin(bearing) / distance)
+        steering = np.clip(steering, -STEERING_RAD, STEERING_RAD)
+        motion = bicycle.drive(motion, acceleration, steering, view.size[:1])
+        states.append(motion)
+        controls.append(np.stack([acceleration, steering], -1))
+    return Proposals(np.stack(states, 1), np.stack(controls, 1))
+
+
+def collisions(view: View, motion: Float[np.ndarray, "n T1 5"]) -> Bool[np.ndarray, "n T1"]:
+    """True from the step on at which a proposal meets a box that is not behind it; overlaps at the start are left out.
+
+    Args:
+        view: of the agent.
+        motion: of the proposals.
+    """
+    time = STEP_S * np.arange(motion.shape[1])
+    meets = _meets(view, motion, np.stack([_coasted(view.others, t) for t in time]))  # [n, T + 1, K]
+    meets &= ~meets[:, :1]
+    return np.logical_or.accumulate(meets.any(-1), axis=1)
+
+
+def score_proposals(
+    view: View, motion: Float[np.ndarray, "n T1 5"], collides: Bool[np.ndarray, "n T1"]
+) -> Float[np.ndarray, "n"]:
+    """NC · DDC · DAC · (5 progress + 5 TTC + 2 comfort) / 12 of each proposal.
+
+    Args:
+        view: of the agent.
+        motion: of the proposals.
+        collides: as `collisions` returns it.
+    """
+    n = len(motion)
+    # 1. what must not happen: collisions, driving against the route, leaving the road
+    end = motion[:, -1]
+    place = np.linalg.norm(view.line - end[:, None, :2], axis=-1).argmin(1)
+    direction = np.cos(end[:, 2] - view.heading[place]) > 0
+    sparse = motion[:, ::SPARSE]
+    allowed = ~collides[:, -1] & direction & ~_leaves_road(view, sparse)
+    # 2. progress along the route, as a fraction of the best proposal's
+    progress = np.where(allowed, place, 0.0)
+    best = progress.max()
+    progress = progress / best if best > LEAST_PROGRESS_M else np.ones(n)
+    # 3. time to collision and comfort
+    risky = np.zeros(n, bool)
+    time = STEP_S * SPARSE * np.arange(sparse.shape[1])
+    for ahead in TTC_S:
+        coasted = sparse.copy()
+        coasted[..., :2] += ahead * sparse[..., 3:]
+        meets = _meets(view, coasted, np.stack([_coasted(view.others, t + ahead) for t in time]))
+        risky |= (meets & (signed_speed(sparse) > 0.1)[..., None]).any((1, 2))
+    speed = signed_speed(motion)
+    acceleration = np.diff(speed, axis=1) / STEP_S
+    lateral = speed[:, 1:] * wrapped(np.diff(motion[..., 2], axis=1)) / STEP_S
+    jerk = np.diff(acceleration, axis=1) / STEP_S
+    low, high = COMFORT_ACCELERATION
+    comfort = ((acceleration >= low) & (acceleration <= high) & (np.abs(lateral) <= COMFORT_LATERAL)).all(1)
+    comfort &= (np.abs(jerk) <= COMFORT_JERK).all(1)
+    return allowed * (5 * progress + 5 * ~risky + 2 * comfort) / 12
+
+
+def _meets(
+    view: View, motion: Float[np.ndarray, "n t 5"], others: Float[np.ndarray, "t K 5"]
+) -> Bool[np.ndarray, "n t K"]:
+    """True where a proposal overlaps a box that is not behind it."""
+    shape = (*motion.shape[:2], *others.shape[1:])
+    boxes = np.broadcast_to(others, shape)
+    sizes = np.broadcast_to(view.other_size, (*shape[:3], 2))
+    meets = boxes_overlap(motion, np.broadcast_to(view.size, (*motion.shape[:2], 2)), boxes, sizes)
+    offset = boxes[..., :2] - motion[..., None, :2]
+    ahead = offset[..., 0] * np.cos(motion[..., None, 2]) + offset[..., 1] * np.sin(motion[..., None, 2])
+    return meets & (ahead > -view.size[0] / 2)
+
+
+def _leaves_road(view: View, motion: Float[np.ndarray, "n t 5"]) -> Bool[np.ndarray, "n"]:
+    """True where a corner gets 0.3 m or more to the right of the nearest road edge."""
+    if not len(view.edges):
+        return np.zeros(len(motion), bool)
+    corners = corners_of(motion.reshape(-1, 5), view.size).reshape(len(motion), -1, 2)  # [n, 4 t, 2]
+    start, delta = view.edges[:, :2], view.edges[:, 2:] - view.edges[:, :2]
+    to = corners[:, :, None] - start  # [n, 4 t, E, 2]
+    squared = np.maximum((delta**2).sum(-1), 1e-9)
+    along = np.clip((to * delta).sum(-1) / squared, 0.0, 1.0)
+    distance = np.linalg.norm(to - along[..., None] * delta, axis=-1)
+    nearest = distance.argmin(-1)
+    rows = np.ogrid[: corners.shape[0], : corners.shape[1]]
+    side = delta[nearest, 0] * to[*rows, nearest, 1] - delta[nearest, 1] * to[*rows, nearest, 0]
+    return ((side < 0) & (distance[*rows, nearest] >= OUTSIDE_M)).any(1)
+
+
+def _coasted(others: Float[np.ndarray, "K 5"], time_s: float) -> Float[np.ndarray, "K 5"]:
+    """Boxes at constant velocity after some time."""
+    moved = others.copy()
+    moved[:, :2] += time_s * others[:, 3:]
+    return moved

@@ -1,0 +1,91 @@
+"""Planners by name. A package of your own adds one with an entry point, or names it as `package.module:Class`:
+
+[project.entry-points."rlftsim.planners"]
+mine = "my_package:MyPlanner"
+"""
+
+import importlib
+from collections.abc import Callable
+from typing import Any, Protocol, runtime_checkable
+
+from rlftsim.envs.actions import ActionKind
+from rlftsim.errors import ConfigError
+from rlftsim.plugins import ExtensionPoint
+
+PLANNERS: ExtensionPoint[Callable[..., Any]] = ExtensionPoint(
+    "planner",
+    "rlftsim.planners",
+    {
+        "replay": "rlftsim.envs.planners.simple:Replay",
+        "constant_velocity": "rlftsim.envs.planners.simple:ConstantVelocityPlanner",
+        "idm": "rlftsim.envs.planners.idm:IdmPlanner",
+        "pdm": "rlftsim.envs.planners.pdm:PdmPlanner",
+    },
+)
+"""Name -> class (or function without arguments) that makes a planner, or the function `observation -> action` itself."""
+
+
+@runtime_checkable
+class Planner(Protocol):
+    """Drives one agent. Attribute `action` names its kind of action; without it that is "bicycle"."""
+
+    def reset(self, info: dict[str, Any]) -> None:
+        """Begin an episode.
+
+        Args:
+            info: of the environment's reset; "logged" holds the agent's logged poses.
+        """
+        ...
+
+    def act(self, observation: dict[str, Any]) -> Any:
+        """Action for an observation."""
+        ...
+
+
+class CallablePlanner:
+    """A plain function from observation to action, as a planner.
+
+    Args:
+        function: called with an observation.
+    """
+
+    def __init__(self, function: Callable[[dict[str, Any]], Any]):
+        self.function = function
+        self.action: ActionKind = getattr(function, "action", "bicycle")
+
+    def reset(self, info: dict[str, Any]) -> None:
+        """Nothing: a function has no memory."""
+
+    def act(self, observation: dict[str, Any]) -> Any:
+        """What the function returns."""
+        return self.function(observation)
+
+
+def load_planner(name: str) -> Planner:
+    """Planner of a name.
+
+    Args:
+        name: a registered name, or "package.module:Class" (or ":function").
+
+    Raises:
+        ConfigError: unknown, not importable, or neither an object with `reset` and `act` nor a function.
+    """
+    if ":" in name:
+        module, _, attribute = name.partition(":")
+        try:
+            found = getattr(importlib.import_module(module), attribute)
+        except (ImportError, AttributeError) as error:
+            raise ConfigError(f"planner {name!r} cannot be imported ({error}): name package.module:Class.") from None
+    else:
+        found = PLANNERS.get(name)
+    planner = found() if isinstance(found, type) else found
+    if isinstance(planner, Planner):
+        return planner
+    if callable(planner):
+        return CallablePlanner(planner)
+    raise ConfigError(f"planner {name!r} is a {type(planner).__name__}: give it reset(info) and act(observation).")
+
+
+def action_of(planner: Planner) -> ActionKind:
+    """Kind of action that a planner takes."""
+    return getattr(planner, "action", "bicycle")

@@ -1,0 +1,60 @@
+"""Planners that look at nothing: the log itself, and constant velocity."""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from rlftsim.envs.actions import ActionKind
+from rlftsim.errors import DataError
+from rlftsim.geometry import wrapped
+
+
+class Replay:
+    """Drives as logged. With replayed traffic it gives the log back, so it tests the whole loop."""
+
+    action: ActionKind = "pose"
+
+    def __init__(self) -> None:
+        self._steps = np.zeros((0, 3), np.float32)
+        self._taken = 0
+
+    def reset(self, info: dict[str, Any]) -> None:
+        """Take the logged poses.
+
+        Raises:
+            DataError: the log's future is withheld.
+        """
+        logged = info["logged"]
+        if np.isnan(logged[1:]).all():
+            raise DataError(f"scenario {info['scenario']} has no logged future: the replay planner needs one.")
+        known = np.isfinite(logged).all(1)
+        # where the log has a gap, the agent waits at the last pose
+        held = logged[np.maximum.accumulate(np.where(known, np.arange(len(logged)), 0))]
+        self._steps, self._taken = _steps_between(held), 0
+
+    def act(self, observation: dict[str, Any]) -> Float[np.ndarray, "3"]:
+        """The next logged pose in the frame of the present one."""
+        self._taken += 1
+        return self._steps[self._taken - 1]
+
+
+def _steps_between(poses: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n-1 3"]:
+    """Each pose but the first in the frame of the one before, float32."""
+    offset = np.diff(poses[:, :2], axis=0)
+    cos, sin = np.cos(poses[:-1, 2]), np.sin(poses[:-1, 2])
+    x, y = cos * offset[:, 0] + sin * offset[:, 1], cos * offset[:, 1] - sin * offset[:, 0]
+    return np.stack([x, y, wrapped(np.diff(poses[:, 2]))], -1).astype(np.float32)
+
+
+class ConstantVelocityPlanner:
+    """Keeps speed and heading: the floor."""
+
+    action: ActionKind = "bicycle"
+
+    def reset(self, info: dict[str, Any]) -> None:
+        """Nothing: it has no memory."""
+
+    def act(self, observation: dict[str, Any]) -> Float[np.ndarray, "2"]:
+        """No acceleration, no steering."""
+        return np.zeros(2, np.float32)

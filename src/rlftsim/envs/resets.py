@@ -1,0 +1,98 @@
+"""Resets of environments: settings by name, choice of the scenario, and what is said about an episode."""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from rlftsim.envs.config import EnvConfig
+from rlftsim.envs.episode import Episode, EpisodeState
+from rlftsim.envs.source import Source
+from rlftsim.envs.world import Dice
+from rlftsim.errors import ConfigError, whole_number
+from rlftsim.scenario.types import CURRENT_STEP
+
+
+def config_of(settings: dict[str, Any]) -> EnvConfig:
+    """Settings by name.
+
+    Raises:
+        ConfigError: one that there is not.
+    """
+    unknown = [name for name in settings if name not in EnvConfig.__dataclass_fields__]
+    if unknown:
+        raise ConfigError(f"no setting {unknown[0]!r}: known are {', '.join(EnvConfig.__dataclass_fields__)}.")
+    return EnvConfig(**settings)
+
+
+def chosen(
+    random: np.random.Generator, source: Source, options: dict[str, Any], seed: int, count: int
+) -> tuple[str, Dice, Any]:
+    """Scenario, dice and goals of a reset.
+
+    Args:
+        random: draws the scenario.
+        source: supplies the scenarios.
+        options: of the reset.
+        seed: of the traffic.
+        count: episodes since the seed, the number of the rollout.
+
+    Raises:
+        ConfigError: an option that there is not.
+    """
+    unknown = [name for name in options if name not in ("scenario", "rollout", "goals")]
+    if unknown:
+        raise ConfigError(f"reset has no option {unknown[0]!r}: known are scenario, rollout, goals.")
+    drawn = int(random.integers(len(source.scenario_ids)))
+    scenario_id = options.get("scenario", source.scenario_ids[drawn])
+    rollout = whole_number("rollout", options.get("rollout", count), 0)
+    return scenario_id, Dice(seed, rollout), options.get("goals")
+
+
+def about(episode: Episode, state: EpisodeState, row: int, source: Source) -> dict[str, Any]:
+    """Information at the beginning of an episode.
+
+    Args:
+        episode: of the agent.
+        state: its first.
+        row: of the agent.
+        source: of the environment.
+    """
+    scene_row, agent = episode.world.actors[row]
+    scene, dice = episode.world.scenes[scene_row], state.world.dice[-1][scene_row]
+    return {
+        "scenario": scene.scenario.scenario_id,
+        "agent": int(scene.object_id[agent]),
+        "seed": dice.seed,
+        "rollout": dice.rollout,
+        "step": 0,
+        "route": episode.atlas.routes[row].source,
+        "model": source.fingerprint,
+        "lights_held": lights_are_held(episode, state, row),
+        "logged": logged_poses(episode, row),
+    }
+
+
+def logged_poses(episode: Episode, row: int) -> Float[np.ndarray, "81 3"]:
+    """Logged poses of an agent from the current step on, map frame; NaN where there is no state.
+
+    Args:
+        episode: of the agent.
+        row: of the agent.
+    """
+    scene, agent = episode.world.actors[row]
+    poses = episode.world.logged[scene, agent, CURRENT_STEP:, :3].copy()
+    poses[~episode.world.valid[scene, agent, CURRENT_STEP:]] = np.nan
+    return poses
+
+
+def lights_are_held(episode: Episode, state: EpisodeState, row: int) -> bool:
+    """True where lights keep their last state as the log has no further ones.
+
+    Args:
+        episode: of the agent.
+        state: the present one.
+        row: of the agent.
+    """
+    lights = episode.world.scenes[episode.world.actors[row][0]].lights
+    return 0 <= lights.last_observed < len(state.world.track) - 1

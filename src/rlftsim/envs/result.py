@@ -1,0 +1,85 @@
+"""Results of episodes: scores, what they lack, pictures and films."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from os import PathLike
+
+import numpy as np
+
+from rlftsim.envs.planner_scores import PlannerScores, missing_scores, score_planner
+from rlftsim.envs.record import Record
+from rlftsim.envs.traffic_scores import TrafficScores, score_traffic
+from rlftsim.scenario.types import HISTORY_STEPS
+from rlftsim.viewer.film import to_film
+from rlftsim.viewer.page import Animation, Panel, animation_html, page_html
+from rlftsim.viewer.scene import SceneMotion, build_scene, logged_trajectories
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """Outcome of one episode; scores are computed when they are first read."""
+
+    record: Record
+
+    @cached_property
+    def planner(self) -> PlannerScores:
+        """Scores of the planner."""
+        return score_planner(self.record)
+
+    @cached_property
+    def traffic(self) -> TrafficScores:
+        """Scores of the traffic around it."""
+        return score_traffic(self.record)
+
+    @cached_property
+    def missing(self) -> dict[str, str]:
+        """Scores that this scenario cannot give, and why."""
+        return missing_scores(self.record)
+
+    def film(self, path: str | PathLike[str], *, title: str = "planner") -> None:
+        """Write a film, .mp4 or .webp.
+
+        Args:
+            path: file to write.
+            title: above the picture.
+        """
+        to_film(path, animation_of({title: self.record}))
+
+    def __repr__(self) -> str:
+        scores = self.planner
+        return (
+            f"Result({self.record.scene.scenario.scenario_id}, {self.record.steps} steps: nuPlan-style "
+            f"{scores.nuplan_style:.2f}, PDMS-style {scores.pdms_style:.2f}, {len(self.record.collisions)} contacts)"
+        )
+
+
+def motion_of(record: Record) -> SceneMotion:
+    """Motion of all agents of a record, after the logged history."""
+    log = logged_trajectories(record.scene.scenario)
+    position = np.concatenate([log.position[0, :, :HISTORY_STEPS], record.motion[:, 1:, :2]], 1)
+    heading = np.concatenate([log.heading[0, :, :HISTORY_STEPS], record.motion[:, 1:, 2]], 1)
+    valid = np.concatenate([log.valid[0, :, :HISTORY_STEPS], record.there[:, 1:]], 1)
+    return SceneMotion(position[None].astype(np.float32), heading[None].astype(np.float32), valid[None])
+
+
+def animation_of(records: Mapping[str, Record]) -> Animation:
+    """Records of one scenario side by side, by title; agents that overlap are marked.
+
+    Args:
+        records: at least one.
+    """
+    scenario = next(iter(records.values())).scene.scenario
+    scene = build_scene(scenario)
+    panels = [Panel(title, motion_of(record).with_overlaps(scene.agents)) for title, record in records.items()]
+    return Animation(f"scenario {scenario.scenario_id}", scene, panels)
+
+
+def page_of(records: Mapping[str, Record]) -> str:
+    """A page that plays records of one scenario side by side.
+
+    Args:
+        records: by title, at least one.
+    """
+    animation = animation_of(records)
+    return page_html(animation.title, animation_html(animation))

@@ -1,0 +1,104 @@
+"""An adapter for Stable-Baselines3, which does not take Gymnasium's vector environments.
+
+from rlftsim.envs.sb3 import SB3VecEnv
+model = PPO("MlpPolicy", SB3VecEnv(8, observation="flat", action="bicycle"))
+"""
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from stable_baselines3.common.vec_env import VecEnv
+
+from rlftsim.envs.vector_env import EgoVectorEnv
+
+
+class SB3VecEnv(VecEnv):
+    """Ego environments as a `VecEnv`, with one network call for scenes that were reset together.
+
+    Args:
+        num_envs: number of environments.
+        settings: of `EgoVectorEnv`.
+    """
+
+    def __init__(self, num_envs: int = 1, **settings: Any):
+        self.vector = EgoVectorEnv(num_envs, autoreset_mode=AutoresetMode.SAME_STEP, **settings)
+        super().__init__(num_envs, self.vector.single_observation_space, self.vector.single_action_space)
+        self._actions = np.zeros(0)
+
+    def reset(self) -> Any:
+        """Observations of new episodes; `seed` sets the seeds of the next reset."""
+        first = self._seeds[0] if self._seeds else None
+        observation, infos = self.vector.reset(seed=first)
+        self.reset_infos = [_own(infos, i) for i in range(self.num_envs)]
+        self._reset_seeds()
+        return observation
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Take the actions of the next step."""
+        self._actions = actions
+
+    def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+        """Carry them out: observations, rewards, ends and infos."""
+        observation, rewards, terminated, truncated, infos = self.vector.step(self._actions)
+        own = [_own(infos, i) for i in range(self.num_envs)]
+        for i in np.flatnonzero(terminated | truncated):
+            last = own[i].pop("final_info")
+            own[i] = {**last, "terminal_observation": own[i].pop("final_obs")}
+            own[i]["TimeLimit.truncated"] = bool(truncated[i])
+        return observation, rewards.astype(np.float32), terminated | truncated, own
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+    def get_attr(self, attr_name: str, indices: int | Iterable[int] | None = None) -> list[Any]:
+        """An attribute of the vector environment, once for each environment.
+
+        Args:
+            attr_name: its name.
+            indices: environments; None = all.
+        """
+        value = None if attr_name == "render_mode" else getattr(self.vector, attr_name)
+        return [value for _ in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: int | Iterable[int] | None = None) -> None:
+        """Set an attribute of the vector environment.
+
+        Args:
+            attr_name: its name.
+            value: of all environments.
+            indices: not used, as they share it.
+        """
+        setattr(self.vector, attr_name, value)
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: int | Iterable[int] | None = None, **method_kwargs: Any
+    ) -> list[Any]:
+        """Call a method of the vector environment, once for each environment.
+
+        Args:
+            method_name: its name.
+            method_args: by position.
+            indices: environments; None = all.
+            method_kwargs: by name.
+        """
+        return [getattr(self.vector, method_name)(*method_args, **method_kwargs) for _ in self._get_indices(indices)]
+
+    def env_is_wrapped(self, wrapper_class: Any, indices: int | Iterable[int] | None = None) -> Sequence[bool]:
+        """False: environments are not wrapped one by one.
+
+        Args:
+            wrapper_class: not used.
+            indices: environments; None = all.
+        """
+        return [False for _ in self._get_indices(indices)]
+
+
+def _own(infos: dict[str, Any], row: int) -> dict[str, Any]:
+    """Entries of one environment in the infos of a vector."""
+    return {
+        name: values[row]
+        for name, values in infos.items()
+        if not name.startswith("_") and (f"_{name}" not in infos or infos[f"_{name}"][row])
+    }

@@ -1,0 +1,83 @@
+"""Snapshots of episodes as bytes: numbers and JSON in the safetensors format, nothing that could run code.
+
+An episode follows from its scenarios, its dice and the planner's motion, so these are all that is stored. Reading runs
+the episode again, which gives equal bits: the same network calls on the same numbers.
+"""
+
+import json
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+from safetensors import SafetensorError
+from safetensors.numpy import load, save
+
+from rlftsim.envs.episode import Episode, EpisodeState, repeat, start
+from rlftsim.envs.source import Source
+from rlftsim.envs.world import Dice
+from rlftsim.errors import ConfigError, DataError
+from rlftsim.scenario.types import CURRENT_STEP
+
+FORMAT = "rlftsim-snapshot-1"
+IGNORED = ("data", "split", "model", "device", "render_mode", "observation", "frame")
+"""Settings that may differ between writing and reading."""
+
+
+def write_snapshot(episode: Episode, state: EpisodeState, fingerprint: str) -> bytes:
+    """Bytes of an episode.
+
+    Args:
+        episode: the scenes.
+        state: the present one.
+        fingerprint: of the traffic model.
+    """
+    scene, agent = episode.world.actors.T
+    about = {
+        "format": FORMAT,
+        "model": fingerprint,
+        "scenarios": [view.scenario.scenario_id for view in episode.world.scenes],
+        "dice": [[asdict(one) for one in dice] for dice in state.world.dice],
+        "settings": _settings(episode),
+        "goals": episode.goals,
+    }
+    motion = np.stack([step[scene, agent] for step in state.world.track[CURRENT_STEP:]])  # [T + 1, M, 5]
+    text = np.frombuffer(json.dumps(about).encode(), np.uint8)
+    return save({"motion": motion, "about": text})
+
+
+def read_snapshot(saved: bytes, source: Source) -> tuple[Episode, EpisodeState]:
+    """Episode and state of a snapshot.
+
+    Args:
+        saved: of `write_snapshot`.
+        source: of the environment that goes on with it.
+
+    Raises:
+        DataError: no snapshot.
+        ConfigError: of another model, or of other settings.
+    """
+    try:
+        arrays = load(saved)
+        about = json.loads(arrays["about"].tobytes())
+        is_ours = about["format"] == FORMAT
+    except (SafetensorError, KeyError, ValueError, TypeError) as error:
+        raise DataError(f"not a snapshot of an episode ({error}): take one with snapshot().") from None
+    if not is_ours:
+        raise DataError("a snapshot of another version: take a new one with snapshot().")
+    if about["model"] != source.fingerprint:
+        raise ConfigError("the snapshot is of another traffic model: make the environment with the same one.")
+    goals = {name: {int(i): point for i, point in own.items()} for name, own in (about["goals"] or {}).items()}
+    episode = source.episode([source.scenario(name) for name in about["scenarios"]], goals or None)
+    different = [name for name, value in _settings(episode).items() if about["settings"].get(name) != value]
+    if different:
+        raise ConfigError(f"the snapshot was taken with another {different[0]}: make the environment alike.")
+    if arrays["motion"].shape[1:] != (episode.num_agents, 5):
+        raise ConfigError("the snapshot was taken with other planner-driven agents: make the environment alike.")
+    dice = [tuple(Dice(**one) for one in row) for row in about["dice"]]
+    return episode, repeat(episode, start(episode, dice[0]), arrays["motion"][1:], dice)
+
+
+def _settings(episode: Episode) -> dict[str, Any]:
+    """Settings that an episode depends on, as JSON has them."""
+    known = {name: value for name, value in asdict(episode.config).items() if name not in IGNORED}
+    return json.loads(json.dumps(known))

@@ -1,0 +1,153 @@
+"""Scores of the traffic around a planner: realism of the others, their reactivity, and the blame for collisions.
+
+Reactivity counts the seven events of ReactSim-Bench (arXiv 2606.14058); its thresholds are ours where it names none.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Int64
+
+from rlftsim.envs.contact import lane_search
+from rlftsim.envs.episode import MAX_PAIRS, OUTSIDE_M, road_edges
+from rlftsim.envs.planner_scores import WRONG_WAY_M, WRONG_WAY_STEPS, least_time_to_collision
+from rlftsim.envs.record import Record
+from rlftsim.geometry import wrapped
+from rlftsim.realism import METRIC_2025, MetricConfig, SimulatedStates, score
+from rlftsim.realism.agents import Trajectories
+from rlftsim.realism.map_based import compute_distance_to_road_edge
+from rlftsim.scenario.types import FUTURE_STEPS, STEP_S, ObjectType, Scenario
+from rlftsim.viewer.overlap import compute_overlap
+
+RISKY_TTC_S = 1.0
+INFEASIBLE_ACCELERATION_MPS2 = 8.0
+"""Change of speed over half a second."""
+INFEASIBLE_CURVATURE = 0.3
+"""Turn per meter driven over half a second, rad/m: tighter than a radius of 3.3 m."""
+SPAN_STEPS = 5
+SLOW_MPS = 1.0
+"""Curvature is not measured below this speed."""
+LANE_M = 2.0
+
+
+@dataclass(frozen=True)
+class TrafficScores:
+    """Events of the other agents in one episode; rates are fractions of the other vehicles (contacts: of all)."""
+
+    ego_contacts: float
+    """Tracks in contact with the planner's agent."""
+    risky_approach_rate: float
+    """1 = the least time to collision fell below 1 s."""
+    others_collision_rate: float
+    others_offroad_rate: float
+    others_wrong_way_rate: float
+    others_acceleration_rate: float
+    others_steering_rate: float
+    blamed_others_rate: float
+    """Of the contacts with the planner's agent, the fraction that was not its fault; NaN without a contact."""
+
+
+def score_traffic(record: Record) -> TrafficScores:
+    """Events of the other agents in one episode."""
+    scene, motion = record.scene, record.motion
+    others = np.arange(len(scene.object_id)) != record.agent
+    vehicles = others & (scene.object_type == ObjectType.VEHICLE)
+    # 1. contacts among the others; those that begin with an overlap do not count
+    length, width = scene.size[:, 0].astype(np.float32), scene.size[:, 1].astype(np.float32)
+    overlaps = compute_overlap(
+        motion[None, ..., :2].astype(np.float32), motion[None, ..., 2].astype(np.float32), length, width,
+        (record.there & others[:, None])[None], ignore_from=0,
+    )[0].any(1)  # fmt: skip
+    # 2. kinematics over half a second
+    speed = np.linalg.norm(np.diff(motion[..., :2], axis=1), axis=-1) / STEP_S  # [A, T]
+    change = np.abs(speed[:, SPAN_STEPS:] - speed[:, :-SPAN_STEPS]) / (SPAN_STEPS * STEP_S)
+    driven = np.stack([speed[:, k : speed.shape[1] - SPAN_STEPS + 1 + k] for k in range(SPAN_STEPS)]).sum(0) * STEP_S
+    turn = np.abs(wrapped(motion[:, SPAN_STEPS:, 2] - motion[:, :-SPAN_STEPS, 2]))
+    fast = driven > SLOW_MPS * SPAN_STEPS * STEP_S
+    tight = np.where(fast, turn / np.maximum(driven, 1e-3), 0.0) > INFEASIBLE_CURVATURE
+    faults = [one.at_fault for one in record.collisions]
+    return TrafficScores(
+        ego_contacts=float(len(faults)),
+        risky_approach_rate=float(least_time_to_collision(record) < RISKY_TTC_S),
+        others_collision_rate=_rate(overlaps, others),
+        others_offroad_rate=_rate(_leaves_road(record), vehicles),
+        others_wrong_way_rate=_rate(_drives_against(record, vehicles), vehicles),
+        others_acceleration_rate=_rate((change > INFEASIBLE_ACCELERATION_MPS2).any(1), vehicles),
+        others_steering_rate=_rate(tight.any(1), vehicles),
+        blamed_others_rate=1.0 - sum(faults) / len(faults) if faults else np.nan,
+    )
+
+
+def _rate(event: Bool[np.ndarray, "A"], among: Bool[np.ndarray, "A"]) -> float:
+    return float(event[among].mean()) if among.any() else np.nan
+
+
+def _leaves_road(record: Record) -> Bool[np.ndarray, "A"]:
+    """True = a corner leaves the road during the episode; those off it from the start do not count."""
+    edges, scene = road_edges(record.scene.scenario), record.scene
+    if edges is None:
+        return np.zeros(len(scene.object_id), bool)
+    x, y = np.moveaxis(record.motion[..., :2] + scene.scenario.origin, -1, 0)
+    z = np.broadcast_to(scene.z[:, None], x.shape)
+    states = Trajectories(*(torch.from_numpy(v.copy()).float()[None] for v in (x, y, z, record.motion[..., 2])))
+    size = torch.from_numpy(scene.size).float()
+    off = compute_distance_to_road_edge(states, size, edges, max_pairs=MAX_PAIRS)[0].numpy()
+    return (off >= OUTSIDE_M).any(1) & (off[:, 0] < OUTSIDE_M)
+
+
+def _drives_against(record: Record, vehicles: Bool[np.ndarray, "A"]) -> Bool[np.ndarray, "A"]:
+    """True = drives 2 m or more within a second against every lane that it is in."""
+    search, found = lane_search(record.scene.scenario), np.zeros(len(vehicles), bool)
+    if search is None:
+        return found
+    step = np.linalg.norm(np.diff(record.motion[..., :2], axis=1), axis=-1)
+    moving = np.flatnonzero(vehicles & (step.sum(1) >= WRONG_WAY_M[0]))
+    for agent in moving:
+        near = search.tree.query_ball_point(record.motion[agent, 1:, :2], LANE_M)
+        heading = record.motion[agent, 1:, 2]
+        against = [
+            bool(points) and bool((np.cos(search.heading[points] - own) < 0).all())
+            for points, own in zip(near, heading)
+        ]
+        window = np.ones(min(WRONG_WAY_STEPS, len(against)))
+        found[agent] = np.convolve(np.where(against, step[agent], 0.0), window, "valid").max() >= WRONG_WAY_M[0]
+    return found
+
+
+class _WithoutEgo(Scenario):
+    """A scenario in which the ego is not evaluated."""
+
+    @cached_property
+    def evaluated_indices(self) -> Int64[np.ndarray, "E"]:
+        """Tracks to predict, by ascending object id."""
+        chosen = np.unique(self.tracks_to_predict.astype(np.int64))
+        chosen = chosen[self.tracks.valid[chosen, 10] & (chosen != self.ego_index)]
+        return chosen[np.argsort(self.tracks.object_id[chosen], kind="stable")]
+
+
+def realism_of_others(records: Sequence[Record], config: MetricConfig = METRIC_2025) -> float:
+    """Realism meta-metric of the agents to predict, the ego left out, over rollouts of one scenario.
+
+    NaN where it cannot be measured: no future, no road edges, an episode that ended early, or no other agent to
+    predict.
+
+    Args:
+        records: episodes of one scenario, at least one.
+        config: the metric's year.
+    """
+    scene = records[0].scene
+    scenario = _WithoutEgo(**{one.name: getattr(scene.scenario, one.name) for one in fields(Scenario)})
+    is_whole = all(record.steps == FUTURE_STEPS for record in records)
+    if not (scenario.has_future and is_whole and len(scenario.evaluated_indices)) or road_edges(scene.scenario) is None:
+        return float("nan")
+    motion = torch.from_numpy(np.stack([record.motion[:, 1:] for record in records]))  # [N, A, 80, 5]
+    world = (motion[..., :2] + torch.from_numpy(scene.scenario.origin)).float()
+    z = torch.from_numpy(scene.z).float()[None, :, None].expand(world.shape[:-1])
+    states = SimulatedStates(scene.object_id, world[..., 0], world[..., 1], z, motion[..., 2].float())
+    return float(score(scenario, states, config).meta_metric)
+
+
+TRAFFIC_SCORES = tuple(field.name for field in fields(TrafficScores))

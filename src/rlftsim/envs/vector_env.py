@@ -1,0 +1,212 @@
+"""Many ego environments at once: scenes that are reset together step together, with one network call for all."""
+
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar
+
+import numpy as np
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from jaxtyping import Bool, Int64
+
+from rlftsim.envs.config import EnvConfig
+from rlftsim.envs.episode import Episode, EpisodeState, advance, look, start
+from rlftsim.envs.record import record_of
+from rlftsim.envs.resets import about, chosen, config_of, lights_are_held
+from rlftsim.envs.result import Result
+from rlftsim.envs.source import Source
+from rlftsim.envs.spaces import action_space, observation_space, shown
+from rlftsim.errors import ConfigError
+from rlftsim.rollout.policy import Policy
+from rlftsim.scenario.any_form import AnyScenarios
+
+
+@dataclass(eq=False)
+class _Slot:
+    """One of the environments: its random numbers, and episodes since its seed."""
+
+    random: np.random.Generator
+    seed: int
+    count: int = 0
+
+
+@dataclass(eq=False)
+class _Group:
+    """Scenes that were reset together. A scene whose slot has gone on to another group is carried along."""
+
+    episode: Episode
+    state: EpisodeState
+    slots: Int64[np.ndarray, "B"]
+    """Slot of each scene; -1 = none any more."""
+    live: Int64[np.ndarray, "b"] = field(init=False)
+    """Scenes with a slot."""
+
+    def __post_init__(self) -> None:
+        self.live = np.flatnonzero(self.slots >= 0)
+
+
+class EgoVectorEnv(VectorEnv):
+    """Ego environments side by side: slot i seeded with s + i is `EgoEnv` seeded with s + i.
+
+    A group of scenes that were reset together makes one network call for all of them every half second. Scenes that
+    end early are reset on their own and form smaller groups, so `stop_on=()` is fastest.
+
+    Args:
+        num_envs: number of slots.
+        autoreset_mode: of Gymnasium: at the next step, in the same step, or by `reset(options={"reset_mask": ...})`.
+        scenarios: in place of the data set `data`.
+        policy: in place of the traffic model `model`.
+        settings: fields of `EnvConfig` by name; pictures and pages are those of `EgoEnv` alone.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        scenarios: AnyScenarios | None = None,
+        policy: Policy | None = None,
+        **settings: Any,
+    ):
+        config: EnvConfig = config_of(settings)
+        if config.render_mode is not None or config.observation == "arrays":
+            raise ConfigError("a vector of environments renders nothing and observes 'dict' or 'flat': change these.")
+        self.source = Source(config, scenarios, policy)
+        self.num_envs = num_envs
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        self.metadata = {**type(self).metadata, "autoreset_mode": self.autoreset_mode}
+        self.single_action_space = action_space(self.source.controls)
+        self.single_observation_space = observation_space(config.observation)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self._slots: list[_Slot] = []
+        self._groups: list[_Group] = []
+        self._over = np.zeros(num_envs, bool)
+
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begin episodes in all slots, or in those of `options["reset_mask"]`.
+
+        Args:
+            seed: s gives slot i the seed s + i; or one seed for each.
+            options: as of `EgoEnv`, the same for all.
+
+        Raises:
+            ConfigError: an unknown option or scenario.
+        """
+        options = dict(options or {})
+        mask = np.asarray(options.pop("reset_mask", np.ones(self.num_envs, bool)), bool)
+        seeds = seed
+        if not isinstance(seeds, list):
+            seeds = [None if seeds is None else seeds + i for i in range(self.num_envs)]
+        for i, given in enumerate(seeds):
+            if len(self._slots) <= i or given is not None:
+                random, used = seeding.np_random(given)
+                self._slots[i : i + 1] = [_Slot(random, int(used))]
+        infos = self._reset(np.flatnonzero(mask), options, {})
+        return self._observe(), infos
+
+    def step(
+        self, actions: Any
+    ) -> tuple[Any, np.ndarray, Bool[np.ndarray, "n"], Bool[np.ndarray, "n"], dict[str, Any]]:
+        """Carry out one action in every slot.
+
+        Args:
+            actions: of the action space.
+
+        Raises:
+            ConfigError: before `reset`, or an action with a NaN or of another shape; with autoreset disabled a slot
+                whose episode is over.
+        """
+        if not self._groups:
+            raise ConfigError("these environments have no episodes yet: call reset() first.")
+        actions, controls = np.asarray(actions), self.source.controls
+        if actions.shape != (self.num_envs, *controls.limits.shape):
+            raise ConfigError(
+                f"actions have shape {actions.shape}, they must have {(self.num_envs, *controls.limits.shape)}."
+            )
+        renewed = np.flatnonzero(self._over)
+        if self.autoreset_mode == AutoresetMode.DISABLED and len(renewed):
+            raise ConfigError(f"the episode of slot {renewed[0]} is over: reset it with options={{'reset_mask': ...}}.")
+        rewards = np.zeros(self.num_envs)
+        terminated, truncated = np.zeros(self.num_envs, bool), np.zeros(self.num_envs, bool)
+        infos: dict[str, Any] = {}
+        # 1. slots whose episode ended in the last step begin another one and take no action
+        if self.autoreset_mode == AutoresetMode.NEXT_STEP and len(renewed):
+            infos = self._reset(renewed, {}, infos)
+        fresh = set(renewed.tolist())
+        # 2. all others act, a group at a time
+        for group in self._groups:
+            if fresh & set(group.slots[group.live].tolist()):
+                continue
+            slots = group.slots[group.live]
+            action = np.zeros((len(group.slots), *controls.limits.shape), actions.dtype)
+            action[group.live] = actions[slots]
+            group.state, outcome = advance(group.episode, group.state, action)
+            rewards[slots] = outcome.reward[group.live]
+            terminated[slots], truncated[slots] = outcome.terminated[group.live], outcome.truncated[group.live]
+            for row, slot in zip(group.live, slots):
+                info = {
+                    "step": group.state.world.step,
+                    "terms": {name: float(value[row]) for name, value in outcome.terms.items()},
+                    "clipped": bool(outcome.clipped[row]),
+                    "lights_held": lights_are_held(group.episode, group.state, int(row)),
+                }
+                if terminated[slot] or truncated[slot]:
+                    info["result"] = Result(record_of(group.episode, group.state, int(row)))
+                infos = self._add_info(infos, info, int(slot))
+        self._over = terminated | truncated
+        # 3. the same step resets at once and hands over the last observation beside the first
+        ended = np.flatnonzero(self._over)
+        if self.autoreset_mode == AutoresetMode.SAME_STEP and len(ended):
+            last = self._observe()
+            for slot in ended:
+                final = {name: values[slot] for name, values in last.items()} if isinstance(last, dict) else last[slot]
+                own = {name: values[slot] for name, values in infos.items() if not name.startswith("_")}
+                infos = self._add_info(infos, {"final_obs": final, "final_info": own}, int(slot))
+            infos = self._reset(ended, {}, infos)
+        return self._observe(), rewards, terminated, truncated, infos
+
+    def _reset(self, which: np.ndarray, options: dict[str, Any], infos: dict[str, Any]) -> dict[str, Any]:
+        """Begin episodes of some slots, which form a group, and add what there is to say about them."""
+        picks = []
+        for i in which:
+            slot = self._slots[i]
+            picks.append(chosen(slot.random, self.source, options, slot.seed, slot.count))
+            slot.count += 1
+        scenarios = [self.source.scenario(scenario_id) for scenario_id, _, _ in picks]
+        goals = {scenario_id: own for scenario_id, _, own in picks if own}
+        episode = self.source.episode(scenarios, goals or None)
+        if episode.num_agents != len(picks):
+            raise ConfigError("the planner drives more than the egos: take rlftsim.envs.parallel_env.")
+        state = start(episode, tuple(dice for _, dice, _ in picks))
+        # groups lose the slots that went on, and are dropped when they have none left
+        kept = [_without(group, which) for group in self._groups]
+        self._groups = [group for group in kept if len(group.live)] + [_Group(episode, state, np.array(which))]
+        self._over[which] = False
+        for row, i in enumerate(which):
+            infos = self._add_info(infos, about(episode, state, row, self.source), int(i))
+        return infos
+
+    def _observe(self) -> Any:
+        """Observations of all slots in order."""
+        kind = self.source.config.observation
+        parts = [(group, shown(look(group.episode, group.state), kind)) for group in self._groups]
+        if len(parts) == 1 and len(parts[0][0].live) == self.num_envs:
+            return parts[0][1]  # a group of all slots has them in order
+        order = np.argsort(np.concatenate([group.slots[group.live] for group, _ in parts]))
+
+        def joined(arrays: list[np.ndarray]) -> np.ndarray:
+            return np.concatenate([array[group.live] for array, (group, _) in zip(arrays, parts)])[order]
+
+        if kind == "flat":
+            return joined([seen for _, seen in parts])
+        return {name: joined([seen[name] for _, seen in parts]) for name in parts[0][1]}
+
+
+def _without(group: _Group, gone: np.ndarray) -> _Group:
+    """A group without some of its slots."""
+    return replace(group, slots=np.where(np.isin(group.slots, gone), -1, group.slots))

@@ -1,0 +1,166 @@
+"""Results of `rlftsim drive`: one row per scenario, for one planner in one kind of traffic, in one Parquet file."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from rich.table import Table
+
+from rlftsim.atomic_io import write_whole
+from rlftsim.errors import DataError
+from rlftsim.evaluation.columns import ARROWS, direction_of, format_number
+from rlftsim.evaluation.compare import PairedDifference, compare_paired
+from rlftsim.statistics import mean_interval
+
+FORMAT = "rlftsim-drive-1"
+SHOWN = (
+    "nuplan_style", "pdms_style", "no_at_fault_collision", "drivable_area", "progress", "time_to_collision", "comfort",
+    "at_fault_collision_rate", "hit_rate", "others_realism", "others_collision_rate", "others_offroad_rate",
+)  # fmt: skip
+"""Columns of the table and of comparisons on the command line; the file has more."""
+
+
+@dataclass(frozen=True)
+class DriveSettings:
+    """How the episodes of a result were made."""
+
+    planner: str
+    traffic: str
+    model: str
+    """Fingerprint of the traffic model; "none" where no agent followed one."""
+    dataset: str
+    split: str | None
+    num_rollouts: int
+    seed: int
+    rlftsim_version: str
+
+
+@dataclass(frozen=True, eq=False)
+class DriveResult:
+    """Scores of one planner in one kind of traffic, means over the rollouts of each scenario."""
+
+    settings: DriveSettings
+    table: pa.Table
+    """Columns `scenario_id`, `traffic` and float64 scores; NaN = not measurable in the scenario."""
+    missing: Mapping[str, Mapping[str, str]]
+    """Scenario id -> score -> reason that it is missing."""
+
+    @classmethod
+    def of(
+        cls, settings: DriveSettings, rows: Sequence[Mapping[str, Any]], missing: Mapping[str, Mapping[str, str]]
+    ) -> "DriveResult":
+        """Result of some rows.
+
+        Args:
+            settings: of the episodes.
+            rows: with the same columns.
+            missing: scores that some scenarios cannot give.
+        """
+        return cls(settings, pa.Table.from_pylist(list(rows)), {name: why for name, why in missing.items() if why})
+
+    @property
+    def name(self) -> str:
+        """Planner and traffic."""
+        return f"{self.settings.planner} in {self.settings.traffic}"
+
+    def values(self, column: str) -> np.ndarray:
+        """A column as float64 [scenarios]."""
+        return self.table[column].to_numpy()
+
+    def write(self, path: str | PathLike[str]) -> None:
+        """Write as Parquet, whole or not at all."""
+        about = {"format": FORMAT, "settings": asdict(self.settings), "missing": self.missing}
+        table = self.table.replace_schema_metadata({"rlftsim": json.dumps(about)})
+        write_whole(Path(path), lambda temporary: pq.write_table(table, temporary, compression="zstd"))
+
+    @classmethod
+    def read(cls, path: str | PathLike[str]) -> "DriveResult":
+        """Read the file that `write` wrote.
+
+        Raises:
+            DataError: not such a file.
+        """
+        try:
+            table = pq.read_table(path)
+            about = json.loads((table.schema.metadata or {})[b"rlftsim"])
+            settings = DriveSettings(**about["settings"])
+        except (OSError, KeyError, TypeError, ValueError, pa.ArrowException) as error:
+            raise DataError(f"{path}: not a result of `rlftsim drive` ({error}): drive again.") from None
+        return cls(settings, table.replace_schema_metadata(None), about["missing"])
+
+
+def is_drive_result(path: str | PathLike[str]) -> bool:
+    """True for a Parquet file of `rlftsim drive`; False for anything else, also for no file."""
+    try:
+        metadata = pq.read_schema(path).metadata or {}
+        return json.loads(metadata.get(b"rlftsim", b"{}")).get("format") == FORMAT
+    except (OSError, ValueError, pa.ArrowException):
+        return False
+
+
+def compare_drives(a: DriveResult, b: DriveResult, *, alpha: float = 0.05) -> tuple[PairedDifference, ...]:
+    """Paired differences of the scores that both have, b minus a.
+
+    Args:
+        a: the reference, such as a planner in replayed traffic.
+        b: the other one, such as the same planner in reactive traffic.
+        alpha: probability of calling a difference that is none.
+
+    Raises:
+        DataError: other numbers of rollouts, or no scenario in common.
+    """
+    if a.settings.num_rollouts != b.settings.num_rollouts:
+        raise DataError(
+            f"{a.name} has {a.settings.num_rollouts} rollouts of a scenario, {b.name} {b.settings.num_rollouts}: "
+            "drive both alike."
+        )
+    place = {name: row for row, name in enumerate(b.table["scenario_id"].to_pylist())}
+    rows_a = [row for row, name in enumerate(a.table["scenario_id"].to_pylist()) if name in place]
+    rows_b = [place[a.table["scenario_id"][row].as_py()] for row in rows_a]
+    if not rows_a:
+        raise DataError(f"{a.name} and {b.name} have no scenario in common.")
+    columns = [name for name in a.table.schema.names[2:] if name in b.table.schema.names]
+    return tuple(compare_paired(name, a.values(name)[rows_a], b.values(name)[rows_b], alpha=alpha) for name in columns)
+
+
+def format_drives(*results: DriveResult) -> Table:
+    """One column per result: mean ± standard error over its scenarios."""
+    table = Table()
+    table.add_column("", no_wrap=True)
+    for result in results:
+        table.add_column(f"{result.name} ({len(result.table)} scenarios)", justify="right")
+    for name in SHOWN:
+        means = [mean_interval(result.values(name)) for result in results]
+        cells = [
+            "–" if not mean.count else f"{format_number(mean.mean, 4)}"
+            + (f" ± {format_number(mean.standard_error, 4)}" if mean.count > 1 else "")
+            for mean in means
+        ]  # fmt: skip
+        table.add_row(f"{name} {ARROWS[direction_of(name)]}", *cells)
+    return table
+
+
+def format_drive_comparison(a: DriveResult, b: DriveResult, *, alpha: float) -> Table:
+    """One row per score: both means and the verdict.
+
+    Args:
+        a: the reference.
+        b: the other one.
+        alpha: probability of calling a difference that is none.
+    """
+    table = Table(title=f"{b.name} against {a.name}", title_justify="left")
+    table.add_column("", no_wrap=True)
+    for name in (a.name, b.name):
+        table.add_column(name, justify="right")
+    table.add_column("verdict")
+    for row in compare_drives(a, b, alpha=alpha):
+        if row.column in SHOWN and row.count:
+            label = f"{row.column} {ARROWS[direction_of(row.column)]}"
+            table.add_row(label, f"{row.mean_a:.4f}", f"{row.mean_b:.4f}", row.verdict)
+    return table

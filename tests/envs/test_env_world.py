@@ -1,0 +1,230 @@
+"""The loop of a planner and the traffic model: the same dice as `simulate`, forks, snapshots, the log itself."""
+
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from rlftsim.envs import EgoEnv, EgoVectorEnv
+from rlftsim.envs.world import Dice, begin, build_world, fork, step_world
+from rlftsim.errors import ConfigError, DataError
+from rlftsim.policies.registry import load_policy
+from rlftsim.rollout.simulate import simulate
+from rlftsim.scenario.batch import collate
+from rlftsim.scenario.open import open_dataset
+from rlftsim.scenario.types import CURRENT_STEP
+from scenes import bend, junction_with_light, straight_road, with_gaps, without_future
+
+
+@pytest.fixture(scope="module")
+def model():
+    return load_policy("demo-base")
+
+
+@pytest.fixture(scope="module")
+def data():
+    return open_dataset("synthetic", "validation")
+
+
+def pose_action(before, after):
+    """The `pose` action that leads from one pose to another, float32 as an action is."""
+    dx, dy = after[:2] - before[:2]
+    cos, sin = np.cos(before[2]), np.sin(before[2])
+    turn = (after[2] - before[2] + np.pi) % (2 * np.pi) - np.pi
+    return np.array([cos * dx + sin * dy, cos * dy - sin * dx, turn], np.float32)
+
+
+def others(env):
+    """Poses of all agents but the ego at all steps after the current one, float32."""
+    track = np.stack([step[0] for step in env.state.world.track[CURRENT_STEP + 1 :]], 1)
+    return np.delete(track[..., :3], env.episode.world.scenes[0].ego, axis=0).astype(np.float32)
+
+
+@pytest.mark.parametrize("name", ["demo-base", "constant_velocity"])
+def test_decisions_of_the_model_fed_back_as_poses_are_a_simulation(name, data):
+    policy = load_policy(name)
+    scenarios = [data[0], data[3]] if name == "demo-base" else [bend()]
+    for scenario in scenarios:
+        reference = simulate(policy, collate([scenario]), num_rollouts=range(3, 4), seed=7)
+        env = EgoEnv(scenarios=[scenario], policy=policy, action="pose", stop_on=(), reward="none")
+        env.reset(seed=7, options={"rollout": 3})
+        ego = env.episode.world.scenes[0].ego
+        wanted = torch.cat([reference.position, reference.heading[..., None]], -1)[0, 0].numpy()  # [A, 80, 3]
+        for step in range(80):
+            env.step(pose_action(env.state.world.now[0, ego], wanted[ego, step].astype(np.float64)))
+        assert np.array_equal(others(env), np.delete(wanted, ego, axis=0))
+        np.testing.assert_allclose(env.state.world.now[0, ego, :2], wanted[ego, -1, :2], atol=1e-4)
+
+
+def test_a_world_that_the_policy_drives_alone_is_a_simulation(model, data):
+    scenario = data[1]
+    world = build_world([scenario], model, rules={"*": "policy"})
+    state = begin(world, [Dice(5, 2)])
+    for _ in range(80):
+        state = step_world(world, state, np.zeros((0, 5)))
+    reference = simulate(model, collate([scenario]), num_rollouts=range(2, 3), seed=5)
+    track = np.stack([step[0] for step in state.track[CURRENT_STEP + 1 :]], 1)
+    assert np.array_equal(track[..., :2].astype(np.float32), reference.position[0, 0].numpy())
+
+
+def test_the_log_replayed_is_the_log(data):
+    worst = 0.0
+    for scenario in [*(data[i] for i in range(30)), bend(), with_gaps()]:
+        env = EgoEnv(scenarios=[scenario], action="pose", traffic="replay", stop_on=(), reward="none")
+        _, info = env.reset(seed=0)
+        logged = info["logged"]
+        for step in range(80):
+            known = np.isfinite(logged[step : step + 2]).all()
+            env.step(pose_action(logged[step], logged[step + 1]) if known else np.zeros(3, np.float32))
+        scene = env.episode.world.scenes[0]
+        track = np.stack([step[0, : len(scene.object_id)] for step in env.state.world.track], 1)
+        away = np.linalg.norm(track[..., :2] - scene.logged[..., :2], axis=-1)
+        worst = max(worst, float(away[scene.valid].max()))
+    assert worst <= 1e-4
+
+
+def test_the_same_seed_gives_the_same_bits_alone_and_in_a_vector(model, data):
+    scenarios = [data[i] for i in range(6)]
+    settings = {"scenarios": scenarios, "policy": model, "stop_on": (), "action": "bicycle"}
+    actions = np.random.default_rng(0).uniform(-1, 1, (12, 32, 2)).astype(np.float32)
+    vector = EgoVectorEnv(32, **settings)
+    seen, _ = vector.reset(seed=40)
+    ours = [seen]
+    for action in actions:
+        ours.append(vector.step(action)[0])
+    for slot in (0, 13, 31):
+        for _ in range(2):
+            env = EgoEnv(**settings)
+            alone, _ = env.reset(seed=40 + slot)
+            for step, action in enumerate([None, *actions[:, slot]]):
+                if action is not None:
+                    alone = env.step(action)[0]
+                assert all(np.array_equal(ours[step][name][slot], alone[name]) for name in alone)
+
+
+def test_forks_with_the_same_dice_differ_only_after_the_running_block(model, data):
+    later = 0
+    for i in range(5):
+        env = EgoEnv(scenarios=[data[i]], policy=model, stop_on=(), reward="none")
+        env.reset(seed=1)
+        for _ in range(12):
+            env.step(np.zeros(2, np.float32))
+        same, braking = env.fork(2)
+        for step in range(30):
+            env.step(np.array([0.5, 0.0], np.float32))
+            same.step(np.array([0.5, 0.0], np.float32))
+            braking.step(np.array([-1.0, 0.3], np.float32))
+            assert np.array_equal(others(env), others(same))
+            if step < 3:  # steps 13, 14 and 15 belong to the block that was running
+                assert np.array_equal(others(env), others(braking))
+        later += not np.array_equal(others(env), others(braking))
+    assert later >= 1
+
+
+def test_a_fork_with_new_dice_differs_where_the_same_actions_are_taken(model, data):
+    env = EgoEnv(scenarios=[data[0]], policy=model, stop_on=(), reward="none")
+    env.reset(seed=1)
+    branches = [env, *env.fork(2, noise="new")]
+    for branch in branches:
+        for _ in range(20):
+            branch.step(np.zeros(2, np.float32))
+    tracks = [others(branch) for branch in branches]
+    assert not np.array_equal(tracks[0], tracks[1])
+    assert not np.array_equal(tracks[1], tracks[2])
+
+
+RESTORE = """
+import sys, numpy as np
+from rlftsim.envs import EgoEnv
+env = EgoEnv(data="synthetic", action="bicycle", stop_on=(), reward="none")
+env.restore(open(sys.argv[1], "rb").read())
+while not env.state.ended[0]:
+    env.step(np.array([-0.2, 0.1], np.float32))
+np.save(sys.argv[2], np.stack(env.state.world.track))
+"""
+
+
+def test_a_snapshot_goes_on_in_another_process(tmp_path):
+    env = EgoEnv(data="synthetic", action="bicycle", stop_on=(), reward="none")
+    env.reset(seed=4)
+    for _ in range(23):
+        env.step(np.array([0.4, 0.0], np.float32))
+    env = env.fork(1, noise="new")[0]
+    for _ in range(10):
+        env.step(np.array([0.4, 0.0], np.float32))
+    saved = env.snapshot()
+    assert len(saved) <= 1e6
+    (tmp_path / "saved").write_bytes(saved)
+    out = tmp_path / "track.npy"
+    subprocess.run([sys.executable, "-c", RESTORE, str(tmp_path / "saved"), str(out)], check=True)
+    while not env.state.ended[0]:
+        env.step(np.array([-0.2, 0.1], np.float32))
+    assert np.array_equal(np.load(out), np.stack(env.state.world.track))
+
+
+def test_snapshots_of_something_else_are_refused(data):
+    env = EgoEnv(scenarios=[bend()], traffic="replay")
+    env.reset(seed=0)
+    saved = env.snapshot()
+    other = EgoEnv(scenarios=[bend()], traffic="replay", max_steps=40)
+    with pytest.raises(ConfigError, match="another max_steps"):
+        other.restore(saved)
+    with pytest.raises(ConfigError, match="another traffic model"):
+        EgoEnv(
+            scenarios=[bend()], traffic="constant_velocity", model="constant_velocity", drivers={101: "policy"}
+        ).restore(saved)
+    with pytest.raises(DataError, match="not a snapshot"):
+        env.restore(b"12345678")
+
+
+def test_replayed_agents_hold_their_last_pose_or_vanish():
+    scenario = with_gaps()
+    for vanish, there in ((False, True), (True, False)):
+        env = EgoEnv(scenarios=[scenario], traffic="replay", vanish=vanish, stop_on=())
+        env.reset(seed=0)
+        for _ in range(16):  # step 26 of the log, where agent 101 is not seen
+            observation = env.step(np.zeros(2, np.float32))[0]
+        row = env.episode.world.scenes[0].row_of(101)
+        assert env.episode.world.there[0, row, 26] == there
+        before = env.episode.world.scenes[0].logged[row, 24, :2]
+        np.testing.assert_array_equal(env.state.world.now[0, row, :2], before)
+        assert observation["neighbors_mask"].sum() == (4 if there else 3)
+
+
+def test_idm_traffic_stops_behind_a_planner_that_stands():
+    env = EgoEnv(scenarios=[straight_road()], traffic="policy", policy=load_policy("constant_velocity"),
+                 drivers={"vehicles": "idm"}, action="pose", stop_on=(), reward="none")  # fmt: skip
+    # the rule for the ego comes first, and pedestrians follow the policy
+    env.reset(seed=0)
+    world = env.episode.world
+    assert [int(d) for d in world.drivers[0]] == [0, 4, 4, 1, 1, 4]
+    follower = build_world([straight_road()], None, rules={101: "planner", "vehicles": "idm", "*": "replay"})
+    state = begin(follower, [Dice(0)])
+    standing = np.append(follower.scenes[0].logged[1, 10, :3], [0.0, 0.0])[None]
+    for _ in range(80):
+        state = step_world(follower, state, standing)
+    gap = standing[0, 0] - state.now[0, 0, 0] - follower.size[0, :2, 0].sum() / 2
+    assert 0.3 < gap < 3.0
+    assert np.hypot(*state.now[0, 0, 3:]) < 0.5
+
+
+def test_lights_hold_their_last_state_where_a_log_ends():
+    cut = replace(without_future(), lights=junction_with_light().lights)
+    lights = cut.lights
+    kept = lights.step <= CURRENT_STEP
+    cut = replace(cut, lights=replace(lights, **{n: getattr(lights, n)[kept] for n in vars(lights)}))
+    env = EgoEnv(scenarios=[cut], traffic="constant_velocity")
+    _, info = env.reset(seed=0)
+    assert not info["lights_held"]
+    observation, _, _, _, info = env.step(np.zeros(2, np.float32))
+    assert info["lights_held"]
+    assert observation["lights"][0, 2] == 1  # red
+
+
+def test_forking_costs_no_copies(data):
+    world = build_world([data[0]], None, rules={"ego": "planner", "*": "replay"})
+    state = begin(world, [Dice(0)])
+    assert all(branch is state for branch in fork(world, state, 8))
