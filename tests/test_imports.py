@@ -21,7 +21,7 @@ FLOORS = (
     ("training",),
     ("recipes",),
     ("evaluation",),
-    ("submission", "experiments"),
+    ("submission", "experiments", "envs"),
     ("_api",),
     ("cli",),
 )

@@ -60,12 +60,20 @@ class Moves:
 class Controls(Protocol):
     """One way to act."""
 
-    steps: int
-    """Steps of 0.1 s that an action lasts."""
-    num_choices: int
-    """Number of discrete actions; 0 where actions are numbers."""
-    limits: np.ndarray
-    """Largest absolute values of an action, in its shape; empty for discrete ones."""
+    @property
+    def steps(self) -> int:
+        """Steps of 0.1 s that an action lasts."""
+        ...
+
+    @property
+    def num_choices(self) -> int:
+        """Number of discrete actions; 0 where actions are numbers."""
+        ...
+
+    @property
+    def limits(self) -> np.ndarray:
+        """Largest absolute values of an action, in its shape; of shape () for discrete ones."""
+        ...
 
     def move(self, action: np.ndarray, actors: Actors) -> Moves:
         """Motion that one action of each agent leads to.
@@ -285,12 +293,11 @@ class TrajectoryControls:
             actors: of any kind; vehicles for the bicycle.
         """
         kept = np.clip(action, -TRAJECTORY_LIMITS, TRAJECTORY_LIMITS)
-        clipped = (kept != action).any((1, 2))
+        clipped = np.any(kept != action, axis=(1, 2))
         if self.tracker is None:
             first = np.clip(kept[:, :1], -POSE_LIMITS, POSE_LIMITS)
-            return Moves(
-                with_velocity(placed(first, actors.motion), actors.motion), clipped | (first != kept[:, :1]).any((1, 2))
-            )
+            clipped = clipped | np.any(first != kept[:, :1], axis=(1, 2))
+            return Moves(with_velocity(placed(first, actors.motion), actors.motion), clipped)
         _only_vehicles(actors, "trajectory with the bicycle")
         # Pure pursuit (Coulter, 1992) of the point ahead; speed of the first pose, so that errors along do not remain.
         speed = signed_speed(actors.motion)

@@ -5,10 +5,10 @@ from dataclasses import dataclass, field
 from typing import Literal, get_args
 
 from rlftsim.envs.actions import ActionKind, Tracker
-from rlftsim.envs.drivers import TRAFFIC, Rules
+from rlftsim.envs.drivers import Rules, Traffic
 from rlftsim.envs.observations import Frame
 from rlftsim.envs.route import RouteChoice
-from rlftsim.errors import ConfigError, in_short
+from rlftsim.errors import ConfigError, in_short, require_types
 from rlftsim.policies.registry import Device
 from rlftsim.rollout.policy import Sampling
 from rlftsim.scenario.types import FUTURE_STEPS
@@ -28,7 +28,7 @@ class EnvConfig:
     """Split of the data set; None = all scenarios."""
     model: str = "demo-base"
     """Traffic model: a run, a model folder or a registered name."""
-    traffic: str = "policy"
+    traffic: Traffic = "policy"
     """Driver of all agents but the ego: policy, replay, constant_velocity or idm."""
     drivers: Rules = field(default_factory=dict)
     """Drivers of some agents, the first match wins; see `drivers_of`. They come before `traffic`."""
@@ -61,21 +61,15 @@ class EnvConfig:
     render_mode: RenderMode | None = None
 
     def __post_init__(self) -> None:
-        if self.traffic not in TRAFFIC:
-            raise ConfigError(f"traffic must be one of {', '.join(TRAFFIC)}, got {in_short(self.traffic)}.")
+        require_types(self)
+        object.__setattr__(self, "stop_on", tuple(self.stop_on))
+        for reason in self.stop_on:
+            if reason not in get_args(StopReason):
+                raise ConfigError(f"stop_on must be one of {', '.join(get_args(StopReason))}, got {in_short(reason)}.")
         if not isinstance(self.drivers, Mapping):
             raise ConfigError(f"drivers must be {{who: driver}}, got {in_short(self.drivers)}.")
         if not 1 <= self.max_steps <= FUTURE_STEPS:
             raise ConfigError(f"max_steps must lie between 1 and {FUTURE_STEPS}, got {self.max_steps}.")
-        object.__setattr__(self, "stop_on", tuple(self.stop_on))
-        for name, known in (
-            ("stop_on", get_args(StopReason)), ("observation", get_args(ObservationKind)), ("frame", get_args(Frame)),
-            ("render_mode", (None, *get_args(RenderMode))),
-        ):  # fmt: skip
-            value = getattr(self, name)
-            for one in value if isinstance(value, tuple) else (value,):
-                if one not in known:
-                    raise ConfigError(f"{name} must be one of {', '.join(map(str, known))}, got {in_short(one)}.")
 
     @property
     def sampling(self) -> Sampling:

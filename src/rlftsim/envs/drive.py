@@ -9,6 +9,7 @@ import numpy as np
 
 import rlftsim
 from rlftsim.envs.config import EnvConfig
+from rlftsim.envs.drivers import TRAFFIC, Traffic
 from rlftsim.envs.ego_env import EgoEnv
 from rlftsim.envs.planners.registry import action_of, load_planner
 from rlftsim.envs.result import Result, animation_of
@@ -32,7 +33,7 @@ class DriveConfig:
     split: str | None = "validation"
     model: str = "demo-base"
     """Traffic model."""
-    traffic: tuple[str, ...] = ("policy", "replay")
+    traffic: tuple[Traffic, ...] = ("policy", "replay")
     num_rollouts: int = 1
     """Episodes of each scenario, with dice of their own."""
     seed: int = 0
@@ -48,10 +49,11 @@ class DriveConfig:
             whole_number(name, getattr(self, name), 1)
         if self.limit is not None:
             whole_number("limit", self.limit, 1)
-        if not self.traffic:
-            raise ConfigError("traffic needs at least one kind: policy, replay, constant_velocity or idm.")
+        for traffic in self.traffic or ("",):
+            if traffic not in TRAFFIC:
+                raise ConfigError(f"traffic must be some of {', '.join(TRAFFIC)}, got {traffic!r}.")
 
-    def settings(self, traffic: str) -> EnvConfig:
+    def settings(self, traffic: Traffic) -> EnvConfig:
         """Settings of the environment for one kind of traffic: nothing ends an episode, and nothing is rewarded."""
         return EnvConfig(
             data=self.data, split=self.split, model=self.model, traffic=traffic,
@@ -108,7 +110,7 @@ def run_planner(env: EgoEnv, planner: Any, scenario: Scenario, *, seed: int, rol
 
 
 def _drive_scenario(
-    config: DriveConfig, traffic: str, scenario_id: str, advance: Any, stop: Any
+    config: DriveConfig, traffic: Traffic, scenario_id: str, advance: Any, stop: Any
 ) -> tuple[dict[str, Any], dict[str, str]]:
     """Row of one scenario, and the scores that it cannot give."""
     env, planner = _environment(config, traffic), load_planner(config.planner)
@@ -124,7 +126,7 @@ def _drive_scenario(
 
 
 @lru_cache(maxsize=8)
-def _environment(config: DriveConfig, traffic: str) -> EgoEnv:
+def _environment(config: DriveConfig, traffic: Traffic) -> EgoEnv:
     """Environment of one kind of traffic, made once in each process."""
     settings = config.settings(traffic)
     return EgoEnv(**{name: getattr(settings, name) for name in settings.__dataclass_fields__})

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from enum import IntEnum
+from typing import Literal, get_args
 
 import numpy as np
 from jaxtyping import Int64
@@ -25,8 +26,9 @@ class Driver(IntEnum):
     """The intelligent driver model along the way of its log, for vehicles alone; all others follow the policy."""
 
 
-TRAFFIC = tuple(driver.name.lower() for driver in Driver if driver != Driver.PLANNER)
-"""Names of drivers that a whole scene may have besides the planner."""
+Traffic = Literal["policy", "replay", "constant_velocity", "idm"]
+"""Drivers that a whole scene may have besides the planner."""
+TRAFFIC = get_args(Traffic)
 GROUPS = {
     "vehicles": ObjectType.VEHICLE,
     "pedestrians": ObjectType.PEDESTRIAN,

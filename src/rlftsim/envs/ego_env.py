@@ -8,7 +8,7 @@ import numpy as np
 
 from rlftsim.envs.episode import Episode, EpisodeState, advance, look, start
 from rlftsim.envs.record import record_of
-from rlftsim.envs.resets import about, chosen, config_of, lights_are_held
+from rlftsim.envs.resets import about, chosen, config_of, note_of
 from rlftsim.envs.result import Result, animation_of, page_of
 from rlftsim.envs.snapshot import read_snapshot, write_snapshot
 from rlftsim.envs.source import Source
@@ -114,16 +114,8 @@ class EgoEnv(gymnasium.Env):
             raise ConfigError("this episode is over: call reset().")
         state, outcome = advance(episode, state, np.asarray(action)[None])
         self._begun = episode, state
-        info = {
-            "step": state.world.step,
-            "terms": {name: float(value[0]) for name, value in outcome.terms.items()},
-            "clipped": bool(outcome.clipped[0]),
-            "lights_held": lights_are_held(episode, state, 0),
-        }
         terminated, truncated = bool(outcome.terminated[0]), bool(outcome.truncated[0])
-        if terminated or truncated:
-            info["result"] = self.result()
-        return self._look(), float(outcome.reward[0]), terminated, truncated, info
+        return self._look(), float(outcome.reward[0]), terminated, truncated, note_of(episode, state, outcome, 0)
 
     def fork(self, number: int, noise: Noise = "same") -> list["EgoEnv"]:
         """Environments that go on from here, which share all that does not change.

@@ -5,7 +5,6 @@ B scenes in step, M planner-driven agents over all of them. An `Episode` does no
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -19,6 +18,7 @@ from rlftsim.envs.rewards import WeightedTerm
 from rlftsim.envs.route import route_of
 from rlftsim.envs.world import Dice, World, WorldState, begin, step_world, with_dice
 from rlftsim.geometry import wrapped
+from rlftsim.goals.types import PointById
 from rlftsim.realism.map_based import (
     RoadEdges,
     build_road_edges,
@@ -31,7 +31,7 @@ from rlftsim.scenario.types import Scenario
 OUTSIDE_M = 0.3
 """A corner this far off the road leaves the drivable area, as in nuPlan."""
 AT_GOAL_M = 2.0
-ScenarioGoals = Mapping[str, Mapping[int, Any]]
+ScenarioGoals = Mapping[str, PointById]
 """Scenario id -> object id -> (x, y), world frame, m."""
 MAX_PAIRS = 1 << 22
 """Bounds the memory of the search for road edges."""

@@ -88,8 +88,8 @@ def find_leaders(
     meets = (ahead <= other_size[..., :1] / 2 + half * np.abs(np.sin(turn))) & mask[..., None]
     meets &= aside <= other_size[..., 1:] / 2 + half * np.abs(np.cos(turn))
     # 3. The first point and its box.
-    any_box = meets.any(1)  # [M, W]
-    first, found, row = any_box.argmax(1), any_box.any(1), np.arange(len(line))
+    any_box = np.any(meets, axis=1)  # [M, W]
+    first, found, row = any_box.argmax(1), np.any(any_box, axis=1), np.arange(len(line))
     box = meets[row, :, first].argmax(1)
     velocity, at = others[row, box, 3:], heading[row, first]
     speed = np.maximum(velocity[:, 0] * np.cos(at) + velocity[:, 1] * np.sin(at), 0.0)

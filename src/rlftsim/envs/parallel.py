@@ -9,9 +9,7 @@ from pettingzoo import ParallelEnv
 
 from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.episode import Episode, EpisodeState, advance, look, start
-from rlftsim.envs.record import record_of
-from rlftsim.envs.resets import about, chosen, config_of, lights_are_held
-from rlftsim.envs.result import Result
+from rlftsim.envs.resets import OPTIONS, about, chosen, config_of, note_of
 from rlftsim.envs.source import Source
 from rlftsim.envs.spaces import action_space, observation_space, shown
 from rlftsim.errors import ConfigError
@@ -93,15 +91,17 @@ class TrafficParallelEnv(ParallelEnv):
 
         Args:
             seed: of the choice of scenarios and of the traffic.
-            options: "scenario", "rollout" and "goals", as of `EgoEnv`.
+            options: "scenario", "rollout" and "goals", as of `EgoEnv`; PettingZoo allows further ones, which are
+                ignored.
 
         Raises:
-            ConfigError: an unknown option or scenario, or no planner-driven agent in it.
+            ConfigError: an unknown scenario, or no planner-driven agent in it.
         """
         if seed is not None:
             self._random, self._seed = seeding.np_random(seed)
             self._count = 0
-        scenario_id, dice, goals = chosen(self._random, self.source, options or {}, int(self._seed), self._count)
+        known = {name: value for name, value in (options or {}).items() if name in OPTIONS}
+        scenario_id, dice, goals = chosen(self._random, self.source, known, int(self._seed), self._count)
         self._count += 1
         scenario = self.source.scenario(scenario_id)
         episode = self.source.episode([scenario], {scenario_id: goals} if goals else None)
@@ -144,14 +144,7 @@ class TrafficParallelEnv(ParallelEnv):
         truncated = {name: bool(outcome.truncated[row]) for name, row in rows.items()}
         infos: dict[str, dict[str, Any]] = {}
         for name, row in rows.items():
-            infos[name] = {
-                "step": state.world.step,
-                "terms": {term: float(value[row]) for term, value in outcome.terms.items()},
-                "clipped": bool(outcome.clipped[row]),
-                "lights_held": lights_are_held(episode, state, row),
-            }
-            if terminated[name] or truncated[name]:
-                infos[name]["result"] = Result(record_of(episode, state, row))
+            infos[name] = note_of(episode, state, outcome, row)
         self.agents = [name for name in acting if not (terminated[name] or truncated[name])]
         rewards = {name: float(outcome.reward[row]) for name, row in rows.items()}
         return self._observe(acting), rewards, terminated, truncated, infos

@@ -16,9 +16,10 @@ from scipy.signal import savgol_filter
 from rlftsim.envs.contact import BEHIND_RAD, boxes_overlap, corners_of, in_one_lane, lane_search
 from rlftsim.envs.episode import MAX_PAIRS, OUTSIDE_M, road_edges
 from rlftsim.envs.record import Record
+from rlftsim.envs.route import Route
 from rlftsim.geometry import wrapped
 from rlftsim.realism.map_based import compute_point_distance_to_road_edge
-from rlftsim.realism.traffic_lights import build_signals, compute_traffic_light_violation
+from rlftsim.realism.traffic_lights import Signals, build_signals, compute_traffic_light_violation
 from rlftsim.scenario.derived import cached_on_scenario
 from rlftsim.scenario.types import CURRENT_STEP, STEP_S, ObjectType, Scenario
 
@@ -173,7 +174,7 @@ def off_road(record: Record) -> Float[np.ndarray, "T1"]:
     return compute_point_distance_to_road_edge(groups, edges, max_pairs=MAX_PAIRS).amax(-1).double().numpy()
 
 
-def _gained(route, own: Float[np.ndarray, "T1 5"]) -> float:
+def _gained(route: Route, own: Float[np.ndarray, "T1 5"]) -> float:
     """Meters along a route between the first and the last step."""
     first, last = route.progress(own[[0, -1], :2])
     return float(last - first)
@@ -283,18 +284,25 @@ def _kinematics(record: Record) -> _Kinematics:
     # odd windows that fit a short record
     short, long = (min(window, len(own) - 1 + len(own) % 2) for window in (SMOOTH_STEPS, SMOOTH_JERK_STEPS))
     cos, sin = np.cos(own[:, 2]), np.sin(own[:, 2])
-    acceleration = savgol_filter(own[:, 3:], short, 2, deriv=1, delta=STEP_S, axis=0)
+    acceleration = _smooth(own[:, 3:], short, order=2, derivative=1)
     longitudinal = acceleration[:, 0] * cos + acceleration[:, 1] * sin
     heading = np.unwrap(own[:, 2])
-    jerk = savgol_filter(acceleration, long, 2, deriv=1, delta=STEP_S, axis=0)
+    jerk = _smooth(acceleration, long, order=2, derivative=1)
     return _Kinematics(
         longitudinal=longitudinal,
         lateral=acceleration[:, 1] * cos - acceleration[:, 0] * sin,
-        yaw_rate=savgol_filter(heading, long, 2, deriv=1, delta=STEP_S),
-        yaw_acceleration=savgol_filter(heading, long, 3, deriv=2, delta=STEP_S),
-        longitudinal_jerk=savgol_filter(longitudinal, long, 2, deriv=1, delta=STEP_S),
+        yaw_rate=_smooth(heading, long, order=2, derivative=1),
+        yaw_acceleration=_smooth(heading, long, order=3, derivative=2),
+        longitudinal_jerk=_smooth(longitudinal, long, order=2, derivative=1),
         jerk=np.linalg.norm(jerk, axis=1),
     )
+
+
+def _smooth(
+    values: Float[np.ndarray, "t *c"], window: int, *, order: int, derivative: int
+) -> Float[np.ndarray, "t *c"]:
+    """Derivative of values over the steps by the Savitzky-Golay filter."""
+    return np.asarray(savgol_filter(values, window, order, deriv=derivative, delta=STEP_S, axis=0))
 
 
 def _comfort(record: Record) -> float:
@@ -315,7 +323,7 @@ def _comfort(record: Record) -> float:
 
 
 @cached_on_scenario
-def _signals(scenario: Scenario):
+def _signals(scenario: Scenario) -> Signals | None:
     return build_signals(scenario.map_features, scenario.lights, torch.device("cpu"))
 
 

@@ -1,4 +1,4 @@
-"""Resets of environments: settings by name, choice of the scenario, and what is said about an episode."""
+"""What all environments share: settings by name, the choice of a scenario, and the `info` of resets and steps."""
 
 from typing import Any
 
@@ -6,11 +6,16 @@ import numpy as np
 from jaxtyping import Float
 
 from rlftsim.envs.config import EnvConfig
-from rlftsim.envs.episode import Episode, EpisodeState
+from rlftsim.envs.episode import Episode, EpisodeState, Outcome
+from rlftsim.envs.record import record_of
+from rlftsim.envs.result import Result
 from rlftsim.envs.source import Source
 from rlftsim.envs.world import Dice
 from rlftsim.errors import ConfigError, whole_number
 from rlftsim.scenario.types import CURRENT_STEP
+
+OPTIONS = ("scenario", "rollout", "goals")
+"""Options of a reset."""
 
 
 def config_of(settings: dict[str, Any]) -> EnvConfig:
@@ -40,9 +45,9 @@ def chosen(
     Raises:
         ConfigError: an option that there is not.
     """
-    unknown = [name for name in options if name not in ("scenario", "rollout", "goals")]
+    unknown = [name for name in options if name not in OPTIONS]
     if unknown:
-        raise ConfigError(f"reset has no option {unknown[0]!r}: known are scenario, rollout, goals.")
+        raise ConfigError(f"reset has no option {unknown[0]!r}: known are {', '.join(OPTIONS)}.")
     drawn = int(random.integers(len(source.scenario_ids)))
     scenario_id = options.get("scenario", source.scenario_ids[drawn])
     rollout = whole_number("rollout", options.get("rollout", count), 0)
@@ -71,6 +76,26 @@ def about(episode: Episode, state: EpisodeState, row: int, source: Source) -> di
         "lights_held": lights_are_held(episode, state, row),
         "logged": logged_poses(episode, row),
     }
+
+
+def note_of(episode: Episode, state: EpisodeState, outcome: Outcome, row: int) -> dict[str, Any]:
+    """Information after an action; at the end of the agent's episode with its `Result`.
+
+    Args:
+        episode: of the agent.
+        state: after the action.
+        outcome: of the action.
+        row: of the agent.
+    """
+    note: dict[str, Any] = {
+        "step": state.world.step,
+        "terms": {name: float(value[row]) for name, value in outcome.terms.items()},
+        "clipped": bool(outcome.clipped[row]),
+        "lights_held": lights_are_held(episode, state, row),
+    }
+    if outcome.terminated[row] or outcome.truncated[row]:
+        note["result"] = Result(record_of(episode, state, row))
+    return note
 
 
 def logged_poses(episode: Episode, row: int) -> Float[np.ndarray, "81 3"]:

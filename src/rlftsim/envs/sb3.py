@@ -30,8 +30,7 @@ class SB3VecEnv(VecEnv):
     def reset(self) -> Any:
         """Observations of new episodes; `seed` sets the seeds of the next reset."""
         first = self._seeds[0] if self._seeds else None
-        observation, infos = self.vector.reset(seed=first)
-        self.reset_infos = [_own(infos, i) for i in range(self.num_envs)]
+        observation, self.reset_infos = self.vector.reset_slots(first)
         self._reset_seeds()
         return observation
 
@@ -41,13 +40,11 @@ class SB3VecEnv(VecEnv):
 
     def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
         """Carry them out: observations, rewards, ends and infos."""
-        observation, rewards, terminated, truncated, infos = self.vector.step(self._actions)
-        own = [_own(infos, i) for i in range(self.num_envs)]
+        observation, rewards, terminated, truncated, notes = self.vector.step_slots(self._actions)
         for i in np.flatnonzero(terminated | truncated):
-            last = own[i].pop("final_info")
-            own[i] = {**last, "terminal_observation": own[i].pop("final_obs")}
-            own[i]["TimeLimit.truncated"] = bool(truncated[i])
-        return observation, rewards.astype(np.float32), terminated | truncated, own
+            ends = {"terminal_observation": notes[i]["final_obs"], "TimeLimit.truncated": bool(truncated[i])}
+            notes[i] = {**notes[i]["final_info"], **ends}
+        return observation, rewards.astype(np.float32), terminated | truncated, notes
 
     def close(self) -> None:
         """Nothing is open."""
@@ -93,12 +90,3 @@ class SB3VecEnv(VecEnv):
             indices: environments; None = all.
         """
         return [False for _ in self._get_indices(indices)]
-
-
-def _own(infos: dict[str, Any], row: int) -> dict[str, Any]:
-    """Entries of one environment in the infos of a vector."""
-    return {
-        name: values[row]
-        for name, values in infos.items()
-        if not name.startswith("_") and (f"_{name}" not in infos or infos[f"_{name}"][row])
-    }

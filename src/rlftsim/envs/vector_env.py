@@ -1,7 +1,7 @@
 """Many ego environments at once: scenes that are reset together step together, with one network call for all."""
 
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from gymnasium.utils import seeding
@@ -11,9 +11,7 @@ from jaxtyping import Bool, Int64
 
 from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.episode import Episode, EpisodeState, advance, look, start
-from rlftsim.envs.record import record_of
-from rlftsim.envs.resets import about, chosen, config_of, lights_are_held
-from rlftsim.envs.result import Result
+from rlftsim.envs.resets import about, chosen, config_of, note_of
 from rlftsim.envs.source import Source
 from rlftsim.envs.spaces import action_space, observation_space, shown
 from rlftsim.errors import ConfigError
@@ -59,7 +57,7 @@ class EgoVectorEnv(VectorEnv):
         settings: fields of `EnvConfig` by name; pictures and pages are those of `EgoEnv` alone.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}
+    metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
 
     def __init__(
         self,
@@ -76,7 +74,7 @@ class EgoVectorEnv(VectorEnv):
         self.source = Source(config, scenarios, policy)
         self.num_envs = num_envs
         self.autoreset_mode = AutoresetMode(autoreset_mode)
-        self.metadata = {**type(self).metadata, "autoreset_mode": self.autoreset_mode}
+        self.metadata = {"render_modes": [], "autoreset_mode": self.autoreset_mode}
         self.single_action_space = action_space(self.source.controls)
         self.single_observation_space = observation_space(config.observation)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -97,22 +95,56 @@ class EgoVectorEnv(VectorEnv):
         Raises:
             ConfigError: an unknown option or scenario.
         """
+        observation, notes = self.reset_slots(seed, options)
+        infos: dict[str, Any] = {}
+        for slot, note in enumerate(notes):
+            infos = self._add_info(infos, note, slot)
+        return observation, infos
+
+    def reset_slots(
+        self, seed: int | list[int | None] | None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, list[dict[str, Any]]]:
+        """As `reset`, with the infos of each slot by themselves.
+
+        Args:
+            seed: s gives slot i the seed s + i; or one seed for each.
+            options: as of `EgoEnv`, the same for all, and "reset_mask".
+
+        Raises:
+            ConfigError: an unknown option or scenario.
+        """
         options = dict(options or {})
         mask = np.asarray(options.pop("reset_mask", np.ones(self.num_envs, bool)), bool)
-        seeds = seed
-        if not isinstance(seeds, list):
-            seeds = [None if seeds is None else seeds + i for i in range(self.num_envs)]
+        seeds = seed if isinstance(seed, list) else [None if seed is None else seed + i for i in range(self.num_envs)]
         for i, given in enumerate(seeds):
             if len(self._slots) <= i or given is not None:
                 random, used = seeding.np_random(given)
                 self._slots[i : i + 1] = [_Slot(random, int(used))]
-        infos = self._reset(np.flatnonzero(mask), options, {})
-        return self._observe(), infos
+        notes: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        self._reset(np.flatnonzero(mask), options, notes)
+        return self._observe(), notes
 
     def step(
         self, actions: Any
     ) -> tuple[Any, np.ndarray, Bool[np.ndarray, "n"], Bool[np.ndarray, "n"], dict[str, Any]]:
         """Carry out one action in every slot.
+
+        Args:
+            actions: of the action space.
+
+        Raises:
+            ConfigError: as `step_slots`.
+        """
+        observation, rewards, terminated, truncated, notes = self.step_slots(actions)
+        infos: dict[str, Any] = {}
+        for slot, note in enumerate(notes):
+            infos = self._add_info(infos, note, slot)
+        return observation, rewards, terminated, truncated, infos
+
+    def step_slots(
+        self, actions: Any
+    ) -> tuple[Any, np.ndarray, Bool[np.ndarray, "n"], Bool[np.ndarray, "n"], list[dict[str, Any]]]:
+        """As `step`, with the infos of each slot by themselves.
 
         Args:
             actions: of the action space.
@@ -128,19 +160,20 @@ class EgoVectorEnv(VectorEnv):
             raise ConfigError(
                 f"actions have shape {actions.shape}, they must have {(self.num_envs, *controls.limits.shape)}."
             )
-        renewed = np.flatnonzero(self._over)
-        if self.autoreset_mode == AutoresetMode.DISABLED and len(renewed):
-            raise ConfigError(f"the episode of slot {renewed[0]} is over: reset it with options={{'reset_mask': ...}}.")
+        over = np.flatnonzero(self._over)
+        if self.autoreset_mode == AutoresetMode.DISABLED and len(over):
+            raise ConfigError(f"the episode of slot {over[0]} is over: reset it with options={{'reset_mask': ...}}.")
         rewards = np.zeros(self.num_envs)
         terminated, truncated = np.zeros(self.num_envs, bool), np.zeros(self.num_envs, bool)
-        infos: dict[str, Any] = {}
+        notes: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         # 1. slots whose episode ended in the last step begin another one and take no action
-        if self.autoreset_mode == AutoresetMode.NEXT_STEP and len(renewed):
-            infos = self._reset(renewed, {}, infos)
-        fresh = set(renewed.tolist())
+        begun: list[_Group] = []
+        if self.autoreset_mode == AutoresetMode.NEXT_STEP and len(over):
+            self._reset(over, {}, notes)
+            begun = self._groups[-1:]
         # 2. all others act, a group at a time
         for group in self._groups:
-            if fresh & set(group.slots[group.live].tolist()):
+            if group in begun:
                 continue
             slots = group.slots[group.live]
             action = np.zeros((len(group.slots), *controls.limits.shape), actions.dtype)
@@ -149,29 +182,20 @@ class EgoVectorEnv(VectorEnv):
             rewards[slots] = outcome.reward[group.live]
             terminated[slots], truncated[slots] = outcome.terminated[group.live], outcome.truncated[group.live]
             for row, slot in zip(group.live, slots):
-                info = {
-                    "step": group.state.world.step,
-                    "terms": {name: float(value[row]) for name, value in outcome.terms.items()},
-                    "clipped": bool(outcome.clipped[row]),
-                    "lights_held": lights_are_held(group.episode, group.state, int(row)),
-                }
-                if terminated[slot] or truncated[slot]:
-                    info["result"] = Result(record_of(group.episode, group.state, int(row)))
-                infos = self._add_info(infos, info, int(slot))
+                notes[slot] = note_of(group.episode, group.state, outcome, int(row))
         self._over = terminated | truncated
         # 3. the same step resets at once and hands over the last observation beside the first
         ended = np.flatnonzero(self._over)
         if self.autoreset_mode == AutoresetMode.SAME_STEP and len(ended):
-            last = self._observe()
+            last, final = self._observe(), {slot: notes[slot] for slot in ended}
+            self._reset(ended, {}, notes)
             for slot in ended:
-                final = {name: values[slot] for name, values in last.items()} if isinstance(last, dict) else last[slot]
-                own = {name: values[slot] for name, values in infos.items() if not name.startswith("_")}
-                infos = self._add_info(infos, {"final_obs": final, "final_info": own}, int(slot))
-            infos = self._reset(ended, {}, infos)
-        return self._observe(), rewards, terminated, truncated, infos
+                seen = {name: values[slot] for name, values in last.items()} if isinstance(last, dict) else last[slot]
+                notes[slot] |= {"final_obs": seen, "final_info": final[slot]}
+        return self._observe(), rewards, terminated, truncated, notes
 
-    def _reset(self, which: np.ndarray, options: dict[str, Any], infos: dict[str, Any]) -> dict[str, Any]:
-        """Begin episodes of some slots, which form a group, and add what there is to say about them."""
+    def _reset(self, which: np.ndarray, options: dict[str, Any], notes: list[dict[str, Any]]) -> None:
+        """Begin episodes of some slots, which form a group, and note what there is to say about them."""
         picks = []
         for i in which:
             slot = self._slots[i]
@@ -184,17 +208,18 @@ class EgoVectorEnv(VectorEnv):
             raise ConfigError("the planner drives more than the egos: take rlftsim.envs.parallel_env.")
         state = start(episode, tuple(dice for _, dice, _ in picks))
         # groups lose the slots that went on, and are dropped when they have none left
-        kept = [_without(group, which) for group in self._groups]
-        self._groups = [group for group in kept if len(group.live)] + [_Group(episode, state, np.array(which))]
+        kept = [replace(group, slots=np.where(np.isin(group.slots, which), -1, group.slots)) for group in self._groups]
+        self._groups = [*(group for group in kept if len(group.live)), _Group(episode, state, np.array(which))]
         self._over[which] = False
         for row, i in enumerate(which):
-            infos = self._add_info(infos, about(episode, state, row, self.source), int(i))
-        return infos
+            notes[i] = about(episode, state, row, self.source)
 
     def _observe(self) -> Any:
         """Observations of all slots in order."""
         kind = self.source.config.observation
-        parts = [(group, shown(look(group.episode, group.state), kind)) for group in self._groups]
+        parts: list[tuple[_Group, Any]] = [
+            (group, shown(look(group.episode, group.state), kind)) for group in self._groups
+        ]
         if len(parts) == 1 and len(parts[0][0].live) == self.num_envs:
             return parts[0][1]  # a group of all slots has them in order
         order = np.argsort(np.concatenate([group.slots[group.live] for group, _ in parts]))
@@ -205,8 +230,3 @@ class EgoVectorEnv(VectorEnv):
         if kind == "flat":
             return joined([seen for _, seen in parts])
         return {name: joined([seen[name] for _, seen in parts]) for name in parts[0][1]}
-
-
-def _without(group: _Group, gone: np.ndarray) -> _Group:
-    """A group without some of its slots."""
-    return replace(group, slots=np.where(np.isin(group.slots, gone), -1, group.slots))

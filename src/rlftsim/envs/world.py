@@ -26,7 +26,7 @@ from rlftsim.envs.drivers import Driver, Rules, drivers_of
 from rlftsim.envs.idm import IdmConfig, IdmLines, advance_idm, idm_lines
 from rlftsim.envs.scene import Scene, build_env_scene
 from rlftsim.errors import ConfigError
-from rlftsim.goals.types import Goals
+from rlftsim.goals.types import Goals, PointById
 from rlftsim.rollout.noise import draw_noise
 from rlftsim.rollout.policy import Policy, Sampling, device_of
 from rlftsim.rollout.types import AgentStates
@@ -118,7 +118,7 @@ def build_world(
     policy: Policy | None,
     *,
     rules: Rules,
-    goals: Mapping[str, Mapping[int, Any]] | None = None,
+    goals: Mapping[str, PointById] | None = None,
     sampling: Sampling = Sampling(),  # noqa: B008
     vanish: bool = False,
     context: Any = None,

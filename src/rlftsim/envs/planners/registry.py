@@ -22,7 +22,7 @@ PLANNERS: ExtensionPoint[Callable[..., Any]] = ExtensionPoint(
         "pdm": "rlftsim.envs.planners.pdm:PdmPlanner",
     },
 )
-"""Name -> class (or function without arguments) that makes a planner, or the function `observation -> action` itself."""
+"""Name -> class of a planner, or a function from observation to action."""
 
 
 @runtime_checkable

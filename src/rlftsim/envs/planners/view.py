@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from rlftsim.envs.idm import LOOKAHEAD_M, ON_LINE_M
 from rlftsim.envs.route import points_every
@@ -60,7 +60,7 @@ def read_view(observation: dict[str, Any]) -> View:
 
 def _stop(observation: dict[str, Any], line: Float[np.ndarray, "P 2"], length: float) -> float:
     lights = observation["lights"][observation["lights_mask"].astype(bool)].astype(float)
-    waits: Bool[np.ndarray, T] = lights[:, 2:4].any(1)
+    waits = lights[:, 2:4].any(1)
     points = lights[waits, :2]
     if not len(points):
         return np.inf
