@@ -50,9 +50,9 @@ def test_a_quiet_drive_has_the_full_score():
         ((Mover(speed_mps=2.0), Mover(x_m=-15.0, speed_mps=9.0)), 0.0, "active_rear", False),
         ((Mover(speed_mps=0.0), Mover(x_m=-15.0, speed_mps=9.0)), 0.0, "stopped_ego", False),
         # a car that drifts into the ego's lane from the left while the ego keeps its lane
-        ((EGO, Mover(x_m=1.0, y_m=4.2, heading_rad=-0.15, speed_mps=9.5)), 0.0, "active_lateral", False),
+        ((EGO, Mover(x_m=-1.5, y_m=4.2, heading_rad=-0.15, speed_mps=9.5)), 0.0, "active_lateral", False),
         # an ego that leaves its lane into a car beside it
-        ((EGO, Mover(x_m=1.0, y_m=3.7, speed_mps=9.3)), 0.8, "active_lateral", True),
+        ((EGO, Mover(x_m=-1.5, y_m=3.7, speed_mps=9.3)), 0.8, "active_lateral", True),
     ],
 )
 def test_a_collision_has_its_type_and_fault(movers, sideways, kind, at_fault):
@@ -164,7 +164,12 @@ def test_realism_of_the_others_is_the_metric_without_the_ego():
     movers = (EGO, Mover(x_m=20.0, speed_mps=8.0), Mover(x_m=-20, y_m=3.7, heading_rad=math.pi, speed_mps=7.0))
     result = drive(movers, num_predicted=2)
     # a scenario whose ego is another agent has the first one in no evaluated set
-    log = replace(result.record.scene.scenario, ego_index=1, tracks_to_predict=np.array([2], np.int32))
+    log = replace(
+        result.record.scene.scenario,
+        ego_index=1,
+        tracks_to_predict=np.array([2], np.int32),
+        difficulty=np.ones(1, np.int8),
+    )
     expected = float(score(log, logged_states(log, num_rollouts=1)).meta_metric)
     assert realism_of_others([result.record]) == pytest.approx(expected, abs=1e-3)
     braking = drive(movers, np.full(80, 1.0), num_predicted=2)

@@ -217,16 +217,14 @@ class EgoVectorEnv(VectorEnv):
     def _observe(self) -> Any:
         """Observations of all slots in order."""
         kind = self.source.config.observation
-        parts: list[tuple[_Group, Any]] = [
-            (group, shown(look(group.episode, group.state), kind)) for group in self._groups
-        ]
-        if len(parts) == 1 and len(parts[0][0].live) == self.num_envs:
-            return parts[0][1]  # a group of all slots has them in order
-        order = np.argsort(np.concatenate([group.slots[group.live] for group, _ in parts]))
+        seen: list[Any] = [shown(look(group.episode, group.state), kind) for group in self._groups]
+        if len(seen) == 1 and len(self._groups[0].live) == self.num_envs:
+            return seen[0]  # a group of all slots has them in order
+        order = np.argsort(np.concatenate([group.slots[group.live] for group in self._groups]))
 
         def joined(arrays: list[np.ndarray]) -> np.ndarray:
-            return np.concatenate([array[group.live] for array, (group, _) in zip(arrays, parts)])[order]
+            return np.concatenate([array[group.live] for array, group in zip(arrays, self._groups)])[order]
 
         if kind == "flat":
-            return joined([seen for _, seen in parts])
-        return {name: joined([seen[name] for _, seen in parts]) for name in parts[0][1]}
+            return joined(seen)
+        return {name: joined([one[name] for one in seen]) for name in seen[0]}

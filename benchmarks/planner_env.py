@@ -1,0 +1,193 @@
+"""Speed of the planner environments beside the bare loop, a table of planners and traffic, and a PPO run.
+
+    python benchmarks/planner_env.py speed [--rounds 3] [--model demo-base]
+    python benchmarks/planner_env.py memory [--episodes 2000]
+    python benchmarks/planner_env.py table --data synthetic --limit 40 [--models demo-base runs/tuned] [--jobs 2]
+    python benchmarks/planner_env.py ppo [--steps 20000] [--limit 40]
+
+Times are CPU time of this process with one thread; contestants of a ratio take turns, so that a busy machine slows both.
+"""
+
+import argparse
+import resource
+import time
+
+import numpy as np
+import torch
+
+from rlftsim.envs import EgoEnv, EgoVectorEnv
+from rlftsim.envs.drive import DriveConfig, drive, run_planner
+from rlftsim.evaluation.compare import compare_paired
+from rlftsim.evaluation.drive_results import compare_drives, format_drives
+from rlftsim.policies.registry import load_policy
+from rlftsim.progress import print_wide
+from rlftsim.rollout.simulate import simulate
+from rlftsim.rollout.types import AgentStates
+from rlftsim.scenario.batch import collate
+from rlftsim.scenario.open import open_dataset
+
+STEPS = 80
+
+
+def bare_loop(policy, batch, context):
+    """Seconds of network, kinematics and a forced ego, without observations and scores: what the traffic costs."""
+    ego = torch.zeros_like(batch.agent_mask)
+    ego[:, 0] = True
+
+    def force(state, step):
+        k = policy.steps_per_decision
+        position = batch.position[:, None, :, 10:11].expand(-1, -1, -1, k, -1)
+        heading = batch.heading[:, None, :, 10:11].expand(-1, -1, -1, k)
+        return AgentStates(position, heading, ego[:, None, :, None].expand(heading.shape))
+
+    begin = time.process_time()
+    simulate(policy, batch, num_rollouts=1, seed=0, context=context, force=force)
+    return time.process_time() - begin
+
+
+def episode(env, action):
+    """Seconds of an episode after its reset."""
+    env.reset(seed=0)
+    begin = time.process_time()
+    for _ in range(STEPS):
+        env.step(action)
+    return time.process_time() - begin
+
+
+def speed(arguments):
+    data, policy = open_dataset("synthetic", "validation"), load_policy(arguments.model)
+    scenario, still = data[0], np.zeros(2, np.float32)
+    one = collate([scenario])
+    eight = collate([data[i] for i in range(8)])
+    with torch.no_grad():
+        contexts = policy.encode(one), policy.encode(eight)
+    common = {"stop_on": (), "policy": policy}
+    envs = {
+        "policy, observations": EgoEnv(scenarios=[scenario], reward="none", **common),
+        "policy, observations and reward": EgoEnv(scenarios=[scenario], **common),
+        "replay": EgoEnv(scenarios=[scenario], traffic="replay", reward="none", stop_on=()),
+        "constant velocity": EgoEnv(scenarios=[scenario], traffic="constant_velocity", reward="none", stop_on=()),
+    }
+    vectors = {
+        "policy, vector of 8": (8, EgoVectorEnv(8, scenarios=[scenario], **common)),
+        "replay, vector of 64": (64, EgoVectorEnv(64, scenarios=[scenario], traffic="replay", stop_on=())),
+    }
+    taken = {name: [] for name in ("bare loop", "bare loop of 8", *envs, *vectors)}
+    for _ in range(arguments.rounds):
+        taken["bare loop"].append(bare_loop(policy, one, contexts[0]))
+        for name, env in envs.items():
+            taken[name].append(episode(env, still))
+        taken["bare loop of 8"].append(bare_loop(policy, eight, contexts[1]))
+        for name, (count, env) in vectors.items():
+            taken[name].append(episode(env, np.zeros((count, 2), np.float32)))
+    counts = {"bare loop of 8": 8, **{name: count for name, (count, _) in vectors.items()}}
+    rate = {name: counts.get(name, 1) * STEPS / min(seconds) for name, seconds in taken.items()}
+    for name, value in rate.items():
+        print(f"{name:34} {value:8.0f} scene steps/s   {value / rate['bare loop']:.2f} of the bare loop")
+    ratio = rate["policy, vector of 8"] / rate["policy, observations and reward"]
+    print(f"vector of 8 over one environment: {ratio:.2f}")
+
+
+def memory(arguments):
+    env = EgoEnv(data="synthetic", split="validation", traffic="replay", action="bicycle")
+    sizes = []
+    for index in range(arguments.episodes):
+        env.reset(seed=index)
+        for _ in range(10):
+            env.step(np.zeros(2, np.float32))
+            if env.state.ended[0]:
+                break
+        if index % (arguments.episodes // 10) == 0:
+            sizes.append(resident_mb())
+    print(f"resident memory every {arguments.episodes // 10} episodes, MB: {', '.join(f'{s:.0f}' for s in sizes)}")
+    print(f"peak {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB")
+
+
+def resident_mb():
+    with open("/proc/self/status") as file:
+        return next(int(line.split()[1]) / 1024 for line in file if line.startswith("VmRSS"))
+
+
+def table(arguments):
+    traffics = {"replay": None, "constant_velocity": None, "idm": None, **{f"policy {m}": m for m in arguments.models}}
+    for planner in arguments.planners:
+        results = []
+        for name, model in traffics.items():
+            config = DriveConfig(
+                planner=planner, data=arguments.data, split=arguments.split, limit=arguments.limit,
+                traffic=("policy",) if model else (name,), model=model or "demo-base", jobs=arguments.jobs,
+            )  # fmt: skip
+            results += drive(config)
+        print_wide(format_drives(*results))
+        # IDM traffic against the learned one: does IDM overrate the planner?
+        for result in results[3:]:
+            row = next(d for d in compare_drives(result, results[2]) if d.column == "nuplan_style")
+            print(
+                f"{planner}, nuplan_style in IDM traffic minus {result.settings.model[:8]}: {row.verdict}", flush=True
+            )
+
+
+def ppo(arguments):
+    from stable_baselines3 import PPO
+
+    from rlftsim.envs.planners.registry import load_planner
+    from rlftsim.envs.sb3 import SB3VecEnv
+
+    torch.set_num_threads(1)
+    settings = {"data": "synthetic", "traffic": arguments.traffic, "observation": "flat", "action": "bicycle"}
+    vector = SB3VecEnv(8, split="training", **settings)
+    model = PPO(
+        "MlpPolicy", vector, n_steps=128, batch_size=256, n_epochs=6, learning_rate=1e-3, gamma=0.97, seed=0,
+        policy_kwargs={"net_arch": [64, 64], "log_std_init": -1.0},
+    )  # fmt: skip
+    begin, cpu = time.monotonic(), time.process_time()
+    model.learn(arguments.steps)
+    print(f"{arguments.steps} steps: {time.monotonic() - begin:.0f} s, {time.process_time() - cpu:.0f} s of CPU time")
+
+    class Trained:
+        def reset(self, info):
+            pass
+
+        def act(self, observation):
+            return model.predict(observation, deterministic=True)[0]
+
+    env = EgoEnv(split="validation", stop_on=(), reward="none", **settings)
+    scores = {}
+    for name, planner in {"constant velocity": load_planner("constant_velocity"), "PPO": Trained()}.items():
+        ids = env.source.scenario_ids[: arguments.limit]
+        found = [run_planner(env, planner, env.source.scenario(i), seed=0).planner for i in ids]
+        scores[name] = np.array([one.nuplan_style for one in found])
+        means = {part: np.nanmean([getattr(one, part) for one in found]) for part in vars(found[0])}
+        print(name, {part: round(float(value), 3) for part, value in means.items()})
+    print(compare_paired("nuplan_style", scores["constant velocity"], scores["PPO"]))
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    verbs = parser.add_subparsers(required=True)
+    one = verbs.add_parser("speed")
+    one.add_argument("--rounds", type=int, default=3)
+    one.add_argument("--model", default="demo-base")
+    one.set_defaults(run=speed)
+    one = verbs.add_parser("memory")
+    one.add_argument("--episodes", type=int, default=2000)
+    one.set_defaults(run=memory)
+    one = verbs.add_parser("table")
+    one.add_argument("--data", default="synthetic")
+    one.add_argument("--split", default="validation")
+    one.add_argument("--limit", type=int, default=40)
+    one.add_argument("--models", nargs="*", default=["demo-base"])
+    one.add_argument("--planners", nargs="*", default=["replay", "constant_velocity", "idm", "pdm"])
+    one.add_argument("--jobs", type=int, default=1)
+    one.set_defaults(run=table)
+    one = verbs.add_parser("ppo")
+    one.add_argument("--steps", type=int, default=20_000)
+    one.add_argument("--traffic", default="replay")
+    one.add_argument("--limit", type=int, default=40)
+    one.set_defaults(run=ppo)
+    arguments = parser.parse_args()
+    arguments.run(arguments)
+
+
+if __name__ == "__main__":
+    main()
