@@ -3,7 +3,7 @@
 from dataclasses import asdict, dataclass
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -33,7 +33,7 @@ class DriveConfig:
     split: str | None = "validation"
     model: str = "demo-base"
     """Traffic model."""
-    traffic: tuple[Traffic, ...] = ("policy", "replay")
+    traffic: tuple[str, ...] = ("policy", "replay")
     num_rollouts: int = 1
     """Episodes of each scenario, with dice of their own."""
     seed: int = 0
@@ -53,10 +53,10 @@ class DriveConfig:
             if traffic not in TRAFFIC:
                 raise ConfigError(f"traffic must be some of {', '.join(TRAFFIC)}, got {traffic!r}.")
 
-    def settings(self, traffic: Traffic) -> EnvConfig:
+    def settings(self, traffic: str) -> EnvConfig:
         """Settings of the environment for one kind of traffic: nothing ends an episode, and nothing is rewarded."""
         return EnvConfig(
-            data=self.data, split=self.split, model=self.model, traffic=traffic,
+            data=self.data, split=self.split, model=self.model, traffic=cast(Traffic, traffic),
             action=action_of(load_planner(self.planner)), stop_on=(), reward="none", hard_braking=True,
         )  # fmt: skip
 
@@ -110,7 +110,7 @@ def run_planner(env: EgoEnv, planner: Any, scenario: Scenario, *, seed: int, rol
 
 
 def _drive_scenario(
-    config: DriveConfig, traffic: Traffic, scenario_id: str, advance: Any, stop: Any
+    config: DriveConfig, traffic: str, scenario_id: str, advance: Any, stop: Any
 ) -> tuple[dict[str, Any], dict[str, str]]:
     """Row of one scenario, and the scores that it cannot give."""
     env, planner = _environment(config, traffic), load_planner(config.planner)
@@ -126,7 +126,7 @@ def _drive_scenario(
 
 
 @lru_cache(maxsize=8)
-def _environment(config: DriveConfig, traffic: Traffic) -> EgoEnv:
+def _environment(config: DriveConfig, traffic: str) -> EgoEnv:
     """Environment of one kind of traffic, made once in each process."""
     settings = config.settings(traffic)
     return EgoEnv(**{name: getattr(settings, name) for name in settings.__dataclass_fields__})

@@ -27,10 +27,13 @@ from rlftsim.realism.map_based import (
 )
 from rlftsim.scenario.derived import cached_on_scenario
 from rlftsim.scenario.types import Scenario
+from rlftsim.viewer.scene import SIMPLIFY_TOLERANCE_M
 
 OUTSIDE_M = 0.3
 """A corner this far off the road leaves the drivable area, as in nuPlan."""
 AT_GOAL_M = 2.0
+SIMPLIFIED_M = 2 * SIMPLIFY_TOLERANCE_M
+"""The edges of the observations are nearer to the logged ones than this."""
 ScenarioGoals = Mapping[str, PointById]
 """Scenario id -> object id -> (x, y), world frame, m."""
 MAX_PAIRS = 1 << 22
@@ -258,7 +261,8 @@ def _step(
     turned = np.abs(wrapped(moved[:, 2] - before[:, 2])) * half_diagonal
     clear = state.clear_m - np.hypot(*(moved[:, :2] - before[:, :2]).T) - turned
     unclear = np.flatnonzero((clear <= 0) & ~state.outside)
-    clear[unclear] = OUTSIDE_M - off_road_m(episode, moved, unclear)
+    if len(unclear):
+        clear[unclear] = _free_way_m(episode, moved, unclear)
     outside = state.outside.copy()
     outside[unclear] = clear[unclear] <= 0
     progress = _progress(episode, moved)
@@ -327,6 +331,36 @@ def off_road_m(
     if episode.edges.is_known is None:
         return farthest
     return np.where(episode.edges.is_known.numpy()[scene], farthest, -np.inf)
+
+
+def _free_way_m(
+    episode: Episode, motion: Float[np.ndarray, "M 5"], rows: Int64[np.ndarray, "m"]
+) -> Float[np.ndarray, "m"]:
+    """Distance that agents may move by before a corner can be 0.3 m off the road; at most 0 where one is.
+
+    The search for the official distance is slow. Where all corners are clearly to the left of the simplified edges of
+    the observations, these decide.
+    """
+    scene, agent = episode.world.actors[rows].T
+    corners = corners_of(motion[rows], episode.world.size[scene, agent])  # [m, 4, 2]
+    edges = episode.atlas.edges[scene][:, None]  # [m, 1, e, 4]
+    dx, dy = edges[..., 2] - edges[..., 0], edges[..., 3] - edges[..., 1]
+    to_x, to_y = corners[..., :1] - edges[..., 0], corners[..., 1:] - edges[..., 1]
+    along = (to_x * dx + to_y * dy) / np.maximum(dx * dx + dy * dy, 1e-9)
+    cut = np.clip(along, 0.0, 1.0)
+    off_x, off_y = to_x - cut * dx, to_y - cut * dy
+    squared = off_x * off_x + off_y * off_y
+    nearest = squared.argmin(-1)[..., None]
+    distance = np.sqrt(np.take_along_axis(squared, nearest, -1))[..., 0]  # [m, 4]
+    # beside the end of an edge its side says nothing
+    is_left = np.take_along_axis(dx * to_y - dy * to_x, nearest, -1)[..., 0] > 0
+    is_beside = np.take_along_axis(cut == along, nearest, -1)[..., 0]
+    free = distance.min(1) - SIMPLIFIED_M
+    unclear = np.flatnonzero((free <= 0) | ~(is_left & is_beside).all(1))
+    free += OUTSIDE_M
+    if len(unclear):
+        free[unclear] = OUTSIDE_M - off_road_m(episode, motion, rows[unclear])
+    return free
 
 
 def _contacts(episode: Episode, world: WorldState, motion: Float[np.ndarray, "M 5"]) -> Bool[np.ndarray, "M A"]:

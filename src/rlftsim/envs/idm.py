@@ -18,6 +18,10 @@ ON_LINE_M = 2.0
 """A light whose stop point is within this distance of a line is on the line."""
 BEYOND_M = 60.0
 """A line goes straight on so far beyond the logged way."""
+PARKED_MPS = 0.5
+"""A vehicle that is never faster in its log stays parked."""
+NEAREST, BEYOND_BOX_M = 16, 10.0
+"""Leaders are searched among so many boxes, whose centers are no farther than this beyond the end of the search."""
 STANDS_M = 2.0
 """A logged way shorter than this has no direction of its own."""
 
@@ -77,6 +81,8 @@ def find_leaders(
         other_size: their length and width.
         mask: True = such a box.
     """
+    if not others.shape[1]:
+        return np.full(len(line), np.inf), np.zeros(len(line))
     # 1. Every point of the line in the frame of every box [M, K, W].
     offset = line[:, None] - others[:, :, None, :2]  # [M, K, W, 2]
     cos, sin = np.cos(others[..., 2])[..., None], np.sin(others[..., 2])[..., None]
@@ -109,17 +115,19 @@ class IdmLines:
     stop_m: Float[np.ndarray, "M T"]
     """Distance along the line to the stop point of each light; infinite where the light is on another way."""
     wanted_mps: Float[np.ndarray, "M"]
-    """The fastest logged speed, at least that of `IdmConfig` where the agent drives at all."""
+    """The fastest logged speed, at least that of `IdmConfig`."""
 
 
 def idm_lines(scene: Scene, agents: np.ndarray, config: IdmConfig) -> IdmLines:
-    """Lines of some agents.
+    """Lines of those of some agents that drive in their logs; the others stay parked.
 
     Args:
         scene: the scenario.
         agents: rows of vehicles.
         config: parameters.
     """
+    fastest = np.linalg.norm(scene.logged[agents, CURRENT_STEP:, 3:], axis=-1).max(1, initial=0.0)
+    agents, fastest = agents[fastest >= PARKED_MPS], fastest[fastest >= PARKED_MPS]
     lines = [_line(scene, int(agent)) for agent in agents]
     longest = max((len(line) for line in lines), default=1)
     points = np.stack([np.pad(line, ((0, longest - len(line)), (0, 0)), mode="edge") for line in lines] or [
@@ -130,11 +138,7 @@ def idm_lines(scene: Scene, agents: np.ndarray, config: IdmConfig) -> IdmLines:
     ])[: len(agents)]  # fmt: skip
     offset = np.linalg.norm(points[:, :, None] - scene.lights.point, axis=-1)  # [M, P, T]
     stop = np.where(offset.min(1) <= ON_LINE_M, offset.argmin(1), np.inf)
-    future = scene.logged[agents, CURRENT_STEP:]
-    fastest = np.linalg.norm(future[..., 3:], axis=-1).max(1)
-    # parked vehicles stay parked
-    wanted = np.where(fastest < 0.5, 0.0, np.maximum(fastest, config.speed_mps))
-    return IdmLines(agents, points, heading, stop, wanted)
+    return IdmLines(agents, points, heading, stop, np.maximum(fastest, config.speed_mps))
 
 
 def _line(scene: Scene, agent: int) -> Float[np.ndarray, "p 2"]:
@@ -180,12 +184,13 @@ def advance_idm(
     rows, size = np.arange(len(lines.agents)), scene.size[:, :2]
     # 1. The next 40 m of each line; the agent's own box is no leader.
     window = np.minimum(way.astype(int)[:, None] + np.arange(LOOKAHEAD_M), lines.points.shape[1] - 1)
-    mask = np.repeat(present[None], len(rows), 0)
-    mask[rows, lines.agents] = False
-    others = np.broadcast_to(motion, (len(rows), *motion.shape))
-    sizes = np.broadcast_to(size, (len(rows), *size.shape))
+    away = np.linalg.norm(motion[lines.agents, None, :2] - motion[:, :2], axis=-1)
+    away[:, ~present] = np.inf
+    away[rows, lines.agents] = np.inf
+    nearest = np.argsort(away, axis=1)[:, :NEAREST]
+    mask = np.take_along_axis(away, nearest, 1) < LOOKAHEAD_M + BEYOND_BOX_M
     line, heading = lines.points[rows[:, None], window], lines.heading[rows[:, None], window]
-    gap, lead = find_leaders(line, heading, size[lines.agents], others, sizes, mask)
+    gap, lead = find_leaders(line, heading, size[lines.agents], motion[nearest], size[nearest], mask)
     # 2. A red or yellow light ahead is a standing leader.
     front = way + size[lines.agents, 0] / 2
     waits = np.isin(scene.lights.state[min(step, TOTAL_STEPS - 1)], (RED, YELLOW))
@@ -194,7 +199,7 @@ def advance_idm(
     lead, gap = np.where(to_stop < gap, 0.0, lead), np.minimum(gap, to_stop)
     # 3. Along the line by the mean speed of the step.
     acceleration = idm_acceleration(speed, lines.wanted_mps, gap, lead, config)
-    new_speed = np.where(lines.wanted_mps > 0, np.maximum(speed + acceleration * STEP_S, 0.0), 0.0)
+    new_speed = np.maximum(speed + acceleration * STEP_S, 0.0)
     way = np.minimum(way + (speed + new_speed) / 2 * STEP_S, lines.points.shape[1] - 1.001)
     low = way.astype(int)
     part = (way - low)[:, None]

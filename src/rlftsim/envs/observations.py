@@ -25,7 +25,7 @@ NEIGHBORS, LANES, EDGES, CROSSINGS, LIGHTS, ROUTE = 32, 64, 64, 8, 16, 40
 SEEN_M = 100.0
 """Rows farther than this are left out."""
 BOUND = 1e4
-"""All numbers are cut to ± this: spaces must be bounded."""
+"""No number is larger: spaces must be bounded. Maps reach a few hundred meters."""
 HISTORY = 10
 OWN_LANES = 12
 """Nearest pieces that an agent's own lane is searched among."""
@@ -189,124 +189,117 @@ def observe(world: World, atlas: Atlas, state: WorldState, *, frame: Frame = "eg
         steps: length of the episode, for the time that is left.
     """
     scene, agent = world.actors.T
-    row = np.arange(len(scene))
+    row, count = np.arange(len(scene)), len(scene)
     now = state.now[scene, agent]  # [M, 5]
     log_step = len(state.track) - 1
-    if frame == "ego":
-        origin, cos, sin = now[:, :2], np.cos(now[:, 2]), np.sin(now[:, 2])
-        angle = now[:, 2]
-    else:
-        origin, cos, sin = np.zeros_like(now[:, :2]), np.ones(len(now)), np.zeros(len(now))
-        angle = np.zeros(len(now))
-
-    def turned(vector: np.ndarray) -> np.ndarray:  # [M, ..., 2]
-        c, s = (values.reshape(-1, *[1] * (vector.ndim - 2)) for values in (cos, sin))
-        x, y = vector[..., 0], vector[..., 1]
-        return np.stack([c * x + s * y, c * y - s * x], -1)
-
-    def local(points: np.ndarray) -> np.ndarray:
-        return turned(points - origin.reshape(-1, *[1] * (points.ndim - 2), 2))
+    is_own = frame == "ego"
+    origin, angle = (now[:, :2], now[:, 2]) if is_own else (np.zeros((count, 2)), np.zeros(count))
 
     def distance(points: np.ndarray) -> np.ndarray:
         """From the agents to points [M, n, 2]."""
-        offset = points - now[:, None, :2]
-        return np.sqrt(offset[..., 0] ** 2 + offset[..., 1] ** 2)
+        dx, dy = points[..., 0] - now[:, :1], points[..., 1] - now[:, 1:2]
+        return np.sqrt(dx * dx + dy * dy)
 
-    # 1. Motion of everybody over the last 11 steps [M, 11, A, 5], own frame.
+    # 1. Motion of everybody over the last 11 steps [M, 11, A, 5], and the other agents that are there, nearest first.
     past = np.stack(state.track[-HISTORY - 1 :], 1)[scene]
     there = np.moveaxis(world.there[scene, :, log_step - HISTORY : log_step + 1], 2, 1)  # [M, 11, A]
-    # 2. Neighbors: the other agents that are there, nearest first.
-    away = distance(past[:, -1, :, :2])
+    away = distance(past[:, -1])
     away[~there[:, -1]] = np.inf
     away[row, agent] = np.inf
     chosen, near = _nearest(away, NEIGHBORS)
     steps_back = np.arange(HISTORY + 1)[:, None]
     seen = past[row[:, None, None], steps_back, chosen[:, None]]  # [M, 11, K, 5]
     seen_there = there[row[:, None, None], steps_back, chosen[:, None]] & near[:, None]
-    place, direction = local(seen[..., :2]), seen[..., 2] - angle[:, None, None]
-    poses = np.concatenate([place, np.cos(direction)[..., None], np.sin(direction)[..., None]], -1)  # [M, 11, K, 4]
-    age = STEP_S * (log_step - atlas.last_logged[scene[:, None], chosen, log_step])
-    held = world.drivers[scene[:, None], chosen] == Driver.REPLAY  # they alone have a log to go by
-    facts = [world.size[scene[:, None], chosen], world.object_type[scene[:, None], chosen][..., None]]
-    neighbors = np.concatenate(
-        [poses[:, -1], turned(seen[:, -1, :, 3:]), *facts, np.where(held, age, 0)[..., None]], -1
-    )
-    history = np.where(seen_there[:, :-1, :, None], poses[:, :-1], 0.0)  # [M, 10, K, 4]
-    # 3. The map.
+    own = past[row, :, agent]  # [M, 11, 5]
+    # 2. The nearest rows of the map, lights whose state is known, and the route from the nearest place on.
     lane, lane_near = _nearest(distance(atlas.lane_middle[scene]), LANES)
-    pieces = atlas.lane_points[scene[:, None], lane]  # [M, L, 10, 2]
-    colors = atlas.light_state[scene, log_step]  # [M, T + 1]
-    lane_facts = atlas.lane_facts[scene[:, None], lane]
-    lane_color = colors[row[:, None], atlas.lane_light[scene[:, None], lane]]
-    lanes = np.concatenate([
-        local(pieces).reshape(len(now), lane.shape[1], -1), lane_facts[..., :2], lane_color[..., None],
-        atlas.on_route[row[:, None], lane][..., None], lane_facts[..., 2:],
-    ], -1)  # fmt: skip
     edge, edge_near = _nearest(distance(atlas.edge_middle[scene]), EDGES)
-    edges = local(atlas.edges[scene[:, None], edge].reshape(len(now), -1, 2, 2))
     area, area_near = _nearest(distance(atlas.crossing_middle[scene]), CROSSINGS)
-    crossings = local(atlas.crossings[scene[:, None], area].reshape(len(now), -1, 4, 2))
-    # 4. Lights whose state is known.
+    colors = atlas.light_state[scene, log_step]  # [M, T + 1]
     light_away = distance(atlas.light_point[scene])
     light_away[colors == 0] = np.inf
     light, light_near = _nearest(light_away, LIGHTS)
-    color = colors[row[:, None], light]
-    lamp = [(color == shown)[..., None] for shown in (RED, YELLOW, GREEN)]
-    light_age = atlas.light_age[scene[:, None], log_step, light]
-    lights = np.concatenate([local(atlas.light_point[scene[:, None], light]), *lamp, light_age[..., None]], -1)
-    # 5. The route from the nearest place on, and its end.
-    has_route = atlas.route_length > 0
-    first = distance(atlas.route_points).argmin(1)
-    index = first[:, None] + np.arange(ROUTE)
+    index = distance(atlas.route_points).argmin(1)[:, None] + np.arange(ROUTE)
     on_route = index < atlas.route_length[:, None]
     index = np.minimum(index, atlas.route_points.shape[1] - 1)
-    ahead, limit = atlas.route_points[row[:, None], index], atlas.route_limit[row[:, None], index]
-    route = np.concatenate([local(ahead), limit[..., None]], -1)
-    end = atlas.route_points[row, np.maximum(atlas.route_length - 1, 0)]
-    goal = np.concatenate([local(end[:, None])[:, 0], np.ones((len(now), 1))], -1)
-    # 6. The agent itself.
-    own = past[row, :, agent]  # [M, 11, 5]
-    own_direction = own[..., 2] - angle[:, None]
-    ego_history = np.concatenate([
-        local(own[..., :2]), np.cos(own_direction)[..., None], np.sin(own_direction)[..., None],
-        signed_speed(own)[..., None],
+    pieces = atlas.lane_points[scene[:, None], lane]  # [M, L, 10, 2]
+    # 3. All points in the frame of the agents, at once, and split again.
+    groups = [
+        seen[..., :2], own[..., :2], pieces, atlas.edges[scene[:, None], edge], atlas.crossings[scene[:, None], area],
+        atlas.light_point[scene[:, None], light], atlas.route_points[row[:, None], index],
+        atlas.route_points[row, np.maximum(atlas.route_length - 1, 0)],
+    ]  # fmt: skip
+    points = np.concatenate([group.reshape(count, -1, 2) for group in groups], 1)
+    ends = np.cumsum([group.size // (2 * count) for group in groups])[:-1] if count else [0] * (len(groups) - 1)
+    x, y = points[..., 0] - origin[:, :1], points[..., 1] - origin[:, 1:]
+    if is_own:
+        x, y = _turned(x, y, angle)
+    local = np.split(np.stack([x, y], -1), ends, axis=1)
+    place, own_place, lane_points, edges, crossings, light_points, ahead, end = local
+    # 4. Columns.
+    direction = seen[..., 2] - angle[:, None, None]
+    poses = np.stack([*np.moveaxis(place.reshape(*seen.shape[:3], 2), -1, 0), np.cos(direction), np.sin(direction)], -1)
+    velocity = np.stack(_turned(seen[:, -1, :, 3], seen[:, -1, :, 4], angle), -1)
+    held = world.drivers[scene[:, None], chosen] == Driver.REPLAY  # they alone have a log to go by
+    age = np.where(held, STEP_S * (log_step - atlas.last_logged[scene[:, None], chosen, log_step]), 0.0)
+    size, kind = world.size[scene[:, None], chosen], world.object_type[scene[:, None], chosen]
+    neighbors = np.concatenate([poses[:, -1], velocity, size, kind[..., None], age[..., None]], -1)
+    history = np.where(seen_there[:, :-1, :, None], poses[:, :-1], 0.0)  # [M, 10, K, 4]
+    lane_facts = atlas.lane_facts[scene[:, None], lane]
+    lanes = np.concatenate([
+        lane_points.reshape(count, lane.shape[1], -1), lane_facts[..., :2],
+        colors[row[:, None], atlas.lane_light[scene[:, None], lane]][..., None],
+        atlas.on_route[row[:, None], lane][..., None], lane_facts[..., 2:],
     ], -1)  # fmt: skip
-    ego_history = np.where(there[row, :, agent][..., None], ego_history, 0.0)
-    ego = _about_itself(
-        world, own, pieces[:, :OWN_LANES], lane_near[:, :OWN_LANES], lane_facts[:, :OWN_LANES, 1], steps - state.step
+    color = colors[row[:, None], light]
+    lamps = [color == RED, color == YELLOW, color == GREEN, atlas.light_age[scene[:, None], log_step, light]]
+    lights = np.concatenate([light_points, np.stack(lamps, -1)], -1)
+    route = np.concatenate([ahead, atlas.route_limit[row[:, None], index][..., None]], -1)
+    goal = np.concatenate([end[:, 0], np.ones((count, 1))], -1)
+    own_direction = own[..., 2] - angle[:, None]
+    ego_history = np.stack(
+        [*np.moveaxis(own_place, -1, 0), np.cos(own_direction), np.sin(own_direction), signed_speed(own)], -1
     )
+    ego_history = np.where(there[row, :, agent][..., None], ego_history, 0.0)
+    few = slice(OWN_LANES)
+    ego = _about_itself(world, own, pieces[:, few], lane_near[:, few], lane_facts[:, few, 1], steps - state.step)
 
-    def rows(values: np.ndarray, mask: np.ndarray, count: int) -> np.ndarray:
-        """Float32 [M, count, ...] with zeros in rows beyond the mask."""
-        out = np.zeros((len(values), count, *values.shape[2:]), np.float32)
-        kept = values.shape[1]
-        shown = mask.reshape(*mask.shape, *[1] * (values.ndim - 2))
-        out[:, :kept] = np.where(shown, np.clip(values, -BOUND, BOUND), 0.0)
+    def rows(values: np.ndarray, mask: np.ndarray, length: int) -> np.ndarray:
+        """Float32 [M, length, columns] with zeros in rows beyond the mask."""
+        out = np.zeros((count, length, values.shape[-1]), np.float32)
+        out[:, : values.shape[1]] = values
+        out[:, : values.shape[1]][~mask] = 0.0
         return out
 
-    def masks(mask: np.ndarray, count: int) -> np.ndarray:
-        out = np.zeros((len(mask), count), np.int8)
+    def masks(mask: np.ndarray, length: int) -> np.ndarray:
+        out = np.zeros((count, length), np.int8)
         out[:, : mask.shape[1]] = mask
         return out
 
     return Observation(
-        ego=np.clip(ego, -BOUND, BOUND).astype(np.float32),
-        ego_history=np.clip(ego_history, -BOUND, BOUND).astype(np.float32),
+        ego=ego.astype(np.float32),
+        ego_history=ego_history.astype(np.float32),
         neighbors=rows(neighbors, near, NEIGHBORS),
         neighbors_mask=masks(near, NEIGHBORS),
-        neighbors_history=rows(np.moveaxis(history, 1, 2).reshape(len(now), chosen.shape[1], -1), near, NEIGHBORS),
+        neighbors_history=rows(np.moveaxis(history, 1, 2).reshape(count, chosen.shape[1], -1), near, NEIGHBORS),
         lanes=rows(lanes, lane_near, LANES),
         lanes_mask=masks(lane_near, LANES),
-        edges=rows(edges.reshape(len(now), -1, 4), edge_near, EDGES),
+        edges=rows(edges.reshape(count, -1, 4), edge_near, EDGES),
         edges_mask=masks(edge_near, EDGES),
-        crossings=rows(crossings.reshape(len(now), -1, 8), area_near, CROSSINGS),
+        crossings=rows(crossings.reshape(count, -1, 8), area_near, CROSSINGS),
         crossings_mask=masks(area_near, CROSSINGS),
         lights=rows(lights, light_near, LIGHTS),
         lights_mask=masks(light_near, LIGHTS),
         route=rows(route, on_route, ROUTE),
         route_mask=masks(on_route, ROUTE),
-        goal=np.where(has_route[:, None], np.clip(goal, -BOUND, BOUND), 0.0).astype(np.float32),
+        goal=np.where((atlas.route_length > 0)[:, None], goal, 0.0).astype(np.float32),
     )
+
+
+def _turned(x: np.ndarray, y: np.ndarray, angle: Float[np.ndarray, "M"]) -> tuple[np.ndarray, np.ndarray]:
+    """Vectors [M, n] in frames that are turned by angles."""
+    cos, sin = np.cos(angle)[:, None], np.sin(angle)[:, None]
+    return cos * x + sin * y, cos * y - sin * x
 
 
 def _nearest(

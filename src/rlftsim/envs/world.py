@@ -231,6 +231,9 @@ def step_world(world: World, state: WorldState, moved: Float[np.ndarray, "M 5"])
         motion[coasts, :2] += STEP_S * before[coasts, 3:]
     # 2. IDM-driven vehicles
     places = state.places
+    driven = world.drivers == Driver.IDM
+    motion[driven] = before[driven]
+    motion[driven, 3:] = 0.0  # parked ones stay; those with a line move below
     if any(len(lines.agents) for lines in world.lines):
         present = world.there[:, :, following - 1]
         moves = [
@@ -239,8 +242,8 @@ def step_world(world: World, state: WorldState, moved: Float[np.ndarray, "M 5"])
             for count in [len(scene.object_id)]
         ]
         places = tuple(place for place, _ in moves)
-        for b, (lines, (_, driven)) in enumerate(zip(world.lines, moves)):
-            motion[b, lines.agents] = driven
+        for b, (lines, (_, moving)) in enumerate(zip(world.lines, moves)):
+            motion[b, lines.agents] = moving
     # 3. the planner's agents; padding stays at zero
     motion[world.actors[:, 0], world.actors[:, 1]] = moved
     return WorldState((*state.track, motion), block, state.noise, dice, places)

@@ -1,0 +1,156 @@
+"""Planners that ship, planners of others, `rlftsim drive` and `rlftsim compare` on its files."""
+
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from rlftsim.cli import main
+from rlftsim.envs import EgoEnv
+from rlftsim.envs.drive import DriveConfig, drive, run_planner
+from rlftsim.envs.episode import OUTSIDE_M
+from rlftsim.envs.idm import IdmConfig, idm_acceleration
+from rlftsim.envs.planner_scores import off_road
+from rlftsim.envs.planners.registry import PLANNERS, action_of, load_planner
+from rlftsim.errors import ConfigError, DataError
+from rlftsim.evaluation.drive_results import DriveResult, compare_drives
+from rlftsim.scenario.open import open_dataset
+from scenes import NO_LIGHTS, Mover, bend, build_scenario, junction_map, light, straight_road, without_future
+
+
+def driven(name, scenario, **settings):
+    planner = load_planner(name)
+    env = EgoEnv(scenarios=[scenario], action=action_of(planner), stop_on=(), **{"traffic": "replay", **settings})
+    return run_planner(env, planner, scenario, seed=0)
+
+
+@pytest.mark.parametrize("name", ["idm", "pdm"])
+def test_planners_keep_their_distance_to_a_slow_car(name):
+    slow = build_scenario("slow", (Mover(speed_mps=9.3), Mover(x_m=30.0, speed_mps=3.0)))
+    result = driven(name, slow)
+    assert result.record.collisions == ()
+    gap = result.record.motion[1, -1, 0] - result.record.own[-1, 0] - 4.6
+    assert 1.0 < gap < 12.0
+    assert result.planner.drivable_area == 1.0
+    assert driven("constant_velocity", slow).planner.at_fault_collision_rate == 1.0
+
+
+@pytest.mark.parametrize("name", ["idm", "pdm"])
+def test_planners_stop_at_a_red_light_and_go_at_green(name):
+    stays = build_scenario("red", (Mover(speed_mps=8.0),), junction_map(), light(1, 38.0, 0.2, red_until=91))
+    result = driven(name, stays)
+    assert result.planner.red_light_rate == 0.0
+    assert 30.0 < result.record.own[-1, 0] + 2.3 < 38.5
+    assert np.hypot(*result.record.own[-1, 3:]) < 0.5
+    goes = build_scenario("green", (Mover(speed_mps=8.0),), junction_map(), light(1, 38.0, 0.2, red_until=11))
+    assert driven(name, goes).record.own[-1, 0] > 45.0
+
+
+def test_planners_follow_a_bending_lane():
+    for name in ("idm", "pdm"):
+        result = driven(name, replace(bend(num_agents=1), lights=NO_LIGHTS))
+        assert result.planner.drivable_area == 1.0
+        assert result.planner.progress > 0.9
+        assert result.planner.displacement_error < 15.0
+
+
+def test_the_intelligent_driver_model_has_its_equilibrium():
+    # at the wanted gap and equal speeds the acceleration is that of the free road less the whole
+    config = IdmConfig()
+    free = idm_acceleration(np.array([10.0]), np.array([10.0]), np.array([np.inf]), np.zeros(1), config)
+    assert free == pytest.approx(0.0)
+    gap = config.gap_m + 5.0 * config.headway_s
+    held = idm_acceleration(np.array([5.0]), np.array([10.0]), np.array([gap]), np.array([5.0]), config)
+    assert held == pytest.approx(-(0.5**4), abs=1e-9)  # 1 - (v/v0)^4 - 1
+
+
+def test_the_road_is_left_where_the_official_distance_says_so():
+    random, data = np.random.default_rng(2), open_dataset("synthetic", "validation")
+    left = []
+    for index in range(6):
+        env = EgoEnv(scenarios=[data[index]], traffic="replay", stop_on=(), max_steps=60)
+        env.reset(seed=0)
+        action = random.uniform((0.2, -0.3), (1.0, 0.3)).astype(np.float32)
+        events = [env.step(action)[4]["terms"]["offroad"] for _ in range(60)]
+        outside = off_road(env.result().record) >= OUTSIDE_M
+        assert env.state.outside[0] == outside.any()
+        if outside.any() and not outside[0]:
+            assert int(np.argmax(events)) + 1 == int(outside.argmax())
+        left.append(bool(outside.any()))
+    assert any(left)
+    assert not all(left)
+
+
+def test_the_replay_planner_needs_a_future():
+    with pytest.raises(DataError, match="no logged future"):
+        driven("replay", without_future())
+
+
+PLANNER_FILE = """
+import numpy as np
+class Still:
+    action = "pose"
+    def reset(self, info):
+        self.scenario = info["scenario"]
+    def act(self, observation):
+        return np.zeros(3, np.float32)
+def straight(observation):
+    return np.zeros(2, np.float32)
+number = 3
+"""
+
+
+def test_planners_of_others_are_found(tmp_path, monkeypatch):
+    (tmp_path / "my_planners.py").write_text(PLANNER_FILE)
+    monkeypatch.syspath_prepend(tmp_path)
+    assert action_of(load_planner("my_planners:Still")) == "pose"
+    assert driven("my_planners:Still", straight_road()).planner.route_completion == pytest.approx(0.0, abs=1e-6)
+    assert action_of(load_planner("my_planners:straight")) == "bicycle"
+    PLANNERS.add("mine", sys.modules["my_planners"].Still)
+    assert action_of(load_planner("mine")) == "pose"
+    PLANNERS.remove("mine")
+    wrong = {"my_planners:number": "is a int", "my_planners:nothing": "cannot be imported", "idn": "mean 'idm'"}
+    for name, message in wrong.items():
+        with pytest.raises(ConfigError, match=message):
+            load_planner(name)
+
+
+def test_drive_writes_a_row_per_scenario_and_compare_reads_them(tmp_path, capsys):
+    out = tmp_path / "drive"
+    words = ["drive", "constant_velocity", "--data", "synthetic", "--out", str(out), "--limit", "2"]
+    assert main([*words, "--traffic", "replay,constant_velocity", "--film"]) == 0
+    first, second = out / "constant_velocity-replay.parquet", out / "constant_velocity-constant_velocity.parquet"
+    table = pq.read_table(first)
+    assert table.num_rows == 2
+    assert set(table["traffic"].to_pylist()) == {"replay"}
+    assert {"nuplan_style", "pdms_style", "others_realism", "hit_rate"} <= set(table.schema.names)
+    assert len(list(out.glob("*.webp"))) == 1
+    capsys.readouterr()
+    assert main(["compare", str(first), str(second)]) == 0
+    text = capsys.readouterr().out
+    assert "nuplan_style" in text
+    assert "2 scenarios" in text
+    assert main(["drive", "walk", "--data", "synthetic", "--out", str(out)]) == 2
+    assert main([*words, "--traffic", "none"]) == 2
+    assert main([*words, "--scenario", "x", "--traffic", "replay"]) == 2
+    errors = capsys.readouterr().err.strip().splitlines()
+    assert len(errors) == 3
+    assert "unknown planner 'walk'" in errors[0]
+
+
+def test_results_survive_their_file_and_pair_by_scenario(tmp_path):
+    config = DriveConfig("constant_velocity", traffic=("replay",), limit=2)
+    (result,) = drive(config)
+    result.write(tmp_path / "a.parquet")
+    again = DriveResult.read(tmp_path / "a.parquet")
+    assert again.table.schema.equals(result.table.schema)
+    np.testing.assert_equal(again.table.to_pydict(), result.table.to_pydict())
+    assert again.settings == result.settings
+    assert all(row.count == 0 or row.difference == 0 for row in compare_drives(result, again))
+    (more,) = drive(DriveConfig("constant_velocity", traffic=("replay",), limit=1, num_rollouts=2))
+    with pytest.raises(DataError, match="drive both alike"):
+        compare_drives(result, more)
+    with pytest.raises(DataError, match="not a result"):
+        DriveResult.read(tmp_path / "none.parquet")
