@@ -128,17 +128,33 @@ def table(arguments):
 
 
 def ppo(arguments):
+    from gymnasium import spaces
     from stable_baselines3 import PPO
+    from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 
     from rlftsim.envs.planners.registry import load_planner
     from rlftsim.envs.sb3 import SB3VecEnv
 
+    class Near(BaseFeaturesExtractor):
+        """The agent itself, five points of its route and its four nearest neighbors, scaled to about 1."""
+
+        def __init__(self, space: spaces.Dict):
+            super().__init__(space, 12 + 5 * 2 + 4 * 6)
+            ego = [10.0, 4.0, 0.5, 0.3, 5.0, 2.0, 1.0, 0.3, 1.0, 10.0, 8.0, 1.0]
+            self.register_buffer("ego", torch.tensor(ego))
+            self.register_buffer("neighbor", torch.tensor([20.0, 5.0, 1.0, 1.0, 10.0, 10.0]))
+
+        def forward(self, seen):
+            route = seen["route"][:, 1:16:3, :2] / torch.tensor([20.0, 3.0])
+            neighbors = seen["neighbors"][:, :4, :6] / self.neighbor
+            return torch.cat([seen["ego"] / self.ego, route.flatten(1), neighbors.flatten(1)], 1).clamp(-5, 5)
+
     torch.set_num_threads(1)
-    settings = {"data": "synthetic", "traffic": arguments.traffic, "observation": "flat", "action": "bicycle"}
-    vector = SB3VecEnv(8, split="training", **settings)
+    settings = {"data": "synthetic", "traffic": arguments.traffic, "action": "bicycle"}
+    vector = SB3VecEnv(8, split="training", stop_on=("collision", "offroad"), **settings)
     model = PPO(
-        "MlpPolicy", vector, n_steps=128, batch_size=256, n_epochs=6, learning_rate=1e-3, gamma=0.97, seed=0,
-        policy_kwargs={"net_arch": [64, 64], "log_std_init": -1.0},
+        "MultiInputPolicy", vector, n_steps=128, batch_size=128, n_epochs=10, learning_rate=5e-4, gamma=0.97, seed=0,
+        policy_kwargs={"features_extractor_class": Near, "net_arch": [64, 64], "log_std_init": -1.5},
     )  # fmt: skip
     begin, cpu = time.monotonic(), time.process_time()
     model.learn(arguments.steps)

@@ -180,7 +180,7 @@ class Bicycle:
         kept = np.clip(action, -1.0, 1.0)
         acceleration = kept[:, 0] * np.where(kept[:, 0] < 0, self.hardest, ACCELERATION_MPS2)
         motion = self.drive(actors.motion, acceleration, kept[:, 1] * STEERING_RAD, actors.size[:, 0])
-        return Moves(motion[:, None], (kept != action).any(1))
+        return Moves(motion[:, None], np.any(kept != action, axis=1))
 
     def drive(
         self,
@@ -266,7 +266,7 @@ class PoseControls:
         """
         kept = np.clip(action, -POSE_LIMITS, POSE_LIMITS)
         # a float32 action rounds its bounds
-        clipped = (np.abs(action) > POSE_LIMITS + 1e-6).any(1)
+        clipped = np.any(np.abs(action) > POSE_LIMITS + 1e-6, axis=1)
         return Moves(with_velocity(placed(kept[:, None], actors.motion), actors.motion), clipped)
 
 

@@ -7,6 +7,7 @@ from typing import Literal, get_args
 from rlftsim.envs.actions import ActionKind, Tracker
 from rlftsim.envs.drivers import Rules, Traffic
 from rlftsim.envs.observations import Frame
+from rlftsim.envs.rewards import parse_terms
 from rlftsim.envs.route import RouteChoice
 from rlftsim.errors import ConfigError, in_short, require_types
 from rlftsim.policies.registry import Device
@@ -68,6 +69,7 @@ class EnvConfig:
                 raise ConfigError(f"stop_on must be one of {', '.join(get_args(StopReason))}, got {in_short(reason)}.")
         if not isinstance(self.drivers, Mapping):
             raise ConfigError(f"drivers must be {{who: driver}}, got {in_short(self.drivers)}.")
+        parse_terms(self.reward)
         if not 1 <= self.max_steps <= FUTURE_STEPS:
             raise ConfigError(f"max_steps must lie between 1 and {FUTURE_STEPS}, got {self.max_steps}.")
 

@@ -1,4 +1,4 @@
-"""Who drives whom: a rule for each agent, and the drivers without weights."""
+"""Drivers of agents: a rule for each, the first match wins."""
 
 from collections.abc import Mapping
 from enum import IntEnum
@@ -13,7 +13,7 @@ from rlftsim.scenario.types import ObjectType
 
 
 class Driver(IntEnum):
-    """What moves an agent."""
+    """Source of an agent's motion."""
 
     PLANNER = 0
     """Actions from outside."""

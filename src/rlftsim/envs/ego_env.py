@@ -1,4 +1,4 @@
-"""The Gymnasium environment: a planner drives the ego of a scenario, a traffic model everybody else."""
+"""The Gymnasium environment: a planner drives the ego of a scenario, a traffic model the others."""
 
 from dataclasses import replace
 from typing import Any, ClassVar

@@ -14,7 +14,7 @@ from rlftsim.envs.actions import Actors, Controls, checked
 from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.contact import Collision, boxes_overlap, collision_of, corners_of
 from rlftsim.envs.observations import Atlas, Observation, build_atlas, observe
-from rlftsim.envs.rewards import WeightedTerm
+from rlftsim.envs.rewards import WeightedTerm, parse_terms
 from rlftsim.envs.route import route_of
 from rlftsim.envs.world import Dice, World, WorldState, begin, step_world, with_dice
 from rlftsim.geometry import wrapped
@@ -42,7 +42,7 @@ MAX_PAIRS = 1 << 22
 
 @dataclass(frozen=True, eq=False)
 class Episode:
-    """What does not change in an episode."""
+    """The part of an episode that does not change."""
 
     world: World
     atlas: Atlas
@@ -89,7 +89,7 @@ class EpisodeState:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What an action led to."""
+    """Reward and ends after an action."""
 
     reward: Float[np.ndarray, "M"]
     terms: dict[str, Float[np.ndarray, "M"]]
@@ -102,7 +102,6 @@ class Outcome:
 def build_episode(
     world: World,
     controls: Controls,
-    terms: tuple[WeightedTerm, ...],
     config: EnvConfig,
     goals: ScenarioGoals | None = None,
 ) -> Episode:
@@ -111,7 +110,6 @@ def build_episode(
     Args:
         world: the scenes.
         controls: of the actions.
-        terms: of the reward.
         config: settings.
         goals: that the world was built with.
     """
@@ -123,7 +121,9 @@ def build_episode(
     )
     bottom = [world.scenes[scene].z[agent] - world.scenes[scene].size[agent, 2] / 2 for scene, agent in world.actors]
     edges = join_road_edges([road_edges(scene.scenario) for scene in world.scenes])
-    return Episode(world, build_atlas(world, routes), controls, terms, config, edges, np.array(bottom), goals)
+    return Episode(
+        world, build_atlas(world, routes), controls, parse_terms(config.reward), config, edges, np.array(bottom), goals
+    )
 
 
 @cached_on_scenario

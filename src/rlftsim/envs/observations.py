@@ -34,7 +34,7 @@ _FAR_M = 1e7
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """What M agents see."""
+    """Observations of M agents."""
 
     ego: Float32[np.ndarray, "M 12"]
     """Speed, acceleration, yaw rate, steering angle that explains it, length, width, cos and sin of the heading to the
@@ -179,7 +179,7 @@ def _stack(parts: list[np.ndarray], fill: float | int) -> np.ndarray:
 
 
 def observe(world: World, atlas: Atlas, state: WorldState, *, frame: Frame = "ego", steps: int) -> Observation:
-    """What the planner-driven agents see now.
+    """Observations of the planner-driven agents at the present step.
 
     Args:
         world: the scenes.
@@ -195,15 +195,10 @@ def observe(world: World, atlas: Atlas, state: WorldState, *, frame: Frame = "eg
     is_own = frame == "ego"
     origin, angle = (now[:, :2], now[:, 2]) if is_own else (np.zeros((count, 2)), np.zeros(count))
 
-    def distance(points: np.ndarray) -> np.ndarray:
-        """From the agents to points [M, n, 2]."""
-        dx, dy = points[..., 0] - now[:, :1], points[..., 1] - now[:, 1:2]
-        return np.sqrt(dx * dx + dy * dy)
-
-    # 1. Motion of everybody over the last 11 steps [M, 11, A, 5], and the other agents that are there, nearest first.
+    # 1. Motion over the last 11 steps [M, 11, A, 5], and the other agents that are there, nearest first.
     past = np.stack(state.track[-HISTORY - 1 :], 1)[scene]
     there = np.moveaxis(world.there[scene, :, log_step - HISTORY : log_step + 1], 2, 1)  # [M, 11, A]
-    away = distance(past[:, -1])
+    away = _distance(now, past[:, -1])
     away[~there[:, -1]] = np.inf
     away[row, agent] = np.inf
     chosen, near = _nearest(away, NEIGHBORS)
@@ -212,14 +207,14 @@ def observe(world: World, atlas: Atlas, state: WorldState, *, frame: Frame = "eg
     seen_there = there[row[:, None, None], steps_back, chosen[:, None]] & near[:, None]
     own = past[row, :, agent]  # [M, 11, 5]
     # 2. The nearest rows of the map, lights whose state is known, and the route from the nearest place on.
-    lane, lane_near = _nearest(distance(atlas.lane_middle[scene]), LANES)
-    edge, edge_near = _nearest(distance(atlas.edge_middle[scene]), EDGES)
-    area, area_near = _nearest(distance(atlas.crossing_middle[scene]), CROSSINGS)
+    lane, lane_near = _nearest(_distance(now, atlas.lane_middle[scene]), LANES)
+    edge, edge_near = _nearest(_distance(now, atlas.edge_middle[scene]), EDGES)
+    area, area_near = _nearest(_distance(now, atlas.crossing_middle[scene]), CROSSINGS)
     colors = atlas.light_state[scene, log_step]  # [M, T + 1]
-    light_away = distance(atlas.light_point[scene])
+    light_away = _distance(now, atlas.light_point[scene])
     light_away[colors == 0] = np.inf
     light, light_near = _nearest(light_away, LIGHTS)
-    index = distance(atlas.route_points).argmin(1)[:, None] + np.arange(ROUTE)
+    index = _distance(now, atlas.route_points).argmin(1)[:, None] + np.arange(ROUTE)
     on_route = index < atlas.route_length[:, None]
     index = np.minimum(index, atlas.route_points.shape[1] - 1)
     pieces = atlas.lane_points[scene[:, None], lane]  # [M, L, 10, 2]
@@ -264,36 +259,45 @@ def observe(world: World, atlas: Atlas, state: WorldState, *, frame: Frame = "eg
     few = slice(OWN_LANES)
     ego = _about_itself(world, own, pieces[:, few], lane_near[:, few], lane_facts[:, few, 1], steps - state.step)
 
-    def rows(values: np.ndarray, mask: np.ndarray, length: int) -> np.ndarray:
-        """Float32 [M, length, columns] with zeros in rows beyond the mask."""
-        out = np.zeros((count, length, values.shape[-1]), np.float32)
-        out[:, : values.shape[1]] = values
-        out[:, : values.shape[1]][~mask] = 0.0
-        return out
-
-    def masks(mask: np.ndarray, length: int) -> np.ndarray:
-        out = np.zeros((count, length), np.int8)
-        out[:, : mask.shape[1]] = mask
-        return out
-
     return Observation(
         ego=ego.astype(np.float32),
         ego_history=ego_history.astype(np.float32),
-        neighbors=rows(neighbors, near, NEIGHBORS),
-        neighbors_mask=masks(near, NEIGHBORS),
-        neighbors_history=rows(np.moveaxis(history, 1, 2).reshape(count, chosen.shape[1], -1), near, NEIGHBORS),
-        lanes=rows(lanes, lane_near, LANES),
-        lanes_mask=masks(lane_near, LANES),
-        edges=rows(edges.reshape(count, -1, 4), edge_near, EDGES),
-        edges_mask=masks(edge_near, EDGES),
-        crossings=rows(crossings.reshape(count, -1, 8), area_near, CROSSINGS),
-        crossings_mask=masks(area_near, CROSSINGS),
-        lights=rows(lights, light_near, LIGHTS),
-        lights_mask=masks(light_near, LIGHTS),
-        route=rows(route, on_route, ROUTE),
-        route_mask=masks(on_route, ROUTE),
+        neighbors=_rows(neighbors, near, NEIGHBORS),
+        neighbors_mask=_masks(near, NEIGHBORS),
+        neighbors_history=_rows(np.moveaxis(history, 1, 2).reshape(count, chosen.shape[1], -1), near, NEIGHBORS),
+        lanes=_rows(lanes, lane_near, LANES),
+        lanes_mask=_masks(lane_near, LANES),
+        edges=_rows(edges.reshape(count, -1, 4), edge_near, EDGES),
+        edges_mask=_masks(edge_near, EDGES),
+        crossings=_rows(crossings.reshape(count, -1, 8), area_near, CROSSINGS),
+        crossings_mask=_masks(area_near, CROSSINGS),
+        lights=_rows(lights, light_near, LIGHTS),
+        lights_mask=_masks(light_near, LIGHTS),
+        route=_rows(route, on_route, ROUTE),
+        route_mask=_masks(on_route, ROUTE),
         goal=np.where((atlas.route_length > 0)[:, None], goal, 0.0).astype(np.float32),
     )
+
+
+def _rows(values: Float[np.ndarray, "M n c"], mask: Bool[np.ndarray, "M n"], length: int) -> np.ndarray:
+    """Float32 [M, length, c] with zeros in rows beyond the mask."""
+    out = np.zeros((len(values), length, values.shape[-1]), np.float32)
+    out[:, : values.shape[1]] = values
+    out[:, : values.shape[1]][~mask] = 0.0
+    return out
+
+
+def _masks(mask: Bool[np.ndarray, "M n"], length: int) -> Int8[np.ndarray, "M length"]:
+    """Masks with zeros appended."""
+    out = np.zeros((len(mask), length), np.int8)
+    out[:, : mask.shape[1]] = mask
+    return out
+
+
+def _distance(now: Float[np.ndarray, "M 5"], points: np.ndarray) -> Float[np.ndarray, "M n"]:
+    """Distances from agents to points, of which x and y come first on the last axis."""
+    dx, dy = points[..., 0] - now[:, :1], points[..., 1] - now[:, 1:2]
+    return np.sqrt(dx * dx + dy * dy)
 
 
 def _turned(x: np.ndarray, y: np.ndarray, angle: Float[np.ndarray, "M"]) -> tuple[np.ndarray, np.ndarray]:
@@ -305,7 +309,7 @@ def _turned(x: np.ndarray, y: np.ndarray, angle: Float[np.ndarray, "M"]) -> tupl
 def _nearest(
     distance: Float[np.ndarray, "M n"], count: int
 ) -> tuple[Int64[np.ndarray, "M k"], Bool[np.ndarray, "M k"]]:
-    """Indices of the nearest `count` columns of each row in order, and True where they are within sight."""
+    """Indices of the nearest `count` columns of each row in order, and True where they are no farther than 100 m."""
     row = np.arange(len(distance))[:, None]
     if distance.shape[1] > count:
         # the nearest in any order first: a full sort of all rows would cost more than all the rest

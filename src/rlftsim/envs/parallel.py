@@ -8,8 +8,10 @@ from gymnasium.utils import seeding
 from pettingzoo import ParallelEnv
 
 from rlftsim.envs.config import EnvConfig
+from rlftsim.envs.drivers import Driver, drivers_of
 from rlftsim.envs.episode import Episode, EpisodeState, advance, look, start
 from rlftsim.envs.resets import OPTIONS, about, chosen, config_of, note_of
+from rlftsim.envs.scene import build_env_scene
 from rlftsim.envs.source import Source
 from rlftsim.envs.spaces import action_space, observation_space, shown
 from rlftsim.errors import ConfigError
@@ -74,8 +76,9 @@ class TrafficParallelEnv(ParallelEnv):
             return [str(object_id) for object_id in controlled]
         found: dict[str, None] = {}
         for scenario_id in self.source.scenario_ids:
-            episode_rows = self.source.planned_agents(self.source.scenario(scenario_id))
-            found.update(dict.fromkeys(str(object_id) for object_id in episode_rows))
+            scene = build_env_scene(self.source.scenario(scenario_id))
+            planned = scene.object_id[drivers_of(scene, self.source.rules) == Driver.PLANNER]
+            found.update(dict.fromkeys(map(str, planned.tolist())))
         return list(found)
 
     def observation_space(self, agent: str) -> Space:

@@ -1,4 +1,4 @@
-"""Records of episodes: what every agent of a scene did, from the current step of the log to the end."""
+"""Records of episodes: motion of all agents of a scene, from the current step of the log to the end."""
 
 from dataclasses import dataclass
 
@@ -48,7 +48,7 @@ class Record:
 
 
 def record_of(episode: Episode, state: EpisodeState, row: int = 0) -> Record:
-    """What happened so far in the scene of a planner-driven agent.
+    """Record of a planner-driven agent's scene so far.
 
     Args:
         episode: the scenes.

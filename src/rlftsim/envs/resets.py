@@ -1,4 +1,4 @@
-"""What all environments share: settings by name, the choice of a scenario, and the `info` of resets and steps."""
+"""Parts that all environments share: settings by name, the choice of a scenario, `info` of resets and steps."""
 
 from typing import Any
 

@@ -141,7 +141,7 @@ def _lights(scenario: Scenario, graph: LaneGraph) -> Lights:
     seen[log.step[kept], column[kept]] = True
     point[column] = log.stop_point[:, :2].astype(np.float64) - scenario.origin
     steps = np.arange(TOTAL_STEPS)[:, None]
-    # a light that is out of sight keeps its last state
+    # a light that is not observed keeps its last state
     last = np.maximum.accumulate(np.where(seen, steps, -1), axis=0)
     state = np.where(last >= 0, np.take_along_axis(state, np.maximum(last, 0), axis=0), 0)
     changed = np.vstack([np.zeros((1, len(ids)), bool), state[1:] != state[:-1]])

@@ -8,10 +8,7 @@ import torch
 
 from rlftsim.envs.actions import Controls, controls_of
 from rlftsim.envs.config import EnvConfig
-from rlftsim.envs.drivers import Driver, drivers_of
 from rlftsim.envs.episode import Episode, ScenarioGoals, build_episode
-from rlftsim.envs.rewards import WeightedTerm, parse_terms
-from rlftsim.envs.scene import build_env_scene
 from rlftsim.envs.world import build_world
 from rlftsim.errors import ConfigError
 from rlftsim.policies.registry import load_policy
@@ -64,7 +61,6 @@ class Source:
             config.action, self.policy, horizon=config.horizon, tracker=config.tracker, reverse=config.reverse,
             hard_braking=config.hard_braking,
         )  # fmt: skip
-        self.terms: tuple[WeightedTerm, ...] = parse_terms(config.reward)
         self._contexts: OrderedDict[str, Any] = OrderedDict()
 
     def scenario(self, scenario_id: str) -> Scenario:
@@ -80,11 +76,6 @@ class Source:
             raise ConfigError(
                 f"no scenario {scenario_id!r}: this environment has {len(self.scenario_ids)}, such as {some}."
             ) from None
-
-    def planned_agents(self, scenario: Scenario) -> list[int]:
-        """Object ids of the planner-driven agents of a scenario, in track order."""
-        scene = build_env_scene(scenario)
-        return scene.object_id[drivers_of(scene, self.rules) == Driver.PLANNER].tolist()
 
     def episode(self, scenarios: list[Scenario], goals: ScenarioGoals | None = None) -> Episode:
         """An episode in some scenarios, which step together.
@@ -107,7 +98,7 @@ class Source:
             raise ConfigError(
                 f"scenario {scenarios[0].scenario_id}: the planner drives no agent: its ego or ids are not simulated."
             )
-        return build_episode(world, self.controls, self.terms, self.config, goals)
+        return build_episode(world, self.controls, self.config, goals)
 
     def _context(self, scenarios: list[Scenario]) -> Any:
         """Context of a single scenario, from the last ones if it is among them; None leaves it to the world."""

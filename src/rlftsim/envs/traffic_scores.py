@@ -76,7 +76,7 @@ def score_traffic(record: Record) -> TrafficScores:
         others_offroad_rate=_rate(_leaves_road(record), vehicles),
         others_wrong_way_rate=_rate(_drives_against(record, vehicles), vehicles),
         others_acceleration_rate=_rate(np.any(change > INFEASIBLE_ACCELERATION_MPS2, axis=1), vehicles),
-        others_steering_rate=_rate(tight.any(1), vehicles),
+        others_steering_rate=_rate(np.any(tight, axis=1), vehicles),
         blamed_others_rate=1.0 - sum(faults) / len(faults) if faults else np.nan,
     )
 

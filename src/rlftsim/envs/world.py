@@ -151,7 +151,7 @@ def build_world(
             context = policy.encode(batch)
     mask = batch.agent_mask.cpu().numpy()
     valid = _padded([scene.valid for scene in scenes], (*shape, 91), False)
-    # from the current step on everybody exists, but replayed agents may vanish with their log
+    # from the current step on all agents exist, but replayed ones may vanish with their log
     there = valid | mask[..., None]
     there[..., : CURRENT_STEP + 1] = valid[..., : CURRENT_STEP + 1]
     if vanish:
@@ -297,7 +297,7 @@ def _decide(world: World, state: WorldState) -> Block:
 
 
 def _forced(world: World, state: WorldState) -> AgentStates | None:
-    """What the agents that the policy does not drive did in the last block; None where it drives all."""
+    """Last block's motion of the agents that the policy does not drive; None where it drives all."""
     assert world.policy is not None
     imposed = world.mask & (world.drivers != Driver.POLICY)
     if not imposed.any():

@@ -28,7 +28,7 @@ SHOWN = (
 
 @dataclass(frozen=True)
 class DriveSettings:
-    """How the episodes of a result were made."""
+    """Planner, traffic, data and dice of a result's episodes."""
 
     planner: str
     traffic: str

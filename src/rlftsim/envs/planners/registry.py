@@ -57,7 +57,7 @@ class CallablePlanner:
         """Nothing: a function has no memory."""
 
     def act(self, observation: dict[str, Any]) -> Any:
-        """What the function returns."""
+        """Result of the function."""
         return self.function(observation)
 
 

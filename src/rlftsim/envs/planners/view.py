@@ -1,4 +1,4 @@
-"""What planners that follow a route read from an observation: the route as a line, boxes and stopping places on it."""
+"""View of planners that follow a route: the route as a line, boxes and stopping places on it."""
 
 from dataclasses import dataclass
 from typing import Any
