@@ -1,5 +1,6 @@
 """The verb that measures a planner: drive."""
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -50,6 +51,8 @@ class Drive:
         # Imported late: the environments need packages of an extra, and help does not.
         from rlftsim.envs.drive import DriveConfig, drive, film
 
+        # As `python -m` does, so that a planner in a file of this folder is found.
+        sys.path.insert(0, "")
         if self.scenario is not None and not self.scenario:
             raise ConfigError("--scenario needs at least one id; leave it out for all scenarios.")
         config = DriveConfig(
