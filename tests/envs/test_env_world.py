@@ -48,7 +48,7 @@ def others(env):
 @pytest.mark.parametrize("name", ["demo-base", "constant_velocity"])
 def test_decisions_of_the_model_fed_back_as_poses_are_a_simulation(name, data):
     policy = load_policy(name)
-    scenarios = [data[0], data[3]] if name == "demo-base" else [bend()]
+    scenarios = [data[0]] if name == "demo-base" else [bend()]
     for scenario in scenarios:
         reference = simulate(policy, collate([scenario]), num_rollouts=range(3, 4), seed=7)
         env = EgoEnv(scenarios=[scenario], policy=policy, action="pose", stop_on=(), reward="none")
@@ -93,14 +93,14 @@ def test_the_log_replayed_is_the_log(data):
 def test_the_same_seed_gives_the_same_bits_alone_and_in_a_vector(model, data):
     scenarios = [data[i] for i in range(6)]
     settings = {"scenarios": scenarios, "policy": model, "stop_on": (), "action": "bicycle"}
-    actions = np.random.default_rng(0).uniform(-1, 1, (12, 32, 2)).astype(np.float32)
+    actions = np.random.default_rng(0).uniform(-1, 1, (7, 32, 2)).astype(np.float32)
     vector = EgoVectorEnv(32, **settings)
     seen, _ = vector.reset(seed=40)
     ours = [seen]
     for action in actions:
         ours.append(vector.step(action)[0])
-    for slot in (0, 13, 31):
-        for _ in range(2):
+    for slot in (13, 31):
+        for _ in range(slot // 13):  # slot 31 twice
             env = EgoEnv(**settings)
             alone, _ = env.reset(seed=40 + slot)
             for step, action in enumerate([None, *actions[:, slot]]):
@@ -111,13 +111,13 @@ def test_the_same_seed_gives_the_same_bits_alone_and_in_a_vector(model, data):
 
 def test_forks_with_the_same_dice_differ_only_after_the_running_block(model, data):
     later = 0
-    for i in range(5):
+    for i in range(3):
         env = EgoEnv(scenarios=[data[i]], policy=model, stop_on=(), reward="none")
         env.reset(seed=1)
         for _ in range(12):
             env.step(np.zeros(2, np.float32))
         same, braking = env.fork(2)
-        for step in range(30):
+        for step in range(17):
             env.step(np.array([0.5, 0.0], np.float32))
             same.step(np.array([0.5, 0.0], np.float32))
             braking.step(np.array([-1.0, 0.3], np.float32))
@@ -133,7 +133,7 @@ def test_a_fork_with_new_dice_differs_where_the_same_actions_are_taken(model, da
     env.reset(seed=1)
     branches = [env, *env.fork(2, noise="new")]
     for branch in branches:
-        for _ in range(20):
+        for _ in range(15):
             branch.step(np.zeros(2, np.float32))
     tracks = [others(branch) for branch in branches]
     assert not np.array_equal(tracks[0], tracks[1])
@@ -143,7 +143,7 @@ def test_a_fork_with_new_dice_differs_where_the_same_actions_are_taken(model, da
 RESTORE = """
 import sys, numpy as np
 from rlftsim.envs import EgoEnv
-env = EgoEnv(data="synthetic", action="bicycle", stop_on=(), reward="none")
+env = EgoEnv(data="synthetic", action="bicycle", stop_on=(), reward="none", max_steps=40)
 env.restore(open(sys.argv[1], "rb").read())
 while not env.state.ended[0]:
     env.step(np.array([-0.2, 0.1], np.float32))
@@ -152,9 +152,9 @@ np.save(sys.argv[2], np.stack(env.state.world.track))
 
 
 def test_a_snapshot_goes_on_in_another_process(tmp_path):
-    env = EgoEnv(data="synthetic", action="bicycle", stop_on=(), reward="none")
+    env = EgoEnv(data="synthetic", action="bicycle", stop_on=(), reward="none", max_steps=40)
     env.reset(seed=4)
-    for _ in range(23):
+    for _ in range(13):
         env.step(np.array([0.4, 0.0], np.float32))
     env = env.fork(1, noise="new")[0]
     for _ in range(10):

@@ -57,7 +57,7 @@ class DriveConfig:
         """Settings of the environment for one kind of traffic: nothing ends an episode, and nothing is rewarded."""
         return EnvConfig(
             data=self.data, split=self.split, model=self.model, traffic=cast(Traffic, traffic),
-            action=action_of(load_planner(self.planner)), stop_on=(), reward="none", hard_braking=True,
+            action=action_of(load_planner(self.planner)), stop_on=(), reward="none",
         )  # fmt: skip
 
 

@@ -45,21 +45,14 @@ class IdmPlanner:
         gap, lead = np.minimum(gap, to_stop), np.where(to_stop < gap, 0.0, lead)
         wanted = np.array([view.limit_mps or self.config.speed_mps])
         acceleration = idm_acceleration(np.array([max(view.speed, 0.0)]), wanted, gap, lead, self.config)
-        steering = pursue(view, np.zeros(1))
-        return np.clip([acceleration[0] / ACCELERATION_MPS2, steering[0] / STEERING_RAD], -1, 1).astype(np.float32)
+        steering = pursue(view)
+        return np.clip([acceleration[0] / ACCELERATION_MPS2, steering / STEERING_RAD], -1, 1).astype(np.float32)
 
 
-def pursue(view: View, offset_m: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-    """Steering angles that lead to the route, by pure pursuit (Coulter, 1992), rad.
-
-    Args:
-        view: of the agent.
-        offset_m: to the left of the route, one for each angle.
-    """
+def pursue(view: View) -> float:
+    """Steering angle that leads to the route, by pure pursuit (Coulter, 1992), rad."""
     away = np.linalg.norm(view.line, axis=1)
     far = np.flatnonzero(away >= max(LEAST_PURSUIT_M, PURSUIT_S * view.speed))
     target = int(far[0]) if len(far) else len(away) - 1
-    heading = view.heading[target]
-    points = view.line[target] + offset_m[:, None] * np.array([-np.sin(heading), np.cos(heading)])
-    squared = np.maximum((points**2).sum(1), 0.01)
-    return np.arctan(2 * WHEELBASE_PER_LENGTH * view.size[0] * points[:, 1] / squared)
+    x, y = view.line[target]
+    return float(np.arctan(2 * WHEELBASE_PER_LENGTH * view.size[0] * y / max(x * x + y * y, 0.01)))

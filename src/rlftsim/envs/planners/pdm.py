@@ -13,7 +13,6 @@ from jaxtyping import Bool, Float
 
 from rlftsim.envs.actions import (
     ACCELERATION_MPS2,
-    HARDEST_BRAKING_MPS2,
     LEAST_PURSUIT_M,
     PURSUIT_S,
     STEERING_RAD,
@@ -72,7 +71,7 @@ class PdmPlanner:
             best = int(score_proposals(view, proposals.motion, collides).argmax())
             controls = proposals.controls[best, :REPLAN_STEPS].copy()
             if collides[best, : round(BRAKE_IF_WITHIN_S / STEP_S) + 1].any():
-                controls[:, 0] = -HARDEST_BRAKING_MPS2
+                controls[:, 0] = -ACCELERATION_MPS2
             scale = np.array([ACCELERATION_MPS2, STEERING_RAD])
             self._plan = np.clip(controls / scale, -1, 1).astype(np.float32)
         control, self._plan = self._plan[0], self._plan[1:]
@@ -83,7 +82,7 @@ def simulate_proposals(view: View) -> Proposals:
     """Drive along the route at several speeds and offsets for 4 s; the others keep their velocity."""
     fraction, offset = (v.ravel() for v in np.meshgrid(SPEED_FRACTIONS, OFFSETS_M))
     wanted = fraction * (view.limit_mps or CONFIG.speed_mps)
-    n, bicycle = len(wanted), Bicycle(hardest=HARDEST_BRAKING_MPS2)
+    n, bicycle = len(wanted), Bicycle()
     normal = np.stack([-np.sin(view.heading), np.cos(view.heading)], -1)
     lines = view.line + offset[:, None, None] * normal  # [n, P, 2]
     motion = np.tile([0.0, 0.0, 0.0, view.speed, 0.0], (n, 1))
@@ -100,7 +99,7 @@ def simulate_proposals(view: View) -> Proposals:
         to_stop = np.where(to_stop > -1.0, np.maximum(to_stop, 0.0), np.inf)
         gap, lead = np.minimum(gap, to_stop), np.where(to_stop < gap, 0.0, lead)
         speed = np.maximum(signed_speed(motion), 0.0)
-        acceleration = np.clip(idm_acceleration(speed, wanted, gap, lead, CONFIG), -8.0, ACCELERATION_MPS2)
+        acceleration = np.maximum(idm_acceleration(speed, wanted, gap, lead, CONFIG), -ACCELERATION_MPS2)
         # 2. pure pursuit of the line
         ahead = np.maximum(LEAST_PURSUIT_M, PURSUIT_S * speed)
         target = lines[row, np.minimum(place + ahead.astype(int), lines.shape[1] - 1)] - motion[:, :2]
