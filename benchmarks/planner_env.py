@@ -153,8 +153,8 @@ def ppo(arguments):
     settings = {"data": "synthetic", "traffic": arguments.traffic, "action": "bicycle"}
     vector = SB3VecEnv(8, split="training", stop_on=("collision", "offroad"), **settings)
     model = PPO(
-        "MultiInputPolicy", vector, n_steps=128, batch_size=128, n_epochs=15, learning_rate=1e-3, gamma=0.97, seed=0,
-        policy_kwargs={"features_extractor_class": Near, "net_arch": [64, 64], "log_std_init": -2.0},
+        "MultiInputPolicy", vector, n_steps=128, batch_size=128, n_epochs=10, learning_rate=5e-4, gamma=0.97, seed=0,
+        policy_kwargs={"features_extractor_class": Near, "net_arch": [64, 64], "log_std_init": -1.5},
     )  # fmt: skip
     begin, cpu = time.monotonic(), time.process_time()
     model.learn(arguments.steps)
