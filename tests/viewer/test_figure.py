@@ -24,7 +24,7 @@ X = np.array([2.0, 4.0, 8.0])
 
 
 def test_curves_have_the_colors_of_the_page():
-    light = read_asset("page.css").split("@media")[0]
+    light = read_asset("palette.css").split("@media")[0]
     assert re.findall(r"--series-\d: (#\w+)", light) == list(COLORS[:4])
 
 

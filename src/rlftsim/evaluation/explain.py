@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from rlftsim.realism import (
@@ -70,10 +70,15 @@ class Explanation:
     cost: Float[np.ndarray, "F E T1"]
     """Part of ceiling minus score that belongs to a feature, evaluated agent and future step; the last column is the
     whole future. Negative where the rollouts do better than the log."""
-    event_fraction: Float[np.ndarray, "J E T"]
-    """Fraction of rollouts with a collision, off the road, passing a red light at a step: `BERNOULLI_FEATURES`."""
+    events: Bool[np.ndarray, "J N E T"]
+    """True = a collision, off the road, passing a red light (`BERNOULLI_FEATURES`) at a step where the log is valid."""
     histograms: tuple[FeatureHistogram, ...]
     rollouts: SceneMotion
+
+    @property
+    def event_fraction(self) -> Float[np.ndarray, "J E T"]:
+        """Fraction of rollouts with an event at a step."""
+        return self.events.mean(1)
 
     @property
     def lost(self) -> float:
@@ -117,7 +122,7 @@ def explain(scenario: Scenario, states: SimulatedStates, config: MetricConfig = 
         result=score_features(log, features, config),
         ceiling=score_features(log, oracle, config),
         cost=cost.unflatten(-1, (len(log.agents.evaluated), -1)).numpy(),
-        event_fraction=(events & log.agents.future_valid).double().mean(1).numpy(),
+        events=(events & log.agents.future_valid).numpy(),
         histograms=_histograms(log, features, config),
         rollouts=_trajectories(scenario, states).with_evaluated_flags(
             scenario, collision=features.collision, offroad=features.offroad

@@ -73,16 +73,30 @@ def read_goals(path: Path) -> GoalsFile:
     """
     try:
         text = path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise DataError(f"{path}: no such goals file: make one with `rlftsim goals propose`.") from None
+    except UnicodeDecodeError:
+        raise DataError(f"{path}: not a text file: goals are JSON, see docs/goals.md.") from None
+    return parse_goals(text, str(path))
+
+
+def parse_goals(text: str, path: str) -> GoalsFile:
+    """Check the text of a goals file.
+
+    Args:
+        text: its content.
+        path: name of the file, for messages.
+
+    Raises:
+        DataError: not JSON, or an entry is wrong: names file, entry and field.
+    """
+    try:
         # Python refuses to parse whole numbers of more than 4300 digits: floats report them as infinite instead.
         about = json.loads(
             text,
             object_pairs_hook=_Object,
             parse_int=lambda digits: int(digits) if len(digits) <= LONGEST_WHOLE else float(digits),
         )
-    except FileNotFoundError:
-        raise DataError(f"{path}: no such goals file: make one with `rlftsim goals propose`.") from None
-    except UnicodeDecodeError:
-        raise DataError(f"{path}: not a text file: goals are JSON, see docs/goals.md.") from None
     except json.JSONDecodeError as error:
         raise DataError(f"{path}: not JSON, line {error.lineno}, column {error.colno}: {error.msg}.") from None
     except RecursionError:

@@ -18,6 +18,7 @@ from rlftsim.threads import one_thread
 
 Choose = Callable[[DecisionDistribution, Any, Sampling, Tensor], Tensor]
 Force = Callable[[Any, int], AgentStates | None]
+Observe = Callable[[Float[Tensor, "B N A t 3"]], None]
 
 
 def sample_decision(
@@ -47,6 +48,7 @@ def simulate(
     sampling: Sampling = Sampling(),  # noqa: B008
     choose: Choose = sample_decision,
     force: Force | None = None,
+    observe: Observe | None = None,
 ) -> Rollouts:
     """Simulate N futures of every scenario, all in one batch; on a CPU with one thread.
 
@@ -61,6 +63,8 @@ def simulate(
         sampling: temperature and truncation.
         choose: picks decisions from a distribution, such as CAT-K's closest among the top K.
         force: called before every advance with the state and the step it starts at; may impose states on agents.
+        observe: called after every decision with the poses so far (x, y, heading, map frame); an error that it raises
+            ends the simulation.
 
     Returns:
         Poses, decisions and log-probabilities, under the distribution that was sampled from.
@@ -97,6 +101,8 @@ def simulate(
         decisions.append(decision)
         log_probs.append(distribution.log_prob(decision, sampling))
         forces.append(forced)
+        if observe is not None:
+            observe(torch.cat(poses, dim=3))
 
     # 3. one value. A decision counts unless the agent is padding or was forced through all of its steps
     path = torch.cat(poses, dim=3)  # [B, N, A, 80, 3]

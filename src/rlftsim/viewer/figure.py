@@ -18,7 +18,7 @@ from rlftsim.atomic_io import write_whole
 from rlftsim.errors import ConfigError
 
 COLORS = ("#1d63d8", "#e07b00", "#11754b", "#a21caf", "#79828f", "#24292f")
-"""Colors of curves; the first four are those of `page.css`, in the same order."""
+"""Colors of curves; the first four are those of `palette.css`, in the same order."""
 INK, PALE = "#24292f", "#c9cfd6"
 BETTER, WORSE, NEITHER, OWN = "#bfe3cf", "#f3c4bf", "#eef0ec", "#d7dbe0"
 DOTS_PER_INCH = 160

@@ -96,8 +96,8 @@ def page_html(title: str, body: str, *, extra_css: str = "", extra_js: str = "")
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{escape(title)}</title><style>\n{read_asset('page.css')}{extra_css}</style></head>\n"
-        f"<body><main>\n{body}\n</main>\n<script>\n{read_asset('player.js')}{extra_js}</script></body></html>\n"
+        f"<title>{escape(title)}</title><style>\n{read_asset('palette.css')}{read_asset('page.css')}{extra_css}</style>"
+        f"</head>\n<body><main>\n{body}\n</main>\n<script>\n{_player_script()}{extra_js}</script></body></html>\n"
     )
 
 
@@ -128,6 +128,12 @@ def embed_json(payload: Any) -> str:
 def read_asset(name: str) -> str:
     """A text file of this package."""
     return (resources.files("rlftsim.viewer") / name).read_text(encoding="utf-8")
+
+
+def _player_script() -> str:
+    """The player and the drawing module before it, in one function: a page that stands alone cannot import."""
+    drawing = read_asset("drawing.js").partition("\nexport {")[0]
+    return f'(() => {{\n"use strict";\n{drawing}\n{read_asset("player.js")}}})();\n'
 
 
 def _controls_html() -> str:
