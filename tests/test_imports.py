@@ -22,6 +22,7 @@ FLOORS = (
     ("recipes",),
     ("evaluation",),
     ("submission", "experiments", "envs"),
+    ("studio",),
     ("_api",),
     ("cli",),
 )

@@ -29,6 +29,7 @@ VERBS = {
     "goals": ("rlftsim.cli.goals", "GoalsVerb"),
     "simulate": ("rlftsim.cli.simulate", "Simulate"),
     "drive": ("rlftsim.cli.drive", "Drive"),
+    "studio": ("rlftsim.cli.studio", "StudioVerb"),
     "score": ("rlftsim.cli.results", "Score"),
     "evaluate": ("rlftsim.cli.results", "Evaluate"),
     "compare": ("rlftsim.cli.results", "Compare"),
@@ -57,6 +58,7 @@ usage: rlftsim VERB ...      rlftsim VERB --help explains a verb
   goals        propose goals for agents and write a goals file, or check one
   simulate     roll out scenarios with a model
   drive        let a planner drive among simulated traffic, and score both
+  studio       ask agents for things in the browser, and look at what happens
 
   score        score rollouts of any simulator with the official realism meta-metric
   evaluate     evaluate a model with the official realism meta-metric
@@ -65,7 +67,7 @@ usage: rlftsim VERB ...      rlftsim VERB --help explains a verb
   experiment   repeat an experiment of the paper: a table, verdicts and a figure
 """
 
-STARTS_ANEW = ("doctor", "data", "recipe", "tokens", "model", "goals", "drive", "compare")
+STARTS_ANEW = ("doctor", "data", "recipe", "tokens", "model", "goals", "drive", "studio", "compare")
 """Verbs that keep nothing of an interrupted run."""
 INTERRUPTED = 130
 USER_MISTAKE = 2

@@ -1,0 +1,153 @@
+"""The gate before every route: host, token, origin, content type and size of a request.
+
+Whoever makes the user's browser speak to the port could run models and write files. So a request needs the name of
+this machine as its host (a foreign name that resolves to 127.0.0.1 is "DNS rebinding"), the token of this start, and
+where it changes something, the studio's own origin.
+"""
+
+import json
+import secrets
+from dataclasses import dataclass, field
+from http.cookies import CookieError, SimpleCookie
+from urllib.parse import parse_qs, urlsplit
+
+from starlette.datastructures import Headers
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+MAX_BODY_BYTES = 1 << 20
+SAFE_METHODS = ("GET", "HEAD")
+LOCAL_NAMES = ("127.0.0.1", "localhost", "[::1]")
+
+
+@dataclass(frozen=True)
+class Access:
+    """Names and secrets of one start of the studio."""
+
+    port: int
+    token: str = field(default_factory=lambda: secrets.token_urlsafe(32), repr=False)
+    """256 random bits."""
+    trusted_hosts: tuple[str, ...] = ()
+    """Further values of the Host header, such as a proxy's "hub.example:443"."""
+    frame_ancestors: tuple[str, ...] = ()
+    """Origins of notebooks that may show the page in a frame."""
+
+    @property
+    def hosts(self) -> frozenset[str]:
+        """Host headers that are answered."""
+        return frozenset([*(f"{name}:{self.port}" for name in LOCAL_NAMES), *self.trusted_hosts])
+
+    @property
+    def cookie(self) -> str:
+        """Name of the cookie: cookies are shared by the ports of a host."""
+        return f"rlftsim-studio-{self.port}"
+
+    def is_token(self, offered: str) -> bool:
+        """True for the token of this start; compared in constant time."""
+        return secrets.compare_digest(offered.encode(), self.token.encode())
+
+    @property
+    def headers(self) -> list[tuple[bytes, bytes]]:
+        """Headers of every answer."""
+        frames = " ".join(("'self'", *self.frame_ancestors)) if self.frame_ancestors else "'none'"
+        policy = (
+            "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; connect-src 'self'; "
+            f"base-uri 'none'; form-action 'none'; frame-ancestors {frames}"
+        )
+        return [
+            (b"content-security-policy", policy.encode()),
+            (b"x-content-type-options", b"nosniff"),
+            (b"cross-origin-resource-policy", b"same-origin"),
+            (b"referrer-policy", b"no-referrer"),
+        ]
+
+
+class Guard:
+    """ASGI middleware that lets a request through or answers it with 401, 403, 413 or 415.
+
+    Args:
+        app: everything behind the gate.
+        access: hosts and token.
+    """
+
+    def __init__(self, app: ASGIApp, access: Access) -> None:
+        self.app = app
+        self.access = access
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Check a request, then hand it on."""
+        if scope["type"] == "lifespan":
+            return await self.app(scope, receive, send)
+        if scope["type"] != "http":  # no route is a WebSocket
+            return await send({"type": "websocket.close", "code": 1008})
+        headers = Headers(scope=scope)
+        refused = self._refusal(scope, headers)
+        if refused is not None:
+            return await self._answer(send, *refused)
+        offered = parse_qs(scope["query_string"].decode("latin-1")).get("token", [])
+        if scope["path"] == "/" and offered:
+            # The address bar, the history and logs of proxies must not keep the token.
+            cookie = f"{self.access.cookie}={self.access.token}; HttpOnly; SameSite=Strict; Path=/"
+            return await self._answer(send, 303, "", {"location": "./", "set-cookie": cookie})
+        body = b""
+        while scope["method"] not in SAFE_METHODS:
+            message = await receive()
+            body += message.get("body", b"")
+            if len(body) > MAX_BODY_BYTES:
+                return await self._answer(send, 413, f"the request is larger than {MAX_BODY_BYTES} bytes: send less.")
+            if not message.get("more_body"):
+                break
+        await self.app(scope, _replay(body, receive), self._with_headers(send))
+
+    def _refusal(self, scope: Scope, headers: Headers) -> tuple[int, str] | None:
+        """Status and sentence for a request that is not let through."""
+        hosts, is_change = headers.getlist("host"), scope["method"] not in SAFE_METHODS
+        if len(hosts) != 1 or hosts[0].lower() not in self.access.hosts:
+            return 403, "this host name is not the studio's: open the address that `rlftsim studio` printed."
+        bearer = headers.get("authorization", "").partition("Bearer ")[2]
+        in_url = parse_qs(scope["query_string"].decode("latin-1")).get("token", []) if scope["path"] == "/" else []
+        if not any(self.access.is_token(word) for word in (bearer, *self._cookies(headers), *in_url)):
+            return 401, "no token, or that of an earlier start: open the address that `rlftsim studio` printed."
+        if is_change:
+            origin = headers.get("origin")
+            if (origin is None and not bearer) or (origin is not None and urlsplit(origin).netloc != hosts[0]):
+                return 403, "the request comes from another page: only the studio's own page may change something."
+            if headers.get("content-type", "").partition(";")[0].strip().lower() != "application/json":
+                return 415, "the body must be application/json."
+        return None
+
+    def _cookies(self, headers: Headers) -> list[str]:
+        found = []
+        for line in headers.getlist("cookie"):
+            try:
+                morsel = SimpleCookie(line).get(self.access.cookie)
+            except CookieError:
+                continue
+            found += [morsel.value] if morsel else []
+        return found
+
+    async def _answer(self, send: Send, status: int, sentence: str, more: dict[str, str] | None = None) -> None:
+        body = json.dumps({"error": sentence, "hint": ""}).encode() if sentence else b""
+        headers = {"content-type": "application/json", "content-length": str(len(body)), "cache-control": "no-store"}
+        pairs = [(name.encode(), value.encode()) for name, value in (headers | (more or {})).items()]
+        await send({"type": "http.response.start", "status": status, "headers": [*pairs, *self.access.headers]})
+        await send({"type": "http.response.body", "body": body})
+
+    def _with_headers(self, send: Send) -> Send:
+        async def send_on(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                present = [name for name, _ in message["headers"]]
+                fresh = [] if b"cache-control" in present else [(b"cache-control", b"no-store")]
+                message["headers"] = [*message["headers"], *self.access.headers, *fresh]
+            await send(message)
+
+        return send_on
+
+
+def _replay(body: bytes, receive: Receive) -> Receive:
+    """The body that has been read already, then whatever comes, such as the end of the connection."""
+    left = [{"type": "http.request", "body": body, "more_body": False}]
+
+    async def receive_again() -> Message:
+        return left.pop() if left else await receive()
+
+    return receive_again

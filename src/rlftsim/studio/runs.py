@@ -1,0 +1,417 @@
+"""Runs: rollouts of one scenario by some models, simulated in small chunks by one thread.
+
+A run has variants: every model with the goals, and the goal-conditioned ones also without, on the same seeds, for
+the change of realism. The first four rollouts of each variant come first. A rollout depends on the seed, the scenario
+and its number alone, so chunks are bit for bit the rows of one large simulation, and pressing simulate twice or
+changing a goal computes only what is new.
+"""
+
+import hashlib
+import json
+import threading
+from collections import OrderedDict
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from rlftsim.errors import RlftsimError
+from rlftsim.goals.goals_file import GoalEntry
+from rlftsim.goals.placement import goals_of_batch
+from rlftsim.policies.registry import with_guidance
+from rlftsim.progress import log
+from rlftsim.rollout.policy import Sampling, device_of
+from rlftsim.rollout.simulate import simulate
+from rlftsim.rollout.types import Rollouts
+from rlftsim.scenario.batch import ScenarioBatch, collate
+from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS
+from rlftsim.studio.bodies import RunBody
+from rlftsim.studio.encoding import encode_poses
+from rlftsim.studio.refusal import Refusal
+from rlftsim.studio.scoring import Scored, score_variant
+from rlftsim.studio.session import Session
+
+CHUNKS = (4, 4, 8, 16)
+LARGEST_CHUNK = 32
+KEPT_BYTES = 512 << 20
+KEPT_RUNS = 64
+
+
+class Cancelled(Exception):
+    """The run was replaced or stopped."""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One model, with or without goals, under the settings of a run."""
+
+    model: str
+    fingerprint: str
+    split: str
+    scenario: str
+    seed: int
+    temperature: float
+    top_k: int | None
+    guidance: float = 1.0
+    goals: tuple[GoalEntry, ...] = ()
+
+
+@dataclass(eq=False)
+class Simulated:
+    """Rollouts of a variant so far; grows by chunks, which runs of different sizes share."""
+
+    parts: dict[range, Rollouts] = field(default_factory=dict)
+    """By numbers of the rollouts."""
+    encoded: dict[range, bytes] = field(default_factory=dict)
+    scored: dict[tuple[int, str], Scored] = field(default_factory=dict)
+    """By number of rollouts and metric."""
+
+    @property
+    def num_bytes(self) -> int:
+        """Memory of tensors and chunks, about."""
+        tensors = (
+            p.position.nbytes + p.heading.nbytes + p.decision.nbytes + p.log_prob.nbytes for p in self.parts.values()
+        )
+        return sum(tensors) + sum(map(len, self.encoded.values()))
+
+
+@dataclass(eq=False)
+class Run:
+    """One press of simulate."""
+
+    name: str
+    body: RunBody
+    variants: tuple[Variant, ...]
+    simulated: tuple[Simulated, ...]
+    chunks: list[tuple[int, range]]
+    """Variant and rollouts of each chunk, in the order of simulation."""
+    events: list[tuple[str, dict[str, Any]]] = field(default_factory=list)
+    growing: dict[int, bytes] = field(default_factory=dict)
+    """Chunks that are being simulated, with the steps so far."""
+    is_over: bool = False
+    stop: threading.Event = field(default_factory=threading.Event)
+
+    def tell(self, event: str, **data: Any) -> None:
+        """Append an event for the page."""
+        self.events.append((event, data))
+
+    def chunk(self, k: int) -> bytes:
+        """Poses of a chunk, also of one that is being simulated.
+
+        Raises:
+            Refusal: there is none yet (404).
+        """
+        if not 0 <= k < len(self.chunks):
+            raise Refusal(f"run {self.name} has no chunk {k}.", status=404)
+        variant, ids = self.chunks[k]
+        found = self.simulated[variant].encoded.get(ids, self.growing.get(k))
+        if found is None:
+            raise Refusal(f"chunk {k} of run {self.name} is not simulated yet.", status=404)
+        return found
+
+    def rollouts(self, variant: int) -> Rollouts:
+        """All rollouts of a variant.
+
+        Raises:
+            Refusal: no such variant, or it is not complete (409).
+        """
+        if not 0 <= variant < len(self.variants):
+            raise Refusal(f"run {self.name} has no variant {variant}.", status=404)
+        parts, wanted = self.simulated[variant].parts, chunks_of(self.body.num_rollouts)
+        if any(ids not in parts for ids in wanted):
+            raise Refusal("these rollouts are not complete yet: wait until the run is done.", status=409)
+        return join([parts[ids] for ids in wanted])
+
+
+def chunks_of(num_rollouts: int) -> list[range]:
+    """Rollouts that are simulated at once: 4, 4, 8, 16, then 32 each."""
+    found: list[range] = []
+    while (first := found[-1].stop if found else 0) < num_rollouts:
+        size = CHUNKS[len(found)] if len(found) < len(CHUNKS) else LARGEST_CHUNK
+        found.append(range(first, min(first + size, num_rollouts)))
+    return found
+
+
+def join(parts: list[Rollouts]) -> Rollouts:
+    """Chunks of one variant as one value on the CPU; goals and draws are left out."""
+    return Rollouts(
+        position=torch.cat([part.position for part in parts], 1).cpu(),
+        heading=torch.cat([part.heading for part in parts], 1).cpu(),
+        decision=torch.cat([part.decision for part in parts], 1).cpu(),
+        decision_mask=torch.cat([part.decision_mask for part in parts], 1).cpu(),
+        log_prob=torch.cat([part.log_prob for part in parts], 1).cpu(),
+    )
+
+
+class Worker:
+    """One thread that simulates; a new run takes the place of the waiting one and cancels the running one.
+
+    Args:
+        session: data and models.
+    """
+
+    def __init__(self, session: Session) -> None:
+        self.session = session
+        self.runs: OrderedDict[str, Run] = OrderedDict()
+        self._known: OrderedDict[Variant, Simulated] = OrderedDict()
+        self._wake = threading.Condition()
+        self._waiting: Run | None = None
+        self._running: Run | None = None
+        self._is_closed = False
+        self._thread = threading.Thread(target=self._work, name="studio worker", daemon=True)
+        self._thread.start()
+
+    @property
+    def is_closed(self) -> bool:
+        """True once the studio ends."""
+        return self._is_closed
+
+    def close(self) -> None:
+        """Stop the running run at its next decision, and the thread."""
+        with self._wake:
+            self._is_closed = True
+            for run in (self._running, self._waiting):
+                if run is not None:
+                    run.stop.set()
+            self._wake.notify()
+        self._thread.join(timeout=1.5)
+
+    def submit(self, body: RunBody) -> Run:
+        """Queue a run; one with the same inputs that is complete or under way is returned as it is.
+
+        Raises:
+            Refusal: an unknown scenario or model, or goals that none of the models takes.
+            DataError: an impossible goal, or two for one agent.
+        """
+        variants = tuple(variants_of(self.session, body))
+        name = hashlib.blake2b(repr((variants, body)).encode(), digest_size=8).hexdigest()
+        with self._wake:
+            known = self.runs.get(name)
+            if known is not None and not known.stop.is_set() and not any(e == "failed" for e, _ in known.events):
+                self.runs.move_to_end(name)
+                return known
+            run = self._new_run(name, body, variants)
+            self.runs[name] = run
+            for other in (self._running, self._waiting):
+                if other is not None:
+                    other.stop.set()
+            if self._waiting is not None:
+                self._end(self._waiting, "failed", message="replaced by a newer run.", cancelled=True)
+            self._waiting = run
+            while len(self.runs) > KEPT_RUNS:
+                self.runs.popitem(last=False)
+            self._wake.notify()
+        return run
+
+    def run(self, name: str) -> Run:
+        """A run by its name.
+
+        Raises:
+            Refusal: it is not in memory any more (404).
+        """
+        if name not in self.runs:
+            raise Refusal(
+                f"no run {name!r}: it belongs to an earlier start, or was dropped.", status=404, hint="Simulate again."
+            )
+        return self.runs[name]
+
+    def cancel(self, name: str) -> None:
+        """Stop a run at its next decision."""
+        run = self.run(name)
+        with self._wake:
+            run.stop.set()
+            if run is self._waiting:
+                self._waiting = None
+                self._end(run, "failed", message="cancelled.", cancelled=True)
+
+    def drop(self, name: str) -> None:
+        """Cancel a run and forget it."""
+        self.cancel(name)
+        self.runs.pop(name, None)
+
+    def _new_run(self, name: str, body: RunBody, variants: tuple[Variant, ...]) -> Run:
+        simulated = []
+        for variant in variants:
+            simulated.append(self._known.setdefault(variant, Simulated()))
+            self._known.move_to_end(variant)
+        # The first chunk of every variant, then the rest; goal-free rollouts only matter for the score, so they end.
+        chunks = [(v, ids) for ids in chunks_of(body.num_rollouts) for v in range(len(variants))]
+        chunks.sort(key=lambda chunk: free_variant(variants, chunk[0]) == chunk[0] and _has_goals(variants, chunk[0]))
+        return Run(name, body, variants, tuple(simulated), chunks)
+
+    def _work(self) -> None:
+        while True:
+            with self._wake:
+                self._wake.wait_for(lambda: self._waiting is not None or self._is_closed)
+                if self._is_closed:
+                    return
+                run, self._waiting = self._waiting, None
+                assert run is not None
+                self._running = run
+            try:
+                self._simulate(run)
+                self._end(run, "done")
+            except Cancelled:
+                self._end(run, "failed", message="cancelled.", cancelled=True)
+            except RlftsimError as error:
+                self._end(run, "failed", message=str(error))
+            except Exception as error:  # the page must hear of it; the log has the traceback
+                log.exception("the run failed")
+                self._end(run, "failed", message=f"{type(error).__name__}: {error}; the terminal shows more.")
+            with self._wake:
+                self._running = None
+                self._forget_oldest()
+
+    @staticmethod
+    def _end(run: Run, event: str, **data: Any) -> None:
+        run.stop.set() if event == "failed" else None
+        run.tell(event, **data)
+        run.is_over = True
+
+    def _forget_oldest(self) -> None:
+        while sum(s.num_bytes for s in self._known.values()) > KEPT_BYTES and len(self._known) > 1:
+            _, dropped = self._known.popitem(last=False)
+            for name in [name for name, run in self.runs.items() if dropped in run.simulated]:
+                del self.runs[name]
+
+    def _simulate(self, run: Run) -> None:
+        """Simulate what is missing, chunk by chunk, and score each variant when it is complete."""
+        scenario = self.session.scenario(run.body.split, run.body.scenario)
+        for k, (v, ids) in enumerate(run.chunks):
+            simulated = run.simulated[v]
+            if ids not in simulated.encoded:
+                batch = collate([scenario]).to(device_of(self.session.model(run.variants[v].model).policy))
+                rollouts = self._rollouts(run, k, batch)
+                poses = torch.cat([rollouts.position, rollouts.heading[..., None]], -1)
+                simulated.parts[ids] = rollouts
+                simulated.encoded[ids] = _encoded(poses, batch)
+                run.growing.pop(k, None)
+            run.tell("chunk", k=k, variant=v, first=ids.start, count=len(ids), steps=FUTURE_STEPS)
+            if ids.stop == run.body.num_rollouts:
+                self._score(run, v)
+
+    def _rollouts(self, run: Run, k: int, batch: ScenarioBatch) -> Rollouts:
+        v, ids = run.chunks[k]
+        variant, model = run.variants[v], self.session.model(run.variants[v].model)
+        policy = with_guidance(model.policy, variant.guidance)
+        num_decisions = FUTURE_STEPS // policy.steps_per_decision
+
+        def observe(poses: Float[Tensor, "B N A t 3"]) -> None:
+            if run.stop.is_set():
+                raise Cancelled
+            done = poses.shape[3] // policy.steps_per_decision
+            # The first chunk of each variant is shown growing; for later ones the page has something to show.
+            if ids.start == 0:
+                run.growing[k] = _encoded(poses, batch)
+            run.tell(
+                "progress", k=k, variant=v, decision=done, of=num_decisions, first=ids.start,
+                count=len(ids), steps=poses.shape[3],
+            )  # fmt: skip
+
+        key = (model.name, variant.guidance, variant.split, variant.scenario)
+        context = self.session.contexts.get(key, lambda: _encode(policy, batch))
+        if run.stop.is_set():
+            raise Cancelled
+        return simulate(
+            policy,
+            batch,
+            num_rollouts=ids,
+            seed=variant.seed,
+            context=context,
+            goals=goals_of_batch(variant.goals, batch) if variant.goals else None,
+            sampling=Sampling(variant.temperature, variant.top_k),
+            observe=observe,
+        )
+
+    def _score(self, run: Run, v: int) -> None:
+        simulated, body = run.simulated[v], run.body
+        scenario = self.session.scenario(body.split, body.scenario)
+        key = (body.num_rollouts, body.metric)
+        if key not in simulated.scored:
+            simulated.scored[key] = score_variant(scenario, run.rollouts(v), run.variants[v].goals, body.metric)
+        # The change of realism is known once the model's rollouts without goals are there, too; they come last.
+        free = free_variant(run.variants, v)
+        again = [i for i in range(len(run.variants)) if free == v and i != v and free_variant(run.variants, i) == v]
+        for one in (v, *again):
+            base = run.simulated[free].scored.get(key) if one != free else None
+            run.tell("score", variant=one, **run.simulated[one].scored[key].to_payload(base))
+
+
+def free_variant(variants: tuple[Variant, ...], index: int) -> int:
+    """Index of the variant of the same model without goals; the variant's own where it has none.
+
+    Args:
+        variants: of a run.
+        index: of one of them.
+    """
+    return next(i for i, other in enumerate(variants) if other.model == variants[index].model and not other.goals)
+
+
+def _has_goals(variants: tuple[Variant, ...], index: int) -> bool:
+    """True if the variant's model is also simulated with goals."""
+    return any(other.goals and other.model == variants[index].model for other in variants)
+
+
+@torch.no_grad()
+def _encode(policy: Any, batch: ScenarioBatch) -> Any:
+    return policy.encode(batch)
+
+
+def _encoded(poses: Float[Tensor, "B N A t 3"], batch: ScenarioBatch) -> bytes:
+    """Bytes of the only scenario's poses."""
+    now = torch.cat([batch.position[0, :, CURRENT_STEP], batch.heading[0, :, CURRENT_STEP, None]], -1)
+    kept = batch.agent_mask[0]
+    return encode_poses(poses[0][:, kept].float().cpu().numpy(), now[kept].float().cpu().numpy())
+
+
+def variants_of(session: Session, body: RunBody) -> Iterator[Variant]:
+    """Variants of a run: models with goals where they take any, and goal-conditioned ones also without.
+
+    Args:
+        session: data and models.
+        body: the request.
+
+    Raises:
+        Refusal: an unknown scenario or model, or goals or guidance that would have no effect.
+        DataError: an impossible goal, or two goals of one agent.
+    """
+    scenario = session.scenario(body.split, body.scenario)
+    models = [session.model(name) for name in dict.fromkeys(body.models)]
+    goals = entries_of(body)
+    goals_of_batch(goals, collate([scenario]))  # refuses impossible ones
+    if goals and not any(model.takes_goals for model in models):
+        raise Refusal(
+            f"{', '.join(m.name for m in models)} is not goal-conditioned, {len(goals)} goals would have no effect.",
+            hint="Take a model that was fine-tuned with goals (docs/goals.md), or remove the goals.",
+        )
+    settings = (body.split, body.scenario, body.seed, body.temperature, body.top_k)
+    for model in models:
+        if goals and model.takes_goals:
+            guidance = body.guidance if model.can_guide else 1.0
+            yield Variant(model.name, model.fingerprint, *settings, guidance=guidance, goals=goals)
+        yield Variant(model.name, model.fingerprint, *settings)
+
+
+def entries_of(body: Any) -> tuple[GoalEntry, ...]:
+    """Goals of a request as entries of a goals file.
+
+    Args:
+        body: with a scenario and goals.
+
+    Raises:
+        Refusal: an agent has two goals.
+    """
+    entries = tuple(GoalEntry(body.scenario, g.agent, round(g.x, 3), round(g.y, 3), g.label) for g in body.goals)
+    agents = [entry.agent_id for entry in entries]
+    twice = next((agent for agent in agents if agents.count(agent) > 1), None)
+    if twice is not None:
+        raise Refusal(f"agent {twice} has two goals: keep one of them.")
+    return entries
+
+
+def as_json(event: tuple[str, dict[str, Any]]) -> str:
+    """Data of an event as one line."""
+    return json.dumps(event[1], separators=(",", ":"), allow_nan=False)

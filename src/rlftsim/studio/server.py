@@ -1,0 +1,246 @@
+"""Routes of the studio. Everything goes through `guard.Guard` first."""
+
+import asyncio
+import hashlib
+from collections.abc import AsyncIterator
+from functools import cache
+from importlib import resources
+from typing import Annotated, Any
+
+from fastapi import FastAPI, Query, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse, Response, StreamingResponse
+from starlette.exceptions import HTTPException
+from starlette.types import ASGIApp
+
+from rlftsim.errors import RlftsimError
+from rlftsim.goals.goals_file import GoalEntry, parse_goals
+from rlftsim.studio.bodies import CheckBody, EmptyBody, ExportBody, OpenGoalsBody, RunBody, SaveGoalsBody
+from rlftsim.studio.exports import export, save_goals
+from rlftsim.studio.guard import Access, Guard
+from rlftsim.studio.refusal import Refusal
+from rlftsim.studio.runs import Run, Worker, as_json, entries_of
+from rlftsim.studio.session import Session
+
+POLL_S = 0.05
+IDLE_S = 60.0
+MAX_STREAMS = 8
+ENDS = ("done", "failed")
+MEDIA_TYPES = {"js": "text/javascript", "css": "text/css", "svg": "image/svg+xml"}
+SHARED = ("drawing.js", "palette.css")
+"""Files of `viewer` that the page loads, too."""
+
+
+@cache
+def static_files() -> dict[str, bytes]:
+    """Files of the page by name."""
+    own = resources.files("rlftsim.studio") / "static"
+    found = {one.name: one.read_bytes() for one in own.iterdir() if one.is_file()}
+    return found | {name: (resources.files("rlftsim.viewer") / name).read_bytes() for name in SHARED}
+
+
+@cache
+def static_hash() -> str:
+    """Hash of the page's files: part of their addresses, so that a browser may keep them for ever."""
+    digest = hashlib.sha256()
+    for name, content in sorted(static_files().items()):
+        digest.update(name.encode() + content)
+    return digest.hexdigest()[:16]
+
+
+def create_app(session: Session, worker: Worker, access: Access) -> ASGIApp:
+    """The server as an ASGI application.
+
+    Args:
+        session: data and models.
+        worker: simulates.
+        access: hosts and token.
+    """
+    app = FastAPI(title="rlftsim studio", docs_url=None, redoc_url=None, openapi_url=None)
+    app.add_exception_handler(RlftsimError, _answer_error)
+    app.add_exception_handler(RequestValidationError, _answer_invalid)
+    app.add_exception_handler(HTTPException, _answer_http)
+    _add_page(app)
+    _add_scenarios(app, session)
+    _add_runs(app, worker)
+    _add_files(app, session, worker)
+    return Guard(app, access)
+
+
+def _add_page(app: FastAPI) -> None:
+    @app.get("/")
+    def page() -> Response:
+        """The page."""
+        text = static_files()["index.html"].replace(b"STATIC", f"static/{static_hash()}".encode())
+        return Response(text, media_type="text/html; charset=utf-8")
+
+    @app.get("/static/{version}/{name}")
+    def static(version: str, name: str) -> Response:
+        """A module or style sheet; names are looked up, so none can lead out of the folder."""
+        ending = name.rpartition(".")[2]
+        if version != static_hash() or name not in static_files() or ending not in MEDIA_TYPES:
+            raise Refusal(f"no file {name!r} on this page.", status=404, hint="Reload the page.")
+        keep = {"cache-control": "private, max-age=31536000, immutable"}
+        return Response(static_files()[name], media_type=f"{MEDIA_TYPES[ending]}; charset=utf-8", headers=keep)
+
+
+def _add_scenarios(app: FastAPI, session: Session) -> None:
+    @app.get("/api/session")
+    def describe() -> dict[str, Any]:
+        """Versions, models and data."""
+        return session.describe()
+
+    @app.get("/api/alive")
+    def alive() -> dict[str, Any]:
+        """Sign of life."""
+        return {"alive": True}
+
+    @app.get("/api/scenarios")
+    def rows(
+        split: str, query: Annotated[str, Query(max_length=400)] = "", offset: Annotated[int, Query(ge=0)] = 0
+    ) -> dict[str, Any]:
+        """A page of the index."""
+        return session.rows(split, query, offset)
+
+    @app.get("/api/scenario/{split}/{scenario_id}")
+    def scene(split: str, scenario_id: str) -> Response:
+        """Scene and log."""
+        return Response(session.scene(split, scenario_id), media_type="application/json")
+
+    @app.get("/api/proposals/{split}/{scenario_id}/{agent}")
+    def proposals(split: str, scenario_id: str, agent: int) -> dict[str, Any]:
+        """Maneuvers of an agent."""
+        return session.proposals(split, scenario_id, agent)
+
+    @app.post("/api/goals/check")
+    def check(body: CheckBody) -> dict[str, Any]:
+        """Refusals and doubts of goals."""
+        return {"goals": session.doubts(session.scenario(body.split, body.scenario), entries_of(body))}
+
+    @app.post("/api/goals/open")
+    def open_goals(body: OpenGoalsBody) -> dict[str, Any]:
+        """Entries of a goals file."""
+        file = parse_goals(body.text, body.name)
+        return {"goals": _plain(file.goals), "alternatives": _plain(file.alternatives)}
+
+
+def _add_runs(app: FastAPI, worker: Worker) -> None:
+    streams = 0
+
+    @app.post("/api/runs")
+    def submit(body: RunBody) -> dict[str, Any]:
+        """Queue a run."""
+        return _described(worker.submit(body))
+
+    @app.get("/api/runs/{name}")
+    def state(name: str, after: Annotated[int, Query(ge=-1)] = -1) -> dict[str, Any]:
+        """Events of a run after a number, for pages behind a proxy that holds streams back."""
+        run = worker.run(name)
+        events = [{"id": i, "event": e, "data": d} for i, (e, d) in enumerate(run.events) if i > after]
+        return {**_described(run), "events": events}
+
+    @app.get("/api/runs/{name}/events")
+    async def events(name: str, request: Request) -> Response:
+        """Events of a run as they come."""
+        nonlocal streams
+        run = worker.run(name)
+        last = request.headers.get("last-event-id", "")
+        first = int(last) + 1 if last.isdecimal() else 0
+        if streams >= MAX_STREAMS:
+            raise Refusal(f"{MAX_STREAMS} pages listen already: close one.", status=429)
+
+        async def stream() -> AsyncIterator[str]:
+            nonlocal streams
+            streams += 1
+            try:
+                async for text in _stream(run, first, worker):
+                    yield text
+            finally:
+                streams -= 1
+
+        # A proxy of nginx's kind would hold the events back.
+        return StreamingResponse(stream(), media_type="text/event-stream", headers={"x-accel-buffering": "no"})
+
+    @app.get("/api/runs/{name}/chunk/{k}")
+    def chunk(name: str, k: int) -> Response:
+        """Poses of a chunk."""
+        return Response(worker.run(name).chunk(k), media_type="application/octet-stream")
+
+    @app.get("/api/runs/{name}/score")
+    def score(name: str) -> dict[str, Any]:
+        """Scores of the variants that are complete."""
+        found = {data["variant"]: data for event, data in list(worker.run(name).events) if event == "score"}
+        return {"variants": [found[v] for v in sorted(found)]}
+
+    @app.get("/api/runs/{name}/explain")
+    def explain(name: str, variant: Annotated[int, Query(ge=0)] = 0) -> dict[str, Any]:
+        """Losses of a variant by feature, agent and step."""
+        run = worker.run(name)
+        run.rollouts(variant)
+        scored = run.simulated[variant].scored.get((run.body.num_rollouts, run.body.metric))
+        if scored is None:
+            raise Refusal("these rollouts are not scored yet: wait until the run is done.", status=409)
+        return scored.explained()
+
+    @app.post("/api/runs/{name}/cancel")
+    def cancel(name: str, body: EmptyBody) -> dict[str, Any]:
+        """Stop a run at its next decision."""
+        worker.cancel(name)
+        return {"run": name}
+
+    @app.delete("/api/runs/{name}")
+    def drop(name: str) -> dict[str, Any]:
+        """Stop a run and forget it."""
+        worker.drop(name)
+        return {"run": name}
+
+
+def _add_files(app: FastAPI, session: Session, worker: Worker) -> None:
+    @app.post("/api/goals/save")
+    def save(body: SaveGoalsBody) -> dict[str, Any]:
+        """Write a goals file."""
+        return {"path": str(save_goals(session, body))}
+
+    @app.post("/api/export")
+    def write(body: ExportBody) -> dict[str, Any]:
+        """Write rollouts of a run."""
+        return {"path": str(export(session, worker.run(body.run), body))}
+
+
+async def _stream(run: Run, first: int, worker: Worker) -> AsyncIterator[str]:
+    """Events of a run from number `first` on; ends with the run, with the studio, or after a minute without any."""
+    sent, idle_s = first, 0.0
+    while idle_s < IDLE_S and not worker.is_closed:
+        events = run.events[sent:]
+        for number, event in enumerate(events, sent):
+            yield f"id: {number}\nevent: {event[0]}\ndata: {as_json(event)}\n\n"
+            if event[0] in ENDS:
+                return
+        sent, idle_s = sent + len(events), 0.0 if events else idle_s + POLL_S
+        await asyncio.sleep(POLL_S)
+
+
+def _described(run: Run) -> dict[str, Any]:
+    variants = [{"model": v.model, "goals": len(v.goals), "guidance": v.guidance} for v in run.variants]
+    return {"run": run.name, "variants": variants, "num_rollouts": run.body.num_rollouts, "is_over": run.is_over}
+
+
+def _plain(entries: tuple[GoalEntry, ...]) -> list[dict[str, Any]]:
+    return [{"scenario": e.scenario_id, "agent": e.agent_id, "x": e.x, "y": e.y, "label": e.label} for e in entries]
+
+
+async def _answer_error(_: Request, error: Exception) -> Response:
+    status, hint = (error.status, error.hint) if isinstance(error, Refusal) else (422, "")
+    return JSONResponse({"error": str(error), "hint": hint}, status)
+
+
+async def _answer_invalid(_: Request, error: Exception) -> Response:
+    assert isinstance(error, RequestValidationError)
+    first = error.errors()[0]
+    place = ".".join(str(part) for part in first["loc"] if part not in ("body", "query"))
+    return JSONResponse({"error": f"{place or 'body'}: {first['msg']}", "hint": ""}, 422)
+
+
+async def _answer_http(_: Request, error: Exception) -> Response:
+    assert isinstance(error, HTTPException)
+    return JSONResponse({"error": str(error.detail), "hint": ""}, error.status_code)

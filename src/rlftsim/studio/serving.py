@@ -1,0 +1,130 @@
+"""The studio as a running server: a free port, a printed address, an end within two seconds."""
+
+import json
+import socket
+import sys
+import threading
+import time
+import webbrowser
+from pathlib import Path
+from types import TracebackType
+
+import uvicorn
+
+from rlftsim.errors import ConfigError
+from rlftsim.studio.guard import LOCAL_NAMES, Access
+from rlftsim.studio.runs import Worker
+from rlftsim.studio.server import create_app
+from rlftsim.studio.session import Session
+
+LOOPBACK = "127.0.0.1"
+ALL_INTERFACES = ("0.0.0.0", "::")
+
+
+class Studio:
+    """A server on this machine, from `start` or `run` until `stop`.
+
+    Args:
+        session: data and models.
+        host: address to listen on.
+        port: 0 = a free one.
+        trusted_hosts: further values of the Host header.
+        frame_ancestors: origins that may show the page in a frame.
+
+    Raises:
+        ConfigError: the port cannot be had.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        *,
+        host: str = LOOPBACK,
+        port: int = 0,
+        trusted_hosts: tuple[str, ...] = (),
+        frame_ancestors: tuple[str, ...] = (),
+    ) -> None:
+        self._socket = _bind(host, port)
+        self.port = int(self._socket.getsockname()[1])
+        # Another interface is reached under the name that was given for it.
+        own = () if f"{host}" in (*LOCAL_NAMES, *ALL_INTERFACES) else (f"{host}:{self.port}",)
+        self.access = Access(self.port, trusted_hosts=(*trusted_hosts, *own), frame_ancestors=frame_ancestors)
+        self._worker = Worker(session)
+        app = create_app(session, self._worker, self.access)
+        # Open streams must not hold up the end.
+        config = uvicorn.Config(app, log_level="error", timeout_graceful_shutdown=1, timeout_keep_alive=60, ws="none")
+        self._server = uvicorn.Server(config)
+        self._thread: threading.Thread | None = None
+
+    @property
+    def url(self) -> str:
+        """Address with the token, to be opened once."""
+        return f"http://{LOOPBACK}:{self.port}/?token={self.access.token}"
+
+    def run(self) -> None:
+        """Serve until Ctrl-C."""
+        try:
+            self._server.run(sockets=[self._socket])
+        finally:
+            self._worker.close()
+
+    def start(self) -> None:
+        """Serve in a thread of its own; returns when the server answers."""
+        self._thread = threading.Thread(
+            target=self._server.run, kwargs={"sockets": [self._socket]}, name="studio server", daemon=True
+        )
+        self._thread.start()
+        while not self._server.started and self._thread.is_alive():
+            time.sleep(0.01)
+
+    def stop(self) -> None:
+        """End the server and its worker, also while it simulates."""
+        self._worker.close()
+        self._server.should_exit = True
+        if self._thread is not None:
+            self._thread.join(timeout=2)
+
+    def __enter__(self) -> "Studio":
+        self.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.stop()
+
+
+def announce(studio: Studio, *, as_json: bool, token_file: Path | None, open_browser: bool) -> None:
+    """Print the address on one line, and open it.
+
+    Args:
+        studio: that is about to serve: its port listens already.
+        as_json: True = a line of JSON.
+        token_file: gets the token, readable by its owner only; None = none.
+        open_browser: True = in the user's browser.
+    """
+    if token_file is not None:
+        token_file.touch(mode=0o600)
+        token_file.chmod(0o600)
+        token_file.write_text(studio.access.token)
+    line = json.dumps({"url": studio.url, "port": studio.port}) if as_json else studio.url
+    print(line, flush=True)
+    if open_browser:
+        # A browser of the terminal would take the terminal; a thread, as some browsers block.
+        threading.Thread(target=webbrowser.open, args=(studio.url,), daemon=True).start()
+
+
+def _bind(host: str, port: int) -> socket.socket:
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    bound = socket.socket(family, socket.SOCK_STREAM)
+    if sys.platform != "win32":
+        bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        bound.bind((host, port))
+        bound.listen(128)
+    except OSError as error:
+        bound.close()
+        raise ConfigError(
+            f"cannot listen on {host}:{port} ({error.strerror or error}): choose another --port, or 0 for a free one."
+        ) from None
+    return bound

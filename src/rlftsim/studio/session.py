@@ -1,0 +1,327 @@
+"""Data and models of one start of the studio, and everything about a scenario that no rollout is needed for."""
+
+import json
+import re
+from collections import OrderedDict
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Lock
+from typing import Any
+
+import numpy as np
+
+import rlftsim
+from rlftsim.errors import ConfigError, DataError
+from rlftsim.experiments.goal_proposals import entry_of, label_of, propose
+from rlftsim.goals.goals_file import GoalEntry
+from rlftsim.goals.maneuvers.proposals import no_proposal_reason
+from rlftsim.goals.placement import goal_warnings
+from rlftsim.goals.types import simulated_track
+from rlftsim.policies.registry import load_policy, with_guidance
+from rlftsim.rollout.fingerprint import fingerprint_policy
+from rlftsim.rollout.policy import Policy, is_goal_conditioned
+from rlftsim.scenario.open import open_dataset, splits_of
+from rlftsim.scenario.types import CURRENT_STEP, Scenario
+from rlftsim.studio.refusal import Refusal
+from rlftsim.viewer.scene import build_scene, logged_trajectories
+
+ROWS_PER_PAGE = 200
+KEPT_SCENES, KEPT_CONTEXTS = 48, 8
+FIELDS = {
+    "id": "scenario_id",
+    "ego_turn": "ego_maneuver",
+    "n_agents": "num_agents",
+    "n_veh": "num_vehicles",
+    "n_ped": "num_pedestrians",
+    "n_cyc": "num_cyclists",
+    "n_eval": "num_evaluated",
+    "lights": "num_light_states",
+    "points": "num_map_points",
+    "source": "source",
+}
+"""Words of a query -> columns of the index; `num_agents` is a sum of three of them."""
+_TERM = re.compile(r"^(\w+)(<=|>=|!=|=|<|>)(.+)$")
+_COMPARE: dict[str, Callable[[Any, Any], bool]] = {
+    "=": lambda a, b: a == b,
+    "!=": lambda a, b: a != b,
+    "<": lambda a, b: a < b,
+    ">": lambda a, b: a > b,
+    "<=": lambda a, b: a <= b,
+    ">=": lambda a, b: a >= b,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A policy under the name that the page shows."""
+
+    name: str
+    source: str
+    """As given on the command line."""
+    policy: Policy
+    fingerprint: str
+    takes_goals: bool
+    note: str
+    """Reason for controls that are switched off; empty where none is."""
+    can_guide: bool
+
+
+class Recent:
+    """Values by key, the most recently used ones; safe in threads.
+
+    Args:
+        size: number of values kept.
+    """
+
+    def __init__(self, size: int) -> None:
+        self.size = size
+        self._lock = Lock()
+        self._values: OrderedDict[Hashable, Any] = OrderedDict()
+
+    def get(self, key: Hashable, compute: Callable[[], Any]) -> Any:
+        """Value of a key, computed where it is not there yet.
+
+        Args:
+            key: of the value.
+            compute: called without arguments.
+        """
+        with self._lock:
+            if key in self._values:
+                self._values.move_to_end(key)
+                return self._values[key]
+        value = compute()
+        with self._lock:
+            self._values[key] = value
+            while len(self._values) > self.size:
+                self._values.popitem(last=False)
+        return value
+
+
+class Session:
+    """One data set and some models.
+
+    Args:
+        data: folder of a data set, or "synthetic".
+        models: names for `load_policy`; folders are read only here, no request can name another one.
+        split: shown first; None = "validation" where there is one.
+        out: folder of everything that is saved.
+        device: of the models.
+
+    Raises:
+        RlftsimError: no such data set, split or model.
+    """
+
+    def __init__(self, data: str, models: tuple[str, ...], split: str | None, out: Path, device: Any = "cpu") -> None:
+        self.data = data
+        self.splits = splits_of(data)
+        self.split = split or ("validation" if "validation" in self.splits else self.splits[0])
+        self._datasets = {name: open_dataset(data, name) for name in dict.fromkeys((self.split, *self.splits))}
+        self.out = out
+        self.models = {model.name: model for model in _load(models, device)}
+        self._rows: dict[str, list[dict[str, Any]]] = {}
+        self._scenes, self._proposals = Recent(KEPT_SCENES), Recent(KEPT_SCENES * 8)
+        self.contexts = Recent(KEPT_CONTEXTS)
+        """Encoded scenarios by (model, split, scenario)."""
+
+    def describe(self) -> dict[str, Any]:
+        """Everything that the page has to know before it shows a scenario."""
+        counts = {name: len(dataset) for name, dataset in self._datasets.items()}
+        return {
+            "version": rlftsim.__version__,
+            "data": self.data,
+            "split": self.split,
+            "splits": [{"name": name, "scenarios": counts[name]} for name in self.splits],
+            "license": next(iter(self._datasets.values())).manifest.license_note,
+            "out": str(self.out),
+            "fields": list(FIELDS),
+            "models": [
+                {
+                    "name": model.name,
+                    "source": model.source,
+                    "fingerprint": model.fingerprint,
+                    "takes_goals": model.takes_goals,
+                    "can_guide": model.can_guide,
+                    "note": model.note,
+                }
+                for model in self.models.values()
+            ],
+        }
+
+    def scenario(self, split: str, scenario_id: str) -> Scenario:
+        """A scenario.
+
+        Args:
+            split: its split.
+            scenario_id: its id.
+
+        Raises:
+            Refusal: there is no such scenario (404).
+        """
+        if split not in self._datasets or scenario_id not in self._datasets[split]:
+            raise Refusal(
+                f"no scenario {scenario_id} in split {split!r} of {self.data}.",
+                status=404,
+                hint="Choose one of the list.",
+            )
+        return self._datasets[split].by_id(scenario_id)
+
+    def model(self, name: str) -> Model:
+        """A model by its name.
+
+        Raises:
+            Refusal: it was not given on the command line (404).
+        """
+        if name not in self.models:
+            known = ", ".join(self.models)
+            raise Refusal(f"no model {name!r}: this studio was started with {known}.", status=404)
+        return self.models[name]
+
+    def rows(self, split: str, query: str, offset: int) -> dict[str, Any]:
+        """A page of the index.
+
+        Args:
+            split: of the data set.
+            query: words with spaces between them, all of which must hold: "ego_turn=left n_ped>3", or a part of an id.
+            offset: first row of the page, counted among those that the query leaves.
+
+        Raises:
+            Refusal: no such split, or a word that names no column.
+        """
+        if split not in self._datasets:
+            raise Refusal(f"no split {split!r} in {self.data}, only {', '.join(self.splits)}.", status=404)
+        if split not in self._rows:
+            columns = self._datasets[split].index.select(["scenario_id", "num_steps", *_index_columns()])
+            self._rows[split] = columns.to_pylist()
+            for row in self._rows[split]:
+                row["num_agents"] = row["num_vehicles"] + row["num_pedestrians"] + row["num_cyclists"]
+        tests = [_test_of(term) for term in query.split()]
+        found = [row for row in self._rows[split] if all(test(row) for test in tests)]
+        page = found[offset : offset + ROWS_PER_PAGE]
+        return {"total": len(found), "offset": offset, "rows": page}
+
+    def scene(self, split: str, scenario_id: str) -> bytes:
+        """JSON of the still scene and the logged motion.
+
+        Args:
+            split: of the scenario.
+            scenario_id: its id.
+
+        Raises:
+            Refusal: there is no such scenario.
+        """
+        scenario = self.scenario(split, scenario_id)
+        return self._scenes.get((split, scenario_id), lambda: _scene_json(scenario))
+
+    def proposals(self, split: str, scenario_id: str, agent: int) -> dict[str, Any]:
+        """Maneuvers that an agent can do, with their ways and goals.
+
+        Args:
+            split: of the scenario.
+            scenario_id: its id.
+            agent: object id.
+
+        Raises:
+            Refusal: there is no such scenario.
+            DataError: no such agent.
+        """
+        scenario = self.scenario(split, scenario_id)
+        track = simulated_track(scenario, agent, "proposals")
+        return self._proposals.get((split, scenario_id, agent), lambda: _proposals_of(scenario, track))
+
+    def doubts(self, scenario: Scenario, goals: tuple[GoalEntry, ...]) -> list[dict[str, Any]]:
+        """Refusal or doubts of each goal, in the words of `rlftsim goals check`.
+
+        Args:
+            scenario: of the goals.
+            goals: to be checked.
+        """
+        found = []
+        for entry in goals:
+            try:
+                found.append({"agent": entry.agent_id, "refused": "", "doubts": list(goal_warnings(entry, scenario))})
+            except DataError as error:
+                found.append({"agent": entry.agent_id, "refused": str(error), "doubts": []})
+        return found
+
+
+def _index_columns() -> list[str]:
+    return [column for column in FIELDS.values() if column not in ("num_agents", "scenario_id")]
+
+
+def _load(names: tuple[str, ...], device: Any) -> list[Model]:
+    found: list[Model] = []
+    for source in names:
+        policy = load_policy(source, device)
+        path = Path(source)
+        # A run's model lies in run/model: the run's name says more.
+        name = path.resolve().parent.name if path.name == "model" else path.name or path.resolve().name
+        if any(model.name == name for model in found):
+            name = next(n for k in range(2, len(names) + 2) if all(m.name != (n := f"{name}-{k}") for m in found))
+        takes_goals = is_goal_conditioned(policy)
+        note = "" if takes_goals else f"{name} is not goal-conditioned: it was not trained to follow goals."
+        found.append(Model(name, source, policy, fingerprint_policy(policy), takes_goals, note, _can_guide(policy)))
+    return found
+
+
+def _can_guide(policy: Policy) -> bool:
+    try:
+        with_guidance(policy, 2.0)
+    except ConfigError:
+        return False
+    return True
+
+
+def _test_of(term: str) -> Callable[[dict[str, Any]], bool]:
+    """Test of a row for one word of a query."""
+    parts = _TERM.match(term)
+    if parts is None:
+        return lambda row: term in row["scenario_id"] or term == row["ego_maneuver"]
+    word, sign, text = parts.groups()
+    if word not in FIELDS:
+        raise Refusal(f"{term}: no column {word!r}.", hint=f"Columns are {', '.join(FIELDS)}.")
+    column, compare = FIELDS[word], _COMPARE[sign]
+    if column in ("scenario_id", "ego_maneuver", "source"):
+        return lambda row: compare(row[column], text)
+    try:
+        number = float(text)
+    except ValueError:
+        raise Refusal(f"{term}: {word} is compared with a number.") from None
+    return lambda row: compare(row[column], number)
+
+
+def _scene_json(scenario: Scenario) -> bytes:
+    scene, log = build_scene(scenario), logged_trajectories(scenario)
+    tracks, chosen = scenario.tracks, scenario.simulated_indices
+    speed = np.linalg.norm(tracks.velocity[chosen, CURRENT_STEP], axis=-1)
+    payload = {
+        "scene": scene.to_payload(),
+        "log": log.with_overlaps(scene.agents).to_payload(),
+        "origin": scenario.origin.tolist(),
+        "speeds": [round(float(v), 2) for v in speed],
+        "has_future": scenario.has_future,
+        "note": scene.note,
+    }
+    return json.dumps(payload, separators=(",", ":"), allow_nan=False).encode()
+
+
+def _proposals_of(scenario: Scenario, track: int) -> dict[str, Any]:
+    proposals = propose(scenario, track)
+    reason = "" if proposals else no_proposal_reason(scenario, track) or "no maneuver can be completed in time"
+    found = []
+    for proposal in proposals:
+        entry = entry_of(scenario, proposal)
+        way = np.round(proposal.way[:, :2] - scenario.origin, 2)
+        found.append(
+            {
+                "maneuver": proposal.maneuver.value,
+                "label": label_of(proposal),
+                "logged": proposal.is_logged,
+                # As a goals file stores it, so that saved and simulated goals are the same.
+                "x": round(entry.x, 3),
+                "y": round(entry.y, 3),
+                "way": way.tolist(),
+                "doubts": list(goal_warnings(entry, scenario)),
+            }
+        )
+    return {"agent": int(scenario.tracks.object_id[track]), "reason": reason, "proposals": found}

@@ -1,0 +1,114 @@
+// Runs: sends a request, follows its events, and turns chunks into rollouts as they arrive.
+import { bytes, follow, post } from "./api.js";
+import { decodeChunk } from "./decode.js";
+import { byId, speak, toast } from "./dom.js";
+import { changed, ownGoals, state } from "./state.js";
+
+const TOTAL_STEPS = 91, QUICK_ROLLOUTS = 4, REST_MS = 1000;
+let end = () => {}, rest = 0;
+
+const modelOf = (key) => key.split("|")[0];
+
+/** Models of the panels in order, each once. */
+const wantedModels = () => [...new Set(state.panels.filter((key) => key !== "log").map(modelOf))];
+
+/** What a click on simulate asks for, as the server takes it. */
+function request(count) {
+  const goals = ownGoals().filter(({ agent }) => !state.doubts.get(agent)?.refused).map(({ agent, x, y, label }) => ({ agent, x, y, label }));
+  const models = wantedModels(), taken = models.some((name) => state.session.models.find((model) => model.name === name)?.takes_goals);
+  return {
+    split: state.split, scenario: state.id, models, goals: taken ? goals : [], num_rollouts: count, seed: state.seed,
+    temperature: state.temperature, top_k: state.topK, guidance: state.guidance, metric: state.metric,
+  };
+}
+
+async function simulate(count = state.count) {
+  clearTimeout(rest);
+  if (!wantedModels().length) return toast("No panel shows a model: add one with C, then simulate.");
+  end();
+  let answer;
+  try { answer = await post("api/runs", request(count)); } catch (error) { toast(error.message); status(error.message); return; }
+  // Variants that the run holds under the names of the panels; old rollouts stay until the first new ones arrive.
+  const hasGoals = answer.variants.some((variant) => variant.goals), names = answer.variants.map((variant) => {
+    const model = state.session.models.find((one) => one.name === variant.model), isFree = hasGoals && model.takes_goals && !variant.goals;
+    return isFree ? `${variant.model}|free` : variant.model;
+  });
+  state.run = answer.run; state.runName = names; state.isRunning = true;
+  const id = state.id, fresh = new Map(), started = performance.now();
+  names.forEach((name, index) => fresh.set(name, { name: name.replace("|free", ", no goals"), run: answer.run, index, rollouts: [], chunks: new Map(), score: null, explained: null, version: 0 }));
+  byId("progress").hidden = false; byId("cancel").hidden = false;
+  status(`${answer.variants.length > 1 ? `${answer.variants.length} sets of ` : ""}${count} rollouts …`);
+  let asked = 0, shown = 0, pending = Promise.resolve();
+
+  const load = (data) => {
+    const turn = ++asked;
+    pending = pending.then(async () => {
+      if (turn < asked && data.steps < 80) return; // a later one has more
+      const buffer = await bytes(`api/runs/${answer.run}/chunk/${data.k}`);
+      if (state.run !== answer.run || state.id !== id) return;
+      take(fresh, names[data.variant], data, buffer);
+      if (!shown++) byId("run-status").dataset.first = String(Math.round(performance.now() - started));
+    }).catch((error) => { if (error.status !== 404) toast(error.message); });
+  };
+
+  end = follow(answer.run, (event, data) => {
+    if (state.run !== answer.run || state.id !== id) return;
+    if (event === "progress") {
+      byId("progress").value = (data.first + (data.count * data.decision) / data.of) / count;
+      if (data.first === 0) load(data);
+    } else if (event === "chunk") load(data);
+    else if (event === "score") pending = pending.then(() => { mark(fresh.get(names[data.variant]), data); publish(fresh, names[data.variant]); });
+    else if (event === "done") pending = pending.then(() => finish(`${count} rollouts in ${((performance.now() - started) / 1000).toFixed(1)} s`, count));
+    else if (event === "failed") pending = pending.then(() => finish(data.message));
+  });
+}
+
+/** Puts rollouts of a chunk in their places; a growing chunk is replaced by its later states. */
+function take(fresh, name, data, buffer) {
+  const variant = fresh.get(name);
+  variant.chunks.set(data.first, decodeChunk(buffer, state.log.agents, state.scene.now, TOTAL_STEPS));
+  variant.rollouts = [...variant.chunks.entries()].sort(([a], [b]) => a - b).flatMap(([, rollouts]) => rollouts);
+  publish(fresh, name);
+}
+
+let versions = 0;
+function publish(fresh, name) {
+  const variant = fresh.get(name);
+  variant.version = ++versions;
+  state.variants.set(name, variant);
+  // Without goals the two are one and the same.
+  if (!fresh.has(`${name}|free`) && !name.endsWith("|free")) state.variants.set(`${name}|free`, variant);
+  changed("data");
+}
+
+/** The metric's events as flags of the agents, like those of the log. */
+function mark(variant, score) {
+  variant.score = score;
+  const { now, agents } = state.scene, rows = new Map(agents.map(([id], i) => [id, i])), flags = { collision: "collides", offroad: "offroad", light: "light" };
+  for (const rollout of variant.rollouts) for (const agent of rollout) for (const name of Object.values(flags)) agent[name].fill(0);
+  for (const [kind, n, id, start, stop] of score.events) variant.rollouts[n]?.[rows.get(id)][flags[kind]].fill(1, now + 1 + start, now + 1 + stop);
+}
+
+function finish(text) {
+  state.isRunning = false;
+  byId("progress").hidden = true; byId("cancel").hidden = true;
+  status(text); speak(text);
+  byId("run-status").dataset.over = state.run;
+  changed("data", "run");
+}
+
+const status = (text) => { byId("run-status").textContent = text; };
+
+async function cancel() { if (state.run && state.isRunning) await post(`api/runs/${state.run}/cancel`).catch((error) => toast(error.message)); }
+
+/** After an edit: a few rollouts at once, and where "live" is on all of them after a second of rest. */
+function simulateSoon() {
+  clearTimeout(rest);
+  if (!wantedModels().length) return;
+  simulate(Math.min(QUICK_ROLLOUTS, state.count));
+  if (state.live) rest = setTimeout(() => simulate(), REST_MS);
+}
+
+function forget() { end(); clearTimeout(rest); state.run = null; state.isRunning = false; state.variants = new Map(); state.loss = null; byId("progress").hidden = true; byId("cancel").hidden = true; status(""); delete byId("run-status").dataset.over; }
+
+export { cancel, forget, modelOf, simulate, simulateSoon, wantedModels };
