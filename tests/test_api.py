@@ -38,7 +38,7 @@ NAMES = [
     *("register_reward", "leave_one_out"),
     *("recipe", "pretrain", "finetune", "FinetuneConfig"),
     *("evaluate", "Evaluation", "compare"),
-    "show",
+    *("show", "open_studio"),
     "RlftsimError",
 ]
 SMALL = "data/small"

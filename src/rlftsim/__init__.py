@@ -38,6 +38,7 @@ __all__ = [
     "leave_one_out",
     "load_dataset",
     "load_policy",
+    "open_studio",
     "pretrain",
     "recipe",
     "register_reward",
@@ -64,6 +65,7 @@ _MODULES = {
     "rlftsim.rollout.types": ("Rollouts",),
     "rlftsim.scenario.dataset": ("write_dataset",),
     "rlftsim.scenario.types": ("Scenario",),
+    "rlftsim.studio.notebook": ("open_studio",),
     "rlftsim.training.finetune": ("FinetuneConfig",),
     "rlftsim.viewer.notebook": ("show",),
 }

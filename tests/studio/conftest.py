@@ -49,7 +49,7 @@ def worker(session):
 
 @pytest.fixture
 def access():
-    return Access(PORT)
+    return Access(PORT, "t" * 43)
 
 
 class Client:

@@ -8,6 +8,7 @@ import tyro
 
 from rlftsim.errors import ConfigError
 from rlftsim.policies.registry import Device
+from rlftsim.studio import require_extra
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
@@ -35,7 +36,7 @@ class StudioVerb:
     json: bool = False
     """Print the address as JSON."""
     token_file: Path | None = None
-    """File that gets the token, for scripts."""
+    """File of the token, for scripts; made where it is missing. With it and --port an open page survives a restart."""
     host: str = "127.0.0.1"
     """Address to listen on; any other one needs --allow-remote."""
     allow_remote: bool = False
@@ -52,15 +53,15 @@ class StudioVerb:
                 f"--host {self.host} makes the studio reachable from other machines: add --allow-remote if that is "
                 "meant, or use ssh -L."
             )
-        try:
-            from rlftsim.studio.serving import Studio, announce
-            from rlftsim.studio.session import Session
-        except ModuleNotFoundError as error:
-            raise ConfigError(f"{error.name} is missing: pip install 'rlftsim[studio]'.") from None
+        require_extra()
+        from rlftsim.studio.serving import Studio, announce, token_of
+        from rlftsim.studio.session import Session
+
         if self.host not in LOOPBACK:
             print(f"rlftsim: listening on {self.host}, unencrypted: keep the address secret.", file=sys.stderr)
         session = Session(self.data, tuple(self.model) or ("demo-base",), self.split, self.out, self.device)
-        studio = Studio(session, host=self.host, port=self.port, trusted_hosts=tuple(self.trust_host))
-        announce(studio, as_json=self.json, token_file=self.token_file, open_browser=not self.no_browser)
+        token = None if self.token_file is None else token_of(self.token_file)
+        studio = Studio(session, host=self.host, port=self.port, token=token, trusted_hosts=tuple(self.trust_host))
+        announce(studio, as_json=self.json, open_browser=not self.no_browser)
         studio.run()
         return 0

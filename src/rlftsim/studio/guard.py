@@ -19,13 +19,17 @@ SAFE_METHODS = ("GET", "HEAD")
 LOCAL_NAMES = ("127.0.0.1", "localhost", "[::1]")
 
 
+def new_token() -> str:
+    """256 random bits as text."""
+    return secrets.token_urlsafe(32)
+
+
 @dataclass(frozen=True)
 class Access:
     """Names and secrets of one start of the studio."""
 
     port: int
-    token: str = field(default_factory=lambda: secrets.token_urlsafe(32), repr=False)
-    """256 random bits."""
+    token: str = field(repr=False)
     trusted_hosts: tuple[str, ...] = ()
     """Further values of the Host header, such as a proxy's "hub.example:443"."""
     frame_ancestors: tuple[str, ...] = ()

@@ -170,14 +170,18 @@ class Worker:
         return self._is_closed
 
     def close(self) -> None:
-        """Stop the running run at its next decision, and the thread."""
+        """End the thread and what it simulates."""
+        self.stop()
+        self._thread.join(timeout=1.5)
+
+    def stop(self) -> None:
+        """Stop the running run at its next decision, and take no other one."""
         with self._wake:
             self._is_closed = True
             for run in (self._running, self._waiting):
                 if run is not None:
                     run.stop.set()
             self._wake.notify()
-        self._thread.join(timeout=1.5)
 
     def submit(self, body: RunBody) -> Run:
         """Queue a run; one with the same inputs that is complete or under way is returned as it is.

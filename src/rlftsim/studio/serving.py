@@ -1,24 +1,39 @@
 """The studio as a running server: a free port, a printed address, an end within two seconds."""
 
 import json
+import os
 import socket
 import sys
 import threading
 import time
 import webbrowser
 from pathlib import Path
-from types import TracebackType
+from types import FrameType, TracebackType
 
 import uvicorn
 
+from rlftsim.atomic_io import errors_name
 from rlftsim.errors import ConfigError
-from rlftsim.studio.guard import LOCAL_NAMES, Access
+from rlftsim.studio.guard import LOCAL_NAMES, Access, new_token
 from rlftsim.studio.runs import Worker
 from rlftsim.studio.server import create_app
 from rlftsim.studio.session import Session
 
 LOOPBACK = "127.0.0.1"
 ALL_INTERFACES = ("0.0.0.0", "::")
+
+
+class _Server(uvicorn.Server):
+    """A server whose streams and simulation end with the first Ctrl-C, before it waits for open connections."""
+
+    def __init__(self, config: uvicorn.Config, worker: Worker) -> None:
+        super().__init__(config)
+        self._worker = worker
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        """Take a signal."""
+        self._worker.stop()
+        super().handle_exit(sig, frame)
 
 
 class Studio:
@@ -28,6 +43,7 @@ class Studio:
         session: data and models.
         host: address to listen on.
         port: 0 = a free one.
+        token: of an earlier start, so that an open page goes on; None = a new one.
         trusted_hosts: further values of the Host header.
         frame_ancestors: origins that may show the page in a frame.
 
@@ -41,6 +57,7 @@ class Studio:
         *,
         host: str = LOOPBACK,
         port: int = 0,
+        token: str | None = None,
         trusted_hosts: tuple[str, ...] = (),
         frame_ancestors: tuple[str, ...] = (),
     ) -> None:
@@ -48,12 +65,14 @@ class Studio:
         self.port = int(self._socket.getsockname()[1])
         # Another interface is reached under the name that was given for it.
         own = () if f"{host}" in (*LOCAL_NAMES, *ALL_INTERFACES) else (f"{host}:{self.port}",)
-        self.access = Access(self.port, trusted_hosts=(*trusted_hosts, *own), frame_ancestors=frame_ancestors)
+        self.access = Access(
+            self.port, token or new_token(), trusted_hosts=(*trusted_hosts, *own), frame_ancestors=frame_ancestors
+        )
         self._worker = Worker(session)
         app = create_app(session, self._worker, self.access)
         # Open streams must not hold up the end.
         config = uvicorn.Config(app, log_level="error", timeout_graceful_shutdown=1, timeout_keep_alive=60, ws="none")
-        self._server = uvicorn.Server(config)
+        self._server = _Server(config, self._worker)
         self._thread: threading.Thread | None = None
 
     @property
@@ -94,19 +113,31 @@ class Studio:
         self.stop()
 
 
-def announce(studio: Studio, *, as_json: bool, token_file: Path | None, open_browser: bool) -> None:
+def token_of(path: Path) -> str:
+    """Token of a file, which is made where it is missing, readable by its owner only.
+
+    Raises:
+        ConfigError: the file holds something else, or others may read it.
+    """
+    if not path.exists():
+        with errors_name(path):
+            descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+            with os.fdopen(descriptor, "w") as file:
+                file.write(new_token())
+    token = path.read_text().strip()
+    if len(token) < len(new_token()) or not token.isascii() or path.stat().st_mode & 0o077:
+        raise ConfigError(f"--token-file {path}: no token that only its owner can read: delete it, a new one is made.")
+    return token
+
+
+def announce(studio: Studio, *, as_json: bool, open_browser: bool) -> None:
     """Print the address on one line, and open it.
 
     Args:
         studio: that is about to serve: its port listens already.
         as_json: True = a line of JSON.
-        token_file: gets the token, readable by its owner only; None = none.
         open_browser: True = in the user's browser.
     """
-    if token_file is not None:
-        token_file.touch(mode=0o600)
-        token_file.chmod(0o600)
-        token_file.write_text(studio.access.token)
     line = json.dumps({"url": studio.url, "port": studio.port}) if as_json else studio.url
     print(line, flush=True)
     if open_browser:

@@ -17,7 +17,7 @@ const MAX_PANELS = 4, SNAP_M = 1.5, PIN_HIT_PX = 12, CLICK_PX = 4, ALIVE_MS = 15
 class Stage {
   constructor(host) {
     this.host = host; this.panels = []; this.ground = new Ground(); this.onCpu = false; this.meter = new FrameMeter();
-    new ResizeObserver(() => { this.panels.forEach((panel) => panel.resize()); this.draw(); }).observe(host);
+    new ResizeObserver(() => { this.arrange(); this.draw(); }).observe(host);
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { this.palette = null; changed("colors"); });
   }
 
@@ -38,8 +38,15 @@ class Stage {
       element.querySelector(".panel-head").append(make("select", { "aria-label": "Panel shows" }), make("span", { class: "panel-status" }), make("button", { "aria-label": "Remove this panel", title: "Remove this panel" }, "×"));
       this.panels.push(new Panel(element, this));
     }
-    this.host.classList.toggle("two-rows", state.panels.length === 4 || (state.panels.length > 2 && this.host.clientWidth < 1000));
     this.panels.forEach((panel, i) => this.head(panel, i));
+    this.arrange();
+  }
+
+  /** Side by side while there is room for it, else in two rows. */
+  arrange() {
+    const count = this.panels.length, { clientWidth: width, clientHeight: height } = this.host;
+    const columns = count < 3 ? count : width > 2.4 * height || (count === 3 && width > 1.2 * height) ? count : 2;
+    this.host.style.setProperty("--columns", String(Math.max(1, columns)));
     this.panels.forEach((panel) => panel.resize());
   }
 
@@ -426,7 +433,8 @@ async function start() {
   if (!(await openScenario(id, { view: found.view, time: found.step }))) await openScenario((await firstRow).rows[0].scenario_id);
   await list.load("");
   byId("count").textContent = `${state.total}`;
-  if (found.goals.length) { state.isQuiet = true; setGoals(found.goals.map((goal) => ({ ...goal, scenario: state.id, label: "" })), { remember: false }); state.isQuiet = false; }
+  if (found.goals.length) { state.isQuiet = true; setGoals(found.goals.map((goal) => ({ ...goal, scenario: state.id })), { remember: false }); state.isQuiet = false; }
+  if (stage.indexOf(found.agent) >= 0) select(found.agent);
   if (found.file) toast(`This address names a goals file: open ${found.file}.json.`);
   if (found.run) { state.rollout = found.rollout ?? 0; await simulate(); }
   else if (found.step === undefined && !matchMedia("(prefers-reduced-motion: reduce)").matches) timeline.toggle(true);

@@ -52,13 +52,14 @@ function toHash() {
   const parts = new URLSearchParams({ split: state.split, id: state.id, panels: state.panels.join(","), step: String(Math.round(state.time)) });
   const { x, y, r } = state.view;
   parts.set("view", [x, y, r].map((v) => v.toFixed(1)).join(","));
+  if (state.selected >= 0) parts.set("agent", String(state.selected));
   if (state.rollout) parts.set("rollout", String(state.rollout));
   for (const [name, usual] of [["seed", 0], ["count", 32], ["temperature", 1], ["topK", null], ["guidance", 1], ["metric", "2025"]]) {
     if (state[name] !== usual) parts.set(name, String(state[name]));
   }
   if (!state.showAll) parts.set("all", "0");
   if (state.variants.size) parts.set("run", "1");
-  const goals = ownGoals().map((goal) => `${goal.agent}@${goal.x},${goal.y}`).join(";");
+  const goals = ownGoals().map((goal) => [`${goal.agent}@${goal.x}`, goal.y, ...(goal.label ? [goal.label.replace(/[;,]/g, " ")] : [])].join(",")).join(";");
   if (goals) parts.set("goals", goals);
   // A link that is too long for mail programs names the file instead.
   if (parts.toString().length > LONGEST_URL) { parts.delete("goals"); parts.set("file", state.savedAs); }
@@ -68,7 +69,7 @@ function toHash() {
 function fromHash(hash) {
   const parts = new URLSearchParams(hash.slice(1)), found = {};
   for (const name of ["split", "id", "metric", "file"]) if (parts.get(name)) found[name] = parts.get(name);
-  for (const name of ["seed", "count", "temperature", "topK", "guidance", "step", "rollout"]) {
+  for (const name of ["seed", "count", "temperature", "topK", "guidance", "step", "rollout", "agent"]) {
     const value = Number(parts.get(name));
     if (parts.has(name) && Number.isFinite(value)) found[name] = value;
   }
@@ -77,8 +78,8 @@ function fromHash(hash) {
   found.run = parts.get("run") === "1";
   const view = (parts.get("view") || "").split(",").map(Number);
   if (view.length === 3 && view.every(Number.isFinite) && view[2] > 0) found.view = { x: view[0], y: view[1], r: view[2] };
-  found.goals = [...(parts.get("goals") || "").matchAll(/(-?\d+)@(-?[\d.e+-]+),(-?[\d.e+-]+)/g)]
-    .map(([, agent, x, y]) => ({ agent: Number(agent), x: Number(x), y: Number(y) }))
+  found.goals = [...(parts.get("goals") || "").matchAll(/(-?\d+)@(-?[\d.e+-]+),(-?[\d.e+-]+),?([^;]*)/g)]
+    .map(([, agent, x, y, label]) => ({ agent: Number(agent), x: Number(x), y: Number(y), label }))
     .filter(({ x, y }) => Number.isFinite(x) && Number.isFinite(y));
   return found;
 }

@@ -1,0 +1,254 @@
+"""The page in a real browser, offline: the loop of a user, the address, the keyboard, a dead server, the frame rate."""
+
+import io
+import json
+import time
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from rlftsim.goals.goals_file import read_goals
+from rlftsim.studio.serving import Studio
+
+CHROMIUM = "/usr/bin/chromium"
+SCENARIO = "9d639de83d6f5239"
+EGO = 179
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """A headless Chromium of the system; skipped where there is none."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    with playwright.sync_playwright() as session:
+        try:
+            launched = session.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu"])
+        except playwright.Error as error:
+            pytest.skip(f"no usable Chromium at {CHROMIUM}: {str(error).splitlines()[0]}")
+        yield launched
+        launched.close()
+
+
+@pytest.fixture(scope="module")
+def studio(session):
+    with Studio(session) as running:
+        yield running
+
+
+class Page:
+    """One page of the browser; fails at its end on errors of the console and on requests to anything but the studio."""
+
+    def __init__(self, browser, studio, **options):
+        options = {"viewport": {"width": 1280, "height": 720}, "reduced_motion": "reduce"} | options
+        self.context, self.studio = browser.new_context(**options), studio
+        self.errors, self.foreign = [], []
+        self.context.route("**/*", self._pass)
+        self.page = self.context.new_page()
+        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
+        self.page.on("console", lambda line: self.errors.append(line.text) if line.type == "error" else None)
+
+    def _pass(self, route):
+        if route.request.url.startswith(f"http://127.0.0.1:{self.studio.port}/"):
+            route.continue_()
+        else:
+            self.foreign.append(route.request.url)
+            route.abort()
+
+    def open(self, fragment=""):
+        self.page.goto(self.studio.url + fragment)
+        self.wait("globalThis.studio?.state.scene && studio.state.total > 0")
+        return self
+
+    def wait(self, condition, seconds=60):
+        """The page forbids eval, so a condition is evaluated from outside."""
+        end = time.monotonic() + seconds
+        while not self.page.evaluate(f"() => Boolean({condition})"):
+            assert time.monotonic() < end, f"{condition} | {self.page.inner_text('body')[-400:]}"
+            time.sleep(0.03)
+
+    def state(self, what):
+        return self.page.evaluate(f"() => {what}")
+
+    def press(self, *keys):
+        for key in keys:
+            self.page.keyboard.press(key)
+
+    def simulated(self):
+        over = "document.getElementById('run-status').dataset.over === studio.state.run"
+        self.wait(f"!studio.state.isRunning && studio.state.run && {over}")
+
+    def close(self):
+        self.context.close()
+        assert self.errors == []
+        assert self.foreign == []
+
+
+@pytest.fixture
+def page(browser, studio):
+    opened = Page(browser, studio)
+    yield opened
+    opened.close()
+
+
+def picture(page):
+    return np.asarray(Image.open(io.BytesIO(page.page.locator("#panels").screenshot())).convert("RGB")).astype(int)
+
+
+PLACE_ON_SCREEN = """([agent, panel]) => {
+  const p = studio.stage.panels[panel], box = p.canvas.getBoundingClientRect(), view = studio.state.view;
+  const one = p.states[studio.stage.indexOf(agent)];
+  return [box.left + box.width / 2 + (one.x - view.x) * p.scale, box.top + box.height / 2 - (one.y - view.y) * p.scale];
+}"""
+
+
+def click_agent(page, agent, panel=0):
+    page.page.mouse.click(*page.page.evaluate(PLACE_ON_SCREEN, [agent, panel]))
+
+
+def test_a_user_asks_compares_saves_and_finds_it_again(page, session, browser, studio):
+    page.open(f"#split=validation&id={SCENARIO}&panels=log,goals&count=8")
+    assert page.state("studio.state.playing") is False  # reduced motion
+    page.press("Space")
+    page.wait("studio.state.time > 12")
+    page.press("Space", "Home")
+    page.state("studio.timeline.seek(10)")
+    # click the ego, choose "left"
+    page.page.wait_for_timeout(100)
+    click_agent(page, EGO)
+    page.wait(f"studio.state.selected === {EGO} && studio.state.proposals")
+    page.page.get_by_role("button", name="left").click()
+    page.simulated()
+    page.page.locator("#simulate").click()
+    page.wait("studio.state.variants.get('goals')?.rollouts.length === 8")
+    page.simulated()
+    # the result line has the numbers of the server
+    outcome = page.state("studio.state.variants.get('goals').score.outcomes[0]")
+    text = page.page.inner_text("#results")
+    assert f"passed in {outcome['passed']} of 8, reached in {outcome['reached']}" in text
+    assert "against the same seeds without goals (8 rollouts)" in text
+    assert (
+        page.page.inner_text("#score .big")
+        == f"{page.state('studio.state.variants.get(`goals`).score.score.official.metametric'):.4f}"
+    )
+    # a second model at the same step
+    page.press("c")
+    page.page.locator("#simulate").click()
+    page.wait("studio.state.variants.get('demo-base')?.score")
+    page.simulated()
+    page.state("studio.timeline.seek(50)")
+    assert "+4.0 s" in page.page.inner_text("#clock")
+    ends = page.state("studio.stage.panels.slice(1).map((p) => [p.states[0].x, p.rollouts[p.shown][0].x[50]])")
+    assert all(drawn == pytest.approx(poses, abs=1e-4) for drawn, poses in ends)
+    # save goals, and see that the file has the goal
+    page.press("Control+s")
+    page.page.locator("#file-name").fill("from-the-page")
+    page.page.locator("#write").click()
+    page.page.get_by_text("from-the-page.json written.").wait_for()
+    (goal,) = read_goals(session.out / "from-the-page.json").goals
+    assert (goal.scenario_id, goal.agent_id, goal.label) == (SCENARIO, EGO, "left (logged)")
+    page.press("Escape")
+    # the address opens the same picture in a fresh tab
+    page.wait("location.hash.includes('goals=') && location.hash.includes('step=50')")
+    page.page.mouse.move(5, 5)
+    before, address = picture(page), page.state("location.hash")
+    assert len(address) < 2000
+    assert studio.access.token not in page.page.url
+    again = Page(browser, studio).open(address)
+    again.simulated()
+    again.wait("studio.state.variants.get('demo-base')?.score && studio.state.variants.get('goals')?.score")
+    again.wait(f"studio.state.selected === {EGO} && studio.state.proposals")
+    again.page.wait_for_timeout(300)
+    after = picture(again)
+    assert before.shape == after.shape
+    assert (np.abs(before - after).max(-1) > 24).mean() < 0.005
+    assert again.state("studio.state.run") == page.state("studio.state.run")
+    again.close()
+
+
+def test_everything_can_be_done_with_keys(page):
+    page.open(f"#split=validation&id={SCENARIO}&panels=log,goals&count=4")
+    page.page.locator(".panel canvas").first.focus()
+    page.press("Tab")
+    page.wait("studio.state.selected >= 0 && studio.state.proposals")
+    assert "m/s" in page.page.inner_text("#speaker")
+    page.press("g", "ArrowUp", "ArrowRight", "Enter")
+    page.wait("studio.state.goals.goals.length === 1")
+    page.simulated()
+    first = page.state("studio.state.goals.goals[0]")
+    page.press("g", "Shift+ArrowLeft", "Enter")
+    page.wait("studio.state.goals.goals[0].x !== " + str(first["x"]))
+    assert page.state("studio.state.goals.goals[0].x") == pytest.approx(first["x"] - 5, abs=2e-3)
+    page.press("Control+z")
+    assert page.state("studio.state.goals.goals[0]") == first
+    page.press("Control+y", "Control+z", "Delete")
+    assert page.state("studio.state.goals.goals.length") == 0
+    page.press("]")
+    assert page.state("studio.state.rollout") == 1
+    page.press("End", "Shift+ArrowLeft")
+    assert page.state("studio.state.time") == 80
+    page.press("?")
+    assert page.page.locator("dialog[open] dt").count() >= 15
+    page.press("Escape")
+    page.page.locator("#query").fill("ego_turn=left")
+    page.wait("studio.state.query === 'ego_turn=left'")
+    page.press("c")  # a letter in a field is a letter
+    assert page.state("studio.state.panels.length") == 2
+    page.page.locator("#table").click()
+    assert page.page.locator("dialog[open] tbody tr").count() == 27
+
+
+def test_a_model_that_takes_no_goals_says_so_and_the_first_page_plays(browser, tmp_path):
+    from rlftsim.studio.session import Session
+
+    with Studio(Session("synthetic", ("demo-base",), None, tmp_path)) as plain:
+        page = Page(browser, plain, reduced_motion="no-preference", color_scheme="dark").open()
+        page.wait("studio.state.playing && studio.state.time > 11")
+        assert page.page.locator("#guidance").is_disabled()
+        assert "not goal-conditioned" in page.page.inner_text("#model-note")
+        page.close()
+
+
+def test_the_page_says_that_the_server_is_gone_and_when_it_is_back(browser, session, tmp_path):
+    token = "k" * 43
+    first = Studio(session, token=token)
+    first.start()
+    page = Page(browser, first).open()
+    first.stop()
+    page.wait("document.getElementById('status').textContent.includes('does not answer')", seconds=8)
+    with Studio(session, port=first.port, token=token):
+        page.page.get_by_text("The studio is back.").wait_for(timeout=8000)
+        page.errors.clear()  # the browser reports the refused connections
+        page.close()
+
+
+CROWD = """() => {
+  const s = studio.state, many = (list) => Array.from({ length: 120 }, (_, i) => list[i % list.length]);
+  s.scene.agents = many(s.scene.agents).map((agent, i) => [i, ...agent.slice(1)]);
+  s.log.agents = many(s.log.agents);
+  const shift = (one, n) => ({ ...one, valid: new Uint8Array(91).fill(1), y: one.y.map((v) => v + 0.1 * n) });
+  const rollouts = Array.from({ length: 32 }, (_, n) => s.log.agents.map((one) => shift(one, n)));
+  s.variants.set("goals", { name: "goals", rollouts, score: null, version: 1 });
+  studio.stage.draw();
+}"""
+GAPS = """() => new Promise((done) => {
+  const stamps = [];
+  const tick = (stamp) => {
+    stamps.push(stamp);
+    if (stamp - stamps[0] < 3000) return requestAnimationFrame(tick);
+    studio.timeline.toggle(false);
+    done(stamps.slice(1).map((one, i) => one - stamps[i]));
+  };
+  studio.state.time = 0;
+  studio.timeline.toggle(true);
+  requestAnimationFrame(tick);
+})"""
+
+
+def test_playing_120_agents_in_32_rollouts_is_smooth(page):
+    """Frames of three seconds: rollouts of the page's own scenario are repeated to 120 agents."""
+    page.open(f"#split=validation&id={SCENARIO}&panels=goals")
+    page.page.evaluate(CROWD)
+    gaps = page.page.evaluate(GAPS)
+    print(json.dumps({"frames_per_s": 1000 * len(gaps) / sum(gaps), "longest_ms": max(gaps)}))
+    # 30 frames/s where nothing else computes; here other processes may share the cores
+    assert 1000 * len(gaps) / sum(gaps) > 10
