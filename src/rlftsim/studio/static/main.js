@@ -52,7 +52,7 @@ class Stage {
 
   head(panel, i) {
     const [select, , remove] = panel.element.querySelector(".panel-head").children;
-    const options = [["log", "record"], ...state.session.models.flatMap(({ name, takes_goals: takes }) => (takes ? [[name, name], [`${name}|free`, `${name}, no goals`]] : [[name, name]]))];
+    const options = [["log", "log"], ...state.session.models.flatMap(({ name, takes_goals: takes }) => (takes ? [[name, name], [`${name}|free`, `${name}, no goals`]] : [[name, name]]))];
     select.replaceChildren(...options.map(([value, text]) => make("option", { value, selected: value === state.panels[i] }, text)));
     select.value = state.panels[i];
     select.onchange = () => { state.panels = state.panels.with(i, select.value); changed("panels"); };
@@ -317,7 +317,7 @@ function stepRollout(by) {
   changed("data");
 }
 
-/** One more panel: the next model that is not shown, or the first one without goals, or the record. */
+/** One more panel: the next model that is not shown, or the first one without goals, or the log. */
 function addPanel() {
   if (state.panels.length >= MAX_PANELS) return toast(`${MAX_PANELS} panels are the most: remove one first.`);
   const wanted = [...state.session.models.map((model) => model.name), ...goalModels().map((model) => `${model.name}|free`), "log"];
