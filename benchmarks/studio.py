@@ -190,7 +190,7 @@ def tell(browser, url: str, folder: Path) -> None:
     page.wait_for_timeout(300)
     film.hold(4)
     page.keyboard.press("Escape")
-    address = page.evaluate("() => location.href")
+    address = url + page.evaluate("() => location.hash")
     film.write(folder / "studio.mp4")
     page.close()
     for name, width, height, scheme in (("compare", 1920, 1080, "light"), ("dark", 1920, 1080, "dark")):

@@ -6,9 +6,13 @@ up twice; `decode.js` does.
 """
 
 import numpy as np
+import torch
 from jaxtyping import Float
+from torch import Tensor
 
 from rlftsim.errors import DataError
+from rlftsim.scenario.batch import ScenarioBatch
+from rlftsim.scenario.types import CURRENT_STEP
 
 MAGIC = 0x31464C52
 HUNDREDTHS = 100.0
@@ -36,3 +40,18 @@ def encode_poses(poses: Float[np.ndarray, "N A t 3"], current: Float[np.ndarray,
     kind = "<i2" if abs(second).max(initial=0) < 1 << 15 else "<i4"
     header = np.array([MAGIC, *poses.shape[:3], np.dtype(kind).itemsize], "<u4")
     return header.tobytes() + np.ascontiguousarray(second, dtype=kind).tobytes()
+
+
+def encode_batch(poses: Float[Tensor, "B N A t 3"], batch: ScenarioBatch) -> bytes:
+    """Bytes of the poses of a batch's only scenario, without padding.
+
+    Args:
+        poses: x, y (m) and heading (rad) of the simulated steps, map frame.
+        batch: of one scenario.
+
+    Raises:
+        DataError: a pose is not finite.
+    """
+    now = torch.cat([batch.position[0, :, CURRENT_STEP], batch.heading[0, :, CURRENT_STEP, None]], -1)
+    kept = batch.agent_mask[0]
+    return encode_poses(poses[0][:, kept].float().cpu().numpy(), now[kept].float().cpu().numpy())

@@ -3,12 +3,9 @@
 import json
 from pathlib import Path
 
-from rlftsim.atomic_io import write_text, write_whole
-from rlftsim.errors import DataError
-from rlftsim.evaluation import submission_pb2
-from rlftsim.evaluation.rollout_files import find_rollouts, read_states
+from rlftsim.atomic_io import write_text
+from rlftsim.evaluation.rollout_files import write_submission
 from rlftsim.goals.goals_file import parse_goals, write_goals
-from rlftsim.realism import SimulatedStates
 from rlftsim.realism.from_rollouts import states_of_rollouts
 from rlftsim.rollout.files import write_rollouts
 from rlftsim.scenario.batch import collate
@@ -90,7 +87,7 @@ def export(session: Session, run: Run, body: ExportBody) -> Path:
             (path,) = write_rollouts(path, batch, rollouts)
         case "submission":
             (states,) = states_of_rollouts(batch, rollouts)
-            _write_submission(path, scenario.scenario_id, states)
+            write_submission(path, scenario.scenario_id, states)
         case "scores":
             scored = run.simulated[body.variant].scored[(run.body.num_rollouts, run.body.metric)]
             write_text(path, json.dumps(scored.to_payload() | scored.explained(), indent=1) + "\n")
@@ -125,22 +122,3 @@ def _animation(session: Session, run: Run, first: int, count: int) -> Animation:
         goals = f", {len(variant.goals)} goals" if variant.goals else ""
         panels.append(Panel(f"{variant.model}{goals}", motion))
     return Animation(f"Scenario {scenario.scenario_id}", scene, panels)
-
-
-def _write_submission(path: Path, scenario_id: str, states: SimulatedStates) -> None:
-    """Write an official ScenarioRollouts message, then read it back as `rlftsim score` would."""
-    message = submission_pb2.ScenarioRollouts(scenario_id=scenario_id)
-    for n in range(states.num_rollouts):
-        scene = message.joint_scenes.add()
-        for a, object_id in enumerate(states.object_id.tolist()):
-            scene.simulated_trajectories.add(
-                center_x=states.x[n, a].tolist(),
-                center_y=states.y[n, a].tolist(),
-                center_z=states.z[n, a].tolist(),
-                heading=states.heading[n, a].tolist(),
-                object_id=object_id,
-            )
-    write_whole(path, lambda temporary: temporary.write_bytes(message.SerializeToString()))
-    (entry,) = find_rollouts(path)
-    if read_states(entry).num_rollouts != states.num_rollouts:
-        raise DataError(f"{path}: was not written as it should be: write it again.")

@@ -1,6 +1,6 @@
 """The gate before every route: host, token, origin, content type and size of a request.
 
-Whoever makes the user's browser speak to the port could run models and write files. So a request needs the name of
+A page that makes the user's browser speak to the port could run models and write files. So a request needs the name of
 this machine as its host (a foreign name that resolves to 127.0.0.1 is "DNS rebinding"), the token of this start, and
 where it changes something, the studio's own origin.
 """

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rlftsim.studio import require_extra
 
@@ -44,9 +44,8 @@ class StudioCell:
         token, port = self.studio.access.token, self.studio.port
         if "google.colab" in sys.modules:
             # Colab forwards a port by its own frame, from an origin that only it knows.
-            sys.modules["google.colab"].output.serve_kernel_port_as_iframe(  # pyright: ignore[reportAttributeAccessIssue]
-                port, path=f"/?token={token}", height=FRAME_HEIGHT
-            )
+            colab: Any = sys.modules["google.colab"]
+            colab.output.serve_kernel_port_as_iframe(port, path=f"/?token={token}", height=FRAME_HEIGHT)
             return ""
         proxied = "JPY_SESSION_NAME" in os.environ and importlib.util.find_spec("jupyter_server_proxy") is not None
         # "localhost", as most notebooks are opened there: the cookie is kept only where both names are the same.

@@ -10,7 +10,6 @@ import hashlib
 import json
 import threading
 from collections import OrderedDict
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -19,20 +18,19 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rlftsim.errors import RlftsimError
-from rlftsim.goals.goals_file import GoalEntry
-from rlftsim.goals.placement import goals_of_batch
 from rlftsim.policies.registry import with_guidance
 from rlftsim.progress import log
 from rlftsim.rollout.policy import Sampling, device_of
 from rlftsim.rollout.simulate import simulate
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch, collate
-from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS
+from rlftsim.scenario.types import FUTURE_STEPS
 from rlftsim.studio.bodies import RunBody
-from rlftsim.studio.encoding import encode_poses
+from rlftsim.studio.encoding import encode_batch
 from rlftsim.studio.refusal import Refusal
 from rlftsim.studio.scoring import Scored, score_variant
 from rlftsim.studio.session import Session
+from rlftsim.studio.variants import Variant, free_variant, has_goals, variants_of
 
 CHUNKS = (4, 4, 8, 16)
 LARGEST_CHUNK = 32
@@ -42,21 +40,6 @@ KEPT_RUNS = 64
 
 class Cancelled(Exception):
     """The run was replaced or stopped."""
-
-
-@dataclass(frozen=True)
-class Variant:
-    """One model, with or without goals, under the settings of a run."""
-
-    model: str
-    fingerprint: str
-    split: str
-    scenario: str
-    seed: int
-    temperature: float
-    top_k: int | None
-    guidance: float = 1.0
-    goals: tuple[GoalEntry, ...] = ()
 
 
 @dataclass(eq=False)
@@ -243,7 +226,7 @@ class Worker:
             self._known.move_to_end(variant)
         # The first chunk of every variant, then the rest; goal-free rollouts only matter for the score, so they end.
         chunks = [(v, ids) for ids in chunks_of(body.num_rollouts) for v in range(len(variants))]
-        chunks.sort(key=lambda chunk: free_variant(variants, chunk[0]) == chunk[0] and _has_goals(variants, chunk[0]))
+        chunks.sort(key=lambda chunk: free_variant(variants, chunk[0]) == chunk[0] and has_goals(variants, chunk[0]))
         return Run(name, body, variants, tuple(simulated), chunks)
 
     def _work(self) -> None:
@@ -291,7 +274,7 @@ class Worker:
                 rollouts = self._rollouts(run, k, batch)
                 poses = torch.cat([rollouts.position, rollouts.heading[..., None]], -1)
                 simulated.parts[ids] = rollouts
-                simulated.encoded[ids] = _encoded(poses, batch)
+                simulated.encoded[ids] = encode_batch(poses, batch)
                 run.growing.pop(k, None)
             run.tell("chunk", k=k, variant=v, first=ids.start, count=len(ids), steps=FUTURE_STEPS)
             if ids.stop == run.body.num_rollouts:
@@ -309,7 +292,7 @@ class Worker:
             done = poses.shape[3] // policy.steps_per_decision
             # The first chunk of each variant is shown growing; for later ones the page has something to show.
             if ids.start == 0:
-                run.growing[k] = _encoded(poses, batch)
+                run.growing[k] = encode_batch(poses, batch)
             run.tell(
                 "progress", k=k, variant=v, decision=done, of=num_decisions, first=ids.start,
                 count=len(ids), steps=poses.shape[3],
@@ -325,7 +308,7 @@ class Worker:
             num_rollouts=ids,
             seed=variant.seed,
             context=context,
-            goals=goals_of_batch(variant.goals, batch) if variant.goals else None,
+            goals=variant.goals_in(batch),
             sampling=Sampling(variant.temperature, variant.top_k),
             observe=observe,
         )
@@ -344,76 +327,9 @@ class Worker:
             run.tell("score", variant=one, **run.simulated[one].scored[key].to_payload(base))
 
 
-def free_variant(variants: tuple[Variant, ...], index: int) -> int:
-    """Index of the variant of the same model without goals; the variant's own where it has none.
-
-    Args:
-        variants: of a run.
-        index: of one of them.
-    """
-    return next(i for i, other in enumerate(variants) if other.model == variants[index].model and not other.goals)
-
-
-def _has_goals(variants: tuple[Variant, ...], index: int) -> bool:
-    """True if the variant's model is also simulated with goals."""
-    return any(other.goals and other.model == variants[index].model for other in variants)
-
-
 @torch.no_grad()
 def _encode(policy: Any, batch: ScenarioBatch) -> Any:
     return policy.encode(batch)
-
-
-def _encoded(poses: Float[Tensor, "B N A t 3"], batch: ScenarioBatch) -> bytes:
-    """Bytes of the only scenario's poses."""
-    now = torch.cat([batch.position[0, :, CURRENT_STEP], batch.heading[0, :, CURRENT_STEP, None]], -1)
-    kept = batch.agent_mask[0]
-    return encode_poses(poses[0][:, kept].float().cpu().numpy(), now[kept].float().cpu().numpy())
-
-
-def variants_of(session: Session, body: RunBody) -> Iterator[Variant]:
-    """Variants of a run: models with goals where they take any, and goal-conditioned ones also without.
-
-    Args:
-        session: data and models.
-        body: the request.
-
-    Raises:
-        Refusal: an unknown scenario or model, or goals or guidance that would have no effect.
-        DataError: an impossible goal, or two goals of one agent.
-    """
-    scenario = session.scenario(body.split, body.scenario)
-    models = [session.model(name) for name in dict.fromkeys(body.models)]
-    goals = entries_of(body)
-    goals_of_batch(goals, collate([scenario]))  # refuses impossible ones
-    if goals and not any(model.takes_goals for model in models):
-        raise Refusal(
-            f"{', '.join(m.name for m in models)} is not goal-conditioned, {len(goals)} goals would have no effect.",
-            hint="Take a model that was fine-tuned with goals (docs/goals.md), or remove the goals.",
-        )
-    settings = (body.split, body.scenario, body.seed, body.temperature, body.top_k)
-    for model in models:
-        if goals and model.takes_goals:
-            guidance = body.guidance if model.can_guide else 1.0
-            yield Variant(model.name, model.fingerprint, *settings, guidance=guidance, goals=goals)
-        yield Variant(model.name, model.fingerprint, *settings)
-
-
-def entries_of(body: Any) -> tuple[GoalEntry, ...]:
-    """Goals of a request as entries of a goals file.
-
-    Args:
-        body: with a scenario and goals.
-
-    Raises:
-        Refusal: an agent has two goals.
-    """
-    entries = tuple(GoalEntry(body.scenario, g.agent, round(g.x, 3), round(g.y, 3), g.label) for g in body.goals)
-    agents = [entry.agent_id for entry in entries]
-    twice = next((agent for agent in agents if agents.count(agent) > 1), None)
-    if twice is not None:
-        raise Refusal(f"agent {twice} has two goals: keep one of them.")
-    return entries
 
 
 def as_json(event: tuple[str, dict[str, Any]]) -> str:

@@ -19,8 +19,9 @@ from rlftsim.studio.bodies import CheckBody, EmptyBody, ExportBody, OpenGoalsBod
 from rlftsim.studio.exports import export, save_goals
 from rlftsim.studio.guard import Access, Guard
 from rlftsim.studio.refusal import Refusal
-from rlftsim.studio.runs import Run, Worker, as_json, entries_of
+from rlftsim.studio.runs import Run, Worker, as_json
 from rlftsim.studio.session import Session
+from rlftsim.studio.variants import entries_of
 
 POLL_S = 0.05
 IDLE_S = 60.0
@@ -69,13 +70,13 @@ def create_app(session: Session, worker: Worker, access: Access) -> ASGIApp:
 
 def _add_page(app: FastAPI) -> None:
     @app.get("/")
-    def page() -> Response:
+    def _page() -> Response:
         """The page."""
         text = static_files()["index.html"].replace(b"STATIC", f"static/{static_hash()}".encode())
         return Response(text, media_type="text/html; charset=utf-8")
 
     @app.get("/static/{version}/{name}")
-    def static(version: str, name: str) -> Response:
+    def _static(version: str, name: str) -> Response:
         """A module or style sheet; names are looked up, so none can lead out of the folder."""
         ending = name.rpartition(".")[2]
         if version != static_hash() or name not in static_files() or ending not in MEDIA_TYPES:
@@ -86,39 +87,39 @@ def _add_page(app: FastAPI) -> None:
 
 def _add_scenarios(app: FastAPI, session: Session) -> None:
     @app.get("/api/session")
-    def describe() -> dict[str, Any]:
+    def _describe() -> dict[str, Any]:
         """Versions, models and data."""
         return session.describe()
 
     @app.get("/api/alive")
-    def alive() -> dict[str, Any]:
+    def _alive() -> dict[str, Any]:
         """Sign of life."""
         return {"alive": True}
 
     @app.get("/api/scenarios")
-    def rows(
+    def _rows(
         split: str, query: Annotated[str, Query(max_length=400)] = "", offset: Annotated[int, Query(ge=0)] = 0
     ) -> dict[str, Any]:
         """A page of the index."""
         return session.rows(split, query, offset)
 
     @app.get("/api/scenario/{split}/{scenario_id}")
-    def scene(split: str, scenario_id: str) -> Response:
+    def _scene(split: str, scenario_id: str) -> Response:
         """Scene and log."""
         return Response(session.scene(split, scenario_id), media_type="application/json")
 
     @app.get("/api/proposals/{split}/{scenario_id}/{agent}")
-    def proposals(split: str, scenario_id: str, agent: int) -> dict[str, Any]:
+    def _proposals(split: str, scenario_id: str, agent: int) -> dict[str, Any]:
         """Maneuvers of an agent."""
         return session.proposals(split, scenario_id, agent)
 
     @app.post("/api/goals/check")
-    def check(body: CheckBody) -> dict[str, Any]:
+    def _check(body: CheckBody) -> dict[str, Any]:
         """Refusals and doubts of goals."""
         return {"goals": session.doubts(session.scenario(body.split, body.scenario), entries_of(body))}
 
     @app.post("/api/goals/open")
-    def open_goals(body: OpenGoalsBody) -> dict[str, Any]:
+    def _open_goals(body: OpenGoalsBody) -> dict[str, Any]:
         """Entries of a goals file."""
         file = parse_goals(body.text, body.name)
         return {"goals": _plain(file.goals), "alternatives": _plain(file.alternatives)}
@@ -128,19 +129,19 @@ def _add_runs(app: FastAPI, worker: Worker) -> None:
     streams = 0
 
     @app.post("/api/runs")
-    def submit(body: RunBody) -> dict[str, Any]:
+    def _submit(body: RunBody) -> dict[str, Any]:
         """Queue a run."""
         return _described(worker.submit(body))
 
     @app.get("/api/runs/{name}")
-    def state(name: str, after: Annotated[int, Query(ge=-1)] = -1) -> dict[str, Any]:
+    def _state(name: str, after: Annotated[int, Query(ge=-1)] = -1) -> dict[str, Any]:
         """Events of a run after a number, for pages behind a proxy that holds streams back."""
         run = worker.run(name)
         events = [{"id": i, "event": e, "data": d} for i, (e, d) in enumerate(run.events) if i > after]
         return {**_described(run), "events": events}
 
     @app.get("/api/runs/{name}/events")
-    async def events(name: str, request: Request) -> Response:
+    async def _events(name: str, request: Request) -> Response:
         """Events of a run as they come."""
         nonlocal streams
         run = worker.run(name)
@@ -162,18 +163,18 @@ def _add_runs(app: FastAPI, worker: Worker) -> None:
         return StreamingResponse(stream(), media_type="text/event-stream", headers={"x-accel-buffering": "no"})
 
     @app.get("/api/runs/{name}/chunk/{k}")
-    def chunk(name: str, k: int) -> Response:
+    def _chunk(name: str, k: int) -> Response:
         """Poses of a chunk."""
         return Response(worker.run(name).chunk(k), media_type="application/octet-stream")
 
     @app.get("/api/runs/{name}/score")
-    def score(name: str) -> dict[str, Any]:
+    def _score(name: str) -> dict[str, Any]:
         """Scores of the variants that are complete."""
         found = {data["variant"]: data for event, data in list(worker.run(name).events) if event == "score"}
         return {"variants": [found[v] for v in sorted(found)]}
 
     @app.get("/api/runs/{name}/explain")
-    def explain(name: str, variant: Annotated[int, Query(ge=0)] = 0) -> dict[str, Any]:
+    def _explain(name: str, variant: Annotated[int, Query(ge=0)] = 0) -> dict[str, Any]:
         """Losses of a variant by feature, agent and step."""
         run = worker.run(name)
         run.rollouts(variant)
@@ -183,13 +184,13 @@ def _add_runs(app: FastAPI, worker: Worker) -> None:
         return scored.explained()
 
     @app.post("/api/runs/{name}/cancel")
-    def cancel(name: str, body: EmptyBody) -> dict[str, Any]:
+    def _cancel(name: str, body: EmptyBody) -> dict[str, Any]:
         """Stop a run at its next decision."""
         worker.cancel(name)
         return {"run": name}
 
     @app.delete("/api/runs/{name}")
-    def drop(name: str) -> dict[str, Any]:
+    def _drop(name: str) -> dict[str, Any]:
         """Stop a run and forget it."""
         worker.drop(name)
         return {"run": name}
@@ -197,12 +198,12 @@ def _add_runs(app: FastAPI, worker: Worker) -> None:
 
 def _add_files(app: FastAPI, session: Session, worker: Worker) -> None:
     @app.post("/api/goals/save")
-    def save(body: SaveGoalsBody) -> dict[str, Any]:
+    def _save(body: SaveGoalsBody) -> dict[str, Any]:
         """Write a goals file."""
         return {"path": str(save_goals(session, body))}
 
     @app.post("/api/export")
-    def write(body: ExportBody) -> dict[str, Any]:
+    def _write(body: ExportBody) -> dict[str, Any]:
         """Write rollouts of a run."""
         return {"path": str(export(session, worker.run(body.run), body))}
 

@@ -31,7 +31,12 @@ class _Server(uvicorn.Server):
         self._worker = worker
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """Take a signal."""
+        """Take a signal.
+
+        Args:
+            sig: its number.
+            frame: where it came.
+        """
         self._worker.stop()
         super().handle_exit(sig, frame)
 

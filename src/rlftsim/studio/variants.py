@@ -1,0 +1,96 @@
+"""Variants of a run: each model with the goals, and goal-conditioned ones also without, on the same seeds."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from rlftsim.goals.goals_file import GoalEntry
+from rlftsim.goals.placement import goals_of_batch
+from rlftsim.goals.types import Goals
+from rlftsim.scenario.batch import ScenarioBatch, collate
+from rlftsim.studio.bodies import CheckBody, RunBody
+from rlftsim.studio.refusal import Refusal
+from rlftsim.studio.session import Session
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One model, with or without goals, under the settings of a run."""
+
+    model: str
+    fingerprint: str
+    split: str
+    scenario: str
+    seed: int
+    temperature: float
+    top_k: int | None
+    guidance: float = 1.0
+    goals: tuple[GoalEntry, ...] = ()
+
+    def goals_in(self, batch: ScenarioBatch) -> Goals | None:
+        """The goals in the frame of a batch of its scenario; None where it has none."""
+        return goals_of_batch(self.goals, batch) if self.goals else None
+
+
+def variants_of(session: Session, body: RunBody) -> Iterator[Variant]:
+    """Variants of a run: models with goals where they take any, and goal-conditioned ones also without.
+
+    Args:
+        session: data and models.
+        body: the request.
+
+    Raises:
+        Refusal: an unknown scenario or model, or goals or guidance that would have no effect.
+        DataError: an impossible goal, or two goals of one agent.
+    """
+    scenario = session.scenario(body.split, body.scenario)
+    models = [session.model(name) for name in dict.fromkeys(body.models)]
+    goals = entries_of(body)
+    goals_of_batch(goals, collate([scenario]))  # refuses impossible ones
+    if goals and not any(model.takes_goals for model in models):
+        raise Refusal(
+            f"{', '.join(m.name for m in models)} is not goal-conditioned, {len(goals)} goals would have no effect.",
+            hint="Take a model that was fine-tuned with goals (docs/goals.md), or remove the goals.",
+        )
+    settings = (body.split, body.scenario, body.seed, body.temperature, body.top_k)
+    for model in models:
+        if goals and model.takes_goals:
+            guidance = body.guidance if model.can_guide else 1.0
+            yield Variant(model.name, model.fingerprint, *settings, guidance=guidance, goals=goals)
+        yield Variant(model.name, model.fingerprint, *settings)
+
+
+def entries_of(body: RunBody | CheckBody) -> tuple[GoalEntry, ...]:
+    """Goals of a request as entries of a goals file.
+
+    Args:
+        body: with a scenario and goals.
+
+    Raises:
+        Refusal: an agent has two goals.
+    """
+    entries = tuple(GoalEntry(body.scenario, g.agent, round(g.x, 3), round(g.y, 3), g.label) for g in body.goals)
+    agents = [entry.agent_id for entry in entries]
+    twice = next((agent for agent in agents if agents.count(agent) > 1), None)
+    if twice is not None:
+        raise Refusal(f"agent {twice} has two goals: keep one of them.")
+    return entries
+
+
+def free_variant(variants: tuple[Variant, ...], index: int) -> int:
+    """Index of the variant of the same model without goals; the variant's own where it has none.
+
+    Args:
+        variants: of a run.
+        index: of one of them.
+    """
+    return next(i for i, other in enumerate(variants) if other.model == variants[index].model and not other.goals)
+
+
+def has_goals(variants: tuple[Variant, ...], index: int) -> bool:
+    """True if the variant's model is also simulated with goals.
+
+    Args:
+        variants: of a run.
+        index: of one of them.
+    """
+    return any(other.goals and other.model == variants[index].model for other in variants)
