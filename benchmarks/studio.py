@@ -8,6 +8,7 @@ Prints a JSON line for each measurement. Needs the extra `studio`, playwright an
 import argparse
 import io
 import json
+import os
 import subprocess
 import sys
 import time
@@ -51,6 +52,27 @@ def wait(page: Page, condition: str, seconds: float = 300) -> None:
         time.sleep(0.02)
 
 
+def cpu_s(root: int) -> float:
+    """CPU seconds of a process and all of its descendants so far."""
+    parents, used = {}, {}
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            fields = (folder / "stat").read_text().rpartition(")")[2].split()
+        except OSError:
+            continue
+        parents[int(folder.name)] = int(fields[1])
+        used[int(folder.name)] = (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    found = {root}
+    while more := {process for process, parent in parents.items() if parent in found} - found:
+        found |= more
+    return sum(used.get(process, 0.0) for process in found)
+
+
+def still(page: Page, path: Path) -> None:
+    """A screenshot as webp."""
+    Image.open(io.BytesIO(page.screenshot())).convert("RGB").save(path, quality=82, method=6)
+
+
 def say(name: str, **values: object) -> None:
     print(json.dumps({"what": name, **values}), flush=True)
 
@@ -77,13 +99,16 @@ def measure(browser, begun: float, url: str) -> None:
         )
     for agents, count in ((120, 32), (27, 32)):
         page.evaluate("() => { studio.state.panels = ['log', studio.state.session.models.at(-1).name]; }")
-        gaps = page.evaluate(GAPS, [agents, count])[5:]
+        before = cpu_s(os.getpid())
+        gaps = page.evaluate(GAPS, [agents, count])
+        cpu_ms = 1000 * (cpu_s(os.getpid()) - before) / len(gaps)
         say(
             "frames",
             agents=agents,
             rollouts=count,
             per_second=round(1000 * len(gaps) / sum(gaps), 1),
             longest_ms=round(max(gaps)),
+            cpu_ms=round(cpu_ms, 1),
         )
     heaps = []
     page.goto(url.partition("?")[0])
@@ -148,7 +173,6 @@ def tell(browser, url: str, folder: Path) -> None:
     page.goto(url)
     wait(page, LOADS)
     page.wait_for_timeout(2500)
-    page.screenshot(path=folder / "first.png")
     film = Film(page)
     film.play(5)
     page.evaluate("() => studio.timeline.seek(10)")
@@ -166,7 +190,7 @@ def tell(browser, url: str, folder: Path) -> None:
     film.play(8)
     page.evaluate("() => studio.timeline.seek(45)")
     page.wait_for_timeout(300)
-    page.screenshot(path=folder / "goal.png")
+    still(page, folder / "goal.webp")
     page.keyboard.press("c")
     page.evaluate("() => studio.timeline.seek(10)")
     simulate(page)
@@ -201,7 +225,7 @@ def tell(browser, url: str, folder: Path) -> None:
         wait(page, f"{LOADS} && studio.state.run && {OVER}")
         page.evaluate("() => studio.timeline.seek(55)")
         page.wait_for_timeout(2500)
-        page.screenshot(path=folder / f"{name}.png")
+        still(page, folder / f"{name}.webp")
         page.close()
 
 
@@ -219,7 +243,7 @@ def main() -> None:
         try:
             browser = session.chromium.launch(executable_path="/usr/bin/chromium", args=ARGUMENTS)
             url = json.loads(server.stdout.readline())["url"]
-            say("from the command to the address", seconds=round(time.monotonic() - begun, 2))
+            say("from the command to the address", seconds=round(time.monotonic() - begun, 2), cpu_s=cpu_s(server.pid))
             measure(browser, begun, url)
             if options.pictures:
                 tell(browser, url, options.pictures)

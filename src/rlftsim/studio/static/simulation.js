@@ -26,6 +26,7 @@ async function simulate(count = state.count) {
   clearTimeout(rest);
   if (!wantedModels().length) return toast("No panel shows a model: add one with C, then simulate.");
   end();
+  delete byId("run-status").dataset.over;
   let answer;
   try { answer = await post("api/runs", request(count)); } catch (error) { toast(error.message); status(error.message); return; }
   // Variants that the run holds under the names of the panels; old rollouts stay until the first new ones arrive.
