@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 import time
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from PIL import Image
 
 from rlftsim.goals.goals_file import read_goals
+from rlftsim.studio.server import static_files
 from rlftsim.studio.serving import Studio
 
 CHROMIUM = "/usr/bin/chromium"
@@ -195,6 +197,44 @@ def test_everything_can_be_done_with_keys(page):
     assert page.state("studio.state.panels.length") == 2
     page.page.locator("#table").click()
     assert page.page.locator("dialog[open] tbody tr").count() == 27
+
+
+def test_a_goals_file_is_stepped_through_and_keeps_scenarios_that_are_not_here(page, session, tmp_path):
+    others = session.rows("validation", "", 0)["rows"][2:4]
+    ids = [others[0]["scenario_id"], "elsewhere", others[1]["scenario_id"]]
+    goals = [{"scenario": one, "agent": 1, "x": 0.5, "y": 0.25} for one in ids]
+    (tmp_path / "three.json").write_text(json.dumps({"format": "rlftsim-goals-1", "goals": goals}))
+    page.open(f"#split=validation&id={SCENARIO}&panels=log")
+    page.page.locator("#goals-file").set_input_files(tmp_path / "three.json")
+    page.wait(f"studio.state.id === '{ids[0]}'")
+    page.press("n")
+    page.wait(f"studio.state.id === '{ids[2]}'")
+    page.press("n")
+    page.wait(f"studio.state.id === '{ids[0]}'")
+    assert json.loads(page.state("studio.goalsText()"))["goals"] == goals
+
+
+def test_every_control_has_a_name_and_text_has_contrast(page):
+    page.open()
+    unnamed = "[...document.querySelectorAll('button, select, input:not([hidden])')].filter((one) => "
+    unnamed += "!one.textContent.trim() && !one.labels?.length && !one.getAttribute('aria-label')).map((one) => one.id)"
+    assert page.state(unnamed) == []
+    light, _, dark = static_files()["palette.css"].decode().partition("@media")
+    for text in (light, dark):
+        colors = dict(re.findall(r"--([\w-]+): (#[0-9a-f]{6})", text))
+        for ink in ("ink", "muted", "accent", "bad", "good"):
+            assert contrast(colors[ink], colors["surface"]) >= 4.5, ink
+        assert contrast(colors["ink"], colors["accent-soft"]) >= 4.5
+
+
+def contrast(first, second):
+    """Ratio of two colors, WCAG 2.2."""
+    levels = []
+    for color in (first, second):
+        parts = [int(color[i : i + 2], 16) / 255 for i in (1, 3, 5)]
+        linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in parts]
+        levels.append(0.05 + 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2])
+    return max(levels) / min(levels)
 
 
 def test_a_model_that_takes_no_goals_says_so_and_the_first_page_plays(browser, tmp_path):

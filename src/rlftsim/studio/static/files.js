@@ -56,10 +56,9 @@ async function openGoals(file) {
     state.goals = { ...state.goals, alternatives: found.alternatives };
     setGoals(found.goals);
     state.savedAs = stem(file.name.replace(/\.json$/, ""));
-    const first = found.goals[0]?.scenario;
     toast(`${found.goals.length} goals of ${new Set(found.goals.map((goal) => goal.scenario)).size} scenarios: N and P step through them.`);
     state.stepThrough = [...new Set(found.goals.map((goal) => goal.scenario))];
-    if (first && first !== state.id) changed("open-first");
+    if (state.stepThrough.length && !state.stepThrough.includes(state.id)) changed("open-first");
   } catch (error) { toast(error.message); }
 }
 

@@ -166,7 +166,7 @@ function agentTableOf(panel) {
       make("td", {}, one ? number(one.speed, 1) : "–"), make("td", {}, goal ? `${number(goal.x, 1)}, ${number(goal.y, 1)}` : ""),
       make("td", {}, make("button", { value: "close", onclick: () => { state.selected = id; changed("selection"); } }, "select")));
   });
-  const heads = ["agent", "kind", "x [m]", "y [m]", "m/s", "goal", ""].map((text) => make("th", { scope: "col" }, text));
+  const heads = ["agent", "kind", "x [m]", "y [m]", "m/s", "goal", "choose"].map((text) => make("th", { scope: "col" }, text));
   return make("div", { class: "scroll", tabindex: "0" }, make("table", {}, make("thead", {}, make("tr", {}, ...heads)), make("tbody", {}, ...rows)));
 }
 

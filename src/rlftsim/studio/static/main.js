@@ -236,20 +236,23 @@ async function openScenario(id, { view = null, time = null } = {}) {
   return true;
 }
 
-/** The scenario before or after; of an open goals file where there is one. */
+/** The scenario before or after; of an open goals file where there is one, passing over scenarios that the data set lacks. */
 async function stepScenario(by) {
   const through = state.stepThrough;
   if (!through?.length) return list.step(by);
-  const at = through.indexOf(state.id), id = through[(at + by + through.length) % through.length];
-  for (const split of [state.split, ...state.session.splits.map((one) => one.name)]) {
-    const known = await get(`api/scenarios?split=${encodeURIComponent(split)}&query=${encodeURIComponent(`id=${id}`)}`);
-    if (!known.total) continue;
-    if (split !== state.split) await openSplit(split);
-    await openScenario(id);
-    await list.find(id);
-    return;
+  const at = through.indexOf(state.id), splits = [state.split, ...state.session.splits.map((one) => one.name)];
+  for (let k = 1; k <= through.length; k++) {
+    const id = through[(((at + by * k) % through.length) + through.length) % through.length];
+    for (const split of splits) {
+      const known = await get(`api/scenarios?split=${encodeURIComponent(split)}&query=${encodeURIComponent(`id=${id}`)}`);
+      if (!known.total) continue;
+      if (split !== state.split) await openSplit(split);
+      await openScenario(id);
+      await list.find(id);
+      return;
+    }
   }
-  toast(`Scenario ${id} is not in this data set; its goals stay in the file.`);
+  toast("None of the file's scenarios is in this data set; its goals stay in it.");
 }
 
 async function openSplit(split) {
@@ -348,7 +351,7 @@ onChange((topics) => {
   if (has("selection") && state.scene) { speak(sentence()); renderScore(); }
   if (has("scene")) list.render();
   if (has("run")) speak(sentence());
-  if (has("open-first")) stepScenario(0);
+  if (has("open-first")) stepScenario(1);
   if (has("selection") && state.selected >= 0 && state.proposals?.agent !== state.selected) loadProposals(state.selected);
   drawSoon();
   clearTimeout(onChange.timer);

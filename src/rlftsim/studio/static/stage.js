@@ -150,27 +150,28 @@ class Panel {
 
   // ---- what moves ---------------------------------------------------------------------------------------------------
 
-  /** Boxes of all rollouts but the shown one: one path and one fill for each color. */
+  /** Boxes of all rollouts but the shown one: a path and a fill for each agent, as one path across the picture fills slowly. */
   drawGhosts(colors) {
-    const { ctx } = this, { agents } = state.scene, step = Math.floor(state.time), share = state.time - step;
-    const paths = [new Path2D(), new Path2D(), new Path2D()];
-    this.rollouts.forEach((rollout, n) => {
-      if (n === this.shown) return;
-      for (let a = 0; a < agents.length; a++) {
-        const motion = rollout[a];
-        if (!motion.valid[step]) continue;
-        const next = motion.valid[step + 1] ? step + 1 : step, [, , length, width, role] = agents[a];
-        const x = motion.x[step] + (motion.x[next] - motion.x[step]) * share, y = motion.y[step] + (motion.y[next] - motion.y[step]) * share;
-        const heading = motion.heading[step], c = Math.cos(heading), s = Math.sin(heading), l = length / 200, w = width / 200, path = paths[role];
-        path.moveTo(x + l * c - w * s, y + l * s + w * c);
-        path.lineTo(x - l * c - w * s, y - l * s + w * c);
-        path.lineTo(x - l * c + w * s, y - l * s - w * c);
-        path.lineTo(x + l * c + w * s, y + l * s - w * c);
-        path.closePath();
-      }
-    });
+    const { ctx, shown, rollouts } = this, { agents } = state.scene, step = Math.floor(state.time), share = state.time - step;
     ctx.globalAlpha = 0.25;
-    paths.forEach((path, role) => { ctx.fillStyle = colors[`agent-${ROLE_NAMES[role]}`]; ctx.fill(path); });
+    for (let a = 0; a < agents.length; a++) {
+      const [, , length, width, role] = agents[a], l = length / 200, w = width / 200;
+      ctx.beginPath();
+      for (let n = 0; n < rollouts.length; n++) {
+        const motion = rollouts[n][a];
+        if (n === shown || !motion.valid[step]) continue;
+        const next = motion.valid[step + 1] ? step + 1 : step;
+        const x = motion.x[step] + (motion.x[next] - motion.x[step]) * share, y = motion.y[step] + (motion.y[next] - motion.y[step]) * share;
+        const heading = motion.heading[step], lc = l * Math.cos(heading), ls = l * Math.sin(heading), wc = w * Math.cos(heading), ws = w * Math.sin(heading);
+        ctx.moveTo(x + lc - ws, y + ls + wc);
+        ctx.lineTo(x - lc - ws, y - ls + wc);
+        ctx.lineTo(x - lc + ws, y - ls - wc);
+        ctx.lineTo(x + lc + ws, y + ls - wc);
+        ctx.closePath();
+      }
+      ctx.fillStyle = colors[`agent-${ROLE_NAMES[role]}`];
+      ctx.fill();
+    }
     ctx.globalAlpha = 1;
   }
 
