@@ -210,6 +210,7 @@ def tell(browser, url: str, folder: Path) -> None:
     wait(page, f"studio.state.run && {OVER}")
     film.play(8)
     page.keyboard.press("Control+z")
+    wait(page, f"studio.state.run && {OVER}")
     page.click("#export")
     page.wait_for_timeout(300)
     film.hold(4)
@@ -234,6 +235,7 @@ def main() -> None:
     parser.add_argument("--model", action="append", required=True)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--pictures", type=Path)
+    parser.add_argument("--only-pictures", action="store_true")
     options = parser.parse_args()
     words = [sys.executable, "-m", "rlftsim", "studio", "--no-browser", "--json", "--out", str(options.out)]
     for model in options.model:
@@ -244,7 +246,8 @@ def main() -> None:
             browser = session.chromium.launch(executable_path="/usr/bin/chromium", args=ARGUMENTS)
             url = json.loads(server.stdout.readline())["url"]
             say("from the command to the address", seconds=round(time.monotonic() - begun, 2), cpu_s=cpu_s(server.pid))
-            measure(browser, begun, url)
+            if not options.only_pictures:
+                measure(browser, begun, url)
             if options.pictures:
                 tell(browser, url, options.pictures)
             browser.close()

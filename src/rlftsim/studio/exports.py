@@ -13,7 +13,6 @@ from rlftsim.studio.bodies import ExportBody, SaveGoalsBody
 from rlftsim.studio.refusal import Refusal
 from rlftsim.studio.runs import Run
 from rlftsim.studio.session import Session
-from rlftsim.viewer.film import to_film
 from rlftsim.viewer.page import Animation, Panel, write_page
 from rlftsim.viewer.scene import SceneMotion, build_scene, logged_trajectories, rollout_trajectories
 
@@ -96,6 +95,9 @@ def export(session: Session, run: Run, body: ExportBody) -> Path:
                 path, f"Scenario {scenario.scenario_id}", [_animation(session, run, body.rollout, MAX_PAGE_ROLLOUTS)]
             )
         case _:
+            # Not at the top: matplotlib takes half a second, for which the page would wait.
+            from rlftsim.viewer.film import to_film
+
             to_film(path, _animation(session, run, body.rollout, 1))
     return path
 

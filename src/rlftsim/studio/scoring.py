@@ -11,13 +11,12 @@ from rlftsim.errors import DataError
 from rlftsim.evaluation.explain import Explanation, explain
 from rlftsim.goals.attainment import Outcome, outcome_of
 from rlftsim.goals.goals_file import GoalEntry
-from rlftsim.realism import FEATURE_NAMES, SimulatedStates, metric_by_name
+from rlftsim.realism import FEATURE_NAMES, metric_by_name
 from rlftsim.realism.config import BERNOULLI_FEATURES
 from rlftsim.realism.from_rollouts import states_of_rollouts
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.types import Scenario
-from rlftsim.statistics import interval_around
 
 EVENT_KINDS = ("collision", "offroad", "light")
 """Names of `BERNOULLI_FEATURES` on the page."""
@@ -115,17 +114,14 @@ def score_variant(scenario: Scenario, rollouts: Rollouts, goals: tuple[GoalEntry
     (states,) = states_of_rollouts(collate([scenario]), rollouts)
     outcomes = tuple((goal, outcome_of(states.way_of(goal.agent_id), (goal.x, goal.y))) for goal in goals)
     explanation, reason = None, ""
-    try:
-        explanation = _explained(scenario, states, metric)
-    except DataError as error:
-        reason = str(error)
-    return Scored(rollouts.num_rollouts, outcomes, explanation, reason)
-
-
-def _explained(scenario: Scenario, states: SimulatedStates, metric: str) -> Explanation:
     if not scenario.has_future:
-        raise DataError("this split withholds the logged future, which realism is measured against: no score.")
-    return explain(scenario, states, metric_by_name(metric))
+        reason = "this split withholds the logged future, which realism is measured against: no score."
+    else:
+        try:
+            explanation = explain(scenario, states, metric_by_name(metric))
+        except DataError as error:  # such as a map without road edges
+            reason = str(error)
+    return Scored(rollouts.num_rollouts, outcomes, explanation, reason)
 
 
 def change_of(scored: Scored, free: Scored) -> dict[str, float] | None:
@@ -138,6 +134,9 @@ def change_of(scored: Scored, free: Scored) -> dict[str, float] | None:
     Returns:
         None without a score.
     """
+    # Not at the top: scipy takes half a second, for which the page would wait.
+    from rlftsim.statistics import interval_around
+
     if scored.explanation is None or free.explanation is None:
         return None
     own, other = scored.explanation.result, free.explanation.result

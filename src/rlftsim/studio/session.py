@@ -191,8 +191,8 @@ class Session:
         if split not in self._datasets:
             raise Refusal(f"no split {split!r} in {self.data}, only {', '.join(self.splits)}.", status=404)
         if split not in self._rows:
-            columns = self._datasets[split].index.select(["scenario_id", "num_steps", *_index_columns()])
-            self._rows[split] = columns.to_pylist()
+            columns = [column for column in FIELDS.values() if column != "num_agents"]
+            self._rows[split] = self._datasets[split].index.select(columns).to_pylist()
             for row in self._rows[split]:
                 row["num_agents"] = row["num_vehicles"] + row["num_pedestrians"] + row["num_cyclists"]
         tests = [_test_of(term) for term in query.split()]
@@ -243,10 +243,6 @@ class Session:
             except DataError as error:
                 found.append({"agent": entry.agent_id, "refused": str(error), "doubts": []})
         return found
-
-
-def _index_columns() -> list[str]:
-    return [column for column in FIELDS.values() if column not in ("num_agents", "scenario_id")]
 
 
 def _load(names: tuple[str, ...], device: Any) -> list[Model]:
