@@ -199,6 +199,33 @@ def test_everything_can_be_done_with_keys(page):
     assert page.page.locator("dialog[open] tbody tr").count() == 27
 
 
+def test_a_dragged_goal_is_simulated_and_a_refused_one_is_not(page):
+    goal = f"{EGO}@-36.715,-2.361"
+    page.open(f"#split=validation&id={SCENARIO}&panels=log,goals&count=4&agent={EGO}&goals={goal}")
+    page.wait("studio.state.proposals")
+    x, y = page.page.evaluate(PIN_ON_SCREEN)
+    page.page.mouse.move(x, y)
+    page.page.mouse.down()
+    page.page.mouse.move(x - 40, y, steps=4)
+    page.page.mouse.up()
+    moved = page.state("studio.state.goals.goals[0].x - -36.715")
+    assert moved == pytest.approx(page.state("-40 / studio.stage.panels[0].scale"), abs=1.6)  # on the nearest lane
+    page.simulated()
+    assert len(page.state("studio.state.variants.get('goals').score.outcomes")) == 1
+    page.page.get_by_label("goal x, meters, world frame").fill("9000")
+    page.press("Tab")
+    page.page.get_by_text("out of reach in 8 s").wait_for()
+    page.simulated()
+    assert page.state("studio.state.variants.get('goals').score.outcomes") == []
+
+
+PIN_ON_SCREEN = """() => {
+  const p = studio.stage.panels[0], box = p.canvas.getBoundingClientRect(), view = studio.state.view;
+  const [x, y] = studio.stage.toMap(studio.state.goals.goals[0]);
+  return [box.left + box.width / 2 + (x - view.x) * p.scale, box.top + box.height / 2 - (y - view.y) * p.scale];
+}"""
+
+
 def test_a_goals_file_is_stepped_through_and_keeps_scenarios_that_are_not_here(page, session, tmp_path):
     others = session.rows("validation", "", 0)["rows"][2:4]
     ids = [others[0]["scenario_id"], "elsewhere", others[1]["scenario_id"]]

@@ -178,7 +178,15 @@ function commitPlacing() {
   putGoal(agent, x + state.origin[0], y + state.origin[1]);
 }
 
-/** Refusals and doubts in the words of the command line; then a quick look at what the goals do. */
+/** Checks changed goals, then takes a quick look at what they do; refused ones are left out of it. */
+async function lookAtGoals() {
+  const id = state.id, looks = state.scene && goalModels().length && !state.isQuiet;
+  if (looks) delete byId("run-status").dataset.over;
+  await checkGoals();
+  if (looks && state.id === id) simulateSoon();
+}
+
+/** Refusals and doubts in the words of the command line. */
 async function checkGoals() {
   const goals = ownGoals(), id = state.id;
   state.doubts = new Map();
@@ -346,7 +354,7 @@ onChange((topics) => {
   const has = (...names) => names.some((name) => topics.has(name));
   if (has("panels")) { stage.layout(); renderNote(); }
   if (has("data", "panels", "scene")) { timeline.renderRollouts(); timeline.collect(); renderResults(); renderScore(); }
-  if (has("goals")) { checkGoals(); timeline.collect(); list.render(); if (state.scene && goalModels().length && !state.isQuiet) simulateSoon(); }
+  if (has("goals")) { timeline.collect(); list.render(); lookAtGoals(); }
   if (has("selection", "goals", "proposals", "scene")) renderAgent(actions);
   if (has("selection") && state.scene) { speak(sentence()); renderScore(); }
   if (has("scene")) list.render();
