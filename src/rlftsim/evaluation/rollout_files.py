@@ -17,7 +17,6 @@ import numpy as np
 import torch
 from google.protobuf.message import DecodeError
 
-from rlftsim.atomic_io import write_whole
 from rlftsim.errors import DataError
 from rlftsim.evaluation import submission_pb2
 from rlftsim.evaluation.wire_format import BYTES, WireField, iterate_fields
@@ -103,35 +102,6 @@ def read_states(entry: RolloutEntry) -> SimulatedStates:
         text, file = str(error), str(entry.file)
         raise DataError(f"{entry}{text[len(file) :] if text.startswith(file) else f': {text}'}") from error
     return states
-
-
-def write_submission(path: Path, scenario_id: str, states: SimulatedStates) -> None:
-    """Write one scenario's rollouts as an official ScenarioRollouts message, and read them back.
-
-    Args:
-        path: file to write, whole or not at all.
-        scenario_id: of the rollouts.
-        states: the rollouts, world frame.
-
-    Raises:
-        DataError: it cannot be written, or is not read back as it was.
-    """
-    message = submission_pb2.ScenarioRollouts(scenario_id=scenario_id)
-    for n in range(states.num_rollouts):
-        scene = message.joint_scenes.add()
-        for a, object_id in enumerate(states.object_id.tolist()):
-            scene.simulated_trajectories.add(
-                center_x=states.x[n, a].tolist(),
-                center_y=states.y[n, a].tolist(),
-                center_z=states.z[n, a].tolist(),
-                heading=states.heading[n, a].tolist(),
-                object_id=object_id,
-            )
-    write_whole(path, lambda temporary: temporary.write_bytes(message.SerializeToString()))
-    (entry,) = find_rollouts(path)
-    back = read_states(entry)
-    if not all(torch.equal(getattr(back, axis), getattr(states, axis).cpu()) for axis in AXES):
-        raise DataError(f"{path}: holds other numbers than were written: write it again.")
 
 
 def _pickle_error(path: Path) -> DataError:

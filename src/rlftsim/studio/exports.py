@@ -3,8 +3,7 @@
 import json
 from pathlib import Path
 
-from rlftsim.atomic_io import write_text
-from rlftsim.evaluation.rollout_files import write_submission
+from rlftsim.atomic_io import write_text, write_whole
 from rlftsim.goals.goals_file import parse_goals, write_goals
 from rlftsim.realism.from_rollouts import states_of_rollouts
 from rlftsim.rollout.files import write_rollouts
@@ -13,6 +12,7 @@ from rlftsim.studio.bodies import ExportBody, SaveGoalsBody
 from rlftsim.studio.refusal import Refusal
 from rlftsim.studio.runs import Run
 from rlftsim.studio.session import Session
+from rlftsim.submission.messages import encode_rollouts
 from rlftsim.viewer.page import Animation, Panel, write_page
 from rlftsim.viewer.scene import SceneMotion, build_scene, logged_trajectories, rollout_trajectories
 
@@ -86,7 +86,8 @@ def export(session: Session, run: Run, body: ExportBody) -> Path:
             (path,) = write_rollouts(path, batch, rollouts)
         case "submission":
             (states,) = states_of_rollouts(batch, rollouts)
-            write_submission(path, scenario.scenario_id, states)
+            message = encode_rollouts(scenario.scenario_id, states)
+            write_whole(path, lambda temporary: temporary.write_bytes(message))
         case "scores":
             scored = run.simulated[body.variant].scored[(run.body.num_rollouts, run.body.metric)]
             write_text(path, json.dumps(scored.to_payload() | scored.explained(), indent=1) + "\n")
