@@ -26,7 +26,7 @@ from rlftsim.submission.build import build_archive, forecast_size
 from rlftsim.submission.check import check_archive
 from rlftsim.submission.closed_loop import refuse_open_loop, statement
 from rlftsim.submission.messages import round_states
-from rlftsim.submission.plan import refuse_incomplete
+from rlftsim.submission.plan import refuse_incomplete, refuse_other_sources
 
 NUM_SHARDS = 6
 
@@ -230,6 +230,13 @@ def test_a_split_with_a_missing_file_is_refused(tmp_path):
     data.manifest = replace(data.manifest, shards=tuple(replace(entry, source=name) for name in names))
     with pytest.raises(DataError, match=r"from 2 of 3 files, testing\.tfrecord-00001-of-00003 is missing"):
         refuse_incomplete(data)
+
+
+def test_recordings_of_others_are_refused(tmp_path):
+    refuse_other_sources(entries.write_data(tmp_path / "set"))
+    write_dataset(replace(scenes.straight_road(), source="av2"), tmp_path / "foreign")
+    with pytest.raises(DataError, match="scenarios of the source av2: the Sim Agents server scores WOMD alone"):
+        refuse_other_sources(ScenarioDataset(tmp_path / "foreign"))
 
 
 class Slow(ConstantVelocity):

@@ -18,7 +18,7 @@ from rlftsim.submission.build import Job, build_archive, delete_parts
 from rlftsim.submission.check import ArchiveCheck, check_archive
 from rlftsim.submission.closed_loop import refuse_open_loop, statement
 from rlftsim.submission.entry import count_parameters, describe_entry, read_entry
-from rlftsim.submission.plan import make_plan, refuse_incomplete
+from rlftsim.submission.plan import make_plan, refuse_incomplete, refuse_other_sources
 from rlftsim.submission.report import Report, estimate_realism, findings_of, model_card, reported_sha256, write_findings
 from rlftsim.submission.scores import ArchiveScores
 from rlftsim.submission.transfer import split_file
@@ -89,6 +89,7 @@ class Build:
             seed=self.seed, temperature=self.temperature, top_k=self.top_k,
             split=self.split, rollouts_per_pass=self.rollouts_per_pass, jobs=self.jobs,
         )  # fmt: skip
+        refuse_other_sources(data)
         if not self.partial:
             refuse_incomplete(data)
         refuse_open_loop(policy, data[0])

@@ -115,6 +115,21 @@ def make_plan(
     return Plan(shards, tuple(int(agents[shard.start : shard.stop].sum()) for shard in shards), identity)
 
 
+def refuse_other_sources(data: ScenarioDataset) -> None:
+    """Refuse recordings that are not Waymo's: the leaderboard knows no other scenarios. Synthetic ones may be packed for
+    practice.
+
+    Raises:
+        DataError: the data set has scenarios of another source.
+    """
+    others = sorted(set(data.sources) - {"womd", "synthetic", "unknown"})
+    if others:
+        raise DataError(
+            f"{data.folder}: scenarios of the source {' and '.join(others)}: the Sim Agents server scores WOMD alone; "
+            "convert a split of it, or score these rollouts with `rlftsim evaluate`."
+        )
+
+
 def refuse_incomplete(data: ScenarioDataset) -> None:
     """Refuse a split that lacks files, before anything is simulated: the server wants every scenario of it.
 
