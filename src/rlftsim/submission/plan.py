@@ -116,8 +116,7 @@ def make_plan(
 
 
 def refuse_other_sources(data: ScenarioDataset) -> None:
-    """Refuse recordings that are not Waymo's: the leaderboard knows no other scenarios. Synthetic ones may be packed for
-    practice.
+    """Refuse recordings that are not Waymo's, the only ones the leaderboard knows; synthetic scenarios are practice.
 
     Raises:
         DataError: the data set has scenarios of another source.
