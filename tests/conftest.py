@@ -11,6 +11,8 @@ from rlftsim.recipes.registry import RECIPES
 from rlftsim.rewards.base import REWARDS
 from rlftsim.scenario.sources import SOURCES
 
+CHROMIUM = "/usr/bin/chromium"
+
 # slow machines are no failure; the same examples every time
 settings.register_profile("rlftsim", deadline=None, derandomize=True)
 settings.load_profile("rlftsim")
@@ -32,3 +34,16 @@ def forget_registered_names():
     for point in (REWARDS, POLICIES, SOURCES, RECIPES, EXPERIMENTS):
         for name in [name for name, value in point._registered.items() if not is_ours(value)]:
             point.remove(name)
+
+
+@pytest.fixture(scope="session")
+def browser():
+    """A headless Chromium of the system; skipped where there is none."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    with playwright.sync_playwright() as session:
+        try:
+            launched = session.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu"])
+        except playwright.Error as error:
+            pytest.skip(f"no usable Chromium at {CHROMIUM}: {str(error).splitlines()[0]}")
+        yield launched
+        launched.close()

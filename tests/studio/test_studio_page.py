@@ -13,22 +13,8 @@ from rlftsim.goals.goals_file import read_goals
 from rlftsim.studio.server import static_files
 from rlftsim.studio.serving import Studio
 
-CHROMIUM = "/usr/bin/chromium"
 SCENARIO = "9d639de83d6f5239"
 EGO = 179
-
-
-@pytest.fixture(scope="module")
-def browser():
-    """A headless Chromium of the system; skipped where there is none."""
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    with playwright.sync_playwright() as session:
-        try:
-            launched = session.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu"])
-        except playwright.Error as error:
-            pytest.skip(f"no usable Chromium at {CHROMIUM}: {str(error).splitlines()[0]}")
-        yield launched
-        launched.close()
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,6 @@ from rlftsim.viewer.page import Animation, Panel
 from rlftsim.viewer.scene import SceneMotion, build_scene, logged_trajectories
 
 STEPS = 91
-CHROMIUM = "/usr/bin/chromium"
 
 
 def draw_tracks() -> Tracks:
@@ -73,19 +72,6 @@ def scenario() -> Scenario:
         difficulty=np.array([1], np.int8),
         objects_of_interest=np.array([], np.int64),
     )
-
-
-@pytest.fixture(scope="session")
-def browser():
-    """A headless Chromium of the system; skipped where there is none."""
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    with playwright.sync_playwright() as session:
-        try:
-            launched = session.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu"])
-        except playwright.Error as error:
-            pytest.skip(f"no usable Chromium at {CHROMIUM}: {str(error).splitlines()[0]}")
-        yield launched
-        launched.close()
 
 
 @pytest.fixture
