@@ -1,4 +1,4 @@
-"""Angles, rotations and boxes in the plane, as pure functions on tensors; angles on arrays, too.
+"""Angles, rotations and boxes in the plane, as pure functions on tensors; at the end those on arrays.
 
 Meters, radians, counter-clockwise, headings in [-pi, pi).
 """
@@ -7,18 +7,13 @@ import math
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 
 def wrap_angle(angle: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
     """The same angle in [-pi, pi)."""
     return torch.remainder(angle + math.pi, 2 * math.pi) - math.pi
-
-
-def wrapped(angle: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """The same angle in [-pi, pi), as `wrap_angle`, for arrays."""
-    return np.remainder(angle + np.pi, 2 * np.pi) - np.pi
 
 
 def heading_vector(heading: Float[Tensor, "..."]) -> Float[Tensor, "... 2"]:
@@ -75,3 +70,55 @@ def pose_of_corners(corners: Float[Tensor, "... 4 2"]) -> tuple[Float[Tensor, ".
     """Position (mean of the corners) and heading (left-back to left-front) of boxes made by `box_corners`."""
     along = corners[..., 0, :] - corners[..., 3, :]  # [..., 2] left side, from back to front
     return corners.mean(-2), torch.atan2(along[..., 1], along[..., 0])
+
+
+def wrapped(angle: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
+    """The same angle in [-pi, pi), as `wrap_angle`, for arrays."""
+    return np.remainder(angle + np.pi, 2 * np.pi) - np.pi
+
+
+def clockwise_corners(
+    position: Float[np.ndarray, "*shape 2"], heading: Float[np.ndarray, "*shape"], size: Float[np.ndarray, "*#shape _"]
+) -> Float[np.ndarray, "*shape 4 2"]:
+    """Corners of boxes, as `box_corners`, for arrays.
+
+    Args:
+        position: centers, m.
+        heading: direction of the front, rad.
+        size: length and width, m, of each box or of all; a height is ignored.
+    """
+    forward = np.stack([np.cos(heading), np.sin(heading)], axis=-1) * size[..., :1] / 2
+    left = np.stack([-np.sin(heading), np.cos(heading)], axis=-1) * size[..., 1:2] / 2
+    signs = ((1, 1), (1, -1), (-1, -1), (-1, 1))
+    return np.stack([position + a * forward + b * left for a, b in signs], axis=-2)
+
+
+def boxes_overlap(
+    gap: Float[np.ndarray, "*shape 2"],
+    heading: Float[np.ndarray, "*#shape"],
+    other_heading: Float[np.ndarray, "*#shape"],
+    size: Float[np.ndarray, "*#shape _"],
+    other_size: Float[np.ndarray, "*#shape _"],
+) -> Bool[np.ndarray, "*shape"]:
+    """True where two boxes have an inner point in common, for arrays.
+
+    Args:
+        gap: from the center of the first box to that of the other, m.
+        heading: of the first box, rad.
+        other_heading: of the other.
+        size: length and width of the first box, m; a height is ignored.
+        other_size: of the other.
+    """
+    # Two convex boxes are apart exactly if one of their four side directions separates them. Along each direction the
+    # distance of the centers is compared with the sum of both half extents.
+    turn = other_heading - heading
+    cos, sin = np.abs(np.cos(turn)), np.abs(np.sin(turn))
+    half, other_half = size / 2, other_size / 2
+    overlap = np.ones(gap.shape[:-1], bool)
+    for angle, own, other in ((heading, half, other_half), (other_heading, other_half, half)):
+        c, s = np.cos(angle), np.sin(angle)
+        along = np.abs(c * gap[..., 0] + s * gap[..., 1])
+        across = np.abs(c * gap[..., 1] - s * gap[..., 0])
+        overlap &= along < own[..., 0] + (cos * other[..., 0] + sin * other[..., 1])
+        overlap &= across < own[..., 1] + (sin * other[..., 0] + cos * other[..., 1])
+    return overlap

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from rlftsim.envs import EgoEnv
-from rlftsim.envs.contact import boxes_overlap
 from rlftsim.envs.planner_scores import missing_scores
 from rlftsim.envs.traffic_scores import realism_of_others
 from rlftsim.realism import score
@@ -175,20 +174,3 @@ def test_realism_of_the_others_is_the_metric_without_the_ego():
     braking = drive(movers, np.full(80, 1.0), num_predicted=2)
     assert realism_of_others([braking.record]) < realism_of_others([result.record]) + 1e-6
     assert math.isnan(realism_of_others([drive(movers, steps=40, num_predicted=2).record]))
-
-
-def test_boxes_overlap_as_shapely_says():
-    shapely = pytest.importorskip("shapely")
-    affinity = pytest.importorskip("shapely.affinity")
-    random = np.random.default_rng(3)
-    pose = random.uniform((-3, -3, -3.1), (3, 3, 3.1), (200, 2, 3))
-    size = random.uniform(0.5, 5.0, (200, 2, 2))
-    ours = boxes_overlap(pose[:, 0], size[:, 0], pose[:, 1:], size[:, 1:])[:, 0]
-
-    def polygon(pose, size):
-        box = shapely.box(-size[0] / 2, -size[1] / 2, size[0] / 2, size[1] / 2)
-        turned = affinity.rotate(box, pose[2], origin=(0, 0), use_radians=True)
-        return affinity.translate(turned, *pose[:2])
-
-    theirs = [polygon(pose[k, 0], size[k, 0]).intersects(polygon(pose[k, 1], size[k, 1])) for k in range(200)]
-    assert ours.tolist() == theirs

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int64
 from scipy.spatial import KDTree
 
 from rlftsim.envs.scene import PIECE_POINTS, Scene, build_env_scene
+from rlftsim.geometry import boxes_overlap, clockwise_corners
 from rlftsim.scenario.derived import cached_on_scenario
 from rlftsim.scenario.types import Scenario
 
@@ -51,34 +52,6 @@ class Collision:
     """Length of the difference of both velocities."""
 
 
-def boxes_overlap(
-    motion: Float[np.ndarray, "*m c"],
-    size: Float[np.ndarray, "*#m 2"],
-    others: Float[np.ndarray, "*#m k c"],
-    other_size: Float[np.ndarray, "*#m k 2"],
-) -> Bool[np.ndarray, "*m k"]:
-    """True where boxes overlap, by the separating axis theorem.
-
-    Args:
-        motion: x, y, heading of boxes.
-        size: their length and width.
-        others: boxes that each of them may meet.
-        other_size: length and width of these.
-    """
-    offset = others[..., :2] - motion[..., None, :2]
-    turn = others[..., 2] - motion[..., None, 2]
-    cos, sin = np.abs(np.cos(turn)), np.abs(np.sin(turn))
-    half, other_half = size[..., None, :] / 2, other_size / 2
-    apart = np.zeros(offset.shape[:-1], bool)
-    # The axes of both boxes; on each the offset is compared with the sum of both half extents.
-    for heading, own, reach in ((motion[..., None, 2], half, other_half), (others[..., 2], other_half, half)):
-        c, s = np.cos(heading), np.sin(heading)
-        along, across = offset[..., 0] * c + offset[..., 1] * s, offset[..., 1] * c - offset[..., 0] * s
-        apart |= np.abs(along) > own[..., 0] + reach[..., 0] * cos + reach[..., 1] * sin
-        apart |= np.abs(across) > own[..., 1] + reach[..., 0] * sin + reach[..., 1] * cos
-    return ~apart
-
-
 def collision_of(
     scene: Scene,
     step: int,
@@ -101,14 +74,14 @@ def collision_of(
     """
     bearing = np.arctan2(track[1] - ego[1], track[0] - ego[0]) - ego[2]
     ahead = np.array([np.cos(ego[2]), np.sin(ego[2])])
-    bumper = np.append(ego[:2] + ego_size[0] / 2 * ahead, ego[2])
+    from_bumper = track[:2] - (ego[:2] + ego_size[0] / 2 * ahead)
     if np.hypot(*ego[3:]) <= STANDS_MPS:
         kind = CollisionType.STOPPED_EGO
     elif np.hypot(*track[3:]) <= STANDS_MPS:
         kind = CollisionType.STOPPED_TRACK
     elif np.cos(bearing) < np.cos(BEHIND_RAD):
         kind = CollisionType.ACTIVE_REAR
-    elif boxes_overlap(bumper, np.array([0.0, ego_size[1]]), track[None, :3], track_size[None])[0]:
+    elif boxes_overlap(from_bumper[None], ego[2:3], track[2:3], np.array([0.0, ego_size[1]]), track_size)[0]:
         kind = CollisionType.ACTIVE_FRONT
     else:
         kind = CollisionType.ACTIVE_LATERAL
@@ -116,19 +89,6 @@ def collision_of(
         kind == CollisionType.ACTIVE_LATERAL and not bool(in_one_lane(scene, ego[None], ego_size)[0])
     )
     return Collision(step, agent, kind, at_fault, float(np.hypot(*(ego[3:] - track[3:]))))
-
-
-def corners_of(motion: Float[np.ndarray, "n c"], size: Float[np.ndarray, "*#n 2"]) -> Float[np.ndarray, "n 4 2"]:
-    """Corners of boxes: left-front, right-front, right-back, left-back.
-
-    Args:
-        motion: x, y, heading.
-        size: length and width, of all or of each.
-    """
-    local = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) * size[..., None, :] / 2  # [n, 4, 2] or [4, 2]
-    cos, sin = np.cos(motion[:, 2, None]), np.sin(motion[:, 2, None])
-    turned = np.stack([cos * local[..., 0] - sin * local[..., 1], sin * local[..., 0] + cos * local[..., 1]], -1)
-    return motion[:, None, :2] + turned
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,11 +146,12 @@ def in_one_lane(scene: Scene, motion: Float[np.ndarray, "n c"], size: Float[np.n
     search = lane_search(scene.scenario)
     if search is None:
         return np.zeros(len(motion), bool)
-    near = search.tree.query_ball_point(corners_of(motion, size).reshape(-1, 2), HALF_LANE_M)
+    corners = clockwise_corners(motion[:, :2], motion[:, 2], size)
+    near = search.tree.query_ball_point(corners.reshape(-1, 2), HALF_LANE_M)
     lanes = [frozenset(search.lane[rows].tolist()) for rows in near]
     inside = np.zeros(len(motion), bool)
     for step in range(len(motion)):
-        corners = lanes[4 * step : 4 * step + 4]
-        candidates = frozenset().union(*(search.joined[lane] for lane in corners[0]))
-        inside[step] = any(all(search.joined[lane] & corner for corner in corners) for lane in candidates)
+        of_corners = lanes[4 * step : 4 * step + 4]
+        candidates = frozenset().union(*(search.joined[lane] for lane in of_corners[0]))
+        inside[step] = any(all(search.joined[lane] & own for own in of_corners) for lane in candidates)
     return inside

@@ -12,12 +12,12 @@ from jaxtyping import Bool, Float, Int64
 
 from rlftsim.envs.actions import Actors, Controls, checked
 from rlftsim.envs.config import EnvConfig
-from rlftsim.envs.contact import Collision, boxes_overlap, collision_of, corners_of
+from rlftsim.envs.contact import Collision, collision_of
 from rlftsim.envs.observations import Atlas, Observation, build_atlas, observe
 from rlftsim.envs.rewards import WeightedTerm, parse_terms
 from rlftsim.envs.route import route_of
 from rlftsim.envs.world import Dice, World, WorldState, begin, step_world, with_dice
-from rlftsim.geometry import wrapped
+from rlftsim.geometry import boxes_overlap, clockwise_corners, wrapped
 from rlftsim.goals.types import PointById
 from rlftsim.realism.map_based import (
     RoadEdges,
@@ -321,7 +321,7 @@ def off_road_m(
     scene, agent = episode.world.actors[rows].T
     if episode.edges is None or not len(rows):
         return np.full(len(rows), -np.inf)
-    corners = corners_of(motion[rows], episode.world.size[scene, agent])
+    corners = clockwise_corners(motion[rows, :2], motion[rows, 2], episode.world.size[scene, agent])
     origin = np.stack([episode.world.scenes[b].scenario.origin for b in scene])
     z = np.repeat(episode.bottom_z[rows, None, None], 4, 1)
     groups = torch.from_numpy(np.concatenate([corners + origin[:, None], z], -1)).float()
@@ -342,7 +342,7 @@ def _free_way_m(
     the observations, these decide.
     """
     scene, agent = episode.world.actors[rows].T
-    corners = corners_of(motion[rows], episode.world.size[scene, agent])  # [m, 4, 2]
+    corners = clockwise_corners(motion[rows, :2], motion[rows, 2], episode.world.size[scene, agent])  # [m, 4, 2]
     edges = episode.atlas.edges[scene][:, None]  # [m, 1, e, 4]
     dx, dy = edges[..., 2] - edges[..., 0], edges[..., 3] - edges[..., 1]
     to_x, to_y = corners[..., :1] - edges[..., 0], corners[..., 1:] - edges[..., 1]
@@ -369,7 +369,9 @@ def _contacts(episode: Episode, world: WorldState, motion: Float[np.ndarray, "M 
     size = episode.world.size
     there = episode.world.there[scene, :, len(world.track) - 1]
     there[np.arange(len(scene)), agent] = False
-    return boxes_overlap(motion[:, :3], size[scene, agent], world.now[scene, :, :3], size[scene]) & there
+    others = world.now[scene]  # [M, A, 5]
+    gap = others[..., :2] - motion[:, None, :2]
+    return there & boxes_overlap(gap, motion[:, None, 2], others[..., 2], size[scene, agent][:, None], size[scene])
 
 
 def _progress(episode: Episode, motion: Float[np.ndarray, "M 5"]) -> Float[np.ndarray, "M"]:

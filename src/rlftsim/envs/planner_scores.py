@@ -13,11 +13,11 @@ import torch
 from jaxtyping import Bool, Float
 from scipy.signal import savgol_filter
 
-from rlftsim.envs.contact import BEHIND_RAD, boxes_overlap, corners_of, in_one_lane, lane_search
+from rlftsim.envs.contact import BEHIND_RAD, in_one_lane, lane_search
 from rlftsim.envs.episode import MAX_PAIRS, OUTSIDE_M, road_edges
 from rlftsim.envs.record import Record
 from rlftsim.envs.route import Route
-from rlftsim.geometry import wrapped
+from rlftsim.geometry import boxes_overlap, clockwise_corners, wrapped
 from rlftsim.realism.map_based import compute_point_distance_to_road_edge
 from rlftsim.realism.traffic_lights import Signals, build_signals, compute_traffic_light_violation
 from rlftsim.scenario.derived import cached_on_scenario
@@ -168,7 +168,10 @@ def off_road(record: Record) -> Float[np.ndarray, "T1"]:
     scene, edges = record.scene, road_edges(record.scene.scenario)
     if edges is None:
         return np.full(record.steps + 1, -np.inf)
-    corners = corners_of(record.own, scene.size[record.agent, :2]) + scene.scenario.origin  # [T + 1, 4, 2]
+    own = record.own
+    corners = (
+        clockwise_corners(own[:, :2], own[:, 2], scene.size[record.agent]) + scene.scenario.origin
+    )  # [T + 1, 4, 2]
     z = np.full((*corners.shape[:2], 1), scene.z[record.agent] - scene.size[record.agent, 2] / 2)
     groups = torch.from_numpy(np.concatenate([corners, z], -1)).float()
     return compute_point_distance_to_road_edge(groups, edges, max_pairs=MAX_PAIRS).amax(-1).double().numpy()
@@ -248,21 +251,13 @@ def least_time_to_collision(record: Record) -> float:
     reach = TTC_HORIZON_S * (speed + other_speed) + (diagonal[:, None] + diagonal[record.agent]) / 2
     agents, steps = np.nonzero(counts & (np.linalg.norm(offset, axis=-1) <= reach))
     time = STEP_S * np.arange(round(TTC_HORIZON_S / STEP_S) + 1)
-    ahead = _coasting(own[steps], time), _coasting(others[agents, steps], time)  # [P, 31, 3] each
-    meets = boxes_overlap(
-        ahead[0], np.broadcast_to(size[record.agent], (*ahead[0].shape[:2], 2)), ahead[1][:, :, None],
-        np.broadcast_to(size[agents, None, None], (*ahead[1].shape[:2], 1, 2)),
-    )[..., 0]  # fmt: skip
+    ego, track = own[steps], others[agents, steps]  # [P, 5] each
+    gap = track[:, None, :2] - ego[:, None, :2] + time[:, None] * (track[:, None, 3:] - ego[:, None, 3:])  # [P, 31, 2]
+    meets = boxes_overlap(gap, ego[:, None, 2], track[:, None, 2], size[record.agent], size[agents, None])
     # tracks that overlap at the start of the episode, such as a stroller and its pusher, are in no danger of it
     overlapping = np.isin(agents, agents[(steps == 0) & meets[:, 0]])
     meets &= ~overlapping[:, None]
     return float(time[meets.argmax(1)[meets.any(1)]].min()) if meets.any() else math.inf
-
-
-def _coasting(motion: Float[np.ndarray, "P 5"], time: Float[np.ndarray, "t"]) -> Float[np.ndarray, "P t 3"]:
-    """Poses at present velocity and heading."""
-    position = motion[:, None, :2] + time[:, None] * motion[:, None, 3:]
-    return np.concatenate([position, np.broadcast_to(motion[:, None, 2:3], (*position.shape[:2], 1))], -1)
 
 
 @dataclass(frozen=True, eq=False)

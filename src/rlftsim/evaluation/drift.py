@@ -10,12 +10,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
-from rlftsim.geometry import wrapped
+from rlftsim.geometry import boxes_overlap, wrapped
 from rlftsim.realism import SimulatedStates
 from rlftsim.scenario.derived import cached_on_scenario
 from rlftsim.scenario.polylines import densify
 from rlftsim.scenario.types import CURRENT_STEP, LANE_TYPES, STEP_S, TOTAL_STEPS, ObjectType, Scenario
-from rlftsim.viewer.overlap import boxes_overlap
 
 MOVING_M_S = 1.0
 """An agent moves if its mean logged speed is at least this."""
@@ -172,7 +171,7 @@ def _contact_speed(
 ) -> float:
     """Mean relative speed at the first contact of evaluated agents with any other, m/s."""
     size = scenario.tracks.size[everyone, CURRENT_STEP, :2].astype(np.float64)  # [A, 2], length and width
-    half, reach = size / 2, np.linalg.norm(size, axis=-1) / 2
+    reach = np.linalg.norm(size, axis=-1) / 2
     # In the log an agent that is lost stands at the origin, and comes back at once: it did not drive there.
     drove = np.linalg.norm(velocity, axis=-1) < FASTEST_M_S  # [N, A, T]
     speeds = []
@@ -182,7 +181,7 @@ def _contact_speed(
         near[:, agent] = False
         near &= drove & drove[:, agent, None]
         rollout, other, step = near.nonzero()
-        hit = boxes_overlap(gap[near], angle[rollout, agent, step], angle[near], half[agent], half[other])
+        hit = boxes_overlap(gap[near], angle[rollout, agent, step], angle[near], size[agent], size[other])
         rollout, other, step = rollout[hit], other[hit], step[hit]
         # The first contact of each rollout: pairs sorted by step, then the first of every rollout.
         order = np.lexsort((step, rollout))

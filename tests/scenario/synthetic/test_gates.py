@@ -2,12 +2,8 @@
 
 import numpy as np
 import pytest
-import torch
 
-from rlftsim.geometry import box_corners
 from rlftsim.scenario.synthetic.gates import (
-    boxes_overlap,
-    clockwise_corners,
     compute_off_road_m,
     compute_overlap_s,
     moves_plausibly,
@@ -19,31 +15,6 @@ CAR = (4.0, 2.0, 1.5)
 def along_x(speeds_mps: np.ndarray) -> np.ndarray:
     x = np.cumsum(speeds_mps) * 0.1
     return np.stack([x, np.zeros_like(x)], axis=1)
-
-
-def test_corners_go_clockwise_from_the_front_left_as_those_of_tensors():
-    corners = clockwise_corners(np.zeros((1, 2)), np.array([np.pi / 2]), CAR)[0]
-    np.testing.assert_allclose(corners, [[-1, 2], [1, 2], [1, -2], [-1, -2]], atol=1e-12)
-    position, heading = np.array([[3.0, -2.0]]), np.array([0.7])
-    length, width = (torch.tensor([side], dtype=torch.float64) for side in CAR[:2])
-    tensors = box_corners(torch.from_numpy(position), torch.from_numpy(heading), length, width)
-    np.testing.assert_allclose(clockwise_corners(position, heading, CAR), tensors.numpy(), atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("offset", "heading", "expected"),
-    [
-        ((3.9, 0.0), 0.0, True),
-        ((4.1, 0.0), 0.0, False),
-        # Turned by 45 degrees, a 4 x 2 m box reaches (4 + 2) / 2 / sqrt(2) = 2.12 m to the side; the other one 1 m.
-        ((0.0, 3.0), np.pi / 4, True),
-        ((0.0, 3.2), np.pi / 4, False),
-    ],
-    ids=["bumpers meet", "bumpers apart", "corner inside", "corner outside"],
-)
-def test_boxes_overlap(offset, heading, expected):
-    found = boxes_overlap(np.zeros((1, 2)), np.zeros(1), CAR, np.array([offset], dtype=float), np.array([heading]), CAR)
-    assert bool(found[0]) is expected
 
 
 def test_overlap_counts_only_steps_at_which_both_are_valid():

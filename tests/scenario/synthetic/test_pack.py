@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from rlftsim.geometry import clockwise_corners
 from rlftsim.scenario.dataset import INDEX, MANIFEST, ScenarioDataset
 from rlftsim.scenario.shards import hash_file
 from rlftsim.scenario.synthetic import pack_path
-from rlftsim.scenario.synthetic.gates import clockwise_corners
 from rlftsim.scenario.types import (
     CURRENT_STEP,
     LANE_TYPES,

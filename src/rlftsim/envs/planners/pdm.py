@@ -21,10 +21,9 @@ from rlftsim.envs.actions import (
     Bicycle,
     signed_speed,
 )
-from rlftsim.envs.contact import boxes_overlap, corners_of
 from rlftsim.envs.idm import LOOKAHEAD_M, IdmConfig, find_leaders, idm_acceleration
 from rlftsim.envs.planners.view import View, read_view
-from rlftsim.geometry import wrapped
+from rlftsim.geometry import boxes_overlap, clockwise_corners, wrapped
 from rlftsim.scenario.types import STEP_S
 
 SPEED_FRACTIONS = (0.2, 0.4, 0.6, 0.8, 1.0)
@@ -169,11 +168,8 @@ def _meets(
     view: View, motion: Float[np.ndarray, "n t 5"], others: Float[np.ndarray, "t K 5"]
 ) -> Bool[np.ndarray, "n t K"]:
     """True where a proposal overlaps a box that is not behind it."""
-    shape = (*motion.shape[:2], *others.shape[1:])
-    boxes = np.broadcast_to(others, shape)
-    sizes = np.broadcast_to(view.other_size, (*shape[:3], 2))
-    meets = boxes_overlap(motion, np.broadcast_to(view.size, (*motion.shape[:2], 2)), boxes, sizes)
-    offset = boxes[..., :2] - motion[..., None, :2]
+    offset = others[..., :2] - motion[..., None, :2]  # [n, t, K, 2]
+    meets = boxes_overlap(offset, motion[..., None, 2], others[..., 2], view.size, view.other_size)
     ahead = offset[..., 0] * np.cos(motion[..., None, 2]) + offset[..., 1] * np.sin(motion[..., None, 2])
     return meets & (ahead > -view.size[0] / 2)
 
@@ -182,7 +178,7 @@ def _leaves_road(view: View, motion: Float[np.ndarray, "n t 5"]) -> Bool[np.ndar
     """True where a corner gets 0.3 m or more to the right of the nearest road edge."""
     if not len(view.edges):
         return np.zeros(len(motion), bool)
-    corners = corners_of(motion.reshape(-1, 5), view.size).reshape(len(motion), -1, 2)  # [n, 4 t, 2]
+    corners = clockwise_corners(motion[..., :2], motion[..., 2], view.size).reshape(len(motion), -1, 2)  # [n, 4 t, 2]
     start, delta = view.edges[:, :2], view.edges[:, 2:] - view.edges[:, :2]
     to = corners[:, :, None] - start  # [n, 4 t, E, 2]
     squared = np.maximum((delta**2).sum(-1), 1e-9)

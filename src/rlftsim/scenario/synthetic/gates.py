@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from rlftsim.geometry import boxes_overlap, clockwise_corners
 from rlftsim.scenario.types import STEP_S
 
 MAX_ACCELERATION_MPS2 = 15.0
@@ -45,53 +46,6 @@ def moves_plausibly(
     return not np.any(slip[fast] > MAX_SLIP_RAD)
 
 
-def clockwise_corners(
-    position: Float[np.ndarray, "n 2"], heading: Float[np.ndarray, "n"], size: Size | np.ndarray
-) -> Float[np.ndarray, "n 4 2"]:
-    """Corners of the boxes of one body in the order of `geometry.box_corners`: clockwise from the front left.
-
-    Args:
-        position: centers at some steps, m.
-        heading: direction of the front, rad.
-        size: the body's length and width, m; a height is ignored.
-    """
-    forward = np.stack([np.cos(heading), np.sin(heading)], axis=1) * size[0] / 2
-    left = np.stack([-np.sin(heading), np.cos(heading)], axis=1) * size[1] / 2
-    signs = ((1, 1), (1, -1), (-1, -1), (-1, 1))
-    return np.stack([position + a * forward + b * left for a, b in signs], axis=1)
-
-
-def boxes_overlap(
-    position: Float[np.ndarray, "n 2"],
-    heading: Float[np.ndarray, "n"],
-    size: Size,
-    other_position: Float[np.ndarray, "n 2"],
-    other_heading: Float[np.ndarray, "n"],
-    other_size: Size,
-) -> Bool[np.ndarray, "n"]:
-    """Steps at which the boxes of two bodies share area, by the separating axis theorem.
-
-    Args:
-        position: centers of the first body, m.
-        heading: its headings, rad.
-        size: its length and width, m.
-        other_position: centers of the second body at the same steps.
-        other_heading: its headings.
-        other_size: its length and width.
-    """
-    first = clockwise_corners(position, heading, size)
-    second = clockwise_corners(other_position, other_heading, other_size)
-    overlap = np.ones(len(heading), bool)
-    # two boxes are apart exactly where one of their four sides' directions separates the projections
-    for angle in (heading, other_heading):
-        for turn in (0.0, np.pi / 2):
-            axis = np.stack([np.cos(angle + turn), np.sin(angle + turn)], axis=1)  # [n, 2]
-            a = np.einsum("nkd,nd->nk", first, axis)
-            b = np.einsum("nkd,nd->nk", second, axis)
-            overlap &= (a.max(1) > b.min(1)) & (b.max(1) > a.min(1))
-    return overlap
-
-
 def compute_overlap_s(
     position: Float[np.ndarray, "v n 2"],
     heading: Float[np.ndarray, "v n"],
@@ -110,12 +64,11 @@ def compute_overlap_s(
     reach = np.array([np.hypot(size[0], size[1]) / 2 for size in sizes])
     for i in range(len(sizes) - 1):
         # circles around the boxes first: few pairs come near each other at all
-        gap = np.linalg.norm(position[i + 1 :] - position[i], axis=-1) - reach[i] - reach[i + 1 :, None]
-        for j in np.flatnonzero(((gap < 0) & valid[i + 1 :] & valid[i]).any(axis=1)) + i + 1:
+        apart = np.linalg.norm(position[i + 1 :] - position[i], axis=-1) - reach[i] - reach[i + 1 :, None]
+        for j in np.flatnonzero(((apart < 0) & valid[i + 1 :] & valid[i]).any(axis=1)) + i + 1:
             steps = np.flatnonzero(valid[i] & valid[j])
-            hits = boxes_overlap(
-                position[i, steps], heading[i, steps], sizes[i], position[j, steps], heading[j, steps], sizes[j]
-            )
+            gap = position[j, steps] - position[i, steps]
+            hits = boxes_overlap(gap, heading[i, steps], heading[j, steps], np.array(sizes[i]), np.array(sizes[j]))
             longest = max(longest, int(hits.sum()))
     return longest * STEP_S
 
@@ -133,5 +86,5 @@ def compute_off_road_m(
     """
     import shapely
 
-    corners = clockwise_corners(position[::3], heading[::3], size).reshape(-1, 2)
+    corners = clockwise_corners(position[::3], heading[::3], np.array(size)).reshape(-1, 2)
     return float(shapely.distance(shapely.points(corners), drivable).max(initial=0.0))

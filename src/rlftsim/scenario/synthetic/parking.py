@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from rlftsim.geometry import boxes_overlap
 from rlftsim.scenario.synthetic.bodies import Body
 from rlftsim.scenario.synthetic.demand import draw_size
-from rlftsim.scenario.synthetic.gates import boxes_overlap
 from rlftsim.scenario.synthetic.map_features import resample
 from rlftsim.scenario.synthetic.network import Network
 from rlftsim.scenario.synthetic.street_plan import Street, offset_polyline
@@ -144,14 +144,13 @@ def park_in_lots(
 
 def drop_overlapping(cars: list[Body]) -> list[Body]:
     """Cars in order, without those whose box meets an earlier one's."""
-    kept: list[Body] = []
-    for car in cars:
-        near = [other for other in kept if np.linalg.norm(other.position[0] - car.position[0]) < 8.0]
-        if not any(
-            boxes_overlap(
-                car.position[:1], car.heading[:1], car.size, other.position[:1], other.heading[:1], other.size
-            )[0]
-            for other in near
-        ):
-            kept.append(car)
-    return kept
+    if not cars:
+        return []
+    position, size = np.stack([car.position[0] for car in cars]), np.array([car.size for car in cars])
+    heading = np.array([car.heading[0] for car in cars])
+    kept: list[int] = []
+    for k in range(len(cars)):
+        gap = position[kept] - position[k]
+        if not boxes_overlap(gap, heading[k : k + 1], heading[kept], size[k], size[kept]).any():
+            kept.append(k)
+    return [cars[k] for k in kept]
