@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from urllib.parse import urlsplit
 
 import pytest
 
@@ -107,6 +108,17 @@ def test_a_rebound_name_is_refused_over_a_real_socket(session):
             connection.request("GET", "/api/session", headers={"Host": host, "Cookie": cookie})
             assert connection.getresponse().status == status
             connection.close()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have no second loopback address")
+def test_the_printed_address_answers_on_another_interface(session):
+    with Studio(session, host="127.0.0.2") as studio:
+        address = urlsplit(studio.url)
+        connection = http.client.HTTPConnection(address.netloc)
+        connection.request("GET", f"{address.path}?{address.query}")
+        answer = connection.getresponse()
+        assert (answer.status, studio.access.cookie in (answer.headers["set-cookie"] or "")) == (303, True)
+        connection.close()
 
 
 def test_the_page_has_no_inline_code_and_never_sets_html(client):

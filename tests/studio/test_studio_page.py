@@ -124,7 +124,7 @@ def test_a_user_asks_compares_saves_and_finds_it_again(page, session, browser, s
     page.wait("studio.state.variants.get('demo-base')?.score")
     page.simulated()
     page.state("studio.timeline.seek(50)")
-    assert "+4.0 s" in page.page.inner_text("#clock")
+    page.wait("document.querySelector('#clock').textContent.includes('+4.0 s')")  # drawn with the next frame
     ends = page.state("studio.stage.panels.slice(1).map((p) => [p.states[0].x, p.rollouts[p.shown][0].x[50]])")
     assert all(drawn == pytest.approx(poses, abs=1e-4) for drawn, poses in ends)
     # save goals, and see that the file has the goal
@@ -183,6 +183,9 @@ def test_everything_can_be_done_with_keys(page):
     assert page.state("studio.state.panels.length") == 2
     page.page.locator("#table").click()
     assert page.page.locator("dialog[open] tbody tr").count() == 27
+    # The maneuvers of the agent before are gone at once: its keys must not place this one's goal.
+    assert page.state("studio.state.proposals.agent === studio.state.selected")
+    assert page.state("(document.querySelectorAll('dialog tbody button')[5].click(), studio.state.proposals)") is None
 
 
 def test_a_dragged_goal_is_simulated_and_a_refused_one_is_not(page):

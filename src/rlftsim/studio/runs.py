@@ -254,7 +254,8 @@ class Worker:
 
     @staticmethod
     def _end(run: Run, event: str, **data: Any) -> None:
-        run.stop.set() if event == "failed" else None
+        if event == "failed":
+            run.stop.set()
         run.tell(event, **data)
         run.is_over = True
 

@@ -68,8 +68,9 @@ class Studio:
     ) -> None:
         self._socket = _bind(host, port)
         self.port = int(self._socket.getsockname()[1])
-        # Another interface is reached under the name that was given for it.
-        own = () if f"{host}" in (*LOCAL_NAMES, *ALL_INTERFACES) else (f"{host}:{self.port}",)
+        # Another interface is reached under the name that was given for it; in addresses IPv6 stands in brackets.
+        self._name = LOOPBACK if host in ALL_INTERFACES else f"[{host}]" if ":" in host else host
+        own = () if self._name in LOCAL_NAMES else (f"{self._name}:{self.port}",)
         self.access = Access(
             self.port, token or new_token(), trusted_hosts=(*trusted_hosts, *own), frame_ancestors=frame_ancestors
         )
@@ -83,7 +84,7 @@ class Studio:
     @property
     def url(self) -> str:
         """Address with the token, to be opened once."""
-        return f"http://{LOOPBACK}:{self.port}/?token={self.access.token}"
+        return f"http://{self._name}:{self.port}/?token={self.access.token}"
 
     def run(self) -> None:
         """Serve until Ctrl-C."""

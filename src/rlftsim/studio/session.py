@@ -18,7 +18,7 @@ from rlftsim.goals.goals_file import GoalEntry
 from rlftsim.goals.maneuvers.proposals import no_proposal_reason
 from rlftsim.goals.placement import goal_warnings
 from rlftsim.goals.types import simulated_track
-from rlftsim.policies.registry import load_policy, with_guidance
+from rlftsim.policies.registry import Device, load_policy, with_guidance
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import Policy, is_goal_conditioned
 from rlftsim.scenario.open import open_dataset, splits_of
@@ -112,7 +112,9 @@ class Session:
         RlftsimError: no such data set, split or model.
     """
 
-    def __init__(self, data: str, models: tuple[str, ...], split: str | None, out: Path, device: Any = "cpu") -> None:
+    def __init__(
+        self, data: str, models: tuple[str, ...], split: str | None, out: Path, device: Device = "cpu"
+    ) -> None:
         self.data = data
         self.splits = splits_of(data)
         self.split = split or ("validation" if "validation" in self.splits else self.splits[0])
@@ -245,7 +247,7 @@ class Session:
         return found
 
 
-def _load(names: tuple[str, ...], device: Any) -> list[Model]:
+def _load(names: tuple[str, ...], device: Device) -> list[Model]:
     found: list[Model] = []
     for source in names:
         policy = load_policy(source, device)

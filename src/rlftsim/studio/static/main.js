@@ -202,9 +202,8 @@ async function checkGoals() {
 
 function select(id) {
   if (id === state.selected) return;
-  state.selected = id; state.proposals = null;
+  state.selected = id;
   changed("selection");
-  loadProposals(id);
 }
 
 async function loadProposals(id) {
@@ -352,6 +351,8 @@ function drawSoon() {
 
 onChange((topics) => {
   const has = (...names) => names.some((name) => topics.has(name));
+  // Before anything is drawn: the proposals of another agent must not become this one's goals.
+  if (has("selection") && state.proposals?.agent !== state.selected) { state.proposals = null; loadProposals(state.selected); }
   if (has("panels")) { stage.layout(); renderNote(); }
   if (has("data", "panels", "scene")) { timeline.renderRollouts(); timeline.collect(); renderResults(); renderScore(); }
   if (has("goals")) { timeline.collect(); list.render(); lookAtGoals(); }
@@ -360,7 +361,6 @@ onChange((topics) => {
   if (has("scene")) list.render();
   if (has("run")) speak(sentence());
   if (has("open-first")) stepScenario(1);
-  if (has("selection") && state.selected >= 0 && state.proposals?.agent !== state.selected) loadProposals(state.selected);
   drawSoon();
   clearTimeout(onChange.timer);
   onChange.timer = setTimeout(() => { if (!state.playing && state.scene) history.replaceState(null, "", toHash()); }, 400);

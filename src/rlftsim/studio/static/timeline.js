@@ -113,4 +113,4 @@ class Timeline {
   }
 }
 
-export { LAST_STEP, Timeline };
+export { Timeline };
