@@ -236,13 +236,9 @@ class DiscreteBicycle:
             action: [M] numbers below 91.
             actors: vehicles.
         """
-        levels = [np.linspace(-1, 1, count)[part] for count, part in zip((ACCELERATIONS, STEERINGS), levels_of(action))]
+        acceleration, steering = np.divmod(action, STEERINGS)
+        levels = np.linspace(-1, 1, ACCELERATIONS)[acceleration], np.linspace(-1, 1, STEERINGS)[steering]
         return self.bicycle.move(np.stack(levels, -1), actors)
-
-
-def levels_of(action: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Levels of acceleration and of steering of discrete actions."""
-    return action // STEERINGS, action % STEERINGS
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,9 @@ import rlftsim
 from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.drivers import TRAFFIC, Traffic
 from rlftsim.envs.ego_env import EgoEnv
-from rlftsim.envs.planners.registry import action_of, load_planner
+from rlftsim.envs.planners.registry import Planner, action_of, load_planner
 from rlftsim.envs.result import Result, animation_of
+from rlftsim.envs.source import Source
 from rlftsim.envs.traffic_scores import realism_of_others
 from rlftsim.errors import ConfigError, whole_number
 from rlftsim.evaluation.drive_results import DriveResult, DriveSettings
@@ -72,13 +73,13 @@ def drive(config: DriveConfig, out: Path | None = None) -> list[DriveResult]:
         ConfigError: an unknown planner, kind of traffic or scenario.
         DataError: no such data, or a scenario that the planner cannot drive.
     """
-    known = [_environment(config, traffic) for traffic in config.traffic]  # before anything is driven
-    ids = list(config.scenarios or known[0].source.scenario_ids)[: config.limit]
+    environments = [_environment(config, traffic) for traffic in config.traffic]  # refuses before anything is driven
+    ids = list(config.scenarios or environments[0].source.scenario_ids)[: config.limit]
     for scenario_id in ids:
-        known[0].source.scenario(scenario_id)
+        environments[0].source.scenario(scenario_id)
     name = config.planner.replace(":", ".")
     results = []
-    for traffic, env in zip(config.traffic, known):
+    for traffic, env in zip(config.traffic, environments):
         with progress_bar(f"{name} in {traffic}", len(ids)) as advance, one_thread():
             found = run_tasks(partial(_drive_scenario, config, traffic), ids, jobs=config.jobs, advance=advance)
         settings = DriveSettings(
@@ -92,12 +93,12 @@ def drive(config: DriveConfig, out: Path | None = None) -> list[DriveResult]:
     return results
 
 
-def run_planner(env: EgoEnv, planner: Any, scenario: Scenario, *, seed: int, rollout: int = 0) -> Result:
+def run_planner(env: EgoEnv, planner: Planner, scenario: Scenario, *, seed: int, rollout: int = 0) -> Result:
     """Drive one scenario from the current step to the end.
 
     Args:
         env: whose actions are those of the planner.
-        planner: object with `reset` and `act`.
+        planner: drives.
         scenario: one of the environment's.
         seed: of the traffic.
         rollout: number of the dice.
@@ -128,8 +129,7 @@ def _drive_scenario(
 @lru_cache(maxsize=8)
 def _environment(config: DriveConfig, traffic: str) -> EgoEnv:
     """Environment of one kind of traffic, made once in each process."""
-    settings = config.settings(traffic)
-    return EgoEnv(**{name: getattr(settings, name) for name in settings.__dataclass_fields__})
+    return EgoEnv(source=Source(config.settings(traffic)))
 
 
 def film(config: DriveConfig, out: Path) -> Path:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from rlftsim.envs.route import points_every
+from rlftsim.envs.route import headings_of, points_every
 from rlftsim.envs.scene import RED, YELLOW, Scene
 from rlftsim.scenario.types import CURRENT_STEP, STEP_S, TOTAL_STEPS
 
@@ -133,7 +133,7 @@ def idm_lines(scene: Scene, agents: np.ndarray, config: IdmConfig) -> IdmLines:
     points = np.stack([np.pad(line, ((0, longest - len(line)), (0, 0)), mode="edge") for line in lines] or [
         np.zeros((1, 2))
     ])[: len(agents)]  # fmt: skip
-    heading = np.stack([np.pad(_heading(line), (0, longest - len(line)), mode="edge") for line in lines] or [
+    heading = np.stack([np.pad(headings_of(line), (0, longest - len(line)), mode="edge") for line in lines] or [
         np.zeros(1)
     ])[: len(agents)]  # fmt: skip
     offset = np.linalg.norm(points[:, :, None] - scene.lights.point, axis=-1)  # [M, P, T]
@@ -153,11 +153,6 @@ def _line(scene: Scene, agent: int) -> Float[np.ndarray, "p 2"]:
     else:
         kept = way[:1]
     return points_every(np.vstack([kept, kept[-1] + BEYOND_M * np.array([np.cos(heading), np.sin(heading)])]), 1.0)
-
-
-def _heading(line: Float[np.ndarray, "p 2"]) -> Float[np.ndarray, "p"]:
-    ahead = np.diff(line, axis=0, append=2 * line[-1:] - line[-2:-1])
-    return np.arctan2(ahead[:, 1], ahead[:, 0])
 
 
 def advance_idm(

@@ -13,9 +13,9 @@ from jaxtyping import Bool, Float, Float32, Int8, Int64
 
 from rlftsim.envs.actions import WHEELBASE_PER_LENGTH, signed_speed
 from rlftsim.envs.drivers import Driver
-from rlftsim.envs.route import Route
+from rlftsim.envs.route import Route, headings_of
 from rlftsim.envs.scene import GREEN, PIECE_POINTS, RED, YELLOW
-from rlftsim.envs.world import World, WorldState
+from rlftsim.envs.world import World, WorldState, padded
 from rlftsim.geometry import wrapped
 from rlftsim.scenario.types import STEP_S, TOTAL_STEPS
 
@@ -172,10 +172,7 @@ def build_atlas(world: World, routes: tuple[Route, ...]) -> Atlas:
 def _stack(parts: list[np.ndarray], fill: float | int) -> np.ndarray:
     """Arrays of different lengths, padded to the longest, at least to one row."""
     longest = max(1, *(len(part) for part in parts))
-    out = np.full((len(parts), longest, *parts[0].shape[1:]), fill, parts[0].dtype)
-    for row, part in zip(out, parts):
-        row[: len(part)] = part
-    return out
+    return padded(parts, (len(parts), longest, *parts[0].shape[1:]), fill)
 
 
 def observe(world: World, atlas: Atlas, state: WorldState, *, frame: Frame = "ego", steps: int) -> Observation:
@@ -337,8 +334,7 @@ def _about_itself(
     moving = np.abs(speed) > 0.1
     steering = np.where(moving, np.arctan(WHEELBASE_PER_LENGTH * length * yaw_rate / np.where(moving, speed, 1.0)), 0.0)
     # the lane point that is nearest among those of lanes that run the agent's way
-    along = np.diff(pieces, axis=2, append=2 * pieces[:, :, -1:] - pieces[:, :, -2:-1])  # [M, L, 10, 2]
-    heading = np.arctan2(along[..., 1], along[..., 0])
+    heading = headings_of(pieces)  # [M, L, 10]
     offset = now[:, None, None, :2] - pieces
     away = np.hypot(offset[..., 0], offset[..., 1])
     same_way = np.cos(heading - now[:, 2, None, None]) > 0

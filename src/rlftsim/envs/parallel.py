@@ -39,12 +39,8 @@ def parallel_env(
     Raises:
         ConfigError: settings that do not fit each other.
     """
-    return TrafficParallelEnv(controlled, Source(config_of(settings), scenarios, policy, _rules(controlled)))
-
-
-def _rules(controlled: Controlled) -> dict[str | int, str]:
-    names = [controlled] if isinstance(controlled, str) else controlled
-    return dict.fromkeys(names, "planner")
+    rules = dict.fromkeys([controlled] if isinstance(controlled, str) else controlled, "planner")
+    return TrafficParallelEnv(controlled, Source(config_of(settings), scenarios, policy, rules))
 
 
 class TrafficParallelEnv(ParallelEnv):
@@ -145,9 +141,7 @@ class TrafficParallelEnv(ParallelEnv):
         rows = {name: self._names.index(name) for name in acting}
         terminated = {name: bool(outcome.terminated[row]) for name, row in rows.items()}
         truncated = {name: bool(outcome.truncated[row]) for name, row in rows.items()}
-        infos: dict[str, dict[str, Any]] = {}
-        for name, row in rows.items():
-            infos[name] = note_of(episode, state, outcome, row)
+        infos = {name: note_of(episode, state, outcome, row) for name, row in rows.items()}
         self.agents = [name for name in acting if not (terminated[name] or truncated[name])]
         rewards = {name: float(outcome.reward[row]) for name, row in rows.items()}
         return self._observe(acting), rewards, terminated, truncated, infos

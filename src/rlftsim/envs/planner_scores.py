@@ -6,7 +6,7 @@ edges and center lines but no lane polygons, hence the suffix `_style`: "inside 
 """
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -340,6 +340,3 @@ def _displacement(record: Record) -> float:
         return math.nan
     offset = record.own[1:, :2] - record.scene.logged[record.agent, steps, :2]
     return float(np.linalg.norm(offset[known], axis=1).mean())
-
-
-PLANNER_SCORES = tuple(field.name for field in fields(PlannerScores))

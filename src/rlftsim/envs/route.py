@@ -144,8 +144,7 @@ def _of_points(scene: Scene, line: Float[np.ndarray, "n 2"], source: str) -> Rou
     if float(arc_length(line)[-1]) < SPACING_M:
         return NO_ROUTE
     points = points_every(line, SPACING_M)
-    ahead = np.diff(points, axis=0, append=2 * points[-1:] - points[-2:-1])
-    heading = np.arctan2(ahead[:, 1], ahead[:, 0])
+    heading = headings_of(points)
     # lanes and limits: of the nearest lane point that runs the same way
     graph = scene.graph
     offset = np.linalg.norm(points[:, None] - (graph.points[:, :2] - scene.scenario.origin), axis=-1)  # [R, P]
@@ -167,3 +166,9 @@ def points_every(line: Float[np.ndarray, "n 2"], spacing_m: float) -> Float[np.n
     along = arc_length(line)
     at = np.arange(0.0, along[-1] + 1e-6, spacing_m)
     return np.stack([np.interp(at, along, line[:, k]) for k in range(2)], axis=1)
+
+
+def headings_of(lines: Float[np.ndarray, "*lines n 2"]) -> Float[np.ndarray, "*lines n"]:
+    """Direction of polylines from each point to the next, rad; at the last point that of the segment before it."""
+    ahead = np.diff(lines, axis=-2, append=2 * lines[..., -1:, :] - lines[..., -2:-1, :])
+    return np.arctan2(ahead[..., 1], ahead[..., 0])

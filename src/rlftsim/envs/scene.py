@@ -15,6 +15,7 @@ from rlftsim.scenario.polylines import arc_length, resample_to
 from rlftsim.scenario.types import (
     CURRENT_STEP,
     ROAD_EDGE_TYPES,
+    STEP_S,
     TOTAL_STEPS,
     LightState,
     MapFeatureType,
@@ -149,7 +150,7 @@ def _lights(scenario: Scenario, graph: LaneGraph) -> Lights:
     lane_of_id = {int(lane_id): row for row, lane_id in enumerate(graph.lane_id)}
     lane = np.array([lane_of_id.get(int(lane_id), -1) for lane_id in ids], np.int64)
     observed = int(log.step[kept].max()) if kept.any() else -1
-    return Lights(point, lane, state, 0.1 * (steps - since), observed)
+    return Lights(point, lane, state, STEP_S * (steps - since), observed)
 
 
 def _lane_pieces(scenario: Scenario, graph: LaneGraph, lights: Lights) -> LanePieces:

@@ -19,7 +19,7 @@ from rlftsim.geometry import wrapped
 from rlftsim.realism import METRIC_2025, MetricConfig, SimulatedStates, score
 from rlftsim.realism.agents import Trajectories
 from rlftsim.realism.map_based import compute_distance_to_road_edge
-from rlftsim.scenario.types import FUTURE_STEPS, STEP_S, ObjectType, Scenario
+from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, STEP_S, ObjectType, Scenario
 from rlftsim.viewer.overlap import compute_overlap
 
 RISKY_TTC_S = 1.0
@@ -124,7 +124,7 @@ class _WithoutEgo(Scenario):
     def evaluated_indices(self) -> Int64[np.ndarray, "E"]:
         """Tracks to predict, by ascending object id."""
         chosen = np.unique(self.tracks_to_predict.astype(np.int64))
-        chosen = chosen[self.tracks.valid[chosen, 10] & (chosen != self.ego_index)]
+        chosen = chosen[self.tracks.valid[chosen, CURRENT_STEP] & (chosen != self.ego_index)]
         return chosen[np.argsort(self.tracks.object_id[chosen], kind="stable")]
 
 
@@ -148,6 +148,3 @@ def realism_of_others(records: Sequence[Record], config: MetricConfig = METRIC_2
     z = torch.from_numpy(scene.z).float()[None, :, None].expand(world.shape[:-1])
     states = SimulatedStates(scene.object_id, world[..., 0], world[..., 1], z, motion[..., 2].float())
     return float(score(scenario, states, config).meta_metric)
-
-
-TRAFFIC_SCORES = tuple(field.name for field in fields(TrafficScores))

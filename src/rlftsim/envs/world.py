@@ -31,7 +31,7 @@ from rlftsim.rollout.noise import draw_noise
 from rlftsim.rollout.policy import Policy, Sampling, device_of
 from rlftsim.rollout.types import AgentStates
 from rlftsim.scenario.batch import ScenarioBatch, collate
-from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, STEP_S, Scenario
+from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, STEP_S, TOTAL_STEPS, Scenario
 from rlftsim.threads import one_thread
 
 IDM = IdmConfig()
@@ -70,7 +70,6 @@ class World:
     sampling: Sampling
     lines: tuple[IdmLines, ...]
     """Of the IDM-driven agents of each scene."""
-
     there: Bool[np.ndarray, "B A 91"]
     """True = the agent is there at a step of the log's time (10 is the current one)."""
 
@@ -140,7 +139,7 @@ def build_world(
     scenes = tuple(build_env_scene(scenario) for scenario in scenarios)
     batch = collate(scenarios)
     shape = tuple(batch.agent_mask.shape)
-    drivers = _padded([drivers_of(scene, rules) for scene in scenes], shape, -1)
+    drivers = padded([drivers_of(scene, rules) for scene in scenes], shape, -1)
     followers = bool((drivers == Driver.POLICY).any())
     if followers and policy is None:
         raise ConfigError("some agents follow the policy, but there is no model: name one, or give them other drivers.")
@@ -150,7 +149,7 @@ def build_world(
         with one_thread(), torch.no_grad():
             context = policy.encode(batch)
     mask = batch.agent_mask.cpu().numpy()
-    valid = _padded([scene.valid for scene in scenes], (*shape, 91), False)
+    valid = padded([scene.valid for scene in scenes], (*shape, TOTAL_STEPS), False)
     # from the current step on all agents exist, but replayed ones may vanish with their log
     there = valid | mask[..., None]
     there[..., : CURRENT_STEP + 1] = valid[..., : CURRENT_STEP + 1]
@@ -163,9 +162,9 @@ def build_world(
         mask=mask,
         drivers=drivers,
         actors=np.argwhere(drivers == Driver.PLANNER),
-        size=_padded([scene.size[:, :2] for scene in scenes], (*shape, 2)),
-        object_type=_padded([scene.object_type for scene in scenes], shape, 0),
-        logged=_padded([scene.logged for scene in scenes], (*shape, 91, 5)),
+        size=padded([scene.size[:, :2] for scene in scenes], (*shape, 2)),
+        object_type=padded([scene.object_type for scene in scenes], shape, 0),
+        logged=padded([scene.logged for scene in scenes], (*shape, TOTAL_STEPS, 5)),
         valid=valid,
         there=there,
         policy=policy if followers else None,
@@ -176,7 +175,14 @@ def build_world(
     )
 
 
-def _padded(parts: list[np.ndarray], shape: tuple[int, ...], fill: float | int | bool = 0.0) -> np.ndarray:
+def padded(parts: list[np.ndarray], shape: tuple[int, ...], fill: float | int | bool = 0.0) -> np.ndarray:
+    """Arrays that differ in the length of their first axis, in one array.
+
+    Args:
+        parts: at least one.
+        shape: of the result; its first axis has an entry for each part.
+        fill: value beyond a part's end.
+    """
     out = np.full((len(parts), *shape[1:]), fill, parts[0].dtype)
     for row, part in zip(out, parts):
         row[: len(part)] = part

@@ -21,7 +21,9 @@ from rlftsim.envs.actions import (
     Bicycle,
     signed_speed,
 )
+from rlftsim.envs.episode import OUTSIDE_M
 from rlftsim.envs.idm import LOOKAHEAD_M, IdmConfig, find_leaders, idm_acceleration
+from rlftsim.envs.planner_scores import ACCELERATION, JERK, LATERAL
 from rlftsim.envs.planners.view import View, read_view
 from rlftsim.geometry import boxes_overlap, clockwise_corners, wrapped
 from rlftsim.scenario.types import STEP_S
@@ -35,9 +37,7 @@ BRAKE_IF_WITHIN_S = 2.0
 TTC_S = (0.3, 0.6, 0.9)
 SPARSE = 5
 """Every so many steps the drivable area and the time to collision are looked at."""
-OUTSIDE_M = 0.3
 LEAST_PROGRESS_M = 0.1
-COMFORT_ACCELERATION, COMFORT_LATERAL, COMFORT_JERK = (-4.05, 2.40), 4.89, 8.37
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,9 +158,9 @@ def score_proposals(
     acceleration = np.diff(speed, axis=1) / STEP_S
     lateral = speed[:, 1:] * wrapped(np.diff(motion[..., 2], axis=1)) / STEP_S
     jerk = np.diff(acceleration, axis=1) / STEP_S
-    low, high = COMFORT_ACCELERATION
-    comfort = ((acceleration >= low) & (acceleration <= high) & (np.abs(lateral) <= COMFORT_LATERAL)).all(1)
-    comfort &= (np.abs(jerk) <= COMFORT_JERK).all(1)
+    low, high = ACCELERATION
+    comfort = ((acceleration >= low) & (acceleration <= high) & (np.abs(lateral) <= LATERAL)).all(1)
+    comfort &= (np.abs(jerk) <= JERK).all(1)
     return allowed * (5 * progress + 5 * ~risky + 2 * comfort) / 12
 
 
