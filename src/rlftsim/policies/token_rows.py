@@ -56,8 +56,8 @@ def row_statistics(
         reference: distributions over the same tokens; None = the policy itself, so that the KL is zero.
     """
     others = () if reference is None else (reference.hidden, reference.last.weight, reference.offset())
-    own = (rows.hidden, rows.last.weight, rows.offset())
-    return _RowStatistics.apply(*own, rows.class_id, chosen, *(v.detach() for v in others))  # type: ignore[return-value]
+    own, others = (rows.hidden, rows.last.weight, rows.offset()), [value.detach() for value in others]
+    return _RowStatistics.apply(*own, rows.class_id, chosen, *others)  # type: ignore[return-value]
 
 
 def _logits(

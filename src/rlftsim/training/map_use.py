@@ -1,4 +1,4 @@
-"""Map use: the nats that a model's predictions of logged tokens lose when the whole map is moved out of sight.
+"""Map use: the nats that a model's predictions of logged tokens lose when the whole map is moved far away.
 
 A model with a low loss may still not read the map: most tokens go straight on or stand still, and history alone
 predicts them. Turning tokens tell. Vehicles only, as they are the ones that follow lanes.

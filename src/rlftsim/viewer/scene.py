@@ -328,7 +328,7 @@ def _lights(lights: LightStates, origin: np.ndarray, num_steps: int) -> tuple[Li
 
 
 def _note(scenario: Scenario) -> str:
-    """What a picture of a scenario must say."""
+    """Attribution of the source, and the parts of the scenario that are guessed."""
     guessed = f"Guessed, not logged: {', '.join(sorted(scenario.guessed))}." if scenario.guessed else ""
     return f"{attribution_of(scenario.source)} {guessed}".strip()
 

@@ -54,7 +54,7 @@ class Nodes:
 
 
 class DestinationMap:
-    """What destinations are chosen from: nodes of lanes and road edges, and the links between lanes."""
+    """Candidates for destinations: nodes of lanes and road edges, and the links between lanes."""
 
     def __init__(self, pieces: MapPieces, successors: dict[int, list[int]]):
         self.pieces = pieces

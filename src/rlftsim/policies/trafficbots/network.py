@@ -133,7 +133,7 @@ class LightEncoder(nn.Module):
         )
 
     def surroundings(self, scene: Scene, map_features: Float[Tensor, "B M D"]) -> LightSurroundings:
-        """What the states of lights do not change, computed once.
+        """The part that the states of lights do not change, computed once.
 
         Args:
             scene: its lights and map.
@@ -175,7 +175,7 @@ class LightEncoder(nn.Module):
 
 @dataclass(frozen=True, eq=False)
 class Windows:
-    """What the network sees of agents at some decisions: their last steps, the newest last."""
+    """Input of the network about agents at some decisions: their last steps, the newest last."""
 
     valid: Bool[Tensor, "*g A W"]
     pose: Float[Tensor, "*g A W 3"]
@@ -478,7 +478,7 @@ class TrafficBotsNetwork(nn.Module):
 
 @dataclass(frozen=True, eq=False)
 class Given:
-    """What the agents of N rollouts are given once."""
+    """Values that the agents of N rollouts get once."""
 
     personality: Float[Tensor, "B N A 16"]
     destination_feature: Float[Tensor, "B N A D"]
