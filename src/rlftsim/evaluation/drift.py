@@ -13,8 +13,9 @@ from scipy.spatial import KDTree
 from rlftsim.geometry import boxes_overlap, wrapped
 from rlftsim.realism import SimulatedStates
 from rlftsim.scenario.derived import cached_on_scenario
+from rlftsim.scenario.lane_graph import lane_graph
 from rlftsim.scenario.polylines import densify
-from rlftsim.scenario.types import CURRENT_STEP, LANE_TYPES, STEP_S, TOTAL_STEPS, ObjectType, Scenario
+from rlftsim.scenario.types import CURRENT_STEP, STEP_S, TOTAL_STEPS, ObjectType, Scenario
 
 MOVING_M_S = 1.0
 """An agent moves if its mean logged speed is at least this."""
@@ -116,12 +117,8 @@ class _LanePoints(NamedTuple):
 def _lane_points(scenario: Scenario) -> _LanePoints | None:
     """None where the map has no lane."""
     parts = []
-    features = scenario.map_features
-    for index in np.flatnonzero(np.isin(features.feature_type, LANE_TYPES)):
-        line = features.polyline(index)[:, :2].astype(np.float64)
-        if len(line) < 2 or np.ptp(line, axis=0).max() < LANE_SPACING_M:
-            continue
-        points = densify(line, LANE_SPACING_M)
+    for line in lane_graph(scenario).lines:
+        points = densify(line[:, :2], LANE_SPACING_M)
         tangent = np.gradient(points, axis=0)
         heading = np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0]))
         step = np.maximum(np.linalg.norm(tangent, axis=-1), 1e-6)
