@@ -148,10 +148,11 @@ def _sort(
     widths = (mask * columns).amax(-1).cpu().numpy()
     sizes = np.ones_like(widths) if groups is None else groups.sizes
     # 2. blocks of lists with as many rows, from the narrowest to the widest; in a group the smaller parts come first
+    # torch's order of equal widths: dropout masks are drawn block after block, so a stored run goes on with its own
+    order = torch.from_numpy(widths).sort().indices.numpy()
     lists, rows, shapes = [], [], []
     for count in (1 << power for power in range(int(sizes.max(initial=1)).bit_length())):
-        found = np.flatnonzero((sizes & count > 0) & (widths > 0))
-        found = found[widths[found].argsort(kind="stable")]
+        found = order[(sizes[order] & count > 0) & (widths[order] > 0)]
         starts = (sizes.cumsum() - sizes + (sizes & (count - 1)))[found]
         lists.append(found)
         rows.append((starts[:, None] + np.arange(count)).flatten())
