@@ -59,7 +59,7 @@ def write(folder, tracks=None, scenarios=None, map_rows=None, **others):
         **others,
     }
     for name, rows in tables.items():
-        pq.write_table(pa.Table.from_pylist(rows), folder / f"{name}.parquet")
+        pq.write_table(rows if isinstance(rows, pa.Table) else pa.Table.from_pylist(rows), folder / f"{name}.parquet")
     return folder
 
 
@@ -147,6 +147,10 @@ def changed(rows, number, **values):
 
 TWO = [*car(7, 0.0), *car(8, 20.0)]
 ROW = {"scenario_id": "one", "ego_id": 7}
+NONE = pa.table({"scenario_id": pa.array([], pa.string()), "ego_id": pa.array([], pa.int64())})
+LANE = {"scenario_id": "one", "lane_id": 1}
+LIGHT = {"scenario_id": "one", "step": 0, "lane_id": 1, "state": "stop"}
+NAMED_MAP = [{"map_id": "m", **{k: v for k, v in row.items() if k != "scenario_id"}} for row in MAP]
 BAD = {
     "NaN": ({"tracks": changed(TWO, 40, x=float("nan"))}, "tracks.parquet: row 40: x is nan"),
     "empty": ({"tracks": changed(TWO, 40, object_id=None)}, "tracks.parquet: row 40: object_id is empty"),
@@ -159,6 +163,14 @@ BAD = {
     "short": ({"tracks": car(7, 0.0, steps=range(50))}, "4.9 s from step 0 on, 9 s are needed"),
     "no ego": ({"scenarios": [{**ROW, "ego_id": 9}]}, "scenarios.parquet: row 0: no ego: object 9 has no rows"),
     "ego gone": ({"scenarios": [{**ROW, "first_step": -20}]}, "no ego: object 7 is not there 1 s after step -20"),
+    "no rows": ({"scenarios": NONE}, "scenarios.parquet has no rows"),
+    "lists": ({"scenarios": [{**ROW, "predict": [["8"]]}]}, "predict is list.*, it must have lists of whole numbers"),
+    "texts": ({"lanes": [{**LANE, "exit": ["4"]}]}, "exit is list.*, it must have lists of whole numbers"),
+    "guessed": ({"scenarios": [{**ROW, "guessed": [1]}]}, "guessed is list.*, it must have lists of words"),
+    "map id": ({"scenarios": [{**ROW, "map_id": "n"}], "map_rows": NAMED_MAP}, "row 0: map n has no rows in map.parq"),
+    "no map id": ({"map_rows": NAMED_MAP}, "scenarios.parquet has no column map_id"),
+    "speed limit": ({"lanes": [{**LANE, "speed_limit_mph": np.inf}]}, "lanes.parquet: row 0: speed_limit_mph is inf"),
+    "stop point": ({"lights": [{**LIGHT, "x": np.nan, "y": 0.0}]}, "lights.parquet: row 0: x is nan"),
     "predict": ({"scenarios": [{**ROW, "predict": [5]}]}, "predict lists object 5"),
     "rate": ({"scenarios": [{**ROW, "step_s": 2.0}]}, "step_s is 2, it must lie between"),
     "edge": ({"map_rows": [*MAP[:2], *MAP[3:1:-1], *MAP[4:]]}, "row 2: road edge 2 has the lanes on its right"),
@@ -180,6 +192,18 @@ def test_a_break_of_the_contract_is_named_with_its_row(tmp_path, kind):
     with pytest.raises(DataError) as caught:
         convert(tmp_path / "d", tmp_path / "data", on_error="stop", jobs=1, show_progress=False)
     assert re.search(cause, str(caught.value)), str(caught.value)
+
+
+def test_a_file_in_place_of_its_folder_is_refused(tmp_path):
+    write(tmp_path / "d")
+    with pytest.raises(DataError, match="no such folder; name the one that tracks.parquet is in"):
+        convert(tmp_path / "d" / "tracks.parquet", tmp_path / "data", reader="tables", show_progress=False)
+
+
+def test_a_column_of_licenses_may_be_empty(tmp_path):
+    write(tmp_path / "d", TWO, [{**ROW, "license": None, "guessed": ["ego", None]}])
+    (scenario,) = read(tmp_path / "d")
+    assert scenario.guessed == {"ego", "predict", "size", "z"}
 
 
 def test_a_bad_scenario_costs_itself_alone(tmp_path):

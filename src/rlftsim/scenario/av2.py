@@ -369,7 +369,7 @@ def _object_ids(file: Path, names: np.ndarray) -> np.ndarray:
     """Track ids as numbers; that of the ego is 0, or one above all others where 0 is taken."""
     wrong = [name for name in names if name != "AV" and not (name.isdecimal() and len(name) < 19)]
     if wrong:
-        raise DataError(f"{file.name}: track id {wrong[0]!r} is no number")
+        raise DataError(f"{file.name}: track id {str(wrong[0])!r} is no number")
     ids = np.array([-1 if name == "AV" else int(name) for name in names], np.int64)
     ids[ids == -1] = ids.max() + 1 if (ids == 0).any() else 0
     if len(np.unique(ids)) < len(ids):

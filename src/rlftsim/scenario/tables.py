@@ -60,7 +60,8 @@ MOST_PREDICTED = 8
 _MAX_COORDINATE_M = 1e7
 _EPSILON_S = 1e-6
 _WORDS, _NUMBERS, _WHOLE = "text", "numbers", "whole numbers"
-_LISTS, _EITHER, _TRUTH = "lists", "names or whole numbers", "True or False"
+_EITHER, _TRUTH = "names or whole numbers", "True or False"
+_LISTS, _WORD_LISTS = "lists of whole numbers", "lists of words"
 _SCHEMAS: Mapping[str, tuple[dict[str, str], dict[str, str]]] = {
     TRACKS: (
         {"scenario_id": _WORDS, "object_id": _WHOLE, "type": _EITHER, "step": _WHOLE}
@@ -74,7 +75,7 @@ _SCHEMAS: Mapping[str, tuple[dict[str, str], dict[str, str]]] = {
     SCENARIOS: (
         {"scenario_id": _WORDS, "ego_id": _WHOLE},
         {"map_id": _WORDS, "license": _WORDS, "step_s": _NUMBERS, "first_step": _WHOLE}
-        | dict.fromkeys(("predict", "interest", "guessed"), _LISTS),
+        | {"predict": _LISTS, "interest": _LISTS, "guessed": _WORD_LISTS},
     ),
     LANES: (
         {"lane_id": _WHOLE},
@@ -126,6 +127,8 @@ class TablesSource:
     def find(self, path: str | os.PathLike[str]) -> list[Unit]:
         """One unit per folder with a `tracks.parquet`."""
         tracks = _find_tracks(path)
+        if not os.path.isdir(path):
+            raise DataError(f"{path}: no such folder; name the one that {TRACKS} is in, or one above it")
         if not tracks:
             raise DataError(f"{path}: no {TRACKS} in this folder or in one below it")
         notes = []
@@ -148,6 +151,10 @@ class TablesSource:
         tables = {name: _read_table(folder / name) for name in (TRACKS, MAP, SCENARIOS)}
         tables |= {name: _read_table(folder / name) for name in (LANES, LIGHTS) if (folder / name).exists()}
         scenarios = tables[SCENARIOS]
+        if not len(scenarios):
+            raise DataError(f"{SCENARIOS} has no rows: each row makes a scenario")
+        if "scenario_id" not in tables[MAP] and "map_id" not in scenarios:
+            raise DataError(f"{SCENARIOS} has no column map_id, which the maps in {MAP} are named by")
         parts = {name: _by_key(table) for name, table in tables.items()}
         for record in range(len(scenarios)):
             row = scenarios.take(np.array([record]))
@@ -174,7 +181,7 @@ def _read_scenario(row: _Rows, parts: Mapping[str, _Rows]) -> Scenario:
         row: the row.
         parts: rows of the other tables that belong to it; optional tables may be missing.
     """
-    guessed = set(row["guessed"][0] or ()) if "guessed" in row else set()
+    guessed = {word for word in row["guessed"][0] or () if word} if "guessed" in row else set()
     step_s = float(row["step_s"][0]) if "step_s" in row else STEP_S
     if not 0.001 <= step_s <= LONGEST_HOLE_S:
         raise row.error(0, f"step_s is {step_s:g}, it must lie between 0.001 and {LONGEST_HOLE_S:g} seconds")
@@ -183,6 +190,8 @@ def _read_scenario(row: _Rows, parts: Mapping[str, _Rows]) -> Scenario:
     ego_rows = np.flatnonzero(rows["object_id"] == ego_id)
     if not len(ego_rows):
         raise row.error(0, f"no ego: object {ego_id} has no rows in {TRACKS}")
+    if "map_id" in row and not len(parts[MAP]):
+        raise row.error(0, f"map {row['map_id'][0]} has no rows in {MAP}")
     first_step = int(row["first_step"][0]) if "first_step" in row else int(rows["step"][ego_rows].min())
     if "z" in rows and "z" not in parts[MAP] and len(parts[MAP]):
         raise row.error(0, f"{TRACKS} has heights (z) and {MAP} has none: give both or neither")
@@ -211,7 +220,7 @@ def _read_scenario(row: _Rows, parts: Mapping[str, _Rows]) -> Scenario:
         difficulty=np.zeros(len(predicted), np.int8),
         objects_of_interest=tracks.object_id[np.array(interest, np.int64)],
         source="tables",
-        guessed=frozenset(map(str, guessed)),
+        guessed=frozenset(guessed),
     )
 
 
@@ -225,11 +234,7 @@ def _read_tracks(rows: _Rows, first_step: int, step_s: float, ground: MapFeature
         ground: map with heights, for tracks that have none; None = the ground is at height 0.
     """
     # 1. What does not depend on the grid.
-    for name in (name for name, kind in (_SCHEMAS[TRACKS][0] | _SCHEMAS[TRACKS][1]).items() if kind == _NUMBERS):
-        if name in rows:
-            bad = np.flatnonzero(~(np.abs(rows[name]) < _MAX_COORDINATE_M))  # NaN is not less, either
-            if len(bad):
-                raise rows.error(bad[0], f"{name} is {rows[name][bad[0]]:g}")
+    _refuse_impossible_numbers(rows)
     for name in (name for name in ("length", "width", "height") if name in rows):
         bad = np.flatnonzero(rows[name] <= 0)
         if len(bad):
@@ -350,10 +355,7 @@ def _indices_of(row: _Rows, name: str, tracks: Tracks) -> list[int]:
 def _read_map(rows: _Rows, lanes: _Rows | None) -> MapFeatures:
     """Map features in the order of their first rows."""
     kind = _numbers_of(rows, "type", MapFeatureType)
-    for name in (name for name in ("x", "y", "z") if name in rows):
-        bad = np.flatnonzero(~(np.abs(rows[name]) < _MAX_COORDINATE_M))
-        if len(bad):
-            raise rows.error(bad[0], f"{name} is {rows[name][bad[0]]:g}")
+    _refuse_impossible_numbers(rows)
     points = np.column_stack([rows["x"], rows["y"], rows["z"] if "z" in rows else np.zeros(len(rows))])
     ids, first, owner = np.unique(rows["feature_id"], return_index=True, return_inverse=True)
     by_feature = np.split(np.argsort(owner, kind="stable"), np.cumsum(np.bincount(owner, minlength=len(ids)))[:-1])
@@ -387,7 +389,10 @@ def _read_topology(rows: _Rows | None, features: Sequence[tuple[int, int, np.nda
             links["neighbors"] += [
                 (lane, side, other, 0, last[lane], 0, last[other]) for other in _list(rows, name, row) if other in place
             ]
-        speed_limit[place[lane]] = np.nan_to_num(rows["speed_limit_mph"][row]) if "speed_limit_mph" in rows else 0.0
+        limit = rows["speed_limit_mph"][row] if "speed_limit_mph" in rows else np.nan  # NaN = unknown
+        if np.isinf(limit):
+            raise rows.error(row, f"speed_limit_mph is {limit:g}")
+        speed_limit[place[lane]] = np.nan_to_num(limit)
         interpolating[place[lane]] = bool(rows["interpolating"][row]) if "interpolating" in rows else False
     return LaneTopology(
         entry_lanes=np.array(links["entry"], np.int64).reshape(-1, 2),
@@ -435,6 +440,7 @@ def _read_lights(
     """Lights at 10 Hz: of each lane the last state that is not older than a step of the recording."""
     found = []
     if rows is not None:
+        _refuse_impossible_numbers(rows)
         state = _numbers_of(rows, "state", LightState)
         seconds = (rows["step"] - first_step) * step_s
         place = {int(features.feature_id[k]): k for k in features.indices_of(LANE_TYPES)}
@@ -457,6 +463,15 @@ def _read_lights(
         columns[:, 2].astype(np.int8),
         columns[:, 3:].astype(np.float32),
     )
+
+
+def _refuse_impossible_numbers(rows: _Rows) -> None:
+    """Raise a `DataError` at the first NaN, infinite or huge number in a column of numbers."""
+    needed, optional = _SCHEMAS[rows.table]
+    for name in (name for name, kind in (needed | optional).items() if kind == _NUMBERS and name in rows):
+        bad = np.flatnonzero(~(np.abs(rows[name]) < _MAX_COORDINATE_M))  # NaN is not less, either
+        if len(bad):
+            raise rows.error(bad[0], f"{name} is {rows[name][bad[0]]:g}")
 
 
 def _numbers_of(rows: _Rows, name: str, kinds: type[IntEnum]) -> Int64[np.ndarray, "n"]:
@@ -518,19 +533,24 @@ def _read_table(path: Path) -> _Rows:
 def _read_column(table: str, name: str, column: pa.ChunkedArray, kind: str) -> np.ndarray:
     """A column as an array: float64, int64, bool, or objects for text and lists."""
     types, found = pa.types, column.type.value_type if pa.types.is_dictionary(column.type) else column.type
-    is_text = types.is_string(found) or types.is_large_string(found)
+    is_list = types.is_list(found) or types.is_large_list(found)
+    inside = found.value_type if is_list else found
+    is_text, is_text_inside = (
+        types.is_string(one) or types.is_large_string(one) or types.is_string_view(one) for one in (found, inside)
+    )
     fits = {
-        _WORDS: is_text or types.is_integer(found),
+        _WORDS: is_text or types.is_integer(found) or types.is_null(found),
         _NUMBERS: types.is_floating(found) or types.is_integer(found),
         _WHOLE: types.is_integer(found),
-        _LISTS: types.is_list(found) or types.is_large_list(found) or types.is_null(found),
+        _LISTS: (is_list and types.is_integer(inside)) or types.is_null(inside),
+        _WORD_LISTS: (is_list and is_text_inside) or types.is_null(inside),
         _EITHER: is_text or types.is_integer(found),
         _TRUTH: types.is_boolean(found),
     }[kind]
     if not fits:
         raise DataError(f"{table}: column {name} is {column.type}, it must have {kind}")
     # empty lists and licenses are allowed, empty numbers are NaN, which is refused where it matters
-    if column.null_count and kind not in (_LISTS, _NUMBERS) and name != "license":
+    if column.null_count and kind not in (_LISTS, _WORD_LISTS, _NUMBERS) and name != "license":
         row = np.flatnonzero(column.is_null().to_numpy())[0]
         raise DataError(f"{table}: row {row}: {name} is empty")
     try:
