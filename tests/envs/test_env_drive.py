@@ -112,6 +112,7 @@ def test_planners_of_others_are_found(tmp_path, monkeypatch):
     assert action_of(load_planner("mine")) == "pose"
     PLANNERS.remove("mine")
     wrong = {"my_planners:number": "is a int", "my_planners:nothing": "cannot be imported", "idn": "mean 'idm'"}
+    wrong |= {":Still": "names no module", "nowhere.at_all:Still": "cannot be imported"}
     for name, message in wrong.items():
         with pytest.raises(ConfigError, match=message):
             load_planner(name)
@@ -135,9 +136,14 @@ def test_drive_writes_a_row_per_scenario_and_compare_reads_them(tmp_path, capsys
     assert main(["drive", "walk", "--data", "synthetic", "--out", str(out)]) == 2
     assert main([*words, "--traffic", "none"]) == 2
     assert main([*words, "--scenario", "x", "--traffic", "replay"]) == 2
+    (tmp_path / "file").touch()
+    assert main([*words, "--seed", "-1"]) == 2
+    assert main([*words, "--traffic", "replay,replay"]) == 2
+    assert main(["drive", "idm", "--data", "synthetic", "--traffic", "replay", "--out", str(tmp_path / "file")]) == 2
     errors = capsys.readouterr().err.strip().splitlines()
-    assert len(errors) == 3
+    assert len(errors) == 6  # no progress bar: nothing was driven
     assert "unknown planner 'walk'" in errors[0]
+    assert "is a file, not a folder" in errors[5]
 
 
 def test_results_survive_their_file_and_pair_by_scenario(tmp_path):

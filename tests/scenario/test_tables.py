@@ -196,8 +196,17 @@ def test_a_break_of_the_contract_is_named_with_its_row(tmp_path, kind):
 
 def test_a_file_in_place_of_its_folder_is_refused(tmp_path):
     write(tmp_path / "d")
-    with pytest.raises(DataError, match="no such folder; name the one that tracks.parquet is in"):
+    with pytest.raises(DataError, match="no such folder; name the one"):
         convert(tmp_path / "d" / "tracks.parquet", tmp_path / "data", reader="tables", show_progress=False)
+
+
+@pytest.mark.parametrize("name", ["../../outside", "a/b", "", ".."])
+def test_an_id_that_is_no_file_name_costs_its_scenario(tmp_path, name):
+    bad = [[{**row, "scenario_id": name} for row in rows] for rows in (TWO, [ROW], MAP)]
+    write(tmp_path / "d", *([*rows, *more] for rows, more in zip(bad, (TWO, [ROW], MAP))))
+    report = convert(tmp_path / "d", tmp_path / "data", jobs=1, show_progress=False)
+    assert report.converted == 1
+    assert f"scenario id {name!r} is no file name" in str(report.skipped[0])
 
 
 def test_a_column_of_licenses_may_be_empty(tmp_path):

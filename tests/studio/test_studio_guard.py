@@ -134,6 +134,22 @@ def test_a_token_file_is_made_private_and_read_again(tmp_path):
     path.chmod(0o644)
     with pytest.raises(ConfigError, match="only its owner"):
         token_of(path)
+    path.write_bytes(b"\xff" * 60)
+    path.chmod(0o600)
+    with pytest.raises(ConfigError, match="only its owner"):
+        token_of(path)
+
+
+def test_what_cannot_be_served_or_saved_is_refused_at_the_start(tmp_path, capsys):
+    from rlftsim.cli.main import main
+
+    words = ["studio", "--no-browser", "--model", "constant_velocity"]
+    (tmp_path / "file").touch()
+    assert main([*words, "--port", "65536"]) == 2
+    assert main([*words, "--out", str(tmp_path / "file")]) == 2
+    port, out = capsys.readouterr().err.splitlines()
+    assert "--port must lie between 0 and 65535, got 65536" in port
+    assert f"--out {tmp_path / 'file'} is a file" in out
 
 
 def test_another_host_needs_a_word_more(capsys):

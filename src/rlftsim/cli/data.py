@@ -25,8 +25,8 @@ class Convert:
     """
 
     source: Annotated[Positional[str], tyro.conf.arg(metavar="SOURCE")]
-    """For WOMD a tfrecord shard, a folder of shards, or a quoted glob such as 'training/*tfrecord*'. For av2 and tables
-    a folder."""
+    """For WOMD a tfrecord shard, a folder of shards, or a quoted glob such as 'training/*tfrecord*'. For other
+    sources a folder."""
     destination: Annotated[Positional[Path], tyro.conf.arg(metavar="FOLDER")]
     """Folder of the data set."""
     reader: Annotated[str, tyro.conf.arg(name="from", metavar="NAME")] = "auto"

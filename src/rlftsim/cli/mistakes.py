@@ -7,6 +7,7 @@ from itertools import pairwise
 
 RULE = re.compile(r"^(╭|╰|─{4}|-{4})")
 FLAG = re.compile(r"--[A-Za-z][\w.-]*")
+ACTIONS = re.compile(r"\A\s*usage: .* \{([\w,-]+)\}$", re.MULTILINE)
 
 
 def flags_of(words: Sequence[str]) -> list[str]:
@@ -22,6 +23,11 @@ def explain(words: Sequence[str], complaint: str, help_text: str) -> str:
         complaint: what tyro printed, a box of lines.
         help_text: the verb's help, for the flags that exist.
     """
+    actions = ACTIONS.search(help_text)
+    if actions and words and not words[0].startswith("-"):
+        near = difflib.get_close_matches(words[0], actions[1].split(","), 1)
+        hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(actions[1].split(','))}."
+        return f"no action {words[0]}: {hint}"
     known = list(dict.fromkeys(FLAG.findall(help_text)))
     for flag in flags_of(words):
         if flag not in known:

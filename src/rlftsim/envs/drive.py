@@ -8,6 +8,7 @@ from typing import Any, cast
 import numpy as np
 
 import rlftsim
+from rlftsim.atomic_io import errors_name
 from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.drivers import TRAFFIC, Traffic
 from rlftsim.envs.ego_env import EgoEnv
@@ -48,11 +49,14 @@ class DriveConfig:
     def __post_init__(self) -> None:
         for name in ("num_rollouts", "jobs"):
             whole_number(name, getattr(self, name), 1)
+        whole_number("seed", self.seed, 0)
         if self.limit is not None:
             whole_number("limit", self.limit, 1)
         for traffic in self.traffic or ("",):
             if traffic not in TRAFFIC:
                 raise ConfigError(f"traffic must be some of {', '.join(TRAFFIC)}, got {traffic!r}.")
+        if len(set(self.traffic)) < len(self.traffic):
+            raise ConfigError(f"traffic names one kind twice: {', '.join(self.traffic)}.")
 
     def settings(self, traffic: str) -> EnvConfig:
         """Settings of the environment for one kind of traffic: nothing ends an episode, and nothing is rewarded."""
@@ -77,6 +81,9 @@ def drive(config: DriveConfig, out: Path | None = None) -> list[DriveResult]:
     ids = list(config.scenarios or environments[0].source.scenario_ids)[: config.limit]
     for scenario_id in ids:
         environments[0].source.scenario(scenario_id)
+    if out is not None:
+        with errors_name(out):
+            out.mkdir(parents=True, exist_ok=True)
     name = config.planner.replace(":", ".")
     results = []
     for traffic, env in zip(config.traffic, environments):

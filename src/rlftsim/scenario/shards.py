@@ -116,9 +116,10 @@ class ShardWriter:
             source_record: number of its record in the file it was converted from; None if there is none.
 
         Raises:
-            DataError: an array of the scenario has another dtype than `types.py` declares, a valid state or map point
-                is not finite, or the file cannot be written (a full disk, say).
+            DataError: its id is no file name, an array of the scenario has another dtype than `types.py` declares, a
+                valid state or map point is not finite, or the file cannot be written (a full disk, say).
         """
+        scenario.refuse_bad_id()
         arrays = _to_arrays(scenario)
         for name, dtype in _ARRAY_DTYPES.items():
             array = arrays[name]

@@ -189,6 +189,11 @@ def read_unit(
                 tally(item)
                 continue
             if isinstance(item, Scenario):
+                try:
+                    item.refuse_bad_id()
+                except DataError as error:
+                    item = SkippedRecord(unit.name, record, str(error))
+            if isinstance(item, Scenario):
                 yield record, item
             elif on_error == "stop":
                 raise DataError(str(item))

@@ -10,6 +10,7 @@ needs torch.
 """
 
 import importlib
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from enum import IntEnum
@@ -214,6 +215,18 @@ class Scenario:
     """Name of the data source that it was read by, such as "womd"."""
     guessed: frozenset[str] = frozenset()
     """Values that the log lacks and the data source made up, such as "size" and "z"."""
+
+    def refuse_bad_id(self) -> None:
+        """Check that the id can be a file name: films and rollouts are named after their scenario.
+
+        Raises:
+            DataError: it is empty, or has a slash or a control character.
+        """
+        if not re.fullmatch(r"[^/\\\x00-\x1f]+", self.scenario_id) or self.scenario_id in (".", ".."):
+            raise DataError(
+                f"scenario id {self.scenario_id!r} is no file name, and files are named after it: write it without "
+                "slashes and control characters"
+            )
 
     def refuse_not_finite(self) -> None:
         """Check every valid state and every map point.

@@ -130,7 +130,7 @@ def token_of(path: Path) -> str:
             descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
             with os.fdopen(descriptor, "w") as file:
                 file.write(new_token())
-    token = path.read_text().strip()
+    token = path.read_text(errors="replace").strip()
     if len(token) < len(new_token()) or not token.isascii() or path.stat().st_mode & 0o077:
         raise ConfigError(f"--token-file {path}: no token that only its owner can read: delete it, a new one is made.")
     return token
@@ -152,6 +152,8 @@ def announce(studio: Studio, *, as_json: bool, open_browser: bool) -> None:
 
 
 def _bind(host: str, port: int) -> socket.socket:
+    if not 0 <= port <= 65535:
+        raise ConfigError(f"--port must lie between 0 and 65535, got {port}: 0 takes a free one.")
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     bound = socket.socket(family, socket.SOCK_STREAM)
     if sys.platform != "win32":

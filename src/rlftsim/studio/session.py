@@ -119,6 +119,8 @@ class Session:
         self.splits = splits_of(data)
         self.split = split or ("validation" if "validation" in self.splits else self.splits[0])
         self._datasets = {name: open_dataset(data, name) for name in dict.fromkeys((self.split, *self.splits))}
+        if out.exists() and not out.is_dir():
+            raise ConfigError(f"--out {out} is a file: name a folder for what the page saves.")
         self.out = out
         self.models = {model.name: model for model in _load(models, device)}
         self._rows: dict[str, list[dict[str, Any]]] = {}

@@ -72,6 +72,8 @@ def load_planner(name: str) -> Planner:
     """
     if ":" in name:
         module, _, attribute = name.partition(":")
+        if not module or module.startswith("."):
+            raise ConfigError(f"planner {name!r} names no module: write package.module:Class.")
         try:
             found = getattr(importlib.import_module(module), attribute)
         except (ImportError, AttributeError) as error:
