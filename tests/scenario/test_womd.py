@@ -1,3 +1,5 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -273,11 +275,13 @@ def test_skipped_records_go_to_the_log_unless_they_are_collected(tmp_path, make_
 def test_files_are_found_by_folder_and_by_glob(tmp_path, make_message, make_tfrecord):
     names = ["b/validation.tfrecord-00000-of-00001", "a/training.tfrecord-00001-of-00002", "c.tfrecord"]
     for name in names:
-        make_tfrecord(tmp_path / name, make_message(name))
+        make_tfrecord(tmp_path / name, make_message(Path(name).name))
     (tmp_path / "a" / "training.csv").write_text("not one")
     found = [path.relative_to(tmp_path).as_posix() for path in find_tfrecords(tmp_path)]
     assert found == sorted(names)
-    assert [s.scenario_id for s in read_scenarios(tmp_path / "*" / "*.tfrecord-*")] == sorted(names[:2])
+    assert [s.scenario_id for s in read_scenarios(tmp_path / "*" / "*.tfrecord-*")] == [
+        Path(name).name for name in sorted(names[:2])
+    ]
     assert find_tfrecords(tmp_path / "c.tfrecord") == [tmp_path / "c.tfrecord"]
 
 
