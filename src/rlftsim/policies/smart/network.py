@@ -298,8 +298,8 @@ class AgentDecoder(nn.Module):
         new_past = Past(steps.position, steps.heading, new_row, ()) if past is None else past.then(steps, new_row)
         # 2. their neighbors, which all layers share
         poses = Poses(steps.position, steps.heading)[rows]
-        # Agents that stand are at the same pose in many steps and rollouts; to find out a device would be waited for, and
-        # in training every row has a dropout mask of its own.
+        # Agents that stand are at the same pose in many steps and rollouts. In training every row has a dropout mask of
+        # its own; and a device would have to be waited for.
         is_shared = not (padded or self.training) and row_of.device.type == "cpu"
         groups = group_rows(rows[0], poses) if is_shared else None
         first = slice(None) if groups is None else groups.first
