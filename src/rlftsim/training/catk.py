@@ -132,7 +132,8 @@ def catk_finetune(
         CheckpointError: `out` holds another run, or the run diverged.
     """
     scenarios = as_scenarios(scenarios)
-    model = require_trainable(policy, scenarios, "CAT-K", needs=("vocabulary",))
+    method = "RoaD" if isinstance(config, RoadConfig) else "CAT-K"
+    model = require_trainable(policy, scenarios, method, needs=("vocabulary",))
     refuse_goals(model, config.goal_probability)
     freeze_untrained(model, config.trained)
     goal_config = GoalConfig(probability=config.goal_probability)
@@ -141,14 +142,15 @@ def catk_finetune(
 
     def predict_along_catk(batch: ScenarioBatch, trained: Bool[Tensor, "B A"], update: int) -> Prediction:
         context = rollout_context = model.encode(batch)
+        behavior = model
         if frozen is not None:
             before, now = (places * config.batch_size // len(scenarios) for places in (update - 1, update))
             if now > before:
                 frozen.to(batch.device).load_state_dict(model.state_dict())
-            rollout_context = frozen.encode(batch)
+            behavior, rollout_context = frozen, frozen.encode(batch)
         goals = choose_goals(batch, goal_config, None, seed=derive_seed(config.seed, "goals", update))
         targeted = roll_out_closest(
-            frozen or model, batch, num_candidates=config.num_candidates, choice=config.choice, targets=config.targets,
+            behavior, batch, num_candidates=config.num_candidates, choice=config.choice, targets=config.targets,
             context=rollout_context, goals=goals, max_distance_lengths=config.max_distance_lengths,
             seed=derive_seed(config.seed, "rollouts", update),
         )  # fmt: skip
@@ -158,8 +160,8 @@ def catk_finetune(
 
     return imitate(
         model, scenarios, out, config, predict_along_catk,
-        title="RoaD" if isinstance(config, RoadConfig) else "CAT-K", card=card,
-        held_out=None if held_out is None else as_scenarios(held_out), kept={"frozen": frozen} if frozen else {},
+        title=method, card=card, held_out=None if held_out is None else as_scenarios(held_out),
+        kept={} if frozen is None else {"frozen": frozen},
     )  # fmt: skip
 
 
