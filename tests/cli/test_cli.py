@@ -153,7 +153,7 @@ WRONG = {
         "unknown recipe 'smart-tinny': did you mean 'smart-tiny'",
     ),
     "a flag that is missing": ("evaluate oracle --data synthetic", "missing: --out"),
-    "an action that does not exist": ("data veriy synthetic", "not understood: veriy"),
+    "an action that does not exist": ("data veriy synthetic", "no action veriy: did you mean verify"),
     "a choice that does not exist": ("convert a b --on-error wait", "--on-error wait: expected one of 'skip', 'stop'"),
     "a value that is missing": ("evaluate oracle --out", "--out needs a value"),
     "a value of the wrong kind": (
