@@ -188,7 +188,7 @@ def test_a_run_without_a_model_yet_says_so(tmp_path):
         ('"dim": 8', '"dims": 8', r"settings do not fit SmartConfig .*dims"),
         ('"dim": 8', '"dim": -8', "dim must be positive"),
         ('"dim": 8', '"dim": 16', "weights do not fit this model"),
-        ('"architecture": "smart"', '"architecture": "cruise"', "not a SMART model, its architecture is 'cruise'"),
+        ('"architecture": "smart"', '"architecture": "cruise"', "not a smart model, its architecture is 'cruise'"),
         ('"dim"', "dim", "damaged model folder"),
     ],
 )

@@ -119,12 +119,17 @@ def save_model(
     write_text(folder / CONFIG, json.dumps({"architecture": architecture, **config}, indent=1) + "\n")
 
 
-def read_model(folder: str | os.PathLike) -> StoredModel:
+def read_model(folder: str | os.PathLike, *, architecture: str | None = None) -> StoredModel:
     """Settings of a model folder, or of the one inside a run's folder.
+
+    Args:
+        folder: the model's or the run's.
+        architecture: refuse models of another one; None = any.
 
     Raises:
         ConfigError: there is no such folder.
-        CheckpointError: it is not a model folder, is damaged, or belongs to a run that has not finished.
+        CheckpointError: it is not a model folder, is damaged, belongs to a run that has not finished, or holds
+            another architecture.
     """
     path = find_model(folder)
     try:
@@ -140,8 +145,8 @@ def read_model(folder: str | os.PathLike) -> StoredModel:
     # Only folders of 0.1 have old names, and only theirs is a format: other architectures may use any of these words.
     first = _FIRST_FORMAT.get(str(values.get("format")))
     config = dict(values) if first is None else current_names({k: v for k, v in values.items() if k != "format"})
-    architecture = config.pop("architecture", first)
-    if not isinstance(architecture, str):
+    stored = config.pop("architecture", first)
+    if not isinstance(stored, str):
         # a run's folder has a config.json of its own beside its checkpoints
         is_run = (path / "environment.json").exists() or (path / "checkpoints").is_dir()
         raise CheckpointError(
@@ -149,7 +154,9 @@ def read_model(folder: str | os.PathLike) -> StoredModel:
             if is_run
             else f"{path / CONFIG}: names no architecture, so this is no model folder."
         )
-    return StoredModel(path, architecture, config)
+    if architecture not in (None, stored):
+        raise CheckpointError(f"{path}: not a {architecture} model, its architecture is {stored!r}.")
+    return StoredModel(path, stored, config)
 
 
 def find_model(name: str | os.PathLike) -> Path:

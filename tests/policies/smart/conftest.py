@@ -6,15 +6,15 @@ Everything here needs the official material.
 import json
 import runpy
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from safetensors.numpy import save_file
 
+from golden_files import Golden
 from rlftsim.policies.smart.catk_checkpoint import import_catk
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.scenario.batch import ScenarioBatch, collate
@@ -23,20 +23,6 @@ from rlftsim.scenario.womd import read_scenarios
 
 FRAMES = {"centred": "map", "absolute": "world"}
 """Our name of each frame of the golden files."""
-
-
-@dataclass(frozen=True)
-class Golden:
-    """The golden files."""
-
-    folder: Path
-
-    def arrays(self, name: str) -> dict[str, np.ndarray]:
-        with np.load(self.folder / f"{name}.npz") as file:
-            return dict(file)
-
-    def scalars(self, name: str) -> dict:
-        return json.loads((self.folder / "scalars.json").read_text())[name]
 
 
 @pytest.fixture(scope="session")

@@ -6,16 +6,15 @@ Everything here needs the official material.
 import json
 import runpy
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from public_names import SMALL, golden_scene, our_weights
 from safetensors.numpy import load_file
 
+from golden_files import Golden
 from rlftsim.policies.trafficbots.config import TrafficBotsConfig
 from rlftsim.policies.trafficbots.policy import TrafficBotsPolicy
 from rlftsim.policies.trafficbots.scene import Scene
@@ -23,20 +22,6 @@ from rlftsim.scenario.types import Scenario
 from rlftsim.scenario.womd import read_scenarios
 
 FILES = {"A": "motion_data_one_scenario.tfrecord", "B": "converted/eb4b91b10ca94ff2.tfrecord"}
-
-
-@dataclass(frozen=True)
-class Golden:
-    """The golden files."""
-
-    folder: Path
-
-    def arrays(self, name: str) -> dict[str, np.ndarray]:
-        with np.load(self.folder / f"{name}.npz") as file:
-            return dict(file)
-
-    def scalars(self, name: str) -> dict:
-        return json.loads((self.folder / "scalars.json").read_text())[name]
 
 
 @pytest.fixture(scope="session")

@@ -164,9 +164,7 @@ class SmartModel(nn.Module):
             CheckpointError: a missing or damaged file, another architecture, or keys and shapes that do not fit:
                 names them all.
         """
-        model = read_model(folder)
-        if model.architecture != cls.architecture:
-            raise CheckpointError(f"{model.folder}: not a SMART model, its architecture is {model.architecture!r}.")
+        model = read_model(folder, architecture=cls.architecture)
         config, weights = model.build(SmartConfig), model.read_weights()
         path = model.folder / VOCABULARY
         if not path.exists():

@@ -11,7 +11,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from rlftsim.errors import CheckpointError
 from rlftsim.policies.checkpoint import load_strictly, read_model, save_model
 from rlftsim.policies.trafficbots.config import TrafficBotsConfig
 from rlftsim.policies.trafficbots.network import TrafficBotsNetwork
@@ -90,11 +89,7 @@ class TrafficBotsModel(nn.Module):
             CheckpointError: a missing or damaged file, another architecture, or keys and shapes that do not fit:
                 names them all.
         """
-        stored = read_model(folder)
-        if stored.architecture != cls.architecture:
-            raise CheckpointError(
-                f"{stored.folder}: not a TrafficBots model, its architecture is {stored.architecture!r}."
-            )
+        stored = read_model(folder, architecture=cls.architecture)
         policy = cls(stored.build(TrafficBotsConfig))
         load_strictly(policy.network, stored.read_weights(), source=str(stored.folder))
         return policy
