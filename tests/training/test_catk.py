@@ -14,7 +14,8 @@ from rlftsim.rollout.policy import Sampling
 from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.types import CURRENT_STEP
-from rlftsim.training.catk import CatkConfig, catk_finetune, roll_out_closest
+from rlftsim.training.catk import CatkConfig, catk_finetune
+from rlftsim.training.catk_rollouts import roll_out_closest
 from rlftsim.training.run_folder import read_metrics
 
 ENDS = slice(4, None, 5)

@@ -27,7 +27,7 @@ from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import write_dataset
 from rlftsim.training import finetune, processes
-from rlftsim.training.catk import roll_out_closest
+from rlftsim.training.catk_rollouts import roll_out_closest
 from rlftsim.training.goals import GoalConfig
 from rlftsim.training.run_folder import read_metrics
 from rlftsim.training.validation import ValidationConfig

@@ -16,7 +16,7 @@ from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.types import ObjectType
 from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
-from rlftsim.training.catk import roll_out_closest
+from rlftsim.training.catk_rollouts import roll_out_closest
 from rlftsim.training.data import trained_agents
 
 SMALL = SmartConfig(

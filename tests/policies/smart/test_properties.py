@@ -22,7 +22,7 @@ from rlftsim.tokens.agent_tokens import clean_tracks
 from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
 from rlftsim.tokens.map_tokens import MapTokens, tokenize_map
 from rlftsim.tokens.vocabulary import class_of_type
-from rlftsim.training.catk import roll_out_closest
+from rlftsim.training.catk_rollouts import roll_out_closest
 
 SCENES = (scenes.bend(), scenes.bend("pair", 2))
 ROUNDING = 2e-5

@@ -18,7 +18,7 @@ from rlftsim.tokens.agent_tokens import tokenize_agents
 from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
 from rlftsim.tokens.map_tokens import tokenize_map
 from rlftsim.tokens.vocabulary import CLASS_BOXES_M
-from rlftsim.training.catk import roll_out_closest
+from rlftsim.training.catk_rollouts import roll_out_closest
 from rlftsim.training.parallel import DeviceConfig
 from rlftsim.training.pretrain import PretrainConfig, pretrain
 from rlftsim.training.run_folder import read_metrics

@@ -1,0 +1,218 @@
+"""CAT-K rollouts and RoaD rollouts: simulations that stay near the log, with a target for each decision."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+
+from rlftsim.errors import ConfigError
+from rlftsim.goals.types import Goals
+from rlftsim.rollout.noise import derive_seed
+from rlftsim.rollout.policy import DecisionDistribution, Sampling, TokenPolicy
+from rlftsim.rollout.rows import pick_rows, place_rows
+from rlftsim.rollout.simulate import simulate
+from rlftsim.scenario.batch import ScenarioBatch
+from rlftsim.tokens import catk_compat
+from rlftsim.tokens.agent_tokens import (
+    HISTORY_TOKENS,
+    AgentTokens,
+    Pose,
+    local_boxes,
+    tokenize_agents,
+    tokens_towards,
+)
+from rlftsim.tokens.vocabulary import Vocabulary, box_of_class, class_of_type
+from rlftsim.training.closed_loop import TargetedRollouts, TokenLogits
+
+DEFAULT_NUM_CANDIDATES = 32
+
+Choice = Literal["closest", "top_k", "trajeglish", "sampled"]
+"""closest: of the K most likely tokens the one that leads nearest to the log. top_k: sampled from the K most likely.
+trajeglish: sampled, by the model's probabilities, from the K that lead nearest. sampled: of K samples from the
+policy the one that leads nearest. Where the next logged state is not valid: the most likely token, samples from the K
+most likely ones, and with "sampled" a sample."""
+Targets = Literal["nearest", "taken"]
+"""nearest: the token of the whole vocabulary that leads nearest to the log. taken: the token of the rollout itself."""
+
+
+def roll_out_closest(
+    policy: TokenPolicy,
+    batch: ScenarioBatch,
+    *,
+    num_candidates: int = DEFAULT_NUM_CANDIDATES,
+    choice: Choice = "closest",
+    targets: Targets = "nearest",
+    max_distance_lengths: float | None = None,
+    num_rollouts: int = 1,
+    seed: int = 0,
+    context: Any = None,
+    goals: Goals | None = None,
+    catk_compat: bool = False,
+) -> TargetedRollouts:
+    """Simulate with CAT-K.
+
+    Without dropout nothing in "closest" is random: more than one rollout makes sense for a policy in training
+    mode only.
+
+    Args:
+        policy: decides for every agent.
+        batch: scenarios with their future.
+        num_candidates: K.
+        choice: see `Choice`.
+        targets: see `Targets`.
+        max_distance_lengths: see `CatkConfig`.
+        num_rollouts: N.
+        seed: of what else is random in the policy, and of samples.
+        context: `policy.encode(batch)`, if it has been computed.
+        goals: of the agents, see `simulate`.
+        catk_compat: round where the public code rounds, see `tokens.catk_compat`.
+
+    Returns:
+        The rollouts with their targets, where the next logged state is valid and the present state is not too far off
+        the log.
+
+    Raises:
+        ConfigError: no candidates.
+    """
+    if num_candidates < 1:
+        raise ConfigError(f"num_candidates must be at least 1, got {num_candidates}.")
+    # The log in steps of one token, 0.5 s: poses and validity, [B, A, tokens].
+    tokens = tokenize_agents(batch, policy.vocabulary, catk_compat=catk_compat)
+    found: list[tuple[Tensor, Tensor]] = []  # target token and its mask of each decision, [B, N, A]
+    logged = _targets(batch, tokens, policy.vocabulary, catk_compat)
+    take = _CHOICES[choice]
+    draws = torch.Generator().manual_seed(derive_seed(seed, "candidates") % 2**63)
+
+    def choose(
+        distribution: DecisionDistribution, state: Any, sampling: Sampling, noise: Tensor
+    ) -> Int64[Tensor, "B N A"]:
+        # `simulate` decides in the order of time, so the next target is that of this decision.
+        target = next(logged)((state.position, state.heading))
+        if choice == "sampled":  # K numbers for each agent instead of one
+            noise = torch.rand((*noise.shape[:-1], num_candidates), generator=draws).to(noise)
+        taken = take(distribution, target, num_candidates, noise)  # type: ignore[arg-type]
+        best = taken if targets == "taken" else target.best_token()
+        found.append((best, target.logged_valid & target.is_near_log(max_distance_lengths)))
+        return taken
+
+    rollouts = simulate(
+        policy, batch, num_rollouts=num_rollouts, seed=seed, context=context, goals=goals, choose=choose
+    )
+    target, mask = (torch.stack(part, -1) for part in zip(*found))  # [B, N, A, L]
+    return TargetedRollouts(rollouts, target, mask, class_of_type(batch.object_type))
+
+
+@dataclass(frozen=True, eq=False)
+class _Target:
+    """Poses of the agents in a simulation, and the logged ones of the same step and of the next."""
+
+    pose: Pose
+    logged_now: Pose
+    logged_now_valid: Bool[Tensor, "B N A"]
+    logged: Pose
+    """Of the next step: where the decision should lead."""
+    logged_valid: Bool[Tensor, "B N A"]
+    class_id: Int64[Tensor, "B N A"]
+    vocabulary: Vocabulary
+    catk_compat: bool
+    """Place the candidates in the map before distances are taken, as the public code does."""
+
+    def best_token(self) -> Int64[Tensor, "B N A"]:
+        """Token of the whole vocabulary that leads nearest to the log."""
+        return tokens_towards(self.logged, self.pose, self.class_id, self.logged_valid, self.vocabulary)
+
+    def is_near_log(self, max_lengths: float | None) -> Bool[Tensor, "B N A"]:
+        """True for agents within so many lengths of their class's box from their logged position, or without one."""
+        if max_lengths is None:
+            return torch.ones_like(self.logged_valid)
+        length, _ = box_of_class(self.class_id)
+        distance = (self.pose[0] - self.logged_now[0]).norm(dim=-1)  # [B, N, A]
+        return (distance <= max_lengths * length) | ~self.logged_now_valid
+
+    def distances(self, ids: Int64[Tensor, "R K"], mask: Bool[Tensor, "B N A"]) -> Float[Tensor, "R K"]:
+        """Mean corner distances, m, between the boxes that tokens lead to and the logged boxes.
+
+        Args:
+            ids: K candidate tokens of each agent.
+            mask: True = one of the R agents.
+        """
+        pick = partial(pick_rows, mask=mask, has_all=len(ids) == mask.numel())
+        class_id = pick(self.class_id)  # [R]
+        ends = self.vocabulary.end_corners()[class_id[:, None], ids]  # [R, K, 4, 2], in the agents' frames
+        logged, pose = ((pick(position), pick(heading)) for position, heading in (self.logged, self.pose))
+        if not self.catk_compat:
+            return (ends - local_boxes(logged, pose, class_id)[:, None]).norm(dim=-1).mean(-1)
+        # The public code compares in the map frame, where float32 rounds coarser: another candidate may win.
+        length, width = box_of_class(class_id)
+        boxes = catk_compat.boxes_around(*logged, length, width)
+        return (catk_compat.place_boxes(ends, *pose) - boxes[:, None]).norm(dim=-1).mean(-1)
+
+
+def _targets(
+    batch: ScenarioBatch, tokens: AgentTokens, vocabulary: Vocabulary, catk_compat: bool
+) -> Iterator[Callable[[Pose], _Target]]:
+    """Yield for each decision the function from the simulation's poses to their targets."""
+    for step in range(HISTORY_TOKENS, tokens.logged_valid.shape[-1]):
+
+        def target_of(pose: Pose, step: int = step) -> _Target:
+            def at(values: Tensor, step: int) -> Tensor:
+                values = values[:, None, :, step]  # the log is the same for all N rollouts
+                return values.expand(-1, pose[1].shape[1], *values.shape[2:])
+
+            # The decision leads from the token before `step` to that at `step`.
+            now, then = ((at(tokens.logged_position, k), at(tokens.logged_heading, k)) for k in (step - 1, step))
+            class_id = class_of_type(batch.object_type)[:, None].expand(pose[1].shape)
+            return _Target(
+                pose, now, at(tokens.logged_valid, step - 1), then, at(tokens.logged_valid, step), class_id, vocabulary,
+                catk_compat,
+            )  # fmt: skip
+
+        yield target_of
+
+
+def _take_closest(distribution: TokenLogits, target: _Target, count: int, noise: Tensor) -> Int64[Tensor, "B N A"]:
+    logits, mask = distribution.logits, distribution.mask  # [R, V], [B, N, A]
+    likely = logits.topk(min(count, logits.shape[-1]), dim=-1).indices  # [R, K]
+    nearest = target.distances(likely, mask).argmin(-1, keepdim=True)
+    # topk sorts, so the first candidate is the most likely token.
+    is_logged = pick_rows(target.logged_valid, mask, has_all=len(logits) == mask.numel())
+    return place_rows(torch.where(is_logged, likely.gather(-1, nearest)[:, 0], likely[:, 0]), mask)
+
+
+def _draw_likely(distribution: Any, target: _Target, count: int, noise: Tensor) -> Int64[Tensor, "B N A"]:
+    return distribution.sample(Sampling(top_k=count), noise)
+
+
+def _draw_near(distribution: Any, target: _Target, count: int, noise: Tensor) -> Int64[Tensor, "B N A"]:
+    logits, mask = distribution.logits, distribution.mask  # [R, V], [B, N, A]
+    ids = torch.arange(logits.shape[-1], device=logits.device).expand_as(logits)
+    # a class may have fewer tokens than the table has rows
+    exists = target.vocabulary.token_mask[pick_rows(target.class_id, mask, has_all=len(logits) == mask.numel())]
+    near = target.distances(ids, mask).masked_fill(~exists, torch.inf)
+    near = near.topk(min(count, logits.shape[-1]), dim=-1, largest=False).indices  # [R, K]
+    kept = torch.zeros_like(logits, dtype=torch.bool).scatter(-1, near, True)
+    # -inf removes a token from the softmax; the others keep their relative probabilities.
+    among_near = replace(distribution, logits=logits.masked_fill(~kept, -torch.inf)).sample(Sampling(), noise)
+    return torch.where(target.logged_valid, among_near, _draw_likely(distribution, target, count, noise))
+
+
+def _take_nearest_sample(
+    distribution: TokenLogits, target: _Target, count: int, noise: Tensor
+) -> Int64[Tensor, "B N A"]:
+    logits, mask = distribution.logits, distribution.mask  # [R, V], [B, N, A]
+    cumulative = logits.softmax(-1).cumsum(-1)  # [R, V]
+    # Its last entry is 1 up to rounding: scaled by it, no number lies beyond the last token.
+    ids = torch.searchsorted(cumulative, noise[mask] * cumulative[:, -1:], right=True)  # [R, K]
+    ids = ids.clamp(max=logits.shape[-1] - 1)
+    nearest = target.distances(ids, mask).argmin(-1, keepdim=True)
+    chosen = torch.where(target.logged_valid[mask], ids.gather(-1, nearest)[:, 0], ids[:, 0])
+    return torch.zeros_like(target.class_id).masked_scatter(mask, chosen)
+
+
+_CHOICES = {
+    "closest": _take_closest, "top_k": _draw_likely, "trajeglish": _draw_near, "sampled": _take_nearest_sample,
+}  # fmt: skip
