@@ -313,7 +313,8 @@ MEASUREMENTS = (
     Measurement("rollouts", "rollouts, tiny, B, random weights", take_turns(Job("rollouts", scenarios=("B",)))),
     Measurement("rollouts", "rollouts, tiny, A, held as logged", take_turns(Job("rollouts", scenarios=("A",), held=True))),
     Measurement("rollouts", "rollouts, tiny, B, held as logged", take_turns(Job("rollouts", scenarios=("B",), held=True))),
-    Measurement("gap", "rollouts, tiny, A and B", take_turns(Job("gap", scenarios=("A", "B")), OURS, 1), ("score_gap",)),
+    # All tokens: with 48, rounding decides between the 48th and the 49th, and the one left out has no probability.
+    Measurement("gap", "rollouts, tiny, A and B", take_turns(Job("gap", scenarios=("A", "B"), top_k=None), OURS, 1), ("score_gap",)),
     Measurement("metric", "metric, 32 rollouts of bada; official evaluator", metric),
     Measurement("demo", "demo, slowest process of each stage", demo, STAGES),
     Measurement("evaluation", f"evaluation of {NUM_EVALUATED} real scenarios, tiny; public code and official evaluator", evaluation, EVALUATED, "real scenarios"),

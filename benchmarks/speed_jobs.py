@@ -46,7 +46,8 @@ class Job:
     num_rollouts: int = 32
     timed_rollouts: int = 3
     """Of the public code, which makes them one after the other; the time of all is extrapolated."""
-    top_k: int = 48
+    top_k: int | None = 48
+    """None = all tokens."""
     device: str = "cpu"
     shared: str = ""
     """Folder of the official material; of `prepare_evaluated`: the folder with its records."""
