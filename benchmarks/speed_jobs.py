@@ -158,7 +158,7 @@ def tiny(job: Job) -> Any:
     """SMART-tiny with the weights of the public code's golden numbers."""
     from rlftsim.policies.smart.policy import SmartPolicy
 
-    return SmartPolicy.from_pretrained(Path(job.inputs) / "tiny").to(job.device)
+    return SmartPolicy.from_pretrained(Path(job.inputs) / "tiny").to(job.device).eval()
 
 
 def finetune(job: Job) -> Repeat:
