@@ -121,15 +121,25 @@ def smart_demo_rlftsim() -> SmartRecipe:
 
 
 def smart_demo_long() -> SmartRecipe:
-    """The demo's model, pre-trained for an hour of one core or more on thousands of scenarios."""
+    """The demo's model, pre-trained for an hour of one core or more on thousands of scenarios, then RoaD, then MLOO."""
     recipe = smart_demo_rlftsim()
+    assert recipe.road is not None
     return replace(
         recipe,
         # Scenarios that are seen a few times leave nothing to learn by heart, so the effort goes into reading the map:
         # moving tokens, more map tokens, and a history that is often hidden.
         model=replace(recipe.model, history_drop=0.2, max_agent_map_neighbors=32),
         pretrain=replace(recipe.pretrain, epochs=6.0, still_weight=0.15, ema_decay=0.998, final_lr_ratio=0.0),
-    )
+        road=replace(
+            recipe.road, epochs=0.5, batch_size=2, learning_rate=5e-4, final_lr_ratio=0.0, warmup_updates=20,
+            still_weight=0.15, ema_decay=0.99, trained="all",
+        ),
+        # A strong base needs small steps: close to it, and held there by a little imitation.
+        finetune=replace(
+            recipe.finetune, epochs=0.25, credit="agent", learning_rate=2e-4, imitation_weight=0.002,
+            kl=replace(recipe.finetune.kl, target=0.02),
+        ),
+    )  # fmt: skip
 
 
 def smart_demo_quick() -> SmartRecipe:
