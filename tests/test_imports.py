@@ -13,6 +13,7 @@ FLOORS = (
     ("errors",),
     ("aliases", "atomic_io", "geometry", "plugins", "progress", "statistics", "threads"),
     ("workers",),
+    ("lease", "cluster"),
     ("scenario",),
     ("tokens", "goals"),
     ("rollout",),

@@ -1,15 +1,17 @@
 """Work in several processes, and plain scripts that start it."""
 
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import rlftsim
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.workers import run_tasks
+from rlftsim.workers import Inline, Processes, SetAside, Share, Unfinished, on_this_machine, require_finished
 
 SCRIPT = """
 import rlftsim.workers
@@ -19,7 +21,8 @@ def double(item, advance, is_stopped):
     return 2 * item
 
 def main():
-    print(rlftsim.workers.run_tasks(double, [1, 2, 3], jobs={jobs}, advance=lambda count: None))
+    runner = rlftsim.workers.on_this_machine({jobs}, 3)
+    print(runner.run(double, [1, 2, 3], advance=lambda count: None))
 
 {call}
 """
@@ -42,8 +45,20 @@ def fail(item, advance, is_stopped):
     raise DataError(f"item {item} is broken")
 
 
-def exit_at_once(item, advance, is_stopped):
-    os._exit(1)
+def write_or_die(item, advance, is_stopped):
+    advance(1)
+    if item == "exit":
+        os._exit(7)
+    if item == "swallow":
+        np.ones(1 << 56)  # more than any machine has
+    return item
+
+
+def die_once(path, advance, is_stopped):
+    if not path.exists():
+        path.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return path.name
 
 
 @pytest.mark.parametrize(("quota", "cores"), [("max 100000", 6), ("250000 100000", 3), ("10000 100000", 1), ("", 6)])
@@ -57,24 +72,68 @@ def test_a_container_may_have_fewer_cores_than_the_machine(quota, cores, tmp_pat
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_results_come_in_the_order_of_the_items(jobs):
     done = []
-    assert run_tasks(double, [3, 1, 2], jobs=jobs, advance=done.append) == [6, 2, 4]
-    assert sum(done) <= 3
+    assert on_this_machine(jobs, 3).run(double, [3, 1, 2], advance=done.append) == [6, 2, 4]
+    assert sum(done) == 3
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_the_error_of_a_task_is_raised(jobs):
     with pytest.raises(DataError, match="is broken"):
-        run_tasks(fail, [1, 2], jobs=jobs, advance=lambda count: None)
+        on_this_machine(jobs, 2).run(fail, [1, 2], advance=lambda count: None)
 
 
-def test_a_process_that_died_is_reported():
-    with pytest.raises(DataError, match="a worker process died"):
-        run_tasks(exit_at_once, [1, 2], jobs=2, advance=lambda count: None)
+def test_an_item_that_kills_its_process_is_tried_again_then_set_aside_and_all_others_are_done(tmp_path, caplog):
+    done = []
+    with pytest.raises(
+        SetAside, match=r"^2 pieces .* 3 times and are set aside: (exit|swallow) .* All others are"
+    ) as caught:
+        Processes(2).run(write_or_die, items := ["exit", "a", "swallow", "b", "c"], advance=done.append, name_of=str)
+    assert "exit (exit status 7)" in str(caught.value)
+    assert "swallow (out of memory)" in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert caught.value.exit_status == 1
+    assert sum(done) == len(items) - 2  # what a dead process had reported does not count
+
+
+def test_an_item_whose_process_died_once_gets_its_result(tmp_path):
+    paths = [tmp_path / name for name in "abc"]
+    assert Processes(2).run(die_once, paths, advance=lambda count: None) == ["a", "b", "c"]
+
+
+def test_a_run_may_stop_at_the_first_dead_process():
+    with pytest.raises(DataError, match=r"a worker process died \(exit status 7; .*__name__ == .*run the same command"):
+        Processes(2, on_death="stop").run(write_or_die, ["a", "exit"], advance=lambda count: None)
 
 
 def test_a_task_that_cannot_be_pickled_is_refused():
     with pytest.raises(ConfigError, match=r"cannot be handed to other processes .* set jobs=1"):
-        run_tasks(lambda item, advance, is_stopped: item, [1, 2], jobs=2, advance=lambda count: None)
+        Processes(2).run(lambda item, advance, is_stopped: item, [1, 2], advance=lambda count: None)
+
+
+@pytest.mark.parametrize("of", [1, 3, 4, 20])
+def test_shares_have_every_item_once(of):
+    items = list(range(14))
+    shares = [Share.parse(f"{k}/{of}", Inline()) for k in range(1, of + 1)]
+    assert sorted(item for share in shares for item in share.own(items)) == items
+    assert max(len(share.own(items)) for share in shares) - min(len(share.own(items)) for share in shares) <= 1
+    assert Share.parse("join", Inline()).own(items) == []
+
+
+@pytest.mark.parametrize("text", ["3", "0/4", "5/4", "a/4", "1/0", "-1/4", "1.5/4", "/", ""])
+def test_a_share_that_is_none_is_refused(text):
+    with pytest.raises(ConfigError, match="--share"):
+        Share.parse(text, Inline())
+
+
+def test_a_share_ends_well_while_others_are_at_work_and_joining_does_not():
+    with pytest.raises(
+        Unfinished, match=r"convert: share 2/4 is done; 5 of 9 pieces are left .* `rlftsim join`"
+    ) as caught:
+        require_finished(Share(2, 4, Inline()), 5, 9, "convert")
+    assert caught.value.exit_status == 0
+    with pytest.raises(DataError, match="5 of 9 pieces are missing: run the shares again"):
+        require_finished(Share.parse("join", Inline()), 5, 9, "convert")
+    require_finished(Share(2, 4, Inline()), 0, 9, "convert")
 
 
 def test_a_script_with_the_main_guard_may_start_processes(tmp_path):
@@ -88,7 +147,7 @@ def test_a_script_without_the_main_guard_gets_a_hint_and_starts_nothing(tmp_path
     assert done.stdout == "once\n"  # no other process ran the script again
     last = done.stderr.strip().splitlines()[-1]
     assert last.startswith("rlftsim.errors.ConfigError: ")
-    assert 'script.py, line 12, starts other processes: put it under `if __name__ == "__main__":`' in last
+    assert 'script.py, line 13, starts other processes: put it under `if __name__ == "__main__":`' in last
     assert "bootstrapping" not in done.stderr
 
 

@@ -2,6 +2,7 @@
 
 import errno
 import os
+import socket
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -57,8 +58,7 @@ def write_whole(path: Path, write: Callable[[Path], object]) -> None:
         DataError: the file cannot be written, such as on a full disk. Then, and after any other error, nothing is left
             behind and a file that was there before is untouched.
     """
-    # Beside the file, as a rename is atomic within a file system only; with the process id, as two runs may write it.
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary = temporary_beside(path)
     try:
         with errors_name(path):
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -70,6 +70,12 @@ def write_whole(path: Path, write: Callable[[Path], object]) -> None:
     finally:
         if temporary.is_file():
             temporary.unlink()
+
+
+def temporary_beside(path: Path) -> Path:
+    """Name for a file until it is whole: of this process alone, on all machines that see the folder."""
+    # Beside the file, as a rename is atomic within a file system only.
+    return path.with_name(f".{path.name}.{socket.gethostname()}.{os.getpid()}.tmp")
 
 
 def write_text(path: Path, text: str) -> None:

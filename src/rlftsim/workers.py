@@ -1,4 +1,13 @@
-"""Work spread over processes that can be stopped at any time and never outlive the one that started them."""
+"""Independent pieces of work, done by whatever is there: this process, several, or one of many machines.
+
+    Inline()                this process
+    Processes(4)            four processes of this machine
+    Share(3, 64, runner)    every 64th item, from the third on; other machines do the others (`--share 3/64`)
+    RayRunner("auto")       a Ray cluster (`rlftsim.cluster.ray`, the extra "ray")
+
+Each piece writes a file of its own, and the same one whenever it is done again. So it does not matter where it is
+done, nor how often: a run that was stopped in any way is resumed by doing the pieces that have no file.
+"""
 
 import ast
 import inspect
@@ -9,25 +18,77 @@ import pickle
 import signal
 import sys
 import threading
+import traceback
+from collections import Counter, deque
 from collections.abc import Callable, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
 from dataclasses import dataclass
-from multiprocessing.queues import SimpleQueue
-from multiprocessing.synchronize import Event
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, Protocol, runtime_checkable
 
-from rlftsim.errors import ConfigError, DataError
+from rlftsim.errors import ConfigError, DataError, RlftsimError
+from rlftsim.progress import log
 from rlftsim.threads import keep_freed_memory
 
 Advance = Callable[[int], None]
 Task = Callable[[Any, Advance, Callable[[], bool]], Any]
 """Called with an item, a function that reports progress, and one that returns True when the task should give up."""
-
-
+OnDeath = Literal["skip", "stop"]
+"""An item whose worker process dies: try it again and set it aside after `ATTEMPTS`, or stop at the first death."""
+ATTEMPTS = 3
+OUT_OF_MEMORY = 137
+"""Exit status of a worker without memory: that of a process that the system has killed for it."""
 CPU_QUOTA = Path("/sys/fs/cgroup/cpu.max")
 """Microseconds of processor time that a container has in a period, and the period; "max" = no limit."""
+
+
+class SetAside(RlftsimError):
+    """Items that killed their worker processes again and again; all others are done."""
+
+    exit_status = 1
+
+    def __init__(self, reasons: dict[str, str]) -> None:
+        listed = "; ".join(f"{name} ({reason})" for name, reason in reasons.items())
+        super().__init__(
+            f"{len(reasons)} pieces of the work ended their process {ATTEMPTS} times and are set aside: {listed}. All "
+            "others are done: run the same command again to try these, with fewer --jobs if memory is short."
+        )
+
+
+class Unfinished(RlftsimError):
+    """This share is done, and others are not."""
+
+    exit_status = 0
+
+
+@runtime_checkable
+class Runner(Protocol):
+    """Does independent items of work somewhere."""
+
+    def own(self, items: Sequence[Any]) -> Sequence[Any]:
+        """Those of all items that this runner does; the others are another machine's."""
+        ...
+
+    def run(
+        self, task: Task, items: Sequence[Any], *, advance: Advance, name_of: Callable[[Any], str] = str
+    ) -> list[Any]:
+        """Call `task` for every item; results in the items' order.
+
+        The first error, and Ctrl-C, stop all the others. A task that has to give up may return or raise as it likes.
+
+        Args:
+            task: can be pickled, if other processes call it. Called again for an item whose process died.
+            items: one for each call.
+            advance: called with the progress that tasks report.
+            name_of: an item as messages show it.
+
+        Raises:
+            ConfigError: the task cannot be handed to another process, or a script calls this without the main guard.
+            SetAside: some items ended their process again and again; raised when all others are done.
+        """
+        ...
 
 
 def usable_cores() -> int:
@@ -40,45 +101,233 @@ def usable_cores() -> int:
     return min(cores, max(math.ceil(quota / period), 1))
 
 
-def run_tasks(task: Task, items: Sequence[Any], *, jobs: int, advance: Advance) -> list[Any]:
-    """Call `task` for every item, in this process or in several with one thread each; results in the items' order.
+@dataclass(frozen=True)
+class Inline:
+    """This process, one item after another."""
 
-    The first error, and Ctrl-C, stop all the others. A task that has to give up may return or raise as it likes.
+    def own(self, items: Sequence[Any]) -> Sequence[Any]:
+        """All items, see `Runner`."""
+        return items
+
+    def run(
+        self, task: Task, items: Sequence[Any], *, advance: Advance, name_of: Callable[[Any], str] = str
+    ) -> list[Any]:
+        """Results of all items, see `Runner`."""
+        return [task(item, advance, lambda: False) for item in items]
+
+
+@dataclass(frozen=True)
+class Share:
+    """Every `of`-th item from number `number` on, counted from 1; number 0 has none and only joins the others'."""
+
+    number: int
+    of: int
+    runner: Runner
+
+    @classmethod
+    def parse(cls, text: str, runner: Runner) -> "Share":
+        """The share that a command line names: "3/64", or "join".
+
+        Args:
+            text: number and count, or "join".
+            runner: does the items of the share.
+
+        Raises:
+            ConfigError: something else.
+        """
+        number, slash, of = ("0", "/", "1") if text == "join" else text.partition("/")
+        if not (slash and number.isdecimal() and of.isdecimal() and int(of) > 0 and int(number) <= int(of)):
+            raise ConfigError(f"--share {text} is no share: write the number and how many there are, such as 3/64.")
+        if int(number) == 0 and text != "join":
+            raise ConfigError(f"--share {text}: shares are counted from 1 to {of}.")
+        return cls(int(number), int(of), runner)
+
+    def __str__(self) -> str:
+        return f"share {self.number}/{self.of}" if self.number else "joining"
+
+    def own(self, items: Sequence[Any]) -> Sequence[Any]:
+        """The items of this share, see `Runner`."""
+        return items[self.number - 1 :: self.of] if self.number else items[:0]
+
+    def run(
+        self, task: Task, items: Sequence[Any], *, advance: Advance, name_of: Callable[[Any], str] = str
+    ) -> list[Any]:
+        """Results of some items, see `Runner`."""
+        return self.runner.run(task, items, advance=advance, name_of=name_of)
+
+
+def on_this_machine(jobs: int, num_items: int, on_death: OnDeath = "skip") -> Runner:
+    """Runner for a number of processes: this one where one is enough.
 
     Args:
-        task: can be pickled, if there is more than one job.
-        items: one for each call.
-        jobs: processes; 1 = this one.
-        advance: called with the progress that tasks report.
+        jobs: processes.
+        num_items: pieces of the whole work, those that are done already included.
+        on_death: see `OnDeath`.
+    """
+    jobs = min(jobs, num_items)
+    return Processes(jobs, on_death) if jobs > 1 else Inline()
+
+
+def require_finished(runner: Runner, num_left: int, num_items: int, title: str) -> None:
+    """Stop before the result is put together where pieces of it are missing.
+
+    Args:
+        runner: that did its items.
+        num_left: pieces that are not there.
+        num_items: all pieces.
+        title: of the work.
 
     Raises:
-        ConfigError: the task cannot be handed to another process, or a script calls this without the main guard.
-        DataError: a process died.
+        Unfinished: this share is done, others are not.
+        DataError: pieces are missing that should be there.
     """
-    jobs = min(jobs, len(items))
-    if jobs <= 1:
-        return [task(item, advance, lambda: False) for item in items]
-    _refuse_unguarded_main()
+    if not num_left:
+        return
+    if isinstance(runner, Share) and runner.number:
+        raise Unfinished(
+            f"{title}: {runner} is done; {num_left} of {num_items} pieces are left to other shares. The last share "
+            "puts the result together; if it was stopped, `rlftsim join` and the same command do."
+        )
+    if isinstance(runner, Share):
+        raise DataError(
+            f"{title}: {num_left} of {num_items} pieces are missing: run the shares again that have not ended with "
+            "status 0, or the command without `join` to do the rest here."
+        )
+    raise DataError(f"{title}: finished pieces vanished meanwhile (another process in the same folder?): run again.")
+
+
+@dataclass(frozen=True)
+class Processes:
+    """Several processes of this machine, each with one thread. They end with the process that started them.
+
+    A process may be killed at any moment: it shares no lock with the others, and its item is done again by a new one.
+    """
+
+    jobs: int
+    on_death: OnDeath = "skip"
+
+    def own(self, items: Sequence[Any]) -> Sequence[Any]:
+        """All items, see `Runner`."""
+        return items
+
+    def run(
+        self, task: Task, items: Sequence[Any], *, advance: Advance, name_of: Callable[[Any], str] = str
+    ) -> list[Any]:
+        """Results of all items, see `Runner`."""
+        if not items:
+            return []
+        _refuse_unguarded_main()
+        pickled = pickle_task(task)
+        results: dict[int, Any] = {}
+        waiting, deaths, reasons = deque(range(len(items))), Counter[int](), dict[str, str]()
+        crew: dict[Any, _Worker] = {}
+        failed_starts = 0
+        try:
+            while (num_left := len(items) - len(results) - len(reasons)) > 0:
+                while len(crew) < min(self.jobs, num_left):
+                    worker = _Worker()
+                    crew[worker.line] = worker
+                for worker in crew.values():
+                    if worker.is_idle and waiting:
+                        worker.give(pickle.dumps(items[waiting[0]]), waiting.popleft())
+                for line in wait(list(crew)):
+                    worker = crew[line]
+                    kind, value = worker.read()
+                    if kind == "error":
+                        raise value
+                    if kind == "progress":
+                        worker.progress += value
+                        advance(value)
+                    elif kind == "result" and worker.item is not None:
+                        results[worker.item] = value
+                        worker.item, worker.progress = None, 0
+                    elif kind == "idle" and not worker.has_task:
+                        worker.give(pickled, None)
+                    elif kind == "idle":
+                        worker.is_idle, failed_starts = True, 0
+                    elif kind == "death":
+                        del crew[line]
+                        advance(-worker.progress)
+                        failed_starts += not worker.was_ready
+                        if failed_starts == ATTEMPTS or (self.on_death == "stop" and worker.item is not None):
+                            raise DataError(_DIED.format(value))
+                        if worker.item is None:
+                            continue
+                        deaths[worker.item] += 1
+                        name = name_of(items[worker.item])
+                        if deaths[worker.item] < ATTEMPTS:
+                            log.warning(f"the process of {name} died ({value}): trying again.")
+                            waiting.appendleft(worker.item)
+                        else:
+                            reasons[name] = value
+        finally:
+            # A closed line is the sign to stop.
+            for worker in crew.values():
+                worker.line.close()
+            for worker in crew.values():
+                worker.process.join()
+        if reasons:
+            raise SetAside(reasons)
+        return [results[number] for number in range(len(items))]
+
+
+_DIED = (
+    'a worker process died ({}; out of memory, or the script lacks `if __name__ == "__main__":`?): '
+    "run the same command again, it resumes."
+)
+
+
+def pickle_task(task: Task) -> bytes:
+    """A task by value, for other processes.
+
+    Raises:
+        ConfigError: it holds something that cannot be handed over.
+    """
     try:
         # By value: torch's own way between processes shares memory through file descriptors, which run out.
-        pickled = pickle.dumps(task)
+        return pickle.dumps(task)
     except (pickle.PicklingError, AttributeError, TypeError) as error:
         raise ConfigError(f"this work cannot be handed to other processes ({error}): set jobs=1.") from error
-    # Spawned, not forked: a forked process inherits locks of torch's threads and may wait for them forever.
-    context = multiprocessing.get_context("spawn")
-    line = _Line(context.Event(), context.SimpleQueue())
-    with ProcessPoolExecutor(jobs, context, _start_worker, (pickled, line)) as pool:
-        futures = [pool.submit(_work, item) for item in items]
+
+
+class _Worker:
+    """A process and the line to it, at this end."""
+
+    def __init__(self) -> None:
+        # Spawned, not forked: a forked process inherits locks of torch's threads and may wait for them forever.
+        context = multiprocessing.get_context("spawn")
+        self.line, far_end = context.Pipe()
+        self.process: BaseProcess = context.Process(target=_work, args=(far_end,))
+        self.process.start()
+        far_end.close()  # so that the line ends with the process
+        self.has_task = self.is_idle = self.was_ready = False
+        self.item: int | None = None
+        self.progress = 0
+        """Reported since the item was begun."""
+
+    def give(self, message: bytes, item: int | None) -> None:
+        """Send the task, or an item of a number."""
+        self.was_ready, self.has_task, self.is_idle, self.item = self.has_task, True, False, item
+        with suppress(OSError):  # the process is gone: reading says so
+            self.line.send_bytes(message)
+
+    def read(self) -> tuple[str, Any]:
+        """The next message: its kind and value; "death" and its reason where the process is gone."""
         try:
-            _wait(futures, line, advance)
-            return [future.result() for future in futures]
-        except BrokenProcessPool as error:
-            raise DataError(
-                "a worker process died (out of memory?): run the same command again, it resumes."
-            ) from error
-        finally:
-            line.stop.set()
-            pool.shutdown(wait=True, cancel_futures=True)
+            return pickle.loads(self.line.recv_bytes())
+        except (EOFError, OSError):
+            self.process.join()
+            return "death", _reason(self.process.exitcode)
+
+
+def _reason(status: int | None) -> str:
+    """Cause of a process's end in words."""
+    if status == OUT_OF_MEMORY:
+        return "out of memory"
+    if status is not None and status < 0:
+        killer = " by the system, which may be out of memory" if status == -signal.SIGKILL else ""
+        return f"killed with {signal.Signals(-status).name}{killer}"
+    return f"exit status {status}"
 
 
 def _refuse_unguarded_main() -> None:
@@ -112,26 +361,37 @@ def _refuse_unguarded_main() -> None:
                 )
 
 
-@dataclass(frozen=True)
-class _Line:
-    """Connection of a worker process to the one that started it."""
-
-    stop: Event
-    progress: "SimpleQueue[int]"
-
-
-_task: Task  # of this process, if it is a worker
-_line: _Line
-
-
-def _start_worker(task: bytes, line: _Line) -> None:
-    global _task, _line
-    # Ctrl-C reaches the whole process group; only the parent reacts, and stops the workers by the event.
+def _work(line: Connection) -> None:
+    """Main function of a worker process: the task first, then an item after each other until the line is closed."""
+    # Ctrl-C reaches the whole process group; only the parent reacts, and stops the workers by closing the lines.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=exit_with_parent, daemon=True).start()
     keep_freed_memory()
     os.environ["OMP_NUM_THREADS"] = "1"  # read when torch is imported, which unpickling the task may do
-    _task, _line = pickle.loads(task), line
+
+    def say(kind: str, value: Any = None) -> None:
+        line.send_bytes(pickle.dumps((kind, value)))
+
+    with suppress(EOFError, OSError):
+        say("idle")
+        task = None
+        while True:
+            message = line.recv_bytes()
+            try:
+                if task is None:
+                    task = pickle.loads(message)
+                else:
+                    # Nothing is sent to a worker that works, so anything at the line is its end.
+                    say("result", task(pickle.loads(message), lambda count: say("progress", count), line.poll))
+            except MemoryError:
+                os._exit(OUT_OF_MEMORY)  # a new process may have enough
+            except Exception as error:
+                error.add_note(traceback.format_exc())
+                try:
+                    say("error", error)
+                except (pickle.PicklingError, AttributeError, TypeError):
+                    say("error", RuntimeError(traceback.format_exc()))
+            say("idle")
 
 
 def exit_with_parent() -> None:
@@ -140,19 +400,3 @@ def exit_with_parent() -> None:
     if parent is not None:
         parent.join()
         os._exit(1)
-
-
-def _work(item: Any) -> Any:
-    return _task(item, _line.progress.put, _line.stop.is_set)
-
-
-def _wait(futures: Sequence[Future[Any]], line: _Line, advance: Advance) -> None:
-    """Show progress until all are done or one failed, whose error is raised."""
-    pending = set(futures)
-    # A short timeout, so that progress is shown while all tasks are still at work.
-    while pending:
-        done, pending = wait(pending, timeout=0.2, return_when=FIRST_COMPLETED)
-        while not line.progress.empty():
-            advance(line.progress.get())
-        for future in done:
-            future.result()

@@ -21,6 +21,7 @@ from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
 from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
+from rlftsim.workers import Inline
 
 CONFIG = EvaluateConfig(num_rollouts=4, rollouts_per_pass=2)
 
@@ -262,7 +263,9 @@ def test_work_in_parts_is_joined_in_order_and_skipped_scenarios_are_kept(data, t
         return {"scenario_id": scenario_id, **row} if position % 3 else module.Skipped(scenario_id, "a third is")
 
     ids = [f"s{position}" for position in range(10)]
-    result = resume_evaluation(work, ids, "made", provenance, tmp_path, jobs=1, title="made", show_progress=False)
+    result = resume_evaluation(
+        work, ids, "made", provenance, tmp_path, runner=Inline(), title="made", show_progress=False
+    )
     assert (done, result.scenario_ids) == (list(range(10)), ["s1", "s2", "s4", "s5", "s7", "s8"])
     assert [skipped.scenario_id for skipped in result.skipped] == ["s0", "s3", "s6", "s9"]
 

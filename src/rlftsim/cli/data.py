@@ -1,6 +1,6 @@
 """Verbs that make and inspect data sets: convert, data, synthesize."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -8,11 +8,13 @@ import tyro
 from rich.table import Table
 from tyro.conf import Positional
 
+from rlftsim.cli.machines import Machines, Work
 from rlftsim.progress import print_wide
 from rlftsim.scenario.convert import convert
 from rlftsim.scenario.inspect import DatasetStats, dataset_stats, verify_dataset
 from rlftsim.scenario.open import dataset_folder
 from rlftsim.scenario.synthetic.generate import generate
+from rlftsim.workers import usable_cores
 
 MAX_LISTED = 20
 
@@ -45,6 +47,7 @@ class Convert:
     """av2 only: keep static objects, construction and the like as objects of no particular type."""
     sizes: Path | None = None
     """av2 only: JSON file with length, width and height in meters by kind, in place of the guessed ones."""
+    machines: Annotated[Machines, tyro.conf.arg(name="")] = field(default_factory=Machines)
 
     def run(self) -> int:
         """Convert, and list the records that were left out."""
@@ -56,6 +59,7 @@ class Convert:
             split=self.split,
             on_error=self.on_error,
             jobs=self.jobs,
+            runner=self.machines.runner(self.jobs or usable_cores(), self.on_error),
             options={name: value for name, value in options.items() if value is not None},
         )
         by_split = ", ".join(f"{count} {split}" for split, count in report.counts.items())
@@ -160,9 +164,16 @@ class Synthesize:
     """Seed of streets and traffic."""
     jobs: int = 1
     """Processes, each with a street network of its own. Changes no result."""
+    work: Annotated[Work, tyro.conf.arg(name="")] = field(default_factory=Work)
 
     def run(self) -> int:
         """Generate the scenarios."""
-        manifest = generate(self.destination, num_scenarios=self.num_scenarios, seed=self.seed, jobs=self.jobs)
+        manifest = generate(
+            self.destination,
+            num_scenarios=self.num_scenarios,
+            seed=self.seed,
+            jobs=self.jobs,
+            runner=self.work.runner(self.jobs, self.work.on_error),
+        )
         print(f"{self.destination}: {sum(shard.num_rows for shard in manifest.shards)} scenarios.")
         return 0

@@ -65,10 +65,13 @@ usage: rlftsim VERB ...      rlftsim VERB --help explains a verb
   compare      compare two evaluations scenario by scenario
   submit       build an archive for the Sim Agents leaderboard, or check one before it is uploaded
   experiment   repeat an experiment of the paper: a table, verdicts and a figure
+
+  join VERB .. put the shares of a command together that ran on several machines (--share K/N)
 """
 
 STARTS_ANEW = ("doctor", "data", "recipe", "tokens", "model", "goals", "drive", "studio", "compare")
 """Verbs that keep nothing of an interrupted run."""
+JOIN = "join"
 INTERRUPTED = 130
 USER_MISTAKE = 2
 
@@ -83,10 +86,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if words[0] in ("-V", "--version"):
         print(f"rlftsim {__version__}")
         return 0
-    if words[0] not in VERBS:
-        near = difflib.get_close_matches(words[0], VERBS, 1)
+    verb = words[1] if words[0] == JOIN and len(words) > 1 else words[0]
+    if verb not in VERBS:
+        near = difflib.get_close_matches(verb, VERBS, 1)
         hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(VERBS)}."
-        print(f"rlftsim: no verb {words[0]!r}: {hint}", file=sys.stderr)
+        hint = f"write it before the whole command of a share, `rlftsim {JOIN} convert ...`." if verb == JOIN else hint
+        print(f"rlftsim: no verb {verb!r}: {hint}", file=sys.stderr)
         return USER_MISTAKE
     try:
         return parse(words).run()
@@ -94,7 +99,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"rlftsim: {error}", file=sys.stderr)
         return error.exit_status
     except KeyboardInterrupt:
-        what_next = "starts anew" if words[0] in STARTS_ANEW else "continues where this one stopped"
+        what_next = "starts anew" if verb in STARTS_ANEW else "continues where this one stopped"
         print(f"\nrlftsim: stopped. The same command {what_next}.", file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:
@@ -119,6 +124,7 @@ def parse(words: Sequence[str]) -> Any:
     # Imported late: the overview is printed without it.
     from rlftsim.cli.parse import parse as parse_words
 
+    words = [*words[1:], "--share", JOIN] if words[0] == JOIN else words
     return parse_words(words, VERBS)
 
 

@@ -9,6 +9,7 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional
 
+from rlftsim.cli.machines import Work
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.compare import columns_of, compare, format_comparison, format_table
 from rlftsim.evaluation.drive_results import DriveResult, format_drive_comparison, format_drives, is_drive_result
@@ -44,6 +45,7 @@ class Evaluate:
     """With --goals logged: factor on the goal-progress bias of the model's logits. Above 1 it follows goals
     more closely than it learned to."""
     config: Annotated[EvaluateConfig, tyro.conf.arg(name="")] = field(default_factory=EvaluateConfig)
+    work: Annotated[Work, tyro.conf.arg(name="")] = field(default_factory=Work)
 
     def run(self) -> int:
         """Evaluate and print the table."""
@@ -54,7 +56,8 @@ class Evaluate:
                 f"--guidance-scale {self.guidance_scale:g} has no effect without goals: add --goals logged."
             )
         policy = with_guidance(load_policy_or_oracle(self.model, self.device), self.guidance_scale)
-        result = evaluate(policy, dataset_folder(self.data), self.out, self.config, name=name)
+        runner = self.work.runner(self.config.jobs, self.work.on_error)
+        result = evaluate(policy, dataset_folder(self.data), self.out, self.config, name=name, runner=runner)
         if not len(result):
             raise DataError(f"none of {len(result.skipped)} scenarios could be scored: {result.skipped[0].reason}")
         print_wide(format_table(result))
@@ -100,11 +103,16 @@ class Score:
     explain: Path | None = None
     """Folder for one page per scenario that attributes the lost score to features, agents and steps."""
     config: Annotated[ScoreConfig, tyro.conf.arg(name="")] = field(default_factory=ScoreConfig)
+    work: Annotated[Work, tyro.conf.arg(name="")] = field(default_factory=Work)
 
     def run(self) -> int:
         """Score, print, explain."""
         scenarios = dataset_folder(self.scenarios)
-        result = score_rollouts(self.rollouts, scenarios, self.out, self.config, name=self.name)
+        runner = self.work.runner(self.config.num_jobs, self.work.on_error)
+        if self.explain is not None:
+            pages = explain_rollouts(self.rollouts, scenarios, self.explain, self.config, runner=runner)
+            print(f"{self.explain}: {len(pages)} pages", file=sys.stderr)
+        result = score_rollouts(self.rollouts, scenarios, self.out, self.config, name=self.name, runner=runner)
         if self.json:
             print(json.dumps(to_json(result), allow_nan=False))
         else:
@@ -112,9 +120,6 @@ class Score:
         # On standard error, so that --json prints nothing but JSON.
         for skipped in result.skipped:
             print(f"  skipped {skipped.scenario_id}: {skipped.reason}", file=sys.stderr)
-        if self.explain is not None:
-            pages = explain_rollouts(self.rollouts, scenarios, self.explain, self.config)
-            print(f"{self.explain}: {len(pages)} pages", file=sys.stderr)
         return 0
 
 

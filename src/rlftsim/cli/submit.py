@@ -1,13 +1,14 @@
 """The verb for entries of the Sim Agents challenge: submit build, check, info."""
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 from tyro.conf import Positional
 
+from rlftsim.cli.machines import Work
 from rlftsim.errors import ConfigError
 from rlftsim.evaluation.evaluate import EvaluateConfig, evaluation_name, frozen_copy
 from rlftsim.policies.registry import Device, load_policy
@@ -77,6 +78,7 @@ class Build:
     evaluation: Path | None = None
     """Evaluation of the same model on the validation split, for the estimate in the report. Left out:
     runs/evaluations/MODEL.parquet."""
+    work: Annotated[Work, tyro.conf.arg(name="")] = field(default_factory=Work)
 
     def run(self) -> int:
         """Refuse what can be refused, build, check, report; exit status 1 if the server would refuse the archive."""
@@ -103,7 +105,9 @@ class Build:
         fingerprint = fingerprint_policy(policy)
         plan = make_plan(data, fingerprint, metadata, config, num_shards=self.num_shards, round_m=self.round)
         archive = build_archive(
-            Job(policy, data, plan, metadata, config, self.round, self.out), delete_parts=self.delete_parts
+            Job(policy, data, plan, metadata, config, self.round, self.out),
+            runner=self.work.runner(self.jobs, self.work.on_error),
+            delete_parts=self.delete_parts,
         )
         # 3. check the file that will be uploaded, and report
         check = check_archive(archive, data)

@@ -22,7 +22,7 @@ from rlftsim.progress import progress_bar
 from rlftsim.scenario.types import Scenario
 from rlftsim.threads import one_thread
 from rlftsim.viewer.film import to_film
-from rlftsim.workers import run_tasks
+from rlftsim.workers import on_this_machine
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,8 @@ def drive(config: DriveConfig, out: Path | None = None) -> list[DriveResult]:
     results = []
     for traffic, env in zip(config.traffic, environments):
         with progress_bar(f"{name} in {traffic}", len(ids)) as advance, one_thread():
-            found = run_tasks(partial(_drive_scenario, config, traffic), ids, jobs=config.jobs, advance=advance)
+            runner = on_this_machine(config.jobs, len(ids))
+            found = runner.run(partial(_drive_scenario, config, traffic), ids, advance=advance)
         settings = DriveSettings(
             planner=config.planner, traffic=traffic, model=env.source.fingerprint, dataset=config.data,
             split=config.split, num_rollouts=config.num_rollouts, seed=config.seed, rlftsim_version=rlftsim.__version__,

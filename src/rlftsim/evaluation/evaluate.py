@@ -16,7 +16,7 @@ from torch import nn
 
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.results import EvaluateConfig, Evaluation, GoalsGiven, Provenance, Skipped, row_of_result
-from rlftsim.evaluation.resumable import resume_evaluation
+from rlftsim.evaluation.resumable import EvaluationParts, resume_evaluation
 from rlftsim.evaluation.scenario_source import choose_scenarios, hash_manifest, open_held_out
 from rlftsim.goals.logged import logged_goals
 from rlftsim.goals.types import Goals
@@ -28,6 +28,7 @@ from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import ScenarioBatch, collate
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.types import Scenario
+from rlftsim.workers import Runner, on_this_machine
 
 __all__ = [
     "EvaluateConfig",
@@ -51,6 +52,7 @@ def evaluate(
     config: EvaluateConfig = EvaluateConfig(),  # noqa: B008
     *,
     name: str | None = None,
+    runner: Runner | None = None,
     show_progress: bool = True,
 ) -> Evaluation:
     """Score a policy on the scenarios of a data set; the result is also written to `out/<name>.parquet`.
@@ -65,6 +67,7 @@ def evaluate(
         name: of the row and the file; None = class and fingerprint of the policy. Unfinished work and results of
             another policy, data set or setting under this name are replaced, with a message on stderr, but never a
             result of more scenarios by one with a limit.
+        runner: does the work in place of `config.jobs` processes, see `rlftsim.workers`.
         show_progress: False = no progress and time left on stderr.
 
     Raises:
@@ -82,7 +85,7 @@ def evaluate(
     positions = choose_scenarios(dataset, config)
     check_jobs(config, device_of(policy))
     provenance = Provenance(
-        config=config,
+        config=replace(config, jobs=1),  # the same bytes from any number of processes
         policy=kind,
         policy_fingerprint=fingerprint,
         dataset=str(dataset.folder.resolve()),
@@ -96,7 +99,7 @@ def evaluate(
         name,
         provenance,
         None if out is None else Path(out),
-        jobs=config.jobs,
+        runner=runner or on_this_machine(config.jobs, -(-len(positions) // EvaluationParts.group_size)),
         title=f"evaluate {name}",
         show_progress=show_progress,
     )

@@ -22,7 +22,7 @@ from rlftsim.threads import one_thread
 from rlftsim.viewer.chart import Chart, Curve, chart_html
 from rlftsim.viewer.page import Animation, Panel, animation_html, page_html
 from rlftsim.viewer.scene import build_scene, logged_trajectories
-from rlftsim.workers import run_tasks
+from rlftsim.workers import Runner, on_this_machine
 
 MAX_STRIPS = 10
 """Rows of (feature, agent) drawn over time."""
@@ -63,6 +63,7 @@ def explain_rollouts(
     out: str | PathLike[str],
     config: ScoreConfig = ScoreConfig(),  # noqa: B008
     *,
+    runner: Runner | None = None,
     show_progress: bool = True,
 ) -> list[Path]:
     """Write `out/<scenario id>.html` for every scenario with rollouts, anew. Returns the pages.
@@ -74,6 +75,7 @@ def explain_rollouts(
         scenarios: converted data set, or tfrecords (file, folder or glob).
         out: folder of the pages, made if missing.
         config: metric, handling of missing maps and scenarios, processes.
+        runner: does the work in place of `config.jobs` processes, see `rlftsim.workers`. A share writes its pages.
         show_progress: False = no progress bar.
 
     Raises:
@@ -87,11 +89,13 @@ def explain_rollouts(
         name = entry.scenario_id.replace("/", "_") or "scenario"
         numbered = (name, *(f"{name}-{k}" for k in range(2, len(entries) + 2)))
         pages[next(path for path in (Path(out) / f"{n}.html" for n in numbered) if path not in pages)] = entry
-    with progress_bar("explain", len(pages), show=show_progress) as advance, one_thread():
-        written = run_tasks(
-            partial(_write_page, source, config), list(pages.items()), jobs=config.num_jobs, advance=advance
+    runner = runner or on_this_machine(config.num_jobs, len(pages))
+    own = runner.own(list(pages.items()))
+    with progress_bar("explain", len(own), show=show_progress) as advance, one_thread():
+        written = runner.run(
+            partial(_write_page, source, config), own, advance=advance, name_of=lambda item: item[0].name
         )
-    return [page for page, is_written in zip(pages, written) if is_written]
+    return [page for (page, _), is_written in zip(own, written) if is_written]
 
 
 def _write_page(

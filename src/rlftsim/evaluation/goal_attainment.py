@@ -25,6 +25,7 @@ from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import Policy, device_of, is_goal_conditioned
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import ScenarioDataset
+from rlftsim.workers import on_this_machine
 
 
 @dataclass(frozen=True)
@@ -85,7 +86,8 @@ def attain_goals(
     ids, information = tuple(by_scenario), {"package_version": __version__}
     files = JsonParts(Path(out), ids, identity, information, partial(_attained, by_scenario))
     work = partial(_simulate_goals, _Job(frozen_copy(policy), dataset, config, by_scenario))
-    parts = map_scenarios(work, len(ids), files, jobs=config.jobs, title=title, show_progress=show_progress)
+    runner = on_this_machine(config.jobs, len(ids))
+    parts = map_scenarios(work, len(ids), files, runner=runner, title=title, show_progress=show_progress)
     # Files are by scenario, goals may come in any order.
     found = {_key(one.entry): one for part in parts for one in part}
     return tuple(found[_key(goal)] for goal in goals)

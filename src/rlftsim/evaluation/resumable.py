@@ -19,9 +19,10 @@ import pyarrow as pa
 from rlftsim.atomic_io import write_text
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.results import SCHEMA, Evaluation, Provenance, Skipped, join_evaluations
+from rlftsim.lease import Lease
 from rlftsim.progress import log, progress_bar
 from rlftsim.threads import one_thread
-from rlftsim.workers import run_tasks
+from rlftsim.workers import Runner, Share, require_finished
 
 Result = TypeVar("Result")
 """Result of one scenario, as the work on it returns it."""
@@ -54,34 +55,55 @@ def map_scenarios(
     num_scenarios: int,
     files: PartFiles[Result, Part],
     *,
-    jobs: int,
+    runner: Runner,
     title: str,
+    lease: Lease | None = None,
     show_progress: bool = True,
 ) -> list[Part]:
-    """Do the missing groups, in one process or several, and return all of them in order.
+    """Do the missing groups and return all of them in order.
 
     Args:
         work: measures the scenario at a position; can be pickled, if there is more than one job.
         num_scenarios: positions run from 0 to this.
         files: of the finished groups.
-        jobs: processes, each with one thread. Changes no result.
+        runner: does the work. Changes no result.
         title: beside the progress bar.
+        lease: on the folder of the files, if several drivers could work in it.
         show_progress: False = no progress bar.
 
     Raises:
+        SetAside: groups that killed their process again and again; all others are done.
+        Unfinished: `runner` is a share, which is done, while others are not.
         DataError: another process removed finished files meanwhile.
     """
-    positions = range(num_scenarios)
-    groups = [positions[first : first + files.group_size] for first in range(0, num_scenarios, files.group_size)]
-    missing = [group for group in groups if files.read(group) is None]
-    num_done = num_scenarios - sum(len(group) for group in missing)
-    with progress_bar(title, num_scenarios, num_done, show=show_progress) as advance, one_thread():
-        run_tasks(partial(_work_on_group, work, files), missing, jobs=jobs, advance=advance)
+    groups = groups_of(num_scenarios, files.group_size)
+    own = runner.own(groups)
+    missing = [group for group in own if files.read(group) is None]
+    total, left = (sum(len(group) for group in some) for some in (own, missing))
+    with progress_bar(title, total, total - left, show=show_progress) as advance, one_thread():
+        runner.run(
+            partial(_work_on_group, work, files),
+            missing,
+            advance=advance,
+            name_of=lambda group: f"scenarios {group.start} to {group.stop - 1}",
+        )
+    if lease is not None:
+        lease.finish(title)
     # Read back even what was just written: a resumed and an uninterrupted call go the same way from here.
     parts = [part for part in map(files.read, groups) if part is not None]
-    if len(parts) < len(groups):
-        raise DataError(f"{title}: results vanished meanwhile (another process in the same folder?): run again.")
+    require_finished(runner, len(groups) - len(parts), len(groups), title)
     return parts
+
+
+def groups_of(num_scenarios: int, size: int) -> list[range]:
+    """Positions of the scenarios in groups, the last of which may be smaller.
+
+    Args:
+        num_scenarios: positions run from 0 to this.
+        size: scenarios in a group.
+    """
+    positions = range(num_scenarios)
+    return [positions[first : first + size] for first in range(0, num_scenarios, size)]
 
 
 def _work_on_group(
@@ -212,7 +234,7 @@ def resume_evaluation(
     provenance: Provenance,
     out: Path | None,
     *,
-    jobs: int,
+    runner: Runner,
     title: str,
     show_progress: bool = True,
 ) -> Evaluation:
@@ -224,21 +246,30 @@ def resume_evaluation(
         name: of the evaluation and its file.
         provenance: what a stored result must agree with to be this one.
         out: folder of the result; None keeps nothing.
-        jobs: processes.
+        runner: does the work.
         title: beside the progress bar.
         show_progress: False = no progress bar.
 
     Raises:
-        ConfigError: the name cannot be a file's, or a limit would replace a result of more scenarios.
+        ConfigError: the name cannot be a file's, a limit would replace a result of more scenarios, or there is no
+            folder in which shares could meet.
+        DataError: another driver is at work on this evaluation.
+        SetAside, Unfinished: see `map_scenarios`.
     """
+    if out is None and isinstance(runner, Share):
+        raise ConfigError("shares meet in a folder: name one with --out.")
     # Processes hand their rows over in files, so even a result that is not kept needs a folder.
     with tempfile.TemporaryDirectory() as nowhere:
         files = EvaluationParts(name, provenance, out or Path(nowhere))
         finished = files.read_finished(scenario_ids)
         if finished is None:
-            parts = map_scenarios(work, len(scenario_ids), files, jobs=jobs, title=title, show_progress=show_progress)
-            finished = join_evaluations(name, provenance, parts)
-            finished.write(files.result_path)
+            with Lease(files.parts_folder / ".lock", runner, "works in") as lease:
+                parts = map_scenarios(
+                    work, len(scenario_ids), files,
+                    runner=runner, title=title, lease=lease, show_progress=show_progress,
+                )  # fmt: skip
+                finished = join_evaluations(name, provenance, parts)
+                finished.write(files.result_path)
         # Only now: an interruption between the two leaves the parts, and the next call finds the result.
         shutil.rmtree(files.parts_folder, ignore_errors=True)
     return finished

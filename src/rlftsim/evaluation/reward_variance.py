@@ -28,6 +28,7 @@ from rlftsim.rewards.mloo import compute_mloo
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import Policy, device_of
 from rlftsim.scenario.dataset import ScenarioDataset
+from rlftsim.workers import on_this_machine
 
 SIZES = (2, 3, 4, 6, 8, 12, 16, 24, 32)
 REWARDS = ("mloo", "rloo")
@@ -81,7 +82,8 @@ def measure_variances(
     identity = {"sizes": list(sizes), "policy": fingerprint_policy(policy), "settings": config.what_counts()}
     files = JsonParts(Path(out), ids, dict.fromkeys(ids, identity), {}, _stored_variances)
     work = partial(_measure_scenario, _Job(frozen_copy(policy), dataset, config, sizes))
-    parts = map_scenarios(work, len(ids), files, jobs=config.jobs, title="variances", show_progress=show_progress)
+    runner = on_this_machine(config.jobs, len(ids))
+    parts = map_scenarios(work, len(ids), files, runner=runner, title="variances", show_progress=show_progress)
     # [rewards, sizes] each; a scenario that cannot be scored has an empty array
     kept = {scenario_id: values for scenario_id, values in zip(ids, parts) if len(values)}
     if not kept:

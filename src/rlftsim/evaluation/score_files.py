@@ -26,7 +26,7 @@ from rlftsim.evaluation.results import (
     Skipped,
     row_of_result,
 )
-from rlftsim.evaluation.resumable import resume_evaluation
+from rlftsim.evaluation.resumable import EvaluationParts, resume_evaluation
 from rlftsim.evaluation.rollout_files import RolloutEntry, find_rollouts, read_states
 from rlftsim.evaluation.scenario_source import ScenarioSource, open_scenarios
 from rlftsim.progress import log
@@ -34,7 +34,7 @@ from rlftsim.realism import MetricConfig, metric_by_name, scenario_log, score
 from rlftsim.realism.map_based import select_polylines
 from rlftsim.realism.official_names import is_reported, official_buckets, official_fields
 from rlftsim.scenario.types import ROAD_EDGE_TYPES, Scenario
-from rlftsim.workers import usable_cores
+from rlftsim.workers import Runner, on_this_machine, usable_cores
 
 _NO_ROAD_EDGE = "has no road edge, so the distance to it is undefined"
 
@@ -75,6 +75,7 @@ def score_rollouts(
     config: ScoreConfig = ScoreConfig(),
     *,
     name: str | None = None,
+    runner: Runner | None = None,
     show_progress: bool = True,
 ) -> Evaluation:
     """Score rollouts from files; every scenario's numbers are also written to `out/<name>.parquet`.
@@ -88,6 +89,7 @@ def score_rollouts(
         out: folder of the result, made if missing; None keeps nothing.
         config: metric, handling of missing maps and scenarios, processes.
         name: of the row and the file; None = the name of `rollouts`.
+        runner: does the work in place of `config.jobs` processes, see `rlftsim.workers`.
         show_progress: False = no progress and time left on stderr.
 
     Raises:
@@ -120,7 +122,7 @@ def score_rollouts(
         name,
         provenance,
         None if out is None else Path(out),
-        jobs=config.num_jobs,
+        runner=runner or on_this_machine(config.num_jobs, -(-len(entries) // EvaluationParts.group_size)),
         title=f"score {name}",
         show_progress=show_progress,
     )

@@ -10,14 +10,13 @@ import json
 import os
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from rlftsim.atomic_io import cannot_write
 from rlftsim.errors import ConfigError, DataError
+from rlftsim.lease import Lease
 from rlftsim.progress import progress_bar
 from rlftsim.scenario.dataset import (
     INCOMPLETE,
@@ -34,9 +33,9 @@ from rlftsim.scenario.dataset import (
 from rlftsim.scenario.shards import SCHEMA_VERSION, ShardWriter, hash_file
 from rlftsim.scenario.sources import AUTO, DataSource, Unit, find_source, read_unit
 from rlftsim.scenario.tfrecord import OnError, SkippedRecord
-from rlftsim.workers import run_tasks, usable_cores
+from rlftsim.workers import Runner, on_this_machine, require_finished, usable_cores
 
-_INCOMPLETE_TEXT = "A conversion runs here or was interrupted: run the same command again, it goes on.\n"
+_INCOMPLETE_TEXT = "A conversion runs here or was interrupted: run the same command again, it goes on."
 _RECEIPTS = "*.arrow.json"
 
 
@@ -90,6 +89,7 @@ def convert(
     split: str | None = None,
     on_error: OnError = "skip",
     jobs: int | None = None,
+    runner: Runner | None = None,
     license_note: str | None = None,
     options: Mapping[str, object] | None = None,
     show_progress: bool = True,
@@ -108,6 +108,7 @@ def convert(
             of the file or its folder, else "unknown".
         on_error: "skip" leaves bad files and records out and reports them, "stop" raises at the first.
         jobs: processes that work at the same time; None = one per usable core.
+        runner: does the work in place of such processes, see `rlftsim.workers`.
         license_note: license of the data, for the manifest; None = that of the data source.
         options: of the data source, such as {"window": "first"} for "av2": arguments of its class.
         show_progress: False shows no progress bar on stderr.
@@ -115,6 +116,8 @@ def convert(
     Raises:
         DataError: nothing to read, nothing readable in it, a destination with something else in it, or one that cannot
             be written to; under "stop" also the first bad file or record.
+        SetAside: units that killed their process again and again; all others are converted.
+        Unfinished: `runner` is a share, which is done, while others are not.
         ConfigError: an unknown data source or option of it, fewer than one process, or a split without a name.
     """
     if jobs is not None and jobs < 1:
@@ -128,7 +131,7 @@ def convert(
             raise DataError(f"{folder} is a file, not a folder: choose another destination")
         if (folder / MANIFEST).exists():
             read_manifest(folder)  # raises where it cannot be added to
-        elif any(folder.iterdir()):
+        elif any(not path.name.startswith(INCOMPLETE) for path in folder.iterdir()):  # shares may begin just now
             raise DataError(f"{folder} is not empty and not a data set: choose another destination")
 
     # 2. One task per unit of the source.
@@ -144,49 +147,42 @@ def convert(
         raise DataError(f"{source}: its data source has two units of one name for {repeated[0]}: names must differ.")
 
     # 3. Make the shards that earlier runs have not finished, then index and manifest.
-    with _claim(folder):
-        for leftover in folder.rglob("*.tmp"):  # of an interrupted run
-            leftover.unlink()
+    runner = runner or on_this_machine(jobs or usable_cores(), len(tasks), on_death=on_error)
+    # The folder is marked as unfinished until the mark is removed.
+    with Lease(folder / INCOMPLETE, runner, "is converting to", _INCOMPLETE_TEXT) as lease:
+        if lease.is_alone:
+            _remove_temporary(folder)
         known = _known_entries(folder)
-        tasks = [replace(task, known=known.get(task.shard)) for task in tasks]
-        total = sum(file.stat().st_size for task in tasks for file in task.unit.files if file.exists())
+        own = [replace(task, known=known.get(task.shard)) for task in runner.own(tasks)]
+        total = sum(file.stat().st_size for task in own for file in task.unit.files if file.exists())
         with progress_bar("converting", total, unit="bytes", show=show_progress) as advance:
             convert_one = partial(_convert_unit, source=data_source)
-            outcomes = run_tasks(convert_one, tasks, jobs=jobs or usable_cores(), advance=advance)
-        manifest = _finish(folder, [outcome.entry for outcome in outcomes], data_source, license_note)
-    return _report(folder, outcomes, manifest)
+            outcomes = runner.run(convert_one, own, advance=advance, name_of=lambda task: task.unit.name)
+        lease.finish("convert")
+        # What other shares made is taken over by size and split: each has compared the checksums of its own.
+        made = {file: entry for file, entry in _known_entries(folder).items()}
+        made |= {outcome.entry.file: outcome.entry for outcome in outcomes}
+        entries = [made[task.shard] for task in tasks if task.shard in made and _is_of(made[task.shard], task)]
+        require_finished(runner, len(tasks) - len(entries), len(tasks), "convert")
+        _remove_temporary(folder)  # of processes that were killed
+        manifest = _finish(folder, entries, data_source, license_note, lease)
+        lease.remove()
+    return _report(folder, entries, outcomes, manifest)
 
 
-@contextmanager
-def _claim(folder: Path) -> Iterator[None]:
-    """Mark the folder as unfinished for the time of the block, and after it if it fails. One process at a time.
+def _remove_temporary(folder: Path) -> None:
+    for leftover in folder.rglob("*.tmp"):
+        leftover.unlink()
 
-    Raises:
-        DataError: another process converts to this folder, or it cannot be written to.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        marker = open(folder / INCOMPLETE, "w", encoding="utf-8")  # noqa: SIM115 (the with follows)
-    except OSError as error:
-        raise cannot_write(folder / INCOMPLETE, error) from error
-    with marker:
-        try:
-            import fcntl
 
-            fcntl.flock(marker.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except ImportError:  # no such locks on this platform: two conversions at a time are not noticed
-            pass
-        except OSError as error:
-            raise DataError(
-                f"another process is converting to {folder}: wait for it or choose another destination"
-            ) from error
-        try:
-            marker.write(_INCOMPLETE_TEXT)
-            marker.flush()
-        except OSError as error:
-            raise cannot_write(folder / INCOMPLETE, error) from error
-        yield
-        (folder / INCOMPLETE).unlink()
+def _is_of(entry: ShardEntry, task: _Task) -> bool:
+    """True if a shard has the split of a task, and the size of its sources as they are now, if they are there."""
+    files = task.unit.files
+    return (
+        entry.split == task.split
+        and all(file.exists() for file in files)
+        and (entry.source_bytes == sum(file.stat().st_size for file in files))
+    )
 
 
 def _known_entries(folder: Path) -> dict[str, ShardEntry]:
@@ -298,14 +294,16 @@ def _fingerprint(files: tuple[Path, ...], settings: Mapping[str, object]) -> tup
     return size, digests[0] if len(digests) == 1 else hashlib.sha256("".join(digests).encode()).hexdigest()
 
 
-def _finish(folder: Path, new: list[ShardEntry], source: DataSource, license_note: str | None) -> Manifest:
+def _finish(
+    folder: Path, new: list[ShardEntry], source: DataSource, license_note: str | None, lease: Lease
+) -> Manifest:
     """Write index and manifest of the new shards and those that were there, and remove the receipts."""
     # shards of earlier runs that this call does not touch stay in the data set
     entries = {**_known_entries(folder), **{entry.file: entry for entry in new}}
     if not any(entry.num_rows for entry in entries.values()):
         # leave nothing behind, as if the command had not been given
         shutil.rmtree(folder / SHARDS, ignore_errors=True)
-        (folder / INCOMPLETE).unlink()
+        lease.remove()
         if not any(folder.iterdir()):
             folder.rmdir()
         causes = [record for entry in new for record in entry.skipped]
@@ -329,9 +327,8 @@ def _finish(folder: Path, new: list[ShardEntry], source: DataSource, license_not
     return manifest
 
 
-def _report(folder: Path, outcomes: list[_Outcome], manifest: Manifest) -> ConvertReport:
-    """Report on the units of this call; a data set may hold more."""
-    entries = [outcome.entry for outcome in outcomes]
+def _report(folder: Path, entries: list[ShardEntry], outcomes: list[_Outcome], manifest: Manifest) -> ConvertReport:
+    """Report on the units of this call; a data set may hold more, and of a share's call other shares made the rest."""
     sources = {entry.source for entry in entries}
     duplicates = tuple(record for record in manifest.duplicates if record.file in sources)
     tallies: Counter[str] = Counter()

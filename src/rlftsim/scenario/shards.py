@@ -17,7 +17,7 @@ import numpy as np
 import pyarrow as pa
 
 from rlftsim.aliases import current_name
-from rlftsim.atomic_io import cannot_write
+from rlftsim.atomic_io import cannot_write, temporary_beside
 from rlftsim.errors import DataError
 from rlftsim.scenario.codec import decode_array, encode_array
 from rlftsim.scenario.index_row import IndexRow, compute_index_row
@@ -98,7 +98,7 @@ class ShardWriter:
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
         self.num_rows = 0
-        self._temporary = self.path.with_name(f"{self.path.name}.{os.getpid()}.tmp")
+        self._temporary = temporary_beside(self.path)
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._file = open(self._temporary, "wb")  # noqa: SIM115 (closed by close and discard)

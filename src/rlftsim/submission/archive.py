@@ -17,7 +17,7 @@ from itertools import chain
 from pathlib import Path
 from typing import BinaryIO
 
-from rlftsim.atomic_io import errors_name
+from rlftsim.atomic_io import errors_name, temporary_beside
 from rlftsim.errors import DataError
 
 LEVEL = 1
@@ -60,7 +60,7 @@ def write_piece(source: Path, name: str, destination: Path) -> Piece:
     header = entry.tobuf(tarfile.USTAR_FORMAT)
     padding = bytes(-entry.size % tarfile.BLOCKSIZE)
     deflate = zlib.compressobj(LEVEL, zlib.DEFLATED, -zlib.MAX_WBITS)
-    temporary = destination.with_name(f".{destination.name}.tmp")
+    temporary = temporary_beside(destination)
     raw_size = raw_crc = size = piece_crc = 0
     try:
         with errors_name(destination), source.open("rb") as contents, temporary.open("wb") as out:

@@ -11,16 +11,16 @@ the plan alone, not on processes or interruptions.
 
 import json
 import shutil
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 
-from rlftsim.atomic_io import errors_name, write_text
+from rlftsim.atomic_io import errors_name, temporary_beside, write_text
 from rlftsim.errors import DataError
 from rlftsim.evaluation.evaluate import check_jobs, simulate_states
 from rlftsim.evaluation.results import EvaluateConfig
+from rlftsim.lease import Lease
 from rlftsim.progress import log, progress_bar
 from rlftsim.rollout.policy import Policy, device_of
 from rlftsim.scenario.dataset import ScenarioDataset
@@ -30,7 +30,7 @@ from rlftsim.submission.messages import decode_rollouts, encode_rollouts, encode
 from rlftsim.submission.plan import GZIP_RATIO, Plan
 from rlftsim.submission.scenario_checks import check_rollouts
 from rlftsim.threads import one_thread
-from rlftsim.workers import run_tasks
+from rlftsim.workers import Runner, on_this_machine, require_finished
 
 ARCHIVE = "submission.tar.gz"
 _SHARDS, _LOCK = "shards", ".lock"
@@ -65,43 +65,57 @@ class Job:
             return None
 
 
-def build_archive(job: Job, *, delete_parts: bool = False, show_progress: bool = True) -> Path:
+def build_archive(
+    job: Job, *, runner: Runner | None = None, delete_parts: bool = False, show_progress: bool = True
+) -> Path:
     """Simulate what is missing and write the archive; returns its path. Interrupted in any way, the same call goes on.
 
     Args:
         job: policy, data, plan and settings.
+        runner: does the work in place of the settings' processes, see `rlftsim.workers`.
         delete_parts: remove each compressed shard as soon as it is in the archive. Halves the disk space.
         show_progress: False = no progress bar.
 
     Raises:
         ConfigError: several processes for a policy on a GPU, or a folder with work on another plan.
-        DataError: rollouts that the server would refuse, or a disk that is full.
+        DataError: rollouts that the server would refuse, a disk that is full, or another driver at work here.
+        SetAside: shards that killed their process again and again; all others are done.
+        Unfinished: `runner` is a share, which is done, while others are not.
     """
     check_jobs(job.config, device_of(job.policy))
     archive = job.folder / ARCHIVE
-    with _only_one(job.folder):
+    numbers = range(len(job.plan.shards))
+    runner = runner or on_this_machine(job.config.jobs, len(numbers))
+    if archive.exists():
         job.plan.claim(job.folder)
-        if archive.exists():
-            return archive
+        return archive
+    with Lease(job.folder / _LOCK, runner, "builds in") as lease:
+        job.plan.claim(job.folder)
         shards = job.folder / _SHARDS
         shards.mkdir(exist_ok=True)
-        # Left by a killed process; no other process writes here now.
-        for stray in shards.glob(".*"):
-            stray.unlink()
-        numbers = range(len(job.plan.shards))
+        if lease.is_alone:
+            _remove_strays(shards)
         receipts = [job.receipt(n) for n in numbers]
         num_joined = count_joined(archive, shards, receipts)
-        missing = [n for n in numbers[num_joined:] if receipts[n] is None or not job.piece_path(n).exists()]
-        total = sum(len(shard) for shard in job.plan.shards)
-        left = sum(len(job.plan.shards[n]) for n in missing)
+        own = runner.own(numbers)
+        missing = [n for n in own if n >= num_joined and (receipts[n] is None or not job.piece_path(n).exists())]
+        total, left = (sum(len(job.plan.shards[n]) for n in some) for some in (own, missing))
         _forecast(job, len(missing))
         with progress_bar("submit", total, total - left, show=show_progress) as advance, one_thread():
-            run_tasks(partial(_build_shard, job), missing, jobs=job.config.jobs, advance=advance)
+            runner.run(partial(_build_shard, job), missing, advance=advance, name_of=job.plan.shard_name)
+        lease.finish("submit")
+        _remove_strays(shards)
         pieces = [piece for piece in map(job.receipt, numbers) if piece is not None]
-        if len(pieces) < len(numbers):
-            raise DataError(f"{shards}: finished shards vanished meanwhile: run the same command again.")
+        require_finished(runner, len(numbers) - len(pieces), len(numbers), "submit")
         join_pieces(archive, shards, pieces, delete=delete_parts)
+        lease.remove()
     return archive
+
+
+def _remove_strays(shards: Path) -> None:
+    """Remove what killed processes left; no other process may write there."""
+    for stray in shards.glob(".*"):
+        stray.unlink()
 
 
 def delete_parts(folder: Path) -> None:
@@ -126,7 +140,7 @@ def _forecast(job: Job, num_missing: int) -> None:
 def _build_shard(job: Job, number: int, advance: Callable[[int], None], is_stopped: Callable[[], bool]) -> None:
     """Simulate the scenarios of a shard, write it, compress it, sign for it."""
     name = job.plan.shard_name(number)
-    raw = job.folder / _SHARDS / f".{name}.tmp"
+    raw = temporary_beside(job.folder / _SHARDS / name)
     try:
         with errors_name(raw), raw.open("wb") as file:
             file.write(job.metadata)
@@ -168,25 +182,3 @@ def forecast_size(plan: Plan, number: int, piece: Piece) -> float:
         piece: the shard.
     """
     return piece.size / plan.num_agents[number] * sum(plan.num_agents)
-
-
-@contextmanager
-def _only_one(folder: Path) -> Iterator[None]:
-    """Hold a folder for the time of the block.
-
-    Raises:
-        DataError: another process builds in it, or it cannot be written to.
-    """
-    with errors_name(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-        lock = open(folder / _LOCK, "w", encoding="utf-8")  # noqa: SIM115 (the with follows)
-    with lock:
-        try:
-            import fcntl
-
-            fcntl.flock(lock.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except ImportError:  # no such locks on this platform
-            pass
-        except OSError:
-            raise DataError(f"another process builds in {folder}: wait for it, or name another --out.") from None
-        yield

@@ -13,6 +13,7 @@ import numpy as np
 from rlftsim.aliases import current_names
 from rlftsim.atomic_io import write_text
 from rlftsim.errors import ConfigError, DataError, RlftsimError
+from rlftsim.lease import Lease
 from rlftsim.progress import progress_bar
 from rlftsim.scenario.dataset import (
     INCOMPLETE,
@@ -28,7 +29,7 @@ from rlftsim.scenario.synthetic import sumo
 from rlftsim.scenario.synthetic.windows import cut_scenarios
 from rlftsim.scenario.synthetic.world import simulate_world
 from rlftsim.scenario.types import Scenario
-from rlftsim.workers import Advance, run_tasks
+from rlftsim.workers import Advance, Runner, on_this_machine, require_finished
 
 GENERATOR_VERSION = 1
 LICENSE_NOTE = "CC0-1.0: synthetic scenarios, no rights reserved."
@@ -121,6 +122,7 @@ def generate(
     num_scenarios: int,
     seed: int,
     jobs: int = 1,
+    runner: Runner | None = None,
     splits: Mapping[str, float] | None = None,
     scenarios_per_network: int = 10,
     show_progress: bool = True,
@@ -134,6 +136,7 @@ def generate(
         num_scenarios: in all splits together.
         seed: source of all networks.
         jobs: networks made at the same time; does not change the result.
+        runner: does the work in place of such processes, see `rlftsim.workers`.
         splits: fraction of the scenarios by split, which share no network; None = 80 % training, 20 % validation.
         scenarios_per_network: scenarios cut from one city; a freeway gives half as many.
         show_progress: False draws no progress bar.
@@ -143,7 +146,8 @@ def generate(
 
     Raises:
         ConfigError: SUMO or shapely is not installed, or an argument is out of range.
-        DataError: the folder holds something else, or scenarios of other arguments.
+        DataError: the folder holds something else, or scenarios of other arguments, or another driver is at work.
+        Unfinished: `runner` is a share, which is done, while others are not.
     """
     request = SyntheticRequest(num_scenarios, seed, scenarios_per_network, splits)
     folder = Path(destination)
@@ -170,23 +174,33 @@ def generate(
         if current_names(json.loads(marker.read_text(encoding="utf-8") or "{}")) != provenance:
             raise DataError(f"{folder} was begun with another seed, other arguments or versions: choose another folder")
     else:
-        if folder.exists() and any(folder.iterdir()):
+        # not what other shares of the same run make in this moment
+        if folder.exists() and any(p.name != INCOMPLETE and p.suffix != ".tmp" for p in folder.iterdir()):
             raise DataError(f"{folder} is not empty: choose another folder or delete it")
-        (folder / SHARDS).mkdir(parents=True)
         write_text(marker, json.dumps(provenance, indent=1))
 
     # 2. Make the shards that are not there yet.
-    done = [task for task in tasks if (folder / SHARDS / task.shard_name).exists()]
-    todo = [task for task in tasks if task not in done]
-    total, so_far = (sum(task.num_scenarios for task in some) for some in (tasks, done))
-    with progress_bar("synthetic scenarios", total, so_far, show=show_progress) as advance:
-        run_tasks(partial(_write_shard, folder=folder), todo, jobs=jobs, advance=advance)
-
-    # 3. Index and manifest.
+    runner = runner or on_this_machine(jobs, len(tasks))
     paths = [folder / SHARDS / task.shard_name for task in tasks]
-    entries = [describe_shard(folder, path, len(ShardReader(path))) for path in paths]
-    manifest = write_index_and_manifest(folder, entries, license_note=LICENSE_NOTE, provenance=provenance)
-    marker.unlink()
+    with Lease(folder / SHARDS / ".lock", runner, "makes scenarios in") as lease:
+        own = runner.own(tasks)
+        todo = [task for task in own if not (folder / SHARDS / task.shard_name).exists()]
+        total, left = (sum(task.num_scenarios for task in some) for some in (own, todo))
+        with progress_bar("synthetic scenarios", total, total - left, show=show_progress) as advance:
+            runner.run(
+                partial(_write_shard, folder=folder), todo, advance=advance, name_of=lambda task: task.shard_name
+            )
+        lease.finish("synthetic scenarios")
+        num_missing = sum(not path.exists() for path in paths)
+        require_finished(runner, num_missing, len(tasks), "synthetic scenarios")
+        for leftover in (folder / SHARDS).glob("*.tmp"):  # of processes that were killed
+            leftover.unlink()
+
+        # 3. Index and manifest.
+        entries = [describe_shard(folder, path, len(ShardReader(path))) for path in paths]
+        manifest = write_index_and_manifest(folder, entries, license_note=LICENSE_NOTE, provenance=provenance)
+        marker.unlink()
+        lease.remove()
     return manifest
 
 

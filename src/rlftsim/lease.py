@@ -1,0 +1,122 @@
+"""One driver at a time for a folder of results, or the shares of one run: any other is refused.
+
+A lock belongs to an open file, so it ends with the process that holds it, however that ends. Network file systems of
+today carry such locks between machines.
+"""
+
+import os
+import socket
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from types import TracebackType
+from typing import TextIO
+
+from rlftsim.atomic_io import errors_name
+from rlftsim.errors import DataError
+from rlftsim.workers import Runner, Share, Unfinished
+
+
+class Lease:
+    """The right to write into a folder; use it as a context manager.
+
+    A share holds the folder together with other shares, and its own number alone.
+
+    Args:
+        path: lock file inside the folder.
+        runner: that does the work; shares may work side by side.
+        doing: verb of the work, for messages: "is converting to".
+        note: first line of the lock file, for people who find it.
+
+    Raises:
+        DataError: another driver holds the folder (says which, and since when), or it cannot be written to.
+    """
+
+    def __init__(self, path: Path, runner: Runner, doing: str, note: str = "") -> None:
+        self._path, self._doing, self._note = path, doing, note
+        self._share = runner if isinstance(runner, Share) and runner.number else None
+        self._files: list[TextIO] = []
+        try:
+            if self._share is not None:
+                self._lock(path.with_name(f"{path.name}.{self._share.number}-of-{self._share.of}"))
+            self._lock(path, is_shared=self._share is not None)
+        except BaseException:
+            self.__exit__(None, None, None)
+            raise
+
+    @property
+    def is_alone(self) -> bool:
+        """True if no share of the same run may be at work."""
+        return self._share is None
+
+    def __enter__(self) -> "Lease":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        for file in self._files:
+            file.close()
+
+    def finish(self, title: str) -> None:
+        """Become the only driver, to put the result together.
+
+        Raises:
+            Unfinished: other shares are at work; the last of them puts the result together.
+        """
+        if self._share is None:
+            return
+        # The lock is let go before it is wanted whole. So of shares that end together the last to let go gets it.
+        self._files.pop().close()
+        try:
+            self._lock(self._path)
+        except DataError:
+            raise Unfinished(
+                f"{title}: {self._share} is done, other shares are at work. The last one puts the result together."
+            ) from None
+        self._share = None
+
+    def remove(self) -> None:
+        """Remove the lock files, at the end of all work. Only after `finish`."""
+        for stray in self._path.parent.glob(f"{self._path.name}.*-of-*"):
+            stray.unlink()
+        self._path.unlink()
+
+    def _lock(self, path: Path, is_shared: bool = False) -> None:
+        """Open a file with a lock on it.
+
+        Raises:
+            DataError: another process has one.
+        """
+        with errors_name(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            while True:
+                file = open(path, "a+", encoding="utf-8")  # noqa: SIM115 (stays open)
+                try:
+                    import fcntl
+
+                    fcntl.flock(file.fileno(), (fcntl.LOCK_SH if is_shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+                except ImportError:  # no such locks on this platform: two drivers at a time are not noticed
+                    pass
+                except BlockingIOError:
+                    with file:
+                        raise DataError(self._refusal(file)) from None
+                # The driver before this one may have removed the file in between: then it is no lock for others.
+                if path.exists() and os.fstat(file.fileno()).st_ino == path.stat().st_ino:
+                    break
+                file.close()
+            self._files.append(file)
+            now = datetime.now(UTC).isoformat(timespec="seconds")
+            file.truncate(0)
+            file.write(f"{self._note}\n{socket.gethostname()} process {os.getpid()} since {now}\n")
+            file.flush()
+
+    def _refusal(self, file: TextIO) -> str:
+        """Message with the owner and age of a lock."""
+        file.seek(0)
+        owner, _, since = (file.read().splitlines() or [""])[-1].partition(" since ")
+        try:
+            age = timedelta(seconds=int((datetime.now(UTC) - datetime.fromisoformat(since)).total_seconds()))
+            whom = f" ({owner}, for {age})"
+        except ValueError:  # it is only just beginning
+            whom = ""
+        return f"another process {self._doing} {self._path.parent}{whom}: wait for it or choose another destination."
