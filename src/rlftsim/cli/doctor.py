@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import Literal
 
 import torch
 from rich.table import Table
@@ -34,10 +35,38 @@ class Diagnosis:
 @dataclass(frozen=True)
 class Doctor:
     """Check this machine: versions, threads, GPU, disk, the embedded scenarios. Prints what to do about each
-    problem."""
+    problem. With --plan: measure how long work on many machines would take, and what it would cost."""
+
+    plan: Literal["convert", "evaluate", "submit"] | None = None
+    """Forecast this work for the Waymo Open Motion Dataset instead, from its cost on this machine."""
+    model: str = "demo-base"
+    """With --plan evaluate or submit: the model."""
+    data: str = "synthetic"
+    """With --plan: data set to measure on; for convert, files to convert (all of them are)."""
+    measure: int = 5
+    """With --plan evaluate or submit: scenarios to measure, of all sizes."""
+    num_scenarios: int | None = None
+    """With --plan: scenarios of the whole work. Left out: 576000 to convert, 44100 to evaluate, 44920 to submit."""
+    nodes: int = 1
+    """With --plan: machines."""
+    cores: int = 16
+    """With --plan: cores of a machine."""
+    price: float = 0.04
+    """With --plan: price of a core for an hour, in dollars."""
 
     def run(self) -> int:
         """Print the results; exit status 1 if a check failed."""
+        if self.plan is not None:
+            from rlftsim.cli.plan import measure_cost, plan_table
+
+            cost = measure_cost(self.plan, self.model, self.data, self.measure)
+            print_wide(
+                plan_table(
+                    self.plan, cost,
+                    num_scenarios=self.num_scenarios, nodes=self.nodes, cores=self.cores, price=self.price,
+                )
+            )  # fmt: skip
+            return 0
         diagnoses = [*_versions(), _threads(), _gpu(), _sumo(), _disk(), _pack()]
         table = Table(show_header=False)
         color = {GOOD: "green", WARNING: "yellow", BAD: "red"}

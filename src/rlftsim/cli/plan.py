@@ -1,0 +1,124 @@
+"""Forecast of long work on many machines, from its cost as measured on this one: `rlftsim doctor --plan`."""
+
+import math
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from rich.table import Table
+
+from rlftsim.evaluation.evaluate import EvaluateConfig, frozen_copy, simulate_states
+from rlftsim.evaluation.resumable import EvaluationParts
+from rlftsim.policies.registry import load_policy
+from rlftsim.progress import progress_bar
+from rlftsim.realism import scenario_log, score
+from rlftsim.rollout.policy import device_of
+from rlftsim.scenario.convert import convert
+from rlftsim.scenario.open import open_dataset
+from rlftsim.submission.messages import encode_rollouts
+from rlftsim.threads import one_thread
+
+Plan = Literal["convert", "evaluate", "submit"]
+WOMD_SCENARIOS: dict[Plan, int] = {"convert": 576_000, "evaluate": 44_100, "submit": 44_920}
+"""All records of the Waymo Open Motion Dataset, its validation split and its test split."""
+WOMD_PIECES: dict[Plan, int] = {"convert": 1_300, "evaluate": 44_100 // EvaluationParts.group_size, "submit": 150}
+"""Pieces of the work, each done by one core: source files, groups of scenarios, shards."""
+_AGENT_COLUMNS = ("num_vehicles", "num_pedestrians", "num_cyclists", "num_others")
+
+
+@dataclass(frozen=True)
+class UnitCost:
+    """Processor time of one scenario on one core of this machine."""
+
+    seconds: float
+    num_measured: int
+    mean_agents: float = math.nan
+    """In the scenarios of the data set; not known of files that are to be converted."""
+
+
+def measure_cost(plan: Plan, model: str, data: str, num_measured: int) -> UnitCost:
+    """Do the work on a few scenarios and measure the processor time.
+
+    The scenarios are those in the middle of bins of equal size by number of agents, so their mean cost is near that of
+    the whole data set.
+
+    Args:
+        plan: the work.
+        model: for "evaluate" and "submit", as the command line names it.
+        data: data set; for "convert" the tfrecord files or other sources, of which everything is converted.
+        num_measured: scenarios.
+    """
+    if plan == "convert":
+        with tempfile.TemporaryDirectory() as folder:
+            start = time.process_time()
+            report = convert(data, Path(folder) / "data", jobs=1)
+            return UnitCost((time.process_time() - start) / report.converted, report.converted)
+    dataset = open_dataset(data, cache_size=2)
+    agents = np.stack([dataset.index[name].to_numpy() for name in _AGENT_COLUMNS]).sum(0)  # [scenarios]
+    bins = np.array_split(np.argsort(agents, kind="stable"), min(num_measured, len(dataset)))
+    chosen = [int(members[len(members) // 2]) for members in bins]
+    policy, config = frozen_copy(load_policy(model, "cpu")), EvaluateConfig()
+    seconds = []
+    with progress_bar("measure", len(chosen) + 1) as advance, one_thread():
+        for position in [chosen[0], *chosen]:
+            start = time.process_time()
+            scenario = dataset[position]
+            states = simulate_states(policy, scenario, config, device_of(policy))
+            if plan == "submit":
+                encode_rollouts(scenario.scenario_id, states)
+            else:
+                score(scenario_log(scenario), states)
+            seconds.append(time.process_time() - start)
+            advance(1)
+    # The first one is done twice: it imports and fills caches, which later ones find.
+    return UnitCost(float(np.mean(seconds[1:])), len(chosen), float(agents.mean()))
+
+
+def forecast_s(seconds: float, num_scenarios: int, num_pieces: int, num_cores: int) -> float:
+    """Time until the last core is done, where each takes one piece of the work after another.
+
+    Args:
+        seconds: of one scenario on one core.
+        num_scenarios: in all.
+        num_pieces: of the work; the scenarios are spread evenly over them.
+        num_cores: at work at the same time.
+    """
+    rounds = math.ceil(num_pieces / num_cores)
+    return seconds * num_scenarios / num_pieces * rounds
+
+
+def plan_table(plan: Plan, cost: UnitCost, *, num_scenarios: int | None, nodes: int, cores: int, price: float) -> Table:
+    """Time and price on one core, one machine and all machines.
+
+    Args:
+        plan: the work.
+        cost: of a scenario.
+        num_scenarios: in all; None = those of the Waymo Open Motion Dataset.
+        nodes: machines.
+        cores: of a machine.
+        price: of a core for an hour, in dollars.
+    """
+    total = num_scenarios or WOMD_SCENARIOS[plan]
+    pieces = max(round(WOMD_PIECES[plan] * total / WOMD_SCENARIOS[plan]), 1)
+    agents = "" if math.isnan(cost.mean_agents) else f", {cost.mean_agents:.0f} agents on average"
+    table = Table(
+        title=f"{plan}: {total} scenarios of {cost.seconds:.3g} s ({cost.num_measured} measured here{agents})",
+        caption=f"at ${price:g} for a core and hour; without reading over a network and starting machines",
+        title_justify="left", caption_justify="left",
+    )  # fmt: skip
+    for heading in ("machines", "cores", "time", "price"):
+        table.add_column(heading, justify="right")
+    for machines, each in dict.fromkeys([(1, 1), (1, cores), (nodes, cores)]):
+        seconds = forecast_s(cost.seconds, total, pieces, machines * each)
+        dollars = cost.seconds * total / 3600 * price
+        table.add_row(f"{machines}", f"{machines * each}", _duration(seconds), f"${dollars:.2f}")
+    return table
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 120:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 2 * 3600 else f"{seconds / 3600:.1f} h"
