@@ -12,7 +12,7 @@ PACKAGE = Path(rlftsim.__file__).parent
 FLOORS = (
     ("errors",),
     ("aliases", "atomic_io", "geometry", "plugins", "progress", "statistics", "threads"),
-    ("workers",),
+    ("workers", "storage"),
     ("lease", "cluster"),
     ("scenario",),
     ("tokens", "goals"),

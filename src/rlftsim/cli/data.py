@@ -9,11 +9,14 @@ from rich.table import Table
 from tyro.conf import Positional
 
 from rlftsim.cli.machines import Machines, Work
+from rlftsim.errors import ConfigError
 from rlftsim.progress import print_wide
 from rlftsim.scenario.convert import convert
 from rlftsim.scenario.inspect import DatasetStats, dataset_stats, verify_dataset
 from rlftsim.scenario.open import dataset_folder
 from rlftsim.scenario.synthetic.generate import generate
+from rlftsim.scenario.transfer import pull_dataset, push_dataset
+from rlftsim.storage import is_url
 from rlftsim.workers import usable_cores
 
 MAX_LISTED = 20
@@ -85,6 +88,7 @@ class Verify:
 
     def run(self) -> int:
         """List the findings; exit status 1 if a file is damaged."""
+        _refuse_remote(self.data)
         findings = verify_dataset(dataset_folder(self.data))
         for finding in findings:
             print(finding)
@@ -92,6 +96,11 @@ class Verify:
         damaged = [f for f in findings if f.problem.is_damage]
         print(f"{self.data}: {len(damaged)} damaged files, {len(findings) - len(damaged)} doubtful contents.")
         return 1 if damaged else 0
+
+
+def _refuse_remote(data: str) -> None:
+    if is_url(data):
+        raise ConfigError(f"{data}: this reads every shard: copy it with `rlftsim data pull` first.")
 
 
 @dataclass(frozen=True)
@@ -105,11 +114,42 @@ class Stats:
 
     def run(self) -> int:
         """Print the numbers."""
+        _refuse_remote(self.data)
         stats = dataset_stats(dataset_folder(self.data), split=self.split)
         table = Table(title=self.data, show_header=False, title_justify="left")
         for label, value in _stats_rows(stats).items():
             table.add_row(label, value)
         print_wide(table)
+        return 0
+
+
+@dataclass(frozen=True)
+class Push:
+    """Copy a data set to a bucket. Readers see it when all of it is there."""
+
+    folder: Annotated[Positional[Path], tyro.conf.arg(metavar="FOLDER")]
+    """Folder of the data set."""
+    url: Annotated[Positional[str], tyro.conf.arg(metavar="URL")]
+    """Address of the copy, such as s3://bucket/womd."""
+
+    def run(self) -> int:
+        """Copy."""
+        print(f"{self.url}: {push_dataset(self.folder, self.url).num_scenarios} scenarios.")
+        return 0
+
+
+@dataclass(frozen=True)
+class Pull:
+    """Copy a data set from a bucket. An interrupted copy continues when the same command is repeated."""
+
+    url: Annotated[Positional[str], tyro.conf.arg(metavar="URL")]
+    """Address of the data set, such as s3://bucket/womd."""
+    folder: Annotated[Positional[Path], tyro.conf.arg(metavar="FOLDER")]
+    """Folder of the copy."""
+
+    def run(self) -> int:
+        """Copy."""
+        print(f"{self.folder}: {pull_dataset(self.url, self.folder).num_scenarios} scenarios.")
         return 0
 
 
@@ -139,9 +179,14 @@ def _counts(counts) -> str:
 
 @dataclass(frozen=True)
 class Data:
-    """Check a data set for damage, or print its statistics."""
+    """Check a data set for damage, print its statistics, or copy it to a bucket and back."""
 
-    action: Annotated[Verify, tyro.conf.subcommand("verify")] | Annotated[Stats, tyro.conf.subcommand("stats")]
+    action: (
+        Annotated[Verify, tyro.conf.subcommand("verify")]
+        | Annotated[Stats, tyro.conf.subcommand("stats")]
+        | Annotated[Push, tyro.conf.subcommand("push")]
+        | Annotated[Pull, tyro.conf.subcommand("pull")]
+    )
 
     def run(self) -> int:
         """Run the action."""

@@ -88,7 +88,7 @@ def evaluate(
         config=replace(config, jobs=1),  # the same bytes from any number of processes
         policy=kind,
         policy_fingerprint=fingerprint,
-        dataset=str(dataset.folder.resolve()),
+        dataset=dataset.url or str(dataset.folder.resolve()),
         manifest_sha256=hash_manifest(dataset.folder),
         sources=dataset.sources,
         guessed=dataset.guessed,

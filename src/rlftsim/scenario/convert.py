@@ -9,6 +9,7 @@ import hashlib
 import json
 import os
 import shutil
+import tempfile
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
@@ -31,8 +32,9 @@ from rlftsim.scenario.dataset import (
     write_json,
 )
 from rlftsim.scenario.shards import SCHEMA_VERSION, ShardWriter, hash_file
-from rlftsim.scenario.sources import AUTO, DataSource, Unit, find_source, read_unit
+from rlftsim.scenario.sources import AUTO, DEFAULT_SOURCE, DataSource, Unit, find_source, read_unit, units_of_urls
 from rlftsim.scenario.tfrecord import OnError, SkippedRecord
+from rlftsim.storage import fetch, find_files, is_url
 from rlftsim.workers import Runner, on_this_machine, require_finished, usable_cores
 
 _INCOMPLETE_TEXT = "A conversion runs here or was interrupted: run the same command again, it goes on."
@@ -100,7 +102,7 @@ def convert(
     it; a source that changed is converted again. The same sources give the same bytes.
 
     Args:
-        source: file, folder or glob that the data source finds its files by.
+        source: file, folder or glob that the data source finds its files by; also tfrecords in a bucket (s3://...).
         destination: folder of the data set: new, empty, or a data set or unfinished conversion of ours.
         reader: name of the data source, such as "womd" (see `sources.SOURCES`); "auto" = the one that recognizes the
             files.
@@ -135,9 +137,14 @@ def convert(
             raise DataError(f"{folder} is not empty and not a data set: choose another destination")
 
     # 2. One task per unit of the source.
-    data_source = find_source(reader, source, options)
+    if is_url(source):
+        data_source = find_source(DEFAULT_SOURCE if reader == AUTO else reader, source, options)
+        units = units_of_urls(find_files(str(source), "*tfrecord*"))
+    else:
+        data_source = find_source(reader, source, options)
+        units = data_source.find(source)
     tasks = []
-    for unit in data_source.find(source):
+    for unit in units:
         label = split or unit.split
         # files of two splits may have the same name: a split's shards have a folder of their own
         place = unit.name if unit.name.startswith(f"{label}/") else f"{label}/{unit.name}"
@@ -154,7 +161,7 @@ def convert(
             _remove_temporary(folder)
         known = _known_entries(folder)
         own = [replace(task, known=known.get(task.shard)) for task in runner.own(tasks)]
-        total = sum(file.stat().st_size for task in own for file in task.unit.files if file.exists())
+        total = sum(task.unit.size for task in own)
         with progress_bar("converting", total, unit="bytes", show=show_progress) as advance:
             convert_one = partial(_convert_unit, source=data_source)
             outcomes = runner.run(convert_one, own, advance=advance, name_of=lambda task: task.unit.name)
@@ -177,12 +184,7 @@ def _remove_temporary(folder: Path) -> None:
 
 def _is_of(entry: ShardEntry, task: _Task) -> bool:
     """True if a shard has the split of a task, and the size of its sources as they are now, if they are there."""
-    files = task.unit.files
-    return (
-        entry.split == task.split
-        and all(file.exists() for file in files)
-        and (entry.source_bytes == sum(file.stat().st_size for file in files))
-    )
+    return (entry.split, entry.source_bytes) == (task.split, task.unit.size)
 
 
 def _known_entries(folder: Path) -> dict[str, ShardEntry]:
@@ -221,9 +223,19 @@ def _convert_unit(
         DataError: under "stop", a bad file or record; always: the shard cannot be written.
         _Stopped: `is_stopped` was true.
     """
-    # 1. Take over the shard of an earlier run if it is whole and made from these very files.
-    size, digest = _fingerprint(task.unit.files, source.describe())
+    # 1. Take over the shard of an earlier run if it is whole and made from these very files; remote ones are compared
+    # by size alone, as their checksums would take as long as fetching them.
     known = task.known
+    if task.unit.url:
+        if known is not None and _is_of(known, task) and hash_file(task.folder / task.shard) == known.sha256:
+            advance(task.unit.size)
+            return _Outcome(known, reused=True)
+        with tempfile.TemporaryDirectory() as folder:
+            local = Path(folder) / Path(task.unit.url).name
+            fetch(task.unit.url, local)
+            unit = replace(task.unit, files=(local,), url="", url_bytes=0)
+            return _convert_unit(replace(task, unit=unit, known=None), advance, is_stopped, source=source)
+    size, digest = _fingerprint(task.unit.files, source.describe())
     if (
         known is not None
         and (known.source_bytes, known.source_sha256, known.split) == (size, digest, task.split)

@@ -42,6 +42,7 @@ from rlftsim.scenario.shards import (
 from rlftsim.scenario.synthetic.pack import pack_path
 from rlftsim.scenario.tfrecord import SkippedRecord
 from rlftsim.scenario.types import Scenario
+from rlftsim.storage import ORIGIN, fetch_shard, is_url, mirror
 
 FORMAT = "rlftsim scenarios"
 MANIFEST, INDEX, INCOMPLETE, SHARDS = "manifest.json", "index.parquet", "INCOMPLETE", "shards"
@@ -98,7 +99,8 @@ class ScenarioDataset:
     identity. Can be handed to other processes: each opens the files itself.
 
     Args:
-        folder: the data set; "synthetic" = the one that ships with the package.
+        folder: the data set, also in a bucket (s3://bucket/folder), of which shards are fetched when they are needed;
+            "synthetic" = the one that ships with the package.
         split: only scenarios of this split, e.g. "training"; None = all.
         cache_size: decoded scenarios kept in memory, the least recently used go first (about 1 MB each).
 
@@ -109,6 +111,9 @@ class ScenarioDataset:
     def __init__(self, folder: str | os.PathLike[str], split: str | None = None, *, cache_size: int = 256) -> None:
         self.folder = dataset_folder(folder)
         self.split = split
+        origin = self.folder / ORIGIN
+        self.url = origin.read_text(encoding="utf-8") if origin.exists() else None
+        """Address of a remote data set, of which the folder holds index and manifest."""
         self.cache_size = cache_size
         self.manifest = read_manifest(self.folder)
         index = load_index(self.folder)
@@ -125,7 +130,7 @@ class ScenarioDataset:
         self._position = {scenario_id: i for i, scenario_id in enumerate(self.scenario_ids)}
         self._lock = Lock()
         # shards are opened on first use and stay open, least recently used ones go
-        self._reader = lru_cache(_MAX_OPEN_SHARDS)(lambda name: ShardReader(self.folder / name))
+        self._reader = lru_cache(_MAX_OPEN_SHARDS)(lambda name: ShardReader(self._shard_path(name)))
         self._decoded = lru_cache(cache_size)(
             lambda position: self._reader(self._shard_names[position]).read(self._rows[position])
         )
@@ -179,11 +184,18 @@ class ScenarioDataset:
 
     def __reduce__(self) -> tuple[Callable[..., "ScenarioDataset"], tuple[object, ...]]:
         # memory maps, locks and caches stay in their process
-        return partial(ScenarioDataset, cache_size=self.cache_size), (self.folder, self.split)
+        return partial(ScenarioDataset, cache_size=self.cache_size), (self.url or self.folder, self.split)
 
     def __repr__(self) -> str:
         split = "" if self.split is None else f", split {self.split!r}"
         return f"ScenarioDataset({str(self.folder)!r}{split}, {len(self)} scenarios)"
+
+    def _shard_path(self, name: str) -> Path:
+        """Local path of a shard; of a remote data set, that in the cache of this machine."""
+        if self.url is None:
+            return self.folder / name
+        sha256 = next(entry.sha256 for entry in self.manifest.shards if entry.file == name)
+        return fetch_shard(f"{self.url}/{name}", sha256)
 
     def by_id(self, scenario_id: str) -> Scenario:
         """Scenario with the given id.
@@ -331,7 +343,12 @@ def write_dataset(
 
 
 def dataset_folder(name: str | os.PathLike[str]) -> Path:
-    """Folder of a data set, "~" expanded; "synthetic" names the one that ships with the package."""
+    """Folder of a data set, "~" expanded; "synthetic" names the one that ships with the package.
+
+    Of a remote data set (s3://...), a local folder with its index and manifest.
+    """
+    if is_url(name):
+        return mirror(str(name), (INDEX, MANIFEST))
     return pack_path() if name == SYNTHETIC else Path(name).expanduser()
 
 

@@ -25,7 +25,7 @@ import inspect
 import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -49,6 +49,14 @@ class Unit:
     files: tuple[Path, ...]
     """All files that are read for it. When one of them changes, the unit is converted again."""
     split: str = "unknown"
+    url: str = ""
+    """Address of its only file, where that is not on this machine; then `files` is empty."""
+    url_bytes: int = 0
+
+    @property
+    def size(self) -> int:
+        """Bytes of the files that are there."""
+        return self.url_bytes + sum(file.stat().st_size for file in self.files if file.exists())
 
 
 class BytesRead(int):
@@ -216,6 +224,17 @@ def units_of_files(files: Sequence[Path]) -> list[Unit]:
     """
     common = os.path.commonpath([file.absolute().parent for file in files])
     return [Unit(file.absolute().relative_to(common).as_posix(), (file,), infer_split(file)) for file in files]
+
+
+def units_of_urls(sizes: Mapping[str, int]) -> list[Unit]:
+    """One unit per remote file, named as by `units_of_files`.
+
+    Args:
+        sizes: bytes of each file by its address; at least one.
+    """
+    paths = {url: Path("/" + url.partition("://")[2]) for url in sizes}
+    names = units_of_files(list(paths.values()))
+    return [replace(unit, files=(), url=url, url_bytes=sizes[url]) for unit, url in zip(names, paths)]
 
 
 def infer_split(path: Path) -> str:

@@ -136,7 +136,7 @@ def refuse_incomplete(data: ScenarioDataset) -> None:
         DataError: a shard of the data set is missing, a source file was not converted, or records were lost.
     """
     missing = [name for name in sorted(set(data.index["shard"].to_pylist())) if not (data.folder / name).is_file()]
-    if missing:
+    if missing and data.url is None:
         raise DataError(f"{data.folder / missing[0]} is missing, and {len(missing) - 1} more: convert again.")
     entries = [entry for entry in data.manifest.shards if entry.split == data.split]
     lost = sum(len(entry.skipped) for entry in entries)

@@ -1,0 +1,203 @@
+"""Data in buckets: `s3://`, `gs://`, `file://` and whatever else fsspec knows.
+
+Credentials are found by the libraries in their own ways; nothing here reads, keeps or prints them.
+"""
+
+import hashlib
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from glob import has_magic
+from pathlib import Path
+from typing import Any
+
+from rlftsim.atomic_io import write_text, write_whole
+from rlftsim.errors import ConfigError, DataError, RlftsimError
+
+ORIGIN = "origin.txt"
+"""File in a local copy of a remote data set's index: the address of its shards."""
+BLOCK_BYTES = 1 << 24
+_EXTRAS = {"s3": "s3", "s3a": "s3", "gs": "gcs", "gcs": "gcs"}
+
+
+def is_url(place: object) -> bool:
+    """True for an address such as s3://bucket/folder, in place of a path."""
+    return isinstance(place, str) and "://" in place
+
+
+def cache_folder() -> Path:
+    """Folder for what was fetched: RLFTSIM_CACHE, else ~/.cache/rlftsim."""
+    return Path(os.environ.get("RLFTSIM_CACHE", "~/.cache/rlftsim")).expanduser()
+
+
+def local_copy(url: str, kind: str) -> Path:
+    """Local folder that stands for an address.
+
+    Args:
+        url: the address.
+        kind: name of the cache's part.
+    """
+    return cache_folder() / kind / hashlib.sha256(url.rstrip("/").encode()).hexdigest()[:16]
+
+
+@contextmanager
+def remote(url: str) -> Iterator[tuple[Any, str]]:
+    """File system of an address and the path in it; errors inside the block become one line that names the address.
+
+    Raises:
+        ConfigError: the protocol is unknown or its library is not installed.
+        DataError: nothing is there, or it cannot be reached.
+    """
+    protocol = url.partition("://")[0]
+    try:
+        import fsspec
+
+        yield fsspec.core.url_to_fs(url)
+    except RlftsimError:
+        raise
+    except ImportError as error:
+        hint = f'pip install "rlftsim[{_EXTRAS[protocol]}]"' if protocol in _EXTRAS else str(error)
+        raise ConfigError(f"{url}: {protocol}:// needs another library: {hint}.") from None
+    except FileNotFoundError:
+        raise DataError(f"{url}: there is no such file or bucket.") from None
+    except PermissionError as error:
+        raise DataError(f"{url}: access denied ({error}): check the credentials of this machine.") from None
+    # Each library has errors of its own: no connection, no credentials, no such protocol.
+    except Exception as error:
+        cause = (str(error).strip().splitlines() or [""])[0]
+        raise DataError(f"{url}: {type(error).__name__}: {cause}") from None
+
+
+def fetch(url: str, path: Path, sha256: str | None = None) -> str:
+    """Copy a remote file, whole or not at all; returns its SHA-256.
+
+    Args:
+        url: of the file.
+        path: of the copy.
+        sha256: that the file must have; None = any.
+
+    Raises:
+        DataError: it cannot be fetched, or is another one.
+    """
+    digest = hashlib.sha256()
+
+    def write(temporary: Path) -> None:
+        with remote(url) as (files, place), temporary.open("wb") as copy:
+            with files.open(place, "rb", block_size=BLOCK_BYTES, cache_type="readahead") as source:
+                while block := source.read(BLOCK_BYTES):
+                    digest.update(block)
+                    copy.write(block)
+            if sha256 not in (None, digest.hexdigest()):
+                raise DataError(f"{url}: damaged or replaced: its checksum is not that of the manifest.")
+
+    write_whole(path, write)
+    return digest.hexdigest()
+
+
+def publish(path: Path, url: str) -> None:
+    """Copy a file to a bucket. Readers see all of it or nothing: an upload that is cut short leaves no object.
+
+    Args:
+        path: of the file.
+        url: of the copy.
+
+    Raises:
+        DataError: it cannot be written there.
+    """
+    with remote(url) as (files, place):
+        files.makedirs(files._parent(place), exist_ok=True)
+        files.put_file(str(path), place)
+
+
+def fetch_shard(url: str, sha256: str) -> Path:
+    """Local path of a shard, fetched once per machine by whichever process comes first.
+
+    Shards used least recently are removed when the cache has more than RLFTSIM_CACHE_GB (50) gigabytes.
+
+    Args:
+        url: of the shard.
+        sha256: of its bytes, which is also its name in the cache.
+
+    Raises:
+        DataError: see `fetch`.
+    """
+    path = cache_folder() / "shards" / sha256
+    with _locked(path.with_suffix(".lock")):
+        if path.exists():
+            os.utime(path)  # used now
+        else:
+            fetch(url, path, sha256)
+            _evict(path)
+    return path
+
+
+def _evict(newest: Path) -> None:
+    """Remove the oldest shards of the cache above its limit. Processes that have one open keep it."""
+    limit = float(os.environ.get("RLFTSIM_CACHE_GB", "50")) * 1e9
+    shards = [path for path in newest.parent.iterdir() if not path.suffix]
+    shards.sort(key=lambda path: path.stat().st_mtime, reverse=True)
+    total = 0
+    for path in shards:
+        total += path.stat().st_size
+        if total > limit and path != newest:
+            path.unlink(missing_ok=True)
+            path.with_suffix(".lock").unlink(missing_ok=True)
+
+
+@contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    """Wait for a lock file, and hold it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("a") as file:
+        try:
+            import fcntl
+
+            fcntl.flock(file.fileno(), fcntl.LOCK_EX)
+        except ImportError:  # no such locks on this platform: a shard may be fetched twice
+            pass
+        yield
+
+
+def mirror(url: str, names: tuple[str, ...]) -> Path:
+    """Local folder with some files of a remote one, fetched again when the last of them has changed.
+
+    Args:
+        url: of the remote folder.
+        names: files in it; the last one changes with the others.
+
+    Raises:
+        DataError: a file is missing.
+    """
+    folder, url = local_copy(url, "data"), url.rstrip("/")
+    with _locked(folder / ".lock"):
+        new = folder / f"{names[-1]}.new"
+        fetch(f"{url}/{names[-1]}", new)
+        old = folder / names[-1]
+        if not old.exists() or old.read_bytes() != new.read_bytes():
+            for name in names[:-1]:
+                fetch(f"{url}/{name}", folder / name)
+            write_text(folder / ORIGIN, url)
+            new.replace(old)
+        new.unlink(missing_ok=True)
+    return folder
+
+
+def find_files(url: str, pattern: str) -> dict[str, int]:
+    """Addresses and sizes of the remote files at a place: a file, a glob, or the matching files of a folder.
+
+    Args:
+        url: the place.
+        pattern: of file names in a folder, at any depth.
+
+    Raises:
+        DataError: there are none, or the place cannot be read.
+    """
+    with remote(url) as (files, place):
+        found = files.glob(place, detail=True) if has_magic(place) else {}
+        if not found and files.isfile(place):
+            found = {place: files.info(place)}
+        found = found or files.glob(f"{place.rstrip('/')}/**/{pattern}", detail=True)
+        sizes = {files.unstrip_protocol(name): info["size"] for name, info in sorted(found.items())}
+    if not sizes:
+        raise DataError(f"{url}: no {pattern} there.")
+    return sizes
