@@ -7,6 +7,7 @@ items write their own files in a folder that all machines see, and an item whose
 import hashlib
 import logging
 import pickle
+import socket
 import time
 import traceback
 from collections import Counter, deque
@@ -63,8 +64,12 @@ class RayRunner:
         is_own_session = not ray.is_initialized()
         if is_own_session:
             try:
+                # Ray itself ends this process where there is nothing at an address.
+                host, colon, port = self.address.rpartition(":")
+                if colon and port.isdecimal() and "/" not in host:
+                    socket.create_connection((host, int(port)), timeout=10).close()
                 ray.init(self.address, log_to_driver=False, logging_level=logging.ERROR)
-            except (ConnectionError, RuntimeError, ValueError) as error:
+            except (OSError, RuntimeError, ValueError) as error:
                 cause = str(error).strip().splitlines()[0]
                 raise ConfigError(
                     f"--ray {self.address}: no Ray cluster there ({cause}): `ray start` makes one."

@@ -1,0 +1,155 @@
+"""The same work inline, in processes, in shares and with processes killed: the same bytes, once each."""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from contextlib import suppress
+
+import pytest
+
+from rlftsim.cli.main import main
+from rlftsim.errors import ConfigError, DataError
+from rlftsim.evaluation.evaluate import EvaluateConfig, evaluate
+from rlftsim.lease import Lease
+from rlftsim.rollout.baselines import ConstantVelocity
+from rlftsim.scenario.convert import convert
+from rlftsim.workers import Inline, Share, Unfinished
+
+CONFIG = EvaluateConfig(num_rollouts=2, limit=9)
+
+
+@pytest.fixture
+def source(tmp_path, make_message, make_tfrecord):
+    """Seven files of three scenarios; two scenarios have the same id."""
+    for number in range(7):
+        messages = [make_message(f"{number}-{k}" if number < 6 or k else "0-0") for k in range(3)]
+        make_tfrecord(tmp_path / "womd" / f"training.tfrecord-{number:05d}-of-00007", *messages)
+    return tmp_path / "womd"
+
+
+def contents(folder):
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def by_shares(numbers, of, work):
+    """Run shares one after the other; all but the last say that others are left."""
+    for number in numbers[:-1]:
+        with pytest.raises(Unfinished, match=f"share {number}/{of} is done"):
+            work(Share(number, of, Inline()))
+    return work(Share(numbers[-1], of, Inline()))
+
+
+@pytest.mark.parametrize("order", [(1, 2, 3, 4), (4, 2, 1, 3)])
+def test_shares_convert_to_the_same_bytes_in_any_order(source, tmp_path, order):
+    whole = convert(source, tmp_path / "whole", jobs=1, show_progress=False)
+    shared = by_shares(order, 4, lambda share: convert(source, tmp_path / "shared", runner=share, show_progress=False))
+    assert contents(tmp_path / "shared") == contents(tmp_path / "whole")
+    assert (shared.converted, shared.duplicates) == (whole.converted, whole.duplicates)
+
+
+def test_shares_evaluate_to_the_same_bytes(tmp_path):
+    def work(share):
+        return evaluate(
+            ConstantVelocity(), "synthetic", tmp_path / "shared", CONFIG, name="a", runner=share, show_progress=False
+        )
+
+    evaluate(ConstantVelocity(), "synthetic", tmp_path / "whole", CONFIG, name="a", show_progress=False)
+    by_shares((2, 1, 3), 3, work)
+    assert contents(tmp_path / "shared") == contents(tmp_path / "whole")
+    with pytest.raises(ConfigError, match="shares meet in a folder"):
+        evaluate(ConstantVelocity(), "synthetic", None, CONFIG, runner=Share(1, 2, Inline()))
+
+
+def test_a_share_does_its_own_files_only_and_repeats_none(source, tmp_path):
+    for _ in range(2):
+        with pytest.raises(Unfinished, match="5 of 7 pieces are left"):
+            convert(source, tmp_path / "data", runner=Share(1, 4, Inline()), show_progress=False)
+    shards = tmp_path / "data" / "shards" / "training"
+    assert sorted(int(path.name[18:23]) for path in shards.glob("*.arrow")) == [0, 4]
+
+
+def test_a_share_that_others_finish_behind_is_put_together_by_join(source, tmp_path, capsys):
+    words = ["convert", str(source), str(tmp_path / "data"), "--jobs", "1"]
+    assert main([*words, "--share", "1/2"]) == 0
+    assert "share 1/2 is done; 3 of 7 pieces are left to other shares" in capsys.readouterr().err
+    assert main(["join", *words]) == 2
+    assert "3 of 7 pieces are missing: run the shares again" in capsys.readouterr().err
+    # the last share ends while another one, started twice by mistake, is still at work
+    with Lease(tmp_path / "data" / "INCOMPLETE", Share(1, 2, Inline()), "is converting to"):
+        assert main([*words, "--share", "2/2"]) == 0
+        assert "other shares are at work" in capsys.readouterr().err
+        assert main(["join", *words]) == 2
+        assert "another process is converting to" in capsys.readouterr().err
+    assert main(["join", *words]) == 0
+    convert(source, tmp_path / "whole", jobs=1, show_progress=False)
+    assert contents(tmp_path / "data") == contents(tmp_path / "whole")
+
+
+def test_a_source_that_changed_after_its_share_is_not_joined(source, tmp_path, make_message, make_tfrecord):
+    with pytest.raises(Unfinished):
+        convert(source, tmp_path / "data", runner=Share(1, 2, Inline()), show_progress=False)
+    make_tfrecord(source / "training.tfrecord-00002-of-00007", make_message("new"))
+    with pytest.raises(Unfinished, match="1 of 7 pieces are left"):
+        convert(source, tmp_path / "data", runner=Share(2, 2, Inline()), show_progress=False)
+
+
+@pytest.mark.parametrize(
+    ("first", "second"), [(Inline(), Inline()), (Inline(), Share(1, 2, Inline())), (Share(1, 2, Inline()), Inline())]
+)
+def test_a_second_driver_is_refused_with_the_owner_and_age_of_the_first(tmp_path, first, second):
+    with Lease(tmp_path / "lock", first, "works in"):
+        owner = rf"another process works in .* \(.* process {os.getpid()}, for 0:00:0\d\): wait for it"
+        with pytest.raises(DataError, match=owner):
+            Lease(tmp_path / "lock", second, "works in")
+        with pytest.raises(DataError, match=owner):  # also the same share twice
+            Lease(tmp_path / "lock", first, "works in")
+
+
+def test_shares_work_side_by_side_and_the_last_to_end_is_alone(tmp_path):
+    one, two = (Lease(tmp_path / "lock", Share(k, 2, Inline()), "works in") for k in (1, 2))
+    with one:
+        with two:
+            assert not two.is_alone
+            with pytest.raises(Unfinished, match="share 2/2 is done, other shares are at work"):
+                two.finish("work")
+        one.finish("work")
+        assert one.is_alone
+        one.remove()
+    assert list(tmp_path.iterdir()) == []
+
+
+SCRIPT = """
+import sys
+from rlftsim.scenario.convert import convert
+if __name__ == "__main__":
+    convert(sys.argv[1], sys.argv[2], jobs=2, show_progress=False)
+"""
+
+
+@pytest.mark.slow
+def test_a_conversion_whose_workers_are_killed_ends_with_the_same_bytes(tmp_path, make_message, make_tfrecord):
+    for number in range(8):
+        messages = [make_message(f"{number}-{k}", num_tracks=40) for k in range(8)]
+        make_tfrecord(tmp_path / "many" / f"training.tfrecord-{number:05d}-of-00008", *messages)
+    (tmp_path / "script.py").write_text(SCRIPT)
+    command = [sys.executable, str(tmp_path / "script.py"), str(tmp_path / "many"), str(tmp_path / "data")]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    num_killed, moments = 0, random.Random(0)
+    while process.poll() is None and num_killed < 4:
+        time.sleep(moments.uniform(0, 0.2))
+        # an unfinished shard has the number of its process in its name
+        for path in (tmp_path / "data").rglob("*.tmp"):
+            with suppress(ProcessLookupError):
+                os.kill(int(path.suffixes[-2][1:]), signal.SIGKILL)
+                num_killed += 1
+            break
+    messages = process.communicate(timeout=240)[1]
+    assert num_killed > 0
+    if process.returncode:  # a file was unlucky three times
+        assert "3 times and are set aside" in messages
+        convert(tmp_path / "many", tmp_path / "data", jobs=1, show_progress=False)
+    convert(tmp_path / "many", tmp_path / "whole", jobs=1, show_progress=False)
+    assert contents(tmp_path / "data") == contents(tmp_path / "whole")
