@@ -38,7 +38,7 @@ def cluster():
     folders = [str(PACKAGE.parent), str(Path(__file__).parent)]
     before = os.environ.get("PYTHONPATH")
     os.environ["PYTHONPATH"] = os.pathsep.join(folders)  # for the processes of the cluster
-    os.environ |= {"RAY_USAGE_STATS_ENABLED": "0", "RAY_raylet_start_wait_time_s": "180"}
+    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
     small = {"object_store_memory": 80_000_000, "include_dashboard": False}
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, **small})
     for _ in range(2):

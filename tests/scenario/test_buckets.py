@@ -1,0 +1,177 @@
+"""Data sets and sources in buckets, against moto's server: a real HTTP end point on this machine."""
+
+import json
+import os
+import urllib.request
+
+import numpy as np
+import pytest
+
+from rlftsim import storage
+from rlftsim.cli.main import main
+from rlftsim.errors import ConfigError, DataError
+from rlftsim.evaluation.evaluate import EvaluateConfig, evaluate
+from rlftsim.rollout.baselines import ConstantVelocity
+from rlftsim.scenario.convert import convert
+from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
+from rlftsim.scenario.transfer import pull_dataset, push_dataset
+from rlftsim.storage import fetch_shard
+
+
+@pytest.fixture(scope="module")
+def server():
+    """An empty S3 on a free port."""
+    moto = pytest.importorskip("moto.server", reason="moto is not installed: pip install 'moto[server]'")
+    pytest.importorskip("s3fs", reason='s3fs is not installed: pip install "rlftsim[s3]"')
+    server = moto.ThreadedMotoServer("127.0.0.1", port=0)
+    server.start()
+    host, port = server.get_host_and_port()
+    yield f"http://{host}:{port}"
+    server.stop()
+
+
+@pytest.fixture
+def bucket(server, tmp_path, monkeypatch):
+    """Address of an empty bucket; the cache is empty, too."""
+    import s3fs
+
+    for name, value in {
+        "AWS_ENDPOINT_URL": server, "AWS_ACCESS_KEY_ID": "a", "AWS_SECRET_ACCESS_KEY": "b",
+        "AWS_DEFAULT_REGION": "us-east-1", "RLFTSIM_CACHE": str(tmp_path / "cache"),
+    }.items():  # fmt: skip
+        monkeypatch.setenv(name, value)
+    request = urllib.request.Request(f"{server}/moto-api/reset", method="POST")
+    urllib.request.urlopen(request).close()
+    s3fs.S3FileSystem.clear_instance_cache()
+    s3fs.S3FileSystem().mkdir("bucket")
+    return "s3://bucket"
+
+
+@pytest.fixture
+def source(tmp_path, make_message, make_tfrecord):
+    for number in range(3):
+        messages = [make_message(f"{number}-{k}") for k in range(2)]
+        make_tfrecord(tmp_path / "womd" / "training" / f"training.tfrecord-{number:05d}-of-00003", *messages)
+    return tmp_path / "womd"
+
+
+@pytest.fixture
+def data(source, tmp_path):
+    convert(source, tmp_path / "data", jobs=1, show_progress=False)
+    return tmp_path / "data"
+
+
+def contents(folder):
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.fixture
+def fetched(monkeypatch):
+    """Addresses of the files that are fetched, in turn."""
+    names, fetch = [], storage.fetch
+
+    def count(url, path, sha256=None):
+        names.append(url.partition("bucket/")[2])
+        return fetch(url, path, sha256)
+
+    monkeypatch.setattr(storage, "fetch", count)
+    return names
+
+
+def test_a_data_set_comes_back_from_a_bucket_as_it_was(bucket, data, tmp_path, capsys):
+    assert main(["data", "push", str(data), f"{bucket}/set/"]) == 0
+    assert main(["data", "pull", f"{bucket}/set", str(tmp_path / "back")]) == 0
+    assert contents(tmp_path / "back") == contents(data)
+    assert main(["data", "verify", f"{bucket}/set"]) == 2
+    assert "copy it with `rlftsim data pull` first" in capsys.readouterr().err
+
+
+def test_an_evaluation_from_a_bucket_is_that_of_the_folder_and_fetches_each_shard_once(bucket, tmp_path, fetched):
+    pack = ScenarioDataset("synthetic", "validation")
+    write_dataset(list(pack[:3]), tmp_path / "data", split="validation")
+    push_dataset(tmp_path / "data", f"{bucket}/set", show_progress=False)
+    del fetched[:]
+    config = EvaluateConfig(num_rollouts=2)
+    for _ in range(2):  # a second process of the machine finds the shards in the cache
+        remote = evaluate(ConstantVelocity(), f"{bucket}/set", None, config, show_progress=False)
+    assert fetched == ["set/manifest.json", "set/index.parquet", "set/shards/00000.arrow", "set/manifest.json"]
+    local = evaluate(ConstantVelocity(), tmp_path / "data", None, config, show_progress=False)
+    assert remote.scenario_ids == local.scenario_ids
+    np.testing.assert_array_equal(remote.values("meta_metric"), local.values("meta_metric"))
+    assert remote.provenance.dataset == f"{bucket}/set"
+
+
+def test_sources_in_a_bucket_are_converted_to_the_same_bytes(bucket, source, data, tmp_path):
+    for path in source.rglob("*tfrecord*"):
+        storage.publish(path, f"{bucket}/womd/{path.relative_to(source).as_posix()}")
+    for place in (f"{bucket}/womd", f"{bucket}/womd/training/*tfrecord*"):
+        convert(place, tmp_path / "from_bucket", jobs=1, show_progress=False)
+        assert contents(tmp_path / "from_bucket") == contents(data)
+    with pytest.raises(DataError, match=r"s3://bucket/nothing: no \*tfrecord\* there"):
+        convert(f"{bucket}/nothing", tmp_path / "other")
+
+
+def test_a_push_that_is_cut_short_leaves_no_data_set_and_goes_on(bucket, data, tmp_path, monkeypatch):
+    url, publish = f"{bucket}/set", storage.publish
+
+    def cut(path, url):
+        if path.name == "index.parquet":
+            raise DataError("cut")
+        publish(path, url)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("rlftsim.scenario.transfer.publish", cut)
+        with pytest.raises(DataError, match="cut"):
+            push_dataset(data, url, show_progress=False)
+    with pytest.raises(DataError, match=r"s3://bucket/set/manifest\.json: there is no such file or bucket"):
+        ScenarioDataset(url)
+    push_dataset(data, url, show_progress=False)
+    pushed = []
+    monkeypatch.setattr("rlftsim.scenario.transfer.publish", lambda path, url: pushed.append(path.name))
+    push_dataset(data, url, show_progress=False)
+    assert pushed == ["index.parquet", "manifest.json"]  # the shards are there by the manifest
+    # a pull that was cut short goes on, too
+    (tmp_path / "back").mkdir()
+    (tmp_path / "back" / "INCOMPLETE").touch()
+    pull_dataset(url, tmp_path / "back", show_progress=False)
+    assert contents(tmp_path / "back") == contents(data)
+
+
+def test_a_shard_that_was_replaced_in_the_bucket_is_refused(bucket, data, tmp_path):
+    push_dataset(data, f"{bucket}/set", show_progress=False)
+    entry = json.loads((data / "manifest.json").read_text())["shards"][0]["file"]
+    (tmp_path / "other").write_bytes(b"other")
+    storage.publish(tmp_path / "other", f"{bucket}/set/{entry}")
+    with pytest.raises(DataError, match="damaged or replaced: its checksum is not that of the manifest"):
+        ScenarioDataset(f"{bucket}/set")[0]
+    assert not list((tmp_path / "cache").rglob("*.tmp"))
+
+
+def test_the_cache_keeps_what_was_used_last(tmp_path, monkeypatch):
+    monkeypatch.setenv("RLFTSIM_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setenv("RLFTSIM_CACHE_GB", "0.0000021")  # 2100 bytes
+    shas = {}
+    for number in range(3):
+        (tmp_path / str(number)).write_bytes(bytes([number]) * 1000)
+        shas[number] = storage.fetch(f"file://{tmp_path}/{number}", tmp_path / "any")
+    kept = {}
+    for age, number in enumerate((0, 1, 0, 2)):
+        path = fetch_shard(f"file://{tmp_path}/{number}", shas[number])
+        os.utime(path, (age, age))
+        kept[number] = path
+    assert [number for number, path in sorted(kept.items()) if path.exists()] == [0, 2]
+
+
+def test_addresses_that_cannot_be_read_are_refused_in_one_line(tmp_path, monkeypatch):
+    monkeypatch.setenv("RLFTSIM_CACHE", str(tmp_path / "cache"))
+    with pytest.raises(DataError, match=r"^file:///nowhere/manifest\.json: there is no such file or bucket\.$"):
+        ScenarioDataset("file:///nowhere")
+    with pytest.raises(DataError, match=r"^nonsense://x/manifest\.json: .*nonsense"):
+        ScenarioDataset("nonsense://x")
+
+    def missing(url):
+        raise ImportError("Install s3fs to access S3")
+
+    monkeypatch.setattr("fsspec.core.url_to_fs", missing)
+    with pytest.raises(ConfigError, match=r's3:// needs another library: pip install "rlftsim\[s3\]"'):
+        ScenarioDataset("s3://x")
