@@ -7,12 +7,15 @@ import subprocess
 import sys
 import time
 from contextlib import suppress
+from pathlib import Path
 
 import pytest
 
+import rlftsim
 from rlftsim.cli.main import main
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.evaluate import EvaluateConfig, evaluate
+from rlftsim.evaluation.results import Evaluation
 from rlftsim.lease import Lease
 from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.scenario.convert import convert
@@ -153,3 +156,28 @@ def test_a_conversion_whose_workers_are_killed_ends_with_the_same_bytes(tmp_path
         convert(tmp_path / "many", tmp_path / "data", jobs=1, show_progress=False)
     convert(tmp_path / "many", tmp_path / "whole", jobs=1, show_progress=False)
     assert contents(tmp_path / "data") == contents(tmp_path / "whole")
+
+
+@pytest.mark.slow
+def test_the_array_of_the_documents_runs_as_shell_processes(tmp_path):
+    page = (Path(__file__).parents[2] / "docs" / "machines.md").read_text()
+    script = next(block for block in page.split("```") if "#SBATCH" in block).partition("\n")[2]
+    small = {
+        "runs/rlft": "constant_velocity",
+        "data/womd": "synthetic",
+        "/64": "/2",
+        "--jobs 16": "--limit 5 --num-rollouts 2",
+    }
+    for old, new in small.items():
+        assert old in script
+        script = script.replace(old, new)
+    script = script.replace("rlftsim evaluate", f"{sys.executable} -m rlftsim evaluate")
+    environment = {**os.environ, "PYTHONPATH": str(Path(rlftsim.__file__).parents[1])}
+    processes = [
+        subprocess.Popen(["bash", "-c", script], env={**environment, "SLURM_ARRAY_TASK_ID": str(k)}, cwd=tmp_path)
+        for k in (1, 2)
+    ]
+    assert [process.wait(timeout=240) for process in processes] == [0, 0]
+    folder = tmp_path / "runs" / "evaluations"
+    assert [path.name for path in folder.iterdir()] == ["constant_velocity.parquet"]
+    assert len(Evaluation.read(folder / "constant_velocity.parquet")) == 5

@@ -27,6 +27,7 @@ from rlftsim.submission.check import check_archive
 from rlftsim.submission.closed_loop import refuse_open_loop, statement
 from rlftsim.submission.messages import round_states
 from rlftsim.submission.plan import refuse_incomplete, refuse_other_sources
+from rlftsim.workers import Inline, Share, Unfinished
 
 NUM_SHARDS = 6
 
@@ -43,7 +44,7 @@ def whole(data, tmp_path_factory):
 
 
 def build(data, folder, **settings):
-    more = {"delete_parts": settings.pop("delete_parts")} if "delete_parts" in settings else {}
+    more = {name: settings.pop(name) for name in ("delete_parts", "runner") if name in settings}
     job = entries.make_job(data, folder, **{"num_shards": NUM_SHARDS, **settings})
     return build_archive(job, show_progress=False, **more)
 
@@ -61,6 +62,30 @@ def test_the_archive_has_every_scenario_and_no_finding(data, whole, tmp_path):
 @pytest.mark.parametrize("jobs", [2])
 def test_any_number_of_processes_gives_the_same_bytes(jobs, data, whole, tmp_path):
     assert build(data, tmp_path, jobs=jobs).read_bytes() == whole
+
+
+@pytest.mark.parametrize("order", [(1, 2, 3), (3, 1, 2)])
+def test_shares_give_the_same_bytes(order, data, whole, tmp_path):
+    for number in order[:-1]:
+        with pytest.raises(Unfinished, match=f"submit: share {number}/3 is done"):
+            build(data, tmp_path, runner=Share(number, 3, Inline()))
+    assert build(data, tmp_path, runner=Share(order[-1], 3, Inline())).read_bytes() == whole
+    assert not [path for path in tmp_path.rglob(".*") if path.is_file()]
+
+
+@pytest.mark.slow
+def test_a_killed_build_with_two_processes_goes_on_to_the_same_bytes(data, whole, tmp_path):
+    for number in (1, 2):
+        process = multiprocessing.get_context("fork").Process(target=build, args=(data, tmp_path), kwargs={"jobs": 2})
+        process.start()
+        while process.is_alive() and len(list(tmp_path.rglob("*.part"))) < 2 * number:
+            time.sleep(0.01)
+        os.kill(process.pid, signal.SIGKILL)
+        process.join()
+        assert process.exitcode == -signal.SIGKILL
+        time.sleep(1.0)  # its workers end by themselves
+    assert build(data, tmp_path, jobs=2).read_bytes() == whole
+    assert not [path for path in tmp_path.rglob(".*") if path.is_file()]
 
 
 def test_a_killed_build_goes_on_to_the_same_bytes(data, whole, tmp_path):
