@@ -13,7 +13,7 @@ FLOORS = (
     ("errors",),
     ("aliases", "atomic_io", "geometry", "plugins", "progress", "statistics", "threads"),
     ("workers", "storage"),
-    ("lease", "cluster"),
+    ("lease",),
     ("scenario",),
     ("tokens", "goals"),
     ("rollout",),

@@ -3,7 +3,6 @@
     Inline()                this process
     Processes(4)            four processes of this machine
     Share(3, 64, runner)    every 64th item, from the third on; other machines do the others (`--share 3/64`)
-    RayRunner("auto")       a Ray cluster (`rlftsim.cluster.ray`, the extra "ray")
 
 Each piece writes a file of its own, and the same one whenever it is done again. So it does not matter where it is
 done, nor how often: a run that was stopped in any way is resumed by doing the pieces that have no file.

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 
-from rlftsim.errors import ConfigError
 from rlftsim.workers import Inline, OnDeath, Processes, Runner, Share
 
 
@@ -13,8 +12,6 @@ class Machines:
     share: str | None = None
     """Do every N-th piece of the work only, from the K-th on: "3/64" on one of 64 machines. The last one puts the
     result together."""
-    ray: str | None = None
-    """Work on a Ray cluster: its address, or "auto" (pip install "rlftsim[ray]")."""
 
     def runner(self, jobs: int, on_death: OnDeath) -> Runner | None:
         """Runner of the flags; None = the verb's own processes.
@@ -24,14 +21,8 @@ class Machines:
             on_death: of an item whose process dies.
 
         Raises:
-            ConfigError: a share that is none, both flags, or Ray is not installed.
+            ConfigError: a share that is none.
         """
-        if self.share is not None and self.ray is not None:
-            raise ConfigError("--share and --ray are two ways to use several machines: choose one.")
-        if self.ray is not None:
-            from rlftsim.cluster.ray import RayRunner
-
-            return RayRunner(self.ray, on_death)
         here = Processes(jobs, on_death) if jobs > 1 else Inline()
         if self.share is not None:
             return Share.parse(self.share, here)
