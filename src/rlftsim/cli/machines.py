@@ -14,7 +14,7 @@ class Machines:
     result together."""
 
     def runner(self, jobs: int, on_death: OnDeath) -> Runner | None:
-        """Runner of the flags; None = the verb's own processes.
+        """Runner of the flags; None = the verb's own choice of processes.
 
         Args:
             jobs: processes of this machine.
@@ -24,9 +24,7 @@ class Machines:
             ConfigError: a share that is none.
         """
         here = Processes(jobs, on_death) if jobs > 1 else Inline()
-        if self.share is not None:
-            return Share.parse(self.share, here)
-        return here if on_death == "stop" else None
+        return None if self.share is None else Share.parse(self.share, here)
 
 
 @dataclass(frozen=True)
@@ -36,3 +34,8 @@ class Work(Machines):
     on_error: OnDeath = "skip"
     """When a process dies three times at the same piece (out of memory, a crash): set that piece aside, do the others
     and end with status 1, or stop at the first death."""
+
+    def runner(self, jobs: int, on_death: OnDeath) -> Runner | None:
+        """Runner of the flags, see `Machines`."""
+        stops = on_death == "stop" and jobs > 1 and self.share is None
+        return Processes(jobs, on_death) if stops else super().runner(jobs, on_death)
