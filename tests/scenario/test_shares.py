@@ -1,21 +1,12 @@
 """The same work inline, in processes, in shares and with processes killed: the same bytes, once each."""
 
 import os
-import random
-import signal
-import subprocess
-import sys
-import time
-from contextlib import suppress
-from pathlib import Path
 
 import pytest
 
-import rlftsim
 from rlftsim.cli.main import main
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.evaluate import EvaluateConfig, evaluate
-from rlftsim.evaluation.results import Evaluation
 from rlftsim.lease import Lease
 from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.scenario.convert import convert
@@ -122,62 +113,3 @@ def test_shares_work_side_by_side_and_the_last_to_end_is_alone(tmp_path):
         assert one.is_alone
         one.remove()
     assert list(tmp_path.iterdir()) == []
-
-
-SCRIPT = """
-import sys
-from rlftsim.scenario.convert import convert
-if __name__ == "__main__":
-    convert(sys.argv[1], sys.argv[2], jobs=2, show_progress=False)
-"""
-
-
-@pytest.mark.slow
-def test_a_conversion_whose_workers_are_killed_ends_with_the_same_bytes(tmp_path, make_message, make_tfrecord):
-    for number in range(8):
-        messages = [make_message(f"{number}-{k}", num_tracks=40) for k in range(8)]
-        make_tfrecord(tmp_path / "many" / f"training.tfrecord-{number:05d}-of-00008", *messages)
-    (tmp_path / "script.py").write_text(SCRIPT)
-    command = [sys.executable, str(tmp_path / "script.py"), str(tmp_path / "many"), str(tmp_path / "data")]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-    num_killed, moments = 0, random.Random(0)
-    while process.poll() is None and num_killed < 4:
-        time.sleep(moments.uniform(0, 0.2))
-        # an unfinished shard has the number of its process in its name
-        for path in (tmp_path / "data").rglob("*.tmp"):
-            with suppress(ProcessLookupError):
-                os.kill(int(path.suffixes[-2][1:]), signal.SIGKILL)
-                num_killed += 1
-            break
-    messages = process.communicate(timeout=240)[1]
-    assert num_killed > 0
-    if process.returncode:  # a file was unlucky three times
-        assert "3 times and are set aside" in messages
-        convert(tmp_path / "many", tmp_path / "data", jobs=1, show_progress=False)
-    convert(tmp_path / "many", tmp_path / "whole", jobs=1, show_progress=False)
-    assert contents(tmp_path / "data") == contents(tmp_path / "whole")
-
-
-@pytest.mark.slow
-def test_the_array_of_the_documents_runs_as_shell_processes(tmp_path):
-    page = (Path(__file__).parents[2] / "docs" / "machines.md").read_text()
-    script = next(block for block in page.split("```") if "#SBATCH" in block).partition("\n")[2]
-    small = {
-        "runs/rlft": "constant_velocity",
-        "data/womd": "synthetic",
-        "/64": "/2",
-        "--jobs 16": "--limit 5 --num-rollouts 2",
-    }
-    for old, new in small.items():
-        assert old in script
-        script = script.replace(old, new)
-    script = script.replace("rlftsim evaluate", f"{sys.executable} -m rlftsim evaluate")
-    environment = {**os.environ, "PYTHONPATH": str(Path(rlftsim.__file__).parents[1])}
-    processes = [
-        subprocess.Popen(["bash", "-c", script], env={**environment, "SLURM_ARRAY_TASK_ID": str(k)}, cwd=tmp_path)
-        for k in (1, 2)
-    ]
-    assert [process.wait(timeout=240) for process in processes] == [0, 0]
-    folder = tmp_path / "runs" / "evaluations"
-    assert [path.name for path in folder.iterdir()] == ["constant_velocity.parquet"]
-    assert len(Evaluation.read(folder / "constant_velocity.parquet")) == 5
