@@ -1,4 +1,4 @@
-"""The same work inline, in processes, in shares and with processes killed: the same bytes, once each."""
+"""The same work by one driver and by shares of it: the same bytes, once each."""
 
 import os
 
