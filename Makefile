@@ -8,7 +8,7 @@ PIP = $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constr
 OUT ?= runs/demo
 PYTEST_FLAGS ?=
 
-.PHONY: demo demo-quick test lint types clean
+.PHONY: demo demo-quick test lint types types-js clean
 .DEFAULT_GOAL := demo
 
 ## the whole pipeline on the synthetic scenarios, to runs/demo/report.html
@@ -39,6 +39,10 @@ $(BIN)/.installed-test: $(BIN)/.installed
 ## static types; pyright and the node that runs it come as wheels
 types: $(BIN)/.installed-test
 	$(BIN)/pyright --pythonpath $(BIN)/python src
+
+## types of the studio's JavaScript, from its JSDoc
+types-js:
+	npx --yes --package typescript@7 tsc --project tests/studio/jsconfig.json
 
 clean:
 	rm -rf $(VENV) runs

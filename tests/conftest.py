@@ -1,4 +1,5 @@
 import os
+import shutil
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,8 @@ from rlftsim.recipes.registry import RECIPES
 from rlftsim.rewards.base import REWARDS
 from rlftsim.scenario.sources import SOURCES
 
-CHROMIUM = "/usr/bin/chromium"
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+"""Of the system; None = the one of `playwright install chromium`."""
 
 # slow machines are no failure; the same examples every time
 settings.register_profile("rlftsim", deadline=None, derandomize=True)
@@ -38,12 +40,12 @@ def forget_registered_names():
 
 @pytest.fixture(scope="session")
 def browser():
-    """A headless Chromium of the system; skipped where there is none."""
+    """A headless Chromium; skipped where there is none."""
     playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
     with playwright.sync_playwright() as session:
         try:
             launched = session.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu"])
         except playwright.Error as error:
-            pytest.skip(f"no usable Chromium at {CHROMIUM}: {str(error).splitlines()[0]}")
+            pytest.skip(f"no usable Chromium ({CHROMIUM or 'not installed'}): {str(error).splitlines()[0]}")
         yield launched
         launched.close()

@@ -74,7 +74,7 @@ function futurePath(agent, from, steps) {
 
 function readColors(element) {
   const style = getComputedStyle(element);
-  return new Proxy({}, { get: (cache, name) => (cache[name] ??= style.getPropertyValue(`--${name}`).trim()) });
+  return new Proxy({}, { get: (cache, name) => (cache[name] ??= style.getPropertyValue(`--${String(name)}`).trim()) });
 }
 
 function drawMap(ctx, map, colors, px) {

@@ -1,6 +1,10 @@
 // Small helpers for the document. Text is always set as text, never as HTML.
 
+/** An element of index.html, where each id is of the kind that its use needs. @returns {any} */
 const byId = (id) => document.getElementById(id);
+
+/** The picture of a canvas. `onCpu` keeps it in the CPU's memory, as a context without a GPU is emulated. @returns {CanvasRenderingContext2D} */
+const contextOf = (canvas, { onCpu = false, alpha = true } = {}) => canvas.getContext("2d", { willReadFrequently: onCpu, alpha });
 
 /** An element with properties (`class`, `onclick`, attributes) and children, which are elements or text. */
 function make(tag, properties = {}, ...children) {
@@ -34,4 +38,4 @@ function openDialog(title, ...content) {
 
 const closeDialog = () => byId("dialog").close();
 
-export { byId, closeDialog, make, openDialog, speak, toast };
+export { byId, closeDialog, contextOf, make, openDialog, speak, toast };

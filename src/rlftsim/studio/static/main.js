@@ -341,7 +341,7 @@ const stage = new Stage(byId("panels"));
 const timeline = new Timeline((stamp) => stage.frame(stamp));
 const list = new ScenarioList(byId("rows"), () => stage.colors(), (id) => openScenario(id));
 const actions = { place: startPlacing };
-let drawing = 0;
+let drawing = 0, addressing = 0;
 
 /** Draws once before the next frame, however many changes there are. */
 function drawSoon() {
@@ -362,8 +362,8 @@ onChange((topics) => {
   if (has("run")) speak(sentence());
   if (has("open-first")) stepScenario(1);
   drawSoon();
-  clearTimeout(onChange.timer);
-  onChange.timer = setTimeout(() => { if (!state.playing && state.scene) history.replaceState(null, "", toHash()); }, 400);
+  clearTimeout(addressing);
+  addressing = setTimeout(() => { if (!state.playing && state.scene) history.replaceState(null, "", toHash()); }, 400);
 });
 
 function renderNote() {

@@ -59,7 +59,7 @@ async function simulate(count = state.count) {
       if (data.first === 0) load(data);
     } else if (event === "chunk") load(data);
     else if (event === "score") pending = pending.then(() => { mark(fresh.get(names[data.variant]), data); publish(fresh, names[data.variant]); });
-    else if (event === "done") pending = pending.then(() => finish(`${count} rollouts in ${((performance.now() - started) / 1000).toFixed(1)} s`, count));
+    else if (event === "done") pending = pending.then(() => finish(`${count} rollouts in ${((performance.now() - started) / 1000).toFixed(1)} s`));
     else if (event === "failed") pending = pending.then(() => finish(data.message));
   });
 }

@@ -1,4 +1,5 @@
 // One panel: a canvas that copies a still layer (map and trails) and draws what moves on top of it.
+import { contextOf } from "./dom.js";
 import { CYCLIST, PEDESTRIAN, ROLE_NAMES, STEP_S, TYPE_NAMES, drawAgent, drawLights, drawMap, stateAt } from "./drawing.js";
 import { goalOf, ownGoals, state } from "./state.js";
 
@@ -17,7 +18,7 @@ class Ground {
     this.key = key;
     if (this.onCpu !== onCpu) { this.onCpu = onCpu; this.layer = document.createElement("canvas"); }
     this.layer.width = width; this.layer.height = height;
-    const ctx = this.layer.getContext("2d", { willReadFrequently: onCpu }), k = scale * ratio;
+    const ctx = contextOf(this.layer, { onCpu }), k = scale * ratio;
     ctx.fillStyle = colors.ground; ctx.fillRect(0, 0, width, height);
     ctx.setTransform(k, 0, 0, -k, width / 2 - k * x, height / 2 + k * y);
     if (state.map) drawMap(ctx, state.map, colors, 1 / scale);
@@ -45,9 +46,9 @@ class Panel {
     this.canvas?.remove();
     this.frame.prepend(canvas);
     this.canvas = canvas;
-    this.ctx = canvas.getContext("2d", { willReadFrequently: this.stage.onCpu, alpha: false });
+    this.ctx = contextOf(canvas, { onCpu: this.stage.onCpu, alpha: false });
     if (this.stage.onCpu) this.still = document.createElement("canvas");
-    this.stillCtx = this.still.getContext("2d", { willReadFrequently: this.stage.onCpu, alpha: false });
+    this.stillCtx = contextOf(this.still, { onCpu: this.stage.onCpu, alpha: false });
     this.stillKey = "";
     this.resize();
     this.stage.bind(this);
@@ -81,6 +82,7 @@ class Panel {
     const { ctx, canvas } = this;
     if (!state.scene || canvas.width < 2) return;
     const ratio = canvas.width / Math.max(canvas.clientWidth, 1), k = this.scale * ratio, px = 1 / this.scale;
+    /** @type {[number, number, number, number, number, number]} */
     this.transform = [k, 0, 0, -k, canvas.width / 2 - k * state.view.x, canvas.height / 2 + k * state.view.y];
     this.drawStill(colors, ratio, px);
     ctx.setTransform(1, 0, 0, 1, 0, 0);

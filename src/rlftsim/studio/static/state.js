@@ -54,7 +54,7 @@ function toHash() {
   parts.set("view", [x, y, r].map((v) => v.toFixed(1)).join(","));
   if (state.selected >= 0) parts.set("agent", String(state.selected));
   if (state.rollout) parts.set("rollout", String(state.rollout));
-  for (const [name, usual] of [["seed", 0], ["count", 32], ["temperature", 1], ["topK", null], ["guidance", 1], ["metric", "2025"]]) {
+  for (const [name, usual] of Object.entries({ seed: 0, count: 32, temperature: 1, topK: null, guidance: 1, metric: "2025" })) {
     if (state[name] !== usual) parts.set(name, String(state[name]));
   }
   if (!state.showAll) parts.set("all", "0");

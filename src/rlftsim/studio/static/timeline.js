@@ -58,7 +58,7 @@ class Timeline {
 
   renderRollouts() {
     const count = Math.max(1, ...state.panels.map((key) => state.variants.get(key)?.rollouts.length ?? 0)), chooser = byId("rollout");
-    document.querySelectorAll(".several").forEach((element) => { element.hidden = count < 2; });
+    document.querySelectorAll(".several").forEach((element) => element.toggleAttribute("hidden", count < 2));
     if (chooser.length !== count) chooser.replaceChildren(...Array.from({ length: count }, (_, n) => make("option", { value: n }, `${n + 1} of ${count}`)));
     chooser.value = String(Math.min(state.rollout, count - 1));
     byId("all").checked = state.showAll; byId("trails").checked = state.trails;
