@@ -24,7 +24,24 @@ def test_shipped_weights_are_computed_with_in_float32():
     assert {weight.dtype for weight in weights} == {torch.float32}
 
 
+def test_the_shipped_goal_model_follows_goals_and_is_the_base_model_without_them():
+    data = rs.load_dataset("synthetic", "validation")
+    scenario = data["9d639de83d6f5239"]
+    base, goals = (rs.load_policy(name) for name in ("demo-base", "demo-goals"))
+    free, same = (rs.simulate(policy, scenario, num_rollouts=4, seed=1).position for policy in (base, goals))
+    assert torch.equal(free, same)
+    # The ego's logged end, 8 s ahead.
+    place = {scenario.scenario_id: {179: (-36.715, -2.361)}}
+    led = rs.simulate(goals, scenario, num_rollouts=4, seed=1, goals=place).position
+    track = int(np.flatnonzero(scenario.tracks.object_id[scenario.simulated_indices] == 179)[0])
+    end = torch.as_tensor(np.array(place[scenario.scenario_id][179]) - scenario.origin, dtype=torch.float32)
+    away = [(one[0, :, track, -1] - end).norm(dim=-1).median() for one in (free, led)]
+    assert away[1] < 0.5 * away[0]
+
+
 def test_shipped_models_are_small_and_say_what_they_are():
     assert sum(file.stat().st_size for file in FOLDER.rglob("*") if file.is_file()) < MOST_BYTES
-    for folder in (path for path in FOLDER.iterdir() if (path / "config.json").exists()):
+    folders = [path for path in FOLDER.iterdir() if any(path.glob("*.safetensors"))]
+    assert sorted(folder.name for folder in folders) == ["demo-base", "demo-goals"]
+    for folder in folders:
         assert "CC0" in (folder / "README.md").read_text()

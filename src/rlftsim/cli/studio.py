@@ -24,7 +24,7 @@ class StudioVerb:
     data: str = "synthetic"
     """Folder of a data set, or "synthetic" for the scenarios that ship with the package."""
     model: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
-    """A run, a model folder, or a registered name; may be given many times. Left out: "demo-base"."""
+    """A run, a model folder, or a registered name; may be given many times. Left out: "demo-goals"."""
     split: str | None = None
     """Split that is shown first. Left out: validation, where there is one."""
     out: Path = Path("studio")
@@ -59,7 +59,7 @@ class StudioVerb:
 
         if self.host not in LOOPBACK:
             print(f"rlftsim: listening on {self.host}, unencrypted: keep the address secret.", file=sys.stderr)
-        session = Session(self.data, tuple(self.model) or ("demo-base",), self.split, self.out, self.device)
+        session = Session(self.data, tuple(self.model) or ("demo-goals",), self.split, self.out, self.device)
         token = None if self.token_file is None else token_of(self.token_file)
         studio = Studio(session, host=self.host, port=self.port, token=token, trusted_hosts=tuple(self.trust_host))
         announce(studio, as_json=self.json, open_browser=not self.no_browser)

@@ -56,7 +56,7 @@ class StudioCell:
 
 def open_studio(
     data: str | os.PathLike[str] = "synthetic",
-    models: Sequence[str | os.PathLike[str]] = ("demo-base",),
+    models: Sequence[str | os.PathLike[str]] = ("demo-goals",),
     *,
     split: str | None = None,
     out: str | os.PathLike[str] = "studio",

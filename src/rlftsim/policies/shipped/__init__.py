@@ -6,9 +6,22 @@ on and how it scores.
 
 from pathlib import Path
 
+from safetensors.torch import load_file
+
+from rlftsim.policies.checkpoint import load_strictly
 from rlftsim.policies.smart.policy import SmartPolicy
+
+FOLDER = Path(__file__).parent
 
 
 def demo_base() -> SmartPolicy:
     """SMART of the demo's size, pre-trained on 2 560 synthetic scenarios: it reads the map, and is not fine-tuned."""
-    return SmartPolicy.from_pretrained(Path(__file__).parent / "demo-base")
+    return SmartPolicy.from_pretrained(FOLDER / "demo-base")
+
+
+def demo_goals() -> SmartPolicy:
+    """`demo_base` with a trained goal encoder: 192 weights more, and without goals the same to the last bit."""
+    policy = demo_base().with_goal_conditioning("indication", logit_bias=True)
+    weights, source = policy.network.state_dict(), FOLDER / "demo-goals" / "goals.safetensors"
+    load_strictly(policy.network, weights | load_file(source), source=str(source))
+    return policy

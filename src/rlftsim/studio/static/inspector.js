@@ -15,25 +15,34 @@ function renderAgent(actions) {
   const host = byId("agent");
   const index = state.scene ? indexOf(state.selected) : -1;
   if (index < 0) {
-    host.replaceChildren(make("h2", {}, "Agent"), make("p", { class: "muted" }, "Click an agent, or press Tab. Its maneuvers and goal appear here."));
+    host.replaceChildren(make("h2", {}, "Agent"), make("p", { class: "muted" }, "Click an agent, or press Tab. Its maneuvers and goal appear here."), ...choiceParts("Or find one that can do", actions));
     return;
   }
   const [id, , length, width] = state.scene.agents[index], goal = goalOf(id), takes = goalModels().length > 0;
   host.replaceChildren(
     make("h2", {}, `Agent ${agentName(index)}`),
     make("dl", {}, make("dt", {}, "speed now"), make("dd", {}, `${number(state.speeds[index], 1)} m/s`), make("dt", {}, "size"), make("dd", {}, `${number(length / 100, 1)} × ${number(width / 100, 1)} m`)),
-    ...proposalParts(id, goal, takes),
+    ...proposalParts(id, goal, takes, actions),
     ...goalParts(id, goal, takes, actions),
+    ...choiceParts("Find an agent that can do", actions),
   );
 }
 
-function proposalParts(id, goal, takes) {
+/** Maneuvers that agents of this scenario can do; a press selects the next of them. */
+function choiceParts(title, actions) {
+  const found = Object.entries(state.maneuvers);
+  if (!found.length) return [];
+  const buttons = found.map(([name, ids]) => make("li", {}, make("button", { onclick: () => actions.find(ids), title: `Select the next of ${ids.length} agents` }, `${maneuverName(name)} · ${ids.length}`)));
+  return [make("p", { class: "note" }, title), make("ul", { class: "choices" }, ...buttons)];
+}
+
+function proposalParts(id, goal, takes, actions) {
   const found = state.proposals && state.proposals.agent === id ? state.proposals : null;
   if (!found) return [make("p", { class: "note" }, "Looking for maneuvers …")];
   if (!found.proposals.length) return [make("p", { class: "note" }, `No maneuver to propose: ${found.reason}. Press G and place a goal.`)];
   const buttons = found.proposals.map((proposal, n) => {
     const chosen = goal && goal.x === proposal.x && goal.y === proposal.y;
-    const press = () => (chosen ? removeGoal(id) : putGoal(id, proposal.x, proposal.y, proposal.label));
+    const press = () => (chosen ? removeGoal(id) : actions.take(proposal));
     return make("li", {}, make("button", { "aria-pressed": String(Boolean(chosen)), disabled: !takes, onclick: press, title: proposal.doubts.join(" ") || null },
       make("kbd", {}, String(n + 1)), ` ${maneuverName(proposal.maneuver)}${proposal.logged ? " · logged" : ""}`));
   });
@@ -66,6 +75,7 @@ function renderResults() {
       const n = found.num_rollouts;
       rows.push(make("p", { class: "result" }, make("b", {}, `${variant.name}, agent ${outcome.agent}`), `: passed in ${outcome.passed} of ${n}, reached in ${outcome.reached}, `,
         `nearest ${number(outcome.best_m, 1)} m, median ${number(outcome.median_m, 1)} m`));
+      if (2 * outcome.passed < n) rows.push(make("p", { class: "note" }, "Few rollouts pass: raise the goal guidance, take an agent that moves, or a nearer goal."));
     }
     if (found?.change) rows.push(make("p", { class: "result" }, `realism ${signed(found.change.mean)} ± ${number(found.change.margin)} against the same seeds without goals (${found.num_rollouts} rollouts)`));
   }

@@ -10,7 +10,7 @@ import { FrameMeter, Ground, Panel } from "./stage.js";
 import { changed, fromHash, goalOf, goalsText, onChange, ownGoals, putGoal, redo, removeGoal, setGoals, state, toHash, undo } from "./state.js";
 import { Timeline } from "./timeline.js";
 
-const MAX_PANELS = 4, SNAP_M = 1.5, PIN_HIT_PX = 12, CLICK_PX = 4, ALIVE_MS = 1500, LEAST_R = 6, MOST_R = 500, PLACE_AHEAD_S = 4;
+const MAX_PANELS = 4, SNAP_M = 1.5, PIN_HIT_PX = 12, CLICK_PX = 4, ALIVE_MS = 1500, LEAST_R = 6, MOST_R = 500, PLACE_AHEAD_S = 4, REST_MS = 400;
 
 // ---- stage ----------------------------------------------------------------------------------------------------------
 
@@ -124,7 +124,7 @@ class Stage {
   click(panel, event, pin) {
     if (state.placing) { [state.placing.x, state.placing.y] = snapped(panel.toWorld(event), event.altKey); return commitPlacing(); }
     if (pin?.goal) return select(pin.goal.agent);
-    if (pin?.proposal) return putGoal(state.selected, pin.proposal.x, pin.proposal.y, pin.proposal.label);
+    if (pin?.proposal) return takeProposal(pin.proposal);
     const index = panel.nearest(panel.toWorld(event));
     select(index < 0 ? -1 : state.scene.agents[index][0]);
   }
@@ -134,6 +134,18 @@ class Stage {
     state.view = { x: x + (state.view.x - x) * share, y: y + (state.view.y - y) * share, r };
     changed("view");
   }
+
+  /** Moves and widens the view so far that points of the map are in sight, with a margin. */
+  reveal(points) {
+    const { canvas, scale } = this.panels[0], [w, h] = [canvas.clientWidth / 2, canvas.clientHeight / 2];
+    if (points.every(([x, y]) => Math.abs(x - state.view.x) * scale < w && Math.abs(y - state.view.y) * scale < h)) return;
+    const xs = points.map(([x]) => x), ys = points.map(([, y]) => y), [left, right, low, high] = [Math.min(...xs), Math.max(...xs), Math.min(...ys), Math.max(...ys)];
+    const needed = Math.max((right - left) / w, (high - low) / h) * 0.65 * Math.min(w, h);
+    state.view = { x: (left + right) / 2, y: (low + high) / 2, r: Math.min(Math.max(state.view.r, needed), MOST_R) };
+    changed("view");
+  }
+
+  placeOf(id) { const { x, y } = state.log.agents[this.indexOf(id)], { now } = state.scene; return [x[now], y[now]]; }
 
   fit() { const [x, y, r] = state.scene.focus; state.view = { x, y, r }; changed("view"); }
 }
@@ -214,11 +226,29 @@ async function loadProposals(id) {
   } catch (error) { toast(error.message); }
 }
 
+/** The next of some agents behind the selected one, in sight. */
+function selectNext(ids) {
+  const id = ids[(ids.indexOf(state.selected) + 1) % ids.length];
+  select(id);
+  stage.reveal([stage.placeOf(id)]);
+}
+
+async function loadManeuvers() {
+  const id = state.id;
+  const found = await get(`api/maneuvers/${encodeURIComponent(state.split)}/${encodeURIComponent(id)}`).catch(() => null);
+  if (found && state.id === id) { state.maneuvers = found.maneuvers; renderAgent(actions); }
+}
+
 const nextAgent = (by) => { const { agents } = state.scene, at = indexOf(state.selected); select(agents[(at + by + agents.length + (at < 0 && by < 0 ? 1 : 0)) % agents.length][0]); };
 
 function chooseManeuver(number) {
   const proposal = state.proposals?.proposals[number - 1];
-  if (proposal && goalModels().length) putGoal(state.selected, proposal.x, proposal.y, proposal.label);
+  if (proposal && goalModels().length) takeProposal(proposal);
+}
+
+function takeProposal({ x, y, label }) {
+  stage.reveal([stage.placeOf(state.selected), stage.toMap({ x, y })]);
+  putGoal(state.selected, x, y, label);
 }
 
 // ---- scenes ---------------------------------------------------------------------------------------------------------
@@ -231,7 +261,7 @@ async function openScenario(id, { view = null, time = null } = {}) {
     id, scene: found.scene, origin: found.origin, speeds: found.speeds, hasFuture: found.has_future, map: buildMap(found.scene.map),
     lanes: [...(found.scene.map.lane ?? []), ...(found.scene.map.bike_lane ?? [])].map(decodePoints),
     log: { steps: found.log.steps, agents: found.log.rollouts[0].map((agent) => decodeAgent(agent, found.log.steps)) },
-    selected: -1, hovered: -1, proposals: null, placing: null, rollout: 0, time: time ?? found.scene.now,
+    selected: -1, hovered: -1, proposals: null, maneuvers: {}, placing: null, rollout: 0, time: time ?? found.scene.now,
   });
   const [x, y, r] = found.scene.focus;
   state.view = view ?? { x, y, r };
@@ -239,6 +269,8 @@ async function openScenario(id, { view = null, time = null } = {}) {
   document.title = `${id} · rlftsim studio`;
   if (found.note) status(found.note);
   changed("scene", "view", "data", "selection");
+  clearTimeout(finding);
+  if (goalModels().length) finding = setTimeout(loadManeuvers, REST_MS); // not while scenarios are stepped through
   checkGoals();
   return true;
 }
@@ -340,8 +372,8 @@ function addPanel() {
 const stage = new Stage(byId("panels"));
 const timeline = new Timeline((stamp) => stage.frame(stamp));
 const list = new ScenarioList(byId("rows"), () => stage.colors(), (id) => openScenario(id));
-const actions = { place: startPlacing };
-let drawing = 0, addressing = 0;
+const actions = { place: startPlacing, find: selectNext, take: takeProposal };
+let drawing = 0, addressing = 0, finding = 0;
 
 /** Draws once before the next frame, however many changes there are. */
 function drawSoon() {

@@ -96,6 +96,7 @@ function finish(text) {
   status(text); speak(text);
   byId("run-status").dataset.over = state.run;
   changed("data", "run");
+  byId("results").scrollIntoView({ block: "nearest" });
 }
 
 const status = (text) => { byId("run-status").textContent = text; };

@@ -10,7 +10,7 @@ const state = {
   time: 0, rollout: 0, speed: 1, playing: false, showAll: true, trails: true,
   view: { x: 0, y: 0, r: 50 },
   seed: 0, count: 32, temperature: 1, topK: null, guidance: 1, metric: "2025", live: false,
-  proposals: null, doubts: new Map(), placing: null, loss: null,
+  proposals: null, maneuvers: {}, doubts: new Map(), placing: null, loss: null,
   goals: { goals: [], alternatives: [] }, savedAs: "goals",
 };
 
