@@ -2,22 +2,32 @@
 
     python benchmarks/studio.py --model runs/goals --out studio_bench [--pictures docs/studio]
 
-Prints a JSON line for each measurement. Needs the extra `studio`, playwright and /usr/bin/chromium.
+Prints a JSON line for each measurement. Needs the extra `studio`, playwright and a chromium.
 """
 
 import argparse
 import io
 import json
 import os
+import shutil
+import signal
 import subprocess
 import sys
+import tempfile
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import imageio_ffmpeg
 import numpy as np
 from PIL import Image
 from playwright.sync_api import Page, sync_playwright
+
+from rlftsim.scenario.dataset import write_dataset
+from rlftsim.scenario.open import open_dataset
+from rlftsim.scenario.types import MapFeatures, Tracks
 
 ARGUMENTS = ["--no-sandbox", "--disable-gpu", "--enable-precise-memory-info", "--js-flags=--expose-gc"]
 LOADS = "studio.state.scene && studio.state.total > 0"
@@ -71,6 +81,51 @@ def cpu_s(root: int) -> float:
 def still(page: Page, path: Path) -> None:
     """A screenshot as webp."""
     Image.open(io.BytesIO(page.screenshot())).convert("RGB").save(path, quality=82, method=6)
+
+
+def write_large(folder: Path) -> None:
+    """A data set with a scenario of 128 agents and 38 000 map points: another one, repeated side by side."""
+    (scenario, *_) = open_dataset("synthetic", "validation")
+    tracks, features = scenario.tracks, scenario.map_features
+    row = np.concatenate([[scenario.ego_index], np.resize(scenario.simulated_indices, 127)])
+    shift = 4.0 * (np.arange(128) // len(scenario.simulated_indices))
+    many = {name: getattr(tracks, name)[row] for name in ("object_type", "heading", "velocity", "size", "valid")}
+    position = tracks.position[row] + np.stack([shift, shift, 0 * shift], -1)[:, None].astype(np.float32)
+    crowd = Tracks(object_id=np.arange(128), position=position, **many)
+    lines = [
+        (k * 10_000 + int(one), int(kind), features.points[start:stop] + np.float32([3.0 * k, 3.0 * k, 0.0]))
+        for k in range(1 + 38_000 // len(features.points))
+        for one, kind, start, stop in zip(
+            features.feature_id, features.feature_type, features.offsets[:-1], features.offsets[1:]
+        )
+    ]
+    kept = np.searchsorted(np.cumsum([len(points) for _, _, points in lines]), 38_000)
+    large = replace(
+        scenario, scenario_id="large", tracks=crowd, map_features=MapFeatures.of(lines[: kept + 1]), ego_index=0,
+        tracks_to_predict=np.arange(1, 9, dtype=np.int32), difficulty=np.zeros(8, np.int8),
+        objects_of_interest=np.zeros(0, np.int64),
+    )  # fmt: skip
+    write_dataset([scenario, large], folder, split="validation")
+
+
+def measure_large(browser, url: str) -> None:
+    """Time from the click on a scenario of 128 agents and 38 000 map points to its picture, scene not in memory."""
+    page = browser.new_page(viewport={"width": 1600, "height": 900}, reduced_motion="reduce")
+    page.goto(url)
+    wait(page, f"{LOADS} && studio.stage.panels[0].states")
+    before = cpu_s(os.getpid())
+    milliseconds = page.evaluate(
+        """async () => {
+          const begun = performance.now();
+          await studio.openScenario("large");
+          await new Promise((drawn) => requestAnimationFrame(() => requestAnimationFrame(drawn)));
+          return performance.now() - begun;
+        }"""
+    )
+    agents = page.evaluate("() => studio.state.scene.agents.length")
+    used = round(cpu_s(os.getpid()) - before, 2)
+    say("a large scenario opens", agents=agents, milliseconds=round(milliseconds), cpu_s=used)
+    page.close()
 
 
 def say(name: str, **values: object) -> None:
@@ -230,6 +285,22 @@ def tell(browser, url: str, folder: Path) -> None:
         page.close()
 
 
+@contextmanager
+def studio(*words: str) -> Iterator[str]:
+    """The command in a process of its own: its address."""
+    begun, command = time.monotonic(), [sys.executable, "-m", "rlftsim", "studio", "--no-browser", "--json", *words]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
+        try:
+            url = json.loads(server.stdout.readline())["url"]
+            seconds = round(time.monotonic() - begun, 2)
+            say("from the command to the address", seconds=seconds, cpu_s=round(cpu_s(server.pid), 2))
+            yield url
+            begun = time.monotonic()
+        finally:
+            server.send_signal(signal.SIGINT)
+    say("from Ctrl-C to the end", seconds=round(time.monotonic() - begun, 2))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--model", action="append", required=True)
@@ -237,22 +308,21 @@ def main() -> None:
     parser.add_argument("--pictures", type=Path)
     parser.add_argument("--only-pictures", action="store_true")
     options = parser.parse_args()
-    words = [sys.executable, "-m", "rlftsim", "studio", "--no-browser", "--json", "--out", str(options.out)]
-    for model in options.model:
-        words += ["--model", model]
+    words = ["--out", str(options.out), *(word for model in options.model for word in ("--model", model))]
     begun = time.monotonic()
-    with sync_playwright() as session, subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as server:
-        try:
-            browser = session.chromium.launch(executable_path="/usr/bin/chromium", args=ARGUMENTS)
-            url = json.loads(server.stdout.readline())["url"]
-            say("from the command to the address", seconds=round(time.monotonic() - begun, 2), cpu_s=cpu_s(server.pid))
+    with sync_playwright() as session:
+        browser = session.chromium.launch(executable_path=shutil.which("chromium"), args=ARGUMENTS)
+        with studio(*words) as url:
             if not options.only_pictures:
                 measure(browser, begun, url)
             if options.pictures:
                 tell(browser, url, options.pictures)
-            browser.close()
-        finally:
-            server.terminate()
+        if not options.only_pictures:
+            with tempfile.TemporaryDirectory() as folder:
+                write_large(Path(folder) / "large")
+                with studio("--out", folder, "--data", str(Path(folder) / "large")) as url:
+                    measure_large(browser, url)
+        browser.close()
 
 
 if __name__ == "__main__":

@@ -152,6 +152,14 @@ def test_what_cannot_be_served_or_saved_is_refused_at_the_start(tmp_path, capsys
     assert f"--out {tmp_path / 'file'} is a file" in out
 
 
+def test_the_error_names_the_flag_that_is_wrong(session):
+    with Studio(session) as first, pytest.raises(ConfigError, match="choose another --port, or 0"):
+        Studio(session, port=first.port)
+    for host in ("192.0.2.7", "no.such.name.invalid"):
+        with pytest.raises(ConfigError, match=r"cannot listen on .*: choose another --host\."):
+            Studio(session, host=host)
+
+
 def test_another_host_needs_a_word_more(capsys):
     from rlftsim.cli.main import main
 

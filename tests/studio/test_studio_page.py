@@ -3,13 +3,23 @@
 import io
 import json
 import re
+import subprocess
+import sys
 import time
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from threading import Thread
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from PIL import Image
 
+import rlftsim as rs
 from rlftsim.goals.goals_file import read_goals
+from rlftsim.rollout.files import write_rollouts
+from rlftsim.scenario.batch import collate
+from rlftsim.studio.notebook import NOTEBOOK_ORIGINS, StudioCell
 from rlftsim.studio.server import static_files
 from rlftsim.studio.serving import Studio
 
@@ -275,6 +285,103 @@ def test_the_page_says_that_the_server_is_gone_and_when_it_is_back(browser, sess
         page.page.get_by_text("The studio is back.").wait_for(timeout=8000)
         page.errors.clear()  # the browser reports the refused connections
         page.close()
+
+
+def start_command(folder, port):
+    """The command itself, in a process of its own, on a port with a token that survive a new start."""
+    words = ["studio", "--no-browser", "--json", "--out", str(folder / "out"), "--token-file", str(folder / "token")]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "rlftsim", *words, "--port", str(port)], stdout=subprocess.PIPE, text=True
+    )
+    return process, json.loads(process.stdout.readline())
+
+
+@pytest.mark.slow
+def test_a_server_that_is_killed_while_it_simulates_is_missed_in_three_seconds_and_the_run_goes_on(browser, tmp_path):
+    process, about = start_command(tmp_path, 0)
+    try:
+        page = Page(browser, SimpleNamespace(port=about["port"], url=about["url"])).open("#count=128")
+        page.page.locator("#simulate").click()
+        page.wait("studio.state.variants.get('demo-goals')?.rollouts.length >= 4")
+        process.kill()
+        process.wait()
+        killed = time.monotonic()
+        page.wait("document.getElementById('status').textContent.includes('does not answer')", seconds=30)
+        print(json.dumps({"missed_s": round(time.monotonic() - killed, 2)}))
+        assert time.monotonic() - killed < 8  # 3 s where nothing else computes
+        process, _ = start_command(tmp_path, about["port"])
+        page.page.get_by_text("The studio is back.").wait_for(timeout=30_000)
+        page.wait("studio.state.isRunning && studio.state.variants.get('demo-goals').rollouts.length >= 4")
+        page.page.locator("#cancel").click()
+        page.errors.clear()  # the browser reports the refused connections
+        page.close()
+    finally:
+        process.kill()
+        process.wait()
+
+
+def test_rollouts_of_files_have_a_panel_with_their_score(browser, tmp_path):
+    from rlftsim.studio.session import Session
+
+    scenario = rs.load_dataset("synthetic", "validation")[SCENARIO]
+    rollouts = rs.simulate("constant_velocity", scenario, num_rollouts=3)
+    write_rollouts(tmp_path / "still", collate([scenario]), rollouts)
+    with Studio(Session("synthetic", ("demo-base",), None, tmp_path, rollouts=(str(tmp_path / "still"),))) as plain:
+        page = Page(browser, plain).open(f"#split=validation&id={SCENARIO}")
+        assert page.state("studio.state.panels") == ["log", "demo-base", "rollouts/still"]
+        page.wait("studio.state.variants.get('rollouts/still')?.score")
+        assert page.state("studio.state.variants.get('rollouts/still').rollouts.length") == 3
+        big = page.page.inner_text("#score .big")
+        assert big == f"{page.state('studio.state.variants.get(`rollouts/still`).score.score.official.metametric'):.4f}"
+        page.page.get_by_role("button", name="by agent").click()
+        assert page.page.locator("#score tbody tr").count() > 0
+        page.press("n")  # a scenario that the files lack
+        page.wait("document.querySelectorAll('.panel-empty')[2].textContent.includes('has no rollouts of scenario')")
+        page.errors.clear()  # the browser reports the 404
+        page.close()
+
+
+def test_a_frame_in_a_notebook_shows_the_page_and_other_pages_may_not_frame_it(browser, session, tmp_path):
+    with Studio(session, frame_ancestors=NOTEBOOK_ORIGINS) as inside, Studio(session) as alone:
+        cell = StudioCell(inside)
+        (tmp_path / "notebook.html").write_text(cell._repr_html_())
+        (tmp_path / "foreign.html").write_text(f'<iframe src="http://localhost:{alone.port}/"></iframe>')
+        handler = partial(QuietHandler, directory=str(tmp_path))
+        with ThreadingHTTPServer(("127.0.0.1", 0), handler) as notebook:
+            Thread(target=notebook.serve_forever, daemon=True).start()
+            context = browser.new_context(viewport={"width": 1280, "height": 900})
+            page = context.new_page()
+            page.goto(f"http://localhost:{notebook.server_port}/notebook.html")
+            frame = page.frames[1]
+            frame.locator(".row").first.wait_for(timeout=60_000)
+            frame.locator("#scenario-name").get_by_text(re.compile("[0-9a-f]{16}")).wait_for(timeout=60_000)
+            assert inside.access.token not in frame.url
+            refused = []
+            page.on("console", lambda line: refused.append(line.text))
+            page.goto(f"http://localhost:{notebook.server_port}/foreign.html")
+            page.wait_for_timeout(500)
+            assert any("frame-ancestors 'none'" in text for text in refused) or "chrome-error" in page.frames[1].url
+            context.close()
+            notebook.shutdown()
+
+
+def test_a_notebook_behind_a_proxy_gets_its_address(session, monkeypatch):
+    with Studio(session) as studio:
+        monkeypatch.setenv("JPY_SESSION_NAME", "a.ipynb")
+        monkeypatch.setattr("importlib.util.find_spec", lambda name: name == "jupyter_server_proxy")
+        assert f'src="/proxy/{studio.port}/?token={studio.access.token}"' in StudioCell(studio)._repr_html_()
+        shown = []
+        colab = SimpleNamespace(
+            output=SimpleNamespace(serve_kernel_port_as_iframe=lambda *a, **k: shown.append((a, k)))
+        )
+        monkeypatch.setitem(sys.modules, "google.colab", colab)
+        assert StudioCell(studio)._repr_html_() == ""
+        assert shown == [((studio.port,), {"path": f"/?token={studio.access.token}", "height": 760})]
+
+
+class QuietHandler(SimpleHTTPRequestHandler):
+    def log_message(self, *words):
+        pass
 
 
 CROWD = """() => {

@@ -12,8 +12,12 @@ from rlftsim.cli.main import main
 from rlftsim.evaluation.rollout_files import find_rollouts, read_states
 from rlftsim.goals.goals_file import GoalEntry, read_goals
 from rlftsim.goals.placement import goal_warnings
+from rlftsim.rollout.files import write_rollouts
+from rlftsim.scenario.batch import collate
 from rlftsim.studio.encoding import MAGIC, encode_poses
-from rlftsim.studio.runs import chunks_of
+from rlftsim.studio.runs import Worker, chunks_of
+from rlftsim.studio.server import create_app
+from rlftsim.studio.session import Session
 
 SCENARIO = "9d639de83d6f5239"
 EGO = 179
@@ -269,6 +273,40 @@ def test_exports_can_be_read_by_what_reads_them(client, session):
         assert "<canvas" in file.read()
     pending = client.post("/api/export", {"kind": "scores", "name": "none", "run": "none"})
     assert pending.status_code == 404
+
+
+def test_rollouts_of_files_are_shown_and_scored_like_simulated_ones(tmp_path, access, client, scenario):
+    rollouts = rs.simulate("constant_velocity", scenario, num_rollouts=3)
+    write_rollouts(tmp_path / "still", collate([scenario]), rollouts)
+    session = Session("synthetic", ("demo-base",), None, tmp_path / "out", rollouts=(str(tmp_path / "still"),))
+    working = Worker(session)
+    files = type(client)(create_app(session, working, access), access)
+    working.close()
+    assert files.get("/api/session").json()["imported"] == [{"name": "still", "scenarios": 1}]
+    place = f"/api/imported/still/validation/{SCENARIO}"
+    (entry,) = find_rollouts(tmp_path / "still")
+    states = read_states(entry)
+    tracks, chosen = scenario.tracks, scenario.simulated_indices
+    assert states.object_id.tolist() == tracks.object_id[chosen].tolist()
+    current = np.concatenate([tracks.position[chosen, 10, :2] - scenario.origin, tracks.heading[chosen, 10, None]], -1)
+    shown = decoded(files.get(place).content, current)  # [N, A, 80, 3]
+    assert np.abs(shown[..., 0] - (states.x.numpy() - scenario.origin[0])).max() < 0.011
+    score = files.get(f"{place}/score").json()
+    expected = rs.score(scenario, rollouts)
+    assert score["score"]["official"]["metametric"] == pytest.approx(float(expected.meta_metric), abs=1e-6)
+    assert np.shape(score["explained"]["cost"])[1] == len(score["explained"]["agents"])
+    other = files.get("/api/imported/still/validation/1870d99f95300e18")
+    assert (other.status_code, other.json()["error"]) == (404, "still has no rollouts of scenario 1870d99f95300e18.")
+    assert client.get(place).status_code == 404  # this studio was started without them
+
+
+def test_agents_are_found_by_the_maneuvers_they_can_do(client):
+    found = client.get(f"/api/maneuvers/validation/{SCENARIO}").json()["maneuvers"]
+    for name, agents in found.items():
+        for agent in agents:
+            proposals = client.get(f"/api/proposals/validation/{SCENARIO}/{agent}").json()["proposals"]
+            assert name in [one["maneuver"] for one in proposals]
+    assert found["left"] == [EGO]
 
 
 def test_a_split_without_its_future_says_why_there_is_no_score(tmp_path, scenario):

@@ -25,6 +25,8 @@ class StudioVerb:
     """Folder of a data set, or "synthetic" for the scenarios that ship with the package."""
     model: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
     """A run, a model folder, or a registered name; may be given many times. Left out: "demo-goals"."""
+    rollouts: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
+    """A file or folder of rollouts, of any simulator, for a panel of its own; may be given many times."""
     split: str | None = None
     """Split that is shown first. Left out: validation, where there is one."""
     out: Path = Path("studio")
@@ -59,7 +61,9 @@ class StudioVerb:
 
         if self.host not in LOOPBACK:
             print(f"rlftsim: listening on {self.host}, unencrypted: keep the address secret.", file=sys.stderr)
-        session = Session(self.data, tuple(self.model) or ("demo-goals",), self.split, self.out, self.device)
+        session = Session(
+            self.data, tuple(self.model) or ("demo-goals",), self.split, self.out, self.device, tuple(self.rollouts)
+        )
         token = None if self.token_file is None else token_of(self.token_file)
         studio = Studio(session, host=self.host, port=self.port, token=token, trusted_hosts=tuple(self.trust_host))
         announce(studio, as_json=self.json, open_browser=not self.no_browser)

@@ -10,6 +10,7 @@ STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
 Text = Annotated[str, Field(min_length=1, max_length=200)]
 Stem = Annotated[str, Field(pattern=r"^[A-Za-z0-9._-]{1,80}$")]
 """Name of a file below `--out`, without its ending."""
+Metric = Literal["2025", "2024"]
 ExportKind = Literal["rollouts", "submission", "film-mp4", "film-webp", "page", "scores"]
 
 
@@ -48,7 +49,7 @@ class RunBody:
     temperature: Annotated[float, Field(ge=0, le=10)] = 1.0
     top_k: Annotated[int, Field(ge=1)] | None = None
     guidance: Annotated[float, Field(ge=0, le=6)] = 1.0
-    metric: Literal["2025", "2024"] = "2025"
+    metric: Metric = "2025"
 
 
 @dataclass(frozen=True)

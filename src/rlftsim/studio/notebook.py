@@ -58,6 +58,7 @@ def open_studio(
     data: str | os.PathLike[str] = "synthetic",
     models: Sequence[str | os.PathLike[str]] = ("demo-goals",),
     *,
+    rollouts: Sequence[str | os.PathLike[str]] = (),
     split: str | None = None,
     out: str | os.PathLike[str] = "studio",
     trusted_hosts: Sequence[str] = (),
@@ -67,6 +68,7 @@ def open_studio(
     Args:
         data: folder of a data set, or "synthetic".
         models: runs, model folders or registered names.
+        rollouts: files or folders of rollouts, for panels of their own.
         split: shown first; None = validation, where there is one.
         out: folder of everything that the page saves.
         trusted_hosts: Host headers of a proxy, such as "hub.example:443"; its origin may show the page, too.
@@ -82,7 +84,8 @@ def open_studio(
     from rlftsim.studio.serving import Studio
     from rlftsim.studio.session import Session
 
-    session = Session(os.fspath(data), tuple(os.fspath(model) for model in models), split, Path(out))
+    names, files = (tuple(map(os.fspath, some)) for some in (models, rollouts))
+    session = Session(os.fspath(data), names, split, Path(out), rollouts=files)
     origins = (*NOTEBOOK_ORIGINS, *(f"https://{host}" for host in trusted_hosts))
     studio = Studio(session, trusted_hosts=tuple(trusted_hosts), frame_ancestors=origins)
     studio.start()

@@ -11,7 +11,7 @@ from rlftsim.errors import DataError
 from rlftsim.evaluation.explain import Explanation, explain
 from rlftsim.goals.attainment import Outcome, outcome_of
 from rlftsim.goals.goals_file import GoalEntry
-from rlftsim.realism import FEATURE_NAMES, metric_by_name
+from rlftsim.realism import FEATURE_NAMES, SimulatedStates, metric_by_name
 from rlftsim.realism.config import BERNOULLI_FEATURES
 from rlftsim.realism.from_rollouts import states_of_rollouts
 from rlftsim.rollout.types import Rollouts
@@ -112,6 +112,18 @@ def score_variant(scenario: Scenario, rollouts: Rollouts, goals: tuple[GoalEntry
         metric: year.
     """
     (states,) = states_of_rollouts(collate([scenario]), rollouts)
+    return score_states(scenario, states, goals, metric)
+
+
+def score_states(scenario: Scenario, states: SimulatedStates, goals: tuple[GoalEntry, ...], metric: str) -> Scored:
+    """Score and outcomes of simulated states.
+
+    Args:
+        scenario: that was simulated.
+        states: world frame.
+        goals: of its agents.
+        metric: year.
+    """
     outcomes = tuple((goal, outcome_of(states.way_of(goal.agent_id), (goal.x, goal.y))) for goal in goals)
     explanation, reason = None, ""
     if not scenario.has_future:
@@ -121,7 +133,7 @@ def score_variant(scenario: Scenario, rollouts: Rollouts, goals: tuple[GoalEntry
             explanation = explain(scenario, states, metric_by_name(metric))
         except DataError as error:  # such as a map without road edges
             reason = str(error)
-    return Scored(rollouts.num_rollouts, outcomes, explanation, reason)
+    return Scored(states.num_rollouts, outcomes, explanation, reason)
 
 
 def change_of(scored: Scored, free: Scored) -> dict[str, float] | None:

@@ -15,9 +15,10 @@ from starlette.types import ASGIApp
 
 from rlftsim.errors import RlftsimError
 from rlftsim.goals.goals_file import GoalEntry, parse_goals
-from rlftsim.studio.bodies import CheckBody, EmptyBody, ExportBody, OpenGoalsBody, RunBody, SaveGoalsBody
+from rlftsim.studio.bodies import CheckBody, EmptyBody, ExportBody, Metric, OpenGoalsBody, RunBody, SaveGoalsBody
 from rlftsim.studio.exports import export, save_goals
 from rlftsim.studio.guard import Access, Guard
+from rlftsim.studio.imported import encode_imported, score_imported
 from rlftsim.studio.refusal import Refusal
 from rlftsim.studio.runs import Run, Worker, as_json
 from rlftsim.studio.session import Session
@@ -117,6 +118,17 @@ def _add_scenarios(app: FastAPI, session: Session) -> None:
     def _maneuvers(split: str, scenario_id: str) -> dict[str, Any]:
         """Agents by what they can do."""
         return {"maneuvers": session.maneuvers(split, scenario_id)}
+
+    @app.get("/api/imported/{name}/{split}/{scenario_id}")
+    def _imported(name: str, split: str, scenario_id: str) -> Response:
+        """Poses of rollouts from files."""
+        content = encode_imported(session.imported(name), session.scenario(split, scenario_id))
+        return Response(content, media_type="application/octet-stream")
+
+    @app.get("/api/imported/{name}/{split}/{scenario_id}/score")
+    def _imported_score(name: str, split: str, scenario_id: str, metric: Metric = "2025") -> dict[str, Any]:
+        """Score of rollouts from files."""
+        return score_imported(session.imported(name), session.scenario(split, scenario_id), metric)
 
     @app.post("/api/goals/check")
     def _check(body: CheckBody) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """The studio as a running server: a free port, a printed address, an end within two seconds."""
 
+import errno
 import json
 import os
 import socket
@@ -20,6 +21,7 @@ from rlftsim.studio.server import create_app
 from rlftsim.studio.session import Session
 
 LOOPBACK = "127.0.0.1"
+PORT_ERRORS = (errno.EADDRINUSE, errno.EACCES)
 ALL_INTERFACES = ("0.0.0.0", "::")
 
 
@@ -163,7 +165,9 @@ def _bind(host: str, port: int) -> socket.socket:
         bound.listen(128)
     except OSError as error:
         bound.close()
-        raise ConfigError(
-            f"cannot listen on {host}:{port} ({error.strerror or error}): choose another --port, or 0 for a free one."
-        ) from None
+        # A taken or forbidden port; everything else is the host's fault, as a name that stands for no address.
+        way_out = (
+            "choose another --port, or 0 for a free one" if error.errno in PORT_ERRORS else "choose another --host"
+        )
+        raise ConfigError(f"cannot listen on {host}:{port} ({error.strerror or error}): {way_out}.") from None
     return bound

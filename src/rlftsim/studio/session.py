@@ -24,6 +24,7 @@ from rlftsim.rollout.policy import Policy, is_goal_conditioned
 from rlftsim.scenario.maneuver import BENCHMARK_MANEUVERS
 from rlftsim.scenario.open import open_dataset, splits_of
 from rlftsim.scenario.types import CURRENT_STEP, Scenario
+from rlftsim.studio.imported import Imported, import_rollouts
 from rlftsim.studio.refusal import Refusal
 from rlftsim.viewer.scene import build_scene, logged_trajectories
 
@@ -108,13 +109,20 @@ class Session:
         split: shown first; None = "validation" where there is one.
         out: folder of everything that is saved.
         device: of the models.
+        rollouts: files and folders of rollouts, for panels of their own.
 
     Raises:
-        RlftsimError: no such data set, split or model.
+        RlftsimError: no such data set, split or model, or no rollouts.
     """
 
     def __init__(
-        self, data: str, models: tuple[str, ...], split: str | None, out: Path, device: Device = "cpu"
+        self,
+        data: str,
+        models: tuple[str, ...],
+        split: str | None,
+        out: Path,
+        device: Device = "cpu",
+        rollouts: tuple[str, ...] = (),
     ) -> None:
         self.data = data
         self.splits = splits_of(data)
@@ -123,6 +131,7 @@ class Session:
         if out.exists() and not out.is_dir():
             raise ConfigError(f"--out {out} is a file: name a folder for what the page saves.")
         self.out = out
+        self._imported = import_rollouts(rollouts)
         self.models = {model.name: model for model in _load(models, device)}
         self._rows: dict[str, list[dict[str, Any]]] = {}
         self._scenes, self._proposals = Recent(KEPT_SCENES), Recent(KEPT_SCENES * 8)
@@ -151,6 +160,7 @@ class Session:
                 }
                 for model in self.models.values()
             ],
+            "imported": [{"name": one.name, "scenarios": len(one.entries)} for one in self._imported.values()],
         }
 
     def scenario(self, split: str, scenario_id: str) -> Scenario:
@@ -181,6 +191,16 @@ class Session:
             known = ", ".join(self.models)
             raise Refusal(f"no model {name!r}: this studio was started with {known}.", status=404)
         return self.models[name]
+
+    def imported(self, name: str) -> Imported:
+        """Rollouts of files by their name.
+
+        Raises:
+            Refusal: they were not given on the command line (404).
+        """
+        if name not in self._imported:
+            raise Refusal(f"no rollouts {name!r}: this studio was started without them.", status=404)
+        return self._imported[name]
 
     def rows(self, split: str, query: str, offset: int) -> dict[str, Any]:
         """A page of the index.

@@ -39,7 +39,7 @@ function follow(run, handle) {
       const state = await get(`api/runs/${run}?after=${last}`);
       for (const { id, event, data } of state.events) take(id, event, data);
     } catch (error) {
-      if (error instanceof Refused) take(Infinity, "failed", { message: error.message });
+      if (error instanceof Refused) take(Infinity, "failed", { message: error.message, isLost: error.status === 404 });
     }
     if (!isOver) timer = setTimeout(poll, POLL_MS);
   }

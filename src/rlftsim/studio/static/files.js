@@ -79,7 +79,7 @@ function commands() {
 }
 
 function exportDialog(panel) {
-  const keys = [...state.variants.entries()].filter(([key]) => state.panels.includes(key)), done = Boolean(state.run) && !state.isRunning && keys.length > 0;
+  const keys = [...state.variants.entries()].filter(([key, one]) => one.run && state.panels.includes(key)), done = Boolean(state.run) && !state.isRunning && keys.length > 0;
   const variant = make("select", { "aria-label": "rollouts of" }, ...keys.map(([key, one]) => make("option", { value: key }, one.name)));
   const kinds = [["film-mp4", "film, mp4"], ["film-webp", "film, webp"], ["page", "page that plays by itself"], ["rollouts", "rollouts, npz"], ["submission", "rollouts, official ScenarioRollouts"], ["scores", "scores, JSON"]];
   const kind = make("select", { id: "export-kind", "aria-label": "kind" }, ...kinds.map(([value, text]) => make("option", { value }, text)));

@@ -5,7 +5,7 @@ import { buildMap, decodeAgent, decodePoints, readColors } from "./drawing.js";
 import { exportDialog, help, openGoals, saveGoals, share, table } from "./files.js";
 import { goalModels, indexOf, renderAgent, renderResults, renderScore, sentence } from "./inspector.js";
 import { ScenarioList } from "./list.js";
-import { cancel, forget, modelOf, simulate, simulateSoon, wantedModels } from "./simulation.js";
+import { IMPORTED, cancel, forget, loadImported, modelOf, simulate, simulateSoon, wantedModels } from "./simulation.js";
 import { FrameMeter, Ground, Panel } from "./stage.js";
 import { changed, fromHash, goalOf, goalsText, onChange, ownGoals, putGoal, redo, removeGoal, setGoals, state, toHash, undo } from "./state.js";
 import { Timeline } from "./timeline.js";
@@ -52,7 +52,7 @@ class Stage {
 
   head(panel, i) {
     const [select, , remove] = panel.element.querySelector(".panel-head").children;
-    const options = [["log", "log"], ...state.session.models.flatMap(({ name, takes_goals: takes }) => (takes ? [[name, name], [`${name}|free`, `${name}, no goals`]] : [[name, name]]))];
+    const options = [["log", "log"], ...state.session.models.flatMap(({ name, takes_goals: takes }) => (takes ? [[name, name], [`${name}|free`, `${name}, no goals`]] : [[name, name]])), ...importedKeys().map((key) => [key, `${key.slice(IMPORTED.length)}, files`])];
     select.replaceChildren(...options.map(([value, text]) => make("option", { value, selected: value === state.panels[i] }, text)));
     select.value = state.panels[i];
     select.onchange = () => { state.panels = state.panels.with(i, select.value); changed("panels"); };
@@ -150,6 +150,7 @@ class Stage {
   fit() { const [x, y, r] = state.scene.focus; state.view = { x, y, r }; changed("view"); }
 }
 
+const importedKeys = () => state.session.imported.map(({ name }) => IMPORTED + name);
 const canvasClass = (canvas, name, on) => canvas.classList.toggle(name, on);
 const status = (text) => { byId("status").textContent = text; };
 
@@ -362,7 +363,7 @@ function stepRollout(by) {
 /** One more panel: the next model that is not shown, or the first one without goals, or the log. */
 function addPanel() {
   if (state.panels.length >= MAX_PANELS) return toast(`${MAX_PANELS} panels are the most: remove one first.`);
-  const wanted = [...state.session.models.map((model) => model.name), ...goalModels().map((model) => `${model.name}|free`), "log"];
+  const wanted = [...state.session.models.map((model) => model.name), ...goalModels().map((model) => `${model.name}|free`), ...importedKeys(), "log"];
   state.panels = [...state.panels, wanted.find((key) => !state.panels.includes(key)) ?? wanted[0]];
   changed("panels");
 }
@@ -386,6 +387,7 @@ onChange((topics) => {
   // Before anything is drawn: the proposals of another agent must not become this one's goals.
   if (has("selection") && state.proposals?.agent !== state.selected) { state.proposals = null; loadProposals(state.selected); }
   if (has("panels")) { stage.layout(); renderNote(); }
+  if (has("panels", "scene", "settings") && state.scene) loadImported();
   if (has("data", "panels", "scene")) { timeline.renderRollouts(); timeline.collect(); renderResults(); renderScore(); }
   if (has("goals")) { timeline.collect(); list.render(); lookAtGoals(); }
   if (has("selection", "goals", "proposals", "scene")) renderAgent(actions);
@@ -450,7 +452,7 @@ function watchServer() {
   setInterval(async () => {
     try {
       await get("api/alive");
-      if (isGone) { toast("The studio is back."); if (state.isRunning) { state.isRunning = false; simulate(); } }
+      if (isGone) toast("The studio is back.");
       isGone = false; byId("status").classList.remove("error");
       if (byId("status").textContent.startsWith("The studio")) status("");
     } catch (error) {
@@ -462,13 +464,14 @@ function watchServer() {
 
 async function start() {
   state.session = await get("api/session");
-  const found = fromHash(location.hash), { models, splits } = state.session, names = new Set(["log", ...models.flatMap(({ name }) => [name, `${name}|free`])]);
+  const found = fromHash(location.hash), { models, splits } = state.session, names = new Set(["log", ...models.flatMap(({ name }) => [name, `${name}|free`]), ...importedKeys()]);
   for (const name of ["seed", "count", "temperature", "topK", "guidance", "metric", "showAll"]) if (name in found) state[name] = found[name];
   state.split = splits.some((one) => one.name === found.split) ? found.split : state.session.split;
   // The first model that takes goals is the one to begin with.
   const first = goalModels()[0] ?? models[0];
-  state.panels = (found.panels ?? ["log", first.name]).filter((key) => names.has(key));
-  if (!state.panels.length) state.panels = ["log", first.name];
+  const usual = ["log", first.name, ...importedKeys()].slice(0, MAX_PANELS);
+  state.panels = (found.panels ?? usual).filter((key) => names.has(key));
+  if (!state.panels.length) state.panels = usual;
   byId("split").replaceChildren(...splits.map((one) => make("option", { value: one.name, selected: one.name === state.split }, `${one.name} (${one.scenarios})`)));
   bindSettings(); showSettings();
   stage.layout(); renderNote();
@@ -484,5 +487,5 @@ async function start() {
   watchServer();
 }
 
-globalThis.studio = { state, stage, timeline, goalsText, modelOf }; // for tests and the console
+globalThis.studio = { state, stage, timeline, openScenario, goalsText, modelOf }; // for tests and the console
 start().catch((error) => { status(error.message); toast(error.message); });

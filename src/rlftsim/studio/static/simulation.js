@@ -1,16 +1,41 @@
 // Runs: sends a request, follows its events, and turns chunks into rollouts as they arrive.
-import { bytes, follow, post } from "./api.js";
+import { bytes, follow, get, post } from "./api.js";
 import { decodeChunk } from "./decode.js";
 import { byId, speak, toast } from "./dom.js";
 import { changed, ownGoals, state } from "./state.js";
 
 const TOTAL_STEPS = 91, QUICK_ROLLOUTS = 4, REST_MS = 1000;
-let end = () => {}, rest = 0;
+let end = () => {}, rest = 0, versions = 0;
 
 const modelOf = (key) => key.split("|")[0];
 
+/** Panels of rollouts from files begin so; names of models have no slash. */
+const IMPORTED = "rollouts/";
+
 /** Models of the panels in order, each once. */
-const wantedModels = () => [...new Set(state.panels.filter((key) => key !== "log").map(modelOf))];
+const wantedModels = () => [...new Set(state.panels.filter((key) => key !== "log" && !key.startsWith(IMPORTED)).map(modelOf))];
+
+/** Loads the rollouts of files that panels show, and their score. */
+async function loadImported() {
+  const { id, metric } = state;
+  for (const key of state.panels) {
+    const known = state.variants.get(key);
+    if (!key.startsWith(IMPORTED) || known?.metric === metric) continue;
+    const name = key.slice(IMPORTED.length), path = `api/imported/${[name, state.split, id].map(encodeURIComponent).join("/")}`;
+    const variant = { name, rollouts: known?.rollouts ?? [], score: null, explained: null, reason: "Loading …", metric, version: ++versions };
+    state.variants.set(key, variant);
+    try {
+      variant.rollouts = decodeChunk(await bytes(path), state.log.agents, state.scene.now, TOTAL_STEPS);
+      if (state.id !== id) return;
+      variant.version = ++versions; changed("data");
+      const score = await get(`${path}/score?metric=${metric}`);
+      if (state.id !== id) return;
+      variant.explained = score.explained;
+      mark(variant, score);
+    } catch (error) { variant.reason = error.message; }
+    variant.version = ++versions; changed("data");
+  }
+}
 
 /** What a click on simulate asks for, as the server takes it. */
 function request(count) {
@@ -60,7 +85,8 @@ async function simulate(count = state.count) {
     } else if (event === "chunk") load(data);
     else if (event === "score") pending = pending.then(() => { mark(fresh.get(names[data.variant]), data); publish(fresh, names[data.variant]); });
     else if (event === "done") pending = pending.then(() => finish(`${count} rollouts in ${((performance.now() - started) / 1000).toFixed(1)} s`));
-    else if (event === "failed") pending = pending.then(() => finish(data.message));
+    // A server that was started anew has lost the run: the same request gives the same rollouts.
+    else if (event === "failed") pending = pending.then(() => (data.isLost ? simulate(count) : finish(data.message)));
   });
 }
 
@@ -72,7 +98,6 @@ function take(fresh, name, data, buffer) {
   publish(fresh, name);
 }
 
-let versions = 0;
 function publish(fresh, name) {
   const variant = fresh.get(name);
   variant.version = ++versions;
@@ -113,4 +138,4 @@ function simulateSoon() {
 
 function forget() { end(); clearTimeout(rest); state.run = null; state.isRunning = false; state.variants = new Map(); state.loss = null; byId("progress").hidden = true; byId("cancel").hidden = true; status(""); delete byId("run-status").dataset.over; }
 
-export { cancel, forget, modelOf, simulate, simulateSoon, wantedModels };
+export { IMPORTED, cancel, forget, loadImported, modelOf, simulate, simulateSoon, wantedModels };

@@ -246,7 +246,7 @@ class Panel {
     if (text !== this.statusText) this.status.textContent = this.statusText = text;
     const empty = this.key !== "log" && !rollout;
     this.empty.hidden = !empty;
-    if (empty) this.empty.textContent = state.isRunning ? "Simulating …" : "Press S to simulate.";
+    if (empty) this.empty.textContent = variant?.reason ?? (state.isRunning ? "Simulating …" : "Press S to simulate.");
     this.describe();
   }
 

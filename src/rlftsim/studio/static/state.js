@@ -58,7 +58,7 @@ function toHash() {
     if (state[name] !== usual) parts.set(name, String(state[name]));
   }
   if (!state.showAll) parts.set("all", "0");
-  if (state.variants.size) parts.set("run", "1");
+  if (state.run) parts.set("run", "1");
   const goals = ownGoals().map((goal) => [`${goal.agent}@${goal.x}`, goal.y, ...(goal.label ? [goal.label.replace(/[;,]/g, " ")] : [])].join(",")).join(";");
   if (goals) parts.set("goals", goals);
   // A link that is too long for mail programs names the file instead.
