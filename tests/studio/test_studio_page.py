@@ -2,6 +2,7 @@
 
 import io
 import json
+import os
 import re
 import subprocess
 import sys
@@ -196,6 +197,14 @@ def test_everything_can_be_done_with_keys(page):
     # The maneuvers of the agent before are gone at once: its keys must not place this one's goal.
     assert page.state("studio.state.proposals.agent === studio.state.selected")
     assert page.state("(document.querySelectorAll('dialog tbody button')[5].click(), studio.state.proposals)") is None
+
+
+def test_an_agent_is_found_by_the_maneuver_it_can_do(page):
+    page.open(f"#split=validation&id={SCENARIO}&panels=log,goals&count=4&view=900,900,20")
+    page.page.get_by_role("button", name="left · 1", exact=True).click(timeout=60_000)
+    assert page.state("studio.state.selected") == EGO  # the only one here
+    x, y = page.state("[studio.state.view.x, studio.state.view.y]")
+    assert [x, y] == page.state(f"studio.stage.placeOf({EGO})")  # and in sight
 
 
 def test_a_dragged_goal_is_simulated_and_a_refused_one_is_not(page):
@@ -409,6 +418,8 @@ GAPS = """() => new Promise((done) => {
 
 def test_playing_120_agents_in_32_rollouts_is_smooth(page):
     """Frames of three seconds: rollouts of the page's own scenario are repeated to 120 agents."""
+    if os.getloadavg()[0] > 2 * (os.cpu_count() or 1):
+        pytest.skip("the machine is busy: its frame rate says nothing")
     page.open(f"#split=validation&id={SCENARIO}&panels=goals")
     page.page.evaluate(CROWD)
     gaps = page.page.evaluate(GAPS)

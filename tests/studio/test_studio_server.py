@@ -300,15 +300,6 @@ def test_rollouts_of_files_are_shown_and_scored_like_simulated_ones(tmp_path, ac
     assert client.get(place).status_code == 404  # this studio was started without them
 
 
-def test_agents_are_found_by_the_maneuvers_they_can_do(client):
-    found = client.get(f"/api/maneuvers/validation/{SCENARIO}").json()["maneuvers"]
-    for name, agents in found.items():
-        for agent in agents:
-            proposals = client.get(f"/api/proposals/validation/{SCENARIO}/{agent}").json()["proposals"]
-            assert name in [one["maneuver"] for one in proposals]
-    assert found["left"] == [EGO]
-
-
 def test_a_split_without_its_future_says_why_there_is_no_score(tmp_path, scenario):
     from dataclasses import replace
 

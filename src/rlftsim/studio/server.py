@@ -114,11 +114,6 @@ def _add_scenarios(app: FastAPI, session: Session) -> None:
         """Maneuvers of an agent."""
         return session.proposals(split, scenario_id, agent)
 
-    @app.get("/api/maneuvers/{split}/{scenario_id}")
-    def _maneuvers(split: str, scenario_id: str) -> dict[str, Any]:
-        """Agents by what they can do."""
-        return {"maneuvers": session.maneuvers(split, scenario_id)}
-
     @app.get("/api/imported/{name}/{split}/{scenario_id}")
     def _imported(name: str, split: str, scenario_id: str) -> Response:
         """Poses of rollouts from files."""

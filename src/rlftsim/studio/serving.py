@@ -2,6 +2,7 @@
 
 import errno
 import json
+import logging
 import os
 import socket
 import sys
@@ -40,6 +41,8 @@ class _Server(uvicorn.Server):
             frame: where it came.
         """
         self._worker.stop()
+        # Requests that are cut off by the end are no errors.
+        logging.getLogger("uvicorn.error").setLevel(logging.CRITICAL)
         super().handle_exit(sig, frame)
 
 

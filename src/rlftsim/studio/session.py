@@ -21,7 +21,6 @@ from rlftsim.goals.types import simulated_track
 from rlftsim.policies.registry import Device, load_policy, with_guidance
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import Policy, is_goal_conditioned
-from rlftsim.scenario.maneuver import BENCHMARK_MANEUVERS
 from rlftsim.scenario.open import open_dataset, splits_of
 from rlftsim.scenario.types import CURRENT_STEP, Scenario
 from rlftsim.studio.imported import Imported, import_rollouts
@@ -253,23 +252,6 @@ class Session:
         scenario = self.scenario(split, scenario_id)
         track = simulated_track(scenario, agent, "proposals")
         return self._proposals.get((split, scenario_id, agent), lambda: _proposals_of(scenario, track))
-
-    def maneuvers(self, split: str, scenario_id: str) -> dict[str, list[int]]:
-        """Object ids of the agents that can do each maneuver; those with doubts, such as parked ones, come last.
-
-        Args:
-            split: of the scenario.
-            scenario_id: its id.
-
-        Raises:
-            Refusal: there is no such scenario.
-        """
-        scenario = self.scenario(split, scenario_id)
-        found: dict[str, list[tuple[bool, int]]] = {maneuver.value: [] for maneuver in BENCHMARK_MANEUVERS}
-        for agent in scenario.tracks.object_id[scenario.simulated_indices].tolist():
-            for proposal in self.proposals(split, scenario_id, agent)["proposals"]:
-                found[proposal["maneuver"]].append((bool(proposal["doubts"]), agent))
-        return {maneuver: [agent for _, agent in sorted(agents)] for maneuver, agents in found.items() if agents}
 
     def doubts(self, scenario: Scenario, goals: tuple[GoalEntry, ...]) -> list[dict[str, Any]]:
         """Refusal or doubts of each goal, in the words of `rlftsim goals check`.

@@ -6,7 +6,7 @@ import { exportDialog, help, openGoals, saveGoals, share, table } from "./files.
 import { goalModels, indexOf, renderAgent, renderResults, renderScore, sentence } from "./inspector.js";
 import { ScenarioList } from "./list.js";
 import { IMPORTED, cancel, forget, loadImported, modelOf, simulate, simulateSoon, wantedModels } from "./simulation.js";
-import { FrameMeter, Ground, Panel } from "./stage.js";
+import { FrameMeter, Ground, MANEUVER_NAMES, Panel } from "./stage.js";
 import { changed, fromHash, goalOf, goalsText, onChange, ownGoals, putGoal, redo, removeGoal, setGoals, state, toHash, undo } from "./state.js";
 import { Timeline } from "./timeline.js";
 
@@ -219,12 +219,26 @@ function select(id) {
   changed("selection");
 }
 
+const fetchProposals = (agent) => get(`api/proposals/${encodeURIComponent(state.split)}/${encodeURIComponent(state.id)}/${agent}`);
+
 async function loadProposals(id) {
   if (id < 0) return;
   try {
-    const found = await get(`api/proposals/${encodeURIComponent(state.split)}/${encodeURIComponent(state.id)}/${id}`);
+    const found = await fetchProposals(id);
     if (state.selected === id) { state.proposals = found; changed("proposals"); }
   } catch (error) { toast(error.message); }
+}
+
+/** Which agents can do what, one agent after the other; those with doubts, such as parked ones, come last. */
+async function loadManeuvers() {
+  const { id } = state, found = Object.fromEntries(Object.keys(MANEUVER_NAMES).map((name) => [name, []]));
+  for (const [agent] of state.scene.agents) {
+    const answer = await fetchProposals(agent).catch(() => ({ proposals: [] }));
+    if (state.id !== id) return;
+    for (const { maneuver, doubts } of answer.proposals) found[maneuver][doubts.length ? "push" : "unshift"](agent);
+  }
+  state.maneuvers = Object.fromEntries(Object.entries(found).filter(([, agents]) => agents.length));
+  renderAgent(actions);
 }
 
 /** The next of some agents behind the selected one, in sight. */
@@ -232,12 +246,6 @@ function selectNext(ids) {
   const id = ids[(ids.indexOf(state.selected) + 1) % ids.length];
   select(id);
   stage.reveal([stage.placeOf(id)]);
-}
-
-async function loadManeuvers() {
-  const id = state.id;
-  const found = await get(`api/maneuvers/${encodeURIComponent(state.split)}/${encodeURIComponent(id)}`).catch(() => null);
-  if (found && state.id === id) { state.maneuvers = found.maneuvers; renderAgent(actions); }
 }
 
 const nextAgent = (by) => { const { agents } = state.scene, at = indexOf(state.selected); select(agents[(at + by + agents.length + (at < 0 && by < 0 ? 1 : 0)) % agents.length][0]); };

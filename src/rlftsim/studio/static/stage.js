@@ -302,4 +302,4 @@ class FrameMeter {
   }
 }
 
-export { FrameMeter, Ground, NEAR_M, Panel, STEP_S, agentName, maneuverName };
+export { FrameMeter, Ground, MANEUVER_NAMES, NEAR_M, Panel, STEP_S, agentName, maneuverName };
