@@ -17,6 +17,7 @@ from rlftsim.envs.planners.registry import PLANNERS, action_of, load_planner
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.drive_results import DriveResult, compare_drives
 from rlftsim.scenario.open import open_dataset
+from rlftsim.scenario.womd import find_tfrecords, read_scenarios
 from scenes import NO_LIGHTS, Mover, bend, build_scenario, junction_map, light, straight_road, without_future
 
 
@@ -88,6 +89,21 @@ def test_the_replay_planner_needs_a_future():
         driven("replay", without_future())
 
 
+@pytest.mark.official
+def test_replay_in_is_the_log_out_on_real_scenarios(shared):
+    scenarios = [one for path in find_tfrecords(shared / "data" / "womd") for one in read_scenarios(path)]
+    assert len(scenarios) == 7
+    for scenario in scenarios:
+        planner = load_planner("replay")
+        env = EgoEnv(scenarios=[scenario], traffic="replay", action="pose", stop_on=(), reward="none")
+        result = run_planner(env, planner, scenario, seed=0)
+        world, track = env.episode.world, np.stack(env.state.world.track, 2)  # [1, A, 91, 5]
+        away = np.abs(track[..., :2] - world.logged[..., :2])[world.valid]
+        assert away.max() < 1e-4
+        assert result.planner.at_fault_collision_rate == 0.0
+        assert result.planner.progress == pytest.approx(1.0, abs=1e-3)
+
+
 PLANNER_FILE = """
 import numpy as np
 class Still:
@@ -121,7 +137,7 @@ def test_planners_of_others_are_found(tmp_path, monkeypatch):
 def test_drive_writes_a_row_per_scenario_and_compare_reads_them(tmp_path, capsys):
     out = tmp_path / "drive"
     words = ["drive", "constant_velocity", "--data", "synthetic", "--out", str(out), "--limit", "2"]
-    assert main([*words, "--traffic", "replay,constant_velocity", "--film"]) == 0
+    assert main([*words, "--traffic", "replay, constant_velocity", "--film"]) == 0
     first, second = out / "constant_velocity-replay.parquet", out / "constant_velocity-constant_velocity.parquet"
     table = pq.read_table(first)
     assert table.num_rows == 2

@@ -10,7 +10,7 @@ import scenes
 from rlftsim.goals.maneuvers import lane_paths
 from rlftsim.goals.maneuvers.lane_paths import Pose, lanes_for, neighbor_lanes, path_through, paths_from
 from rlftsim.goals.maneuvers.logged import logged_maneuver
-from rlftsim.goals.maneuvers.proposals import Driver, no_proposal_reason, propose_from_lanes
+from rlftsim.goals.maneuvers.proposals import CurrentAgent, no_proposal_reason, propose_from_lanes
 from rlftsim.goals.maneuvers.reach import reach_along
 from rlftsim.scenario.lane_graph import lane_graph
 from rlftsim.scenario.maneuver import Maneuver, maneuver_of_turn
@@ -221,6 +221,6 @@ def test_without_a_future_nothing_is_logged():
 
 
 def test_drivers_stand_on_the_ground():
-    driver = Driver.of(driving(), 0)
+    driver = CurrentAgent.of(driving(), 0)
     assert driver.pose.position[2] == pytest.approx(3.0 - 0.8)  # half of 1.6 m below the box's center
     assert driver.speed_mps == pytest.approx(8.0)

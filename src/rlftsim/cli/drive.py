@@ -55,9 +55,10 @@ class Drive:
         sys.path.insert(0, "")
         if self.scenario is not None and not self.scenario:
             raise ConfigError("--scenario needs at least one id; leave it out for all scenarios.")
+        traffic = tuple(kind.strip() for kind in self.traffic.split(","))
         config = DriveConfig(
             planner=self.planner, data=self.data, split=self.split, model=self.model,
-            traffic=tuple(self.traffic.split(",")), num_rollouts=self.num_rollouts, seed=self.seed, limit=self.limit,
+            traffic=traffic, num_rollouts=self.num_rollouts, seed=self.seed, limit=self.limit,
             scenarios=tuple(self.scenario) if self.scenario else None, jobs=self.jobs,
         )  # fmt: skip
         results = drive(config, self.out)

@@ -295,20 +295,15 @@ class TrajectoryControls:
             clipped = clipped | np.any(first != kept[:, :1], axis=(1, 2))
             return Moves(with_velocity(placed(first, actors.motion), actors.motion), clipped)
         _only_vehicles(actors, "trajectory with the bicycle")
-        # Pure pursuit (Coulter, 1992) of the point ahead; speed of the first pose, so that errors along do not remain.
+        # Steers for the point ahead; has the speed of the first pose, so that errors along do not remain.
         speed = signed_speed(actors.motion)
         away = np.linalg.norm(kept[..., :2], axis=-1)  # [M, H]
-        wanted = np.maximum(LEAST_PURSUIT_M, PURSUIT_S * speed)[:, None]
+        wanted = pursuit_m(speed)[:, None]
         target = np.where((away >= wanted).any(1), (away >= wanted).argmax(1), self.horizon - 1)
-        point = kept[np.arange(len(kept)), target]
-        distance = np.maximum(np.linalg.norm(point[:, :2], axis=-1), 0.1)
-        wheelbase = WHEELBASE_PER_LENGTH * actors.size[:, 0]
-        steering = np.arctan(2 * wheelbase * point[:, 1] / distance**2)
+        steering = pursue(kept[np.arange(len(kept)), target, :2], actors.size[:, 0])
         needed = 2 * (kept[:, 0, 0] - speed * STEP_S) / STEP_S**2
         acceleration = np.clip(needed, -self.tracker.hardest, ACCELERATION_MPS2)
-        motion = self.tracker.drive(
-            actors.motion, acceleration, np.clip(steering, -STEERING_RAD, STEERING_RAD), actors.size[:, 0]
-        )
+        motion = self.tracker.drive(actors.motion, acceleration, steering, actors.size[:, 0])
         return Moves(motion[:, None], clipped)
 
 
@@ -352,6 +347,23 @@ class TokenControls:
             )
         poses = vocabulary.poses.cpu()[classes, ids].numpy().astype(np.float64)
         return Moves(with_velocity(placed(poses, actors.motion), actors.motion), np.zeros(len(action), bool))
+
+
+def pursue(point: Float[np.ndarray, "*m 2"], length: Float[np.ndarray, "*#m"]) -> Float[np.ndarray, "*m"]:
+    """Steering angle of the arc to a point, within the bounds of the bicycle: pure pursuit (Coulter, 1992), rad.
+
+    Args:
+        point: in the vehicle's own frame, m.
+        length: of the vehicle, m.
+    """
+    squared = np.maximum((point * point).sum(-1), 0.01)
+    steering = np.arctan(2 * WHEELBASE_PER_LENGTH * length * point[..., 1] / squared)
+    return np.clip(steering, -STEERING_RAD, STEERING_RAD)
+
+
+def pursuit_m(speed: Float[np.ndarray, "*m"]) -> Float[np.ndarray, "*m"]:
+    """Distance of the point that is steered for at a speed, m."""
+    return np.maximum(LEAST_PURSUIT_M, PURSUIT_S * speed)
 
 
 def signed_speed(motion: Float[np.ndarray, "*m 5"]) -> Float[np.ndarray, "*m"]:

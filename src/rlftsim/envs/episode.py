@@ -15,29 +15,19 @@ from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.contact import Collision, collision_of
 from rlftsim.envs.observations import Atlas, Observation, build_atlas, observe
 from rlftsim.envs.rewards import WeightedTerm, parse_terms
+from rlftsim.envs.road import MAX_PAIRS, OUTSIDE_M, nearest_edges, road_edges
 from rlftsim.envs.route import route_of
 from rlftsim.envs.world import Dice, World, WorldState, begin, step_world, with_dice
 from rlftsim.geometry import boxes_overlap, clockwise_corners, wrapped
 from rlftsim.goals.types import PointById
-from rlftsim.realism.map_based import (
-    RoadEdges,
-    build_road_edges,
-    compute_point_distance_to_road_edge,
-    join_road_edges,
-)
-from rlftsim.scenario.derived import cached_on_scenario
-from rlftsim.scenario.types import Scenario
+from rlftsim.realism.map_based import RoadEdges, compute_point_distance_to_road_edge, join_road_edges
 from rlftsim.viewer.scene import SIMPLIFY_TOLERANCE_M
 
-OUTSIDE_M = 0.3
-"""A corner this far off the road leaves the drivable area, as in nuPlan."""
 AT_GOAL_M = 2.0
 SIMPLIFIED_M = 2 * SIMPLIFY_TOLERANCE_M
 """The edges of the observations are nearer to the logged ones than this."""
 ScenarioGoals = Mapping[str, PointById]
 """Scenario id -> object id -> (x, y), world frame, m."""
-MAX_PAIRS = 1 << 22
-"""Bounds the memory of the search for road edges."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,12 +114,6 @@ def build_episode(
     return Episode(
         world, build_atlas(world, routes), controls, parse_terms(config.reward), config, edges, np.array(bottom), goals
     )
-
-
-@cached_on_scenario
-def road_edges(scenario: Scenario) -> RoadEdges | None:
-    """Road edges of a scenario; None without any."""
-    return build_road_edges(scenario.map_features, torch.device("cpu"))
 
 
 def start(episode: Episode, dice: tuple[Dice, ...]) -> EpisodeState:
@@ -343,20 +327,9 @@ def _free_way_m(
     """
     scene, agent = episode.world.actors[rows].T
     corners = clockwise_corners(motion[rows, :2], motion[rows, 2], episode.world.size[scene, agent])  # [m, 4, 2]
-    edges = episode.atlas.edges[scene][:, None]  # [m, 1, e, 4]
-    dx, dy = edges[..., 2] - edges[..., 0], edges[..., 3] - edges[..., 1]
-    to_x, to_y = corners[..., :1] - edges[..., 0], corners[..., 1:] - edges[..., 1]
-    along = (to_x * dx + to_y * dy) / np.maximum(dx * dx + dy * dy, 1e-9)
-    cut = np.clip(along, 0.0, 1.0)
-    off_x, off_y = to_x - cut * dx, to_y - cut * dy
-    squared = off_x * off_x + off_y * off_y
-    nearest = squared.argmin(-1)[..., None]
-    distance = np.sqrt(np.take_along_axis(squared, nearest, -1))[..., 0]  # [m, 4]
-    # beside the end of an edge its side says nothing
-    is_left = np.take_along_axis(dx * to_y - dy * to_x, nearest, -1)[..., 0] > 0
-    is_beside = np.take_along_axis(cut == along, nearest, -1)[..., 0]
+    distance, side, is_beside = nearest_edges(corners, episode.atlas.edges[scene])
     free = distance.min(1) - SIMPLIFIED_M
-    unclear = np.flatnonzero((free <= 0) | ~(is_left & is_beside).all(1))
+    unclear = np.flatnonzero((free <= 0) | ~((side > 0) & is_beside).all(1))
     free += OUTSIDE_M
     if len(unclear):
         free[unclear] = OUTSIDE_M - off_road_m(episode, motion, rows[unclear])

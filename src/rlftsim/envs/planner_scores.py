@@ -14,8 +14,8 @@ from jaxtyping import Bool, Float
 from scipy.signal import savgol_filter
 
 from rlftsim.envs.contact import BEHIND_RAD, in_one_lane, lane_search
-from rlftsim.envs.episode import MAX_PAIRS, OUTSIDE_M, road_edges
 from rlftsim.envs.record import Record
+from rlftsim.envs.road import MAX_PAIRS, OUTSIDE_M, road_edges
 from rlftsim.envs.route import Route
 from rlftsim.geometry import boxes_overlap, clockwise_corners, wrapped
 from rlftsim.realism.map_based import compute_point_distance_to_road_edge

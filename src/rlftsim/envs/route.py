@@ -13,7 +13,7 @@ from rlftsim.envs.scene import Scene, build_env_scene
 from rlftsim.errors import ConfigError
 from rlftsim.geometry import wrapped
 from rlftsim.goals.maneuvers.lane_paths import LanePath, lanes_for
-from rlftsim.goals.maneuvers.proposals import Driver, own_paths, propose_from_lanes
+from rlftsim.goals.maneuvers.proposals import CurrentAgent, own_paths, propose_from_lanes
 from rlftsim.goals.maneuvers.side_paths import lane_change_paths
 from rlftsim.scenario.derived import cached_on_scenario
 from rlftsim.scenario.polylines import arc_length
@@ -112,7 +112,7 @@ def _logged_route(scene: Scene, agent: int) -> Route:
 
 def _paths(scenario: Scenario, agent: int, length_m: float) -> list[LanePath]:
     """Paths along the lanes from an agent's pose, with a lane change and without."""
-    driver = Driver.of(scenario, int(scenario.simulated_indices[agent]))
+    driver = CurrentAgent.of(scenario, int(scenario.simulated_indices[agent]))
     lanes = lanes_for(build_env_scene(scenario).graph, driver.kind)
     own = own_paths(driver, lanes, length_m=length_m)
     speed = max(driver.speed_mps, 5.0)

@@ -12,9 +12,9 @@ import torch
 from jaxtyping import Bool, Int64
 
 from rlftsim.envs.contact import lane_search
-from rlftsim.envs.episode import MAX_PAIRS, OUTSIDE_M, road_edges
 from rlftsim.envs.planner_scores import WRONG_WAY_M, WRONG_WAY_STEPS, least_time_to_collision
 from rlftsim.envs.record import Record
+from rlftsim.envs.road import MAX_PAIRS, OUTSIDE_M, road_edges
 from rlftsim.geometry import wrapped
 from rlftsim.realism import METRIC_2025, MetricConfig, SimulatedStates, score
 from rlftsim.realism.agents import Trajectories

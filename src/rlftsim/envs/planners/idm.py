@@ -5,16 +5,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from rlftsim.envs.actions import (
-    ACCELERATION_MPS2,
-    LEAST_PURSUIT_M,
-    PURSUIT_S,
-    STEERING_RAD,
-    WHEELBASE_PER_LENGTH,
-    ActionKind,
-)
+from rlftsim.envs.actions import ACCELERATION_MPS2, STEERING_RAD, ActionKind, pursue, pursuit_m
 from rlftsim.envs.idm import LOOKAHEAD_M, IdmConfig, find_leaders, idm_acceleration
-from rlftsim.envs.planners.view import View, read_view
+from rlftsim.envs.planners.view import read_view
 
 
 class IdmPlanner:
@@ -43,16 +36,8 @@ class IdmPlanner:
         )  # fmt: skip
         to_stop = np.maximum(view.stop_m - view.size[0] / 2, 0.0)
         gap, lead = np.minimum(gap, to_stop), np.where(to_stop < gap, 0.0, lead)
-        wanted = np.array([view.limit_mps or self.config.speed_mps])
-        acceleration = idm_acceleration(np.array([max(view.speed, 0.0)]), wanted, gap, lead, self.config)
-        steering = pursue(view)
-        return np.clip([acceleration[0] / ACCELERATION_MPS2, steering / STEERING_RAD], -1, 1).astype(np.float32)
-
-
-def pursue(view: View) -> float:
-    """Steering angle that leads to the route, by pure pursuit (Coulter, 1992), rad."""
-    away = np.linalg.norm(view.line, axis=1)
-    far = np.flatnonzero(away >= max(LEAST_PURSUIT_M, PURSUIT_S * view.speed))
-    target = int(far[0]) if len(far) else len(away) - 1
-    x, y = view.line[target]
-    return float(np.arctan(2 * WHEELBASE_PER_LENGTH * view.size[0] * y / max(x * x + y * y, 0.01)))
+        wanted, speed = np.array([view.limit_mps or self.config.speed_mps]), np.array([max(view.speed, 0.0)])
+        acceleration = idm_acceleration(speed, wanted, gap, lead, self.config)
+        far = np.flatnonzero(np.linalg.norm(view.line, axis=1) >= pursuit_m(speed))
+        steering = pursue(view.line[None, far[0] if len(far) else -1], view.size[:1])
+        return np.clip([acceleration[0] / ACCELERATION_MPS2, steering[0] / STEERING_RAD], -1, 1).astype(np.float32)

@@ -13,18 +13,17 @@ from jaxtyping import Bool, Float
 
 from rlftsim.envs.actions import (
     ACCELERATION_MPS2,
-    LEAST_PURSUIT_M,
-    PURSUIT_S,
     STEERING_RAD,
-    WHEELBASE_PER_LENGTH,
     ActionKind,
     Bicycle,
+    pursue,
+    pursuit_m,
     signed_speed,
 )
-from rlftsim.envs.episode import OUTSIDE_M
 from rlftsim.envs.idm import LOOKAHEAD_M, IdmConfig, find_leaders, idm_acceleration
 from rlftsim.envs.planner_scores import ACCELERATION, JERK, LATERAL
 from rlftsim.envs.planners.view import View, read_view
+from rlftsim.envs.road import OUTSIDE_M, nearest_edges
 from rlftsim.geometry import boxes_overlap, clockwise_corners, wrapped
 from rlftsim.scenario.types import STEP_S
 
@@ -100,12 +99,10 @@ def simulate_proposals(view: View) -> Proposals:
         speed = np.maximum(signed_speed(motion), 0.0)
         acceleration = np.maximum(idm_acceleration(speed, wanted, gap, lead, CONFIG), -ACCELERATION_MPS2)
         # 2. pure pursuit of the line
-        ahead = np.maximum(LEAST_PURSUIT_M, PURSUIT_S * speed)
-        target = lines[row, np.minimum(place + ahead.astype(int), lines.shape[1] - 1)] - motion[:, :2]
-        bearing = np.arctan2(target[:, 1], target[:, 0]) - motion[:, 2]
-        distance = np.maximum(np.linalg.norm(target, axis=1), 0.5)
-        steering = np.arctan(2 * WHEELBASE_PER_LENGTH * view.size[0] * np.sin(bearing) / distance)
-        steering = np.clip(steering, -STEERING_RAD, STEERING_RAD)
+        target = lines[row, np.minimum(place + pursuit_m(speed).astype(int), lines.shape[1] - 1)] - motion[:, :2]
+        cos, sin = np.cos(motion[:, 2]), np.sin(motion[:, 2])
+        x, y = cos * target[:, 0] + sin * target[:, 1], cos * target[:, 1] - sin * target[:, 0]
+        steering = pursue(np.stack([x, y], -1), view.size[:1])
         motion = bicycle.drive(motion, acceleration, steering, view.size[:1])
         states.append(motion)
         controls.append(np.stack([acceleration, steering], -1))
@@ -179,15 +176,8 @@ def _leaves_road(view: View, motion: Float[np.ndarray, "n t 5"]) -> Bool[np.ndar
     if not len(view.edges):
         return np.zeros(len(motion), bool)
     corners = clockwise_corners(motion[..., :2], motion[..., 2], view.size).reshape(len(motion), -1, 2)  # [n, 4 t, 2]
-    start, delta = view.edges[:, :2], view.edges[:, 2:] - view.edges[:, :2]
-    to = corners[:, :, None] - start  # [n, 4 t, E, 2]
-    squared = np.maximum((delta**2).sum(-1), 1e-9)
-    along = np.clip((to * delta).sum(-1) / squared, 0.0, 1.0)
-    distance = np.linalg.norm(to - along[..., None] * delta, axis=-1)
-    nearest = distance.argmin(-1)
-    rows = np.ogrid[: corners.shape[0], : corners.shape[1]]
-    side = delta[nearest, 0] * to[*rows, nearest, 1] - delta[nearest, 1] * to[*rows, nearest, 0]
-    return ((side < 0) & (distance[*rows, nearest] >= OUTSIDE_M)).any(1)
+    distance, side, _ = nearest_edges(corners, view.edges[None])
+    return ((side < 0) & (distance >= OUTSIDE_M)).any(1)
 
 
 def _coasted(others: Float[np.ndarray, "K 5"], time_s: float) -> Float[np.ndarray, "K 5"]:

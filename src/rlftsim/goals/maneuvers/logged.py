@@ -9,7 +9,7 @@ from rlftsim.goals.maneuvers.proposals import (
     LANE_CHANGE_OFFSET_M,
     LANE_CHANGES,
     NEAREST_GOAL_M,
-    Driver,
+    CurrentAgent,
     Proposal,
     distance_to,
     own_paths,
@@ -55,12 +55,12 @@ def logged_maneuver(scenario: Scenario, track: int) -> Proposal | None:
 
 def _lane_change(scenario: Scenario, track: int, way: Float[np.ndarray, "S 3"]) -> Maneuver | None:
     """Lane change that a straight path ends with, if any."""
-    driver = Driver.of(scenario, track)
-    if driver.kind != ObjectType.VEHICLE:
+    agent = CurrentAgent.of(scenario, track)
+    if agent.kind != ObjectType.VEHICLE:
         return None
-    lanes = lanes_for(lane_graph(scenario), driver.kind)
+    lanes = lanes_for(lane_graph(scenario), agent.kind)
     driven_m = float(np.linalg.norm(np.diff(way[:, :2], axis=0), axis=1).sum())
-    own = own_paths(driver, lanes, length_m=driven_m + BEYOND_END_M)
+    own = own_paths(agent, lanes, length_m=driven_m + BEYOND_END_M)
     if not own or distance_to(own, way[-1]) < LANE_CHANGE_OFFSET_M:
         return None
     for maneuver, side in LANE_CHANGES:

@@ -73,7 +73,7 @@ class Proposal:
 
 
 @dataclass(frozen=True, eq=False)
-class Driver:
+class CurrentAgent:
     """An agent at the current step."""
 
     object_id: int
@@ -84,7 +84,7 @@ class Driver:
     top_history_mps: float
 
     @classmethod
-    def of(cls, scenario: Scenario, track: int) -> "Driver":
+    def of(cls, scenario: Scenario, track: int) -> "CurrentAgent":
         """The agent of a track that is valid at the current step; its pose is on the ground.
 
         Args:
@@ -116,21 +116,21 @@ def propose_from_lanes(scenario: Scenario, track: int, road_test: RoadTest | Non
     """
     if no_proposal_reason(scenario, track) is not None:
         return ()
-    driver = Driver.of(scenario, track)
-    lanes = lanes_for(lane_graph(scenario), driver.kind)
-    found = sorted(_candidates(scenario, driver, lanes), key=lambda c: c.merit)
+    agent = CurrentAgent.of(scenario, track)
+    lanes = lanes_for(lane_graph(scenario), agent.kind)
+    found = sorted(_candidates(scenario, agent, lanes), key=lambda c: c.merit)
     best: dict[Maneuver, Proposal] = {}
     for candidate in found:
         if candidate.maneuver in best:
             continue
         path = candidate.path
         if road_test is not None:
-            outside = road_test(path.points, path.heading, driver.size)  # [S], m, negative on the road
+            outside = road_test(path.points, path.heading, agent.size)  # [S], m, negative on the road
             # The goal's box is wholly on the road. On the way corners may stick out a little, and as far as at the
             # start.
             if not (outside[-1] <= 0 and outside.max() <= max(CLIPPED_M, float(outside[0]) + CLIPPED_M)):
                 continue
-        best[candidate.maneuver] = Proposal(driver.object_id, candidate.maneuver, path.points[-1, :2], path.points)
+        best[candidate.maneuver] = Proposal(agent.object_id, candidate.maneuver, path.points[-1, :2], path.points)
     return tuple(best[m] for m in BENCHMARK_MANEUVERS if m in best)
 
 
@@ -141,29 +141,29 @@ def no_proposal_reason(scenario: Scenario, track: int) -> str | None:
         scenario: the map and the history.
         track: index of a simulated track.
     """
-    driver = Driver.of(scenario, track)
-    if driver.kind not in KINDS:
-        return f"a {driver.kind.name.lower()} does not follow lanes"
-    lanes = lanes_for(lane_graph(scenario), driver.kind)
-    own = own_lanes(lanes, driver.pose)
+    agent = CurrentAgent.of(scenario, track)
+    if agent.kind not in KINDS:
+        return f"a {agent.kind.name.lower()} does not follow lanes"
+    lanes = lanes_for(lane_graph(scenario), agent.kind)
+    own = own_lanes(lanes, agent.pose)
     if not own:
         return f"no lane within {MAX_LANE_DISTANCE_M:g} m runs in its direction of travel"
-    aside = float(np.linalg.norm(lanes.graph.points[own[0], :2] - driver.pose.position[:2]))
-    if driver.top_history_mps < PARKED_MPS and aside > PARKED_ASIDE_M:
+    aside = float(np.linalg.norm(lanes.graph.points[own[0], :2] - agent.pose.position[:2]))
+    if agent.top_history_mps < PARKED_MPS and aside > PARKED_ASIDE_M:
         return "it stands beside its lane, probably parked"
     return None
 
 
-def own_paths(driver: Driver, lanes: Lanes, *, length_m: float) -> list[LanePath]:
+def own_paths(agent: CurrentAgent, lanes: Lanes, *, length_m: float) -> list[LanePath]:
     """Paths along the lanes that an agent is on.
 
     Args:
-        driver: the agent.
+        agent: at the current step.
         lanes: those that it may use.
         length_m: greatest length of a path.
     """
-    ease = ease_m(driver.speed_mps)
-    return paths_from(lanes, driver.pose, own_lanes(lanes, driver.pose), length_m=length_m, ease_m=ease)
+    ease = ease_m(agent.speed_mps)
+    return paths_from(lanes, agent.pose, own_lanes(lanes, agent.pose), length_m=length_m, ease_m=ease)
 
 
 def distance_to(paths: Iterable[LanePath], point: Float[np.ndarray, "3"]) -> float:
@@ -195,30 +195,30 @@ class _Candidate:
         return self.is_cut_short, abs(float(self.path.turn[-1]) - self.maneuver.usual_turn_rad)
 
 
-def _candidates(scenario: Scenario, driver: Driver, lanes: Lanes) -> Iterator[_Candidate]:
+def _candidates(scenario: Scenario, agent: CurrentAgent, lanes: Lanes) -> Iterator[_Candidate]:
     # No path needs to be longer than the fastest driver gets.
-    top = max(driver.speed_mps, BRISK.over_limit * float(lanes.speed_limit_mps[lanes.usable].max()))
+    top = max(agent.speed_mps, BRISK.over_limit * float(lanes.speed_limit_mps[lanes.usable].max()))
     gained = BRISK.acceleration_mps2 * HORIZON_S / 2
-    length_m = HORIZON_S * min(top, driver.speed_mps + gained) + SPARE_M
+    length_m = HORIZON_S * min(top, agent.speed_mps + gained) + SPARE_M
     # 1. Along the own lane and those it continues into: straight, left, right, and lanes that turn round.
-    own = own_paths(driver, lanes, length_m=length_m)
-    yield from _turns(own, driver)
-    if driver.kind != ObjectType.VEHICLE:
+    own = own_paths(agent, lanes, length_m=length_m)
+    yield from _turns(own, agent)
+    if agent.kind != ObjectType.VEHICLE:
         return
     # 2. Into the lanes beside.
-    yield from _lane_changes(scenario, driver, lanes, own, length_m)
+    yield from _lane_changes(scenario, agent, lanes, own, length_m)
     # 3. Round by a half circle, at the places where a left turn is possible.
-    if driver.size[0] <= LONGEST_UTURN_M:
+    if agent.size[0] <= LONGEST_UTURN_M:
         left_turns = [path for path in own if (np.abs(path.turn - np.pi / 2) < np.pi / 4).any()]
         for path in left_turns:
             for way in uturn_paths(lanes, path, length_m=length_m):
-                yield from (c for c in _turns([way], driver) if c.maneuver == Maneuver.LEFT_UTURN)
+                yield from (c for c in _turns([way], agent) if c.maneuver == Maneuver.LEFT_UTURN)
 
 
-def _turns(paths: Iterable[LanePath], driver: Driver) -> Iterator[_Candidate]:
+def _turns(paths: Iterable[LanePath], agent: CurrentAgent) -> Iterator[_Candidate]:
     """Candidates that follow paths as they are."""
     for path in paths:
-        reach = reach_along(path, driver.speed_mps)
+        reach = reach_along(path, agent.speed_mps)
         goal = _settled_goal(path, reach)
         if goal is None:
             continue
@@ -228,14 +228,14 @@ def _turns(paths: Iterable[LanePath], driver: Driver) -> Iterator[_Candidate]:
 
 
 def _lane_changes(
-    scenario: Scenario, driver: Driver, lanes: Lanes, own: list[LanePath], length_m: float
+    scenario: Scenario, agent: CurrentAgent, lanes: Lanes, own: list[LanePath], length_m: float
 ) -> Iterator[_Candidate]:
     for path in own:
-        speed = reach_along(path, driver.speed_mps).usual_m / HORIZON_S
+        speed = reach_along(path, agent.speed_mps).usual_m / HORIZON_S
         for maneuver, side in LANE_CHANGES:
             for way, complete in lane_change_paths(lanes, path, side=side, speed_mps=speed, length_m=length_m):
-                # The goal is as far as a usual driver gets, but after the change is complete, and before any turn.
-                reach = reach_along(way, driver.speed_mps)
+                # The goal is as far as a usual agent gets, but after the change is complete, and before any turn.
+                reach = reach_along(way, agent.speed_mps)
                 goal = max(int(reach.usual_m), complete)
                 if not reach.least_m <= goal <= min(reach.most_m, way.length_m) or abs(way.turn[goal]) >= STRAIGHT_RAD:
                     continue

@@ -1,0 +1,49 @@
+"""Road edges of scenarios, and points beside them.
+
+The official distance to the road edge searches long; where the nearest edge tells enough, `nearest_edges` is quick.
+"""
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+
+from rlftsim.realism.map_based import RoadEdges, build_road_edges
+from rlftsim.scenario.derived import cached_on_scenario
+from rlftsim.scenario.types import Scenario
+
+OUTSIDE_M = 0.3
+"""A corner this far off the road leaves the drivable area, as in nuPlan."""
+MAX_PAIRS = 1 << 22
+"""Bounds the memory of the search for road edges."""
+
+
+@cached_on_scenario
+def road_edges(scenario: Scenario) -> RoadEdges | None:
+    """Road edges of a scenario; None without any."""
+    return build_road_edges(scenario.map_features, torch.device("cpu"))
+
+
+def nearest_edges(
+    points: Float[np.ndarray, "n p 2"], edges: Float[np.ndarray, "#n e 4"]
+) -> tuple[Float[np.ndarray, "n p"], Float[np.ndarray, "n p"], Bool[np.ndarray, "n p"]]:
+    """Distance of each point to the nearest edge, its side of that edge, and True where it is beside it.
+
+    Args:
+        points: m.
+        edges: x0, y0, x1, y1, at least one; the drivable side is on the left.
+
+    Returns:
+        Distances, m; a positive number for points on the left, a negative one on the right; False for points beyond
+        the end of the edge, where the side says nothing.
+    """
+    edges = edges[:, None]  # [n, 1, e, 4]
+    dx, dy = edges[..., 2] - edges[..., 0], edges[..., 3] - edges[..., 1]
+    to_x, to_y = points[..., :1] - edges[..., 0], points[..., 1:] - edges[..., 1]  # [n, p, e]
+    along = (to_x * dx + to_y * dy) / np.maximum(dx * dx + dy * dy, 1e-9)
+    cut = np.clip(along, 0.0, 1.0)
+    off_x, off_y = to_x - cut * dx, to_y - cut * dy
+    squared = off_x * off_x + off_y * off_y
+    nearest = squared.argmin(-1)[..., None]
+    distance = np.sqrt(np.take_along_axis(squared, nearest, -1))[..., 0]
+    side = np.take_along_axis(dx * to_y - dy * to_x, nearest, -1)[..., 0]
+    return distance, side, np.take_along_axis(cut == along, nearest, -1)[..., 0]
