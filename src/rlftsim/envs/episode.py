@@ -16,7 +16,7 @@ from rlftsim.envs.contact import Collision, collision_of
 from rlftsim.envs.observations import Atlas, Observation, build_atlas, observe
 from rlftsim.envs.rewards import WeightedTerm, parse_terms
 from rlftsim.envs.road import MAX_PAIRS, OUTSIDE_M, nearest_edges, road_edges
-from rlftsim.envs.route import route_of
+from rlftsim.envs.route import SPACING_M, route_of
 from rlftsim.envs.world import Dice, World, WorldState, begin, step_world, with_dice
 from rlftsim.geometry import boxes_overlap, clockwise_corners, wrapped
 from rlftsim.goals.types import PointById
@@ -348,6 +348,11 @@ def _contacts(episode: Episode, world: WorldState, motion: Float[np.ndarray, "M 
 
 
 def _progress(episode: Episode, motion: Float[np.ndarray, "M 5"]) -> Float[np.ndarray, "M"]:
-    return np.array([
-        float(route.progress(row[None, :2])[0]) for route, row in zip(episode.atlas.routes, motion)
-    ])  # fmt: skip
+    """Distance of each agent along its route, as `Route.progress`, for all at once."""
+    atlas, row = episode.atlas, np.arange(len(motion))
+    dx = motion[:, :1] - atlas.route_points[..., 0]  # [M, r]; padding is far away
+    dy = motion[:, 1:2] - atlas.route_points[..., 1]
+    nearest = (dx * dx + dy * dy).argmin(1)
+    heading = atlas.route_heading[row, nearest]
+    ahead = np.cos(heading) * dx[row, nearest] + np.sin(heading) * dy[row, nearest]
+    return np.where(atlas.route_length > 0, SPACING_M * nearest + ahead, 0.0)

@@ -104,6 +104,7 @@ class Atlas:
     """Maps of B scenes side by side, and the routes of M agents: cut once for each episode. Padding is far away."""
 
     lane_points: Float[np.ndarray, "B n 10 2"]
+    lane_heading: Float[np.ndarray, "B n 10"]
     lane_middle: Float[np.ndarray, "B n 2"]
     lane_facts: Float[np.ndarray, "B n 3"]
     """Class, speed limit, stop sign."""
@@ -123,6 +124,7 @@ class Atlas:
     routes: tuple[Route, ...]
     route_points: Float[np.ndarray, "M r 2"]
     """Points beyond a route's end are far away."""
+    route_heading: Float[np.ndarray, "M r"]
     route_limit: Float[np.ndarray, "M r"]
     route_length: Int64[np.ndarray, "M"]
 
@@ -150,6 +152,7 @@ def build_atlas(world: World, routes: tuple[Route, ...]) -> Atlas:
     on_route = [np.isin(owner[b], route.lanes) for (b, _), route in zip(world.actors, routes)]
     return Atlas(
         lane_points=points,
+        lane_heading=headings_of(points),
         lane_middle=points[:, :, PIECE_POINTS // 2],
         lane_facts=_stack(facts, 0.0),
         lane_light=lane_light,
@@ -164,6 +167,7 @@ def build_atlas(world: World, routes: tuple[Route, ...]) -> Atlas:
         last_logged=np.maximum.accumulate(np.where(world.valid, np.arange(TOTAL_STEPS), 0), axis=2),
         routes=routes,
         route_points=_stack([route.points for route in routes] or [np.zeros((0, 2))], _FAR_M),
+        route_heading=_stack([route.heading for route in routes] or [np.zeros(0)], 0.0),
         route_limit=_stack([route.limit_mps for route in routes] or [np.zeros(0)], 0.0),
         route_length=np.array([len(route) for route in routes], np.int64),
     )
@@ -230,13 +234,15 @@ def observe(world: World, atlas: Atlas, state: WorldState, *, frame: Frame = "eg
     place, own_place, lane_points, edges, crossings, light_points, ahead, end = local
     # 4. Columns.
     direction = seen[..., 2] - angle[:, None, None]
-    poses = np.stack([*np.moveaxis(place.reshape(*seen.shape[:3], 2), -1, 0), np.cos(direction), np.sin(direction)], -1)
+    poses = np.empty((*direction.shape, 4), np.float32)  # [M, 11, K, 4]
+    poses[..., :2] = place.reshape(*direction.shape, 2)
+    poses[..., 2], poses[..., 3] = np.cos(direction), np.sin(direction)
     velocity = np.stack(_turned(seen[:, -1, :, 3], seen[:, -1, :, 4], angle), -1)
     held = world.drivers[scene[:, None], chosen] == Driver.REPLAY  # they alone have a log to go by
     age = np.where(held, STEP_S * (log_step - atlas.last_logged[scene[:, None], chosen, log_step]), 0.0)
     size, kind = world.size[scene[:, None], chosen], world.object_type[scene[:, None], chosen]
     neighbors = np.concatenate([poses[:, -1], velocity, size, kind[..., None], age[..., None]], -1)
-    history = np.where(seen_there[:, :-1, :, None], poses[:, :-1], 0.0)  # [M, 10, K, 4]
+    history = np.where(seen_there[:, :-1, :, None], poses[:, :-1], np.float32(0.0))  # [M, 10, K, 4]
     lane_facts = atlas.lane_facts[scene[:, None], lane]
     lanes = np.concatenate([
         lane_points.reshape(count, lane.shape[1], -1), lane_facts[..., :2],
@@ -254,7 +260,10 @@ def observe(world: World, atlas: Atlas, state: WorldState, *, frame: Frame = "eg
     )
     ego_history = np.where(there[row, :, agent][..., None], ego_history, 0.0)
     few = slice(OWN_LANES)
-    ego = _about_itself(world, own, pieces[:, few], lane_near[:, few], lane_facts[:, few, 1], steps - state.step)
+    heading = atlas.lane_heading[scene[:, None], lane[:, few]]
+    ego = _about_itself(
+        world, own, pieces[:, few], heading, lane_near[:, few], lane_facts[:, few, 1], steps - state.step
+    )
 
     return Observation(
         ego=ego.astype(np.float32),
@@ -321,6 +330,7 @@ def _about_itself(
     world: World,
     own: Float[np.ndarray, "M 11 5"],
     pieces: Float[np.ndarray, "M L 10 2"],
+    heading: Float[np.ndarray, "M L 10"],
     near: Bool[np.ndarray, "M L"],
     limit: Float[np.ndarray, "M L"],
     steps_left: int,
@@ -334,7 +344,6 @@ def _about_itself(
     moving = np.abs(speed) > 0.1
     steering = np.where(moving, np.arctan(WHEELBASE_PER_LENGTH * length * yaw_rate / np.where(moving, speed, 1.0)), 0.0)
     # the lane point that is nearest among those of lanes that run the agent's way
-    heading = headings_of(pieces)  # [M, L, 10]
     offset = now[:, None, None, :2] - pieces
     away = np.hypot(offset[..., 0], offset[..., 1])
     same_way = np.cos(heading - now[:, 2, None, None]) > 0
