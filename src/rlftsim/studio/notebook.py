@@ -84,7 +84,7 @@ def open_studio(
     from rlftsim.studio.serving import Studio
     from rlftsim.studio.session import Session
 
-    names, files = (tuple(map(os.fspath, some)) for some in (models, rollouts))
+    names, files = tuple(os.fspath(one) for one in models), tuple(os.fspath(one) for one in rollouts)
     session = Session(os.fspath(data), names, split, Path(out), rollouts=files)
     origins = (*NOTEBOOK_ORIGINS, *(f"https://{host}" for host in trusted_hosts))
     studio = Studio(session, trusted_hosts=tuple(trusted_hosts), frame_ancestors=origins)

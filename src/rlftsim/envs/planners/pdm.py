@@ -177,7 +177,7 @@ def _leaves_road(view: View, motion: Float[np.ndarray, "n t 5"]) -> Bool[np.ndar
         return np.zeros(len(motion), bool)
     corners = clockwise_corners(motion[..., :2], motion[..., 2], view.size).reshape(len(motion), -1, 2)  # [n, 4 t, 2]
     distance, side, _ = nearest_edges(corners, view.edges[None])
-    return ((side < 0) & (distance >= OUTSIDE_M)).any(1)
+    return np.any((side < 0) & (distance >= OUTSIDE_M), axis=1)
 
 
 def _coasted(others: Float[np.ndarray, "K 5"], time_s: float) -> Float[np.ndarray, "K 5"]:
