@@ -194,8 +194,9 @@ def test_the_command_prints_its_address_and_ends_within_two_seconds_while_it_sim
         end_s = time.monotonic() - before
         print(json.dumps({"begin_s": round(begin_s, 2), "end_s": round(end_s, 2)}))
         # Three and two seconds where nothing else computes; the simulation itself would take much longer than this.
-        assert begin_s < 60
-        assert end_s < 8
+        slowness = max(2.0, os.getloadavg()[0])
+        assert begin_s < 10 * slowness
+        assert end_s < 4 * slowness
         assert "Traceback" not in started.stderr.read()
     finally:
         started.kill()
