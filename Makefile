@@ -8,7 +8,7 @@ PIP = $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constr
 OUT ?= runs/demo
 PYTEST_FLAGS ?=
 
-.PHONY: demo demo-quick test lint types types-js clean
+.PHONY: demo demo-quick test lint types types-js wheel try-wheel clean
 .DEFAULT_GOAL := demo
 
 ## the whole pipeline on the synthetic scenarios, to runs/demo/report.html
@@ -33,7 +33,7 @@ $(BIN)/.installed: pyproject.toml constraints.txt
 	touch $@
 
 $(BIN)/.installed-test: $(BIN)/.installed
-	$(PIP) -e ".[test]"
+	$(PIP) -e ".[test,docs,wheel]"
 	touch $@
 
 ## static types; pyright and the node that runs it come as wheels
@@ -43,6 +43,20 @@ types: $(BIN)/.installed-test
 ## types of the studio's JavaScript, from its JSDoc
 types-js:
 	npx --yes --package typescript@7 tsc --project tests/studio/jsconfig.json
+
+## the wheel and the sdist, in dist/: two builds of a commit are the same bytes
+wheel: $(BIN)/.installed-test
+	rm -rf dist
+	SOURCE_DATE_EPOCH=$$(git log -1 --format=%ct) $(BIN)/python -m hatchling build
+	$(BIN)/twine check --strict dist/*
+	$(BIN)/check-wheel-contents dist/*.whl
+	sha256sum dist/*
+
+## the wheel in an environment of its own: make try-wheel PYTHON=python3.12
+try-wheel: wheel
+	$(PYTHON) -m venv --clear dist/venv
+	dist/venv/bin/pip install --quiet -c constraints.txt dist/*.whl
+	$(BIN)/python tests/try_installed.py $(CURDIR)/dist/venv/bin/python
 
 clean:
 	rm -rf $(VENV) runs
