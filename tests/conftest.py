@@ -1,16 +1,12 @@
 import os
 import shutil
+import sys
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
 
-from rlftsim.experiments.registry import EXPERIMENTS
-from rlftsim.plugins import is_ours
-from rlftsim.policies.registry import POLICIES
-from rlftsim.recipes.registry import RECIPES
-from rlftsim.rewards.base import REWARDS
-from rlftsim.scenario.sources import SOURCES
+from rlftsim.plugins import POINTS, is_ours
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 """Of the system; None = the one of `playwright install chromium`."""
@@ -33,7 +29,11 @@ def shared() -> Path:
 def forget_registered_names():
     """Names that a test registers are forgotten after it, so that no other test of the same process finds them."""
     yield
-    for point in (REWARDS, POLICIES, SOURCES, RECIPES, EXPERIMENTS):
+    for place in POINTS.values():
+        module, _, attribute = place.partition(":")
+        if module not in sys.modules:
+            continue  # nothing can have been registered
+        point = getattr(sys.modules[module], attribute)
         for name in [name for name, value in point._registered.items() if not is_ours(value)]:
             point.remove(name)
 

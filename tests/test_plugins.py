@@ -1,13 +1,25 @@
 """Extension points: the one way in which names of other packages, notebooks and this package come together."""
 
+import importlib
+import re
+import shutil
+import subprocess
 import sys
+from pathlib import Path
 
+import numpy as np
 import pytest
 
+import third_party
+from rlftsim.cli.main import main
+from rlftsim.envs.planners.registry import load_planner
 from rlftsim.errors import ConfigError
-from rlftsim.plugins import ExtensionPoint
+from rlftsim.plugins import POINTS, ExtensionPoint
+from rlftsim.rewards.base import reward_by_name
 
+ROOT = Path(__file__).parents[1]
 GROUP = "rlftsim.test_colors"
+SCENARIO = "9d639de83d6f5239"
 
 
 @pytest.fixture
@@ -75,15 +87,24 @@ def test_only_the_package_that_has_a_name_is_imported(colors, install):
 
 def test_a_package_that_cannot_be_imported_is_named(colors, install):
     install("test_broken", "import a_module_that_is_not_there\n", {"black": "test_broken:black"})
-    expected = r"color 'black' of test_broken:black cannot be imported .*a_module_that_is_not_there.*uninstall"
-    for look_up in (lambda: colors.get("black"), lambda: colors.find("white"), colors.names):
+    expected = r"'black' of package test_broken 1.0 \(test_broken:black\) cannot .*a_module_that_is_not_there.*repair"
+    for look_up in (colors.get, colors.find):
         with pytest.raises(ConfigError, match=expected):
-            look_up()
+            look_up("black")
+
+
+def test_a_package_that_cannot_be_imported_does_not_break_others(colors, install):
+    install("test_broken", "1 / 0\n", {"black": "test_broken:black"})
+    install("test_fine", "violet = 'v'\n", {"violet": "test_fine:violet"})
+    with pytest.warns(UserWarning, match="'black' of package test_broken 1.0 .*division by zero"):
+        assert colors.find("white") is None
+    with pytest.warns(UserWarning, match="division by zero"):
+        assert colors.names() == ["ours", "tau", "violet"]
 
 
 def test_an_attribute_that_is_missing_is_named(colors, install):
     install("test_empty", "", {"pink": "test_empty:pink"})
-    with pytest.raises(ConfigError, match=r"color 'pink' of test_empty:pink cannot be imported .*pink"):
+    with pytest.raises(ConfigError, match=r"color 'pink' of package test_empty 1.0 .* cannot be imported .*pink"):
         colors.get("pink")
 
 
@@ -112,8 +133,8 @@ def test_the_name_of_a_shipped_thing_is_refused(colors):
 def test_an_entry_point_cannot_take_the_name_of_a_shipped_thing(colors, install):
     install("test_thief", "tau = 3\n", {"tau": "test_thief:tau"})
     assert colors.get("tau") != 3
-    with pytest.raises(ConfigError, match="color 'tau' ships with rlftsim"):
-        colors.names()
+    with pytest.warns(UserWarning, match="color 'tau' ships with rlftsim"):
+        assert colors.names() == ["ours", "tau"]
 
 
 def test_an_unknown_name_is_refused_with_the_nearest_one(colors):
@@ -123,3 +144,56 @@ def test_an_unknown_name_is_refused_with_the_nearest_one(colors):
         colors.get("xyzzy")
     with pytest.raises(ConfigError, match="unknown shade 'a': there are none"):
         ExtensionPoint("shade", "rlftsim.test_shades").get("a")
+
+
+@pytest.fixture
+def template(tmp_path, monkeypatch):
+    """The template of docs/ built and installed as pip does it, and a broken package beside it."""
+    shutil.copytree(ROOT / "docs" / "plugin_template", tmp_path / "source")
+    target = tmp_path / "installed"
+    command = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--no-index"]
+    subprocess.run([*command, "--target", str(target), str(tmp_path / "source")], check=True, capture_output=True)
+    third_party.install(target, "test_shattered", "1 / 0\n", {"rlftsim.rewards": {"calm": "test_shattered:calm"}})
+    monkeypatch.syspath_prepend(target)
+    monkeypatch.chdir(tmp_path)
+    yield
+    sys.modules.pop("rlftsim_plugin", None)
+
+
+def test_the_template_is_built_installed_listed_and_used(template, capsys):
+    # 1. listed with package and version; the broken package has its reason and stops nothing
+    assert main(["plugins"]) == 1
+    rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in capsys.readouterr().out.splitlines()]
+    states = {row[1]: (row[0], row[2], row[3], row[5]) for row in rows if len(row) == 6}
+    assert states["on_the_road"] == ("rlftsim.rewards", "rlftsim-plugin", "0.1.0", "works")
+    assert states["csv"] == ("rlftsim.exporters", "rlftsim-plugin", "0.1.0", "works")
+    assert states["coast"] == ("rlftsim.planners", "rlftsim-plugin", "0.1.0", "works")
+    assert states["calm"] == ("rlftsim.rewards", "test_shattered", "0.1.0", "fails")
+    main(["plugins"])
+    assert "reward 'calm' of package test_shattered 0.1.0" in capsys.readouterr().out
+    # 2. used by name
+    assert reward_by_name("on_the_road").__module__ == "rlftsim_plugin"
+    command = f"simulate constant_velocity --data synthetic --scenario {SCENARIO} --num-rollouts 2 --out r"
+    assert main([*command.split(), "--export", "csv", "page"]) == 0
+    lines = (Path("r") / f"{SCENARIO}.csv").read_text().splitlines()
+    with np.load(Path("r") / f"{SCENARIO}.npz") as stored:
+        assert len(lines) == 1 + 2 * len(stored["object_ids"])
+        assert lines[1].startswith(f"0,{stored['object_ids'][0]},{stored['x'][0, 0, -1]:.3f}"[:-1])
+    assert "<canvas" in (Path("r") / f"{SCENARIO}.html").read_text()
+    assert load_planner("coast").act({}) == [0.0, 0.0]
+
+
+def test_without_plug_ins_the_groups_are_named(capsys):
+    assert main(["plugins"]) == 0
+    text = capsys.readouterr().out
+    assert all(group in text for group in POINTS)
+
+
+def test_every_group_is_listed():
+    """Each extension point of the package announces itself in the table that `rlftsim plugins` reads."""
+    sources = [path.read_text() for path in (ROOT / "src" / "rlftsim").rglob("*.py")]
+    groups = {found for text in sources for found in re.findall(r'\(\s*"[\w ]+",\s*"(rlftsim\.\w+)"', text)}
+    assert groups == set(POINTS)
+    for group, place in POINTS.items():
+        module, _, attribute = place.partition(":")
+        assert getattr(importlib.import_module(module), attribute).group == group

@@ -1,6 +1,7 @@
 """Extension points: names that other packages and notebooks can add to, by one mechanism for every kind of thing.
 
-Rewards, policies, data sources, recipes and experiments are each an `ExtensionPoint`. A name is looked for
+Rewards, policies, data sources, recipes, experiments, planners and exporters are each an `ExtensionPoint`. A name is
+looked for
 
 1. among what was registered by a decorator, in a notebook or in an imported module,
 2. among what this package ships, which is imported on first use,
@@ -10,18 +11,31 @@ Rewards, policies, data sources, recipes and experiments are each an `ExtensionP
     on_the_road = "my_package.rewards:on_the_road"
 
 A name that ships with this package cannot be taken. Any other name can be registered again, which replaces the earlier
-thing with a warning: so a notebook's cell can be run twice.
+thing with a warning: so a notebook's cell can be run twice. A package that cannot be imported stops only those who use
+its names; `rlftsim plugins` says why.
 """
 
 import difflib
 import importlib
 import warnings
 from collections.abc import Callable, Mapping
-from importlib.metadata import entry_points
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint, entry_points
 from types import ModuleType
 from typing import Generic, TypeVar
 
 from rlftsim.errors import ConfigError
+
+POINTS = {
+    "rlftsim.policies": "rlftsim.policies.registry:POLICIES",
+    "rlftsim.recipes": "rlftsim.recipes.registry:RECIPES",
+    "rlftsim.rewards": "rlftsim.rewards:REWARDS",
+    "rlftsim.sources": "rlftsim.scenario.sources:SOURCES",
+    "rlftsim.planners": "rlftsim.envs.planners.registry:PLANNERS",
+    "rlftsim.experiments": "rlftsim.experiments.registry:EXPERIMENTS",
+    "rlftsim.exporters": "rlftsim.evaluation.exporters:EXPORTERS",
+}
+"""Entry-point group -> place of its `ExtensionPoint`."""
 
 Value = TypeVar("Value")
 Registered = TypeVar("Registered")
@@ -82,7 +96,7 @@ class ExtensionPoint(Generic[Value]):
         """The thing of a name.
 
         Raises:
-            ConfigError: unknown, with the nearest known name; or a package that may have it cannot be imported.
+            ConfigError: unknown, with the nearest known name; or the package that announces it cannot be imported.
         """
         found = self.find(name)
         if found is None:
@@ -97,7 +111,7 @@ class ExtensionPoint(Generic[Value]):
         """The thing of a name; None if there is none.
 
         Raises:
-            ConfigError: a package that may have it cannot be imported.
+            ConfigError: the package that announces this name cannot be imported.
         """
         # Shipped things first: looking one up does not import other packages.
         if name not in self._registered and name in self._shipped:
@@ -108,33 +122,80 @@ class ExtensionPoint(Generic[Value]):
         return self._registered.get(name)
 
     def names(self) -> list[str]:
-        """All names in alphabetical order, those of installed packages included.
-
-        Raises:
-            ConfigError: an installed package cannot be imported.
-        """
+        """All names in alphabetical order, those of installed packages included as far as these can be imported."""
         self._load_entry_points()
         return sorted({*self._shipped, *self._registered})
 
     def _load_entry_points(self, name: str | None = None) -> None:
         """Add what installed packages announce: the entry point of a name if there is one, else all of them.
 
-        All, because a module that registers things by itself may have any of them.
+        All, because a module that registers things by itself may have any of them. Then a package that cannot be
+        imported is passed over with a warning: the others are none the worse.
+
+        Raises:
+            ConfigError: the package that announces the name cannot be imported.
         """
         entries = list(entry_points(group=self.group))
-        for entry in [one for one in entries if one.name == name] or entries:
-            if entry.name in self._registered:
-                continue
-            # Any error, not only ImportError: the package runs code of its own.
+        announced = [one for one in entries if one.name == name]
+        for entry in announced or entries:
+            problem = self.problem_of(entry)
+            if problem and announced:
+                raise ConfigError(problem)
+            if problem:
+                warnings.warn(problem, stacklevel=4)
+
+    def problem_of(self, entry: EntryPoint) -> str | None:
+        """Add an entry point to the table unless it is there; one line about its failure, None = it works."""
+        if entry.name in self._registered:
+            return None
+        # Any error, not only ImportError: the package runs code of its own.
+        try:
+            value = entry.load()
+        except Exception as error:
+            package = f" of package {entry.dist.name} {entry.dist.version}" if entry.dist else ""
+            return (
+                f"{self.kind} {entry.name!r}{package} ({entry.value}) cannot be imported ({error}): repair or "
+                "uninstall the package."
+            )
+        if not isinstance(value, ModuleType):  # a module has registered its things itself
             try:
-                value = entry.load()
-            except Exception as error:
-                raise ConfigError(
-                    f"{self.kind} {entry.name!r} of {entry.value} cannot be imported ({error}): "
-                    "repair or uninstall its package."
-                ) from error
-            if not isinstance(value, ModuleType):  # a module has registered its things itself
                 self.add(entry.name, value)
+            except ConfigError as error:
+                return str(error)
+        return None
+
+
+@dataclass(frozen=True)
+class PlugIn:
+    """An entry point of an installed package."""
+
+    group: str
+    """Entry-point group, such as "rlftsim.rewards"."""
+    name: str
+    value: str
+    """Object or module that it names, "package.module:attribute"."""
+    package: str
+    """Name of the distribution that announces it."""
+    version: str
+    """Version of this distribution."""
+    problem: str | None
+    """Reason why it cannot be used; None = it works."""
+
+
+def installed_plug_ins() -> list[PlugIn]:
+    """Entry points of installed packages in all groups; their packages are imported."""
+    found = []
+    for group, place in POINTS.items():
+        for entry in sorted(entry_points(group=group), key=lambda one: one.name):
+            module, _, attribute = place.partition(":")
+            # The group itself may need an extra that is not installed.
+            try:
+                problem = getattr(importlib.import_module(module), attribute).problem_of(entry)
+            except ConfigError as error:
+                problem = str(error)
+            package, version = (entry.dist.name, entry.dist.version) if entry.dist else ("", "")
+            found.append(PlugIn(group, entry.name, entry.value, package, version, problem))
+    return found
 
 
 def is_ours(value: object) -> bool:

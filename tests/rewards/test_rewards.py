@@ -255,6 +255,7 @@ def test_a_reward_of_an_installed_package_is_found_where_only_its_name_is_given(
 def test_a_package_whose_rewards_are_broken_is_named(installed):
     installed("import a_module_that_is_not_there\n")
     with pytest.raises(
-        ConfigError, match=r"reward 'kindness' of test_kindness cannot be imported .*a_module_that_is_not_there"
+        ConfigError,
+        match=r"reward 'kindness' of package \S+ \S+ \(test_kindness\) cannot .*a_module_that_is_not_there",
     ):
         reward_by_name("kindness")

@@ -17,6 +17,7 @@ from rlftsim.threads import keep_freed_memory
 VERBS = {
     "demo": ("rlftsim.cli.demo", "Demo"),
     "doctor": ("rlftsim.cli.doctor", "Doctor"),
+    "plugins": ("rlftsim.cli.plugins", "Plugins"),
     "convert": ("rlftsim.cli.data", "Convert"),
     "data": ("rlftsim.cli.data", "Data"),
     "synthesize": ("rlftsim.cli.data", "Synthesize"),
@@ -44,6 +45,7 @@ usage: rlftsim VERB ...      rlftsim VERB --help explains a verb
 
   demo         run the whole pipeline on synthetic scenarios, in minutes, on a CPU
   doctor       check this machine and print what to do about each problem
+  plugins      list what other installed packages add, and why one fails
 
   convert      convert logged scenarios, such as WOMD tfrecords, to a portable data set
   data         check a data set, or print its statistics
@@ -69,7 +71,7 @@ usage: rlftsim VERB ...      rlftsim VERB --help explains a verb
   join VERB .. put the shares of a command together that ran on several machines (--share K/N)
 """
 
-STARTS_ANEW = ("doctor", "data", "recipe", "tokens", "model", "goals", "drive", "studio", "compare")
+STARTS_ANEW = ("doctor", "plugins", "data", "recipe", "tokens", "model", "goals", "drive", "studio", "compare")
 """Verbs that keep nothing of an interrupted run."""
 JOIN = "join"
 INTERRUPTED = 130

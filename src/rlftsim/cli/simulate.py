@@ -7,10 +7,11 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional
 
-from rlftsim.cli.goal_outcomes import report_outcomes
+from rlftsim.cli.goal_outcomes import read_rollouts, report_outcomes
 from rlftsim.cli.goals import given_goals, warn_of_doubts
 from rlftsim.cli.rollout_folder import claim_folder
 from rlftsim.errors import ConfigError
+from rlftsim.evaluation.exporters import EXPORTERS
 from rlftsim.goals.placement import goals_of_batch
 from rlftsim.policies.registry import Device, load_policy, with_guidance
 from rlftsim.progress import log, progress_bar
@@ -58,6 +59,9 @@ class Simulate:
     learned to."""
     picture: bool = False
     """Draw OUT/SCENARIO.png: simulated paths of the agents with goals, or else of the evaluated agents."""
+    export: list[str] = field(default_factory=list)
+    """Write further files of each scenario: "page" is OUT/SCENARIO.html, which plays in any browser; other names are
+    those of installed plug-ins."""
     device: Device = "auto"
     """auto: the GPU if torch has one."""
 
@@ -66,6 +70,7 @@ class Simulate:
         if self.scenario is not None and not self.scenario:
             raise ConfigError("--scenario needs at least one id; leave it out for all scenarios.")
         # 1. model, data and goals; anything that does not fit is refused before the folder is touched
+        exporters = [EXPORTERS.get(name) for name in self.export]
         policy = with_guidance(load_policy(self.model, self.device), self.guidance_scale)
         sampling = Sampling(self.temperature, self.top_k)
         scenarios = open_dataset(self.data, self.split)
@@ -116,5 +121,10 @@ class Simulate:
         # 4. outcomes of goals, also of rollouts that an earlier call has written
         shown = [scenarios.by_id(i) for i in ids if given.of_scenario(i) or self.picture]
         report_outcomes(self.out, shown, given, picture=self.picture)
+        # 5. further files, likewise
+        for scenario in map(scenarios.by_id, ids if exporters else ()):
+            states = read_rollouts(self.out, scenario)
+            for export in exporters:
+                print(export(scenario, states, self.out))
         print(f"{self.out}: {self.num_rollouts} rollouts of {len(ids)} scenarios.")
         return 0

@@ -124,7 +124,7 @@ def explain(scenario: Scenario, states: SimulatedStates, config: MetricConfig = 
         cost=cost.unflatten(-1, (len(log.agents.evaluated), -1)).numpy(),
         events=(events & log.agents.future_valid).numpy(),
         histograms=_histograms(log, features, config),
-        rollouts=_trajectories(scenario, states).with_evaluated_flags(
+        rollouts=motion_of(scenario, states).with_evaluated_flags(
             scenario, collision=features.collision, offroad=features.offroad
         ),
     )
@@ -162,7 +162,7 @@ def _histograms(log: ScenarioLog, features: Features, config: MetricConfig) -> t
     return tuple(found)
 
 
-def _trajectories(scenario: Scenario, states: SimulatedStates) -> SceneMotion:
+def motion_of(scenario: Scenario, states: SimulatedStates) -> SceneMotion:
     """The rollouts after the logged history, in the map frame of the viewer."""
     ids = scenario.tracks.object_id[scenario.simulated_indices].astype(np.int64)
     order = torch.from_numpy(match_agents(ids, states.object_id, scenario.scenario_id))

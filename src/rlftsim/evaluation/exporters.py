@@ -1,0 +1,46 @@
+"""Exporters: further files of simulated rollouts, for `rlftsim simulate --export NAME`. A package of your own adds one:
+
+[project.entry-points."rlftsim.exporters"]
+csv = "my_package:write_csv"
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from rlftsim.evaluation.explain import motion_of
+from rlftsim.plugins import ExtensionPoint
+from rlftsim.realism import SimulatedStates
+from rlftsim.scenario.types import Scenario
+from rlftsim.viewer.page import Animation, Panel, write_page
+from rlftsim.viewer.scene import build_scene, logged_trajectories
+
+Exporter = Callable[[Scenario, SimulatedStates, Path], Path]
+"""Called with a scenario, its rollouts and the folder of the rollouts; writes a file there and returns its path."""
+
+EXPORTERS: ExtensionPoint[Exporter] = ExtensionPoint(
+    "exporter", "rlftsim.exporters", {"page": "rlftsim.evaluation.exporters:write_player"}
+)
+"""Name -> function."""
+MAX_ROLLOUTS = 8
+"""Rollouts that play on a page; each adds about 50 kB."""
+
+
+def write_player(scenario: Scenario, states: SimulatedStates, folder: Path) -> Path:
+    """Write FOLDER/SCENARIO.html, which plays the first rollouts beside the log in any browser.
+
+    Args:
+        scenario: map and log.
+        states: its rollouts, world frame.
+        folder: of the page.
+
+    Raises:
+        DataError: the file cannot be written.
+    """
+    scene = build_scene(scenario)
+    panels = [
+        Panel("logged", logged_trajectories(scenario).with_overlaps(scene.agents)),
+        Panel("rollouts", motion_of(scenario, states).first(MAX_ROLLOUTS).with_overlaps(scene.agents)),
+    ]
+    path, title = folder / f"{scenario.scenario_id}.html", f"Scenario {scenario.scenario_id}"
+    write_page(path, title, [Animation(title, scene, panels)])
+    return path
