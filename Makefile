@@ -8,7 +8,7 @@ PIP = $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constr
 OUT ?= runs/demo
 PYTEST_FLAGS ?=
 
-.PHONY: demo demo-quick test lint types types-js wheel try-wheel clean
+.PHONY: demo demo-quick test lint types types-js reference docs wheel try-wheel clean
 .DEFAULT_GOAL := demo
 
 ## the whole pipeline on the synthetic scenarios, to runs/demo/report.html
@@ -43,6 +43,14 @@ types: $(BIN)/.installed-test
 ## types of the studio's JavaScript, from its JSDoc
 types-js:
 	npx --yes --package typescript@7 tsc --project tests/studio/jsconfig.json
+
+## docs/reference, written from the package
+reference: $(BIN)/.installed-test
+	$(BIN)/python docs/write_reference.py
+
+## the site, in build/site: opens from disk, needs no server
+docs: $(BIN)/.installed-test
+	$(BIN)/python docs/build_site.py
 
 ## the wheel and the sdist, in dist/: two builds of a commit are the same bytes
 wheel: $(BIN)/.installed-test

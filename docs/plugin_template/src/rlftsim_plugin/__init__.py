@@ -3,12 +3,13 @@
 import csv
 from pathlib import Path
 
+from torch import Tensor
+
 from rlftsim.realism import RealismResult, SimulatedStates
 from rlftsim.rewards import leave_one_out
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import Scenario
-from torch import Tensor
 
 
 def on_the_road(scores: RealismResult, rollouts: Rollouts, batch: ScenarioBatch, *, scale: float = 1.0) -> Tensor:
