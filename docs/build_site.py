@@ -1,0 +1,117 @@
+"""Build the site: pages of docs/, benchmarks/ and the root go to build/pages, from there to build/site.
+
+    python docs/build_site.py                      # with Zensical
+    python docs/build_site.py --builder mkdocs
+    REPOSITORY=https://... python docs/build_site.py
+
+Pages of the repository link to each other as files. Here links to pages become links of the site; links to other files
+lead to the commit in REPOSITORY, and are plain text where that is not set.
+"""
+
+import argparse
+import os
+import posixpath
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = ROOT / "build" / "pages"
+LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\((?!\w+:)([^)\s#]*)(#[^)\s]*)?\)")
+FENCE = re.compile(r"(^```.*?^```)", re.MULTILINE | re.DOTALL)
+ELSEWHERE = {"CHANGELOG.md": "changes.md", "CONTRIBUTING.md": "contributing.md", "README.md": "index.md"}
+"""Files of the root that are pages; the README's place is the home page."""
+NO_PAGES = (".py", ".toml")
+
+
+def place_of(path: str) -> str | None:
+    """Page of the site that a file of the repository becomes; None = none.
+
+    Args:
+        path: relative to the root, with slashes.
+    """
+    if path.startswith("docs/") and not path.endswith(NO_PAGES):
+        return path.removeprefix("docs/")
+    if path.startswith("benchmarks/") and not path.endswith(NO_PAGES):
+        return f"results/{path.removeprefix('benchmarks/')}"
+    return ELSEWHERE.get(path)
+
+
+def relinked(text: str, source: str, base: str | None) -> str:
+    """A page with its links rewritten for the site.
+
+    Args:
+        text: Markdown.
+        source: path of the page in the repository.
+        base: address of the repository at the built commit; None = links to files that are no pages become text.
+    """
+    own = place_of(source) or source
+
+    def rewrite(match: re.Match[str]) -> str:
+        mark, words, path, anchor = match[1], match[2], match[3], match[4] or ""
+        target = posixpath.normpath(posixpath.join(posixpath.dirname(source), path)) if path else source
+        place = place_of(target)
+        if place is not None and (ROOT / target).is_file():
+            relative = posixpath.relpath(place, posixpath.dirname(own) or ".") if path else ""
+            return f"{mark}[{words}]({relative}{anchor})"
+        return f"[{words}]({base}/{target}{anchor})" if base else words
+
+    # Brackets in code are no links.
+    return "".join(
+        part if part.startswith("```") else LINK.sub(rewrite, part) for part in FENCE.split(text)
+    )
+
+
+def stage() -> None:
+    """Fill build/pages anew."""
+    shutil.rmtree(PAGES, ignore_errors=True)
+    repository, base = os.environ.get("REPOSITORY"), None
+    if repository:
+        commit = subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=True)
+        base = f"{repository}/blob/{commit.stdout.strip()}"
+    sources = [*(ROOT / "docs").rglob("*"), *(ROOT / "benchmarks").rglob("*"), ROOT / "CHANGELOG.md"]
+    for path in (*sources, ROOT / "CONTRIBUTING.md"):
+        name = path.relative_to(ROOT).as_posix()
+        place = place_of(name)
+        if path.is_dir() or place is None or "__pycache__" in name:
+            continue
+        target = PAGES / place
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if path.suffix == ".md":
+            target.write_text(relinked(path.read_text(), name, base))
+        else:
+            shutil.copyfile(path, target)
+
+
+def build(builder: str, out: Path) -> None:
+    """Build the staged pages.
+
+    Args:
+        builder: "zensical" or "mkdocs".
+        out: folder of the site.
+
+    Raises:
+        SystemExit: a dead link, or anything else that the builder's strict mode refuses.
+    """
+    # Zensical takes the folder from the file alone.
+    command = [sys.executable, "-m", builder, "build", "--strict"]
+    environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1", "DISABLE_MKDOCS_2_WARNING": "true"}
+    if builder == "mkdocs":
+        command += ["--quiet", "--site-dir", str(out)]
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+    if done.returncode:
+        raise SystemExit(re.sub(r"\x1b\[[0-9;]*m", "", done.stdout + done.stderr))
+    if builder == "zensical" and out != ROOT / "build" / "site":
+        shutil.copytree(ROOT / "build" / "site", out, dirs_exist_ok=True)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--builder", choices=("zensical", "mkdocs"), default="zensical")
+    parser.add_argument("--out", type=Path, default=ROOT / "build" / "site")
+    arguments = parser.parse_args()
+    stage()
+    build(arguments.builder, arguments.out)
+    print(arguments.out / "index.html")
