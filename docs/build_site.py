@@ -17,6 +17,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jupytext
+
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = ROOT / "build" / "pages"
 LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\((?!\w+:)([^)\s#]*)(#[^)\s]*)?\)")
@@ -24,6 +26,8 @@ FENCE = re.compile(r"(^```.*?^```)", re.MULTILINE | re.DOTALL)
 ELSEWHERE = {"CHANGELOG.md": "changes.md", "CONTRIBUTING.md": "contributing.md", "README.md": "index.md"}
 """Files of the root that are pages; the README's place is the home page."""
 NO_PAGES = (".py", ".toml")
+SHIM = "https://unpkg.com/iframe-worker/shim"
+"""Script of another host that the builders name in every page; docs/assets has it."""
 
 
 def place_of(path: str) -> str | None:
@@ -59,9 +63,7 @@ def relinked(text: str, source: str, base: str | None) -> str:
         return f"[{words}]({base}/{target}{anchor})" if base else words
 
     # Brackets in code are no links.
-    return "".join(
-        part if part.startswith("```") else LINK.sub(rewrite, part) for part in FENCE.split(text)
-    )
+    return "".join(part if part.startswith("```") else LINK.sub(rewrite, part) for part in FENCE.split(text))
 
 
 def stage() -> None:
@@ -80,22 +82,26 @@ def stage() -> None:
         target = PAGES / place
         target.parent.mkdir(parents=True, exist_ok=True)
         if path.suffix == ".md":
-            target.write_text(relinked(path.read_text(), name, base))
+            text = relinked(path.read_text(), name, base)
+            if place.startswith("tutorials/") and path.name != "index.md":
+                jupytext.write(jupytext.reads(text, fmt="md"), target.with_suffix(".ipynb"))
+                text += f"\n[This page as a notebook]({path.stem}.ipynb)\n"
+            target.write_text(text)
         else:
             shutil.copyfile(path, target)
 
 
-def build(builder: str, out: Path) -> None:
-    """Build the staged pages.
+def build(builder: str) -> Path:
+    """Build the staged pages. Returns the folder of the site.
 
     Args:
-        builder: "zensical" or "mkdocs".
-        out: folder of the site.
+        builder: "zensical", to build/site, or "mkdocs", to build/mkdocs.
 
     Raises:
         SystemExit: a dead link, or anything else that the builder's strict mode refuses.
     """
     # Zensical takes the folder from the file alone.
+    out = ROOT / "build" / ("site" if builder == "zensical" else builder)
     command = [sys.executable, "-m", builder, "build", "--strict"]
     environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1", "DISABLE_MKDOCS_2_WARNING": "true"}
     if builder == "mkdocs":
@@ -103,15 +109,17 @@ def build(builder: str, out: Path) -> None:
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
     if done.returncode:
         raise SystemExit(re.sub(r"\x1b\[[0-9;]*m", "", done.stdout + done.stderr))
-    if builder == "zensical" and out != ROOT / "build" / "site":
-        shutil.copytree(ROOT / "build" / "site", out, dirs_exist_ok=True)
+    for page in out.rglob("*.html"):
+        up = "../" * (len(page.relative_to(out).parts) - 1)
+        text = page.read_text()
+        if SHIM in text:
+            page.write_text(text.replace(SHIM, f"{up}assets/iframe-worker.js"))
+    return out
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser()
     parser.add_argument("--builder", choices=("zensical", "mkdocs"), default="zensical")
-    parser.add_argument("--out", type=Path, default=ROOT / "build" / "site")
-    arguments = parser.parse_args()
+    builder = parser.parse_args().builder
     stage()
-    build(arguments.builder, arguments.out)
-    print(arguments.out / "index.html")
+    print(build(builder) / "index.html")

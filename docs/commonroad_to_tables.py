@@ -42,11 +42,13 @@ def number(element, path):
 
 
 def bound(lanelet, name):
+    """Points of one side of a lanelet, [n, 2], without repetitions."""
     points = [(float(p.findtext("x")), float(p.findtext("y"))) for p in lanelet.find(name).iter("point")]
     return np.array([p for k, p in enumerate(points) if k == 0 or p != points[k - 1]])
 
 
 def at_fractions(points, count):
+    """Points of a line at equal fractions of its length."""
     along = np.append(0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
     at = np.linspace(0, along[-1], count)
     return np.column_stack([np.interp(at, along, points[:, k]) for k in range(2)])
@@ -120,6 +122,7 @@ def choose_ego(root, tracks):
 
 
 def main(source, destination):
+    """Write the tables of all scenarios of a folder."""
     tables = {"tracks": [], "map": [], "lanes": [], "scenarios": []}
     for path in sorted([*Path(source).glob("*.xml"), *Path(source).glob("*.xml.gz")]):
         root = ElementTree.fromstring(gzip.decompress(path.read_bytes()) if path.suffix == ".gz" else path.read_bytes())

@@ -36,6 +36,7 @@ STATES = {"TRAFFIC_LIGHT_RED": "stop", "TRAFFIC_LIGHT_YELLOW": "caution", "TRAFF
 
 
 def main(source, destination):
+    """Write the tables of all scenarios of a folder."""
     tables = {"tracks": [], "map": [], "scenarios": [], "lights": []}
     for path in sorted(Path(source).rglob("sd_*.pkl")):
         scenario = pickle.loads(path.read_bytes())

@@ -47,9 +47,10 @@ def write_demo(path: Path) -> None:
         title = f"Scenario {scenario.scenario_id}"
         animations.append(Animation(title, scene, panels, caption=". ".join(scores)))
     caption = (
-        f"The {NUM_SCENARIOS} of {len(data)} held-out synthetic scenarios with the smallest maps, the first {SHOWN_ROLLOUTS} of "
-        f"{NUM_ROLLOUTS} rollouts. Scores are of all {NUM_ROLLOUTS}, metric 2025; synthetic traffic says nothing about real traffic."
-    )  # fmt: skip
+        f"The {NUM_SCENARIOS} of {len(data)} held-out synthetic scenarios with the smallest maps, the first "
+        f"{SHOWN_ROLLOUTS} of {NUM_ROLLOUTS} rollouts. Scores are of all {NUM_ROLLOUTS}, metric 2025; synthetic traffic "
+        "says nothing about real traffic."
+    )
     write_page(path, "Six scenarios, simulated in advance", animations, caption=caption)
 
 

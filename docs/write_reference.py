@@ -126,8 +126,8 @@ def fields_page() -> str:
     recipes = {name: sections_of(RECIPES.get(name)()) for name in ("smart-tiny", "smart-demo", "trafficbots")}
     lines = [
         "# Settings", "",
-        "Every setting of a recipe is a flag, `--finetune.learning-rate 1e-5`, and a key of `config.json`. `rlftsim recipe NAME`",
-        "prints a recipe. Empty cells: the recipe has no such setting.", "",
+        "Every setting of a recipe is a flag, `--finetune.learning-rate 1e-5`, and a key of `config.json`.",
+        "`rlftsim recipe NAME` prints a recipe. Empty cells: the recipe has no such setting.", "",
     ]  # fmt: skip
     for section in dict.fromkeys(name for sections in recipes.values() for name in sections):
         owners = [sections.get(section) for sections in recipes.values()]
@@ -176,8 +176,9 @@ def errors_page() -> str:
     kinds = [kind for kind in kinds if issubclass(kind, errors.RlftsimError)]
     lines = [
         "# Errors", "",
-        "Every message names the value, the cause and the way out. `…` stands for values. On the command line a message is one line; in",
-        "Python all are `rlftsim.RlftsimError`.", "", "| class | exit status | raised for |", "|---|---|---|",
+        "Every message names the value, the cause and the way out. `…` stands for values. On the command line a message",
+        "is one line; in Python all are `rlftsim.RlftsimError`.", "", "| class | exit status | raised for |",
+        "|---|---|---|",
         *(f"| `{kind.__name__}` | {kind.exit_status} | {plain(summary(kind))} |" for kind in kinds), "",
     ]  # fmt: skip
     names = {kind.__name__ for kind in kinds}
@@ -221,7 +222,8 @@ def plugins_page() -> str:
     lines = [
         "# Extension points", "",
         "Another package announces objects in these entry-point groups ([extending](../extending.md),",
-        "[a package to copy](../plugin_template/README.md)). `rlftsim plugins` lists what is installed and why one fails.", "",
+        "[a package to copy](../plugin_template/README.md)). `rlftsim plugins` lists what is installed, and failures.",
+        "",
         "| group | one of them is a | where it is read | names that ship |", "|---|---|---|---|",
     ]  # fmt: skip
     for group, place in POINTS.items():
@@ -235,8 +237,9 @@ def plugins_page() -> str:
 def python_page() -> str:
     """Directives for mkdocstrings: the public names, then the modules for extensions."""
     lines = [
-        "# Python", "", "`import rlftsim as rs` offers these names, loaded on first use. One scenario, several, a data set or a batch are taken",
-        "everywhere, paths may be text, and agents are addressed by object id.", "",
+        "# Python", "",
+        "`import rlftsim as rs` offers these names, loaded on first use. One scenario, several, a data set or a batch",
+        "are taken everywhere, paths may be text, and agents are addressed by object id.", "",
     ]  # fmt: skip
     for name in rlftsim.__all__:
         lines += [f"::: rlftsim.{name}", ""]

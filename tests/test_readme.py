@@ -35,7 +35,9 @@ INLINE = [
 @pytest.mark.parametrize(("page", "line"), COMMANDS, ids=[f"{p}: {line[8:60]}" for p, line in COMMANDS])
 def test_every_command_can_be_read(page, line):
     words = [word for word in shlex.split(line, comments=True)[1:] if word not in ("|", "...")]
-    words = [word.replace("on_the_road(scale=2)", "rloo").replace("on_the_road", "rloo") for word in words]  # of a plug-in
+    words = [
+        word.replace("on_the_road(scale=2)", "rloo").replace("on_the_road", "rloo") for word in words
+    ]  # of a plug-in
     if ">" in words:
         words = words[: words.index(">")]
     if words != ["--help"] and "--config" not in words:

@@ -1,0 +1,98 @@
+"""The site: both builders in strict mode, no dead link or anchor, nothing from another host, and a search that finds."""
+
+import html.parser
+import json
+import subprocess
+import sys
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
+
+import pytest
+
+pytest.importorskip("zensical", reason="the site's builder is not installed")
+pytest.importorskip("mkdocs", reason="the site's second builder is not installed")
+pytestmark = pytest.mark.slow
+
+ROOT = Path(__file__).parents[1]
+FIRST = {
+    "MLOO": ("training", "glossary", "3_finetune", "paper_map", "decisions", "python", "fields"),
+    "road edge": ("2_score", "glossary", "decisions", "walk", "data", "errors", "fields"),
+    "tracks to predict": ("glossary", "data", "planner", "walk", "extending", "python", "errors"),
+    "vocabulary": ("training", "glossary", "tokens", "catk"),
+}
+"""Words for the search, and pages one of which has to come first."""
+KINDS = (
+    "index", "start", "live", "comparison", "training", "results", "results/smart_cpu_2026-11-21", "tutorials/1_futures",
+    "reference/cli/finetune", "reference/python",
+)  # fmt: skip
+"""A page of each kind."""
+
+
+class Links(html.parser.HTMLParser):
+    """Targets and anchors of a page."""
+
+    def __init__(self, text: str):
+        super().__init__()
+        self.targets: list[str] = []
+        self.anchors: set[str] = set()
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        values = dict(attrs)
+        self.anchors |= {values[name] for name in ("id", "name") if values.get(name)}
+        name = {"a": "href", "link": "href", "img": "src", "script": "src", "iframe": "src"}.get(tag)
+        if name and values.get(name) and values.get("rel") not in ("canonical", "next", "prev"):
+            self.targets.append(values[name])
+
+
+@pytest.fixture(scope="module", params=["zensical", "mkdocs"])
+def site(request) -> Path:
+    """Folder of the site, as `make docs` builds it."""
+    command = [sys.executable, str(ROOT / "docs" / "build_site.py"), "--builder", request.param]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return Path(done.stdout.strip()).parent
+
+
+def test_no_link_or_anchor_is_dead_and_nothing_is_loaded_from_another_host(site):
+    pages = {path: Links(path.read_text()) for path in site.rglob("*.html") if path.name != "404.html"}
+    assert len(pages) > 60
+    dead = []
+    for path, page in pages.items():
+        for target in page.targets:
+            parts = urlsplit(target)
+            if parts.scheme or target.startswith("//"):
+                continue
+            goal = (path.parent / unquote(parts.path)).resolve() if parts.path else path
+            if not goal.exists():
+                dead.append(f"{path.relative_to(site)}: {target}")
+            elif parts.fragment and goal in pages and unquote(parts.fragment) not in pages[goal].anchors:
+                # "__..." are the theme's own switches
+                dead += [f"{path.relative_to(site)}: {target}"] if not parts.fragment.startswith("__") else []
+    assert dead == []
+    assert (site / "demo" / "live.html").stat().st_size <= 1_500_000
+    # every public name has an entry, under the name that `import rlftsim as rs` gives it
+    reference = pages[site / "reference" / "python.html"]
+    assert {"rlftsim.simulate", "rlftsim.load_policy", "rlftsim.Scenario"} <= reference.anchors
+
+
+def test_from_disk_nothing_is_requested_elsewhere_and_the_search_finds(site, browser):
+    page, elsewhere = browser.new_page(viewport={"width": 360, "height": 740}), []
+    page.on("request", lambda request: elsewhere.append(request.url) if request.url.startswith("http") else None)
+    for kind in KINDS:
+        page.goto(f"file://{site}/{kind}.html")
+        # readable on a telephone: wide tables and code scroll by themselves
+        assert page.evaluate("document.documentElement.scrollWidth") <= 360, kind
+    page.close()
+    assert elsewhere == []
+
+
+def test_the_first_tutorial_runs_as_a_notebook(site, tmp_path):
+    nbclient = pytest.importorskip("nbclient")
+    nbformat = pytest.importorskip("nbformat")
+    if site.name == "mkdocs":
+        pytest.skip("the notebooks are those of the other builder")
+    notebook = nbformat.read(site / "tutorials" / "1_futures.ipynb", as_version=4)
+    nbclient.NotebookClient(notebook, timeout=600, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    assert "(1, 32, 27, 80, 2)" in json.dumps(notebook.cells)
+    assert (tmp_path / "futures.html").stat().st_size > 100_000
