@@ -48,8 +48,8 @@ def write_demo(path: Path) -> None:
         animations.append(Animation(title, scene, panels, caption=". ".join(scores)))
     caption = (
         f"The {NUM_SCENARIOS} of {len(data)} held-out synthetic scenarios with the smallest maps, the first "
-        f"{SHOWN_ROLLOUTS} of {NUM_ROLLOUTS} rollouts. Scores are of all {NUM_ROLLOUTS}, metric 2025; synthetic traffic "
-        "says nothing about real traffic."
+        f"{SHOWN_ROLLOUTS} of {NUM_ROLLOUTS} rollouts. Scores are of all {NUM_ROLLOUTS}, metric 2025; synthetic "
+        "traffic says nothing about real traffic."
     )
     write_page(path, "Six scenarios, simulated in advance", animations, caption=caption)
 

@@ -176,8 +176,8 @@ def errors_page() -> str:
     kinds = [kind for kind in kinds if issubclass(kind, errors.RlftsimError)]
     lines = [
         "# Errors", "",
-        "Every message names the value, the cause and the way out. `…` stands for values. On the command line a message",
-        "is one line; in Python all are `rlftsim.RlftsimError`.", "", "| class | exit status | raised for |",
+        "Every message names the value, the cause and the way out. `…` stands for values. On the command line a",
+        "message is one line; in Python all are `rlftsim.RlftsimError`.", "", "| class | exit status | raised for |",
         "|---|---|---|",
         *(f"| `{kind.__name__}` | {kind.exit_status} | {plain(summary(kind))} |" for kind in kinds), "",
     ]  # fmt: skip

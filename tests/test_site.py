@@ -1,4 +1,4 @@
-"""The site: both builders in strict mode, no dead link or anchor, nothing from another host, and a search that finds."""
+"""The site: both builders in strict mode, no dead link or anchor, nothing from another host, and a search."""
 
 import html.parser
 import json
@@ -22,8 +22,8 @@ FIRST = {
 }
 """Words for the search, and pages one of which has to come first."""
 KINDS = (
-    "index", "start", "live", "comparison", "training", "results", "results/smart_cpu_2026-11-21", "tutorials/1_futures",
-    "reference/cli/finetune", "reference/python",
+    "index", "start", "live", "comparison", "training", "results", "results/smart_cpu_2026-11-21",
+    "tutorials/1_futures", "reference/cli/finetune", "reference/python",
 )  # fmt: skip
 """A page of each kind."""
 
