@@ -185,7 +185,8 @@ def errors_page() -> str:
     for path in sorted(PACKAGE.rglob("*.py")):
         messages = list(messages_of(path, names))
         if messages:
-            lines += [f"## {path.relative_to(PACKAGE).with_suffix('').as_posix()}", ""]
+            # No headings: the search would find a module before the page that explains it.
+            lines += [f"**{path.relative_to(PACKAGE).with_suffix('').as_posix().replace('_', chr(92) + '_')}**", ""]
             lines += [f"- {kind}: {message}" for kind, message in dict.fromkeys(messages)]
             lines.append("")
     return "\n".join(lines)

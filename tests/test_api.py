@@ -4,6 +4,7 @@ import ast
 import html
 import importlib
 import os
+import re
 import subprocess
 import sys
 import warnings
@@ -20,6 +21,7 @@ from made_up import CPU, TINY
 from rlftsim.cli.main import main
 from rlftsim.errors import CheckpointError, ConfigError
 from rlftsim.evaluation.results import EvaluateConfig, Evaluation
+from rlftsim.evaluation.score_files import ScoreConfig
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.simulate import simulate as simulate_batch
 from rlftsim.scenario.batch import collate
@@ -619,3 +621,22 @@ def test_a_misspelled_public_name_has_a_suggestion():
     with pytest.raises(AttributeError, match="no attribute 'simulat': did you mean 'simulate'"):
         _ = rs.simulat
     assert repr(CV) == "ConstantVelocity()"
+
+
+@pytest.mark.parametrize(
+    ("make", "name"),
+    [
+        (lambda: rs.Sampling(temperature="1"), "temperature"),
+        (lambda: rs.Sampling(top_k=2.5), "top_k"),
+        (lambda: replace(rs.recipe("smart-demo").model, dim="64"), "dim"),
+        (lambda: replace(rs.recipe("smart-demo").tokens, kind="k-discs"), "kind"),
+        (lambda: ScoreConfig(limit="3"), "limit"),
+    ],
+)
+def test_settings_of_another_type_are_refused_by_name(make, name):
+    with pytest.raises(ConfigError, match=f"^{name} must be .*, got "):
+        make()
+
+
+def test_a_model_shows_itself_on_one_line():
+    assert re.fullmatch(r"SmartPolicy\([\d,]+ weights, follows no goals\)", repr(rs.load_policy("demo-base")))

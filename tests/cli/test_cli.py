@@ -154,6 +154,14 @@ WRONG = {
     ),
     "a flag that is missing": ("evaluate oracle --data synthetic", "missing: --out"),
     "an action that does not exist": ("data veriy synthetic", "no action veriy: did you mean verify"),
+    "a choice of a flag that may be left out": (
+        "convert a b --window frist",
+        "--window frist: expected one of 'av2', 'both', 'first', 'last'.",
+    ),
+    "an old flag with a value that is none": (
+        "finetune smart-demo --model m --data d --out o --goal-aim maybe",
+        "no flag --goal-aim: did you mean --goal-logit-bias?",
+    ),
     "a choice that does not exist": ("convert a b --on-error wait", "--on-error wait: expected one of 'skip', 'stop'"),
     "a value that is missing": ("evaluate oracle --out", "--out needs a value"),
     "a value of the wrong kind": (

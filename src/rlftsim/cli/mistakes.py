@@ -5,6 +5,8 @@ import re
 from collections.abc import Sequence
 from itertools import pairwise
 
+from rlftsim.aliases import current_name
+
 RULE = re.compile(r"^(╭|╰|─{4}|-{4})")
 FLAG = re.compile(r"--[A-Za-z][\w.-]*")
 ACTIONS = re.compile(r"\A\s*usage: .* \{([\w,-]+)\}$", re.MULTILINE)
@@ -31,7 +33,9 @@ def explain(words: Sequence[str], complaint: str, help_text: str) -> str:
     known = list(dict.fromkeys(FLAG.findall(help_text)))
     for flag in flags_of(words):
         if flag not in known:
-            near = nearest(flag, known)
+            # A flag of earlier versions whose value was not understood leads to the flag of today.
+            renamed = "--" + current_name(flag.removeprefix("--").replace("-", "_")).replace("_", "-")
+            near = renamed if renamed in known else nearest(flag, known)
             return f"no flag {flag}: " + (f"did you mean {near}?" if near else "`--help` lists them all.")
     # `--switch yes`: tyro complains about the value alone
     left_over = re.search(r"Unrecognized options: (\S+)", complaint)
@@ -86,9 +90,17 @@ def _one_line(complaint: str) -> str:
     return message
 
 
+def _choices(match: re.Match[str]) -> str:
+    """The choices of a flag without None, which is no word to type; tyro has no order of its own for these."""
+    names = match[3].split(", ")
+    if "'None'" in names:
+        names = sorted({*names} - {"'None'"})
+    return f"{match[2]} {match[1]}: expected one of {', '.join(names)}."
+
+
 _REWORDED = (
     (r"^Unrecognized options: (.*)$", r"not understood: \1 (one word too many, or a pattern without quotes)."),
-    (r"^invalid choice '(.*)' for argument '(.*)'\. Expected one of \((.*?),?\)\.$", r"\2 \1: expected one of \3."),
+    (r"^invalid choice '(.*)' for argument '(.*)'\. Expected one of \((.*?),?\)\.$", _choices),
     (r"^Missing value for argument '(.*)'\. Expected 1 values\.$", r"\1 needs a value."),
     (r"^Missing value for argument '(.*)'\. Expected (\d+) values\.$", r"\1 needs \2 values."),
     (r"^(.*): no type matching (.*) could be instantiated from \['?(.*?)'?\]\.$", r"\1 \3: expected \2."),

@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 from rich.table import Table
 
-from rlftsim.errors import ConfigError, DataError
+from rlftsim.errors import ConfigError, DataError, require_types
 from rlftsim.evaluation.columns import ARROWS, direction_of
 from rlftsim.evaluation.results import (
     SCORE_COLUMNS,
@@ -56,6 +56,7 @@ class ScoreConfig:
     """Processes, each with one thread; left out, as many as there are cores. Changes no result."""
 
     def __post_init__(self) -> None:
+        require_types(self)
         for name in ("limit", "jobs"):
             value = getattr(self, name)
             if value is not None and value < 1:

@@ -42,7 +42,7 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 
-from rlftsim.errors import ConfigError
+from rlftsim.errors import ConfigError, require_types
 from rlftsim.goals.types import Goals
 from rlftsim.rollout.types import AgentStates, Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
@@ -59,6 +59,7 @@ class Sampling:
     """Keep only this many of the most likely decisions; None keeps all."""
 
     def __post_init__(self) -> None:
+        require_types(self)
         if not self.temperature >= 0:
             raise ConfigError(
                 f"sampling temperature must be >= 0, got {self.temperature}: 1 samples, 0 takes the mode."

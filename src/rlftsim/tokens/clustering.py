@@ -7,7 +7,15 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 
-from rlftsim.errors import ConfigError, DataError, given, require_finite, require_not_negative, require_positive
+from rlftsim.errors import (
+    ConfigError,
+    DataError,
+    given,
+    require_finite,
+    require_not_negative,
+    require_positive,
+    require_types,
+)
 from rlftsim.progress import progress_bar
 from rlftsim.scenario.types import STEP_S, Scenarios
 from rlftsim.tokens.agent_tokens import nearest_rows
@@ -57,6 +65,7 @@ class TokensConfig:
     seed: int = 2
 
     def __post_init__(self) -> None:
+        require_types(self)
         if self.num_tokens < 2 or self.num_map_prototypes < 1:
             raise ConfigError(f"a vocabulary needs num_tokens >= 2 and num_map_prototypes >= 1, got {self}.")
         if not 0 < self.coverage <= 1:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal, get_args
 
-from rlftsim.errors import ConfigError, given, require_finite, require_positive
+from rlftsim.errors import ConfigError, given, require_finite, require_positive, require_types
 
 GoalEncoding = Literal["concat", "indication"]
 """Encoding of an agent's goal, see `goal_conditioning`."""
@@ -73,6 +73,7 @@ class SmartConfig:
         return 0.0 if self.catk_compat else 1e-3
 
     def __post_init__(self) -> None:
+        require_types(self)
         sizes = (
             "dim",
             "num_heads",

@@ -41,6 +41,11 @@ class SmartPolicy(SmartModel):
 
     # ---- the policy interface -------------------------------------------------------------------------------------
 
+    def __repr__(self) -> str:
+        # torch would print every layer
+        goals = "follows goals" if self.is_goal_conditioned else "follows no goals"
+        return f"{type(self).__name__}({sum(one.numel() for one in self.parameters()):,} weights, {goals})"
+
     def encode(self, scenarios: ScenarioBatch) -> SmartContext:
         """Map features, history tokens and their decoder features, for goal-free agents."""
         tokens = self._tokenize(scenarios)
