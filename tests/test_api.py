@@ -633,7 +633,7 @@ def test_a_misspelled_public_name_has_a_suggestion():
         (lambda: ScoreConfig(limit="3"), "limit"),
     ],
 )
-def test_settings_of_another_type_are_refused_by_name(make, name):
+def test_settings_of_another_type_are_refused_by_name(unchecked, make, name):
     with pytest.raises(ConfigError, match=f"^{name} must be .*, got "):
         make()
 
