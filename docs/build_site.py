@@ -27,7 +27,7 @@ ELSEWHERE = {"CHANGELOG.md": "changes.md", "CONTRIBUTING.md": "contributing.md",
 """Files of the root that are pages; the README's place is the home page."""
 NO_PAGES = (".py", ".toml")
 SHIM = "https://unpkg.com/iframe-worker/shim"
-"""Script of another host that the builders name in every page; docs/assets has it."""
+"""Script of another host that the builders name in every page; docs/assets has one of our own in its place."""
 
 
 def place_of(path: str) -> str | None:
