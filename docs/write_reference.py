@@ -2,7 +2,7 @@
 
     python docs/write_reference.py
 
-A test fails where the pages differ from what this script writes (`tests/test_reference.py`).
+A test fails where the pages differ from what this script writes (`tests/test_reference_pages.py`).
 """
 
 import ast
