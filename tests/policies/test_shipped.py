@@ -19,6 +19,13 @@ def test_the_shipped_base_is_more_realistic_than_constant_velocity():
     assert np.mean(base["meta_metric"]) > np.mean(still["meta_metric"]) + 0.1
 
 
+def test_the_shipped_tuned_model_is_more_realistic_than_its_base():
+    data = rs.load_dataset("synthetic", "validation")
+    base, tuned = (rs.evaluate(name, data, num_rollouts=4, limit=10) for name in ("demo-base", "demo-tuned"))
+    # Measured +0.016 on these ten, +0.033 on all forty with 32 rollouts.
+    assert np.mean(tuned["meta_metric"]) > np.mean(base["meta_metric"])
+
+
 def test_shipped_weights_are_computed_with_in_float32():
     weights = list(rs.load_policy("demo-base").parameters())  # type: ignore[attr-defined]
     assert {weight.dtype for weight in weights} == {torch.float32}
@@ -42,6 +49,6 @@ def test_the_shipped_goal_model_follows_goals_and_is_the_base_model_without_them
 def test_shipped_models_are_small_and_say_what_they_are():
     assert sum(file.stat().st_size for file in FOLDER.rglob("*") if file.is_file()) < MOST_BYTES
     folders = [path for path in FOLDER.iterdir() if any(path.glob("*.safetensors"))]
-    assert sorted(folder.name for folder in folders) == ["demo-base", "demo-goals"]
+    assert sorted(folder.name for folder in folders) == ["demo-base", "demo-goals", "demo-tuned"]
     for folder in folders:
         assert "CC0" in (folder / "README.md").read_text()

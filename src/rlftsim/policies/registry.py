@@ -30,6 +30,7 @@ POLICIES: ExtensionPoint[Callable[..., Any]] = ExtensionPoint(
         "trafficbots": "rlftsim.policies.trafficbots.policy:TrafficBotsPolicy",
         "constant_velocity": "rlftsim.rollout.baselines:ConstantVelocity",
         "demo-base": "rlftsim.policies.shipped:demo_base",
+        "demo-tuned": "rlftsim.policies.shipped:demo_tuned",
         "demo-goals": "rlftsim.policies.shipped:demo_goals",
     },
 )
