@@ -49,7 +49,8 @@ def pages() -> dict[str, str]:
 
 def cli_index() -> str:
     """The overview that `rlftsim --help` prints, with a link for each verb."""
-    rows = [f"| [`{verb}`](cli/{verb}.md) | {text} |" for verb, text in re.findall(r"^  (\w+) +(.+)$", OVERVIEW, re.M)]
+    described = re.findall(r"^  (\w+) +(.+)$", OVERVIEW, re.M)  # `join VERB` has no page of its own
+    rows = [f"| [`{verb}`]({verb}.md) | {text} |" for verb, text in described if verb in VERBS]
     lines = [
         "# Command line",
         "",
@@ -58,7 +59,7 @@ def cli_index() -> str:
         "| verb | what it does |",
         "|---|---|",
     ]
-    return "\n".join([*lines, *(row.replace("(cli/", "(") for row in rows), ""])
+    return "\n".join([*lines, *rows, ""])
 
 
 def help_of(*words: str) -> str:

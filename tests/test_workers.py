@@ -45,6 +45,15 @@ def fail(item, advance, is_stopped):
     raise DataError(f"item {item} is broken")
 
 
+class Unreadable(Exception):
+    def __init__(self, one, other):
+        super().__init__(f"{one} {other}")
+
+
+def fail_unreadably(item, advance, is_stopped):
+    raise Unreadable("broken", "beyond reading")
+
+
 def write_or_die(item, advance, is_stopped):
     advance(1)
     if item == "exit":
@@ -74,6 +83,11 @@ def test_results_come_in_the_order_of_the_items(jobs):
     done = []
     assert on_this_machine(jobs, 3).run(double, [3, 1, 2], advance=done.append) == [6, 2, 4]
     assert sum(done) == 3
+
+
+def test_an_error_that_cannot_be_read_back_is_shown_with_its_traceback():
+    with pytest.raises(RuntimeError, match="Unreadable: broken beyond reading"):
+        on_this_machine(2, 2).run(fail_unreadably, [1, 2], advance=lambda count: None)
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
@@ -121,7 +135,7 @@ def test_shares_have_every_item_once(of):
 
 @pytest.mark.parametrize("text", ["3", "0/4", "5/4", "a/4", "1/0", "-1/4", "1.5/4", "/", ""])
 def test_a_share_that_is_none_is_refused(text):
-    with pytest.raises(ConfigError, match="--share"):
+    with pytest.raises(ConfigError, match="counted from 1 to 4" if text in ("0/4", "5/4") else "--share"):
         Share.parse(text, Inline())
 
 

@@ -25,6 +25,17 @@ def is_url(place: object) -> bool:
     return isinstance(place, str) and "://" in place
 
 
+def folder_address(url: str) -> str:
+    """The address of a remote folder, without a slash at its end.
+
+    Raises:
+        ConfigError: no address, or one without a place in it.
+    """
+    if not is_url(url) or not url.partition("://")[2].strip("/"):
+        raise ConfigError(f"{url} is no address of a folder: write one such as s3://bucket/folder.")
+    return url.rstrip("/")
+
+
 def cache_folder() -> Path:
     """Folder for what was fetched: RLFTSIM_CACHE, else ~/.cache/rlftsim."""
     return Path(os.environ.get("RLFTSIM_CACHE", "~/.cache/rlftsim")).expanduser()
@@ -109,6 +120,16 @@ def publish(path: Path, url: str) -> None:
         files.put_file(str(path), place)
 
 
+def remove(url: str) -> None:
+    """Remove a remote file.
+
+    Raises:
+        DataError: it is not there or cannot be removed.
+    """
+    with remote(url) as (files, place):
+        files.rm_file(place)
+
+
 def fetch_shard(url: str, sha256: str) -> Path:
     """Local path of a shard, fetched once per machine by whichever process comes first.
 
@@ -133,15 +154,20 @@ def fetch_shard(url: str, sha256: str) -> Path:
 
 def _evict(newest: Path) -> None:
     """Remove the oldest shards of the cache above its limit. Processes that have one open keep it."""
-    limit = float(os.environ.get("RLFTSIM_CACHE_GB", "50")) * 1e9
-    shards = [path for path in newest.parent.iterdir() if not path.suffix]
-    shards.sort(key=lambda path: path.stat().st_mtime, reverse=True)
-    total = 0
-    for path in shards:
-        total += path.stat().st_size
-        if total > limit and path != newest:
-            path.unlink(missing_ok=True)
-            path.with_suffix(".lock").unlink(missing_ok=True)
+    given = os.environ.get("RLFTSIM_CACHE_GB", "50")
+    try:
+        limit = float(given) * 1e9
+    except ValueError:
+        raise ConfigError(f"RLFTSIM_CACHE_GB={given} is no number of gigabytes.") from None
+    with _locked(newest.parent / "evict.lock"):  # one process at a time counts and removes
+        shards = [path for path in newest.parent.iterdir() if not path.suffix]
+        shards.sort(key=lambda path: path.stat().st_mtime, reverse=True)
+        total = 0
+        for path in shards:
+            total += path.stat().st_size
+            if total > limit and path != newest:
+                path.unlink(missing_ok=True)
+                path.with_suffix(".lock").unlink(missing_ok=True)
 
 
 @contextmanager

@@ -135,9 +135,9 @@ class Share:
             ConfigError: something else.
         """
         number, slash, of = ("0", "/", "1") if text == "join" else text.partition("/")
-        if not (slash and number.isdecimal() and of.isdecimal() and int(of) > 0 and int(number) <= int(of)):
+        if not (slash and number.isdecimal() and of.isdecimal() and int(of) > 0):
             raise ConfigError(f"--share {text} is no share: write the number and how many there are, such as 3/64.")
-        if int(number) == 0 and text != "join":
+        if not 1 <= int(number) <= int(of) and text != "join":
             raise ConfigError(f"--share {text}: shares are counted from 1 to {of}.")
         return cls(int(number), int(of), runner)
 
@@ -387,9 +387,10 @@ def _work(line: Connection) -> None:
             except Exception as error:
                 error.add_note(traceback.format_exc())
                 try:
-                    say("error", error)
-                except (pickle.PicklingError, AttributeError, TypeError):
-                    say("error", RuntimeError(traceback.format_exc()))
+                    pickle.loads(pickle.dumps(error))  # some errors can be pickled and not be read back
+                except Exception:
+                    error = RuntimeError(traceback.format_exc())
+                say("error", error)
             say("idle")
 
 

@@ -21,7 +21,7 @@ from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
 from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
-from rlftsim.workers import Inline
+from rlftsim.workers import Inline, Share, Unfinished
 
 CONFIG = EvaluateConfig(num_rollouts=4, rollouts_per_pass=2)
 
@@ -170,6 +170,16 @@ def test_an_interrupted_run_goes_on_with_what_is_missing(data, tmp_path, monkeyp
     rest.clear()
     assert same(evaluate(Wobble(), data, tmp_path, CONFIG, name="cut"), whole)
     assert rest == []
+
+
+def test_unfinished_parts_of_other_settings_outlive_a_repeated_command(data, tmp_path):
+    evaluate(Wobble(), data, tmp_path, CONFIG, name="run")
+    with pytest.raises(Unfinished):
+        evaluate(Wobble(), data, tmp_path, replace(CONFIG, seed=1), name="run", runner=Share(1, 2, Inline()))
+    parts = sorted((tmp_path / "run.parts").glob("*.parquet"))
+    assert parts
+    evaluate(Wobble(), data, tmp_path, CONFIG, name="run")
+    assert sorted((tmp_path / "run.parts").glob("*.parquet")) == parts
 
 
 def test_parts_and_results_of_another_policy_are_replaced_with_a_message(data, tmp_path, capsys):

@@ -11,11 +11,13 @@ from rlftsim import storage
 from rlftsim.cli.main import main
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.evaluate import EvaluateConfig, evaluate
+from rlftsim.lease import Lease
 from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.scenario.convert import convert
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
 from rlftsim.scenario.transfer import pull_dataset, push_dataset
 from rlftsim.storage import fetch_shard
+from rlftsim.workers import Inline
 
 
 @pytest.fixture(scope="module")
@@ -130,11 +132,53 @@ def test_a_push_that_is_cut_short_leaves_no_data_set_and_goes_on(bucket, data, t
     monkeypatch.setattr("rlftsim.scenario.transfer.publish", lambda path, url: pushed.append(path.name))
     push_dataset(data, url, show_progress=False)
     assert pushed == ["index.parquet", "manifest.json"]  # the shards are there by the manifest
-    # a pull that was cut short goes on, too
-    (tmp_path / "back").mkdir()
-    (tmp_path / "back" / "INCOMPLETE").touch()
-    pull_dataset(url, tmp_path / "back", show_progress=False)
-    assert contents(tmp_path / "back") == contents(data)
+
+
+def test_a_pull_that_is_cut_short_goes_on_and_disturbs_no_other_work(bucket, data, tmp_path, monkeypatch):
+    url, back = f"{bucket}/set", tmp_path / "back"
+    push_dataset(data, url, show_progress=False)
+    fetched = []
+
+    def cut(url, path, sha256):
+        if fetched:
+            raise DataError("cut")
+        fetched.append(storage.fetch(url, path, sha256))
+
+    with monkeypatch.context() as patch:
+        patch.setattr("rlftsim.scenario.transfer.fetch", cut)
+        with pytest.raises(DataError, match="cut"):
+            pull_dataset(url, back, show_progress=False)
+    with pytest.raises(DataError, match="is not empty"):
+        pull_dataset(f"{bucket}/other", back, show_progress=False)
+    pull_dataset(url, back, show_progress=False)
+    assert contents(back) == contents(data)
+
+    converting = tmp_path / "converting"
+    with Lease(converting / "INCOMPLETE", Inline(), "is converting to", "A conversion runs here"):
+        with pytest.raises(DataError, match="is not empty"):
+            pull_dataset(url, converting, show_progress=False)
+        assert (converting / "INCOMPLETE").read_text().startswith("A conversion runs here")
+
+
+def test_a_push_over_another_data_set_that_is_cut_short_leaves_none(bucket, data, source, tmp_path, monkeypatch):
+    url, publish = f"{bucket}/set", storage.publish
+    convert(source, tmp_path / "one", jobs=1, show_progress=False, split="validation")
+    push_dataset(data, url, show_progress=False)
+
+    def cut(path, url):
+        if path.name == "index.parquet":
+            raise DataError("cut")
+        publish(path, url)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("rlftsim.scenario.transfer.publish", cut)
+        with pytest.raises(DataError, match="cut"):
+            push_dataset(tmp_path / "one", url, show_progress=False)
+    with pytest.raises(DataError, match="there is no such file or bucket"):
+        ScenarioDataset(url)
+    push_dataset(data, url, show_progress=False)
+    pull_dataset(url, tmp_path / "again", show_progress=False)
+    assert contents(tmp_path / "again") == contents(data)
 
 
 def test_a_shard_that_was_replaced_in_the_bucket_is_refused(bucket, data, tmp_path):
@@ -168,6 +212,12 @@ def test_addresses_that_cannot_be_read_are_refused_in_one_line(tmp_path, monkeyp
         ScenarioDataset("file:///nowhere")
     with pytest.raises(DataError, match=r"^nonsense://x/manifest\.json: .*nonsense"):
         ScenarioDataset("nonsense://x")
+
+    for url in ("file://", "s3://", "s3:///", "/a/path"):
+        with pytest.raises(ConfigError, match="is no address of a folder"):
+            pull_dataset(url, tmp_path / "x")
+    assert not (tmp_path / "x").exists()
+    assert main(["evaluate", "constant_velocity", "--data", "synthetic", "--out", "s3://b/x"]) == 2
 
     def missing(url):
         raise ImportError("Install s3fs to access S3")

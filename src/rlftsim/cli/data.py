@@ -40,7 +40,7 @@ class Convert:
     split: str | None = None
     """Split of all sources; left out, it is read off their folder or name."""
     on_error: Literal["skip", "stop"] = "skip"
-    """What to do with a damaged record: leave it out and list it, or stop with exit status 1."""
+    """A damaged record is left out and listed, or the command stops with exit status 1."""
     jobs: int | None = None
     """Processes, each with a shard of its own. Left out: one for each core."""
     window: Literal["last", "first", "both", "av2"] | None = None

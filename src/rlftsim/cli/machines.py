@@ -7,7 +7,7 @@ from rlftsim.workers import Inline, OnDeath, Processes, Runner, Share
 
 @dataclass(frozen=True)
 class Machines:
-    """Where the work is done, beside the processes of this machine (--jobs)."""
+    """The machines that do the work, beside the processes of this machine (--jobs)."""
 
     share: str | None = None
     """Do every N-th piece of the work only, from the K-th on: "3/64" on one of 64 machines. The last one puts the

@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import fields, is_dataclass
+from pathlib import Path
 from typing import Any
 
 from rlftsim.aliases import current_name, current_words
@@ -22,6 +23,8 @@ COUNTS = (
 """Fields of verbs that are 1 or more."""
 EITHER_OR = {"--goal-logit-bias": "True", "--no-goal-logit-bias": "False"}
 """Switches that may also be left out, which is a third value. tyro has no such kind: it is handed the value."""
+ADDRESS = re.compile(r"\w{2,}:/")
+"""Beginning of an address such as s3://bucket, of which a path keeps one slash."""
 NUMBERS = re.compile(r"[\d.eE+\-\s]+(,[\d.eE+\-\s]+)+,?")
 
 
@@ -91,7 +94,7 @@ def _parsed(name: str, words: list[str], verbs: Mapping[str, tuple[str, str]], r
     # Warnings on the way, such as that of a reward that is registered twice, are shown after all.
     if complaint.getvalue():
         log.warning(complaint.getvalue().rstrip())
-    _refuse_no_count(parsed)
+    _refuse_values(parsed)
     if has_settings:
         parsed.refuse_useless(flags_of(words))
     return parsed
@@ -159,8 +162,8 @@ def _flag_of_setting(setting: str) -> list[str]:
     return flags
 
 
-def _refuse_no_count(verb: Any, prefix: str = "--") -> None:
-    """Refuse zero and less where something is counted.
+def _refuse_values(verb: Any, prefix: str = "--") -> None:
+    """Refuse zero and less where something is counted, and addresses of buckets in place of paths.
 
     Raises:
         ConfigError: names the flag.
@@ -169,6 +172,8 @@ def _refuse_no_count(verb: Any, prefix: str = "--") -> None:
         value = getattr(verb, field.name)
         if field.name in COUNTS and isinstance(value, int) and value < 1:
             raise ConfigError(f"{prefix}{field.name.replace('_', '-')} must be at least 1, got {value}.")
+        if isinstance(value, Path) and ADDRESS.match(str(value)):
+            raise ConfigError(f"{value} is an address: name a folder or a file of this machine here.")
         # Fields of these two are shown without a prefix, so they belong to the verb.
         if field.name in ("config", "action") and is_dataclass(value):
-            _refuse_no_count(value)
+            _refuse_values(value)

@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 from rich.table import Table
 
+from rlftsim.errors import DataError
 from rlftsim.evaluation.evaluate import EvaluateConfig, frozen_copy, simulate_states
 from rlftsim.evaluation.resumable import EvaluationParts
 from rlftsim.policies.registry import load_policy
@@ -55,6 +56,8 @@ def measure_cost(plan: Plan, model: str, data: str, num_measured: int) -> UnitCo
         with tempfile.TemporaryDirectory() as folder:
             start = time.process_time()
             report = convert(data, Path(folder) / "data", jobs=1)
+            if not report.converted:
+                raise DataError(f"{data}: no scenario could be converted, so there is no cost to plan with.")
             return UnitCost((time.process_time() - start) / report.converted, report.converted)
     dataset = open_dataset(data, cache_size=2)
     agents = np.stack([dataset.index[name].to_numpy() for name in _AGENT_COLUMNS]).sum(0)  # [scenarios]

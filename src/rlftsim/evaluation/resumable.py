@@ -9,6 +9,7 @@ import shutil
 import tempfile
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -22,7 +23,7 @@ from rlftsim.evaluation.results import SCHEMA, Evaluation, Provenance, Skipped, 
 from rlftsim.lease import Lease
 from rlftsim.progress import log, progress_bar
 from rlftsim.threads import one_thread
-from rlftsim.workers import Runner, Share, require_finished
+from rlftsim.workers import Inline, Runner, Share, require_finished
 
 Result = TypeVar("Result")
 """Result of one scenario, as the work on it returns it."""
@@ -220,6 +221,11 @@ class EvaluationParts(PartFiles[Mapping[str, object] | Skipped, Evaluation]):
         found_ids = {*found.scenario_ids, *(skipped.scenario_id for skipped in found.skipped)}
         return found if found_ids == set(scenario_ids) else None
 
+    def has_only_ours(self) -> bool:
+        """True if no part of an evaluation with other settings is there."""
+        found = (_read_if_readable(path) for path in self.parts_folder.glob("*.parquet"))
+        return not any(part is not None and part.provenance.differences(self.provenance) for part in found)
+
     def _is_ours(self, found: Evaluation, path: Path, fate: str) -> bool:
         other = found.provenance.differences(self.provenance)
         if other:
@@ -270,8 +276,11 @@ def resume_evaluation(
                 )  # fmt: skip
                 finished = join_evaluations(name, provenance, parts)
                 finished.write(files.result_path)
-        # Only now: an interruption between the two leaves the parts, and the next call finds the result.
-        shutil.rmtree(files.parts_folder, ignore_errors=True)
+                # Only now: an interruption between the two leaves the parts, and the next call finds the result.
+                shutil.rmtree(files.parts_folder, ignore_errors=True)
+        elif files.parts_folder.exists() and files.has_only_ours():
+            with suppress(DataError), Lease(files.parts_folder / ".lock", Inline(), "works in"):
+                shutil.rmtree(files.parts_folder, ignore_errors=True)
     return finished
 
 

@@ -166,9 +166,8 @@ def convert(
             convert_one = partial(_convert_unit, source=data_source)
             outcomes = runner.run(convert_one, own, advance=advance, name_of=lambda task: task.unit.name)
         lease.finish("convert")
-        # What other shares made is taken over by size and split: each has compared the checksums of its own.
-        made = {file: entry for file, entry in _known_entries(folder).items()}
-        made |= {outcome.entry.file: outcome.entry for outcome in outcomes}
+        # Shards of other shares are taken over by size and split: each share has compared the checksums of its own.
+        made = _known_entries(folder) | {outcome.entry.file: outcome.entry for outcome in outcomes}
         entries = [made[task.shard] for task in tasks if task.shard in made and _is_of(made[task.shard], task)]
         require_finished(runner, len(tasks) - len(entries), len(tasks), "convert")
         _remove_temporary(folder)  # of processes that were killed

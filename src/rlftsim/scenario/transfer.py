@@ -4,18 +4,20 @@ import os
 import shutil
 from pathlib import Path
 
-from rlftsim.atomic_io import write_text
 from rlftsim.errors import DataError
+from rlftsim.lease import Lease
 from rlftsim.progress import progress_bar
 from rlftsim.scenario.dataset import INCOMPLETE, INDEX, MANIFEST, Manifest, parse_manifest, read_manifest
 from rlftsim.scenario.shards import hash_file
-from rlftsim.storage import fetch, mirror, publish
+from rlftsim.storage import fetch, folder_address, mirror, publish, remove
+from rlftsim.workers import Inline
 
 
 def push_dataset(folder: str | os.PathLike[str], url: str, *, show_progress: bool = True) -> Manifest:
     """Copy a data set to a bucket: shards first, the manifest last, so that readers never see a part of it.
 
-    Shards that are there already, by the manifest there, are not copied again.
+    Shards that are there already, by the manifest there, are not copied again. Where others are replaced, the manifest
+    is removed first: until the end there is no data set, and after an interruption the same call copies all.
 
     Args:
         folder: the data set.
@@ -23,14 +25,17 @@ def push_dataset(folder: str | os.PathLike[str], url: str, *, show_progress: boo
         show_progress: False = no progress bar.
 
     Raises:
+        ConfigError: no address of a folder.
         DataError: no finished data set in the folder, or the bucket cannot be written to.
     """
-    folder, url = Path(folder), url.rstrip("/")
+    folder, url = Path(folder), folder_address(url)
     manifest = read_manifest(folder)
     try:
         there = {(entry.file, entry.sha256) for entry in parse_manifest(mirror(url, (INDEX, MANIFEST))).shards}
     except DataError:  # no data set there yet
         there = set()
+    if there and any((entry.file, entry.sha256) not in there for entry in manifest.shards):
+        remove(f"{url}/{MANIFEST}")
     with progress_bar("push", len(manifest.shards), show=show_progress) as advance:
         for entry in manifest.shards:
             if (entry.file, entry.sha256) not in there:
@@ -50,20 +55,26 @@ def pull_dataset(url: str, folder: str | os.PathLike[str], *, show_progress: boo
         show_progress: False = no progress bar.
 
     Raises:
-        DataError: no data set there, something else in the folder, or a shard that is not the manifest's.
+        ConfigError: no address of a folder.
+        DataError: no data set there, something else in the folder or at work in it, or a shard that is not the
+            manifest's.
     """
-    folder, url = Path(folder), url.rstrip("/")
-    if folder.exists() and not (folder / INCOMPLETE).exists() and any(folder.iterdir()):
+    folder, url = Path(folder), folder_address(url)
+    mark = folder / INCOMPLETE
+    note = f"A copy of {url} runs here or was interrupted: run the same command again, it goes on."
+    is_begun = mark.exists() and mark.read_text(encoding="utf-8").startswith(note)
+    if folder.exists() and not is_begun and any(folder.iterdir()):
         raise DataError(f"{folder} is not empty: choose another folder or delete it")
     manifest = read_manifest(source := mirror(url, (INDEX, MANIFEST)))
-    write_text(folder / INCOMPLETE, f"A copy of {url} was interrupted: run the same command again, it goes on.\n")
-    with progress_bar("pull", len(manifest.shards), show=show_progress) as advance:
-        for entry in manifest.shards:
-            path = folder / entry.file
-            if not path.exists() or hash_file(path) != entry.sha256:
-                fetch(f"{url}/{entry.file}", path, entry.sha256)
-            advance(1)
-    for name in (INDEX, MANIFEST):
-        shutil.copyfile(source / name, folder / name)
-    (folder / INCOMPLETE).unlink()
+    # The folder is marked as unfinished until the mark is removed.
+    with Lease(mark, Inline(), "is copying to", note) as lease:
+        with progress_bar("pull", len(manifest.shards), show=show_progress) as advance:
+            for entry in manifest.shards:
+                path = folder / entry.file
+                if not path.exists() or hash_file(path) != entry.sha256:
+                    fetch(f"{url}/{entry.file}", path, entry.sha256)
+                advance(1)
+        for name in (INDEX, MANIFEST):
+            shutil.copyfile(source / name, folder / name)
+        lease.remove()
     return manifest
