@@ -23,10 +23,10 @@ if (location.protocol === "file:") {
       this.ready = load(url);
     }
     postMessage(data) {
-      // In order, and not before the script listens.
+      // In order, not before the script listens, and a copy, as a worker gets.
       this.ready = this.ready.then(() => {
         const { MessageEvent } = this.frame.contentWindow;
-        this.frame.contentWindow.dispatchEvent(new MessageEvent("message", { data }));
+        this.frame.contentWindow.dispatchEvent(new MessageEvent("message", { data: structuredClone(data) }));
       });
     }
     terminate() {

@@ -184,7 +184,7 @@ def test_two_builds_do_not_share_a_folder(data, tmp_path):
     (tmp_path / "out").mkdir()
     with (tmp_path / "out" / ".lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        with pytest.raises(DataError, match=r"another process builds in .*: wait for it, or name another --out"):
+        with pytest.raises(DataError, match=r"another process builds in .*: wait for it or choose another destination"):
             build(data, tmp_path / "out")
     build(data, tmp_path / "out")
 

@@ -38,7 +38,7 @@ def test_a_build_is_declared_checked_and_reported(place, capsys):
     assert main([*BUILD, "--i-comply"]) == 0
     assert "all 32 scenes are equal" in capsys.readouterr().out
     assert {path.name for path in (place / "out").iterdir()} == {
-        ".lock", "plan.json", "submission.report.json", "submission.report.md", "submission.tar.gz"
+        "plan.json", "submission.report.json", "submission.report.md", "submission.tar.gz"
     }  # fmt: skip
     report = json.loads((place / "out" / "submission.report.json").read_text())
     assert report["bytes"] == (place / "out" / "submission.tar.gz").stat().st_size
