@@ -33,7 +33,7 @@ class Lease:
 
     def __init__(self, path: Path, runner: Runner, doing: str, note: str = "") -> None:
         self._path, self._doing, self._note = path, doing, note
-        self._share = runner if isinstance(runner, Share) and runner.number else None
+        self._share = runner if isinstance(runner, Share) else None
         self._files: list[TextIO] = []
         try:
             if self._share is not None:

@@ -117,15 +117,15 @@ class Inline:
 
 @dataclass(frozen=True)
 class Share:
-    """Every `of`-th item from number `number` on, counted from 1; number 0 has none and only joins the others'."""
+    """Every `of`-th item from number `number` on, counted from 1."""
 
     number: int
     of: int
     runner: Runner
 
     @classmethod
-    def parse(cls, text: str, runner: Runner) -> "Share":
-        """The share that a command line names: "3/64", or "join".
+    def parse(cls, text: str, runner: Runner) -> "Share | Joining":
+        """The share that a command line names, "3/64", or "join" for none.
 
         Args:
             text: number and count, or "join".
@@ -134,25 +134,36 @@ class Share:
         Raises:
             ConfigError: something else.
         """
-        number, slash, of = ("0", "/", "1") if text == "join" else text.partition("/")
+        if text == "join":
+            return Joining()
+        number, slash, of = text.partition("/")
         if not (slash and number.isdecimal() and of.isdecimal() and int(of) > 0):
             raise ConfigError(f"--share {text} is no share: write the number and how many there are, such as 3/64.")
-        if not 1 <= int(number) <= int(of) and text != "join":
+        if not 1 <= int(number) <= int(of):
             raise ConfigError(f"--share {text}: shares are counted from 1 to {of}.")
         return cls(int(number), int(of), runner)
 
     def __str__(self) -> str:
-        return f"share {self.number}/{self.of}" if self.number else "joining"
+        return f"share {self.number}/{self.of}"
 
     def own(self, items: Sequence[Any]) -> Sequence[Any]:
         """The items of this share, see `Runner`."""
-        return items[self.number - 1 :: self.of] if self.number else items[:0]
+        return items[self.number - 1 :: self.of]
 
     def run(
         self, task: Task, items: Sequence[Any], *, advance: Advance, name_of: Callable[[Any], str] = str
     ) -> list[Any]:
         """Results of some items, see `Runner`."""
         return self.runner.run(task, items, advance=advance, name_of=name_of)
+
+
+@dataclass(frozen=True)
+class Joining(Inline):
+    """No item: only puts together what shares have made (`rlftsim join`)."""
+
+    def own(self, items: Sequence[Any]) -> Sequence[Any]:
+        """No items, see `Runner`."""
+        return items[:0]
 
 
 def on_this_machine(jobs: int, num_items: int, on_death: OnDeath = "skip") -> Runner:
@@ -182,12 +193,12 @@ def require_finished(runner: Runner, num_left: int, num_items: int, title: str) 
     """
     if not num_left:
         return
-    if isinstance(runner, Share) and runner.number:
+    if isinstance(runner, Share):
         raise Unfinished(
             f"{title}: {runner} is done; {num_left} of {num_items} pieces are left to other shares. The last share "
             "puts the result together; if it was stopped, `rlftsim join` and the same command do."
         )
-    if isinstance(runner, Share):
+    if isinstance(runner, Joining):
         raise DataError(
             f"{title}: {num_left} of {num_items} pieces are missing: run the shares again that have not ended with "
             "status 0, or the command without `join` to do the rest here."
@@ -216,7 +227,7 @@ class Processes:
         if not items:
             return []
         _refuse_unguarded_main()
-        pickled = pickle_task(task)
+        pickled = _pickled(task)
         results: dict[int, Any] = {}
         waiting, deaths, reasons = deque(range(len(items))), Counter[int](), dict[str, str]()
         crew: dict[Any, _Worker] = {}
@@ -276,7 +287,7 @@ _DIED = (
 )
 
 
-def pickle_task(task: Task) -> bytes:
+def _pickled(task: Task) -> bytes:
     """A task by value, for other processes.
 
     Raises:

@@ -113,8 +113,9 @@ def test_sources_in_a_bucket_are_converted_to_the_same_bytes(bucket, source, dat
         convert(f"{bucket}/nothing", tmp_path / "other")
 
 
-def test_a_push_that_is_cut_short_leaves_no_data_set_and_goes_on(bucket, data, tmp_path, monkeypatch):
-    url, publish = f"{bucket}/set", storage.publish
+def cut_push(folder, url, monkeypatch):
+    """A push that ends when all shards are there."""
+    publish = storage.publish
 
     def cut(path, url):
         if path.name == "index.parquet":
@@ -124,7 +125,12 @@ def test_a_push_that_is_cut_short_leaves_no_data_set_and_goes_on(bucket, data, t
     with monkeypatch.context() as patch:
         patch.setattr("rlftsim.scenario.transfer.publish", cut)
         with pytest.raises(DataError, match="cut"):
-            push_dataset(data, url, show_progress=False)
+            push_dataset(folder, url, show_progress=False)
+
+
+def test_a_push_that_is_cut_short_leaves_no_data_set_and_goes_on(bucket, data, tmp_path, monkeypatch):
+    url = f"{bucket}/set"
+    cut_push(data, url, monkeypatch)
     with pytest.raises(DataError, match=r"s3://bucket/set/manifest\.json: there is no such file or bucket"):
         ScenarioDataset(url)
     push_dataset(data, url, show_progress=False)
@@ -161,19 +167,10 @@ def test_a_pull_that_is_cut_short_goes_on_and_disturbs_no_other_work(bucket, dat
 
 
 def test_a_push_over_another_data_set_that_is_cut_short_leaves_none(bucket, data, source, tmp_path, monkeypatch):
-    url, publish = f"{bucket}/set", storage.publish
+    url = f"{bucket}/set"
     convert(source, tmp_path / "one", jobs=1, show_progress=False, split="validation")
     push_dataset(data, url, show_progress=False)
-
-    def cut(path, url):
-        if path.name == "index.parquet":
-            raise DataError("cut")
-        publish(path, url)
-
-    with monkeypatch.context() as patch:
-        patch.setattr("rlftsim.scenario.transfer.publish", cut)
-        with pytest.raises(DataError, match="cut"):
-            push_dataset(tmp_path / "one", url, show_progress=False)
+    cut_push(tmp_path / "one", url, monkeypatch)
     with pytest.raises(DataError, match="there is no such file or bucket"):
         ScenarioDataset(url)
     push_dataset(data, url, show_progress=False)

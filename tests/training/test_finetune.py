@@ -372,7 +372,7 @@ def test_a_policy_without_a_pretraining_loss_has_no_imitation_term(drawn_scenari
             torch.nn.Module.__init__(self)
 
         def save_pretrained(self, folder, *, card=""):
-            raise NotImplementedError
+            raise AssertionError("refused before anything is saved")
 
     with pytest.raises(ConfigError, match="it has no teacher_forced and no imitation_loss"):
         finetune(Learned(), drawn_scenarios, tmp_path, replace(tiny.FINETUNE, imitation_weight=0.1))

@@ -16,7 +16,7 @@ from torch import nn
 
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.results import EvaluateConfig, Evaluation, GoalsGiven, Provenance, Skipped, row_of_result
-from rlftsim.evaluation.resumable import EvaluationParts, resume_evaluation
+from rlftsim.evaluation.resumable import EvaluationParts, groups_of, resume_evaluation
 from rlftsim.evaluation.scenario_source import choose_scenarios, hash_manifest, open_held_out
 from rlftsim.goals.logged import logged_goals
 from rlftsim.goals.types import Goals
@@ -99,7 +99,7 @@ def evaluate(
         name,
         provenance,
         None if out is None else Path(out),
-        runner=runner or on_this_machine(config.jobs, -(-len(positions) // EvaluationParts.group_size)),
+        runner=runner or on_this_machine(config.jobs, len(groups_of(len(positions), EvaluationParts.group_size))),
         title=f"evaluate {name}",
         show_progress=show_progress,
     )

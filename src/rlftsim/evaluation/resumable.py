@@ -23,7 +23,7 @@ from rlftsim.evaluation.results import SCHEMA, Evaluation, Provenance, Skipped, 
 from rlftsim.lease import Lease
 from rlftsim.progress import log, progress_bar
 from rlftsim.threads import one_thread
-from rlftsim.workers import Inline, Runner, Share, require_finished
+from rlftsim.workers import Inline, Joining, Runner, Share, require_finished
 
 Result = TypeVar("Result")
 """Result of one scenario, as the work on it returns it."""
@@ -262,7 +262,7 @@ def resume_evaluation(
         DataError: another driver is at work on this evaluation.
         SetAside, Unfinished: see `map_scenarios`.
     """
-    if out is None and isinstance(runner, Share):
+    if out is None and isinstance(runner, Share | Joining):
         raise ConfigError("shares meet in a folder: name one with --out.")
     # Processes hand their rows over in files, so even a result that is not kept needs a folder.
     with tempfile.TemporaryDirectory() as nowhere:

@@ -26,7 +26,7 @@ from rlftsim.evaluation.results import (
     Skipped,
     row_of_result,
 )
-from rlftsim.evaluation.resumable import EvaluationParts, resume_evaluation
+from rlftsim.evaluation.resumable import EvaluationParts, groups_of, resume_evaluation
 from rlftsim.evaluation.rollout_files import RolloutEntry, find_rollouts, read_states
 from rlftsim.evaluation.scenario_source import ScenarioSource, open_scenarios
 from rlftsim.progress import log
@@ -123,7 +123,7 @@ def score_rollouts(
         name,
         provenance,
         None if out is None else Path(out),
-        runner=runner or on_this_machine(config.num_jobs, -(-len(entries) // EvaluationParts.group_size)),
+        runner=runner or on_this_machine(config.num_jobs, len(groups_of(len(entries), EvaluationParts.group_size))),
         title=f"score {name}",
         show_progress=show_progress,
     )
