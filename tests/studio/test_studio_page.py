@@ -421,6 +421,7 @@ def test_playing_120_agents_in_32_rollouts_is_smooth(page):
     if os.getloadavg()[0] > 2 * (os.cpu_count() or 1):
         pytest.skip("the machine is busy: its frame rate says nothing")
     page.open(f"#split=validation&id={SCENARIO}&panels=goals")
+    page.wait("Object.keys(studio.state.maneuvers).length")  # it is looked for agent by agent, and the crowd is made up
     page.page.evaluate(CROWD)
     gaps = page.page.evaluate(GAPS)
     print(json.dumps({"frames_per_s": 1000 * len(gaps) / sum(gaps), "longest_ms": max(gaps)}))
