@@ -4,7 +4,8 @@ There is no GPU here, see `pretend_device`.
 """
 
 import copy
-from contextlib import nullcontext
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 
 import pytest
@@ -51,10 +52,11 @@ class PretendFabric:
         raise AssertionError("a single process has nothing to reduce")
 
 
-@pytest.fixture
-def device(monkeypatch):
-    monkeypatch.setattr(processes, "start_fabric", lambda config: PretendFabric())
-    with PretendDevice() as device:
+@contextmanager
+def on_device() -> Iterator[PretendDevice]:
+    """A block in which training takes place on the pretend device."""
+    with pytest.MonkeyPatch.context() as patch, PretendDevice() as device:
+        patch.setattr(processes, "start_fabric", lambda config: PretendFabric())
         yield device
 
 
@@ -122,23 +124,23 @@ def test_the_device_has_the_gradients_of_the_cpu():
 # ---- planted mistakes ----------------------------------------------------------------------------------------------
 
 
-def test_a_table_that_stays_on_the_host_is_found(device, policy, batch, monkeypatch):
+def test_a_table_that_stays_on_the_host_is_found(policy, batch, monkeypatch):
     table = torch.tensor([0, 0, 1, 2, 0])
     monkeypatch.setattr("rlftsim.policies.smart.model.class_of_type", lambda object_type: table[object_type])
-    with pytest.raises(RuntimeError, match=r"same device.*index"):
+    with on_device(), pytest.raises(RuntimeError, match=r"same device.*index"):
         policy.to(DEVICE).encode(batch.to(DEVICE))
 
 
-def test_noise_that_stays_on_the_host_is_found(device, policy, batch, monkeypatch):
+def test_noise_that_stays_on_the_host_is_found(policy, batch, monkeypatch):
     draw = simulate_module.draw_noise
     monkeypatch.setattr(simulate_module, "draw_noise", lambda *args, **named: draw(*args, **named).cpu())
-    with pytest.raises(RuntimeError, match=r"same device.*distributions.py"):
+    with on_device(), pytest.raises(RuntimeError, match=r"same device.*distributions.py"):
         simulate(policy.to(DEVICE), batch.to(DEVICE), num_rollouts=1, seed=0)
 
 
-def test_a_missing_copy_to_the_host_is_found(device, policy, batch, monkeypatch):
+def test_a_missing_copy_to_the_host_is_found(policy, monkeypatch):
     monkeypatch.setattr(torch.Tensor, "cpu", lambda self: self)
-    with pytest.raises(RuntimeError, match="numpy"):
+    with on_device(), pytest.raises(RuntimeError, match="numpy"):
         fingerprint_policy(policy.to(DEVICE))
 
 
@@ -157,7 +159,7 @@ MODELS = {
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_rollouts_are_those_of_the_cpu(device, vocabulary, drawn_scenarios, model):
+def test_rollouts_are_those_of_the_cpu(vocabulary, drawn_scenarios, model):
     policy = tiny.tiny_policy(vocabulary, MODELS[model]).eval().requires_grad_(False)
     for part in policy.goal_parts():
         for weight in part.parameters():
@@ -166,27 +168,26 @@ def test_rollouts_are_those_of_the_cpu(device, vocabulary, drawn_scenarios, mode
     batch = collate([drawn_scenarios[1], scenes.lone_agent(), scenes.without_map(), drawn_scenarios[2]])
     goals = logged_goals(batch).only(batch.object_id[:, None] % 2 == 0) if policy.is_goal_conditioned else None
     expected = simulate(policy, batch, num_rollouts=2, seed=1, goals=goals)
-    there = None if goals is None else Goals(goals.position.to(DEVICE), goals.goal_mask.to(DEVICE))
-    found = simulate(policy.to(DEVICE), batch.to(DEVICE), num_rollouts=2, seed=1, goals=there)
-    assert found.position.device == DEVICE
-    assert found.decision.cpu().equal(expected.decision)
-    torch.testing.assert_close(found.position.cpu(), expected.position)
-    torch.testing.assert_close(found.log_prob.cpu(), expected.log_prob, atol=1e-5, rtol=0)
+    with on_device():
+        there = None if goals is None else Goals(goals.position.to(DEVICE), goals.goal_mask.to(DEVICE))
+        found = simulate(policy.to(DEVICE), batch.to(DEVICE), num_rollouts=2, seed=1, goals=there)
+        assert found.position.device == DEVICE
+        assert found.decision.cpu().equal(expected.decision)
+        torch.testing.assert_close(found.position.cpu(), expected.position)
+        torch.testing.assert_close(found.log_prob.cpu(), expected.log_prob, atol=1e-5, rtol=0)
 
 
 TRAINING = {
     "pretrain": {},
     "pretrain, spatial smoothing": {"label_smoothing": 0.1, "label_smoothing_kind": "spatial"},
     "catk": {"validation": ValidationConfig(every=1, num_scenarios=1, num_rollouts=2)},
-    "catk, top_k": {"choice": "top_k"},
-    "catk, trajeglish": {"choice": "trajeglish", "max_distance_lengths": 1.0},
     "everything, concat": {},
     "everything, indication": {},
 }
 
 
 @pytest.mark.parametrize("name", TRAINING)
-def test_an_update_is_that_of_the_cpu(device, vocabulary, drawn_scenarios, tmp_path, monkeypatch, name):
+def test_an_update_is_that_of_the_cpu(vocabulary, drawn_scenarios, tmp_path, name):
     stage, _, variant = name.partition(", ")
     # a small step: Adam's first one has the size of the learning rate wherever a gradient is not exactly zero
     changes = {"epochs": 0.5, "batch_size": 2, "learning_rate": 1e-7, **TRAINING[name]}
@@ -197,10 +198,10 @@ def test_an_update_is_that_of_the_cpu(device, vocabulary, drawn_scenarios, tmp_p
             "reward": tiny.OF_EVERYTHING.reward + " + 0.1*goal", "goals": GoalConfig(probability=1.0, hindsight=1.0),
         }  # fmt: skip
     held_out = drawn_scenarios[2:] if "validation" in changes else None
-    there = copy.deepcopy(policy)
-    tiny.train(stage, there, drawn_scenarios[:2], tmp_path / "device", held_out, **changes)
-    assert next(there.parameters()).device == DEVICE
-    monkeypatch.undo()
+    with on_device():
+        there = copy.deepcopy(policy)
+        tiny.train(stage, there, drawn_scenarios[:2], tmp_path / "device", held_out, **changes)
+        assert next(there.parameters()).device == DEVICE
     tiny.train(stage, policy, drawn_scenarios[:2], tmp_path / "cpu", held_out, **changes)
     (found,), (expected,) = (read_metrics(tmp_path / folder) for folder in ("device", "cpu"))
     assert found.keys() == expected.keys()
@@ -209,11 +210,30 @@ def test_an_update_is_that_of_the_cpu(device, vocabulary, drawn_scenarios, tmp_p
             assert found[key] == pytest.approx(expected[key], rel=1e-3, abs=1e-5, nan_ok=True), key
 
 
-def test_scores_are_those_of_the_cpu(device, policy, drawn_scenarios, tmp_path):
-    write_dataset(drawn_scenarios[:2], tmp_path / "data")
-    config = EvaluateConfig(num_rollouts=4, top_k=8, split=None)
+CHOICES = {
+    "top_k": {"choice": "top_k"},
+    "trajeglish": {"choice": "trajeglish", "max_distance_lengths": 1.0},
+    "road": {"choice": "sampled", "targets": "taken"},
+}
+
+
+@pytest.mark.parametrize("name", CHOICES)
+def test_rollouts_near_the_log_are_those_of_the_cpu(policy, batch, name):
+    expected = roll_out_closest(policy, batch, num_candidates=8, **CHOICES[name])
+    with on_device():
+        found = roll_out_closest(policy.to(DEVICE), batch.to(DEVICE), num_candidates=8, **CHOICES[name])
+        assert found.target.device == DEVICE
+        assert found.target.cpu().equal(expected.target)
+        assert found.target_mask.cpu().equal(expected.target_mask)
+        torch.testing.assert_close(found.rollouts.position.cpu(), expected.rollouts.position)
+
+
+def test_scores_are_those_of_the_cpu(policy, drawn_scenarios, tmp_path):
+    write_dataset(drawn_scenarios[:1], tmp_path / "data")
+    config = EvaluateConfig(num_rollouts=2, top_k=8, split=None)
     expected = evaluate(policy, tmp_path / "data", config=config, show_progress=False).table
-    found = evaluate(policy.to(DEVICE), tmp_path / "data", config=config, show_progress=False).table
+    with on_device():
+        found = evaluate(policy.to(DEVICE), tmp_path / "data", config=config, show_progress=False).table
     for column in SCORE_COLUMNS:
         assert found[column].to_pylist() == pytest.approx(expected[column].to_pylist(), abs=1e-6, nan_ok=True), column
 
@@ -225,12 +245,13 @@ LAUNCHES = {"demo": (smart_demo(), 700), "tiny": (smart_tiny(), 1300)}
 
 
 @pytest.mark.parametrize("name", LAUNCHES)
-def test_decisions_never_wait_and_are_all_alike(device, vocabulary, batch, name):
+def test_decisions_never_wait_and_are_all_alike(vocabulary, batch, name):
     config, most = LAUNCHES[name]
-    policy, batch = tiny.tiny_policy(vocabulary, config).eval().requires_grad_(False).to(DEVICE), batch.to(DEVICE)
-    noise = torch.rand(2, 3, batch.agent_mask.shape[1], 1, device=DEVICE)
+    policy = tiny.tiny_policy(vocabulary, config).eval().requires_grad_(False)
     decisions = []
-    with torch.no_grad():
+    with torch.no_grad(), on_device() as device:
+        policy, batch = policy.to(DEVICE), batch.to(DEVICE)
+        noise = torch.rand(2, 3, batch.agent_mask.shape[1], 1, device=DEVICE)
         context = policy.encode(batch)
         state = policy.begin(context, 3, None, noise[..., :0])
         for _ in range(4):
@@ -248,24 +269,25 @@ def test_decisions_never_wait_and_are_all_alike(device, vocabulary, batch, name)
     assert decisions[2].operations == decisions[3].operations
 
 
-def test_counts_of_larger_pieces_are_bounded(device, vocabulary, batch):
+def test_counts_of_larger_pieces_are_bounded(vocabulary, batch):
     """Whatever the number of rollouts; each bound is some percent above what was counted."""
     config = replace(tiny.FINETUNE, num_rollouts=4)
-    learner = finetune.prepare(tiny.tiny_policy(vocabulary, smart_demo()), config, DEVICE)
-    policy, batch = learner.policy, batch.to(DEVICE)
-    with torch.no_grad():
-        context = policy.encode(batch)
-    with device.count() as counts:
-        targeted = roll_out_closest(policy, batch, context=context)
-    assert_below(counts, launches=12_500, waits=0, copies=12)
-    states = states_of_rollouts(batch, targeted.rollouts)
-    score_batch(batch.scenarios, states)  # the logs are computed once
-    with device.count() as counts:
-        score_batch(batch.scenarios, states)
-    assert_below(counts, launches=1_350, waits=10, copies=10)
-    with device.count() as counts:
-        finetune.update_policy(learner, batch, config, PretendFabric())
-    assert_below(counts, launches=20_000, waits=60, copies=115)
+    with on_device() as device:
+        learner = finetune.prepare(tiny.tiny_policy(vocabulary, smart_demo()), config, DEVICE)
+        policy, batch = learner.policy, batch.to(DEVICE)
+        with torch.no_grad():
+            context = policy.encode(batch)
+        with device.count() as counts:
+            targeted = roll_out_closest(policy, batch, context=context)
+        assert_below(counts, launches=12_500, waits=0, copies=12)
+        states = states_of_rollouts(batch, targeted.rollouts)
+        score_batch(batch.scenarios, states)  # the logs are computed once
+        with device.count() as counts:
+            score_batch(batch.scenarios, states)
+        assert_below(counts, launches=1_350, waits=10, copies=10)
+        with device.count() as counts:
+            finetune.update_policy(learner, batch, config, PretendFabric())
+        assert_below(counts, launches=20_000, waits=60, copies=115)
 
 
 def assert_below(counts, launches, waits, copies):
