@@ -16,7 +16,7 @@ from rlftsim.threads import keep_freed_memory
 if sys.argv[1] == "keep":
     keep_freed_memory()
 def step():
-    return [torch.ones(1 << 20) for _ in range(32)]  # 128 MiB
+    return [torch.ones(1 << 20) for _ in range(32)] + [torch.ones(1 << 24)]  # 128 MiB in pieces, 64 in one
 step()
 before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
 for _ in range(3):

@@ -5,24 +5,22 @@ import platform
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
+_TRIM_THRESHOLD, _MMAP_MAX = -1, -4
 """Parameters of glibc's `mallopt`."""
 KEPT_BYTES = 1 << 30
-LARGEST_KEPT_BYTES = 1 << 25
-"""Larger blocks are always returned to the system; glibc takes no larger limit."""
 
 
 def keep_freed_memory() -> None:
     """Let glibc keep freed memory for the next allocation. Other C libraries stay as they are.
 
     By default it returns most of it to the system after every simulated step and gets it again page by page, which
-    takes up to a twelfth of a rollout.
+    takes up to a twelfth of a rollout or of an update.
     """
     if platform.libc_ver()[0] == "glibc":
         libc = ctypes.CDLL(None)
-        # the heap keeps its free top, and large blocks are taken from it instead of mapped one by one
+        # the heap keeps its free top, and large blocks are taken from it, too, instead of mapped one by one
         libc.mallopt(_TRIM_THRESHOLD, KEPT_BYTES)
-        libc.mallopt(_MMAP_THRESHOLD, LARGEST_KEPT_BYTES)
+        libc.mallopt(_MMAP_MAX, 0)
 
 
 @contextmanager
