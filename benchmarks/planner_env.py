@@ -1,9 +1,8 @@
-"""Speed of the planner environments beside the bare loop, a table of planners and traffic, and a PPO run.
+"""Speed of the planner environments beside the bare loop, and a table of planners and traffic.
 
     python benchmarks/planner_env.py speed [--rounds 3] [--model demo-base]
     python benchmarks/planner_env.py memory [--episodes 2000]
     python benchmarks/planner_env.py table --data synthetic --limit 40 [--models demo-base runs/tuned] [--jobs 2]
-    python benchmarks/planner_env.py ppo [--steps 20000] [--limit 40]
 
 Times are CPU time of this process with one thread; contestants of a ratio take turns, so that a busy machine slows both.
 """
@@ -16,8 +15,7 @@ import numpy as np
 import torch
 
 from rlftsim.envs import EgoEnv, EgoVectorEnv
-from rlftsim.envs.drive import DriveConfig, drive, run_planner
-from rlftsim.evaluation.compare import compare_paired
+from rlftsim.envs.drive import DriveConfig, drive
 from rlftsim.evaluation.drive_results import compare_drives, format_drives
 from rlftsim.policies.registry import load_policy
 from rlftsim.progress import print_wide
@@ -127,57 +125,6 @@ def table(arguments):
             )
 
 
-def ppo(arguments):
-    from gymnasium import spaces
-    from stable_baselines3 import PPO
-    from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
-
-    from rlftsim.envs.planners.registry import load_planner
-    from rlftsim.envs.sb3 import SB3VecEnv
-
-    class Near(BaseFeaturesExtractor):
-        """The agent itself, five points of its route and its four nearest neighbors, scaled to about 1."""
-
-        def __init__(self, space: spaces.Dict):
-            super().__init__(space, 12 + 5 * 2 + 4 * 6)
-            ego = [10.0, 4.0, 0.5, 0.3, 5.0, 2.0, 1.0, 0.3, 1.0, 10.0, 8.0, 1.0]
-            self.register_buffer("ego", torch.tensor(ego))
-            self.register_buffer("neighbor", torch.tensor([20.0, 5.0, 1.0, 1.0, 10.0, 10.0]))
-
-        def forward(self, seen):
-            route = seen["route"][:, 1:16:3, :2] / torch.tensor([20.0, 3.0])
-            neighbors = seen["neighbors"][:, :4, :6] / self.neighbor
-            return torch.cat([seen["ego"] / self.ego, route.flatten(1), neighbors.flatten(1)], 1).clamp(-5, 5)
-
-    torch.set_num_threads(1)
-    settings = {"data": "synthetic", "traffic": arguments.traffic, "action": "bicycle"}
-    vector = SB3VecEnv(8, split="training", stop_on=("collision", "offroad"), **settings)
-    model = PPO(
-        "MultiInputPolicy", vector, n_steps=128, batch_size=128, n_epochs=10, learning_rate=5e-4, gamma=0.97, seed=0,
-        policy_kwargs={"features_extractor_class": Near, "net_arch": [64, 64], "log_std_init": -1.5},
-    )  # fmt: skip
-    begin, cpu = time.monotonic(), time.process_time()
-    model.learn(arguments.steps)
-    print(f"{arguments.steps} steps: {time.monotonic() - begin:.0f} s, {time.process_time() - cpu:.0f} s of CPU time")
-
-    class Trained:
-        def reset(self, info):
-            pass
-
-        def act(self, observation):
-            return model.predict(observation, deterministic=True)[0]
-
-    env = EgoEnv(split="validation", stop_on=(), reward="none", **settings)
-    scores = {}
-    for name, planner in {"constant velocity": load_planner("constant_velocity"), "PPO": Trained()}.items():
-        ids = env.source.scenario_ids[: arguments.limit]
-        found = [run_planner(env, planner, env.source.scenario(i), seed=0).planner for i in ids]
-        scores[name] = np.array([one.nuplan_style for one in found])
-        means = {part: np.nanmean([getattr(one, part) for one in found]) for part in vars(found[0])}
-        print(name, {part: round(float(value), 3) for part, value in means.items()})
-    print(compare_paired("nuplan_style", scores["constant velocity"], scores["PPO"]))
-
-
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     verbs = parser.add_subparsers(required=True)
@@ -196,11 +143,6 @@ def main():
     one.add_argument("--planners", nargs="*", default=["replay", "constant_velocity", "idm", "pdm"])
     one.add_argument("--jobs", type=int, default=1)
     one.set_defaults(run=table)
-    one = verbs.add_parser("ppo")
-    one.add_argument("--steps", type=int, default=20_000)
-    one.add_argument("--traffic", default="replay")
-    one.add_argument("--limit", type=int, default=40)
-    one.set_defaults(run=ppo)
     arguments = parser.parse_args()
     arguments.run(arguments)
 
