@@ -10,6 +10,8 @@ from rlftsim.plugins import POINTS, is_ours
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 """Of the system; None = the one of `playwright install chromium`."""
+BROWSER = os.environ.get("RLFTSIM_BROWSER", "chromium")
+"""Or "firefox", of `playwright install firefox`."""
 
 # slow machines are no failure; the same examples every time
 settings.register_profile("rlftsim", deadline=None, derandomize=True)
@@ -40,12 +42,29 @@ def forget_registered_names():
 
 @pytest.fixture(scope="session")
 def browser():
-    """A headless Chromium; skipped where there is none."""
+    """A headless browser; skipped where there is none."""
     playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    found = {"executable_path": CHROMIUM, "args": ["--no-sandbox", "--disable-gpu"]} if BROWSER == "chromium" else {}
     with playwright.sync_playwright() as session:
         try:
-            launched = session.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu"])
+            launched = getattr(session, BROWSER).launch(**found)
         except playwright.Error as error:
-            pytest.skip(f"no usable Chromium ({CHROMIUM or 'not installed'}): {str(error).splitlines()[0]}")
+            pytest.skip(f"no usable {BROWSER}: {str(error).splitlines()[0]}")
         yield launched
         launched.close()
+
+
+@pytest.fixture(scope="session")
+def barriers():
+    """Serious and critical violations that axe-core finds on a page, each with its first places."""
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="axe-playwright-python is not installed")
+
+    def find(page) -> list[str]:
+        violations = axe.Axe().run(page).response["violations"]
+        return [
+            f"{one['id']}: {[node['target'] for node in one['nodes'][:4]]} {one['nodes'][0].get('failureSummary')}"
+            for one in violations
+            if one["impact"] in ("serious", "critical")
+        ]
+
+    return find

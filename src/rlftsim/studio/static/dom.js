@@ -6,6 +6,9 @@ const byId = (id) => document.getElementById(id);
 /** The picture of a canvas. `onCpu` keeps it in the CPU's memory, as a context without a GPU is emulated. @returns {CanvasRenderingContext2D} */
 const contextOf = (canvas, { onCpu = false, alpha = true } = {}) => canvas.getContext("2d", { willReadFrequently: onCpu, alpha });
 
+/** Pixels of the screen for one of a canvas' own, in zoomed parts of the page too. */
+const pixelRatio = (canvas) => (devicePixelRatio || 1) * (canvas.currentCSSZoom || 1);
+
 /** An element with properties (`class`, `onclick`, attributes) and children, which are elements or text. */
 function make(tag, properties = {}, ...children) {
   const element = document.createElement(tag);
@@ -38,4 +41,4 @@ function openDialog(title, ...content) {
 
 const closeDialog = () => byId("dialog").close();
 
-export { byId, closeDialog, contextOf, make, openDialog, speak, toast };
+export { byId, closeDialog, contextOf, make, openDialog, pixelRatio, speak, toast };

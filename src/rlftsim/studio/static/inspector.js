@@ -1,6 +1,6 @@
 // The right side: the selected agent and its goal, outcomes of goals, the score and where it is lost.
 import { get } from "./api.js";
-import { byId, make } from "./dom.js";
+import { byId, make, pixelRatio } from "./dom.js";
 import { TYPE_NAMES } from "./drawing.js";
 import { agentName, maneuverName } from "./stage.js";
 import { changed, goalOf, ownGoals, putGoal, removeGoal, state } from "./state.js";
@@ -105,9 +105,9 @@ function renderScore() {
   const tabs = ["feature", "agent", "step"].map((name) => make("button", { "aria-pressed": String(axis === name), onclick: () => { axis = name; renderScore(); } }, `by ${name}`));
   host.replaceChildren(
     head,
-    make("p", {}, make("span", { class: "big" }, number(official.metametric, 4)), make("span", { class: "muted" }, `  of ${number(ceiling.metametric, 4)}, the log's own · metric ${score.metric}`)),
+    make("p", {}, make("span", { class: "big" }, number(official.metametric, 4)), make("span", { class: "muted" }, `  the log itself: ${number(ceiling.metametric, 4)} · metric ${score.metric}`)),
     make("table", {}, ...["kinematic", "interactive", "map_based"].map((name) => make("tr", {}, make("th", { scope: "row" }, name.replace("_", "-")),
-      make("td", {}, number(official.buckets[`${name}_metrics`])), make("td", { class: "muted" }, `of ${number(ceiling.buckets[`${name}_metrics`])}`)))),
+      make("td", {}, number(official.buckets[`${name}_metrics`])), make("td", { class: "muted" }, `log ${number(ceiling.buckets[`${name}_metrics`])}`)))),
     make("div", { class: "tabs", role: "group", "aria-label": "Loss" }, ...tabs),
     lossView(variant, score),
   );
@@ -148,7 +148,7 @@ function stepChart(found) {
   const steps = found.cost[0][0].length - 1, byStep = Array.from({ length: steps }, (_, t) => sum(found.cost.map((byAgent) => sum(byAgent.map((row) => row[t])))));
   const canvas = make("canvas", { class: "steps", role: "img", "aria-label": "Loss by step" }), whole = sum(found.cost.map((byAgent) => sum(byAgent.map((row) => row[steps]))));
   const draw = (marked = -1) => {
-    const ratio = devicePixelRatio || 1, width = (canvas.width = canvas.clientWidth * ratio || 560), height = (canvas.height = 46 * ratio), ctx = canvas.getContext("2d");
+    const ratio = pixelRatio(canvas), width = (canvas.width = canvas.clientWidth * ratio || 560), height = (canvas.height = 46 * ratio), ctx = canvas.getContext("2d");
     const style = getComputedStyle(document.documentElement), most = Math.max(...byStep.map(Math.abs), 1e-9), wide = width / steps;
     byStep.forEach((value, t) => {
       const tall = (Math.abs(value) / most) * height * 0.5;

@@ -12,8 +12,8 @@ const maneuverName = (name) => MANEUVER_NAMES[name] || name;
 class Ground {
   constructor() { this.layer = document.createElement("canvas"); this.key = ""; }
 
-  get(width, height, ratio, scale, colors, onCpu) {
-    const { x, y } = state.view, key = [state.split, state.id, width, height, x, y, scale, colors.ground, onCpu].join();
+  get(width, height, ratio, scale, px, colors, onCpu) {
+    const { x, y } = state.view, key = [state.split, state.id, width, height, x, y, scale, px, colors.ground, onCpu].join();
     if (key === this.key) return this.layer;
     this.key = key;
     if (this.onCpu !== onCpu) { this.onCpu = onCpu; this.layer = document.createElement("canvas"); }
@@ -21,7 +21,7 @@ class Ground {
     const ctx = contextOf(this.layer, { onCpu }), k = scale * ratio;
     ctx.fillStyle = colors.ground; ctx.fillRect(0, 0, width, height);
     ctx.setTransform(k, 0, 0, -k, width / 2 - k * x, height / 2 + k * y);
-    if (state.map) drawMap(ctx, state.map, colors, 1 / scale);
+    if (state.map) drawMap(ctx, state.map, colors, px);
     return this.layer;
   }
 }
@@ -64,6 +64,9 @@ class Panel {
 
   get shown() { return Math.min(state.rollout, this.rollouts.length - 1); }
 
+  /** Lines and pins grow with the text of large screens. */
+  get grown() { return this.status.currentCSSZoom || 1; }
+
   get scale() { return Math.min(this.canvas.clientWidth, this.canvas.clientHeight) / (2 * state.view.r) || 1; }
 
   toWorld(event) {
@@ -81,7 +84,7 @@ class Panel {
   draw(colors) {
     const { ctx, canvas } = this;
     if (!state.scene || canvas.width < 2) return;
-    const ratio = canvas.width / Math.max(canvas.clientWidth, 1), k = this.scale * ratio, px = 1 / this.scale;
+    const ratio = canvas.width / Math.max(canvas.clientWidth, 1), k = this.scale * ratio, px = this.grown / this.scale;
     /** @type {[number, number, number, number, number, number]} */
     this.transform = [k, 0, 0, -k, canvas.width / 2 - k * state.view.x, canvas.height / 2 + k * state.view.y];
     this.drawStill(colors, ratio, px);
@@ -105,7 +108,7 @@ class Panel {
     ].join();
     if (key === this.stillKey) return;
     this.stillKey = key;
-    const ground = this.stage.ground.get(canvas.width, canvas.height, ratio, this.scale, colors, this.stage.onCpu);
+    const ground = this.stage.ground.get(canvas.width, canvas.height, ratio, this.scale, px, colors, this.stage.onCpu);
     if (this.still.width !== canvas.width || this.still.height !== canvas.height) { this.still.width = canvas.width; this.still.height = canvas.height; }
     stillCtx.setTransform(1, 0, 0, 1, 0, 0);
     stillCtx.drawImage(ground, 0, 0);
@@ -210,11 +213,11 @@ class Panel {
 
   /** A goal or a proposal; an arrow at the border where it lies outside the view. */
   pin(x, y, text, colors, px, ratio, isGoal) {
-    const { ctx, canvas } = this, [k, , , , dx, dy] = this.transform, margin = 16 * ratio;
+    const { ctx, canvas } = this, [k, , , , dx, dy] = this.transform, unit = ratio * this.grown, margin = 16 * unit;
     const cx = k * x + dx, cy = -k * y + dy, w = canvas.width, h = canvas.height;
     const ink = isGoal ? colors.surface : colors["series-4"], color = isGoal ? colors["series-4"] : colors.surface;
     ctx.save();
-    ctx.setTransform(ratio, 0, 0, ratio, Math.min(Math.max(cx, margin), w - margin), Math.min(Math.max(cy, margin), h - margin));
+    ctx.setTransform(unit, 0, 0, unit, Math.min(Math.max(cx, margin), w - margin), Math.min(Math.max(cy, margin), h - margin));
     ctx.fillStyle = color; ctx.strokeStyle = isGoal ? colors.surface : colors["series-4"]; ctx.lineWidth = 1.5;
     ctx.beginPath();
     if (cx < 0 || cy < 0 || cx > w || cy > h) {
@@ -224,7 +227,7 @@ class Panel {
       return;
     }
     ctx.arc(0, 0, PIN_PX - 3, 0, 2 * Math.PI); ctx.fill(); ctx.stroke();
-    if (isGoal) { ctx.beginPath(); ctx.arc(0, 0, NEAR_M * this.scale, 0, 2 * Math.PI); ctx.strokeStyle = colors["series-4"]; ctx.setLineDash([3, 3]); ctx.stroke(); ctx.setLineDash([]); }
+    if (isGoal) { ctx.beginPath(); ctx.arc(0, 0, (NEAR_M * this.scale) / this.grown, 0, 2 * Math.PI); ctx.strokeStyle = colors["series-4"]; ctx.setLineDash([3, 3]); ctx.stroke(); ctx.setLineDash([]); }
     ctx.font = "600 11.5px system-ui, sans-serif"; ctx.textBaseline = "middle";
     const width = ctx.measureText(text).width;
     ctx.fillStyle = color; ctx.beginPath(); ctx.roundRect(9, -9, width + 10, 18, 5); ctx.fill();
@@ -243,7 +246,7 @@ class Panel {
       if (this.key === "log" && state.log.steps <= step) parts.push("log ends here");
     }
     const text = parts.join(" · ");
-    if (text !== this.statusText) this.status.textContent = this.statusText = text;
+    if (text !== this.statusText) this.status.textContent = this.status.title = this.statusText = text;
     const empty = this.key !== "log" && !rollout;
     this.empty.hidden = !empty;
     if (empty) this.empty.textContent = variant?.reason ?? (state.isRunning ? "Simulating …" : "Press S to simulate.");

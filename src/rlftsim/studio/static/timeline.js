@@ -1,5 +1,5 @@
 // The time line: play, step, and marks where a shown rollout collides, leaves the road, runs a red light, gets to a goal.
-import { byId, make } from "./dom.js";
+import { byId, make, pixelRatio } from "./dom.js";
 import { NEAR_M, STEP_S } from "./stage.js";
 import { changed, ownGoals, state } from "./state.js";
 
@@ -87,7 +87,7 @@ class Timeline {
   }
 
   drawMarks() {
-    const canvas = byId("marks"), ratio = devicePixelRatio || 1, ctx = canvas.getContext("2d"), style = getComputedStyle(document.documentElement);
+    const canvas = byId("marks"), ratio = pixelRatio(canvas), ctx = canvas.getContext("2d"), style = getComputedStyle(document.documentElement);
     canvas.width = canvas.clientWidth * ratio; canvas.height = 14 * ratio;
     ctx.scale(ratio, ratio);
     const rule = style.getPropertyValue("--rule"), muted = style.getPropertyValue("--muted");
