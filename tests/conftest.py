@@ -56,11 +56,12 @@ def browser():
 
 @pytest.fixture(scope="session")
 def barriers():
-    """Serious and critical violations that axe-core finds on a page, each with its first places."""
+    """Serious and critical violations that axe-core finds on a page, of all its rules or of some."""
     axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="axe-playwright-python is not installed")
 
-    def find(page) -> list[str]:
-        violations = axe.Axe().run(page).response["violations"]
+    def find(page, rules: tuple[str, ...] = ()) -> list[str]:
+        options = {"resultTypes": ["violations"]} | ({"runOnly": rules} if rules else {})
+        violations = axe.Axe().run(page, options=options).response["violations"]
         return [
             f"{one['id']}: {[node['target'] for node in one['nodes'][:4]]} {one['nodes'][0].get('failureSummary')}"
             for one in violations

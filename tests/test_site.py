@@ -26,6 +26,9 @@ KINDS = (
     "tutorials/1_futures", "reference/cli/finetune", "reference/python",
 )  # fmt: skip
 """A page of each kind."""
+SHORTER = """["article .doc-object", ".md-nav--secondary li"].forEach((entries) =>
+  [...document.querySelectorAll(entries)].slice(15).forEach((one) => one.remove()))"""
+"""The Python page has hundreds of entries of a few kinds, and axe-core looks at each for milliseconds."""
 
 
 class Links(html.parser.HTMLParser):
@@ -88,6 +91,34 @@ def test_from_disk_nothing_is_requested_elsewhere_and_the_search_finds(site, bro
         assert {words: first_result(page, words).rpartition(".")[2].rpartition("#")[2] for words in FIRST} == FIRST
     page.close()
     assert elsewhere == []
+
+
+def test_axe_finds_no_serious_violation_on_any_kind_of_page(site, browser, barriers):
+    if site.name == "mkdocs":
+        pytest.skip("the published site is the other builder's")
+    found = {}
+    for scheme, rules in (("light", ()), ("dark", ("color-contrast",))):
+        page = browser.new_page(viewport={"width": 1280, "height": 800}, color_scheme=scheme, reduced_motion="reduce")
+        for kind in (*KINDS, "demo/live"):
+            page.goto(f"file://{site}/{kind}.html")
+            page.evaluate(SHORTER)
+            found[kind, scheme] = barriers(page, rules)
+        page.close()
+    assert {name: violations for name, violations in found.items() if violations} == {}
+
+
+def test_films_stand_still_where_less_motion_is_wanted(site, browser):
+    page = browser.new_page(viewport={"width": 360, "height": 740}, reduced_motion="reduce")
+    page.goto(f"file://{site}/index.html")
+    film = page.get_by_role("button", name="Play: Film of synthetic traffic")
+    film.wait_for()
+    assert film.locator("canvas").evaluate("(one) => one.width") > 500
+    film.click()
+    assert page.locator("img[alt^=Film]").is_visible()
+    page.emulate_media(reduced_motion="no-preference")
+    page.reload()
+    assert page.locator("img[alt^=Film]").is_visible()
+    page.close()
 
 
 def first_result(page, words: str) -> str:

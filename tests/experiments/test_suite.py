@@ -230,7 +230,8 @@ def test_pairs_are_films_of_the_rollouts_that_were_scored(done):
     for number, pair in enumerate(shown, 1):
         assert (done.out / f"qualitative-{number}.mp4").stat().st_size > 1000
         assert (
-            f"![Scenario {pair['scenario_id']}](qualitative-{number}.webp)" in (done.out / "qualitative.md").read_text()
+            f"![Film of Scenario {pair['scenario_id']}](qualitative-{number}.webp)"
+            in (done.out / "qualitative.md").read_text()
         )
     assert (done.out / "qualitative.html").read_text().count('<figure class="player"') == len(shown)
     # the rollouts that are shown were scored: the events that are counted are the marks on the picture

@@ -114,7 +114,7 @@ def _markdown(name: str, experiment: Experiment[Any], result: ExperimentResult, 
     for number, animation in enumerate(result.animations, 1):
         film = f"{name}-{number}"
         caption = f"{animation.caption} [Film]({film}.mp4)"
-        parts += [f"## {animation.title}", caption, f"![{animation.title}]({film}.webp)"]
+        parts += [f"## {animation.title}", caption, f"![Film of {animation.title}]({film}.webp)"]
     environment = describe_environment()
     packages = ", ".join(f"{package} {version}" for package, version in environment["packages"].items())
     commit = environment["commit"] or "of an installed package"

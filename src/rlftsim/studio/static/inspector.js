@@ -84,7 +84,7 @@ function renderResults() {
   host.replaceChildren(make("h2", {}, ownGoals().length ? "Goals" : "Goals of the last run"), ...rows);
 }
 
-const signed = (value) => `${value < 0 ? "−" : "+"}${Math.abs(value).toFixed(3)}`;
+const signed = (value) => `${Number(value.toFixed(3)) < 0 ? "−" : "+"}${Math.abs(value).toFixed(3)}`;
 
 let shownKey = "", axis = "feature";
 
@@ -105,7 +105,7 @@ function renderScore() {
   const tabs = ["feature", "agent", "step"].map((name) => make("button", { "aria-pressed": String(axis === name), onclick: () => { axis = name; renderScore(); } }, `by ${name}`));
   host.replaceChildren(
     head,
-    make("p", {}, make("span", { class: "big" }, number(official.metametric, 4)), make("span", { class: "muted" }, `  the log itself: ${number(ceiling.metametric, 4)} · metric ${score.metric}`)),
+    make("p", {}, make("span", { class: "big" }, number(official.metametric, 4)), make("span", { class: "muted" }, `  the log: ${number(ceiling.metametric, 4)} · metric ${score.metric}`)),
     make("table", {}, ...["kinematic", "interactive", "map_based"].map((name) => make("tr", {}, make("th", { scope: "row" }, name.replace("_", "-")),
       make("td", {}, number(official.buckets[`${name}_metrics`])), make("td", { class: "muted" }, `log ${number(ceiling.buckets[`${name}_metrics`])}`)))),
     make("div", { class: "tabs", role: "group", "aria-label": "Loss" }, ...tabs),

@@ -241,8 +241,10 @@ class Panel {
     const parts = [];
     if (rollout) {
       const soFar = (name) => rollout.filter((agent) => agent[name]?.subarray(now + 1, step + 1).includes(1)).length;
-      if (this.key === "log" || variant?.score?.score) parts.push(`${soFar("collides")} collided`);
-      if (this.key !== "log" && variant?.score?.score) parts.push(`${soFar("offroad")} off road`, `RMM ${variant.score.score.official.metametric.toFixed(3)}`);
+      const official = this.key === "log" ? null : variant?.score?.score?.official;
+      if (official) parts.push(`RMM ${official.metametric.toFixed(3)}`);
+      if (this.key === "log" || official) parts.push(`${soFar("collides")} collided`);
+      if (official) parts.push(`${soFar("offroad")} off road`);
       if (this.key === "log" && state.log.steps <= step) parts.push("log ends here");
     }
     const text = parts.join(" · ");
