@@ -67,6 +67,15 @@ def test_the_page_needs_no_network_and_names_feature_agent_and_ceiling(scenario,
         assert text in page
 
 
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_axe_finds_no_serious_violation(scenario, states, browser, barriers, scheme):
+    page = browser.new_page(viewport={"width": 360, "height": 740}, color_scheme=scheme)
+    page.set_content(explanation_html(explain(scenario, states)))
+    assert page.evaluate("document.documentElement.scrollWidth") <= 360
+    assert barriers(page) == []
+    page.close()
+
+
 def test_every_scenario_has_a_page_and_other_rollouts_another_one(scenario, tmp_path):
     write_dataset([scenario, scenes.lone_agent(), scenes.without_road_edges()], tmp_path / "data")
     (tmp_path / "rollouts").mkdir()

@@ -99,6 +99,15 @@ def test_whole_report_is_well_formed_and_complete(report, tmp_path):
     assert [p.name for p in (tmp_path / "runs").iterdir()] == ["report.html"]
 
 
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_axe_finds_no_serious_violation(report, browser, barriers, scheme):
+    page = browser.new_page(viewport={"width": 360, "height": 740}, color_scheme=scheme)
+    page.set_content(report_html(report))
+    assert page.evaluate("document.documentElement.scrollWidth") <= 360
+    assert barriers(page) == []
+    page.close()
+
+
 def test_report_loads_nothing_from_elsewhere(report):
     html = report_html(report).replace(SVG_NAMESPACE, "")
     assert not re.search(r"<link|<img|<iframe|@import|\b(src|href)\s*=|url\(|https?://", html)

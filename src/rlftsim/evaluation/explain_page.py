@@ -39,8 +39,8 @@ _UNITS = {
 _BAR_WIDTH, _BAR_HEIGHT, _LEFT, _BOTTOM, _TOP = 380, 190, 40, 46, 8
 _CSS = """
 .results thead th.narrow { white-space: normal; min-width: 64px; padding-left: 8px; padding-right: 8px; }
-.cost { background: color-mix(in srgb, var(--bad) calc(var(--heat) * 70%), transparent); }
-.gain { background: color-mix(in srgb, var(--good) calc(var(--heat) * 70%), transparent); }
+.cost { background: color-mix(in srgb, var(--bad) calc(var(--heat) * 45%), transparent); }
+.gain { background: color-mix(in srgb, var(--good) calc(var(--heat) * 45%), transparent); }
 .strip {
   display: grid; grid-template-columns: minmax(200px, 290px) minmax(0, 1fr) 70px; gap: 4px 14px; align-items: center;
   font-size: 14px; padding: 14px 18px; font-variant-numeric: tabular-nums;
@@ -283,8 +283,8 @@ def _histogram_html(histogram: FeatureHistogram) -> str:
 
 
 def _table_html(head: str, rows: list[str]) -> str:
-    body = "".join(rows)
-    return f'<div class="card scroll"><table class="results"><thead>{head}</thead><tbody>{body}</tbody></table></div>'
+    table = f'<table class="results"><thead>{head}</thead><tbody>{"".join(rows)}</tbody></table>'
+    return f'<div class="card scroll" tabindex="0">{table}</div>'
 
 
 def _heat_cell(value: float, among: Float[np.ndarray, "..."]) -> str:

@@ -238,7 +238,7 @@ def _table_html(title: str, rows: Sequence[ResultRow], columns: Sequence[Column]
         cells = "".join(_cell_html(column, row.estimates.get(column.source)) for column in shown)
         body.append(f'<tr{style}><th scope="row">{escape(row.name)}{below}</th>{cells}</tr>')
     return (
-        f'<h2>{escape(title)}</h2><div class="card scroll"><table class="results"><thead><tr>'
+        f'<h2>{escape(title)}</h2><div class="card scroll" tabindex="0"><table class="results"><thead><tr>'
         f'<th scope="col">policy</th>{headings}</tr></thead>'
         f"<tbody>{''.join(body)}</tbody></table></div>"
         f'<p class="note" style="margin-top:10px">{escape(note.strip())}</p>'
