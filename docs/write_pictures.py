@@ -239,8 +239,8 @@ def gallery_text() -> str:
         "# Gallery",
         "Twelve pieces, all of the held-out synthetic scenarios and the models that ship, seed 0; of films the first "
         "rollout. Scenarios were chosen to differ from each other, rollouts were not chosen. Each command shows the "
-        "same on your machine; [the demo page](live.md) plays six more. Films that a rule alone chose, of an experiment "
-        "with smaller models: [before and after](qualitative/qualitative.md).",
+        "same on your machine; [the demo page](live.md) plays six more. Films that a rule alone chose, of an "
+        "experiment with smaller models: [before and after](qualitative/qualitative.md).",
     ]
     for piece in PIECES:
         alternative = f"Film of {piece.title[0].lower()}{piece.title[1:]}" if piece.is_film else piece.title
