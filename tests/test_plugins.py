@@ -160,6 +160,14 @@ def template(tmp_path, monkeypatch):
     sys.modules.pop("rlftsim_plugin", None)
 
 
+def test_the_page_of_the_template_shows_its_files():
+    folder = ROOT / "docs" / "plugin_template"
+    page = (folder / "README.md").read_text()
+    for path in (folder / "pyproject.toml", folder / "src" / "rlftsim_plugin" / "__init__.py"):
+        assert f"`{path.relative_to(folder).as_posix()}`:" in page
+        assert path.read_text() in page
+
+
 def test_the_template_is_built_installed_listed_and_used(template, capsys):
     # 1. listed with package and version; the broken package has its reason and stops nothing
     assert main(["plugins"]) == 1
