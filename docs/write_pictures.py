@@ -19,6 +19,7 @@ from pathlib import Path
 from PIL import Image
 
 import rlftsim as rs
+from rlftsim.goals.types import PointById
 from rlftsim.policies.registry import with_guidance
 from rlftsim.viewer.film import to_film
 from rlftsim.viewer.page import Animation, Panel, write_page
@@ -39,7 +40,7 @@ class Simulated:
 
     model: str = "demo-tuned"
     temperature: float = 1.0
-    goals: Mapping[int, tuple[float, float]] | None = None
+    goals: PointById | None = None
     guidance: float = 1.0
 
     def rollouts(self, scenario: rs.Scenario, num_rollouts: int) -> rs.Rollouts:
