@@ -27,7 +27,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any, Literal, Protocol, runtime_checkable
 
-from rlftsim.errors import ConfigError, DataError, RlftsimError
+from rlftsim.errors import ConfigError, DataError, NotYetError, RlftsimError
 from rlftsim.progress import log
 from rlftsim.threads import keep_freed_memory
 
@@ -189,7 +189,7 @@ def require_finished(runner: Runner, num_left: int, num_items: int, title: str) 
 
     Raises:
         Unfinished: this share is done, others are not.
-        DataError: pieces are missing that should be there.
+        NotYetError: pieces are missing that should be there.
     """
     if not num_left:
         return
@@ -199,11 +199,11 @@ def require_finished(runner: Runner, num_left: int, num_items: int, title: str) 
             "puts the result together; if it was stopped, `rlftsim join` and the same command do."
         )
     if isinstance(runner, Joining):
-        raise DataError(
+        raise NotYetError(
             f"{title}: {num_left} of {num_items} pieces are missing: run the shares again that have not ended with "
             "status 0, or the command without `join` to do the rest here."
         )
-    raise DataError(f"{title}: finished pieces vanished meanwhile (another process in the same folder?): run again.")
+    raise NotYetError(f"{title}: finished pieces vanished meanwhile (another process in the same folder?): run again.")
 
 
 @dataclass(frozen=True)
