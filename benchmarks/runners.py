@@ -1,6 +1,6 @@
 """Overhead of processes, shares and Ray over the work itself; the error of `rlftsim doctor --plan`.
 
-python benchmarks/runners.py [--rows sleep share memory ray ray-kills plan] [--model demo-base] [--limit 40]
+python benchmarks/runners.py [--rows sleep share memory ray ray-memory ray-kills plan] [--model demo-base] [--limit 160]
 
 Each row prints a line of Markdown; ray rows start a cluster of two raylets on this machine. Items of the rows sleep,
 memory and ray only sleep, so that other work on the machine's cores does not count.
@@ -16,7 +16,8 @@ import sys
 import tempfile
 import threading
 import time
-from contextlib import contextmanager
+from collections import Counter
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from rlftsim.workers import Inline, Processes, Share
@@ -70,26 +71,16 @@ def row_sleep(options):
 
 
 def row_share(options):
-    """Evaluations of one rollout of constant velocity: all of an item's time that is not work."""
-    from rlftsim.evaluation.evaluate import EvaluateConfig, evaluate
-    from rlftsim.evaluation.resumable import EvaluationParts
-    from rlftsim.rollout.baselines import ConstantVelocity
+    """Everything that a run has more as a share: two locks, one of them let go and taken again."""
+    from rlftsim.lease import Lease
 
-    config = EvaluateConfig(num_rollouts=1, limit=40)
-    seconds = {"inline": [], "share 1/1": []}
-    for number in range(options.repeats + 1):
-        for name, runner in (("inline", Inline()), ("share 1/1", Share(1, 1, Inline()))):
-            with tempfile.TemporaryDirectory() as folder:
-                start = time.process_time()
-                evaluate(ConstantVelocity(), "synthetic", folder, config, name="a", runner=runner, show_progress=False)
-                if number:  # the first time imports
-                    seconds[name].append(time.process_time() - start)
-    items = 40 // EvaluationParts.group_size
-    inline, share = (min(values) for values in seconds.values())
-    print(
-        f"| CPU of an evaluation of 40 scenarios, {items} items | inline {inline:.2f} s, share {share:.2f} s: "
-        f"{1000 * (share - inline) / items:.1f} ms an item |"
-    )
+    start, number = time.process_time(), 1000
+    with tempfile.TemporaryDirectory() as folder:
+        for _ in range(number):
+            with Lease(Path(folder) / ".lock", Share(1, 1, Inline()), "works in") as lease:
+                lease.finish("work")
+                lease.remove()
+    print(f"| lease of a share, once for all its items | {1000 * (time.process_time() - start) / number:.2f} ms |")
 
 
 def row_memory(options):
@@ -123,11 +114,17 @@ def row_ray(options):
     from rlftsim.cluster.ray import RayRunner
 
     with ray_cluster():
-        here, there = over_two(Processes(2)), over_two(RayRunner())
-        print(
-            f"| time added to {NUM_ITEMS} items of {ITEM_S:g} s, start included | two processes {here:.1%}, "
-            f"Ray, two raylets {there:.1%}: {(1 + there) / (1 + here) - 1:+.1%} |"
-        )
+        here, first, second = over_two(Processes(2)), over_two(RayRunner()), over_two(RayRunner())
+    print(
+        f"| time added to {NUM_ITEMS} items of {ITEM_S:g} s | two processes {here:.1%}; Ray, two raylets, "
+        f"with the start of its workers {first:.1%}, on a cluster whose workers run {second:.1%} |"
+    )
+
+
+def row_ray_memory(options):
+    from rlftsim.cluster.ray import RayRunner
+
+    with ray_cluster():
         before = resident_mb()
         spent = seconds_of(lambda: RayRunner().run(sleep, [0.0] * MANY, advance=ignore))
         print(
@@ -138,50 +135,45 @@ def row_ray(options):
 def row_ray_kills(options):
     """Kill workers of a Ray cluster at random moments, and now and then a raylet, until 100 are dead."""
     from rlftsim.cluster.ray import RayRunner
+    from rlftsim.workers import SetAside
 
-    dice, kills, rounds, set_aside = random.Random(0), {"worker": 0, "raylet": 0}, 0, 0
+    dice, kills, rounds = random.Random(0), Counter(), 0
+
+    def work(paths):
+        # An item that met three of the kills is set aside, and done by the next call.
+        while left := [path for path in paths if not path.exists()]:
+            try:
+                RayRunner().run(write_slowly, left, advance=ignore)
+            except SetAside as error:
+                kills["set aside"] += len(str(error).split("set aside: ")[1].split("; "))
+
     with ray_cluster() as cluster, tempfile.TemporaryDirectory() as folder:
-        while sum(kills.values()) < options.kills:
+        while kills["worker"] + kills["raylet"] < options.kills:
             rounds += 1
             place = Path(folder) / str(rounds)
             place.mkdir()
-            paths, is_over = [place / f"{number}" for number in range(40)], threading.Event()
-
-            def shoot(is_over=is_over):
-                while not is_over.wait(dice.uniform(0.2, 1.5)):
-                    if dice.random() < 0.1:
-                        cluster.remove_node(dice.choice(list(cluster.worker_nodes)), allow_graceful=False)
-                        cluster.add_node(num_cpus=1, object_store_memory=80_000_000)
-                        kills["raylet"] += 1
-                        continue
-                    found = subprocess.run(["pgrep", "-f", "ray::_work"], capture_output=True, text=True).stdout.split()
+            paths = [place / f"{number}" for number in range(40)]
+            worker = threading.Thread(target=work, args=(paths,), daemon=True)
+            worker.start()
+            while worker.is_alive():  # Ray adds nodes from the main thread alone
+                time.sleep(dice.uniform(0.2, 1.5))
+                if dice.random() < 0.1:
+                    cluster.remove_node(dice.choice(list(cluster.worker_nodes)), allow_graceful=False)
+                    cluster.add_node(num_cpus=1, object_store_memory=80_000_000)
+                    kills["raylet"] += 1
+                    continue
+                found = subprocess.run(["pgrep", "-f", "ray::_work"], capture_output=True, text=True).stdout.split()
+                with suppress(ProcessLookupError):
                     if found:
-                        try:
-                            os.kill(int(dice.choice(found)), signal.SIGKILL)
-                        except ProcessLookupError:
-                            continue
+                        os.kill(int(dice.choice(found)), signal.SIGKILL)
                         kills["worker"] += 1
-
-            shooter = threading.Thread(target=shoot)
-            shooter.start()
-            left = paths
-            while left:
-                try:
-                    RayRunner().run(write_slowly, left, advance=ignore)
-                except Exception as error:  # an item that met three of the kills is set aside: the same command again
-                    if type(error).__name__ != "SetAside":
-                        raise
-                    set_aside += 1
-                left = [path for path in paths if not path.exists()]
-            is_over.set()
-            shooter.join()
             written = {path.name: path.read_text() for path in place.iterdir() if not path.name.startswith(".")}
             if written != {path.name: path.name for path in paths}:
                 raise SystemExit(f"round {rounds}: {sorted(written)}")
-            print(f"round {rounds}: {kills}", file=sys.stderr)
+            print(f"round {rounds}: {dict(kills)}", file=sys.stderr)
     print(
-        f"| Ray, kills of {kills['worker']} workers and {kills['raylet']} raylets | {rounds} rounds of 40 items, "
-        f"{set_aside} times items set aside and done by the next call, 0 lost, 0 doubled |"
+        f"| Ray, SIGKILL of {kills['worker']} workers and {kills['raylet']} raylets | {rounds} rounds of 40 items, "
+        f"{kills['set aside']} items set aside and done by the next call, 0 lost, 0 different |"
     )
 
 
@@ -218,11 +210,10 @@ ROWS = {
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rows", nargs="+", choices=list(ROWS), default=list(ROWS))
-    parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--kills", type=int, default=100)
     parser.add_argument("--model", default="demo-base")
     parser.add_argument("--split", default="training")
-    parser.add_argument("--limit", type=int, default=60)
+    parser.add_argument("--limit", type=int, default=160)
     options = parser.parse_args()
     print("| measured | result |\n|---|---|")
     for name in options.rows:

@@ -28,10 +28,11 @@ from rlftsim.workers import (
     Task,
     pickle_task,
     portable_error,
-)  # fmt: skip
+)
 
 try:
     import ray
+    from ray import cloudpickle
     from ray.exceptions import NodeDiedError, RayError
 except ImportError as error:
     raise ConfigError('Ray is not installed: pip install "rlftsim[ray]", or use --jobs or --share.') from error
@@ -70,7 +71,7 @@ class RayRunner:
             ConfigError: there is no such cluster, or another version of this package on it; see also `Runner`.
         """
         # Ray's pickle: processes of a cluster do not import the main module, in which a policy may be defined.
-        pickled = pickle_task(task, ray.cloudpickle.dumps)
+        pickled = pickle_task(task, cloudpickle.dumps)
         is_own_session = not ray.is_initialized()
         if is_own_session:
             try:
@@ -94,6 +95,7 @@ class RayRunner:
         results: dict[int, Any] = {}
         waiting, deaths, reasons = deque(range(len(items))), Counter[int](), dict[str, str]()
         at_work: dict[Any, int] = {}
+        is_waiting = False
         counted = Counter[int]()  # progress by item; a new process counts from zero
 
         # In the object store once; each worker process reads it once.
@@ -114,6 +116,9 @@ class RayRunner:
                     number = waiting.popleft()
                     at_work[work.remote([task], key, driver, pickle.dumps(items[number]), number, board)] = number
                 done, _ = ray.wait(list(at_work), timeout=SECONDS_BETWEEN_REPORTS)
+                if not num_cores and not is_waiting:
+                    log.warning("the cluster has no cores now: waiting for machines.")
+                is_waiting = not num_cores
                 if not done:
                     # Not by `get` alone: the board's machine may be gone, and progress is worth no error.
                     with suppress(RayError):
