@@ -1,7 +1,7 @@
 """Random kills: conversions, evaluations and submissions that are killed again and again end with the bytes of
 undisturbed ones.
 
-python benchmarks/kills.py FOLDER [--kills 100] [--backends inline processes shares] [--seed 0]
+python benchmarks/kills.py FOLDER [--kills 100] [--backends inline processes shares ray] [--seed 0] [--scenarios 24]
 
 Kills (SIGKILL) come at random moments: of the command itself, of one of its workers, or of all at once. The same
 command is repeated until it ends with status 0; then every file is compared with that of an undisturbed run. Finished
@@ -20,9 +20,11 @@ import random
 import resource
 import shutil
 import signal
+import subprocess
 import sys
 import time
 from collections import Counter
+from contextlib import contextmanager, nullcontext
 from multiprocessing import forkserver
 from pathlib import Path
 
@@ -34,9 +36,8 @@ from rlftsim.scenario import womd_pb2
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
 from rlftsim.scenario.tfrecord import write_records
 
-NUM_FILES, RECORDS = 6, 6
-NUM_SCENARIOS = 24
-LIMIT_S = 240.0
+NUM_FILES = 6
+LIMIT_S = 400.0
 ENTRY = """
 account = "jane@doe.edu"
 method = "Benchmark"
@@ -49,24 +50,30 @@ SHARED_WORDS = {
     "inline": [["--jobs", "1"]],
     "processes": [["--jobs", "2"]],
     "shares": [["--jobs", "1", "--share", "1/2"], ["--jobs", "1", "--share", "2/2"]],
+    "ray": [["--ray", "auto"]],
 }
 """Command lines that run side by side, by back end."""
-VICTIMS = {"inline": ["command"], "processes": ["command", "worker", "all"], "shares": ["command", "all"]}
+VICTIMS = {
+    "inline": ["command"],
+    "processes": ["command", "worker", "all"],
+    "shares": ["command", "all"],
+    "ray": ["command", "worker", "all"],
+}
 TIMED = ("submission.report.json", "submission.report.md")
 """Files that hold the duration of the run."""
 
 
-def write_sources(folder):
+def write_sources(folder, num_scenarios):
     """Tfrecords, a data set and the description of an entry."""
     if (folder / "entry.toml").exists():
         return
     shutil.rmtree(folder, ignore_errors=True)
     (folder / "womd").mkdir(parents=True)
     for number in range(NUM_FILES):
-        messages = [message(f"{number}-{k}").SerializeToString() for k in range(RECORDS)]
+        messages = [message(f"{number}-{k}").SerializeToString() for k in range(num_scenarios // 4)]
         write_records(folder / "womd" / f"training.tfrecord-{number:05d}-of-{NUM_FILES:05d}", messages)
     pack = ScenarioDataset("synthetic", "validation")
-    write_dataset(list(pack[:NUM_SCENARIOS]), folder / "set", split="validation")
+    write_dataset(list(pack[:num_scenarios]), folder / "set", split="validation")
     (folder / "entry.toml").write_text(ENTRY)
 
 
@@ -133,6 +140,38 @@ def start_fork_server():
     forkserver.set_forkserver_preload(["rlftsim.cli.data", "rlftsim.cli.results", "rlftsim.cli.submit"])
     forkserver.ensure_running()
     forkserver._forkserver.ensure_running = lambda: None  # a forked command finds it by its address
+
+
+@contextmanager
+def ray_cluster():
+    """Two raylets of one core each, in a process of their own: one with Ray's threads is not forked."""
+    import rlftsim.cluster.ray  # noqa: F401 (so that forked commands need not import it)
+
+    script = """
+import sys
+from ray.cluster_utils import Cluster
+small = {"object_store_memory": 80_000_000, "include_dashboard": False}
+cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, **small})
+for _ in range(2):
+    cluster.add_node(num_cpus=1, object_store_memory=80_000_000)
+print(cluster.address, flush=True)
+sys.stdin.read()
+cluster.shutdown()
+"""
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1] / "src")}
+    cluster = subprocess.Popen(
+        [sys.executable, "-c", script], env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    SHARED_WORDS["ray"] = [["--ray", cluster.stdout.readline().strip()]]
+    try:
+        yield
+    finally:
+        cluster.communicate()
+
+
+def ray_workers():
+    """Process ids of the workers of a Ray cluster that do an item now."""
+    return [int(pid) for pid in subprocess.run(["pgrep", "-f", "ray::_work"], capture_output=True).stdout.split()]
 
 
 def workers():
@@ -203,7 +242,7 @@ def end_with_kills(lines, backend, log, seconds, dice):
             raise SystemExit(f"{lines[0]} does not end, see {log}")
         running |= {start(line, log): line for line in waiting}
         waiting = []
-        moment = time.monotonic() + dice.uniform(0.0, seconds / 2)
+        moment = time.monotonic() + dice.uniform(0.0, 1.2 * seconds)
         while running and time.monotonic() < moment:
             time.sleep(0.005)
             for pid in list(running):
@@ -213,7 +252,7 @@ def end_with_kills(lines, backend, log, seconds, dice):
                     waiting += [line] if status else []
         if not running:
             continue
-        victim, crew = dice.choice(VICTIMS[backend]), workers()
+        victim, crew = dice.choice(VICTIMS[backend]), ray_workers() if backend == "ray" else workers()
         if victim == "worker" and crew:
             kills[victim] += kill(dice.choice(crew))
             continue
@@ -235,7 +274,7 @@ def end_with_kills(lines, backend, log, seconds, dice):
 def measure(options):
     """Do rounds until each back end has had its kills; returns the rounds."""
     sources, out, log, kept = (options.folder / name for name in ("sources", "out", "log.txt", "rounds.jsonl"))
-    write_sources(sources)
+    write_sources(sources, options.scenarios)
     start_fork_server()
     rounds = [json.loads(line) for line in kept.read_text().splitlines()] if kept.exists() else []
     for backend in options.backends:
@@ -282,11 +321,13 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--kills", type=int, default=100, help="of each back end")
-    parser.add_argument("--backends", nargs="+", choices=list(SHARED_WORDS), default=list(SHARED_WORDS))
+    parser.add_argument("--backends", nargs="+", choices=list(SHARED_WORDS), default=["inline", "processes", "shares"])
+    parser.add_argument("--scenarios", type=int, default=24, help="of the data set")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     options.folder = options.folder.resolve()
-    rounds = measure(options)
+    with ray_cluster() if "ray" in options.backends else nullcontext():
+        rounds = measure(options)
     print(table(rounds))
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     print(

@@ -43,7 +43,7 @@ def test_the_array_of_the_documents_runs_as_shell_processes(tmp_path):
 
 
 def test_work_that_is_killed_at_random_moments_ends_with_the_same_bytes(tmp_path):
-    command = [sys.executable, ROOT / "benchmarks" / "kills.py", tmp_path, "--kills", "5"]
+    command = [sys.executable, ROOT / "benchmarks" / "kills.py", tmp_path, "--kills", "5", "--scenarios", "8"]
     done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, timeout=900)
     assert done.returncode == 0, done.stdout + done.stderr
     rows = [line.split("|")[1:-1] for line in done.stdout.splitlines()[2:]]
