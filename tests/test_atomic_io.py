@@ -10,7 +10,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from rlftsim.atomic_io import append_text, errors_name, save_tensors, write_text, write_whole
+from rlftsim.atomic_io import append_text, errors_name, remove_temporaries, save_tensors, write_text, write_whole
 from rlftsim.errors import DataError
 
 
@@ -29,6 +29,13 @@ def test_a_failed_write_leaves_the_old_file_and_no_other(tmp_path, monkeypatch):
         write_text(tmp_path / "page.html", "new")
     assert names(tmp_path) == ["page.html"]
     assert (tmp_path / "page.html").read_text() == "old"
+
+
+def test_what_killed_writers_left_of_a_file_is_removed_and_nothing_else(tmp_path):
+    for name in (".a[1].json.host.12.tmp", ".a[1].json.other-host.7.tmp", ".b.json.host.12.tmp", "a[1].json"):
+        (tmp_path / name).touch()
+    remove_temporaries(tmp_path / "a[1].json")
+    assert names(tmp_path) == [".b.json.host.12.tmp", "a[1].json"]
 
 
 def test_an_interrupted_write_leaves_nothing(tmp_path):

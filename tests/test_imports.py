@@ -13,7 +13,7 @@ FLOORS = (
     ("errors",),
     ("aliases", "atomic_io", "geometry", "plugins", "progress", "statistics", "threads"),
     ("workers", "storage"),
-    ("lease",),
+    ("lease", "cluster"),
     ("scenario",),
     ("tokens", "goals"),
     ("rollout",),

@@ -5,6 +5,7 @@ import os
 import socket
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from glob import escape
 from pathlib import Path
 
 from safetensors import SafetensorError
@@ -76,6 +77,12 @@ def temporary_beside(path: Path) -> Path:
     """Name for a file until it is whole: of this process alone, on all machines that see the folder."""
     # Beside the file, as a rename is atomic within a file system only.
     return path.with_name(f".{path.name}.{socket.gethostname()}.{os.getpid()}.tmp")
+
+
+def remove_temporaries(path: Path) -> None:
+    """Remove what killed processes left beside a file that they were writing. No process may be writing it now."""
+    for leftover in path.parent.glob(f".{escape(path.name)}.*.tmp"):
+        leftover.unlink(missing_ok=True)
 
 
 def write_text(path: Path, text: str) -> None:

@@ -25,6 +25,12 @@ class BadRecordError(DataError):
     exit_status = 1
 
 
+class NotYetError(DataError):
+    """Work of other processes that has to end first; the same command does it later."""
+
+    exit_status = 1
+
+
 class ConfigError(RlftsimError, ValueError):
     """A setting that contradicts another one or lies outside its range; the message says what to set instead."""
 

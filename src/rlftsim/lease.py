@@ -6,14 +6,19 @@ today carry such locks between machines.
 
 import os
 import socket
+import time
+from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from types import TracebackType
 from typing import TextIO
 
 from rlftsim.atomic_io import errors_name
-from rlftsim.errors import DataError
+from rlftsim.errors import NotYetError
 from rlftsim.workers import Runner, Share, Unfinished
+
+SECONDS_TO_WAIT = 10.0
+"""A share waits so long for a driver that may only be putting the result together, or for its predecessor to end."""
 
 
 class Lease:
@@ -28,7 +33,9 @@ class Lease:
         note: first line of the lock file, for people who find it.
 
     Raises:
-        DataError: another driver holds the folder (says which, and since when), or it cannot be written to.
+        NotYetError: another driver holds the folder; says which, and since when.
+        Unfinished: the work ended while a share waited for its turn, so nothing is left to do.
+        DataError: the folder cannot be written to.
     """
 
     def __init__(self, path: Path, runner: Runner, doing: str, note: str = "") -> None:
@@ -36,9 +43,19 @@ class Lease:
         self._share = runner if isinstance(runner, Share) else None
         self._files: list[TextIO] = []
         try:
-            if self._share is not None:
-                self._lock(path.with_name(f"{path.name}.{self._share.number}-of-{self._share.of}"))
-            self._lock(path, is_shared=self._share is not None)
+            if self._share is None:
+                self._lock(path)
+            else:
+                own = path.with_name(f"{path.name}.{self._share.number}-of-{self._share.of}")
+                until = time.monotonic() + SECONDS_TO_WAIT
+                self._lock(own, until=until)
+                try:
+                    self._lock(path, is_shared=True, until=until)
+                except Unfinished:
+                    own.unlink(missing_ok=True)
+                    with suppress(OSError):  # a folder of its own that went with the work
+                        path.parent.rmdir()
+                    raise
         except BaseException:
             self.__exit__(None, None, None)
             raise
@@ -69,7 +86,7 @@ class Lease:
         self._files.pop().close()
         try:
             self._lock(self._path)
-        except DataError:
+        except NotYetError:
             raise Unfinished(
                 f"{title}: {self._share} is done, other shares are at work. The last one puts the result together."
             ) from None
@@ -81,16 +98,31 @@ class Lease:
             stray.unlink()
         self._path.unlink()
 
-    def _lock(self, path: Path, is_shared: bool = False) -> None:
+    def _lock(self, path: Path, *, is_shared: bool = False, until: float = 0.0) -> None:
         """Open a file with a lock on it.
 
+        Args:
+            path: of the file.
+            is_shared: others may have such a lock, too.
+            until: moment at which waiting for another process ends, `time.monotonic`.
+
         Raises:
-            DataError: another process has one.
+            NotYetError: another process has one.
+            Unfinished: another process had one and has removed the file, at the end of all work.
         """
         with errors_name(path):
             path.parent.mkdir(parents=True, exist_ok=True)
+            has_waited = False
             while True:
-                file = open(path, "a+", encoding="utf-8")  # noqa: SIM115 (stays open)
+                try:
+                    # A file that was there and is gone must not come back: its work is done.
+                    file = open(path, "r+" if has_waited else "a+", encoding="utf-8")  # noqa: SIM115 (stays open)
+                except FileNotFoundError:
+                    if not has_waited:
+                        raise
+                    raise Unfinished(
+                        f"{path.parent}: another process has just finished this work: nothing is left to do."
+                    ) from None
                 try:
                     import fcntl
 
@@ -99,7 +131,11 @@ class Lease:
                     pass
                 except BlockingIOError:
                     with file:
-                        raise DataError(self._refusal(file)) from None
+                        if time.monotonic() >= until:
+                            raise NotYetError(self._refusal(file)) from None
+                    has_waited = True
+                    time.sleep(0.1)
+                    continue
                 # The driver before this one may have removed the file in between: then it is no lock for others.
                 if path.exists() and os.fstat(file.fileno()).st_ino == path.stat().st_ino:
                     break

@@ -17,6 +17,8 @@ from rlftsim.errors import ConfigError, DataError, RlftsimError
 ORIGIN = "origin.txt"
 """File in a local copy of a remote data set's index: the address of its shards."""
 BLOCK_BYTES = 1 << 24
+OBJECT_STORES = ("s3", "s3a", "gs", "gcs", "az", "abfs")
+"""Protocols of stores without folders."""
 _EXTRAS = {"s3": "s3", "s3a": "s3", "gs": "gcs", "gcs": "gcs"}
 
 
@@ -34,6 +36,17 @@ def folder_address(url: str) -> str:
     if not is_url(url) or not url.partition("://")[2].strip("/"):
         raise ConfigError(f"{url} is no address of a folder: write one such as s3://bucket/folder.")
     return url.rstrip("/")
+
+
+def require_folder(place: str | os.PathLike[str]) -> Path:
+    """The path of a folder of this machine.
+
+    Raises:
+        ConfigError: it is an address.
+    """
+    if is_url(place):
+        raise ConfigError(f"{place} is an address: name a folder of this machine here (docs/machines.md, Buckets).")
+    return Path(place)
 
 
 def cache_folder() -> Path:
@@ -70,13 +83,16 @@ def remote(url: str) -> Iterator[tuple[Any, str]]:
         hint = f'pip install "rlftsim[{_EXTRAS[protocol]}]"' if protocol in _EXTRAS else str(error)
         raise ConfigError(f"{url}: {protocol}:// needs another library: {hint}.") from None
     except FileNotFoundError:
-        raise DataError(f"{url}: there is no such file or bucket.") from None
-    except PermissionError as error:
-        raise DataError(f"{url}: access denied ({error}): check the credentials of this machine.") from None
-    # Each library has errors of its own: no connection, no credentials, no such protocol.
+        raise DataError(
+            f"{url}: there is no such file or bucket: check the address, and that the copy to it has ended."
+        ) from None
+    # Each library has errors of its own: no permission, no credentials, no connection, no such protocol.
     except Exception as error:
-        cause = (str(error).strip().splitlines() or [""])[0]
-        raise DataError(f"{url}: {type(error).__name__}: {cause}") from None
+        cause = (str(error).strip().splitlines() or [""])[0].rstrip(".")
+        raise DataError(
+            f"{url}: {type(error).__name__}: {cause}: check the address, the network and the credentials of this "
+            "machine (docs/machines.md, Buckets)."
+        ) from None
 
 
 def fetch(url: str, path: Path, sha256: str | None = None) -> str:
@@ -116,7 +132,8 @@ def publish(path: Path, url: str) -> None:
         DataError: it cannot be written there.
     """
     with remote(url) as (files, place):
-        files.makedirs(files._parent(place), exist_ok=True)
+        if url.partition("://")[0] not in OBJECT_STORES:  # there this would make a bucket of a mistyped name
+            files.makedirs(files._parent(place), exist_ok=True)
         files.put_file(str(path), place)
 
 

@@ -3,6 +3,7 @@
     Inline()                this process
     Processes(4)            four processes of this machine
     Share(3, 64, runner)    every 64th item, from the third on; other machines do the others (`--share 3/64`)
+    RayRunner("auto")       a Ray cluster (`rlftsim.cluster.ray`, the extra "ray")
 
 Each piece writes a file of its own, and the same one whenever it is done again. So it does not matter where it is
 done, nor how often: a run that was stopped in any way is resumed by doing the pieces that have no file.
@@ -27,7 +28,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any, Literal, Protocol, runtime_checkable
 
-from rlftsim.errors import ConfigError, DataError, RlftsimError
+from rlftsim.errors import ConfigError, DataError, NotYetError, RlftsimError
 from rlftsim.progress import log
 from rlftsim.threads import keep_freed_memory
 
@@ -189,7 +190,7 @@ def require_finished(runner: Runner, num_left: int, num_items: int, title: str) 
 
     Raises:
         Unfinished: this share is done, others are not.
-        DataError: pieces are missing that should be there.
+        NotYetError: pieces are missing that should be there.
     """
     if not num_left:
         return
@@ -199,11 +200,11 @@ def require_finished(runner: Runner, num_left: int, num_items: int, title: str) 
             "puts the result together; if it was stopped, `rlftsim join` and the same command do."
         )
     if isinstance(runner, Joining):
-        raise DataError(
+        raise NotYetError(
             f"{title}: {num_left} of {num_items} pieces are missing: run the shares again that have not ended with "
             "status 0, or the command without `join` to do the rest here."
         )
-    raise DataError(f"{title}: finished pieces vanished meanwhile (another process in the same folder?): run again.")
+    raise NotYetError(f"{title}: finished pieces vanished meanwhile (another process in the same folder?): run again.")
 
 
 @dataclass(frozen=True)
@@ -227,7 +228,7 @@ class Processes:
         if not items:
             return []
         _refuse_unguarded_main()
-        pickled = _pickled(task)
+        pickled = pickle_task(task)
         results: dict[int, Any] = {}
         waiting, deaths, reasons = deque(range(len(items))), Counter[int](), dict[str, str]()
         crew: dict[Any, _Worker] = {}
@@ -287,15 +288,19 @@ _DIED = (
 )
 
 
-def _pickled(task: Task) -> bytes:
+def pickle_task(task: Task, dumps: Callable[[Task], bytes] = pickle.dumps) -> bytes:
     """A task by value, for other processes.
+
+    Args:
+        task: of all items.
+        dumps: makes bytes that `pickle` reads.
 
     Raises:
         ConfigError: it holds something that cannot be handed over.
     """
     try:
         # By value: torch's own way between processes shares memory through file descriptors, which run out.
-        return pickle.dumps(task)
+        return dumps(task)
     except (pickle.PicklingError, AttributeError, TypeError) as error:
         raise ConfigError(f"this work cannot be handed to other processes ({error}): set jobs=1.") from error
 
@@ -328,6 +333,16 @@ class _Worker:
         except (EOFError, OSError):
             self.process.join()
             return "death", _reason(self.process.exitcode)
+
+
+def portable_error(error: Exception) -> Exception:
+    """The error that is being handled as another process can read it, with its traceback as a note."""
+    error.add_note(traceback.format_exc())
+    try:
+        pickle.loads(pickle.dumps(error))  # some errors can be pickled and not be read back
+    except Exception:
+        return RuntimeError(traceback.format_exc())
+    return error
 
 
 def _reason(status: int | None) -> str:
@@ -396,12 +411,7 @@ def _work(line: Connection) -> None:
             except MemoryError:
                 os._exit(OUT_OF_MEMORY)  # a new process may have enough
             except Exception as error:
-                error.add_note(traceback.format_exc())
-                try:
-                    pickle.loads(pickle.dumps(error))  # some errors can be pickled and not be read back
-                except Exception:
-                    error = RuntimeError(traceback.format_exc())
-                say("error", error)
+                say("error", portable_error(error))
             say("idle")
 
 

@@ -674,7 +674,7 @@ PROPOSE = ["goals", "propose", "synthetic", "--scenario", SCENARIO]
     ("more", "message"),
     [
         (["--picture", "plot"], "plot: pictures are written as .png, .svg, .pdf: name the file so"),
-        (["--agent", "--picture", "a.png"], "--agent needs at least one object id; leave it out"),
+        (["--agent", "--picture", "a.png"], "--agent needs at least one value."),
         (
             ["--agent", TURNS, "--choose", "left_uturn", "--out", "g.json"],
             "none of these agents can do left_uturn: they can do straight, right, lane_change_left (--choose)",
@@ -686,7 +686,7 @@ def test_proposals_that_cannot_be_are_refused(more, message, tmp_path, capsys, m
     status, _, err = run(capsys, *PROPOSE, *more)
     assert (status, message in err) == (2, True), err
     assert not list(tmp_path.iterdir())
-    assert "--scenario needs at least one id" in run(capsys, *PROPOSE[:4])[2]
+    assert "--scenario needs at least one value." in run(capsys, *PROPOSE[:4])[2]
 
 
 def test_agents_named_twice_have_one_goal_and_doubts_are_printed_at_once(tmp_path, capsys):

@@ -154,6 +154,18 @@ BAD = [
     ([*EXPERIMENT, "--catk.batch-size", "3"], "--catk.batch-size has no effect: experiments vary it"),
     (["finetune", "smart-dmo", "--model", "m"], "unknown recipe 'smart-dmo': did you mean 'smart-demo'"),
     (["tokens", "--recipe", "smarttiny", "--data", "d"], "unknown recipe 'smarttiny': did you mean 'smart-tiny'"),
+    (["simulate", "demo-base", "--data", "synthetic", "--out", "o", "--export"], "^--export needs at least one value"),
+    (["doctor", "--nodes", "4"], "^--nodes has no effect: add --plan evaluate"),
+    (["join"], "^join: write the command of a share behind join, .* are convert, evaluate, score, submit build, synth"),
+    (["join", "foo"], "^join foo: write the command of a share behind join"),
+    (["join", "simulate", "--help"], "^join simulate --help: write the command of a share behind join"),
+    (["join", "submit", "check"], "^join submit check: write the command of a share behind join"),
+    (["join", "convert", "a", "b", "--share", "1/2"], "^join convert a: write .* without --share"),
+    (
+        ["convert", "my files", "s3://b/c", "--jobs", "2"],
+        "^s3://b/c is an address, .*: `rlftsim convert 'my files' FOLDER --jobs 2`, then `rlftsim data push FOLDER s3:",
+    ),
+    (["evaluate", "oracle", "--data", "synthetic", "--out", "gs://b/c/"], "^gs://b/c/ is an address: name a folder"),
 ]
 
 

@@ -7,9 +7,10 @@ import urllib.request
 import numpy as np
 import pytest
 
+import rlftsim as rs
 from rlftsim import storage
 from rlftsim.cli.main import main
-from rlftsim.errors import ConfigError, DataError
+from rlftsim.errors import ConfigError, DataError, NotYetError
 from rlftsim.evaluation.evaluate import EvaluateConfig, evaluate
 from rlftsim.lease import Lease
 from rlftsim.rollout.baselines import ConstantVelocity
@@ -17,7 +18,7 @@ from rlftsim.scenario.convert import convert
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
 from rlftsim.scenario.transfer import pull_dataset, push_dataset
 from rlftsim.storage import fetch_shard
-from rlftsim.workers import Inline
+from rlftsim.workers import Inline, Share, Unfinished
 
 
 @pytest.fixture(scope="module")
@@ -101,6 +102,26 @@ def test_an_evaluation_from_a_bucket_is_that_of_the_folder_and_fetches_each_shar
     assert remote.scenario_ids == local.scenario_ids
     np.testing.assert_array_equal(remote.values("meta_metric"), local.values("meta_metric"))
     assert remote.provenance.dataset == f"{bucket}/set"
+
+
+def test_an_evaluation_from_a_bucket_is_shared_and_refuses_a_second_driver(bucket, tmp_path):
+    write_dataset(list(ScenarioDataset("synthetic", "validation")[:6]), tmp_path / "data", split="validation")
+    push_dataset(tmp_path / "data", f"{bucket}/set", show_progress=False)
+    config, out = EvaluateConfig(num_rollouts=2), tmp_path / "out"
+
+    def work(folder, runner=None):
+        return evaluate(
+            ConstantVelocity(), f"{bucket}/set", folder, config, name="a", runner=runner, show_progress=False
+        )
+
+    with pytest.raises(Unfinished, match="share 2/2 is done"):
+        work(out, Share(2, 2, Inline()))
+    other = Lease(out / "a.parts" / ".lock", Inline(), "works in")
+    with other, pytest.raises(NotYetError, match="another process works in"):
+        work(out)
+    work(out, Share(1, 2, Inline()))
+    work(tmp_path / "whole")
+    assert contents(out) == contents(tmp_path / "whole")
 
 
 def test_sources_in_a_bucket_are_converted_to_the_same_bytes(bucket, source, data, tmp_path):
@@ -205,7 +226,7 @@ def test_the_cache_keeps_what_was_used_last(tmp_path, monkeypatch):
 
 def test_addresses_that_cannot_be_read_are_refused_in_one_line(tmp_path, monkeypatch):
     monkeypatch.setenv("RLFTSIM_CACHE", str(tmp_path / "cache"))
-    with pytest.raises(DataError, match=r"^file:///nowhere/manifest\.json: there is no such file or bucket\.$"):
+    with pytest.raises(DataError, match=r"^file:///nowhere/manifest\.json: there is no such file or bucket: check the"):
         ScenarioDataset("file:///nowhere")
     with pytest.raises(DataError, match=r"^nonsense://x/manifest\.json: .*nonsense"):
         ScenarioDataset("nonsense://x")
@@ -214,7 +235,15 @@ def test_addresses_that_cannot_be_read_are_refused_in_one_line(tmp_path, monkeyp
         with pytest.raises(ConfigError, match="is no address of a folder"):
             pull_dataset(url, tmp_path / "x")
     assert not (tmp_path / "x").exists()
-    assert main(["evaluate", "constant_velocity", "--data", "synthetic", "--out", "s3://b/x"]) == 2
+    config = EvaluateConfig(num_rollouts=2, limit=1)
+    for make in (
+        lambda: convert(tmp_path, "s3://b/x"),
+        lambda: evaluate(ConstantVelocity(), "synthetic", "s3://b/x", config),
+        lambda: rs.evaluate("constant_velocity", "synthetic", out="s3://b/x", num_rollouts=2, limit=1),
+        lambda: write_dataset([], "s3://b/x"),
+    ):
+        with pytest.raises(ConfigError, match=r"^s3://b/x is an address: name a folder of this machine here"):
+            make()
 
     def missing(url):
         raise ImportError("Install s3fs to access S3")
@@ -222,3 +251,28 @@ def test_addresses_that_cannot_be_read_are_refused_in_one_line(tmp_path, monkeyp
     monkeypatch.setattr("fsspec.core.url_to_fs", missing)
     with pytest.raises(ConfigError, match=r's3:// needs another library: pip install "rlftsim\[s3\]"'):
         ScenarioDataset("s3://x")
+
+
+@pytest.mark.parametrize("credentials", ["wrong", "none"])
+def test_a_bucket_that_refuses_is_explained_with_a_way_out(bucket, data, tmp_path, monkeypatch, credentials, capsys):
+    import s3fs
+
+    with pytest.raises(DataError, match=r"^s3://other/.*: there is no such file or bucket: check the address"):
+        push_dataset(data, "s3://other/set", show_progress=False)
+    if credentials == "none":
+        monkeypatch.delenv("AWS_ACCESS_KEY_ID")
+        monkeypatch.delenv("AWS_SECRET_ACCESS_KEY")
+        monkeypatch.setenv("AWS_EC2_METADATA_DISABLED", "true")
+        monkeypatch.setenv("HOME", str(tmp_path))
+    else:
+
+        def refuse(*arguments, **more):
+            raise PermissionError("Forbidden")
+
+        monkeypatch.setattr(s3fs.S3FileSystem, "_get_file", refuse)
+        monkeypatch.setattr(s3fs.S3FileSystem, "open", refuse)
+    s3fs.S3FileSystem.clear_instance_cache()
+    assert main(["data", "pull", f"{bucket}/set", str(tmp_path / "back")]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "check the address, the network and the credentials of this machine" in said

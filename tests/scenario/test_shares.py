@@ -1,11 +1,18 @@
 """The same work by one driver and by shares of it: the same bytes, once each."""
 
+import importlib
 import os
+import threading
+import time
+from typing import get_type_hints
 
 import pytest
 
-from rlftsim.cli.main import main
-from rlftsim.errors import ConfigError, DataError
+from rlftsim import lease
+from rlftsim.cli.machines import Machines, Work
+from rlftsim.cli.main import HAVE_SHARES, VERBS, main
+from rlftsim.cli.submit import Build
+from rlftsim.errors import ConfigError, NotYetError
 from rlftsim.evaluation.evaluate import EvaluateConfig, evaluate
 from rlftsim.lease import Lease
 from rlftsim.rollout.baselines import ConstantVelocity
@@ -13,6 +20,12 @@ from rlftsim.scenario.convert import convert
 from rlftsim.workers import Inline, Share, Unfinished
 
 CONFIG = EvaluateConfig(num_rollouts=2, limit=9)
+
+
+@pytest.fixture
+def impatient(monkeypatch):
+    """A share waits for others no longer than this."""
+    monkeypatch.setattr(lease, "SECONDS_TO_WAIT", 0.3)
 
 
 @pytest.fixture
@@ -69,13 +82,13 @@ def test_a_share_that_others_finish_behind_is_put_together_by_join(source, tmp_p
     words = ["convert", str(source), str(tmp_path / "data"), "--jobs", "1"]
     assert main([*words, "--share", "1/2"]) == 0
     assert "share 1/2 is done; 3 of 7 pieces are left to other shares" in capsys.readouterr().err
-    assert main(["join", *words]) == 2
+    assert main(["join", *words]) == 1  # so that what depends on it does not start
     assert "3 of 7 pieces are missing: run the shares again" in capsys.readouterr().err
     # the last share ends while another one, started twice by mistake, is still at work
     with Lease(tmp_path / "data" / "INCOMPLETE", Share(1, 2, Inline()), "is converting to"):
         assert main([*words, "--share", "2/2"]) == 0
         assert "other shares are at work" in capsys.readouterr().err
-        assert main(["join", *words]) == 2
+        assert main(["join", *words]) == 1
         assert "another process is converting to" in capsys.readouterr().err
     assert main(["join", *words]) == 0
     convert(source, tmp_path / "whole", jobs=1, show_progress=False)
@@ -93,12 +106,12 @@ def test_a_source_that_changed_after_its_share_is_not_joined(source, tmp_path, m
 @pytest.mark.parametrize(
     ("first", "second"), [(Inline(), Inline()), (Inline(), Share(1, 2, Inline())), (Share(1, 2, Inline()), Inline())]
 )
-def test_a_second_driver_is_refused_with_the_owner_and_age_of_the_first(tmp_path, first, second):
+def test_a_second_driver_is_refused_with_the_owner_and_age_of_the_first(tmp_path, first, second, impatient):
     with Lease(tmp_path / "lock", first, "works in"):
         owner = rf"another process works in .* \(.* process {os.getpid()}, for 0:00:0\d\): wait for it"
-        with pytest.raises(DataError, match=owner):
+        with pytest.raises(NotYetError, match=owner):
             Lease(tmp_path / "lock", second, "works in")
-        with pytest.raises(DataError, match=owner):  # also the same share twice
+        with pytest.raises(NotYetError, match=owner):  # also the same share twice
             Lease(tmp_path / "lock", first, "works in")
 
 
@@ -113,3 +126,45 @@ def test_shares_work_side_by_side_and_the_last_to_end_is_alone(tmp_path):
         assert one.is_alone
         one.remove()
     assert list(tmp_path.iterdir()) == []
+
+
+def wait_behind(holder, end):
+    """Begin a share while another driver holds the folder; that one ends a moment later, in its own way."""
+    ending = threading.Timer(0.3, end)
+    with holder:
+        ending.start()
+        try:
+            return Lease(holder._path, Share(1, 2, Inline()), "works in")
+        finally:
+            ending.join()
+
+
+def test_a_share_waits_for_the_driver_that_puts_the_result_together_and_finds_nothing_left(tmp_path):
+    path = tmp_path / "a.parts" / ".lock"
+    finishing = Lease(path, Inline(), "works in")
+
+    def end():
+        finishing.remove()
+        finishing.__exit__(None, None, None)
+
+    with pytest.raises(Unfinished, match="another process has just finished this work: nothing is left to do"):
+        wait_behind(finishing, end)
+    assert not [p for p in tmp_path.rglob("*") if p.is_file()]
+
+
+def test_a_share_takes_over_from_a_driver_that_was_stopped(tmp_path):
+    path = tmp_path / "a.parts" / ".lock"
+    killed = Lease(path, Inline(), "works in")
+    start = time.monotonic()
+    with wait_behind(killed, lambda: killed.__exit__(None, None, None)) as mine:
+        assert not mine.is_alone
+    assert 0.2 < time.monotonic() - start < lease.SECONDS_TO_WAIT
+
+
+def test_the_commands_that_join_takes_are_those_with_shares():
+    classes = {verb: getattr(importlib.import_module(module), name) for verb, (module, name) in VERBS.items()}
+    classes["submit build"] = Build
+    with_shares = {
+        verb for verb, cls in classes.items() if any(hint in (Machines, Work) for hint in get_type_hints(cls).values())
+    }
+    assert with_shares == set(HAVE_SHARES)

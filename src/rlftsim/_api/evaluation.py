@@ -18,6 +18,7 @@ from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import Policy, Sampling
 from rlftsim.scenario.any_form import AnyScenarios, Name, scenarios_of
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
+from rlftsim.storage import require_folder
 
 ORACLE = "oracle"
 
@@ -85,7 +86,7 @@ def evaluate(
             folder, split = temporary / "scenarios", None
             write_dataset((scenarios[position] for position in range(len(scenarios))), folder)
         # Without `out` the results are in memory alone when the folder is gone.
-        out = Path(out or temporary / "results")
+        out = require_folder(out or temporary / "results")
         return evaluation.evaluate(subject, folder, out, replace(config, split=split), name=name)
 
 

@@ -5,7 +5,7 @@ import platform
 import shutil
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -15,6 +15,7 @@ import torch
 from rich.table import Table
 from rich.text import Text
 
+from rlftsim.errors import ConfigError
 from rlftsim.progress import print_wide
 from rlftsim.scenario.inspect import verify_dataset
 from rlftsim.scenario.synthetic import pack_path
@@ -53,6 +54,15 @@ class Doctor:
     """With --plan: cores of a machine."""
     price: float = 0.04
     """With --plan: price of a core for an hour, in dollars."""
+
+    def refuse_useless(self, flags: Sequence[str]) -> None:
+        """Refuse the flags of a forecast without one.
+
+        Raises:
+            ConfigError: there are some.
+        """
+        if self.plan is None and flags:
+            raise ConfigError(f"{flags[0]} has no effect: add --plan evaluate, convert or submit.")
 
     def run(self) -> int:
         """Print the results; exit status 1 if a check failed."""

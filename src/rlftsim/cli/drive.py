@@ -8,7 +8,6 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional
 
-from rlftsim.errors import ConfigError
 from rlftsim.evaluation.drive_results import format_drives
 from rlftsim.progress import print_wide
 
@@ -53,8 +52,6 @@ class Drive:
 
         # As `python -m` does, so that a planner in a file of this folder is found.
         sys.path.insert(0, "")
-        if self.scenario is not None and not self.scenario:
-            raise ConfigError("--scenario needs at least one id; leave it out for all scenarios.")
         traffic = tuple(kind.strip() for kind in self.traffic.split(","))
         config = DriveConfig(
             planner=self.planner, data=self.data, split=self.split, model=self.model,

@@ -54,10 +54,6 @@ class Propose:
     def run(self) -> int:
         """Propose goals; print, draw and write them."""
         # 1. mistakes that need no scenario to be seen
-        if not self.scenario:
-            raise ConfigError("--scenario needs at least one id.")
-        if self.agent is not None and not self.agent:
-            raise ConfigError("--agent needs at least one object id; leave it out for the evaluated agents.")
         if self.picture is not None:
             refuse_no_picture(self.picture)
         # 2. a table for each scenario, and its goals and pictures for later

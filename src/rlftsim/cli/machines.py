@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from rlftsim.errors import ConfigError
 from rlftsim.workers import Inline, OnDeath, Processes, Runner, Share
 
 
@@ -12,6 +13,8 @@ class Machines:
     share: str | None = None
     """Do every N-th piece of the work only, from the K-th on: "3/64" on one of 64 machines. The last one puts the
     result together."""
+    ray: str | None = None
+    """Work on a Ray cluster: its address, or "auto" (pip install "rlftsim[ray]")."""
 
     def runner(self, jobs: int, on_death: OnDeath) -> Runner | None:
         """Runner of the flags; None = the verb's own choice of processes.
@@ -21,8 +24,14 @@ class Machines:
             on_death: of an item whose process dies.
 
         Raises:
-            ConfigError: a share that is none.
+            ConfigError: a share that is none, both flags, or Ray is not installed.
         """
+        if self.share is not None and self.ray is not None:
+            raise ConfigError("--share and --ray are two ways to use several machines: choose one.")
+        if self.ray is not None:
+            from rlftsim.cluster.ray import RayRunner
+
+            return RayRunner(self.ray, on_death)
         here = Processes(jobs, on_death) if jobs > 1 else Inline()
         return None if self.share is None else Share.parse(self.share, here)
 
@@ -37,5 +46,5 @@ class Work(Machines):
 
     def runner(self, jobs: int, on_death: OnDeath) -> Runner | None:
         """Runner of the flags, see `Machines`."""
-        stops = on_death == "stop" and jobs > 1 and self.share is None
+        stops = on_death == "stop" and jobs > 1 and self.share is None and self.ray is None
         return Processes(jobs, on_death) if stops else super().runner(jobs, on_death)

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from rlftsim import __version__
-from rlftsim.errors import RlftsimError
+from rlftsim.errors import ConfigError, RlftsimError
 from rlftsim.threads import keep_freed_memory
 
 VERBS = {
@@ -74,6 +74,8 @@ usage: rlftsim VERB ...      rlftsim VERB --help explains a verb
 STARTS_ANEW = ("doctor", "plugins", "data", "recipe", "tokens", "model", "goals", "drive", "studio", "compare")
 """Verbs that keep nothing of an interrupted run."""
 JOIN = "join"
+HAVE_SHARES = ("convert", "evaluate", "score", "submit build", "synthesize")
+"""Commands with --share, whose shares `join` puts together."""
 INTERRUPTED = 130
 USER_MISTAKE = 2
 
@@ -88,11 +90,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if words[0] in ("-V", "--version"):
         print(f"rlftsim {__version__}")
         return 0
-    verb = words[1] if words[0] == JOIN and len(words) > 1 else words[0]
-    if verb not in VERBS:
-        near = difflib.get_close_matches(verb, VERBS, 1)
+    verb = words[0]
+    if verb not in VERBS and verb != JOIN:
+        near = difflib.get_close_matches(verb, [*VERBS, JOIN], 1)
         hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(VERBS)}."
-        hint = f"write it before the whole command of a share, `rlftsim {JOIN} convert ...`." if verb == JOIN else hint
         print(f"rlftsim: no verb {verb!r}: {hint}", file=sys.stderr)
         return USER_MISTAKE
     try:
@@ -126,8 +127,15 @@ def parse(words: Sequence[str]) -> Any:
     # Imported late: the overview is printed without it.
     from rlftsim.cli.parse import parse as parse_words
 
-    words = [*words[1:], "--share", JOIN] if words[0] == JOIN else words
-    return parse_words(words, VERBS)
+    if words[0] != JOIN:
+        return parse_words(words, VERBS)
+    command = words[1:]
+    if "--share" in command or not any(" ".join(command[:length]) in HAVE_SHARES for length in (1, 2)):
+        raise ConfigError(
+            f"{' '.join(words[:3])}: write the command of a share behind {JOIN}, without --share; commands with shares "
+            f"are {', '.join(HAVE_SHARES)}."
+        )
+    return parse_words([*command, "--share", JOIN], VERBS)
 
 
 def _in_words(error: Exception) -> str | None:

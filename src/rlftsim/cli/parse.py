@@ -4,6 +4,7 @@ import importlib
 import io
 import os
 import re
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import fields, is_dataclass
@@ -94,8 +95,8 @@ def _parsed(name: str, words: list[str], verbs: Mapping[str, tuple[str, str]], r
     # Warnings on the way, such as that of a reward that is registered twice, are shown after all.
     if complaint.getvalue():
         log.warning(complaint.getvalue().rstrip())
-    _refuse_values(parsed)
-    if has_settings:
+    _refuse_values(parsed, [name, *words])
+    if hasattr(parsed, "refuse_useless"):
         parsed.refuse_useless(flags_of(words))
     return parsed
 
@@ -162,18 +163,48 @@ def _flag_of_setting(setting: str) -> list[str]:
     return flags
 
 
-def _refuse_values(verb: Any, prefix: str = "--") -> None:
-    """Refuse zero and less where something is counted, and addresses of buckets in place of paths.
+def _refuse_values(verb: Any, words: Sequence[str]) -> None:
+    """Refuse zero and less where something is counted, no value where some are listed, and addresses of buckets in
+    place of paths.
+
+    Args:
+        verb: as parsed, or a part of it.
+        words: the whole command.
 
     Raises:
-        ConfigError: names the flag.
+        ConfigError: names the flag, or the commands that do it.
     """
     for field in fields(verb):
-        value = getattr(verb, field.name)
+        value, flag = getattr(verb, field.name), f"--{field.name.replace('_', '-')}"
         if field.name in COUNTS and isinstance(value, int) and value < 1:
-            raise ConfigError(f"{prefix}{field.name.replace('_', '-')} must be at least 1, got {value}.")
+            raise ConfigError(f"{flag} must be at least 1, got {value}.")
+        if value == [] and flag in words:
+            raise ConfigError(f"{flag} needs at least one value.")
         if isinstance(value, Path) and ADDRESS.match(str(value)):
-            raise ConfigError(f"{value} is an address: name a folder or a file of this machine here.")
+            _refuse_address(value, words)
         # Fields of these two are shown without a prefix, so they belong to the verb.
         if field.name in ("config", "action") and is_dataclass(value):
-            _refuse_values(value)
+            _refuse_values(value, words)
+
+
+def _refuse_address(path: Path, words: Sequence[str]) -> None:
+    """Refuse an address of a bucket in place of a path, with the commands that bring the result there.
+
+    Args:
+        path: made of the address.
+        words: the whole command.
+
+    Raises:
+        ConfigError: always.
+    """
+    address = next((word for word in words if "://" in word and Path(word) == path), str(path))
+    if words[0] not in ("convert", "synthesize"):
+        raise ConfigError(
+            f"{address} is an address: name a folder or a file of this machine here, and copy it by the bucket's own "
+            "tools (docs/machines.md)."
+        )
+    command = shlex.join("FOLDER" if word == address else word for word in words)
+    raise ConfigError(
+        f"{address} is an address, and a data set is made in a folder: `rlftsim {command}`, then "
+        f"`rlftsim data push FOLDER {address}`."
+    )

@@ -67,8 +67,6 @@ class Simulate:
 
     def run(self) -> int:
         """Simulate the scenarios that have no file yet, and report goals."""
-        if self.scenario is not None and not self.scenario:
-            raise ConfigError("--scenario needs at least one id; leave it out for all scenarios.")
         # 1. model, data and goals; anything that does not fit is refused before the folder is touched
         exporters = [EXPORTERS.get(name) for name in self.export]
         policy = with_guidance(load_policy(self.model, self.device), self.guidance_scale)

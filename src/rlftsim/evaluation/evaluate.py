@@ -28,6 +28,7 @@ from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import ScenarioBatch, collate
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.types import Scenario
+from rlftsim.storage import require_folder
 from rlftsim.workers import Runner, on_this_machine
 
 __all__ = [
@@ -98,7 +99,7 @@ def evaluate(
         dataset.scenario_ids[: len(positions)],
         name,
         provenance,
-        None if out is None else Path(out),
+        None if out is None else require_folder(out),
         runner=runner or on_this_machine(config.jobs, len(groups_of(len(positions), EvaluationParts.group_size))),
         title=f"evaluate {name}",
         show_progress=show_progress,

@@ -17,7 +17,7 @@ from typing import Any, ClassVar, Generic, TypeVar
 
 import pyarrow as pa
 
-from rlftsim.atomic_io import write_text
+from rlftsim.atomic_io import remove_temporaries, write_text
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.results import SCHEMA, Evaluation, Provenance, Skipped, join_evaluations
 from rlftsim.lease import Lease
@@ -275,6 +275,7 @@ def resume_evaluation(
                     runner=runner, title=title, lease=lease, show_progress=show_progress,
                 )  # fmt: skip
                 finished = join_evaluations(name, provenance, parts)
+                remove_temporaries(files.result_path)
                 finished.write(files.result_path)
                 # Only now: an interruption between the two leaves the parts, and the next call finds the result.
                 shutil.rmtree(files.parts_folder, ignore_errors=True)

@@ -34,7 +34,7 @@ from rlftsim.scenario.dataset import (
 from rlftsim.scenario.shards import SCHEMA_VERSION, ShardWriter, hash_file
 from rlftsim.scenario.sources import AUTO, DEFAULT_SOURCE, DataSource, Unit, find_source, read_unit, units_of_urls
 from rlftsim.scenario.tfrecord import OnError, SkippedRecord
-from rlftsim.storage import fetch, find_files, is_url
+from rlftsim.storage import fetch, find_files, is_url, require_folder
 from rlftsim.workers import Runner, on_this_machine, require_finished, usable_cores
 
 _INCOMPLETE_TEXT = "A conversion runs here or was interrupted: run the same command again, it goes on."
@@ -127,7 +127,7 @@ def convert(
     if split is not None and not split.strip():
         raise ConfigError("the split has no name: leave it out to read it off the folder or file.")
     # 1. Refuse a destination that holds anything but a data set or an unfinished conversion.
-    folder = Path(destination)
+    folder = require_folder(destination)
     if folder.exists() and not (folder / INCOMPLETE).exists():
         if not folder.is_dir():
             raise DataError(f"{folder} is a file, not a folder: choose another destination")

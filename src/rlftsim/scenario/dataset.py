@@ -42,7 +42,7 @@ from rlftsim.scenario.shards import (
 from rlftsim.scenario.synthetic.pack import pack_path
 from rlftsim.scenario.tfrecord import SkippedRecord
 from rlftsim.scenario.types import Scenario
-from rlftsim.storage import ORIGIN, fetch_shard, is_url, mirror
+from rlftsim.storage import ORIGIN, fetch_shard, is_url, mirror, require_folder
 
 FORMAT = "rlftsim scenarios"
 MANIFEST, INDEX, INCOMPLETE, SHARDS = "manifest.json", "index.parquet", "INCOMPLETE", "shards"
@@ -232,7 +232,7 @@ class DatasetWriter:
         license_note: str = DEFAULT_LICENSE_NOTE,
         provenance: Mapping[str, object] | None = None,
     ) -> None:
-        self.folder = Path(folder)
+        self.folder = require_folder(folder)
         if self.folder.exists() and (not self.folder.is_dir() or any(self.folder.iterdir())):
             raise DataError(f"{self.folder} is not an empty folder: choose another one or delete it")
         # beside the folder, so that renaming it never crosses file systems

@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 
-from rlftsim.atomic_io import errors_name, temporary_beside, write_text
+from rlftsim.atomic_io import errors_name, remove_temporaries, temporary_beside, write_text
 from rlftsim.errors import DataError
 from rlftsim.evaluation.evaluate import check_jobs, simulate_states
 from rlftsim.evaluation.results import EvaluateConfig
@@ -27,7 +27,7 @@ from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.types import Scenario
 from rlftsim.submission.archive import Piece, count_joined, join_pieces, write_piece
 from rlftsim.submission.messages import decode_rollouts, encode_rollouts, encode_varint, round_states
-from rlftsim.submission.plan import GZIP_RATIO, Plan
+from rlftsim.submission.plan import GZIP_RATIO, PLAN, Plan
 from rlftsim.submission.scenario_checks import check_rollouts
 from rlftsim.threads import one_thread
 from rlftsim.workers import Runner, on_this_machine, require_finished
@@ -105,6 +105,7 @@ def build_archive(
             runner.run(partial(_build_shard, job), missing, advance=advance, name_of=job.plan.shard_name)
         lease.finish("submit")
         _remove_strays(shards)
+        remove_temporaries(job.folder / PLAN)
         pieces = [piece for piece in map(job.receipt, numbers) if piece is not None]
         require_finished(runner, len(numbers) - len(pieces), len(numbers), "submit")
         join_pieces(archive, shards, pieces, delete=delete_parts)

@@ -61,7 +61,8 @@ class Plan:
             raise ConfigError(
                 f"{folder} holds a submission of another {', '.join(differing)}: name another --out, or remove it."
             )
-        write_text(path, json.dumps(values, indent=1) + "\n")
+        if not path.exists():
+            write_text(path, json.dumps(values, indent=1) + "\n")
 
 
 def make_plan(

@@ -10,7 +10,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from rlftsim.atomic_io import write_text
+from rlftsim.atomic_io import remove_temporaries, write_text
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.results import EvaluateConfig, Evaluation
 from rlftsim.policies.checkpoint import CARD, find_model
@@ -91,6 +91,8 @@ class Report:
     def write(self, archive: Path) -> list[Path]:
         """Write `submission.report.md` and `.json` beside the archive; returns both paths."""
         json_path, text_path = (report_path(archive, ending) for ending in ("json", "md"))
+        for path in (json_path, text_path):
+            remove_temporaries(path)
         write_text(text_path, self.as_text())
         write_text(json_path, json.dumps(asdict(self), indent=1) + "\n")
         return [text_path, json_path]

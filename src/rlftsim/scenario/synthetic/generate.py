@@ -193,7 +193,7 @@ def generate(
         lease.finish("synthetic scenarios")
         num_missing = sum(not path.exists() for path in paths)
         require_finished(runner, num_missing, len(tasks), "synthetic scenarios")
-        for leftover in (folder / SHARDS).glob("*.tmp"):  # of processes that were killed
+        for leftover in folder.rglob("*.tmp"):  # of processes that were killed
             leftover.unlink()
 
         # 3. Index and manifest.

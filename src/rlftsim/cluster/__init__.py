@@ -1,0 +1,1 @@
+"""Runners for clusters that need a library of their own."""

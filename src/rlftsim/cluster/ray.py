@@ -1,0 +1,220 @@
+"""Work on a Ray cluster (the extra "ray"). No other module imports Ray.
+
+Ray starts processes on the machines of the cluster and notices which of them die. All else is as with `Processes`:
+items write their own files in a folder that all machines see, and an item whose process died is done again.
+"""
+
+import hashlib
+import logging
+import os
+import pickle
+import socket
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+
+import rlftsim
+from rlftsim.errors import ConfigError, DataError
+from rlftsim.progress import log
+from rlftsim.workers import (
+    ATTEMPTS,
+    OUT_OF_MEMORY,
+    Advance,
+    OnDeath,
+    SetAside,
+    Task,
+    pickle_task,
+    portable_error,
+)
+
+try:
+    import ray
+    from ray import cloudpickle
+    from ray.exceptions import NodeDiedError, RayError
+except ImportError as error:
+    raise ConfigError('Ray is not installed: pip install "rlftsim[ray]", or use --jobs or --share.') from error
+
+AHEAD = 4
+"""Items handed to Ray for each core of the cluster; more would make its scheduler and this process grow."""
+SECONDS_BETWEEN_REPORTS = 5.0
+SECONDS_TO_STOP = 5.0
+
+_tasks: dict[str, Task] = {}
+"""The task of this worker process by its hash: model and data set stay open between items."""
+
+
+@dataclass(frozen=True)
+class RayRunner:
+    """Processes of a Ray cluster, one for each of its cores.
+
+    Args:
+        address: of the cluster, such as "10.0.0.1:6379"; "auto" = the one that runs on this machine.
+        on_death: see `rlftsim.workers.OnDeath`.
+    """
+
+    address: str = "auto"
+    on_death: OnDeath = "skip"
+
+    def own(self, items: Sequence[Any]) -> Sequence[Any]:
+        """All items, see `Runner`."""
+        return items
+
+    def run(
+        self, task: Task, items: Sequence[Any], *, advance: Advance, name_of: Callable[[Any], str] = str
+    ) -> list[Any]:
+        """Results of all items, see `Runner`.
+
+        Raises:
+            ConfigError: there is no such cluster, or another version of this package on it; see also `Runner`.
+        """
+        # Ray's pickle: processes of a cluster do not import the main module, in which a policy may be defined.
+        pickled = pickle_task(task, cloudpickle.dumps)
+        is_own_session = not ray.is_initialized()
+        if is_own_session:
+            try:
+                # Ray itself ends this process where there is nothing at an address.
+                host, colon, port = self.address.rpartition(":")
+                if colon and port.isdecimal() and "/" not in host:
+                    socket.create_connection((host, int(port)), timeout=10).close()
+                ray.init(self.address, log_to_driver=False, logging_level=logging.ERROR)
+            except (OSError, RuntimeError, ValueError) as error:
+                cause = str(error).strip().splitlines()[0]
+                raise ConfigError(
+                    f"--ray {self.address}: no Ray cluster there ({cause}): `ray start` makes one."
+                ) from None
+        try:
+            return self._run(pickled, items, advance, name_of)
+        finally:
+            if is_own_session:
+                ray.shutdown()
+
+    def _run(self, pickled: bytes, items: Sequence[Any], advance: Advance, name_of: Callable[[Any], str]) -> list[Any]:
+        results: dict[int, Any] = {}
+        waiting, deaths, reasons = deque(range(len(items))), Counter[int](), dict[str, str]()
+        at_work: dict[Any, int] = {}
+        is_waiting = False
+        counted = Counter[int]()  # progress by item; a new process counts from zero
+
+        # In the object store once; each worker process reads it once.
+        task = ray.put(pickled)
+        key, driver = hashlib.sha256(pickled).hexdigest(), (rlftsim.__version__, os.getcwd())
+        board = ray.remote(_Board).options(num_cpus=0).remote()
+        # No retries by Ray: it would try an item that eats all memory forever, and not tell.
+        work = ray.remote(_work).options(num_cpus=1, max_retries=0, scheduling_strategy="SPREAD")
+
+        def count(number: int, total: int) -> None:
+            advance(total - counted[number])
+            counted[number] = total
+
+        try:
+            while len(results) + len(reasons) < len(items):
+                num_cores = int(ray.cluster_resources().get("CPU", 0))
+                while waiting and len(at_work) < AHEAD * max(num_cores, 1):
+                    number = waiting.popleft()
+                    at_work[work.remote([task], key, driver, pickle.dumps(items[number]), number, board)] = number
+                done, _ = ray.wait(list(at_work), timeout=SECONDS_BETWEEN_REPORTS)
+                if not num_cores and not is_waiting:
+                    log.warning("the cluster has no cores now: waiting for machines.")
+                is_waiting = not num_cores
+                if not done:
+                    # Not by `get` alone: the board's machine may be gone, and progress is worth no error.
+                    with suppress(RayError):
+                        totals: Any = ray.get(board.take.remote(), timeout=1.0)
+                        for number, total in totals.items():
+                            if number in at_work.values():
+                                count(number, total)
+                for ref in done:
+                    number = at_work.pop(ref)
+                    try:
+                        kind, value, total = pickle.loads(ray.get(ref))
+                    except RayError as error:
+                        reason, name = _reason(error), name_of(items[number])
+                        if self.on_death == "stop":
+                            raise DataError(
+                                f"the process of {name} died ({reason}): run the same command again, it resumes."
+                            ) from None
+                        deaths[number] += not isinstance(error, NodeDiedError)
+                        if deaths[number] < ATTEMPTS:
+                            log.warning(f"the process of {name} died ({reason}): trying again.")
+                            waiting.appendleft(number)
+                        else:
+                            reasons[name] = reason
+                        continue
+                    if kind == "error":
+                        raise value
+                    results[number] = value
+                    count(number, total)
+        finally:
+            _cancel(list(at_work))
+        if reasons:
+            raise SetAside(reasons)
+        return [results[number] for number in range(len(items))]
+
+
+class _Board:
+    """An actor that remembers what tasks at work report."""
+
+    def __init__(self) -> None:
+        self._totals: dict[int, int] = {}
+
+    def put(self, number: int, total: int) -> None:
+        """Remember the progress of an item."""
+        self._totals[number] = total
+
+    def take(self) -> dict[int, int]:
+        """What was reported since the last call."""
+        totals, self._totals = self._totals, {}
+        return totals
+
+
+def _work(task: list[Any], key: str, driver: tuple[str, str], item: bytes, number: int, board: Any) -> bytes:
+    """Do an item in a process of the cluster; "result" or "error", its value, and the progress made, pickled."""
+    total, last = 0, time.monotonic()
+    version, folder = driver
+
+    def advance(count: int) -> None:
+        nonlocal total, last
+        total += count
+        if time.monotonic() - last > SECONDS_BETWEEN_REPORTS:
+            last = time.monotonic()
+            board.put.remote(number, total)
+
+    try:
+        if version != rlftsim.__version__:
+            raise ConfigError(
+                f"the cluster has rlftsim {rlftsim.__version__}, this machine {version}: install the same on all."
+            )
+        if key not in _tasks:
+            try:
+                os.chdir(folder)  # so that relative paths are those of the command
+            except OSError as error:
+                raise ConfigError(
+                    f"{folder} ({error.strerror}): give the command in a folder that all machines of the cluster see."
+                ) from None
+            _tasks.clear()
+            _tasks[key] = pickle.loads(ray.get(task[0]))
+        return pickle.dumps(("result", _tasks[key](pickle.loads(item), advance, lambda: False), total))
+    except MemoryError:
+        os._exit(OUT_OF_MEMORY)  # a new process may have enough
+    except Exception as error:
+        error = portable_error(error)
+        error.add_note(f"on {ray.util.get_node_ip_address()}")
+        return pickle.dumps(("error", error, total))
+
+
+def _reason(error: RayError) -> str:
+    """First line of what Ray says about the end of a process."""
+    return f"{type(error).__name__}: {(str(error).strip().splitlines() or [''])[0][:200]}"
+
+
+def _cancel(refs: list[Any]) -> None:
+    """Stop tasks: at first they may clean up, then their processes are killed."""
+    with suppress(RayError):
+        for ref in refs:
+            ray.cancel(ref)
+        _, left = ray.wait(refs, num_returns=len(refs), timeout=SECONDS_TO_STOP) if refs else ([], [])
+        for ref in left:
+            ray.cancel(ref, force=True)

@@ -1,0 +1,26 @@
+"""Tasks that processes of a Ray cluster can import."""
+
+import os
+import time
+
+
+def double_or_die(item, advance, is_stopped):
+    """Twice the number; "exit" ends the process."""
+    if item == "exit":
+        os._exit(7)
+    advance(1)
+    return 2 * item
+
+
+def slow_file(path, advance, is_stopped):
+    """Write a file after a second, as work does."""
+    time.sleep(1.0)
+    path.write_text(path.name)
+    return path.name
+
+
+def refuse(item, advance, is_stopped):
+    """Fail as a user error."""
+    from rlftsim.errors import DataError
+
+    raise DataError(f"item {item} is broken")
