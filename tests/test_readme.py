@@ -6,27 +6,26 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from run_pages import PAGES, ROOT, blocks_of
 
 import rlftsim
 from rlftsim.cli.main import VERBS, parse
 from rlftsim.errors import RlftsimError
 from rlftsim.recipes.registry import recipe_by_name
 
-ROOT = Path(__file__).parents[1]
-PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), *(ROOT / "docs").glob("tutorials/*.md")])
-FENCE = re.compile(r"^```\w*\n(.*?)^```", re.DOTALL | re.MULTILINE)
 README = (ROOT / "README.md").read_text()
 CONTRIBUTING = (ROOT / "CONTRIBUTING.md").read_text()
 
 
-def shell_lines(text: str) -> list[str]:
-    """Lines of fenced blocks."""
-    return [line.strip() for block in FENCE.findall(text) for line in block.splitlines()]
-
-
-COMMANDS = [
-    (page.name, line) for page in PAGES for line in shell_lines(page.read_text()) if line.startswith("rlftsim ")
+SHELL = [
+    (page.name, line)
+    for page in PAGES
+    for block in blocks_of(page)
+    if block.language == "sh"
+    for line in block.commands
 ]
+COMMANDS = [(page, line[line.index("rlftsim ") :]) for page, line in SHELL if re.search(r"(^|-m )rlftsim ", line)]
+"""Commands of all pages, also of blocks that are not run."""
 INLINE = [
     (page.name, code) for page in PAGES for code in re.findall(r"`(rlftsim [^`\n]+)`", page.read_text())
 ]  # fmt: skip
@@ -78,7 +77,7 @@ def test_every_setting_in_the_documents_is_a_field(name):
 
 def test_make_knows_the_targets_that_are_shown():
     makefile = (ROOT / "Makefile").read_text()
-    shown = {w.split()[1] for page in PAGES for w in shell_lines(page.read_text()) if w.startswith("make ")}
+    shown = {line.split()[1] for _, line in SHELL if line.startswith("make ")}
     shown |= set(re.findall(r"`make ([\w-]+)", README))
     assert {"demo", "test"} <= shown
     assert all(re.search(rf"^{target}:", makefile, re.MULTILINE) for target in shown)
@@ -86,7 +85,7 @@ def test_make_knows_the_targets_that_are_shown():
 
 def tree() -> dict[str, str]:
     """Path → reason of the file tree in CONTRIBUTING."""
-    block = next(b for b in FENCE.findall(CONTRIBUTING) if b.startswith("src/rlftsim/"))
+    block = next(b.text for b in blocks_of(ROOT / "CONTRIBUTING.md") if b.text.startswith("src/rlftsim/"))
     entries, parent = {}, ""
     for line in block.splitlines():
         name, _, reason = line.strip().partition(" ")

@@ -10,11 +10,11 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 import shapely
-from av2_files import clipped_edges, crop_box, left_of_nearest, map_archive, track_rows, write_av2
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import scenes
+from av2_files import clipped_edges, crop_box, left_of_nearest, map_archive, track_rows, write_av2
 from rlftsim.cli.main import main
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.realism import metric_by_name, scenario_log, score

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 
 from rlftsim.errors import DataError
@@ -20,47 +19,9 @@ from rlftsim.scenario.inspect import verify_dataset
 from rlftsim.scenario.sources import find_source
 from rlftsim.scenario.tables import TablesSource
 from rlftsim.scenario.types import CURRENT_STEP, MapFeatureType, ObjectType
+from table_files import MAP, car, write_tables
 
 ROOT = Path(__file__).parents[2]
-
-
-def car(object_id, x, y=0.0, *, speed=10.0, kind="vehicle", steps=range(91), step_s=0.1, scenario_id="one", **more):
-    """Rows of an object that drives along +x, at x at step 0."""
-    return [
-        {
-            "scenario_id": scenario_id, "object_id": object_id, "type": kind, "step": step,
-            "x": x + speed * step * step_s, "y": y, "heading": 0.0, "vx": speed, "vy": 0.0, **more,
-        }
-        for step in steps
-    ]  # fmt: skip
-
-
-def line(feature_id, kind, *points, scenario_id="one", **more):
-    return [
-        {"scenario_id": scenario_id, "feature_id": feature_id, "type": kind, "x": x, "y": y, **more} for x, y in points
-    ]
-
-
-MAP = [
-    *line(1, "lane_surface_street", (-50, 0), (200, 0)),
-    *line(2, "edge_boundary", (-50, -2), (200, -2)),
-    *line(3, "edge_boundary", (200, 6), (-50, 6)),
-    *line(4, "lane_surface_street", (200, 4), (-50, 4)),
-]
-
-
-def write(folder, tracks=None, scenarios=None, map_rows=None, **others):
-    """Tables of one scenario with two cars."""
-    folder.mkdir(parents=True, exist_ok=True)
-    tables = {
-        "tracks": [*car(7, 0.0), *car(8, 20.0, speed=8.0)] if tracks is None else tracks,
-        "scenarios": [{"scenario_id": "one", "ego_id": 7, "predict": [8]}] if scenarios is None else scenarios,
-        "map": MAP if map_rows is None else map_rows,
-        **others,
-    }
-    for name, rows in tables.items():
-        pq.write_table(rows if isinstance(rows, pa.Table) else pa.Table.from_pylist(rows), folder / f"{name}.parquet")
-    return folder
 
 
 def read(folder):
@@ -70,7 +31,7 @@ def read(folder):
 
 
 def test_tables_become_a_scenario(tmp_path):
-    (scenario,) = read(write(tmp_path / "drive"))
+    (scenario,) = read(write_tables(tmp_path / "drive"))
     tracks = scenario.tracks
     assert (scenario.scenario_id, scenario.source, scenario.guessed) == ("one", "tables", {"size", "z"})
     assert tracks.position[scenario.ego_index, CURRENT_STEP, :2].tolist() == pytest.approx([10.0, 0.0])
@@ -86,12 +47,14 @@ def test_tables_become_a_scenario(tmp_path):
 def test_what_is_given_is_not_guessed(tmp_path):
     tracks = car(7, 0.0, z=3.5, length=5.0, width=2.0, height=1.5)
     high = [{**row, "z": 3.0} for row in MAP]
-    (scenario,) = read(write(tmp_path / "drive", tracks, [{"scenario_id": "one", "ego_id": 7, "predict": []}], high))
+    (scenario,) = read(
+        write_tables(tmp_path / "drive", tracks, [{"scenario_id": "one", "ego_id": 7, "predict": []}], high)
+    )
     assert scenario.guessed == set()
     assert scenario.tracks.position[0, 0, 2] == 3.5
     # without heights of tracks the boxes stand on the map
     bare = [{k: v for k, v in row.items() if k != "z"} for row in tracks]
-    (scenario,) = read(write(tmp_path / "flat", bare, [{"scenario_id": "one", "ego_id": 7}], high))
+    (scenario,) = read(write_tables(tmp_path / "flat", bare, [{"scenario_id": "one", "ego_id": 7}], high))
     assert scenario.guessed == {"z", "predict"}
     assert scenario.tracks.position[0, 0, 2] == pytest.approx(3.75)
 
@@ -103,7 +66,7 @@ def test_any_rate_becomes_ten_hertz(tmp_path, step_s):
     for row in tracks:  # a turn through pi, along the circle
         row["heading"] = float(np.remainder(3.1 + 0.2 * row["step"] * step_s + np.pi, 2 * np.pi) - np.pi)
         row["vx"], row["x"] = 0.0, 0.0
-    (scenario,) = read(write(tmp_path / "d", tracks, [{"scenario_id": "one", "ego_id": 7, "step_s": step_s}]))
+    (scenario,) = read(write_tables(tmp_path / "d", tracks, [{"scenario_id": "one", "ego_id": 7, "step_s": step_s}]))
     expected = np.remainder(3.1 + 0.02 * np.arange(91) + np.pi, 2 * np.pi) - np.pi
     assert np.abs(scenario.tracks.heading[0] - expected).max() < 1e-5
     assert scenario.tracks.valid.all()
@@ -111,7 +74,7 @@ def test_any_rate_becomes_ten_hertz(tmp_path, step_s):
 
 def test_short_holes_are_filled_and_longer_ones_are_not(tmp_path):
     steps = [s for s in range(91) if s not in (31, 32, 33, 34) and not 50 <= s < 55]
-    (scenario,) = read(write(tmp_path / "d", [*car(7, 0.0), *car(8, 20.0, steps=steps)]))
+    (scenario,) = read(write_tables(tmp_path / "d", [*car(7, 0.0), *car(8, 20.0, steps=steps)]))
     valid = scenario.tracks.valid[1]
     assert valid[31:35].all()
     assert not valid[50:55].any()
@@ -126,7 +89,7 @@ def test_lanes_lights_and_shared_maps(tmp_path):
         {"scenario_id": "one", "step": s, "lane_id": 1, "state": "stop" if s < 5 else "go"} for s in range(0, 91, 2)
     ]
     row = [{"scenario_id": "one", "ego_id": 7, "map_id": "m", "step_s": 0.1}]
-    (scenario,) = read(write(tmp_path / "d", None, row, shared, lanes=lanes, lights=lights))
+    (scenario,) = read(write_tables(tmp_path / "d", None, row, shared, lanes=lanes, lights=lights))
     topology = scenario.map_features.topology
     assert topology.exit_lanes.tolist() == [[1, 4]]
     assert not len(topology.entry_lanes)  # lane 9 is not on the map
@@ -188,14 +151,14 @@ BAD = {
 @pytest.mark.parametrize("kind", BAD)
 def test_a_break_of_the_contract_is_named_with_its_row(tmp_path, kind):
     tables, cause = BAD[kind]
-    write(tmp_path / "d", **tables)
+    write_tables(tmp_path / "d", **tables)
     with pytest.raises(DataError) as caught:
         convert(tmp_path / "d", tmp_path / "data", on_error="stop", jobs=1, show_progress=False)
     assert re.search(cause, str(caught.value)), str(caught.value)
 
 
 def test_a_file_in_place_of_its_folder_is_refused(tmp_path):
-    write(tmp_path / "d")
+    write_tables(tmp_path / "d")
     with pytest.raises(DataError, match="no such folder; name the one"):
         convert(tmp_path / "d" / "tracks.parquet", tmp_path / "data", reader="tables", show_progress=False)
 
@@ -203,14 +166,14 @@ def test_a_file_in_place_of_its_folder_is_refused(tmp_path):
 @pytest.mark.parametrize("name", ["../../outside", "a/b", "", ".."])
 def test_an_id_that_is_no_file_name_costs_its_scenario(tmp_path, name):
     bad = [[{**row, "scenario_id": name} for row in rows] for rows in (TWO, [ROW], MAP)]
-    write(tmp_path / "d", *([*rows, *more] for rows, more in zip(bad, (TWO, [ROW], MAP))))
+    write_tables(tmp_path / "d", *([*rows, *more] for rows, more in zip(bad, (TWO, [ROW], MAP))))
     report = convert(tmp_path / "d", tmp_path / "data", jobs=1, show_progress=False)
     assert report.converted == 1
     assert f"scenario id {name!r} is no file name" in str(report.skipped[0])
 
 
 def test_a_column_of_licenses_may_be_empty(tmp_path):
-    write(tmp_path / "d", TWO, [{**ROW, "license": None, "guessed": ["ego", None]}])
+    write_tables(tmp_path / "d", TWO, [{**ROW, "license": None, "guessed": ["ego", None]}])
     (scenario,) = read(tmp_path / "d")
     assert scenario.guessed == {"ego", "predict", "size", "z"}
 
@@ -218,7 +181,7 @@ def test_a_column_of_licenses_may_be_empty(tmp_path):
 def test_a_bad_scenario_costs_itself_alone(tmp_path):
     tracks = [*TWO, *car(7, 0.0, scenario_id="two", speed=float("nan"))]
     rows = [{**ROW, "scenario_id": "two"}, ROW]
-    report = convert(write(tmp_path / "d", tracks, rows), tmp_path / "data", jobs=1, show_progress=False)
+    report = convert(write_tables(tmp_path / "d", tracks, rows), tmp_path / "data", jobs=1, show_progress=False)
     assert report.converted == 1
     assert str(report.skipped[0]).startswith("d: record 0: scenario two: tracks.parquet: row 182: x is nan")
 
@@ -226,7 +189,7 @@ def test_a_bad_scenario_costs_itself_alone(tmp_path):
 def test_several_folders_are_several_shards_with_their_licenses(tmp_path):
     for name, note in (("training", "CC0-1.0"), ("validation", "ODbL")):
         rows = [{**car_row, "scenario_id": name} for car_row in TWO]
-        write(tmp_path / "all" / name, rows, [{**ROW, "scenario_id": name, "license": note, "guessed": ["ego"]}],
+        write_tables(tmp_path / "all" / name, rows, [{**ROW, "scenario_id": name, "license": note, "guessed": ["ego"]}],
               [{**row, "scenario_id": name} for row in MAP])  # fmt: skip
     assert isinstance(find_source("auto", tmp_path / "all"), TablesSource)
     report = convert(tmp_path / "all", tmp_path / "data", jobs=1, show_progress=False)
