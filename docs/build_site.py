@@ -50,6 +50,9 @@ def relinked(text: str, source: str, base: str | None) -> str:
         text: Markdown.
         source: path of the page in the repository.
         base: address of the repository at the built commit; None = links to files that are no pages become text.
+
+    Raises:
+        SystemExit: a link to a file that the repository does not have.
     """
     own = place_of(source) or source
 
@@ -60,6 +63,8 @@ def relinked(text: str, source: str, base: str | None) -> str:
         if place is not None and (ROOT / target).is_file():
             relative = posixpath.relpath(place, posixpath.dirname(own) or ".") if path else ""
             return f"{mark}[{words}]({relative}{anchor})"
+        if not (ROOT / target).exists():
+            raise SystemExit(f"{source}: dead link to {path}: there is no {target}.")
         return f"[{words}]({base}/{target}{anchor})" if base else words
 
     # Brackets in code are no links.

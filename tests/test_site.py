@@ -11,6 +11,7 @@ import pytest
 
 pytest.importorskip("zensical", reason="the site's builder is not installed")
 pytest.importorskip("mkdocs", reason="the site's second builder is not installed")
+build_site = pytest.importorskip("build_site", reason="jupytext is not installed")
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[1]
@@ -114,3 +115,11 @@ def test_the_first_tutorial_runs_as_a_notebook(site, tmp_path):
     nbclient.NotebookClient(notebook, timeout=600, resources={"metadata": {"path": str(tmp_path)}}).execute()
     assert "(1, 32, 27, 80, 2)" in json.dumps(notebook.cells)  # scenarios, rollouts, agents, steps, x and y
     assert (tmp_path / "futures.html").stat().st_size > 50_000
+
+
+def test_a_dead_link_stops_the_build():
+    for link in ("[walk](wlak.md)", "![picture](studio/none.webp)", "[code](../src/rlftsim/none.py)"):
+        with pytest.raises(SystemExit, match=r"docs/start.md: dead link to \S+: there is no "):
+            build_site.relinked(f"See {link}.", "docs/start.md", None)
+    fine = "[walk](walk.md#one) and [code](../src/rlftsim/errors.py)"
+    assert build_site.relinked(fine, "docs/start.md", None) == "[walk](walk.md#one) and code"
