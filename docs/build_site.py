@@ -18,6 +18,8 @@ import sys
 from pathlib import Path
 
 import jupytext
+import nbformat
+from run_pages import RUN, blocks_of
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = ROOT / "build" / "pages"
@@ -71,6 +73,27 @@ def relinked(text: str, source: str, base: str | None) -> str:
     return "".join(part if part.startswith("```") else LINK.sub(rewrite, part) for part in FENCE.split(text))
 
 
+def notebook_of(page: Path, base: str | None) -> nbformat.NotebookNode:
+    """A tutorial as a notebook; what the page shows below a block is the output of its cell.
+
+    Args:
+        page: Markdown below docs.
+        base: as in `relinked`.
+    """
+    text, blocks = page.read_text(), [block for block in blocks_of(page) if block.language in RUN]
+    for block in reversed(blocks):
+        if block.output is not None:
+            text = text[: block.output.start()].rstrip() + text[block.output.end() :]
+    text = relinked(text, page.relative_to(ROOT).as_posix(), base)
+    notebook = jupytext.reads(text, fmt="md", as_version=4)
+    cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    for cell, block in zip(cells, blocks, strict=True):
+        if block.output is not None:
+            cell.outputs = [nbformat.v4.new_output("stream", name="stdout", text=block.output["text"])]
+    notebook.metadata["kernelspec"] = {"name": "python3", "display_name": "Python 3", "language": "python"}
+    return notebook
+
+
 def stage() -> None:
     """Fill build/pages anew."""
     shutil.rmtree(PAGES, ignore_errors=True)
@@ -89,7 +112,7 @@ def stage() -> None:
         if path.suffix == ".md":
             text = relinked(path.read_text(), name, base)
             if place.startswith("tutorials/") and path.name != "index.md":
-                jupytext.write(jupytext.reads(text, fmt="md"), target.with_suffix(".ipynb"))
+                nbformat.write(notebook_of(path, base), target.with_suffix(".ipynb"))
                 text += f"\n[This page as a notebook]({path.stem}.ipynb)\n"
             target.write_text(text)
         else:
