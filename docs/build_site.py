@@ -28,6 +28,9 @@ FENCE = re.compile(r"(^```.*?^```)", re.MULTILINE | re.DOTALL)
 ELSEWHERE = {"CHANGELOG.md": "changes.md", "CONTRIBUTING.md": "contributing.md", "README.md": "index.md"}
 """Files of the root that are pages; the README's place is the home page."""
 NO_PAGES = (".py", ".toml")
+DOWNLOADS = "_to_tables.py"
+"""End of the names of scripts that readers take from the site."""
+TEMPLATE = ROOT / "docs" / "plugin_template"
 SHIM = "https://unpkg.com/iframe-worker/shim"
 """Script of another host that the builders name in every page; docs/assets has one of our own in its place."""
 
@@ -38,7 +41,7 @@ def place_of(path: str) -> str | None:
     Args:
         path: relative to the root, with slashes.
     """
-    if path.startswith("docs/") and not path.endswith(NO_PAGES):
+    if path.startswith("docs/") and (path.endswith(DOWNLOADS) or not path.endswith(NO_PAGES)):
         return path.removeprefix("docs/")
     if path.startswith("benchmarks/") and not path.endswith(NO_PAGES):
         return f"results/{path.removeprefix('benchmarks/')}"
@@ -94,6 +97,16 @@ def notebook_of(page: Path, base: str | None) -> nbformat.NotebookNode:
     return notebook
 
 
+def template_files() -> str:
+    """The files of the plug-in template, for its page: the site alone is enough to copy them."""
+    files = sorted(path for path in TEMPLATE.rglob("*") if path.suffix in NO_PAGES)
+    return "".join(
+        f'\n```{"toml" if path.suffix == ".toml" else "python"} title="{path.relative_to(TEMPLATE).as_posix()}"\n'
+        f"{path.read_text()}```\n"
+        for path in files
+    )
+
+
 def stage() -> None:
     """Fill build/pages anew."""
     shutil.rmtree(PAGES, ignore_errors=True)
@@ -111,6 +124,7 @@ def stage() -> None:
         target.parent.mkdir(parents=True, exist_ok=True)
         if path.suffix == ".md":
             text = relinked(path.read_text(), name, base)
+            text += template_files() if path.parent == TEMPLATE else ""
             if place.startswith("tutorials/") and path.name != "index.md":
                 nbformat.write(notebook_of(path, base), target.with_suffix(".ipynb"))
                 text += f"\n[This page as a notebook]({path.stem}.ipynb)\n"

@@ -78,6 +78,10 @@ def test_no_link_or_anchor_is_dead_and_nothing_is_loaded_from_another_host(site)
                 dead += [f"{path.relative_to(site)}: {target}"] if not parts.fragment.startswith("__") else []
     assert dead == []
     assert (site / "demo" / "live.html").stat().st_size <= 1_500_000
+    # what pages tell a reader to copy is there
+    template = (site / "plugin_template" / "index.html").read_text()
+    assert all(words in template for words in ("entry-points", "write_csv", "src/rlftsim_plugin/__init__.py"))
+    assert (site / "commonroad_to_tables.py").is_file()
     # every public name has an entry, under the name that `import rlftsim as rs` gives it
     reference = pages[site / "reference" / "python.html"]
     assert {"rlftsim.simulate", "rlftsim.load_policy", "rlftsim.Scenario"} <= reference.anchors
