@@ -18,6 +18,8 @@ import sys
 from pathlib import Path
 
 import jupytext
+import nbformat
+from run_pages import RUN, blocks_of
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = ROOT / "build" / "pages"
@@ -26,6 +28,9 @@ FENCE = re.compile(r"(^```.*?^```)", re.MULTILINE | re.DOTALL)
 ELSEWHERE = {"CHANGELOG.md": "changes.md", "CONTRIBUTING.md": "contributing.md", "README.md": "index.md"}
 """Files of the root that are pages; the README's place is the home page."""
 NO_PAGES = (".py", ".toml")
+DOWNLOADS = "_to_tables.py"
+"""End of the names of scripts that readers take from the site."""
+TEMPLATE = ROOT / "docs" / "plugin_template"
 SHIM = "https://unpkg.com/iframe-worker/shim"
 """Script of another host that the builders name in every page; docs/assets has one of our own in its place."""
 
@@ -36,7 +41,7 @@ def place_of(path: str) -> str | None:
     Args:
         path: relative to the root, with slashes.
     """
-    if path.startswith("docs/") and not path.endswith(NO_PAGES):
+    if path.startswith("docs/") and (path.endswith(DOWNLOADS) or not path.endswith(NO_PAGES)):
         return path.removeprefix("docs/")
     if path.startswith("benchmarks/") and not path.endswith(NO_PAGES):
         return f"results/{path.removeprefix('benchmarks/')}"
@@ -50,6 +55,9 @@ def relinked(text: str, source: str, base: str | None) -> str:
         text: Markdown.
         source: path of the page in the repository.
         base: address of the repository at the built commit; None = links to files that are no pages become text.
+
+    Raises:
+        SystemExit: a link to a file that the repository does not have.
     """
     own = place_of(source) or source
 
@@ -60,10 +68,43 @@ def relinked(text: str, source: str, base: str | None) -> str:
         if place is not None and (ROOT / target).is_file():
             relative = posixpath.relpath(place, posixpath.dirname(own) or ".") if path else ""
             return f"{mark}[{words}]({relative}{anchor})"
+        if not (ROOT / target).exists():
+            raise SystemExit(f"{source}: dead link to {path}: there is no {target}.")
         return f"[{words}]({base}/{target}{anchor})" if base else words
 
     # Brackets in code are no links.
     return "".join(part if part.startswith("```") else LINK.sub(rewrite, part) for part in FENCE.split(text))
+
+
+def notebook_of(page: Path, base: str | None) -> nbformat.NotebookNode:
+    """A tutorial as a notebook; what the page shows below a block is the output of its cell.
+
+    Args:
+        page: Markdown below docs.
+        base: as in `relinked`.
+    """
+    text, blocks = page.read_text(), [block for block in blocks_of(page) if block.language in RUN]
+    for block in reversed(blocks):
+        if block.output is not None:
+            text = text[: block.output.start()].rstrip() + text[block.output.end() :]
+    text = relinked(text, page.relative_to(ROOT).as_posix(), base)
+    notebook = jupytext.reads(text, fmt="md", as_version=4)
+    cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    for cell, block in zip(cells, blocks, strict=True):
+        if block.output is not None:
+            cell.outputs = [nbformat.v4.new_output("stream", name="stdout", text=block.output["text"])]
+    notebook.metadata["kernelspec"] = {"name": "python3", "display_name": "Python 3", "language": "python"}
+    return notebook
+
+
+def template_files() -> str:
+    """The files of the plug-in template, for its page: the site alone is enough to copy them."""
+    files = sorted(path for path in TEMPLATE.rglob("*") if path.suffix in NO_PAGES)
+    return "".join(
+        f'\n```{"toml" if path.suffix == ".toml" else "python"} title="{path.relative_to(TEMPLATE).as_posix()}"\n'
+        f"{path.read_text()}```\n"
+        for path in files
+    )
 
 
 def stage() -> None:
@@ -83,8 +124,9 @@ def stage() -> None:
         target.parent.mkdir(parents=True, exist_ok=True)
         if path.suffix == ".md":
             text = relinked(path.read_text(), name, base)
+            text += template_files() if path.parent == TEMPLATE else ""
             if place.startswith("tutorials/") and path.name != "index.md":
-                jupytext.write(jupytext.reads(text, fmt="md"), target.with_suffix(".ipynb"))
+                nbformat.write(notebook_of(path, base), target.with_suffix(".ipynb"))
                 text += f"\n[This page as a notebook]({path.stem}.ipynb)\n"
             target.write_text(text)
         else:

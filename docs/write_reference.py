@@ -22,7 +22,7 @@ import rlftsim
 from rlftsim import errors
 from rlftsim.cli.main import OVERVIEW, VERBS, main
 from rlftsim.cli.mistakes import ACTIONS
-from rlftsim.plugins import POINTS
+from rlftsim.plugins import POINTS, is_ours
 from rlftsim.recipes.registry import RECIPES
 from rlftsim.recipes.settings import field_documentation, sections_of, summary_of
 from rlftsim.training.run_folder import to_plain
@@ -173,8 +173,10 @@ def shown(value: object) -> str:
 
 def errors_page() -> str:
     """Every message that the package raises on purpose, by module, with … for the values in it."""
-    kinds = [value for value in vars(errors).values() if inspect.isclass(value)]
-    kinds = [kind for kind in kinds if issubclass(kind, errors.RlftsimError)]
+    for path in PACKAGE.rglob("*.py"):
+        if re.search(r"^class \w+\(\w*Error\b", path.read_text(), re.M):
+            import_module(".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts))
+    kinds = [errors.RlftsimError, *subclasses_of(errors.RlftsimError)]
     lines = [
         "# Errors", "",
         "Every message names the value, the cause and the way out. `…` stands for values. On the command line a",
@@ -193,9 +195,24 @@ def errors_page() -> str:
     return "\n".join(lines)
 
 
+def subclasses_of(kind: type) -> list[type]:
+    """Subclasses of an error in this package, and theirs, those of `errors` first."""
+    found = [one for direct in kind.__subclasses__() for one in (direct, *subclasses_of(direct))]
+    return sorted(
+        (one for one in found if is_ours(one)), key=lambda one: (one.__module__ != errors.__name__, one.__module__)
+    )
+
+
 def messages_of(path: Path, names: set[str]) -> Iterator[tuple[str, str]]:
-    """Class and message of each `raise` in a file that writes its message in place."""
-    for node in ast.walk(ast.parse(path.read_text())):
+    """Class and message of each `raise` in a file that writes its message in place, and of each error that does."""
+    tree = ast.parse(path.read_text())
+    # An error may also write its message itself.
+    for kind in (node for node in tree.body if isinstance(node, ast.ClassDef) and node.name in names):
+        for call in (node for node in ast.walk(kind) if isinstance(node, ast.Call) and node.args):
+            message = text_of(call.args[0])
+            if ast.unparse(call.func) == "super().__init__" and message != "…":
+                yield kind.name, plain(message.replace("`", "'"))
+    for node in ast.walk(tree):
         if not (isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call) and node.exc.args):
             continue
         message = text_of(node.exc.args[0])

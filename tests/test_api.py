@@ -20,7 +20,7 @@ import rlftsim as rs
 from made_up import CPU, TINY
 from rlftsim.cli.main import main
 from rlftsim.errors import CheckpointError, ConfigError
-from rlftsim.evaluation.results import EvaluateConfig, Evaluation
+from rlftsim.evaluation.results import SCORE_COLUMNS, EvaluateConfig, Evaluation
 from rlftsim.evaluation.score_files import ScoreConfig
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.simulate import simulate as simulate_batch
@@ -289,12 +289,35 @@ def test_goals_by_object_id_equal_those_of_the_command_line(follower, data, home
     assert int(rollouts.goals.goal_mask.sum()) == 2  # one agent in both rollouts
 
 
-def test_evaluate_equals_the_command_line(base, data):
+@pytest.mark.parametrize("metric", ["2025", "2024"])
+def test_score_equals_the_command_line(base, data, metric):
+    words = ["simulate", "runs/base", "--data", SMALL, "--out", "runs/rollouts", "--num-rollouts", "3", "--seed", "5"]
+    assert main([*words, "--device", "cpu"]) == 0
+    assert main(["score", "runs/rollouts", "--scenarios", SMALL, "--out", "runs/scores", "--metric", metric]) == 0
+    rows = {row["scenario_id"]: row for row in Evaluation.read(Path("runs/scores/rollouts.parquet")).table.to_pylist()}
+    assert set(rows) == set(data.scenario_ids)
+    for scenario in data:
+        result = rs.score(scenario, rs.simulate(base, scenario, num_rollouts=3, seed=5), metric=metric)
+        # the rest is measured beside the metric: misses and drift
+        names = SCORE_COLUMNS[: SCORE_COLUMNS.index("traffic_light_violation_rate") + 1]
+        names = [name for name in names if name != "meta_metric_light_one"]
+        assert len(names) > 15
+        # NaN where a likelihood has no scored step
+        expected = [rows[scenario.scenario_id][name] for name in names]
+        np.testing.assert_array_equal([float(result.score_of(name)) for name in names], expected)
+
+
+@pytest.mark.parametrize("goals", ["none", "logged"])
+def test_evaluate_equals_the_command_line(base, follower, data, home, goals):
+    if goals == "logged":
+        base = follower
+        (home / "runs" / "base").unlink()
+        follower.save_pretrained(home / "runs" / "base" / "model")
     words = ["evaluate", "runs/base", "--data", SMALL, "--out", "runs/e", "--num-rollouts", "2", "--device", "cpu"]
-    assert main(words) == 0
+    assert main([*words, "--goals", goals]) == 0
     by_command = Evaluation.read(Path("runs/e/base.parquet"))
-    by_name, by_policy = (rs.evaluate(policy, data, num_rollouts=2) for policy in ("runs/base", base))
-    from_list = rs.evaluate(base, list(data), num_rollouts=2)
+    by_name, by_policy = (rs.evaluate(policy, data, num_rollouts=2, goals=goals) for policy in ("runs/base", base))
+    from_list = rs.evaluate(base, list(data), num_rollouts=2, goals=goals)
     assert by_name.name == by_command.name == "base"
     assert by_name.table.equals(by_command.table)
     assert by_policy.table.equals(by_command.table)

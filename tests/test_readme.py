@@ -121,7 +121,7 @@ def test_the_block_of_measurements_is_marked():
 
 
 def test_the_readme_is_short():
-    assert len(README.split()) <= 700
+    assert len(re.sub(r"<!--.*?-->", "", README).split()) <= 700
 
 
 def test_one_version_everywhere():

@@ -1,5 +1,6 @@
 """docs/reference is what docs/write_reference.py writes, and every public name is in it."""
 
+import ast
 import inspect
 from pathlib import Path
 
@@ -46,6 +47,20 @@ def test_public_functions_document_every_argument():
         text = inspect.getdoc(function) or ""
         missing = [name for name in names if f"{name}:" not in text]
         assert len(names) < 2 or missing == [], function.__name__
+
+
+def test_every_error_of_the_package_is_listed(written):
+    bases: dict[str, list[str]] = {}
+    for path in (DOCS.parent / "src").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ClassDef):
+                bases[node.name] = [ast.unparse(base) for base in node.bases]
+    errors = {"RlftsimError"}
+    while more := {name for name, above in bases.items() if errors & {*above}} - errors:
+        errors |= more
+    assert {"SetAside", "Unfinished", "ConfigError"} <= errors
+    assert [name for name in errors if f"\n| `{name}` | " not in written["errors.md"]] == []
+    assert "\n- SetAside: … pieces of the work ended their process" in written["errors.md"]
 
 
 def test_messages_are_collected_from_the_sources(written):

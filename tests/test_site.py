@@ -1,16 +1,23 @@
 """The site: both builders in strict mode, no dead link or anchor, nothing from another host, and a search."""
 
 import html.parser
-import json
+import os
+import resource
 import subprocess
 import sys
+import time
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 import pytest
+from run_pages import TUTORIALS, blocks_of
+
+from test_docs import TOLERANCE, assert_alike
 
 pytest.importorskip("zensical", reason="the site's builder is not installed")
 pytest.importorskip("mkdocs", reason="the site's second builder is not installed")
+build_site = pytest.importorskip("build_site", reason="jupytext is not installed")
+nbformat = pytest.importorskip("nbformat")
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[1]
@@ -74,6 +81,10 @@ def test_no_link_or_anchor_is_dead_and_nothing_is_loaded_from_another_host(site)
                 dead += [f"{path.relative_to(site)}: {target}"] if not parts.fragment.startswith("__") else []
     assert dead == []
     assert (site / "demo" / "live.html").stat().st_size <= 1_500_000
+    # what pages tell a reader to copy is there
+    template = (site / "plugin_template" / "index.html").read_text()
+    assert all(words in template for words in ("entry-points", "write_csv", "src/rlftsim_plugin/__init__.py"))
+    assert (site / "commonroad_to_tables.py").is_file()
     # every public name has an entry, under the name that `import rlftsim as rs` gives it
     reference = pages[site / "reference" / "python.html"]
     assert {"rlftsim.simulate", "rlftsim.load_policy", "rlftsim.Scenario"} <= reference.anchors
@@ -136,12 +147,39 @@ def first_result(page, words: str) -> str:
     return results.first.get_attribute("href")
 
 
-def test_the_first_tutorial_runs_as_a_notebook(site, tmp_path):
-    nbclient = pytest.importorskip("nbclient")
-    nbformat = pytest.importorskip("nbformat")
+def test_every_tutorial_is_a_notebook_with_its_outputs(site):
     if site.name == "mkdocs":
         pytest.skip("the notebooks are those of the other builder")
-    notebook = nbformat.read(site / "tutorials" / "1_futures.ipynb", as_version=4)
+    for page in TUTORIALS:
+        notebook = nbformat.read(site / "tutorials" / f"{page.stem}.ipynb", as_version=4)
+        shown = [block.output["text"] for block in blocks_of(page) if block.output is not None]
+        assert [output.text for cell in code_cells(notebook) for output in cell.outputs] == shown
+
+
+def code_cells(notebook) -> list:
+    return [cell for cell in notebook.cells if cell.cell_type == "code"]
+
+
+def test_the_first_tutorial_runs_as_a_notebook_and_prints_what_it_shows(tmp_path, monkeypatch):
+    nbclient = pytest.importorskip("nbclient")
+    monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
+    notebook = build_site.notebook_of(TUTORIALS[0], None)
+    shown = [cell.get("outputs") for cell in code_cells(notebook)]
+    start, before = time.monotonic(), resource.getrusage(resource.RUSAGE_CHILDREN)
     nbclient.NotebookClient(notebook, timeout=600, resources={"metadata": {"path": str(tmp_path)}}).execute()
-    assert "(1, 32, 27, 80, 2)" in json.dumps(notebook.cells)  # scenarios, rollouts, agents, steps, x and y
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    seconds = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    print(f"{time.monotonic() - start:.1f} s, {seconds:.1f} s of them computing")
+    assert seconds <= 60
+    for cell, expected in zip(code_cells(notebook), shown, strict=True):
+        printed = "".join(output.text for output in cell.outputs if output.get("name") == "stdout")
+        assert_alike(printed, "".join(output.text for output in expected), TOLERANCE)
     assert (tmp_path / "futures.html").stat().st_size > 50_000
+
+
+def test_a_dead_link_stops_the_build():
+    for link in ("[walk](wlak.md)", "![picture](studio/none.webp)", "[code](../src/rlftsim/none.py)"):
+        with pytest.raises(SystemExit, match=r"docs/start.md: dead link to \S+: there is no "):
+            build_site.relinked(f"See {link}.", "docs/start.md", None)
+    fine = "[walk](walk.md#one) and [code](../src/rlftsim/errors.py)"
+    assert build_site.relinked(fine, "docs/start.md", None) == "[walk](walk.md#one) and code"
