@@ -112,7 +112,7 @@ def drawn(*commands: str, picture: str) -> Callable[[Path], None]:
     """Writer of a picture that commands draw.
 
     Args:
-        commands: with "out" as the folder or the beginning of the files that they write.
+        commands: run one after the other in an empty folder.
         picture: the file, relative to the folder of the command; a page (.html) is photographed.
     """
 
@@ -146,48 +146,50 @@ def photograph(page: Path) -> Image.Image:
     return picture
 
 
-def simulate(model: str, scenario: str, more: str = "--export page") -> str:
+def simulate(model: str, scenario: str, out: str, more: str = " --export page") -> str:
     """Command that simulates a scenario."""
-    return f"rlftsim simulate {model} --data synthetic --scenario {scenario} --out out {more}"
+    return f"rlftsim simulate {model} --data synthetic --scenario {scenario} --out {out}{more}"
 
 
 LEFT, CROWD, WALKERS, CORNER = "e77410beaa9f1e75", "4978b9a8e3f6368b", "1dc59c7592914940", "c7f74c372249ae91"
 BRANCH, SEVEN, RISE = "0827749d3c33a3d1", "c4b1a5f56a185145", "c4b1a5f56a185145"
-PROPOSE = f"rlftsim goals propose synthetic --scenario {BRANCH} --agent 98 99 --out out.json --picture out.png"
+PROPOSE = f"rlftsim goals propose synthetic --scenario {BRANCH} --agent 98 99 --out goals.json --picture goals.png"
 AHEAD, RIGHT = (-191.2, -238.1), (-133.5, -185.9)
-ASK = "--goal 191={},{} --guidance-scale 3 --export page"
-FUTURES = simulate("demo-tuned", SEVEN, "--picture")
-TURN = simulate("demo-goals", BRANCH, "--goal 99=102.6,76.9 --guidance-scale 3 --picture")
-DRIVE = f"rlftsim drive pdm --model demo-tuned --data synthetic --scenario {SEVEN} --out out --film"
-EXPLAIN = (simulate("demo-tuned", WALKERS, ""), "rlftsim score out --scenarios synthetic --explain pages")
+ASK = " --goal 191={},{} --guidance-scale 3 --export page"
+FUTURES = simulate("demo-tuned", SEVEN, "futures", " --picture")
+TURN = simulate("demo-goals", BRANCH, "turn", " --goal 99=102.6,76.9 --guidance-scale 3 --picture")
+DRIVE = f"rlftsim drive pdm --model demo-tuned --data synthetic --scenario {SEVEN} --out drive --film"
+EXPLAIN = (simulate("demo-tuned", WALKERS, "scored", ""), "rlftsim score scored --scenarios synthetic --explain pages")
 
 PIECES = (
     Piece(
         "left", "A left turn at a light", "Every agent on the right moves by `demo-tuned`, the ego (blue) too.",
-        (simulate("demo-tuned", LEFT),), film(LEFT, {"logged": None, "simulated": Simulated()}),
+        (simulate("demo-tuned", LEFT, "left"),), film(LEFT, {"logged": None, "simulated": Simulated()}),
     ),
     Piece(
         "crowd", "Sixty-nine cars", "The most crowded of the held-out scenarios, most of it parked.",
-        (simulate("demo-tuned", CROWD),), film(CROWD, {"logged": None, "simulated": Simulated()}),
+        (simulate("demo-tuned", CROWD, "crowd"),), film(CROWD, {"logged": None, "simulated": Simulated()}),
     ),
     Piece(
         "walkers", "People on foot", "Eleven pedestrians (discs) and forty-three vehicles; red frames are collisions.",
-        (simulate("demo-tuned", WALKERS),), film(WALKERS, {"logged": None, "simulated": Simulated()}),
+        (simulate("demo-tuned", WALKERS, "walkers"),), film(WALKERS, {"logged": None, "simulated": Simulated()}),
     ),
     Piece(
         "futures", "Thirty-two futures at once", "Paths of the evaluated agents in 32 rollouts of the same moment.",
-        (FUTURES,), drawn(FUTURES, picture=f"out/{SEVEN}.png"), is_film=False,
+        (FUTURES,), drawn(FUTURES, picture=f"futures/{SEVEN}.png"), is_film=False,
     ),
     Piece(
         "maneuvers", "What could they do?",
         "Goals that the lanes allow, for two cars. They go into a goals file, which "
         "`rlftsim simulate --goals` takes.",
-        (PROPOSE,), drawn(PROPOSE, picture="out.png"), is_film=False,
+        (PROPOSE,), drawn(PROPOSE, picture="goals.png"), is_film=False,
     ),
     Piece(
         "goal", "The same car, two goals",
         "Car 191 is asked to go straight on, and to turn right. The others react, nothing else is changed.",
-        tuple(simulate("demo-goals", CORNER, ASK.format(*goal)) for goal in (AHEAD, RIGHT)),
+        tuple(
+            simulate("demo-goals", CORNER, out, ASK.format(*goal)) for out, goal in (("ahead", AHEAD), ("right", RIGHT))
+        ),
         film(
             CORNER,
             {
@@ -201,30 +203,33 @@ PIECES = (
         "turn", "A goal against habit",
         "Car 99 comes at 12 m/s and is asked to turn left. Most of its 32 futures do so, "
         "6 come within 2 m of the goal.",
-        (TURN,), drawn(TURN, picture=f"out/{BRANCH}.png"), is_film=False,
+        (TURN,), drawn(TURN, picture=f"turn/{BRANCH}.png"), is_film=False,
     ),
     Piece(
         "tuned", "Before and after fine-tuning",
         "Of the 40 held-out scenarios the one where the score rises most, from 0.63 to 0.75 (32 rollouts). The same "
         "random numbers in both.",
-        (simulate("demo-base", RISE), simulate("demo-tuned", RISE)),
+        (simulate("demo-base", RISE, "base"), simulate("demo-tuned", RISE, "tuned")),
         film(RISE, {"demo-base": Simulated("demo-base"), "demo-tuned": Simulated()}),
     ),
     Piece(
         "temperature", "Temperature 1 and 0.5", "Below 1 likely motions become likelier: calmer traffic, less variety.",
-        (simulate("demo-base", CORNER), simulate("demo-base", CORNER, "--temperature 0.5 --export page")),
+        (
+            simulate("demo-base", CORNER, "warm"),
+            simulate("demo-base", CORNER, "cool", " --temperature 0.5 --export page"),
+        ),
         film(CORNER, {"temperature 1": Simulated("demo-base"), "0.5": Simulated("demo-base", temperature=0.5)}),
     ),
     Piece(
         "floor", "The floor", "Constant velocity, the simplest simulator, beside `demo-tuned`.",
-        (simulate("constant_velocity", LEFT), simulate("demo-tuned", LEFT)),
+        (simulate("constant_velocity", LEFT, "floor"),),
         film(LEFT, {"constant velocity": Simulated("constant_velocity"), "demo-tuned": Simulated()}),
     ),
     Piece(
         "planner", "A planner in the loop",
         "A PDM-style planner drives the ego among agents of the model, which answer, and among the logged ones, "
         "which do not.",
-        (DRIVE,), drawn(DRIVE, picture=f"out/{SEVEN}.webp"),
+        (DRIVE,), drawn(DRIVE, picture=f"drive/{SEVEN}.webp"),
     ),
     Piece(
         "explained", "Where realism is lost", "The score of one scenario by "

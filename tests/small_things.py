@@ -1,6 +1,7 @@
 """Small things under the names that the documentation uses: data sets, models, recipes, files of other tools."""
 
 import pickle
+import re
 import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -31,6 +32,8 @@ from womd_messages import build_message
 
 SHOWN = "9d639de83d6f5239"
 """The scenario that most pages show."""
+GALLERY = tuple(dict.fromkeys(re.findall(r"--scenario (\w+)", (ROOT / "docs" / "gallery.md").read_text())))
+"""Scenarios of the gallery."""
 TINY_BOTS = TrafficBotsConfig(
     dim=32, num_heads=2, num_map_layers=1, num_light_layers=1, num_agent_layers=1, map_neighbors=4,
     light_neighbors=2, agent_map_neighbors=8, agent_light_neighbors=2, agent_neighbors=4, radius_m=100.0,
@@ -38,15 +41,15 @@ TINY_BOTS = TrafficBotsConfig(
 )  # fmt: skip
 
 
-def write_synthetic(folder: Path, *, with_shown: bool) -> None:
-    """Four of the scenarios that ship: the smallest two of each split, or the one that pages show in place of one."""
+def write_synthetic(folder: Path, *named: str) -> None:
+    """A few of the scenarios that ship: the smallest two of each split, or named ones in place of one."""
     data = rs.load_dataset("synthetic")
     counts = [data.index[f"num_{kind}"].to_numpy() for kind in ("vehicles", "pedestrians", "cyclists")]
     order = np.argsort(200 * sum(counts) + data.index["num_map_points"].to_numpy(), kind="stable").tolist()
     splits = data.index["split"].to_pylist()
     training, held_out = ([data[i] for i in order if splits[i] == name][:2] for name in ("training", "validation"))
-    if with_shown:
-        held_out[1] = data[SHOWN]
+    if named:
+        held_out[1:] = [data[name] for name in named]
     ids = {scenario.scenario_id for scenario in held_out}
     rs.write_dataset(
         [*held_out, *training], folder, split=lambda one: "validation" if one.scenario_id in ids else "training"
@@ -66,8 +69,9 @@ def write_womd(folder: Path) -> list[rs.Scenario]:
 def write_things(folder: Path) -> None:
     """Write everything that a page may take for granted, under the page's names."""
     # 1. data sets, and files to be converted
-    write_synthetic(folder / "synthetic", with_shown=False)
-    write_synthetic(folder / "synthetic_shown", with_shown=True)
+    write_synthetic(folder / "synthetic")
+    write_synthetic(folder / "synthetic_shown", SHOWN)
+    write_synthetic(folder / "synthetic_gallery", *GALLERY)
     training = write_womd(folder / "data" / "womd")
     write_womd(folder / "DATA")
     for split in ("training", "validation"):
@@ -161,13 +165,15 @@ def small_world(things: Path, commands: str) -> Iterator[None]:
     Args:
         things: folder that `write_things` has filled.
         commands: that are run. If they, or files of the current folder, name the scenario that pages show, then it is
-            among the four, and the models are as they ship.
+            among the four, and the models are as they ship. Scenarios of the gallery have small models.
     """
     is_shown = SHOWN in commands or any(Path().rglob(f"*{SHOWN}*"))
-    folder = things / ("synthetic_shown" if is_shown else "synthetic")
+    is_gallery = any(name in commands for name in GALLERY)
+    folder = things / ("synthetic_shown" if is_shown else "synthetic_gallery" if is_gallery else "synthetic")
+    models = {} if is_shown else {"demo-base": "base", "demo-tuned": "tuned", "demo-goals": "goals"}
     with pytest.MonkeyPatch.context() as patch:
-        for name in () if is_shown else ("demo-base", "demo-tuned"):
-            patch.setitem(POLICIES._registered, name, lambda: rs.load_policy(things / "runs" / "base"))
+        for name, run in models.items():
+            patch.setitem(POLICIES._registered, name, lambda run=run: rs.load_policy(things / "runs" / run))
         patch.setattr("rlftsim.scenario.dataset.pack_path", lambda: folder)
         for name in RECIPES._shipped:
             recipe = small(recipe_by_name(name))
