@@ -162,7 +162,7 @@ def tiny(job: Job) -> Any:
 
 
 def finetune(job: Job) -> Repeat:
-    """An update of the demo's recipe: simulate, reward, score, step."""
+    """An update of the demo's sizes by the paper's objective: simulate, reward, score, step."""
     from rlftsim.policies.smart.policy import SmartPolicy
     from rlftsim.recipes.smart import smart_demo_rlftsim
     from rlftsim.scenario.dataset import ScenarioDataset
@@ -170,7 +170,11 @@ def finetune(job: Job) -> Repeat:
     from rlftsim.training.finetune import prepare, update_policy
     from rlftsim.training.parallel import DeviceConfig, start_fabric
 
-    config = replace(smart_demo_rlftsim().finetune, device=DeviceConfig(job.device, threads=1))
+    config = smart_demo_rlftsim().finetune
+    # the recipe's own objective is not that of all versions
+    objective = {"credit": "rollout", "imitation_weight": 0.0, "kl": replace(config.kl, target=0.05)}
+    known = {name: value for name, value in objective.items() if hasattr(config, name)}
+    config = replace(config, device=DeviceConfig(job.device, threads=1), **known)
     policy = SmartPolicy.from_pretrained(Path(job.inputs) / "base" / "model")
     dataset = ScenarioDataset(pack_path() if job.data == "synthetic" else Path(job.inputs) / "real", "training")
     fabric = start_fabric(config.device)
