@@ -106,6 +106,7 @@ class RayRunner:
         work = ray.remote(_work).options(num_cpus=1, max_retries=0, scheduling_strategy="SPREAD")
 
         def count(number: int, total: int) -> None:
+            """Report what an item has done since it was last counted."""
             advance(total - counted[number])
             counted[number] = total
 
@@ -161,7 +162,12 @@ class _Board:
         self._totals: dict[int, int] = {}
 
     def put(self, number: int, total: int) -> None:
-        """Remember the progress of an item."""
+        """Remember the progress of an item.
+
+        Args:
+            number: of the item.
+            total: progress since it was begun.
+        """
         self._totals[number] = total
 
     def take(self) -> dict[int, int]:
@@ -176,6 +182,7 @@ def _work(task: list[Any], key: str, driver: tuple[str, str], item: bytes, numbe
     version, folder = driver
 
     def advance(count: int) -> None:
+        """Add to the item's progress, and send it now and then."""
         nonlocal total, last
         total += count
         if time.monotonic() - last > SECONDS_BETWEEN_REPORTS:
