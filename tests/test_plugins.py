@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import imageio_ffmpeg
 import numpy as np
 import pytest
 
@@ -182,12 +183,15 @@ def test_the_template_is_built_installed_listed_and_used(template, capsys):
     # 2. used by name
     assert reward_by_name("on_the_road").__module__ == "rlftsim_plugin"
     command = f"simulate constant_velocity --data synthetic --scenario {SCENARIO} --num-rollouts 2 --out r"
-    assert main([*command.split(), "--export", "csv", "page"]) == 0
+    assert main([*command.split(), "--export", "csv", "page", "film"]) == 0
     lines = (Path("r") / f"{SCENARIO}.csv").read_text().splitlines()
     with np.load(Path("r") / f"{SCENARIO}.npz") as stored:
         assert len(lines) == 1 + 2 * len(stored["object_ids"])
         assert lines[1].startswith(f"0,{stored['object_ids'][0]},{stored['x'][0, 0, -1]:.3f}"[:-1])
     assert "<canvas" in (Path("r") / f"{SCENARIO}.html").read_text()
+    film = imageio_ffmpeg.read_frames(str(Path("r") / f"{SCENARIO}.mp4"))
+    assert next(film)["fps"] == 10.0
+    assert len(list(film)) == 81 + 10  # from the current step on, and a second to look at the end
     assert load_planner("coast").act({}) == [0.0, 0.0]
 
 

@@ -60,8 +60,8 @@ class Simulate:
     picture: bool = False
     """Draw OUT/SCENARIO.png: simulated paths of the agents with goals, or else of the evaluated agents."""
     export: list[str] = field(default_factory=list)
-    """Write further files of each scenario: "page" is OUT/SCENARIO.html, which plays in any browser; other names are
-    those of installed plug-ins."""
+    """Write further files of each scenario: "page" is OUT/SCENARIO.html, which plays in any browser, "film" is
+    OUT/SCENARIO.mp4; other names are those of installed plug-ins."""
     device: Device = "auto"
     """auto: the GPU if torch has one."""
 

@@ -11,6 +11,7 @@ from rlftsim.evaluation.explain import motion_of
 from rlftsim.plugins import ExtensionPoint
 from rlftsim.realism import SimulatedStates
 from rlftsim.scenario.types import Scenario
+from rlftsim.viewer.film import to_film
 from rlftsim.viewer.page import Animation, Panel, write_page
 from rlftsim.viewer.scene import build_scene, logged_trajectories
 
@@ -18,7 +19,9 @@ Exporter = Callable[[Scenario, SimulatedStates, Path], Path]
 """Called with a scenario, its rollouts and the folder of the rollouts; writes a file there and returns its path."""
 
 EXPORTERS: ExtensionPoint[Exporter] = ExtensionPoint(
-    "exporter", "rlftsim.exporters", {"page": "rlftsim.evaluation.exporters:write_player"}
+    "exporter",
+    "rlftsim.exporters",
+    {"page": "rlftsim.evaluation.exporters:write_player", "film": "rlftsim.evaluation.exporters:write_film"},
 )
 """Name -> function."""
 MAX_ROLLOUTS = 8
@@ -36,11 +39,32 @@ def write_player(scenario: Scenario, states: SimulatedStates, folder: Path) -> P
     Raises:
         DataError: the file cannot be written.
     """
+    path, animation = folder / f"{scenario.scenario_id}.html", _animation(scenario, states)
+    write_page(path, animation.title, [animation])
+    return path
+
+
+def write_film(scenario: Scenario, states: SimulatedStates, folder: Path) -> Path:
+    """Write FOLDER/SCENARIO.mp4: the log beside the first rollouts, in real time.
+
+    Args:
+        scenario: map and log.
+        states: its rollouts, world frame.
+        folder: of the film.
+
+    Raises:
+        DataError: the file cannot be written.
+    """
+    path = folder / f"{scenario.scenario_id}.mp4"
+    to_film(path, _animation(scenario, states))
+    return path
+
+
+def _animation(scenario: Scenario, states: SimulatedStates) -> Animation:
+    """The log, and the first rollouts."""
     scene = build_scene(scenario)
     panels = [
         Panel("logged", logged_trajectories(scenario).with_overlaps(scene.agents)),
         Panel("rollouts", motion_of(scenario, states).first(MAX_ROLLOUTS).with_overlaps(scene.agents)),
     ]
-    path, title = folder / f"{scenario.scenario_id}.html", f"Scenario {scenario.scenario_id}"
-    write_page(path, title, [Animation(title, scene, panels)])
-    return path
+    return Animation(f"Scenario {scenario.scenario_id}", scene, panels)
