@@ -159,6 +159,20 @@ def test_others_that_collide_leave_the_road_or_drive_backwards_are_counted():
     assert result.traffic.others_wrong_way_rate == pytest.approx(1 / 4)
 
 
+def test_others_are_not_judged_where_their_log_has_no_state():
+    # a car with a gap, one that would stand in the way of the next after its last state, one that turns in a gap
+    movers = (
+        Mover(y_m=3.7, heading_rad=math.pi, speed_mps=1.0),
+        Mover(x_m=-20.0, speed_mps=6.0, missing=tuple(range(30, 40))),
+        Mover(x_m=30.0, speed_mps=6.0, missing=tuple(range(15, 91))),
+        Mover(x_m=10.0, y_m=0.2, speed_mps=6.0),
+        Mover(x_m=-40.0, speed_mps=6.0, turn_rate_radps=0.4, missing=tuple(range(18, 40))),
+    )
+    scores = drive(movers).traffic
+    rates = scores.others_collision_rate, scores.others_acceleration_rate, scores.others_steering_rate
+    assert rates == (0.0, 0.0, 0.0)
+
+
 def test_realism_of_the_others_is_the_metric_without_the_ego():
     movers = (EGO, Mover(x_m=20.0, speed_mps=8.0), Mover(x_m=-20, y_m=3.7, heading_rad=math.pi, speed_mps=7.0))
     result = drive(movers, num_predicted=2)

@@ -53,8 +53,6 @@ class EnvConfig:
     """Length of an episode, at most 80 steps of 0.1 s."""
     route: RouteChoice = "logged"
     """"logged" (the lanes that the logged ego drove), "none", a maneuver, or lane ids."""
-    vanish: bool = False
-    """True = replayed agents are gone where their log has no state; else they hold their last pose."""
     temperature: float = 1.0
     top_k: int | None = None
     device: Device = "cpu"

@@ -340,11 +340,11 @@ def _contacts(episode: Episode, world: WorldState, motion: Float[np.ndarray, "M 
     """Tracks that each planner-driven agent overlaps now."""
     scene, agent = episode.world.actors.T
     size = episode.world.size
-    there = episode.world.there[scene, :, len(world.track) - 1]
-    there[np.arange(len(scene)), agent] = False
+    known = episode.world.known[scene, :, len(world.track) - 1]
+    known[np.arange(len(scene)), agent] = False
     others = world.now[scene]  # [M, A, 5]
     gap = others[..., :2] - motion[:, None, :2]
-    return there & boxes_overlap(gap, motion[:, None, 2], others[..., 2], size[scene, agent][:, None], size[scene])
+    return known & boxes_overlap(gap, motion[:, None, 2], others[..., 2], size[scene, agent][:, None], size[scene])
 
 
 def _progress(episode: Episode, motion: Float[np.ndarray, "M 5"]) -> Float[np.ndarray, "M"]:

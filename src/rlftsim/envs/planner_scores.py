@@ -242,7 +242,7 @@ def least_time_to_collision(record: Record) -> float:
     crossing = np.abs(np.sin(others[..., 2] - own[:, 2])) > np.sin(CROSSING_RAD)
     _, _, junction = _lane_headings(record)
     beside = ~in_one_lane(record.scene, own, size[record.agent]) | junction
-    counts = record.there & (bearing < BEHIND_RAD) & ((bearing < AHEAD_RAD) | crossing | beside)
+    counts = record.known & (bearing < BEHIND_RAD) & ((bearing < AHEAD_RAD) | crossing | beside)
     counts[record.agent] = False
     counts &= speed > TTC_MOVING_MPS
     for one in record.collisions:

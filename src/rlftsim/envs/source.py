@@ -92,7 +92,7 @@ class Source:
             raise ConfigError("goals have no effect: the traffic model is not goal-conditioned.")
         world = build_world(
             scenarios, self.policy, rules=self.rules, goals=goals, sampling=self.config.sampling,
-            vanish=self.config.vanish, context=self._context(scenarios),
+            context=self._context(scenarios),
         )  # fmt: skip
         if not len(world.actors):
             raise ConfigError(

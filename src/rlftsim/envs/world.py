@@ -71,7 +71,9 @@ class World:
     lines: tuple[IdmLines, ...]
     """Of the IDM-driven agents of each scene."""
     there: Bool[np.ndarray, "B A 91"]
-    """True = the agent is there at a step of the log's time (10 is the current one)."""
+    """True = the agent is there at a step of the log's time (10 is the current one); replayed ones go with their log."""
+    known: Bool[np.ndarray, "B A 91"]
+    """True = it is there, and not held in a gap of its log: contacts and scores count these states alone."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +121,6 @@ def build_world(
     rules: Rules,
     goals: Mapping[str, PointById] | None = None,
     sampling: Sampling = Sampling(),  # noqa: B008
-    vanish: bool = False,
     context: Any = None,
 ) -> World:
     """The world of some scenarios, which step together.
@@ -130,7 +131,6 @@ def build_world(
         rules: agents to driver, see `drivers_of`.
         goals: of agents that follow the policy, scenario id to object id to (x, y), world frame.
         sampling: temperature and truncation of its decisions.
-        vanish: True = replayed agents are gone where their log has no state.
         context: `policy.encode` of these scenarios, if it is known.
 
     Raises:
@@ -150,11 +150,11 @@ def build_world(
             context = policy.encode(batch)
     mask = batch.agent_mask.cpu().numpy()
     valid = padded([scene.valid for scene in scenes], (*shape, TOTAL_STEPS), False)
-    # from the current step on all agents exist, but replayed ones may vanish with their log
-    there = valid | mask[..., None]
+    # from the current step on all agents exist, but replayed ones are gone after the last state of their log
+    goes_on = np.maximum.accumulate(valid[..., ::-1], axis=-1)[..., ::-1]
+    simulated = (drivers != Driver.REPLAY)[..., None]
+    there = mask[..., None] & (simulated | goes_on)
     there[..., : CURRENT_STEP + 1] = valid[..., : CURRENT_STEP + 1]
-    if vanish:
-        there &= valid | (drivers != Driver.REPLAY)[..., None]
     idm_rows = [np.flatnonzero(row[: len(scene.object_id)] == Driver.IDM) for row, scene in zip(drivers, scenes)]
     return World(
         scenes=scenes,
@@ -167,6 +167,7 @@ def build_world(
         logged=padded([scene.logged for scene in scenes], (*shape, TOTAL_STEPS, 5)),
         valid=valid,
         there=there,
+        known=there & (simulated | valid),
         policy=policy if followers else None,
         context=context if followers else None,
         goals=Goals.from_points(batch, goals) if goals and followers else None,
