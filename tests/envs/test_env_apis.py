@@ -104,6 +104,25 @@ def test_autoreset_gives_what_gymnasium_s_own_vector_gives(mode):
         assert ("final_obs" in mine[3]) == ("final_obs" in other[3])
 
 
+def test_a_reset_without_a_seed_names_one_that_gives_the_episode_again():
+    settings = {"scenarios": [straight_road(), bend()], "traffic": "replay"}
+    theirs = gymnasium.vector.SyncVectorEnv([lambda: EgoEnv(**settings)] * 2)
+    for vector in (EgoVectorEnv(2, **settings), theirs):
+        seen, info = vector.reset()
+        again, other = vector.reset(seed=info["seed"].tolist())
+        assert np.array_equal(seen["ego_history"], again["ego_history"])
+        assert list(info["scenario"]) == list(other["scenario"])
+    env = EgoEnv(**settings)
+    _, info = env.reset()
+    saved, branch = env.snapshot(), env.fork(1)[0]
+    restored = EgoEnv(**settings)
+    restored.restore(saved)
+    for one in (branch, restored):
+        later = one.reset()[1]
+        assert (later["seed"], later["rollout"]) == (info["seed"], 1)
+    assert parallel_env(**settings).reset()[1]["100"]["seed"] < 2**31
+
+
 def test_with_autoreset_disabled_a_mask_resets():
     vector = EgoVectorEnv(2, scenarios=[straight_road()], traffic="replay", max_steps=2, autoreset_mode="Disabled")
     vector.reset(seed=0)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from rlftsim.envs import EgoEnv, EgoVectorEnv
+from rlftsim.envs import EgoEnv, EgoVectorEnv, parallel_env
 from rlftsim.envs.episode import advance
 from rlftsim.envs.planners.registry import load_planner
 from rlftsim.envs.world import Dice, begin, build_world, fork, step_world
@@ -228,6 +228,28 @@ def test_idm_traffic_stops_behind_a_planner_that_stands():
     gap = standing[0, 0] - state.now[0, 0, 0] - follower.size[0, :2, 0].sum() / 2
     assert 0.3 < gap < 3.0
     assert np.hypot(*state.now[0, 0, 3:]) < 0.5
+
+
+def test_a_driver_of_all_the_others_comes_before_the_traffic():
+    settings = {"scenarios": [straight_road()], "traffic": "replay", "drivers": {"*": "constant_velocity"}}
+    env = EgoEnv(**settings)
+    env.reset(seed=0)
+    assert [int(d) for d in env.episode.world.drivers[0]] == [0, 3, 3, 3, 3, 3]
+    everyone = parallel_env(scenarios=[straight_road()], traffic="replay", controlled="*")
+    assert len(everyone.reset(seed=0)[0]) == 6
+
+
+def test_a_bicycle_that_tracks_a_steady_plan_keeps_its_speed():
+    log = build_scenario("steady", (Mover(speed_mps=9.9),))
+    env = EgoEnv(scenarios=[log], traffic="replay", action="trajectory", tracker="bicycle", stop_on=(), reward="none")
+    env.reset(seed=0)
+    plan = np.zeros((5, 3), np.float32)
+    plan[:, 0] = np.arange(1, 6)  # 10 m/s
+    for _ in range(80):
+        env.step(plan)
+    result = env.result()
+    np.testing.assert_allclose(np.hypot(*result.record.own[3:, 3:].T), 10.0, atol=1e-3)
+    assert result.planner.comfort == 1.0
 
 
 def test_lights_hold_their_last_state_where_a_log_ends():

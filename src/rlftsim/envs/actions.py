@@ -301,7 +301,7 @@ class TrajectoryControls:
         wanted = pursuit_m(speed)[:, None]
         target = np.where((away >= wanted).any(1), (away >= wanted).argmax(1), self.horizon - 1)
         steering = pursue(kept[np.arange(len(kept)), target, :2], actors.size[:, 0])
-        needed = 2 * (kept[:, 0, 0] - speed * STEP_S) / STEP_S**2
+        needed = (kept[:, 0, 0] / STEP_S - speed) / STEP_S
         acceleration = np.clip(needed, -self.tracker.hardest, ACCELERATION_MPS2)
         motion = self.tracker.drive(actors.motion, acceleration, steering, actors.size[:, 0])
         return Moves(motion[:, None], clipped)

@@ -10,7 +10,7 @@ from pettingzoo import ParallelEnv
 from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.drivers import Driver, drivers_of
 from rlftsim.envs.episode import Episode, EpisodeState, advance, look, start
-from rlftsim.envs.resets import OPTIONS, about, chosen, config_of, note_of
+from rlftsim.envs.resets import OPTIONS, about, chosen, config_of, fresh_seed, note_of
 from rlftsim.envs.scene import build_env_scene
 from rlftsim.envs.source import Source
 from rlftsim.envs.spaces import action_space, observation_space, shown
@@ -59,7 +59,8 @@ class TrafficParallelEnv(ParallelEnv):
             raise ConfigError("this environment renders nothing and observes 'dict' or 'flat': change these.")
         self.source, self.render_mode = source, None
         self._spaces = observation_space(config.observation), action_space(source.controls)
-        self._random, self._seed = seeding.np_random()
+        self._seed = fresh_seed()
+        self._random, _ = seeding.np_random(self._seed)
         self._count = 0
         self._begun: tuple[Episode, EpisodeState] | None = None
         self.agents: list[str] = []
@@ -97,10 +98,10 @@ class TrafficParallelEnv(ParallelEnv):
             ConfigError: an unknown scenario, or no planner-driven agent in it.
         """
         if seed is not None:
-            self._random, self._seed = seeding.np_random(seed)
-            self._count = 0
+            self._random, _ = seeding.np_random(seed)
+            self._seed, self._count = seed, 0
         known = {name: value for name, value in (options or {}).items() if name in OPTIONS}
-        scenario_id, dice, goals = chosen(self._random, self.source, known, int(self._seed), self._count)
+        scenario_id, dice, goals = chosen(self._random, self.source, known, self._seed, self._count)
         self._count += 1
         scenario = self.source.scenario(scenario_id)
         episode = self.source.episode([scenario], {scenario_id: goals} if goals else None)

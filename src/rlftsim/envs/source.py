@@ -50,7 +50,8 @@ class Source:
             scenarios_of(scenarios) if scenarios is not None else open_dataset(config.data, config.split)
         )
         self.scenario_ids = list(scenario_ids_of(self.scenarios))
-        self.rules = {**(controlled or {"ego": "planner"}), **config.drivers, "*": config.traffic}
+        self.rules = {**(controlled or {"ego": "planner"}), **config.drivers}
+        self.rules.setdefault("*", config.traffic)
         # IDM leaves pedestrians and cyclists to the policy
         needs_policy = "policy" in self.rules.values() or "idm" in self.rules.values() or config.action == "token"
         self.policy = (

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Int64, Shaped
 
-from rlftsim.envs.contact import lane_search
-from rlftsim.envs.planner_scores import WRONG_WAY_M, WRONG_WAY_STEPS, least_time_to_collision
+from rlftsim.envs.contact import Collision, lane_search
+from rlftsim.envs.planner_scores import LANE_M, WRONG_WAY_M, WRONG_WAY_STEPS, least_time_to_collision
 from rlftsim.envs.record import Record
 from rlftsim.envs.road import MAX_PAIRS, OUTSIDE_M, road_edges
 from rlftsim.geometry import wrapped
@@ -30,7 +30,6 @@ INFEASIBLE_CURVATURE = 0.3
 SPAN_STEPS = 5
 SLOW_MPS = 1.0
 """Curvature is not measured below this speed."""
-LANE_M = 2.0
 
 
 @dataclass(frozen=True)
@@ -55,6 +54,7 @@ def score_traffic(record: Record) -> TrafficScores:
     scene, motion = record.scene, record.motion
     others = np.arange(len(scene.object_id)) != record.agent
     vehicles = others & (scene.object_type == ObjectType.VEHICLE)
+    has_edges, has_lanes = (found(scene.scenario) is not None for found in (road_edges, lane_search))
     # 1. contacts among the others; those that begin with an overlap do not count
     length, width = scene.size[:, 0].astype(np.float32), scene.size[:, 1].astype(np.float32)
     overlaps = compute_overlap(
@@ -71,17 +71,21 @@ def score_traffic(record: Record) -> TrafficScores:
     turn = np.abs(wrapped(headings[..., -1] - headings[..., 0]))
     fast = (driven > SLOW_MPS * SPAN_STEPS * STEP_S) & _runs(record.known, SPAN_STEPS + 1).all(-1)
     tight = np.where(fast, turn / np.maximum(driven, 1e-3), 0.0) > INFEASIBLE_CURVATURE
-    faults = [one.at_fault for one in record.collisions]
     return TrafficScores(
-        ego_contacts=float(len(faults)),
+        ego_contacts=float(len(record.collisions)),
         risky_approach_rate=float(least_time_to_collision(record) < RISKY_TTC_S),
         others_collision_rate=_rate(overlaps, others),
-        others_offroad_rate=_rate(_leaves_road(record), vehicles),
-        others_wrong_way_rate=_rate(_drives_against(record, vehicles), vehicles),
+        others_offroad_rate=_rate(_leaves_road(record), vehicles & has_edges),
+        others_wrong_way_rate=_rate(_drives_against(record, vehicles), vehicles & has_lanes),
         others_acceleration_rate=_rate(np.any(jolt, axis=1), vehicles),
         others_steering_rate=_rate(np.any(tight, axis=1), vehicles),
-        blamed_others_rate=1.0 - sum(faults) / len(faults) if faults else np.nan,
+        blamed_others_rate=blamed_others_rate(record.collisions),
     )
+
+
+def blamed_others_rate(collisions: Sequence[Collision]) -> float:
+    """Fraction of contacts with the planner's agent, in one episode or several, that were not its fault; NaN without."""
+    return sum(not one.at_fault for one in collisions) / len(collisions) if collisions else np.nan
 
 
 def _rate(event: Bool[np.ndarray, "A"], among: Bool[np.ndarray, "A"]) -> float:

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Int64
 
 from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.episode import Episode, EpisodeState, advance, look, start
-from rlftsim.envs.resets import about, chosen, config_of, note_of
+from rlftsim.envs.resets import about, chosen, config_of, fresh_seed, note_of
 from rlftsim.envs.source import Source
 from rlftsim.envs.spaces import action_space, observation_space, shown
 from rlftsim.errors import ConfigError
@@ -118,8 +118,8 @@ class EgoVectorEnv(VectorEnv):
         seeds = seed if isinstance(seed, list) else [None if seed is None else seed + i for i in range(self.num_envs)]
         for i, given in enumerate(seeds):
             if len(self._slots) <= i or given is not None:
-                random, used = seeding.np_random(given)
-                self._slots[i : i + 1] = [_Slot(random, int(used))]
+                used = fresh_seed() if given is None else given
+                self._slots[i : i + 1] = [_Slot(seeding.np_random(used)[0], used)]
         notes: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         self._reset(np.flatnonzero(mask), options, notes)
         return self._observe(), notes
