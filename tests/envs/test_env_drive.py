@@ -115,6 +115,15 @@ class Still:
 def straight(observation):
     return np.zeros(2, np.float32)
 number = 3
+class Far:
+    action, horizon = "trajectory", 20
+    def reset(self, info):
+        pass
+    def act(self, observation):
+        return np.outer(np.arange(1, 21), [0.5, 0, 0])
+class Needy:
+    def __init__(self, wish):
+        pass
 """
 
 
@@ -127,8 +136,12 @@ def test_planners_of_others_are_found(tmp_path, monkeypatch):
     PLANNERS.add("mine", sys.modules["my_planners"].Still)
     assert action_of(load_planner("mine")) == "pose"
     PLANNERS.remove("mine")
+    (far,) = drive(DriveConfig("my_planners:Far", traffic=("replay",), limit=1))
+    assert far.values("route_completion")[0] > 0
     wrong = {"my_planners:number": "is a int", "my_planners:nothing": "cannot be imported", "idn": "mean 'idm'"}
     wrong |= {":Still": "names no module", "nowhere.at_all:Still": "cannot be imported"}
+    (tmp_path / "broken.py").write_text("def (")
+    wrong |= {"my_planners:Needy": "without arguments .*wish", "broken:Still": "cannot be imported"}
     for name, message in wrong.items():
         with pytest.raises(ConfigError, match=message):
             load_planner(name)

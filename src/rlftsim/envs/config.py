@@ -62,6 +62,8 @@ class EnvConfig:
     def __post_init__(self) -> None:
         require_types(self)
         object.__setattr__(self, "stop_on", tuple(self.stop_on))
+        if isinstance(self.route, list):
+            object.__setattr__(self, "route", tuple(self.route))
         for reason in self.stop_on:
             if reason not in get_args(StopReason):
                 raise ConfigError(f"stop_on must be one of {', '.join(get_args(StopReason))}, got {in_short(reason)}.")

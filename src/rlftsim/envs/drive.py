@@ -12,7 +12,7 @@ from rlftsim.atomic_io import errors_name
 from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.drivers import TRAFFIC, Traffic
 from rlftsim.envs.ego_env import EgoEnv
-from rlftsim.envs.planners.registry import Planner, action_of, load_planner
+from rlftsim.envs.planners.registry import Planner, action_of, horizon_of, load_planner
 from rlftsim.envs.result import Result, animation_of
 from rlftsim.envs.source import Source
 from rlftsim.envs.traffic_scores import blamed_others_rate, realism_of_others
@@ -63,9 +63,10 @@ class DriveConfig:
 
     def settings(self, traffic: str) -> EnvConfig:
         """Settings of the environment for one kind of traffic: nothing ends an episode, and nothing is rewarded."""
+        planner = load_planner(self.planner)
         return EnvConfig(
             data=self.data, split=self.split, model=self.model, traffic=cast(Traffic, traffic),
-            action=action_of(load_planner(self.planner)), stop_on=(), reward="none",
+            action=action_of(planner), horizon=horizon_of(planner), stop_on=(), reward="none",
         )  # fmt: skip
 
 

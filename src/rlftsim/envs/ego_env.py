@@ -114,7 +114,7 @@ class EgoEnv(gymnasium.Env):
         episode, state = self._running
         if state.ended[0]:
             raise ConfigError("this episode is over: call reset().")
-        state, outcome = advance(episode, state, np.asarray(action)[None])
+        state, outcome = advance(episode, state, [action])
         self._begun = episode, state
         terminated, truncated = bool(outcome.terminated[0]), bool(outcome.truncated[0])
         return self._look(), float(outcome.reward[0]), terminated, truncated, note_of(episode, state, outcome, 0)

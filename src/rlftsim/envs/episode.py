@@ -5,6 +5,7 @@ B scenes in step, M planner-driven agents over all of them. An `Episode` does no
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -139,7 +140,7 @@ def start(episode: Episode, dice: tuple[Dice, ...]) -> EpisodeState:
     )
 
 
-def advance(episode: Episode, state: EpisodeState, action: np.ndarray) -> tuple[EpisodeState, Outcome]:
+def advance(episode: Episode, state: EpisodeState, action: Any) -> tuple[EpisodeState, Outcome]:
     """State and outcome after one action of every planner-driven agent.
 
     Args:
@@ -148,12 +149,13 @@ def advance(episode: Episode, state: EpisodeState, action: np.ndarray) -> tuple[
         action: [M, *shape]; those of agents whose episode is over are ignored.
 
     Raises:
-        ConfigError: a NaN, another shape, or an action that an agent cannot take.
+        ConfigError: no numbers, a NaN, another shape, or an action that an agent cannot take.
     """
     motion = own_motion(episode, state.world)
     scene, agent = episode.world.actors.T
     actors = Actors(episode.name_of, motion, episode.world.size[scene, agent], episode.world.object_type[scene, agent])
-    moves = episode.controls.move(checked(action, episode.controls, actors), actors)
+    action = checked(action, episode.controls, episode.name_of, episode.num_agents)
+    moves = episode.controls.move(action, actors)
     terms = {}
     for step in range(episode.controls.steps):
         # an agent whose episode is over stands still

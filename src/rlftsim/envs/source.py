@@ -10,7 +10,7 @@ from rlftsim.envs.actions import Controls, controls_of
 from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.episode import Episode, ScenarioGoals, build_episode
 from rlftsim.envs.world import build_world
-from rlftsim.errors import ConfigError
+from rlftsim.errors import ConfigError, in_short
 from rlftsim.policies.registry import load_policy
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import Policy, device_of, is_goal_conditioned
@@ -45,6 +45,8 @@ class Source:
         policy: Policy | None = None,
         controlled: Mapping[str | int, str] | None = None,
     ):
+        if policy is not None and not isinstance(policy, Policy):
+            raise ConfigError(f"policy is {in_short(policy)}, not a policy: name a stored one as `model`.")
         self.config = config
         self.scenarios: Scenarios = (
             scenarios_of(scenarios) if scenarios is not None else open_dataset(config.data, config.split)

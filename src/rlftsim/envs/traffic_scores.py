@@ -84,7 +84,7 @@ def score_traffic(record: Record) -> TrafficScores:
 
 
 def blamed_others_rate(collisions: Sequence[Collision]) -> float:
-    """Fraction of contacts with the planner's agent, in one episode or several, that were not its fault; NaN without."""
+    """Fraction of contacts with the planner's agent, in one episode or several, not its fault; NaN without."""
     return sum(not one.at_fault for one in collisions) / len(collisions) if collisions else np.nan
 
 

@@ -15,7 +15,7 @@ seconds. Motion: x, y, heading, vx, vy.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -25,7 +25,7 @@ from torch import Tensor
 from rlftsim.envs.drivers import Driver, Rules, drivers_of
 from rlftsim.envs.idm import IdmConfig, IdmLines, advance_idm, idm_lines
 from rlftsim.envs.scene import Scene, build_env_scene
-from rlftsim.errors import ConfigError
+from rlftsim.errors import ConfigError, in_short
 from rlftsim.goals.types import Goals, PointById
 from rlftsim.rollout.noise import draw_noise
 from rlftsim.rollout.policy import Policy, Sampling, device_of
@@ -71,7 +71,7 @@ class World:
     lines: tuple[IdmLines, ...]
     """Of the IDM-driven agents of each scene."""
     there: Bool[np.ndarray, "B A 91"]
-    """True = the agent is there at a step of the log's time (10 is the current one); replayed ones go with their log."""
+    """True = the agent is there at a step of the log's time (10 is the current one); replayed ones until it ends."""
     known: Bool[np.ndarray, "B A 91"]
     """True = it is there, and not held in a gap of its log: contacts and scores count these states alone."""
 
@@ -265,7 +265,12 @@ def fork(world: World, state: WorldState, number: int, noise: Noise = "same") ->
         number: of branches.
         noise: "same" = all meet the dice of `state`; "new" = branch i meets those of rollout + 1 + i, from the next
             decision on.
+
+    Raises:
+        ConfigError: another word for the noise.
     """
+    if noise not in get_args(Noise):
+        raise ConfigError(f"noise must be one of {', '.join(get_args(Noise))}, got {in_short(noise)}.")
     if noise == "same" or state.noise is None:
         return (state,) * number
     return tuple(
