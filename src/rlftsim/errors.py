@@ -187,5 +187,5 @@ def _in_words(hint: Any) -> str:
     if get_origin(hint) is Literal:
         return f"one of {', '.join(get_args(hint))}"
     if get_origin(hint) is tuple:
-        return f"{len(get_args(hint))} numbers"
+        return "a list" if ... in get_args(hint) else f"{len(get_args(hint))} numbers"
     return _WORDS.get(hint) or f"a {hint.__name__}"

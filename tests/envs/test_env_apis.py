@@ -104,6 +104,25 @@ def test_autoreset_gives_what_gymnasium_s_own_vector_gives(mode):
         assert ("final_obs" in mine[3]) == ("final_obs" in other[3])
 
 
+def test_a_reset_without_a_seed_names_one_that_gives_the_episode_again():
+    settings = {"scenarios": [straight_road(), bend()], "traffic": "replay"}
+    theirs = gymnasium.vector.SyncVectorEnv([lambda: EgoEnv(**settings)] * 2)
+    for vector in (EgoVectorEnv(2, **settings), theirs):
+        seen, info = vector.reset()
+        again, other = vector.reset(seed=info["seed"].tolist())
+        assert np.array_equal(seen["ego_history"], again["ego_history"])
+        assert list(info["scenario"]) == list(other["scenario"])
+    env = EgoEnv(**settings)
+    _, info = env.reset()
+    saved, branch = env.snapshot(), env.fork(1)[0]
+    restored = EgoEnv(**settings)
+    restored.restore(saved)
+    for one in (branch, restored):
+        later = one.reset()[1]
+        assert (later["seed"], later["rollout"]) == (info["seed"], 1)
+    assert parallel_env(**settings).reset()[1]["100"]["seed"] < 2**31
+
+
 def test_with_autoreset_disabled_a_mask_resets():
     vector = EgoVectorEnv(2, scenarios=[straight_road()], traffic="replay", max_steps=2, autoreset_mode="Disabled")
     vector.reset(seed=0)
@@ -127,9 +146,11 @@ def test_stable_baselines_trains():
     before = [p.detach().clone() for p in model.policy.parameters()]
     model.learn(512)
     assert any(not (p == q).all() for p, q in zip(model.policy.parameters(), before))
-    assert len(model.ep_info_buffer) == 0 or np.isfinite([e["r"] for e in model.ep_info_buffer]).all()
+    assert env.get_attr("action_space") == [env.action_space] * 2
     env.seed(0)
+    env.set_options({"scenario": "bend"})
     env.reset()
+    assert [info["scenario"] for info in env.reset_infos] == ["bend", "bend"]
     for _ in range(20):
         _, _, over, infos = env.step(np.zeros((2, 2), np.float32))
     assert over.all()
@@ -163,7 +184,12 @@ def unchecked():
     [
         ({}, [np.nan, 0.0], "agent 100 in scenario straight at entry 0 is nan"),
         ({}, [0.0], "shape"),
+        ({}, "left", "must be numbers"),
+        ({}, {"steer": 1}, "must be numbers"),
+        ({}, [[0.0], [0.0, 1.0]], "must be numbers"),
         ({"action": "bicycle_discrete"}, 91, "below 91"),
+        ({"action": "bicycle_discrete"}, 2.9, "is 2.9, it must be a whole number"),
+        ({"action": "bicycle_discrete"}, np.nan, "is nan"),
         ({"action": "token", "model": "constant_velocity"}, 0, "motion tokens"),
         ({"action": "fly"}, 0, "action must be one of bicycle"),
         ({"action": "trajectory", "horizon": 3}, 0, "5 to 80 poses"),
@@ -174,7 +200,10 @@ def unchecked():
         ({"reward": "progress 5"}, 0, "cannot be read"),
         ({"route": "left_uturn"}, [0.0, 0.0], "allow"),
         ({"route": (99,)}, [0.0, 0.0], "no lane 99"),
+        ({"route": [1, 99]}, [0.0, 0.0], "no lane 99"),
         ({"stop_on": ("rain",)}, 0, "stop_on must be one of"),
+        ({"stop_on": "collision"}, 0, "stop_on must be a list"),
+        ({"policy": "demo-base"}, 0, "not a policy: name a stored one as `model`"),
         ({"max_steps": 200}, 0, "max_steps"),
         ({"colour": 1}, 0, "no setting 'colour'"),
     ],
@@ -183,8 +212,44 @@ def test_bad_input_is_one_line(settings, action, message, unchecked):
     with pytest.raises(ConfigError, match=message) as caught:  # noqa: PT012
         env = EgoEnv(scenarios=[straight_road()], **{"traffic": "replay", **settings})
         env.reset(seed=0)
-        env.step(np.asarray(action))
+        env.step(action)
     assert "\n" not in str(caught.value)
+
+
+def test_bad_input_of_several_environments_is_one_line(unchecked):
+    log = {"scenarios": [straight_road()], "traffic": "replay"}
+    for controlled, message in ((None, "must be a group"), ([], "is empty"), ([1.5], "object ids"), ("x", "no such")):
+        with pytest.raises(ConfigError, match=message):
+            parallel_env(controlled=controlled, **log)
+    env = parallel_env(controlled=["100", np.int64(100)], max_steps=1, **log)
+    assert env.possible_agents == ["100"]
+    env.reset(seed=0)
+    for actions, message in ((None, "agent: action"), ({}, "no action"), ({"100": "left"}, "agent 100 .* numbers")):
+        with pytest.raises(ConfigError, match=message):
+            env.step(actions)
+    env.step({"100": np.zeros(2)})
+    with pytest.raises(ConfigError, match="is over"):
+        env.step({})
+    for number, mode, message in (("2", "NextStep", "num_envs"), (-1, "NextStep", "num_envs"), (2, "never", "autores")):
+        with pytest.raises(ConfigError, match=message):
+            EgoVectorEnv(number, autoreset_mode=mode, **log)
+    vector = EgoVectorEnv(2, **log)
+    with pytest.raises(ConfigError, match="begins an episode in every slot"):
+        vector.reset(options={"reset_mask": np.array([True, False])})
+    for settings, message in (
+        ({"seed": [1]}, "seed has 1 numbers"),
+        ({"seed": (1, "a")}, "seed must be"),
+        ({"options": {"reset_mask": np.ones(3, bool)}}, "2 truth values"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            vector.reset(**settings)
+    vector.reset(seed=(1, 2))
+    with pytest.raises(ConfigError, match="slot 1, agent 100 in scenario straight at entry 0 is nan"):
+        vector.step(np.array([[0.0, 0.0], [np.nan, 0.0]]))
+    ego = EgoEnv(**log)
+    ego.reset(seed=0)
+    with pytest.raises(ConfigError, match="noise must be one of"):
+        ego.fork(1, noise="other")
 
 
 def test_mistakes_in_the_order_of_calls_are_named():

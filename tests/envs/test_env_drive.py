@@ -15,7 +15,7 @@ from rlftsim.envs.idm import IdmConfig, idm_acceleration
 from rlftsim.envs.planner_scores import off_road
 from rlftsim.envs.planners.registry import PLANNERS, action_of, load_planner
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.evaluation.drive_results import DriveResult, compare_drives
+from rlftsim.evaluation.drive_results import DriveResult, compare_drives, format_drive_comparison
 from rlftsim.scenario.open import open_dataset
 from rlftsim.scenario.womd import find_tfrecords, read_scenarios
 from scenes import NO_LIGHTS, Mover, bend, build_scenario, junction_map, light, straight_road, without_future
@@ -115,6 +115,15 @@ class Still:
 def straight(observation):
     return np.zeros(2, np.float32)
 number = 3
+class Far:
+    action, horizon = "trajectory", 20
+    def reset(self, info):
+        pass
+    def act(self, observation):
+        return np.outer(np.arange(1, 21), [0.5, 0, 0])
+class Needy:
+    def __init__(self, wish):
+        pass
 """
 
 
@@ -127,8 +136,12 @@ def test_planners_of_others_are_found(tmp_path, monkeypatch):
     PLANNERS.add("mine", sys.modules["my_planners"].Still)
     assert action_of(load_planner("mine")) == "pose"
     PLANNERS.remove("mine")
+    (far,) = drive(DriveConfig("my_planners:Far", traffic=("replay",), limit=1))
+    assert far.values("route_completion")[0] > 0
     wrong = {"my_planners:number": "is a int", "my_planners:nothing": "cannot be imported", "idn": "mean 'idm'"}
     wrong |= {":Still": "names no module", "nowhere.at_all:Still": "cannot be imported"}
+    (tmp_path / "broken.py").write_text("def (")
+    wrong |= {"my_planners:Needy": "without arguments .*wish", "broken:Still": "cannot be imported"}
     for name, message in wrong.items():
         with pytest.raises(ConfigError, match=message):
             load_planner(name)
@@ -156,10 +169,25 @@ def test_drive_writes_a_row_per_scenario_and_compare_reads_them(tmp_path, capsys
     assert main([*words, "--seed", "-1"]) == 2
     assert main([*words, "--traffic", "replay,replay"]) == 2
     assert main(["drive", "idm", "--data", "synthetic", "--traffic", "replay", "--out", str(tmp_path / "file")]) == 2
+    assert main([*words, "--traffic", "replay", "--scenario", "x", "x"]) == 2
     errors = capsys.readouterr().err.strip().splitlines()
-    assert len(errors) == 6  # no progress bar: nothing was driven
+    assert len(errors) == 7  # no progress bar: nothing was driven
     assert "unknown planner 'walk'" in errors[0]
     assert "is a file, not a folder" in errors[5]
+    assert "names one twice: x, x" in errors[6]
+
+
+def test_a_rollout_without_a_value_leaves_it_to_the_others(monkeypatch):
+    # from the second rollout on a car stands in the planner's way
+    rollouts = iter(["free", "blocked", "rammed"])
+    movers = {"free": (), "blocked": (Mover(x_m=30.0, speed_mps=0.0),), "rammed": (Mover(x_m=-15.0, speed_mps=15.0),)}
+    results = {name: driven("constant_velocity", build_scenario(name, (Mover(), *movers[name]))) for name in movers}
+    monkeypatch.setattr("rlftsim.envs.drive.run_planner", lambda *_, **__: results[next(rollouts)])
+    (row,) = drive(DriveConfig("constant_velocity", traffic=("replay",), limit=1, num_rollouts=3))
+    assert row.values("blamed_others_rate")[0] == 0.5
+    assert row.values("others_collision_rate")[0] == 0.0  # NaN where the planner is alone
+    assert results["free"].planner.least_ttc_s == 3.0
+    assert 1.0 < row.values("least_ttc_s")[0] < 3.0
 
 
 def test_results_survive_their_file_and_pair_by_scenario(tmp_path):
@@ -172,7 +200,14 @@ def test_results_survive_their_file_and_pair_by_scenario(tmp_path):
     assert again.settings == result.settings
     assert all(row.count == 0 or row.difference == 0 for row in compare_drives(result, again))
     (more,) = drive(DriveConfig("constant_velocity", traffic=("replay",), limit=1, num_rollouts=2))
-    with pytest.raises(DataError, match="drive both alike"):
-        compare_drives(result, more)
+    other_dice, other_data = (
+        replace(result, settings=replace(result.settings, **new)) for new in ({"seed": 1}, {"dataset": "elsewhere"})
+    )
+    for other in (more, other_dice, other_data):
+        with pytest.raises(DataError, match="drive both alike"):
+            compare_drives(result, other)
+    models = [replace(result, settings=replace(result.settings, model=model)) for model in ("none", "first", "second")]
+    titles = [str(format_drive_comparison(models[a], models[b], alpha=0.05).title) for a, b in ((0, 1), (1, 2))]
+    assert ["models differ" in title for title in titles] == [False, True]
     with pytest.raises(DataError, match="not a result"):
         DriveResult.read(tmp_path / "none.parquet")

@@ -12,7 +12,7 @@ from rlftsim.envs.traffic_scores import realism_of_others
 from rlftsim.realism import score
 from rlftsim.realism.from_rollouts import logged_states
 from rlftsim.scenario.types import ObjectType
-from scenes import SIZES_M, Mover, build_scenario, junction_map, light, straight_map, without_road_edges
+from scenes import SIZES_M, Mover, build_scenario, junction_map, light, straight_map, without_map, without_road_edges
 
 STEP_S = 0.1
 
@@ -144,9 +144,16 @@ def test_scores_that_a_map_cannot_give_are_left_out_and_named():
     for _ in range(10):
         env.step(np.zeros(2, np.float32))
     result = env.result()
-    assert missing_scores(result.record) == {"drivable_area": "the map has no road edges"}
+    edges = ("drivable_area", "off_road_m", "others_offroad_rate")
+    assert missing_scores(result.record) == dict.fromkeys(edges, "the map has no road edges")
     assert math.isnan(result.planner.drivable_area)
+    assert math.isnan(result.planner.off_road_m)
+    assert math.isnan(result.traffic.others_offroad_rate)
     assert result.planner.nuplan_style > 0
+    empty = EgoEnv(scenarios=[without_map()], traffic="replay")
+    empty.reset(seed=0)
+    assert math.isnan(empty.result().traffic.others_wrong_way_rate)
+    assert "others_wrong_way_rate" in empty.result().missing
 
 
 def test_others_that_collide_leave_the_road_or_drive_backwards_are_counted():
@@ -157,6 +164,20 @@ def test_others_that_collide_leave_the_road_or_drive_backwards_are_counted():
     assert result.traffic.others_collision_rate == pytest.approx(2 / 4)
     assert result.traffic.others_offroad_rate == pytest.approx(1 / 4)
     assert result.traffic.others_wrong_way_rate == pytest.approx(1 / 4)
+
+
+def test_others_are_not_judged_where_their_log_has_no_state():
+    # a car with a gap, one that would stand in the way of the next after its last state, one that turns in a gap
+    movers = (
+        Mover(y_m=3.7, heading_rad=math.pi, speed_mps=1.0),
+        Mover(x_m=-20.0, speed_mps=6.0, missing=tuple(range(30, 40))),
+        Mover(x_m=30.0, speed_mps=6.0, missing=tuple(range(15, 91))),
+        Mover(x_m=10.0, y_m=0.2, speed_mps=6.0),
+        Mover(x_m=-40.0, speed_mps=6.0, turn_rate_radps=0.4, missing=tuple(range(18, 40))),
+    )
+    scores = drive(movers).traffic
+    rates = scores.others_collision_rate, scores.others_acceleration_rate, scores.others_steering_rate
+    assert rates == (0.0, 0.0, 0.0)
 
 
 def test_realism_of_the_others_is_the_metric_without_the_ego():

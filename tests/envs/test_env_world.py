@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from rlftsim.envs import EgoEnv, EgoVectorEnv
+from rlftsim.envs import EgoEnv, EgoVectorEnv, parallel_env
 from rlftsim.envs.episode import advance
 from rlftsim.envs.planners.registry import load_planner
 from rlftsim.envs.world import Dice, begin, build_world, fork, step_world
@@ -18,7 +18,7 @@ from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.open import open_dataset
 from rlftsim.scenario.types import CURRENT_STEP
-from scenes import bend, junction_with_light, straight_road, with_gaps, without_future
+from scenes import Mover, bend, build_scenario, junction_with_light, straight_road, with_gaps, without_future
 
 
 @pytest.fixture(scope="module")
@@ -184,18 +184,33 @@ def test_snapshots_of_something_else_are_refused(data):
         env.restore(b"12345678")
 
 
-def test_replayed_agents_hold_their_last_pose_or_vanish():
-    scenario = with_gaps()
-    for vanish, there in ((False, True), (True, False)):
-        env = EgoEnv(scenarios=[scenario], traffic="replay", vanish=vanish, stop_on=())
+def test_replayed_agents_stand_in_a_gap_of_their_log_and_leave_with_its_end():
+    env = EgoEnv(scenarios=[with_gaps()], traffic="replay", stop_on=())
+    env.reset(seed=0)
+    scene = env.episode.world.scenes[0]
+    row = scene.row_of(101)
+    for _ in range(16):  # step 26 of the log, where agent 101 is not seen
+        observation = env.step(np.zeros(2, np.float32))[0]
+    np.testing.assert_array_equal(env.state.world.now[0, row], [*scene.logged[row, 24, :3], 0.0, 0.0])
+    assert observation["neighbors_mask"].sum() == 4
+    assert observation["neighbors"][:4, 9].max() == pytest.approx(0.2)
+    for _ in range(61):  # step 87, its last state
+        observation = env.step(np.zeros(2, np.float32))[0]
+    left = env.step(np.zeros(2, np.float32))[0]
+    assert left["neighbors_mask"].sum() == observation["neighbors_mask"].sum() - 1
+
+
+def test_a_replayed_agent_is_not_hit_where_it_is_not_logged():
+    for missing, contacts in ((range(20, 91), 0), (range(20, 85), 0), (range(85, 91), 1)):
+        lead = Mover(x_m=40.0, speed_mps=4.5, missing=tuple(missing))
+        env = EgoEnv(scenarios=[build_scenario("cut", (Mover(speed_mps=11.0), lead))], traffic="replay",
+                     action="pose", stop_on=(), reward="none")  # fmt: skip
         env.reset(seed=0)
-        for _ in range(16):  # step 26 of the log, where agent 101 is not seen
-            observation = env.step(np.zeros(2, np.float32))[0]
-        row = env.episode.world.scenes[0].row_of(101)
-        assert env.episode.world.there[0, row, 26] == there
-        before = env.episode.world.scenes[0].logged[row, 24, :2]
-        np.testing.assert_array_equal(env.state.world.now[0, row, :2], before)
-        assert observation["neighbors_mask"].sum() == (4 if there else 3)
+        for _ in range(80):
+            env.step(np.array([1.1, 0.0, 0.0], np.float32))
+        result = env.result()
+        assert len(result.record.collisions) == contacts
+        assert result.planner.time_to_collision == float(not contacts)
 
 
 def test_idm_traffic_stops_behind_a_planner_that_stands():
@@ -213,6 +228,28 @@ def test_idm_traffic_stops_behind_a_planner_that_stands():
     gap = standing[0, 0] - state.now[0, 0, 0] - follower.size[0, :2, 0].sum() / 2
     assert 0.3 < gap < 3.0
     assert np.hypot(*state.now[0, 0, 3:]) < 0.5
+
+
+def test_a_driver_of_all_the_others_comes_before_the_traffic():
+    settings = {"scenarios": [straight_road()], "traffic": "replay", "drivers": {"*": "constant_velocity"}}
+    env = EgoEnv(**settings)
+    env.reset(seed=0)
+    assert [int(d) for d in env.episode.world.drivers[0]] == [0, 3, 3, 3, 3, 3]
+    everyone = parallel_env(scenarios=[straight_road()], traffic="replay", controlled="*")
+    assert len(everyone.reset(seed=0)[0]) == 6
+
+
+def test_a_bicycle_that_tracks_a_steady_plan_keeps_its_speed():
+    log = build_scenario("steady", (Mover(speed_mps=9.9),))
+    env = EgoEnv(scenarios=[log], traffic="replay", action="trajectory", tracker="bicycle", stop_on=(), reward="none")
+    env.reset(seed=0)
+    plan = np.zeros((5, 3), np.float32)
+    plan[:, 0] = np.arange(1, 6)  # 10 m/s
+    for _ in range(80):
+        env.step(plan)
+    result = env.result()
+    np.testing.assert_allclose(np.hypot(*result.record.own[3:, 3:].T), 10.0, atol=1e-3)
+    assert result.planner.comfort == 1.0
 
 
 def test_lights_hold_their_last_state_where_a_log_ends():

@@ -7,7 +7,7 @@ in the center of the box and x ahead.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -128,31 +128,35 @@ def controls_of(
     raise ConfigError(f"action {kind!r}: known are bicycle, bicycle_discrete, pose, trajectory, token.")
 
 
-def checked(action: np.ndarray, controls: Controls, actors: Actors) -> np.ndarray:
-    """Actions of M agents as an array of the right shape.
+def checked(action: Any, controls: Controls, name_of: Callable[[int], str], count: int) -> np.ndarray:
+    """Actions of some agents as an array of the right shape and type.
 
     Args:
-        action: [M, *shape] numbers, or [M] whole numbers.
+        action: [count, *shape] numbers, or [count] whole numbers.
         controls: of the action.
-        actors: that it is for.
+        name_of: name of a row's agent in messages.
+        count: number of agents.
 
     Raises:
-        ConfigError: another shape, a NaN, or no such discrete action; names agent and entry.
+        ConfigError: no numbers, another shape, a NaN, or no such discrete action; names agent and entry.
     """
-    shape = (len(actors.motion), *controls.limits.shape)
-    array = np.asarray(action, np.int64 if controls.num_choices else np.float64)
+    shape = (count, *controls.limits.shape)
+    try:
+        array = np.asarray(action, np.float64)
+    except (TypeError, ValueError):
+        raise ConfigError(f"action of {name_of(0)} must be numbers in shape {shape[1:]}.") from None
     if array.shape != shape:
-        raise ConfigError(f"action of {actors.name_of(0)} has shape {array.shape[1:]}, it must have {shape[1:]}.")
+        raise ConfigError(f"action of {name_of(0)} has shape {array.shape[1:]}, it must have {shape[1:]}.")
     if controls.num_choices:
-        wrong = (array < 0) | (array >= controls.num_choices)
+        wrong = ~((array >= 0) & (array < controls.num_choices) & (array == np.floor(array)))
     else:
         wrong = ~np.isfinite(array)
     if wrong.any():
         agent, *entry = np.argwhere(wrong)[0].tolist()
         where = f" at entry {', '.join(map(str, entry))}" if entry else ""
-        known = f"a number below {controls.num_choices}" if controls.num_choices else "finite"
-        raise ConfigError(f"action of {actors.name_of(agent)}{where} is {array[(agent, *entry)]}, it must be {known}.")
-    return array
+        known = f"a whole number below {controls.num_choices}" if controls.num_choices else "finite"
+        raise ConfigError(f"action of {name_of(agent)}{where} is {array[(agent, *entry)]:g}, it must be {known}.")
+    return array.astype(np.int64) if controls.num_choices else array
 
 
 @dataclass(frozen=True)
@@ -301,7 +305,7 @@ class TrajectoryControls:
         wanted = pursuit_m(speed)[:, None]
         target = np.where((away >= wanted).any(1), (away >= wanted).argmax(1), self.horizon - 1)
         steering = pursue(kept[np.arange(len(kept)), target, :2], actors.size[:, 0])
-        needed = 2 * (kept[:, 0, 0] - speed * STEP_S) / STEP_S**2
+        needed = (kept[:, 0, 0] / STEP_S - speed) / STEP_S
         acceleration = np.clip(needed, -self.tracker.hardest, ACCELERATION_MPS2)
         motion = self.tracker.drive(actors.motion, acceleration, steering, actors.size[:, 0])
         return Moves(motion[:, None], clipped)

@@ -53,8 +53,6 @@ class EnvConfig:
     """Length of an episode, at most 80 steps of 0.1 s."""
     route: RouteChoice = "logged"
     """"logged" (the lanes that the logged ego drove), "none", a maneuver, or lane ids."""
-    vanish: bool = False
-    """True = replayed agents are gone where their log has no state; else they hold their last pose."""
     temperature: float = 1.0
     top_k: int | None = None
     device: Device = "cpu"
@@ -64,6 +62,8 @@ class EnvConfig:
     def __post_init__(self) -> None:
         require_types(self)
         object.__setattr__(self, "stop_on", tuple(self.stop_on))
+        if isinstance(self.route, list):
+            object.__setattr__(self, "route", tuple(self.route))
         for reason in self.stop_on:
             if reason not in get_args(StopReason):
                 raise ConfigError(f"stop_on must be one of {', '.join(get_args(StopReason))}, got {in_short(reason)}.")

@@ -12,14 +12,15 @@ from rlftsim.atomic_io import errors_name
 from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.drivers import TRAFFIC, Traffic
 from rlftsim.envs.ego_env import EgoEnv
-from rlftsim.envs.planners.registry import Planner, action_of, load_planner
+from rlftsim.envs.planners.registry import Planner, action_of, horizon_of, load_planner
 from rlftsim.envs.result import Result, animation_of
 from rlftsim.envs.source import Source
-from rlftsim.envs.traffic_scores import realism_of_others
+from rlftsim.envs.traffic_scores import blamed_others_rate, realism_of_others
 from rlftsim.errors import ConfigError, whole_number
 from rlftsim.evaluation.drive_results import DriveResult, DriveSettings
 from rlftsim.progress import progress_bar
 from rlftsim.scenario.types import Scenario
+from rlftsim.statistics import mean_interval
 from rlftsim.threads import one_thread
 from rlftsim.viewer.film import to_film
 from rlftsim.workers import on_this_machine
@@ -57,12 +58,15 @@ class DriveConfig:
                 raise ConfigError(f"traffic must be some of {', '.join(TRAFFIC)}, got {traffic!r}.")
         if len(set(self.traffic)) < len(self.traffic):
             raise ConfigError(f"traffic names one kind twice: {', '.join(self.traffic)}.")
+        if len(set(self.scenarios or ())) < len(self.scenarios or ()):
+            raise ConfigError(f"scenarios names one twice: {', '.join(self.scenarios or ())}.")
 
     def settings(self, traffic: str) -> EnvConfig:
         """Settings of the environment for one kind of traffic: nothing ends an episode, and nothing is rewarded."""
+        planner = load_planner(self.planner)
         return EnvConfig(
             data=self.data, split=self.split, model=self.model, traffic=cast(Traffic, traffic),
-            action=action_of(load_planner(self.planner)), stop_on=(), reward="none",
+            action=action_of(planner), horizon=horizon_of(planner), stop_on=(), reward="none",
         )  # fmt: skip
 
 
@@ -128,7 +132,9 @@ def _drive_scenario(
         run_planner(env, planner, scenario, seed=config.seed, rollout=rollout) for rollout in range(config.num_rollouts)
     ]
     rows = [{**asdict(result.planner), **asdict(result.traffic)} for result in results]
-    means = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
+    # a rollout that cannot give a score leaves it to the others
+    means = {name: mean_interval(np.array([row[name] for row in rows])).mean for name in rows[0]}
+    means["blamed_others_rate"] = blamed_others_rate([one for result in results for one in result.record.collisions])
     realism = realism_of_others([result.record for result in results])
     advance(1)
     return {"scenario_id": scenario_id, "traffic": traffic, **means, "others_realism": realism}, results[0].missing

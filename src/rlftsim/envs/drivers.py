@@ -20,7 +20,7 @@ class Driver(IntEnum):
     POLICY = 1
     """The traffic model."""
     REPLAY = 2
-    """Its log, which it holds the last pose of."""
+    """Its log: it holds its pose in a gap, and is gone after the last state."""
     CONSTANT_VELOCITY = 3
     IDM = 4
     """The intelligent driver model along the way of its log, for vehicles alone; all others follow the policy."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from rlftsim.envs.episode import Episode, EpisodeState, advance, look, start
 from rlftsim.envs.record import record_of
-from rlftsim.envs.resets import about, chosen, config_of, note_of
+from rlftsim.envs.resets import about, chosen, config_of, fresh_seed, note_of
 from rlftsim.envs.result import Result, animation_of, page_of
 from rlftsim.envs.snapshot import read_snapshot, write_snapshot
 from rlftsim.envs.source import Source
@@ -85,9 +85,11 @@ class EgoEnv(gymnasium.Env):
         Raises:
             ConfigError: an unknown option or scenario.
         """
+        if seed is None and self._begun is None:
+            seed = fresh_seed()
         super().reset(seed=seed)
-        if seed is not None or self._begun is None:
-            self._seed, self._count = int(self.np_random_seed or 0), 0
+        if seed is not None:
+            self._seed, self._count = seed, 0
         scenario_id, dice, goals = chosen(self.np_random, self.source, options or {}, self._seed, self._count)
         self._count += 1
         scenario = self.source.scenario(scenario_id)
@@ -112,7 +114,7 @@ class EgoEnv(gymnasium.Env):
         episode, state = self._running
         if state.ended[0]:
             raise ConfigError("this episode is over: call reset().")
-        state, outcome = advance(episode, state, np.asarray(action)[None])
+        state, outcome = advance(episode, state, [action])
         self._begun = episode, state
         terminated, truncated = bool(outcome.terminated[0]), bool(outcome.truncated[0])
         return self._look(), float(outcome.reward[0]), terminated, truncated, note_of(episode, state, outcome, 0)
@@ -128,8 +130,7 @@ class EgoEnv(gymnasium.Env):
         branches = []
         for world in fork(episode.world, state.world, number, noise):
             branch = EgoEnv(source=self.source)
-            branch._begun = episode, replace(state, world=world)
-            branch._seed, branch._count = self._seed, self._count
+            branch._go_on(episode, replace(state, world=world))
             branches.append(branch)
         return branches
 
@@ -164,8 +165,14 @@ class EgoEnv(gymnasium.Env):
             ConfigError: of another model, or of other settings.
             DataError: no snapshot.
         """
-        self._begun = read_snapshot(saved, self.source)
+        self._go_on(*read_snapshot(saved, self.source))
         return self._look(), about(self.episode, self.state, 0, self.source)
+
+    def _go_on(self, episode: Episode, state: EpisodeState) -> None:
+        """Take over a running episode; the next ones follow from its seed, with the next rollouts."""
+        dice = state.world.dice[-1][0]
+        super().reset(seed=dice.seed)
+        self._begun, self._seed, self._count = (episode, state), dice.seed, dice.rollout + 1
 
     def _look(self) -> Any:
         return shown(look(self.episode, self.state), self.config.observation, 0)

@@ -5,6 +5,7 @@ B scenes in step, M planner-driven agents over all of them. An `Episode` does no
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -139,7 +140,7 @@ def start(episode: Episode, dice: tuple[Dice, ...]) -> EpisodeState:
     )
 
 
-def advance(episode: Episode, state: EpisodeState, action: np.ndarray) -> tuple[EpisodeState, Outcome]:
+def advance(episode: Episode, state: EpisodeState, action: Any) -> tuple[EpisodeState, Outcome]:
     """State and outcome after one action of every planner-driven agent.
 
     Args:
@@ -148,12 +149,13 @@ def advance(episode: Episode, state: EpisodeState, action: np.ndarray) -> tuple[
         action: [M, *shape]; those of agents whose episode is over are ignored.
 
     Raises:
-        ConfigError: a NaN, another shape, or an action that an agent cannot take.
+        ConfigError: no numbers, a NaN, another shape, or an action that an agent cannot take.
     """
     motion = own_motion(episode, state.world)
     scene, agent = episode.world.actors.T
     actors = Actors(episode.name_of, motion, episode.world.size[scene, agent], episode.world.object_type[scene, agent])
-    moves = episode.controls.move(checked(action, episode.controls, actors), actors)
+    action = checked(action, episode.controls, episode.name_of, episode.num_agents)
+    moves = episode.controls.move(action, actors)
     terms = {}
     for step in range(episode.controls.steps):
         # an agent whose episode is over stands still
@@ -340,11 +342,11 @@ def _contacts(episode: Episode, world: WorldState, motion: Float[np.ndarray, "M 
     """Tracks that each planner-driven agent overlaps now."""
     scene, agent = episode.world.actors.T
     size = episode.world.size
-    there = episode.world.there[scene, :, len(world.track) - 1]
-    there[np.arange(len(scene)), agent] = False
+    known = episode.world.known[scene, :, len(world.track) - 1]
+    known[np.arange(len(scene)), agent] = False
     others = world.now[scene]  # [M, A, 5]
     gap = others[..., :2] - motion[:, None, :2]
-    return there & boxes_overlap(gap, motion[:, None, 2], others[..., 2], size[scene, agent][:, None], size[scene])
+    return known & boxes_overlap(gap, motion[:, None, 2], others[..., 2], size[scene, agent][:, None], size[scene])
 
 
 def _progress(episode: Episode, motion: Float[np.ndarray, "M 5"]) -> Float[np.ndarray, "M"]:

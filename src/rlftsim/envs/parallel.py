@@ -1,5 +1,7 @@
 """The PettingZoo environment: a planner for each of several agents, in one scene."""
 
+from collections.abc import Mapping, Sequence
+from operator import index
 from typing import Any, ClassVar
 
 import numpy as np
@@ -7,18 +9,19 @@ from gymnasium.spaces import Space
 from gymnasium.utils import seeding
 from pettingzoo import ParallelEnv
 
+from rlftsim.envs.actions import checked
 from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.drivers import Driver, drivers_of
 from rlftsim.envs.episode import Episode, EpisodeState, advance, look, start
-from rlftsim.envs.resets import OPTIONS, about, chosen, config_of, note_of
+from rlftsim.envs.resets import OPTIONS, about, chosen, config_of, fresh_seed, note_of
 from rlftsim.envs.scene import build_env_scene
 from rlftsim.envs.source import Source
 from rlftsim.envs.spaces import action_space, observation_space, shown
-from rlftsim.errors import ConfigError
+from rlftsim.errors import ConfigError, in_short
 from rlftsim.rollout.policy import Policy
 from rlftsim.scenario.any_form import AnyScenarios
 
-Controlled = str | list[int]
+Controlled = str | Sequence[int | str]
 
 
 def parallel_env(
@@ -37,8 +40,16 @@ def parallel_env(
         settings: fields of `EnvConfig` by name.
 
     Raises:
-        ConfigError: settings that do not fit each other.
+        ConfigError: settings that do not fit each other, or no agents.
     """
+    if not isinstance(controlled, str):
+        try:
+            # names of agents are their ids as text
+            controlled = list(dict.fromkeys(int(one) if isinstance(one, str) else index(one) for one in controlled))
+        except (TypeError, ValueError):
+            raise ConfigError("controlled must be a group such as 'vehicles', or a list of object ids.") from None
+        if not controlled:
+            raise ConfigError("controlled is empty: name at least one object id, or a group such as 'vehicles'.")
     rules = dict.fromkeys([controlled] if isinstance(controlled, str) else controlled, "planner")
     return TrafficParallelEnv(controlled, Source(config_of(settings), scenarios, policy, rules))
 
@@ -59,7 +70,8 @@ class TrafficParallelEnv(ParallelEnv):
             raise ConfigError("this environment renders nothing and observes 'dict' or 'flat': change these.")
         self.source, self.render_mode = source, None
         self._spaces = observation_space(config.observation), action_space(source.controls)
-        self._random, self._seed = seeding.np_random()
+        self._seed = fresh_seed()
+        self._random, _ = seeding.np_random(self._seed)
         self._count = 0
         self._begun: tuple[Episode, EpisodeState] | None = None
         self.agents: list[str] = []
@@ -68,7 +80,7 @@ class TrafficParallelEnv(ParallelEnv):
         self.possible_agents = self._all_agents(controlled)
 
     def _all_agents(self, controlled: Controlled) -> list[str]:
-        if isinstance(controlled, list):
+        if not isinstance(controlled, str):
             return [str(object_id) for object_id in controlled]
         found: dict[str, None] = {}
         for scenario_id in self.source.scenario_ids:
@@ -97,10 +109,10 @@ class TrafficParallelEnv(ParallelEnv):
             ConfigError: an unknown scenario, or no planner-driven agent in it.
         """
         if seed is not None:
-            self._random, self._seed = seeding.np_random(seed)
-            self._count = 0
+            self._random, _ = seeding.np_random(seed)
+            self._seed, self._count = seed, 0
         known = {name: value for name, value in (options or {}).items() if name in OPTIONS}
-        scenario_id, dice, goals = chosen(self._random, self.source, known, int(self._seed), self._count)
+        scenario_id, dice, goals = chosen(self._random, self.source, known, self._seed, self._count)
         self._count += 1
         scenario = self.source.scenario(scenario_id)
         episode = self.source.episode([scenario], {scenario_id: goals} if goals else None)
@@ -119,23 +131,24 @@ class TrafficParallelEnv(ParallelEnv):
             actions: by agent.
 
         Raises:
-            ConfigError: before `reset`, an agent without an action, or one with a NaN or of another shape.
+            ConfigError: before `reset`, after the end, an agent without an action, or one with a NaN or of another
+                shape.
         """
         if self._begun is None:
             raise ConfigError("this environment has no episode yet: call reset() first.")
         episode, state = self._begun
-        acting, shape = self.agents, self.source.controls.limits.shape
+        acting, controls = self.agents, self.source.controls
+        if not acting:
+            raise ConfigError("this episode is over: call reset().")
+        if not isinstance(actions, Mapping):
+            raise ConfigError(f"actions must be {{agent: action}}, got {in_short(actions)}.")
         missing = [name for name in acting if name not in actions]
         if missing:
             raise ConfigError(f"agent {missing[0]} has no action: every agent in env.agents needs one.")
-        dtype = np.int64 if self.source.controls.num_choices else np.float64
-        array = np.zeros((len(self._names), *shape), dtype)
+        array = np.zeros((len(self._names), *controls.limits.shape))
         for row, name in enumerate(self._names):
             if name in acting:
-                given = np.asarray(actions[name], dtype)
-                if given.shape != shape:
-                    raise ConfigError(f"action of agent {name} has shape {given.shape}, it must have {shape}.")
-                array[row] = given
+                array[row] = checked([actions[name]], controls, lambda _, row=row: episode.name_of(row), 1)[0]
         state, outcome = advance(episode, state, array)
         self._begun = episode, state
         rows = {name: self._names.index(name) for name in acting}

@@ -31,7 +31,7 @@ WRONG_WAY_M, WRONG_WAY_STEPS = (2.0, 6.0), 10
 TTC_LEAST_S, TTC_HORIZON_S, TTC_MOVING_MPS = 0.95, 3.0, 0.005
 AHEAD_RAD, CROSSING_RAD = np.radians(30.0), np.radians(45.0)
 OVER_SPEED_MPS = 2.23
-LANE_M = 4.0
+LANE_M = 2.0
 """Lanes farther than this from an agent say nothing about it."""
 ACCELERATION = (-4.05, 2.40)
 LATERAL, YAW_RATE, YAW_ACCELERATION, LONGITUDINAL_JERK, JERK = 4.89, 0.95, 1.93, 4.13, 8.37
@@ -67,6 +67,7 @@ class PlannerScores:
     red_light_rate: float
     """1 = passed a red light, as the official metric defines it."""
     least_ttc_s: float
+    """3 = at least that."""
     off_road_m: float
     """Largest distance of a corner off the road; 0 = never off."""
     route_completion: float
@@ -84,7 +85,7 @@ def score_planner(record: Record) -> PlannerScores:
     Args:
         record: of the episode; one that ended early is scored for as long as it lasted.
     """
-    parts = _parts(record)
+    parts, missing = _parts(record), missing_scores(record)
     early = _parts(record.first(PDMS_STEPS))
     multiplied = ("no_at_fault_collision", "drivable_area", "making_progress", "driving_direction")
     nuplan = math.prod(parts[name] for name in multiplied if math.isfinite(parts[name]))
@@ -102,7 +103,7 @@ def score_planner(record: Record) -> PlannerScores:
         hit_rate=float(not all(faults)),
         red_light_rate=_red_light(record),
         least_ttc_s=least_time_to_collision(record),
-        off_road_m=max(0.0, float(off_road(record).max())),
+        off_road_m=math.nan if "off_road_m" in missing else max(0.0, float(off_road(record).max())),
         route_completion=_gained(record.route, record.own) / whole if whole else math.nan,
         speed_change_mps=max((one.speed_change_mps for one in found), default=0.0),
         mean_jerk_mps3=float(jerk.mean()) if len(jerk) else math.nan,
@@ -120,11 +121,11 @@ def missing_scores(record: Record) -> dict[str, str]:
     elif not len(record.logged_route):
         found |= dict.fromkeys(("progress", "making_progress"), "there is no lane to measure progress along")
     if lane_search(record.scene.scenario) is None:
-        found |= dict.fromkeys(("driving_direction", "speed_limit"), "the map has no lanes")
+        found |= dict.fromkeys(("driving_direction", "speed_limit", "others_wrong_way_rate"), "the map has no lanes")
     if not len(record.route):
         found["route_completion"] = "there is no route"
     if road_edges(record.scene.scenario) is None:
-        found["drivable_area"] = "the map has no road edges"
+        found |= dict.fromkeys(("drivable_area", "off_road_m", "others_offroad_rate"), "the map has no road edges")
     return found
 
 
@@ -201,7 +202,7 @@ def _lane_headings(record: Record) -> tuple[Float[np.ndarray, "T1"], Float[np.nd
     junction = np.zeros(record.steps + 1, bool)
     if search is None:
         return angle, limit, junction
-    near = search.tree.query_ball_point(record.own[:, :2], LANE_M / 2)
+    near = search.tree.query_ball_point(record.own[:, :2], LANE_M)
     for step, points in enumerate(near):
         if points:
             turn = np.abs(wrapped(search.heading[points] - record.own[step, 2]))
@@ -229,7 +230,7 @@ def _speed_score(record: Record) -> float:
 
 
 def least_time_to_collision(record: Record) -> float:
-    """Least time until a box is met if all keep their speed and heading, s; infinite if none is within 3 s.
+    """Least time until a box is met if all keep their speed and heading, s; at most 3.
 
     Tracks ahead and crossing ones count. Those beside the agent do only while it is not in one lane, or in a junction;
     those behind, and those it has touched already, never do.
@@ -242,7 +243,7 @@ def least_time_to_collision(record: Record) -> float:
     crossing = np.abs(np.sin(others[..., 2] - own[:, 2])) > np.sin(CROSSING_RAD)
     _, _, junction = _lane_headings(record)
     beside = ~in_one_lane(record.scene, own, size[record.agent]) | junction
-    counts = record.there & (bearing < BEHIND_RAD) & ((bearing < AHEAD_RAD) | crossing | beside)
+    counts = record.known & (bearing < BEHIND_RAD) & ((bearing < AHEAD_RAD) | crossing | beside)
     counts[record.agent] = False
     counts &= speed > TTC_MOVING_MPS
     for one in record.collisions:
@@ -257,7 +258,7 @@ def least_time_to_collision(record: Record) -> float:
     # tracks that overlap at the start of the episode, such as a stroller and its pusher, are in no danger of it
     overlapping = np.isin(agents, agents[(steps == 0) & meets[:, 0]])
     meets &= ~overlapping[:, None]
-    return float(time[meets.argmax(1)[meets.any(1)]].min()) if meets.any() else math.inf
+    return float(time[meets.argmax(1)[meets.any(1)]].min()) if meets.any() else TTC_HORIZON_S
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,6 +22,9 @@ class Record:
     motion: Float[np.ndarray, "A T1 5"]
     """x, y, heading, vx, vy at T + 1 steps."""
     there: Bool[np.ndarray, "A T1"]
+    """False = a replayed agent whose log has ended."""
+    known: Bool[np.ndarray, "A T1"]
+    """False also in the gaps of a replayed agent's log: scores leave these states out."""
     collisions: tuple[Collision, ...]
     """Of the planner's agent."""
     route: Route
@@ -42,7 +45,7 @@ class Record:
     def first(self, steps: int) -> "Record":
         """The first steps alone."""
         return Record(
-            self.scene, self.agent, self.motion[:, : steps + 1], self.there[:, : steps + 1],
+            self.scene, self.agent, self.motion[:, : steps + 1], self.there[:, : steps + 1], self.known[:, : steps + 1],
             tuple(one for one in self.collisions if one.step <= steps), self.route, self.logged_route,
         )  # fmt: skip
 
@@ -63,6 +66,7 @@ def record_of(episode: Episode, state: EpisodeState, row: int = 0) -> Record:
         agent=agent,
         motion=np.stack([step[scene_row, :count] for step in state.world.track[CURRENT_STEP:]], 1),
         there=episode.world.there[scene_row, :count, CURRENT_STEP:last],
+        known=episode.world.known[scene_row, :count, CURRENT_STEP:last],
         collisions=state.collisions[row],
         route=episode.atlas.routes[row],
         logged_route=route_of(scene.scenario, agent, "logged"),

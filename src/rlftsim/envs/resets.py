@@ -30,6 +30,11 @@ def config_of(settings: dict[str, Any]) -> EnvConfig:
     return EnvConfig(**settings)
 
 
+def fresh_seed() -> int:
+    """A seed where none is given: one that fits an array of int64 and gives the same episodes again."""
+    return int(np.random.default_rng().integers(2**31))
+
+
 def chosen(
     random: np.random.Generator, source: Source, options: dict[str, Any], seed: int, count: int
 ) -> tuple[str, Dice, Any]:

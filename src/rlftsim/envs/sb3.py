@@ -12,6 +12,7 @@ from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env import VecEnv
 
 from rlftsim.envs.vector_env import EgoVectorEnv
+from rlftsim.errors import ConfigError
 
 
 class SB3VecEnv(VecEnv):
@@ -28,10 +29,16 @@ class SB3VecEnv(VecEnv):
         self._actions = np.zeros(0)
 
     def reset(self) -> Any:
-        """Observations of new episodes; `seed` sets the seeds of the next reset."""
-        first = self._seeds[0] if self._seeds else None
-        observation, self.reset_infos = self.vector.reset_slots(first)
+        """Observations of new episodes; `seed` and `set_options` hold for the next reset.
+
+        Raises:
+            ConfigError: options that are not the same for all environments.
+        """
+        if any(options != self._options[0] for options in self._options):
+            raise ConfigError("set_options has different options: they must be the same for all environments.")
+        observation, self.reset_infos = self.vector.reset_slots(self._seeds[0], self._options[0])
         self._reset_seeds()
+        self._reset_options()
         return observation
 
     def step_async(self, actions: np.ndarray) -> None:
@@ -56,7 +63,9 @@ class SB3VecEnv(VecEnv):
             attr_name: its name.
             indices: environments; None = all.
         """
-        value = None if attr_name == "render_mode" else getattr(self.vector, attr_name)
+        # the spaces are those of one environment
+        name = f"single_{attr_name}" if attr_name in ("action_space", "observation_space") else attr_name
+        value = None if attr_name == "render_mode" else getattr(self.vector, name)
         return [value for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: int | Iterable[int] | None = None) -> None:

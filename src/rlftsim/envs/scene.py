@@ -79,7 +79,7 @@ class Scene:
     z: Float[np.ndarray, "A"]
     """Height of the center at the current step, m."""
     logged: Float[np.ndarray, "A 91 5"]
-    """x, y, heading, vx, vy; where a state is not valid, that of the last valid step (of the first before it)."""
+    """x, y, heading, vx, vy; where a state is not valid, the last valid pose (the first before it), at rest."""
     valid: Bool[np.ndarray, "A 91"]
     """False beyond the end of a test split's log."""
     graph: LaneGraph
@@ -112,6 +112,8 @@ def build_env_scene(scenario: Scenario) -> Scene:
     step = np.arange(TOTAL_STEPS)
     last = np.maximum.accumulate(np.where(valid, step, -1), axis=1)
     source = np.where(last < 0, valid.argmax(1)[:, None], last)  # [A, 91]
+    logged = np.take_along_axis(states, source[..., None], axis=1)
+    logged[~valid, 3:] = 0.0
     lights = _lights(scenario, graph)
     return Scene(
         scenario=scenario,
@@ -120,7 +122,7 @@ def build_env_scene(scenario: Scenario) -> Scene:
         object_type=tracks.object_type[chosen].astype(np.int64),
         size=tracks.size[chosen, CURRENT_STEP].astype(np.float64),
         z=tracks.position[chosen, CURRENT_STEP, 2].astype(np.float64),
-        logged=np.take_along_axis(states, source[..., None], axis=1),
+        logged=logged,
         valid=valid,
         graph=graph,
         lanes=_lane_pieces(scenario, graph, lights),

@@ -10,7 +10,7 @@ from rlftsim.envs.actions import Controls, controls_of
 from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.episode import Episode, ScenarioGoals, build_episode
 from rlftsim.envs.world import build_world
-from rlftsim.errors import ConfigError
+from rlftsim.errors import ConfigError, in_short
 from rlftsim.policies.registry import load_policy
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import Policy, device_of, is_goal_conditioned
@@ -45,12 +45,15 @@ class Source:
         policy: Policy | None = None,
         controlled: Mapping[str | int, str] | None = None,
     ):
+        if policy is not None and not isinstance(policy, Policy):
+            raise ConfigError(f"policy is {in_short(policy)}, not a policy: name a stored one as `model`.")
         self.config = config
         self.scenarios: Scenarios = (
             scenarios_of(scenarios) if scenarios is not None else open_dataset(config.data, config.split)
         )
         self.scenario_ids = list(scenario_ids_of(self.scenarios))
-        self.rules = {**(controlled or {"ego": "planner"}), **config.drivers, "*": config.traffic}
+        self.rules = {**(controlled or {"ego": "planner"}), **config.drivers}
+        self.rules.setdefault("*", config.traffic)
         # IDM leaves pedestrians and cyclists to the policy
         needs_policy = "policy" in self.rules.values() or "idm" in self.rules.values() or config.action == "token"
         self.policy = (
@@ -92,7 +95,7 @@ class Source:
             raise ConfigError("goals have no effect: the traffic model is not goal-conditioned.")
         world = build_world(
             scenarios, self.policy, rules=self.rules, goals=goals, sampling=self.config.sampling,
-            vanish=self.config.vanish, context=self._context(scenarios),
+            context=self._context(scenarios),
         )  # fmt: skip
         if not len(world.actors):
             raise ConfigError(

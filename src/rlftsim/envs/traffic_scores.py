@@ -9,10 +9,10 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Int64
+from jaxtyping import Bool, Int64, Shaped
 
-from rlftsim.envs.contact import lane_search
-from rlftsim.envs.planner_scores import WRONG_WAY_M, WRONG_WAY_STEPS, least_time_to_collision
+from rlftsim.envs.contact import Collision, lane_search
+from rlftsim.envs.planner_scores import LANE_M, WRONG_WAY_M, WRONG_WAY_STEPS, least_time_to_collision
 from rlftsim.envs.record import Record
 from rlftsim.envs.road import MAX_PAIRS, OUTSIDE_M, road_edges
 from rlftsim.geometry import wrapped
@@ -30,7 +30,6 @@ INFEASIBLE_CURVATURE = 0.3
 SPAN_STEPS = 5
 SLOW_MPS = 1.0
 """Curvature is not measured below this speed."""
-LANE_M = 2.0
 
 
 @dataclass(frozen=True)
@@ -55,34 +54,49 @@ def score_traffic(record: Record) -> TrafficScores:
     scene, motion = record.scene, record.motion
     others = np.arange(len(scene.object_id)) != record.agent
     vehicles = others & (scene.object_type == ObjectType.VEHICLE)
+    has_edges, has_lanes = (found(scene.scenario) is not None for found in (road_edges, lane_search))
     # 1. contacts among the others; those that begin with an overlap do not count
     length, width = scene.size[:, 0].astype(np.float32), scene.size[:, 1].astype(np.float32)
     overlaps = compute_overlap(
         motion[None, ..., :2].astype(np.float32), motion[None, ..., 2].astype(np.float32), length, width,
-        (record.there & others[:, None])[None], ignore_from=0,
+        (record.known & others[:, None])[None], ignore_from=0,
     )[0].any(1)  # fmt: skip
-    # 2. kinematics over half a second
+    # 2. kinematics over half a second whose states are all known
     speed = np.linalg.norm(np.diff(motion[..., :2], axis=1), axis=-1) / STEP_S  # [A, T]
-    change = np.abs(speed[:, SPAN_STEPS:] - speed[:, :-SPAN_STEPS]) / (SPAN_STEPS * STEP_S)
-    driven = np.stack([speed[:, k : speed.shape[1] - SPAN_STEPS + 1 + k] for k in range(SPAN_STEPS)]).sum(0) * STEP_S
-    turn = np.abs(wrapped(motion[:, SPAN_STEPS:, 2] - motion[:, :-SPAN_STEPS, 2]))
-    fast = driven > SLOW_MPS * SPAN_STEPS * STEP_S
+    speeds = _runs(speed, SPAN_STEPS + 1)
+    change = np.abs(speeds[..., -1] - speeds[..., 0]) / (SPAN_STEPS * STEP_S)
+    jolt = (change > INFEASIBLE_ACCELERATION_MPS2) & _runs(record.known, SPAN_STEPS + 2).all(-1)
+    driven = _runs(speed, SPAN_STEPS).sum(-1) * STEP_S
+    headings = _runs(motion[..., 2], SPAN_STEPS + 1)
+    turn = np.abs(wrapped(headings[..., -1] - headings[..., 0]))
+    fast = (driven > SLOW_MPS * SPAN_STEPS * STEP_S) & _runs(record.known, SPAN_STEPS + 1).all(-1)
     tight = np.where(fast, turn / np.maximum(driven, 1e-3), 0.0) > INFEASIBLE_CURVATURE
-    faults = [one.at_fault for one in record.collisions]
     return TrafficScores(
-        ego_contacts=float(len(faults)),
+        ego_contacts=float(len(record.collisions)),
         risky_approach_rate=float(least_time_to_collision(record) < RISKY_TTC_S),
         others_collision_rate=_rate(overlaps, others),
-        others_offroad_rate=_rate(_leaves_road(record), vehicles),
-        others_wrong_way_rate=_rate(_drives_against(record, vehicles), vehicles),
-        others_acceleration_rate=_rate(np.any(change > INFEASIBLE_ACCELERATION_MPS2, axis=1), vehicles),
+        others_offroad_rate=_rate(_leaves_road(record), vehicles & has_edges),
+        others_wrong_way_rate=_rate(_drives_against(record, vehicles), vehicles & has_lanes),
+        others_acceleration_rate=_rate(np.any(jolt, axis=1), vehicles),
         others_steering_rate=_rate(np.any(tight, axis=1), vehicles),
-        blamed_others_rate=1.0 - sum(faults) / len(faults) if faults else np.nan,
+        blamed_others_rate=blamed_others_rate(record.collisions),
     )
+
+
+def blamed_others_rate(collisions: Sequence[Collision]) -> float:
+    """Fraction of contacts with the planner's agent, in one episode or several, not its fault; NaN without."""
+    return sum(not one.at_fault for one in collisions) / len(collisions) if collisions else np.nan
 
 
 def _rate(event: Bool[np.ndarray, "A"], among: Bool[np.ndarray, "A"]) -> float:
     return float(event[among].mean()) if among.any() else np.nan
+
+
+def _runs(values: Shaped[np.ndarray, "A t"], length: int) -> Shaped[np.ndarray, "A r n"]:
+    """All runs of n consecutive steps; none where there are fewer steps."""
+    if values.shape[1] < length:
+        return np.zeros((len(values), 0, length), values.dtype)
+    return np.lib.stride_tricks.sliding_window_view(values, length, axis=1)
 
 
 def _leaves_road(record: Record) -> Bool[np.ndarray, "A"]:
@@ -95,7 +109,7 @@ def _leaves_road(record: Record) -> Bool[np.ndarray, "A"]:
     states = Trajectories(*(torch.from_numpy(v.copy()).float()[None] for v in (x, y, z, record.motion[..., 2])))
     size = torch.from_numpy(scene.size).float()
     off = compute_distance_to_road_edge(states, size, edges, max_pairs=MAX_PAIRS)[0].numpy()
-    return (off >= OUTSIDE_M).any(1) & (off[:, 0] < OUTSIDE_M)
+    return ((off >= OUTSIDE_M) & record.known).any(1) & (off[:, 0] < OUTSIDE_M)
 
 
 def _drives_against(record: Record, vehicles: Bool[np.ndarray, "A"]) -> Bool[np.ndarray, "A"]:
@@ -103,7 +117,9 @@ def _drives_against(record: Record, vehicles: Bool[np.ndarray, "A"]) -> Bool[np.
     search, found = lane_search(record.scene.scenario), np.zeros(len(vehicles), bool)
     if search is None:
         return found
-    step = np.linalg.norm(np.diff(record.motion[..., :2], axis=1), axis=-1)
+    # a replayed agent jumps over the gaps of its log
+    known = record.known[:, 1:] & record.known[:, :-1]
+    step = np.where(known, np.linalg.norm(np.diff(record.motion[..., :2], axis=1), axis=-1), 0.0)
     moving = np.flatnonzero(vehicles & (step.sum(1) >= WRONG_WAY_M[0]))
     for agent in moving:
         near = search.tree.query_ball_point(record.motion[agent, 1:, :2], LANE_M)

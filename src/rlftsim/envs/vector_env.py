@@ -1,5 +1,6 @@
 """Many ego environments at once: scenes that are reset together step together, with one network call for all."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -9,12 +10,13 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from jaxtyping import Bool, Int64
 
+from rlftsim.envs.actions import checked
 from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.episode import Episode, EpisodeState, advance, look, start
-from rlftsim.envs.resets import about, chosen, config_of, note_of
+from rlftsim.envs.resets import about, chosen, config_of, fresh_seed, note_of
 from rlftsim.envs.source import Source
 from rlftsim.envs.spaces import action_space, observation_space, shown
-from rlftsim.errors import ConfigError
+from rlftsim.errors import ConfigError, in_short, whole_number
 from rlftsim.rollout.policy import Policy
 from rlftsim.scenario.any_form import AnyScenarios
 
@@ -72,7 +74,10 @@ class EgoVectorEnv(VectorEnv):
         if config.render_mode is not None or config.observation == "arrays":
             raise ConfigError("a vector of environments renders nothing and observes 'dict' or 'flat': change these.")
         self.source = Source(config, scenarios, policy)
-        self.num_envs = num_envs
+        self.num_envs = whole_number("num_envs", num_envs, 1)
+        modes = [mode.value for mode in AutoresetMode]
+        if autoreset_mode not in [*modes, *AutoresetMode]:
+            raise ConfigError(f"autoreset_mode must be one of {', '.join(modes)}, got {in_short(autoreset_mode)}.")
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {"render_modes": [], "autoreset_mode": self.autoreset_mode}
         self.single_action_space = action_space(self.source.controls)
@@ -84,7 +89,7 @@ class EgoVectorEnv(VectorEnv):
         self._over = np.zeros(num_envs, bool)
 
     def reset(
-        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Begin episodes in all slots, or in those of `options["reset_mask"]`.
 
@@ -102,7 +107,7 @@ class EgoVectorEnv(VectorEnv):
         return observation, infos
 
     def reset_slots(
-        self, seed: int | list[int | None] | None, options: dict[str, Any] | None = None
+        self, seed: int | Sequence[int | None] | None, options: dict[str, Any] | None = None
     ) -> tuple[Any, list[dict[str, Any]]]:
         """As `reset`, with the infos of each slot by themselves.
 
@@ -114,12 +119,21 @@ class EgoVectorEnv(VectorEnv):
             ConfigError: an unknown option or scenario.
         """
         options = dict(options or {})
-        mask = np.asarray(options.pop("reset_mask", np.ones(self.num_envs, bool)), bool)
-        seeds = seed if isinstance(seed, list) else [None if seed is None else seed + i for i in range(self.num_envs)]
+        mask = np.asarray(options.pop("reset_mask", np.ones(self.num_envs, bool)))
+        if mask.shape != (self.num_envs,) or mask.dtype != bool:
+            raise ConfigError(f"reset_mask must be {self.num_envs} truth values, got {mask.dtype} {mask.shape}.")
+        if not self._groups and not mask.all():
+            raise ConfigError("the first reset begins an episode in every slot: leave out reset_mask.")
+        if isinstance(seed, list | tuple | np.ndarray):
+            seeds = [None if one is None else whole_number("seed", one, 0) for one in seed]
+        else:
+            seeds = [None if seed is None else whole_number("seed", seed, 0) + i for i in range(self.num_envs)]
+        if len(seeds) != self.num_envs:
+            raise ConfigError(f"seed has {len(seeds)} numbers, it must be one number or {self.num_envs}.")
         for i, given in enumerate(seeds):
             if len(self._slots) <= i or given is not None:
-                random, used = seeding.np_random(given)
-                self._slots[i : i + 1] = [_Slot(random, int(used))]
+                used = fresh_seed() if given is None else given
+                self._slots[i : i + 1] = [_Slot(seeding.np_random(used)[0], used)]
         notes: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         self._reset(np.flatnonzero(mask), options, notes)
         return self._observe(), notes
@@ -155,11 +169,9 @@ class EgoVectorEnv(VectorEnv):
         """
         if not self._groups:
             raise ConfigError("these environments have no episodes yet: call reset() first.")
-        actions, controls = np.asarray(actions), self.source.controls
-        if actions.shape != (self.num_envs, *controls.limits.shape):
-            raise ConfigError(
-                f"actions have shape {actions.shape}, they must have {(self.num_envs, *controls.limits.shape)}."
-            )
+        controls = self.source.controls
+        # all slots before any of them moves
+        actions = checked(actions, controls, self._name_of, self.num_envs)
         over = np.flatnonzero(self._over)
         if self.autoreset_mode == AutoresetMode.DISABLED and len(over):
             raise ConfigError(f"the episode of slot {over[0]} is over: reset it with options={{'reset_mask': ...}}.")
@@ -193,6 +205,10 @@ class EgoVectorEnv(VectorEnv):
                 seen = {name: values[slot] for name, values in last.items()} if isinstance(last, dict) else last[slot]
                 notes[slot] |= {"final_obs": seen, "final_info": final[slot]}
         return self._observe(), rewards, terminated, truncated, notes
+
+    def _name_of(self, slot: int) -> str:
+        group = next(group for group in self._groups if slot in group.slots)
+        return f"slot {slot}, {group.episode.name_of(int(np.flatnonzero(group.slots == slot)[0]))}"
 
     def _reset(self, which: np.ndarray, options: dict[str, Any], notes: list[dict[str, Any]]) -> None:
         """Begin episodes of some slots, which form a group, and note what there is to say about them."""

@@ -15,7 +15,7 @@ seconds. Motion: x, y, heading, vx, vy.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -25,7 +25,7 @@ from torch import Tensor
 from rlftsim.envs.drivers import Driver, Rules, drivers_of
 from rlftsim.envs.idm import IdmConfig, IdmLines, advance_idm, idm_lines
 from rlftsim.envs.scene import Scene, build_env_scene
-from rlftsim.errors import ConfigError
+from rlftsim.errors import ConfigError, in_short
 from rlftsim.goals.types import Goals, PointById
 from rlftsim.rollout.noise import draw_noise
 from rlftsim.rollout.policy import Policy, Sampling, device_of
@@ -71,7 +71,9 @@ class World:
     lines: tuple[IdmLines, ...]
     """Of the IDM-driven agents of each scene."""
     there: Bool[np.ndarray, "B A 91"]
-    """True = the agent is there at a step of the log's time (10 is the current one)."""
+    """True = the agent is there at a step of the log's time (10 is the current one); replayed ones until it ends."""
+    known: Bool[np.ndarray, "B A 91"]
+    """True = it is there, and not held in a gap of its log: contacts and scores count these states alone."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +121,6 @@ def build_world(
     rules: Rules,
     goals: Mapping[str, PointById] | None = None,
     sampling: Sampling = Sampling(),  # noqa: B008
-    vanish: bool = False,
     context: Any = None,
 ) -> World:
     """The world of some scenarios, which step together.
@@ -130,7 +131,6 @@ def build_world(
         rules: agents to driver, see `drivers_of`.
         goals: of agents that follow the policy, scenario id to object id to (x, y), world frame.
         sampling: temperature and truncation of its decisions.
-        vanish: True = replayed agents are gone where their log has no state.
         context: `policy.encode` of these scenarios, if it is known.
 
     Raises:
@@ -150,11 +150,11 @@ def build_world(
             context = policy.encode(batch)
     mask = batch.agent_mask.cpu().numpy()
     valid = padded([scene.valid for scene in scenes], (*shape, TOTAL_STEPS), False)
-    # from the current step on all agents exist, but replayed ones may vanish with their log
-    there = valid | mask[..., None]
+    # from the current step on all agents exist, but replayed ones are gone after the last state of their log
+    goes_on = np.maximum.accumulate(valid[..., ::-1], axis=-1)[..., ::-1]
+    simulated = (drivers != Driver.REPLAY)[..., None]
+    there = mask[..., None] & (simulated | goes_on)
     there[..., : CURRENT_STEP + 1] = valid[..., : CURRENT_STEP + 1]
-    if vanish:
-        there &= valid | (drivers != Driver.REPLAY)[..., None]
     idm_rows = [np.flatnonzero(row[: len(scene.object_id)] == Driver.IDM) for row, scene in zip(drivers, scenes)]
     return World(
         scenes=scenes,
@@ -167,6 +167,7 @@ def build_world(
         logged=padded([scene.logged for scene in scenes], (*shape, TOTAL_STEPS, 5)),
         valid=valid,
         there=there,
+        known=there & (simulated | valid),
         policy=policy if followers else None,
         context=context if followers else None,
         goals=Goals.from_points(batch, goals) if goals and followers else None,
@@ -264,7 +265,12 @@ def fork(world: World, state: WorldState, number: int, noise: Noise = "same") ->
         number: of branches.
         noise: "same" = all meet the dice of `state`; "new" = branch i meets those of rollout + 1 + i, from the next
             decision on.
+
+    Raises:
+        ConfigError: another word for the noise.
     """
+    if noise not in get_args(Noise):
+        raise ConfigError(f"noise must be one of {', '.join(get_args(Noise))}, got {in_short(noise)}.")
     if noise == "same" or state.noise is None:
         return (state,) * number
     return tuple(

@@ -113,13 +113,12 @@ def compare_drives(a: DriveResult, b: DriveResult, *, alpha: float = 0.05) -> tu
         alpha: probability of calling a difference that is none.
 
     Raises:
-        DataError: other numbers of rollouts, or no scenario in common.
+        DataError: other numbers of rollouts, seeds or data, or no scenario in common.
     """
-    if a.settings.num_rollouts != b.settings.num_rollouts:
-        raise DataError(
-            f"{a.name} has {a.settings.num_rollouts} rollouts of a scenario, {b.name} {b.settings.num_rollouts}: "
-            "drive both alike."
-        )
+    for setting in ("num_rollouts", "seed", "dataset", "split"):
+        own, other = getattr(a.settings, setting), getattr(b.settings, setting)
+        if own != other:
+            raise DataError(f"{a.name} was driven with {setting} {own}, {b.name} with {other}: drive both alike.")
     place = {name: row for row, name in enumerate(b.table["scenario_id"].to_pylist())}
     rows_a = [row for row, name in enumerate(a.table["scenario_id"].to_pylist()) if name in place]
     rows_b = [place[a.table["scenario_id"][row].as_py()] for row in rows_a]
@@ -154,7 +153,9 @@ def format_drive_comparison(a: DriveResult, b: DriveResult, *, alpha: float) -> 
         b: the other one.
         alpha: probability of calling a difference that is none.
     """
-    table = Table(title=f"{b.name} against {a.name}", title_justify="left")
+    models = {a.settings.model, b.settings.model} - {"none"}
+    note = ", whose traffic models differ" if len(models) > 1 else ""
+    table = Table(title=f"{b.name} against {a.name}{note}", title_justify="left")
     table.add_column("", no_wrap=True)
     for name in (a.name, b.name):
         table.add_column(name, justify="right")

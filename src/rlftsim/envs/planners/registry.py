@@ -8,7 +8,7 @@ import importlib
 from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
-from rlftsim.envs.actions import ActionKind
+from rlftsim.envs.actions import LEAST_HORIZON, ActionKind
 from rlftsim.errors import ConfigError
 from rlftsim.plugins import ExtensionPoint
 
@@ -27,7 +27,10 @@ PLANNERS: ExtensionPoint[Callable[..., Any]] = ExtensionPoint(
 
 @runtime_checkable
 class Planner(Protocol):
-    """Drives one agent. Attribute `action` names its kind of action; without it that is "bicycle"."""
+    """Drives one agent. Attribute `action` names its kind of action; without it that is "bicycle".
+
+    Attribute `horizon` is the number of poses of a "trajectory"; without it that is 5.
+    """
 
     def reset(self, info: dict[str, Any]) -> None:
         """Begin an episode.
@@ -51,7 +54,8 @@ class CallablePlanner:
 
     def __init__(self, function: Callable[[dict[str, Any]], Any]):
         self.function = function
-        self.action: ActionKind = getattr(function, "action", "bicycle")
+        self.action: ActionKind = action_of(function)
+        self.horizon = horizon_of(function)
 
     def reset(self, info: dict[str, Any]) -> None:
         """Nothing: a function has no memory."""
@@ -76,11 +80,14 @@ def load_planner(name: str) -> Planner:
             raise ConfigError(f"planner {name!r} names no module: write package.module:Class.")
         try:
             found = getattr(importlib.import_module(module), attribute)
-        except (ImportError, AttributeError) as error:
+        except Exception as error:  # a file of others may fail in any way
             raise ConfigError(f"planner {name!r} cannot be imported ({error}): name package.module:Class.") from None
     else:
         found = PLANNERS.get(name)
-    planner = found() if isinstance(found, type) else found
+    try:
+        planner = found() if isinstance(found, type) else found
+    except TypeError as error:
+        raise ConfigError(f"planner {name!r} cannot be made without arguments ({error}).") from None
     if isinstance(planner, Planner):
         return planner
     if callable(planner):
@@ -88,6 +95,11 @@ def load_planner(name: str) -> Planner:
     raise ConfigError(f"planner {name!r} is a {type(planner).__name__}: give it reset(info) and act(observation).")
 
 
-def action_of(planner: Planner) -> ActionKind:
+def action_of(planner: Planner | Callable[..., Any]) -> ActionKind:
     """Kind of action that a planner takes."""
     return getattr(planner, "action", "bicycle")
+
+
+def horizon_of(planner: Planner | Callable[..., Any]) -> int:
+    """Number of poses of a planner's trajectories."""
+    return getattr(planner, "horizon", LEAST_HORIZON)
