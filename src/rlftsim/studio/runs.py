@@ -108,6 +108,18 @@ class Run:
             raise Refusal("these rollouts are not complete yet: wait until the run is done.", status=409)
         return join([parts[ids] for ids in wanted])
 
+    def score(self, variant: int) -> Scored:
+        """Score of a variant.
+
+        Raises:
+            Refusal: no such variant, or it is not scored yet (409).
+        """
+        self.rollouts(variant)
+        scored = self.simulated[variant].scored.get((self.body.num_rollouts, self.body.metric))
+        if scored is None:
+            raise Refusal("these rollouts are not scored yet: wait until the run is done.", status=409)
+        return scored
+
 
 def chunks_of(num_rollouts: int) -> list[range]:
     """Rollouts that are simulated at once: 4, 4, 8, 16, then 32 each."""
