@@ -244,6 +244,13 @@ def test_a_goal_of_an_agent_that_is_not_there_does_not_hold_up_the_others(page):
     assert page.page.get_by_text("passed in").count() > 0
 
 
+def test_numbers_of_an_address_are_brought_within_their_bounds(page):
+    wild = "step=1e9&rollout=-3&seed=1.5&guidance=99&count=1e9&temperature=-1&topK=0"
+    page.open(f"#split=validation&id={SCENARIO}&panels=log&{wild}")
+    names = ("time", "rollout", "seed", "guidance", "count", "temperature", "topK")
+    assert [page.state(f"studio.state.{name}") for name in names] == [90, 0, 2, 6, 128, 0, 1]
+
+
 DELAYED = """() => {
   const own = fetch;
   globalThis.delays = {};

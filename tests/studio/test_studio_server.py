@@ -192,6 +192,16 @@ def test_a_cancelled_run_says_so_and_a_newer_run_takes_its_place(client, worker)
     assert client.get(f"/api/runs/{long}").status_code == 404
 
 
+def test_a_run_that_another_page_replaces_says_so(client, worker):
+    running, waiting = (
+        client.post("/api/runs", RUN | {"num_rollouts": 128, "seed": seed}).json()["run"] for seed in (21, 22)
+    )
+    client.finished(**RUN | {"models": ["demo-base"], "num_rollouts": 2})
+    for name in (running, waiting):
+        last = client.get(f"/api/runs/{name}").json()["events"][-1]
+        assert (last["event"], last["data"]["message"]) == ("failed", "replaced by a newer run.")
+
+
 def test_an_observer_that_raises_ends_a_simulation(scenario):
     from rlftsim.rollout.simulate import simulate
     from rlftsim.scenario.batch import collate

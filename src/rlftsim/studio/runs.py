@@ -76,6 +76,7 @@ class Run:
     """Chunks that are being simulated, with the steps so far."""
     is_over: bool = False
     stop: threading.Event = field(default_factory=threading.Event)
+    stop_reason: str = "cancelled."
 
     def tell(self, event: str, **data: Any) -> None:
         """Append an event for the page."""
@@ -195,10 +196,11 @@ class Worker:
             run = self._new_run(name, body, variants)
             self.runs[name] = run
             for other in (self._running, self._waiting):
-                if other is not None:
+                if other is not None and not other.stop.is_set():
+                    other.stop_reason = "replaced by a newer run."
                     other.stop.set()
             if self._waiting is not None:
-                self._end(self._waiting, "failed", message="replaced by a newer run.", cancelled=True)
+                self._end(self._waiting, "failed", message=self._waiting.stop_reason, cancelled=True)
             self._waiting = run
             while len(self.runs) > KEPT_RUNS:
                 self.runs.popitem(last=False)
@@ -224,7 +226,7 @@ class Worker:
             run.stop.set()
             if run is self._waiting:
                 self._waiting = None
-                self._end(run, "failed", message="cancelled.", cancelled=True)
+                self._end(run, "failed", message=run.stop_reason, cancelled=True)
 
     def drop(self, name: str) -> None:
         """Cancel a run and forget it."""
@@ -254,7 +256,7 @@ class Worker:
                 self._simulate(run)
                 self._end(run, "done")
             except Cancelled:
-                self._end(run, "failed", message="cancelled.", cancelled=True)
+                self._end(run, "failed", message=run.stop_reason, cancelled=True)
             except RlftsimError as error:
                 self._end(run, "failed", message=str(error))
             except Exception as error:  # the page must hear of it; the log has the traceback
