@@ -256,7 +256,8 @@ DELAYED = """() => {
   globalThis.delays = {};
   globalThis.fetch = async (path, options) => {
     const answer = await own(path, options);
-    for (const [part, ms] of Object.entries(delays)) if (path.endsWith(part)) await new Promise((go) => setTimeout(go, ms));
+    const late = Object.keys(delays).find((part) => path.endsWith(part));
+    if (late) await new Promise((go) => setTimeout(go, delays[late]));
     return answer;
   };
 }"""
