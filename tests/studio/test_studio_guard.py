@@ -13,7 +13,8 @@ from urllib.parse import urlsplit
 import pytest
 
 from rlftsim.errors import ConfigError
-from rlftsim.studio.server import static_files, static_hash
+from rlftsim.studio.guard import Access
+from rlftsim.studio.server import create_app, static_files, static_hash
 from rlftsim.studio.serving import Studio, token_of
 
 HOST = "127.0.0.1:4711"
@@ -33,10 +34,32 @@ def test_nothing_is_read_without_the_token_or_under_a_foreign_host(client, acces
     assert client.get(path, {"cookie": None, "authorization": f"Bearer {access.token}"}).status_code in (200, 404)
 
 
+@pytest.mark.parametrize("other", ['theme={"dark": 1}', "list[0]=1", "name=\u00e9", "a b c", 'x="unclosed'])
+def test_cookies_of_other_programs_on_this_host_do_not_hide_the_token(client, access, other):
+    both = f"{other}; {access.cookie}={access.token}; {other}"
+    assert client.get("/api/alive", {"cookie": both.encode()}).status_code == 200
+
+
+def test_a_trusted_host_may_be_written_in_any_case(client, session, worker):
+    access = Access(4711, "t" * 43, trusted_hosts=("Hub.Example",))
+    hub = type(client)(create_app(session, worker, access), access)
+    assert hub.get("/api/alive", {"host": "hub.example"}).status_code == 200
+    assert hub.get("/api/alive", {"host": "hub.example:1"}).status_code == 403
+
+
 @pytest.mark.parametrize("path", CHANGES)
 def test_nothing_is_changed_from_another_page(client, access, path):
-    for origin in ("http://evil.example", "null", f"http://{HOST}.evil.example", "http://127.0.0.1:80", None):
+    for origin in (
+        "http://evil.example",
+        "null",
+        f"http://{HOST}.evil.example",
+        "http://127.0.0.1:80",
+        "http://[::1",
+        None,
+    ):
         assert client.post(path, {}, {"origin": origin}).status_code == 403
+    # a bearer that is not the token stands in for no origin, even beside the right cookie
+    assert client.post(path, {}, {"origin": None, "authorization": "Bearer x"}).status_code == 403
     assert client.post(path, {}, {"cookie": None}).status_code == 401
     assert client.post(path, {}, {"content-type": "text/plain"}).status_code == 415
     assert client.request("DELETE", "/api/runs/x", {"origin": "http://evil.example"}).status_code == 403
@@ -86,6 +109,13 @@ def test_names_that_are_paths_write_nothing(client, session, name):
         assert answer.status_code in (403, 404, 422) or name in ("..", ".")
     after = set(sorted(session.out.parent.rglob("*"))) - set(before)
     assert all(session.out in file.parents for file in after)
+
+
+@pytest.mark.parametrize("name", ["..", "."])
+def test_a_folder_of_rollouts_is_never_the_folder_of_exports_or_the_one_above(client, session, name):
+    state = client.finished(split="validation", scenario="9d639de83d6f5239", models=["demo-base"], num_rollouts=1)
+    answer = client.post("/api/export", {"kind": "rollouts", "name": name, "run": state["run"], "replace": True})
+    assert (answer.status_code, list(session.out.parent.rglob("*.npz"))) == (403, [])
 
 
 def test_a_symbolic_link_does_not_lead_out_of_the_folder(client, session, tmp_path):

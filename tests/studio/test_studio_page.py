@@ -235,6 +235,62 @@ PIN_ON_SCREEN = """() => {
 }"""
 
 
+def test_a_goal_of_an_agent_that_is_not_there_does_not_hold_up_the_others(page):
+    goals = f"99999@1,2;{EGO}@-36.715,-2.361"
+    page.open(f"#split=validation&id={SCENARIO}&panels=goals&count=2&agent={EGO}&goals={goals}&run=1")
+    page.simulated()
+    assert [one["agent"] for one in page.state("studio.state.variants.get('goals').score.outcomes")] == [EGO]
+    assert page.page.locator("#score .big").inner_text() != ""
+    assert page.page.get_by_text("passed in").count() > 0
+
+
+def test_numbers_of_an_address_are_brought_within_their_bounds(page):
+    wild = "step=1e9&rollout=-3&seed=1.5&guidance=99&count=1e9&temperature=-1&topK=0"
+    page.open(f"#split=validation&id={SCENARIO}&panels=log&{wild}")
+    names = ("time", "rollout", "seed", "guidance", "count", "temperature", "topK")
+    assert [page.state(f"studio.state.{name}") for name in names] == [90, 0, 2, 6, 128, 0, 1]
+
+
+DELAYED = """() => {
+  const own = fetch;
+  globalThis.delays = {};
+  globalThis.fetch = async (path, options) => {
+    const answer = await own(path, options);
+    const late = Object.keys(delays).find((part) => path.endsWith(part));
+    if (late) await new Promise((go) => setTimeout(go, delays[late]));
+    return answer;
+  };
+}"""
+
+
+def test_late_answers_do_not_change_the_scenario_that_was_opened_since(page, session):
+    first, second = (row["scenario_id"] for row in session.rows("validation", "", 0)["rows"][:2])
+    page.open(f"#split=validation&id={SCENARIO}&panels=goals&count=2")
+    page.page.evaluate(DELAYED)
+    page.page.evaluate(f"() => {{ delays['{first}'] = 400; studio.openScenario('{first}'); }}")
+    page.page.evaluate(f"() => studio.openScenario('{second}')")
+    page.page.wait_for_timeout(800)
+    assert page.state("studio.state.id") == second
+    # a run of one scenario whose name arrives when another one is shown
+    page.page.evaluate("() => { delays['api/runs'] = 400; document.getElementById('simulate').click(); }")
+    page.page.evaluate(f"() => studio.openScenario('{SCENARIO}')")
+    page.page.wait_for_timeout(1200)
+    assert page.state("[studio.state.id, studio.state.run, studio.state.variants.size]") == [SCENARIO, None, 0]
+
+
+def test_a_refused_run_ends_the_progress_of_the_one_before(page):
+    page.open(f"#split=validation&id={SCENARIO}&panels=goals&count=128")
+    page.press("s")
+    page.wait("studio.state.isRunning")
+    page.page.evaluate("() => { studio.state.temperature = 11; }")
+    page.press("s")
+    page.wait("document.getElementById('run-status').textContent.startsWith('temperature')")
+    assert page.state("[studio.state.isRunning, document.getElementById('progress').hidden]") == [False, True]
+    (line,) = page.errors
+    assert "422" in line  # the browser logs every refusal
+    page.errors.clear()
+
+
 def test_a_goals_file_is_stepped_through_and_keeps_scenarios_that_are_not_here(page, session, tmp_path):
     others = session.rows("validation", "", 0)["rows"][2:4]
     ids = [others[0]["scenario_id"], "elsewhere", others[1]["scenario_id"]]

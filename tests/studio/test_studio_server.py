@@ -178,6 +178,7 @@ def test_events_stream_with_ids_and_resume_behind_the_last_one(client):
     last = len(state["events"]) - 1
     rest = client.get(f"/api/runs/{state['run']}/events", {"last-event-id": str(last - 1)}).text
     assert rest == f"id: {last}\nevent: done\ndata: {{}}\n\n"
+    assert client.get(f"/api/runs/{state['run']}/events", {"last-event-id": "9" * 5000}).text == whole
 
 
 def test_a_cancelled_run_says_so_and_a_newer_run_takes_its_place(client, worker):
@@ -189,6 +190,16 @@ def test_a_cancelled_run_says_so_and_a_newer_run_takes_its_place(client, worker)
     assert (events[-1]["event"], events[-1]["data"]["message"]) == ("failed", "cancelled.")
     assert client.request("DELETE", f"/api/runs/{long}").status_code == 200
     assert client.get(f"/api/runs/{long}").status_code == 404
+
+
+def test_a_run_that_another_page_replaces_says_so(client, worker):
+    running, waiting = (
+        client.post("/api/runs", RUN | {"num_rollouts": 128, "seed": seed}).json()["run"] for seed in (21, 22)
+    )
+    client.finished(**RUN | {"models": ["demo-base"], "num_rollouts": 2})
+    for name in (running, waiting):
+        last = client.get(f"/api/runs/{name}").json()["events"][-1]
+        assert (last["event"], last["data"]["message"]) == ("failed", "replaced by a newer run.")
 
 
 def test_an_observer_that_raises_ends_a_simulation(scenario):
@@ -273,6 +284,48 @@ def test_exports_can_be_read_by_what_reads_them(client, session):
         assert "<canvas" in file.read()
     pending = client.post("/api/export", {"kind": "scores", "name": "none", "run": "none"})
     assert pending.status_code == 404
+
+
+GOALS_TEXT = '{"format": "rlftsim-goals-1", "goals": []}'
+
+
+def test_exports_that_cannot_be_written_are_refused_with_a_sentence(client, session, worker, tmp_path, monkeypatch):
+    state = client.finished(**RUN | {"models": ["demo-base"], "num_rollouts": 2})
+    (tmp_path / "file").touch()
+
+    def refusal(path, **body):
+        answer = client.post(path, body)
+        return answer.status_code, answer.json()["error"]
+
+    monkeypatch.setattr(session, "out", tmp_path / "file" / "below")
+    status, sentence = refusal("/api/goals/save", name="own", text=GOALS_TEXT)
+    assert (status, f"{tmp_path / 'file'} is a file" in sentence) == (422, True)
+    monkeypatch.setattr(session, "out", tmp_path)
+    # a folder of rollouts in place of a file, and a rollout that the run does not have
+    status, sentence = refusal("/api/export", kind="rollouts", name="file", run=state["run"], replace=True)
+    assert (status, f"{tmp_path / 'file'} is a file" in sentence) == (422, True)
+    for kind in ("film-mp4", "page"):
+        status, sentence = refusal("/api/export", kind=kind, name="far", run=state["run"], rollout=2)
+        assert (status, sentence) == (422, "no rollout 3: this run has 2.")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_rollouts_that_are_complete_but_not_scored_have_no_scores_to_export(client, worker):
+    scored = client.finished(**RUN | {"models": ["demo-base"], "num_rollouts": 2})
+    # another metric finds the rollouts there; until the worker comes to it, there is no score
+    worker.stop()
+    run = client.post("/api/runs", RUN | {"models": ["demo-base"], "num_rollouts": 2, "metric": "2024"}).json()["run"]
+    assert run != scored["run"]
+    answer = client.post("/api/export", {"kind": "scores", "name": "early", "run": run})
+    assert (answer.status_code, "not scored yet" in answer.json()["error"]) == (409, True)
+    assert client.get(f"/api/runs/{run}/explain").status_code == 409
+
+
+def test_an_error_of_the_program_has_the_shape_of_all_errors(client, worker, monkeypatch):
+    monkeypatch.setattr(worker, "submit", lambda body: 1 / 0)
+    answer = client.post("/api/runs", RUN)
+    expected = {"error": "ZeroDivisionError: division by zero; the terminal shows more.", "hint": ""}
+    assert (answer.status_code, answer.json()) == (500, expected)
 
 
 def test_rollouts_of_files_are_shown_and_scored_like_simulated_ones(tmp_path, access, client, scenario):

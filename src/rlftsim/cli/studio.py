@@ -44,7 +44,7 @@ class StudioVerb:
     allow_remote: bool = False
     """Listen on another address: the token, and everything else, travels there unencrypted."""
     trust_host: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
-    """Further Host header that is answered, such as a proxy's "hub.example:443"."""
+    """Further Host header that is answered, such as a proxy's "hub.example"."""
     device: Device = "auto"
     """auto: the GPU if torch has one."""
 

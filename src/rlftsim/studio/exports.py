@@ -3,7 +3,7 @@
 import json
 from pathlib import Path
 
-from rlftsim.atomic_io import write_text, write_whole
+from rlftsim.atomic_io import errors_name, write_text, write_whole
 from rlftsim.goals.goals_file import parse_goals, write_goals
 from rlftsim.realism.from_rollouts import states_of_rollouts
 from rlftsim.rollout.files import write_rollouts
@@ -36,10 +36,12 @@ def place_of(out: Path, name: str, *, replace: bool) -> Path:
         replace: True = an existing file may be replaced.
 
     Raises:
+        DataError: the folder cannot be made.
         Refusal: it would lie elsewhere, also through a symbolic link (403), or exists already (409).
     """
-    out.mkdir(parents=True, exist_ok=True)
     path = out / name
+    with errors_name(path):
+        out.mkdir(parents=True, exist_ok=True)
     if path.is_symlink() or path.resolve().parent != out.resolve():
         raise Refusal(f"{name!r} does not lie below {out}: choose another name.", status=403)
     if path.exists() and not replace:
@@ -77,6 +79,8 @@ def export(session: Session, run: Run, body: ExportBody) -> Path:
         DataError: it cannot be written.
     """
     rollouts = run.rollouts(body.variant)
+    if body.rollout >= run.body.num_rollouts:
+        raise Refusal(f"no rollout {body.rollout + 1}: this run has {run.body.num_rollouts}.")
     path = place_of(session.out, body.name + ENDINGS[body.kind], replace=body.replace)
     scenario = session.scenario(run.body.split, run.body.scenario)
     batch = collate([scenario])
@@ -89,7 +93,7 @@ def export(session: Session, run: Run, body: ExportBody) -> Path:
             message = encode_rollouts(scenario.scenario_id, states)
             write_whole(path, lambda temporary: temporary.write_bytes(message))
         case "scores":
-            scored = run.simulated[body.variant].scored[(run.body.num_rollouts, run.body.metric)]
+            scored = run.score(body.variant)
             write_text(path, json.dumps(scored.to_payload() | scored.explained(), indent=1) + "\n")
         case "page":
             write_page(

@@ -8,10 +8,10 @@ where it changes something, the studio's own origin.
 import json
 import secrets
 from dataclasses import dataclass, field
-from http.cookies import CookieError, SimpleCookie
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qs
 
 from starlette.datastructures import Headers
+from starlette.requests import cookie_parser
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 MAX_BODY_BYTES = 1 << 20
@@ -31,14 +31,15 @@ class Access:
     port: int
     token: str = field(repr=False)
     trusted_hosts: tuple[str, ...] = ()
-    """Further values of the Host header, such as a proxy's "hub.example:443"."""
+    """Further values of the Host header, such as a proxy's "hub.example"."""
     frame_ancestors: tuple[str, ...] = ()
     """Origins of notebooks that may show the page in a frame."""
 
     @property
     def hosts(self) -> frozenset[str]:
         """Host headers that are answered."""
-        return frozenset([*(f"{name}:{self.port}" for name in LOCAL_NAMES), *self.trusted_hosts])
+        local = (f"{name}:{self.port}" for name in LOCAL_NAMES)
+        return frozenset([*local, *(host.lower() for host in self.trusted_hosts)])
 
     @property
     def cookie(self) -> str:
@@ -108,26 +109,20 @@ class Guard:
         if len(hosts) != 1 or hosts[0].lower() not in self.access.hosts:
             return 403, "this host name is not the studio's: open the address that `rlftsim studio` printed."
         bearer = headers.get("authorization", "").partition("Bearer ")[2]
+        # Not the standard library's parser: one odd cookie of another program on this host would hide all others.
+        cookies = [cookie_parser(line).get(self.access.cookie, "") for line in headers.getlist("cookie")]
         in_url = parse_qs(scope["query_string"].decode("latin-1")).get("token", []) if scope["path"] == "/" else []
-        if not any(self.access.is_token(word) for word in (bearer, *self._cookies(headers), *in_url)):
+        if not any(self.access.is_token(word) for word in (bearer, *cookies, *in_url)):
             return 401, "no token, or that of an earlier start: open the address that `rlftsim studio` printed."
         if is_change:
+            # "null", or a scheme and a host; a script that knows the token has none.
             origin = headers.get("origin")
-            if (origin is None and not bearer) or (origin is not None and urlsplit(origin).netloc != hosts[0]):
+            is_own = self.access.is_token(bearer) if origin is None else origin.partition("://")[2] == hosts[0]
+            if not is_own:
                 return 403, "the request comes from another page: only the studio's own page may change something."
             if headers.get("content-type", "").partition(";")[0].strip().lower() != "application/json":
                 return 415, "the body must be application/json."
         return None
-
-    def _cookies(self, headers: Headers) -> list[str]:
-        found = []
-        for line in headers.getlist("cookie"):
-            try:
-                morsel = SimpleCookie(line).get(self.access.cookie)
-            except CookieError:
-                continue
-            found += [morsel.value] if morsel else []
-        return found
 
     async def _answer(self, send: Send, status: int, sentence: str, more: dict[str, str] | None = None) -> None:
         body = json.dumps({"error": sentence, "hint": ""}).encode() if sentence else b""

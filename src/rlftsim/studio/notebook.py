@@ -71,7 +71,7 @@ def open_studio(
         rollouts: files or folders of rollouts, for panels of their own.
         split: shown first; None = validation, where there is one.
         out: folder of everything that the page saves.
-        trusted_hosts: Host headers of a proxy, such as "hub.example:443"; its origin may show the page, too.
+        trusted_hosts: Host headers of a proxy, such as "hub.example"; its origin may show the page, too.
 
     Returns:
         A value that a notebook displays; `stop()` ends the server.

@@ -76,6 +76,7 @@ class Run:
     """Chunks that are being simulated, with the steps so far."""
     is_over: bool = False
     stop: threading.Event = field(default_factory=threading.Event)
+    stop_reason: str = "cancelled."
 
     def tell(self, event: str, **data: Any) -> None:
         """Append an event for the page."""
@@ -107,6 +108,18 @@ class Run:
         if any(ids not in parts for ids in wanted):
             raise Refusal("these rollouts are not complete yet: wait until the run is done.", status=409)
         return join([parts[ids] for ids in wanted])
+
+    def score(self, variant: int) -> Scored:
+        """Score of a variant.
+
+        Raises:
+            Refusal: no such variant, or it is not scored yet (409).
+        """
+        self.rollouts(variant)
+        scored = self.simulated[variant].scored.get((self.body.num_rollouts, self.body.metric))
+        if scored is None:
+            raise Refusal("these rollouts are not scored yet: wait until the run is done.", status=409)
+        return scored
 
 
 def chunks_of(num_rollouts: int) -> list[range]:
@@ -183,10 +196,11 @@ class Worker:
             run = self._new_run(name, body, variants)
             self.runs[name] = run
             for other in (self._running, self._waiting):
-                if other is not None:
+                if other is not None and not other.stop.is_set():
+                    other.stop_reason = "replaced by a newer run."
                     other.stop.set()
             if self._waiting is not None:
-                self._end(self._waiting, "failed", message="replaced by a newer run.", cancelled=True)
+                self._end(self._waiting, "failed", message=self._waiting.stop_reason, cancelled=True)
             self._waiting = run
             while len(self.runs) > KEPT_RUNS:
                 self.runs.popitem(last=False)
@@ -212,7 +226,7 @@ class Worker:
             run.stop.set()
             if run is self._waiting:
                 self._waiting = None
-                self._end(run, "failed", message="cancelled.", cancelled=True)
+                self._end(run, "failed", message=run.stop_reason, cancelled=True)
 
     def drop(self, name: str) -> None:
         """Cancel a run and forget it."""
@@ -242,7 +256,7 @@ class Worker:
                 self._simulate(run)
                 self._end(run, "done")
             except Cancelled:
-                self._end(run, "failed", message="cancelled.", cancelled=True)
+                self._end(run, "failed", message=run.stop_reason, cancelled=True)
             except RlftsimError as error:
                 self._end(run, "failed", message=str(error))
             except Exception as error:  # the page must hear of it; the log has the traceback

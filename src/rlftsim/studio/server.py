@@ -27,6 +27,7 @@ from rlftsim.studio.variants import entries_of
 POLL_S = 0.05
 IDLE_S = 60.0
 MAX_STREAMS = 8
+LONGEST_ID = 10
 ENDS = ("done", "failed")
 MEDIA_TYPES = {"js": "text/javascript", "css": "text/css", "svg": "image/svg+xml"}
 SHARED = ("drawing.js", "palette.css")
@@ -62,6 +63,7 @@ def create_app(session: Session, worker: Worker, access: Access) -> ASGIApp:
     app.add_exception_handler(RlftsimError, _answer_error)
     app.add_exception_handler(RequestValidationError, _answer_invalid)
     app.add_exception_handler(HTTPException, _answer_http)
+    app.add_exception_handler(Exception, _answer_failure)
     _add_page(app)
     _add_scenarios(app, session)
     _add_runs(app, worker)
@@ -158,7 +160,8 @@ def _add_runs(app: FastAPI, worker: Worker) -> None:
         nonlocal streams
         run = worker.run(name)
         last = request.headers.get("last-event-id", "")
-        first = int(last) + 1 if last.isdecimal() else 0
+        # Longer words are no number of an event, and Python refuses to read very long ones.
+        first = int(last) + 1 if last.isdecimal() and len(last) < LONGEST_ID else 0
         if streams >= MAX_STREAMS:
             raise Refusal(f"{MAX_STREAMS} pages listen already: close one.", status=429)
 
@@ -188,12 +191,7 @@ def _add_runs(app: FastAPI, worker: Worker) -> None:
     @app.get("/api/runs/{name}/explain")
     def _explain(name: str, variant: Annotated[int, Query(ge=0)] = 0) -> dict[str, Any]:
         """Losses of a variant by feature, agent and step."""
-        run = worker.run(name)
-        run.rollouts(variant)
-        scored = run.simulated[variant].scored.get((run.body.num_rollouts, run.body.metric))
-        if scored is None:
-            raise Refusal("these rollouts are not scored yet: wait until the run is done.", status=409)
-        return scored.explained()
+        return worker.run(name).score(variant).explained()
 
     @app.post("/api/runs/{name}/cancel")
     def _cancel(name: str, body: EmptyBody) -> dict[str, Any]:
@@ -257,3 +255,8 @@ async def _answer_invalid(_: Request, error: Exception) -> Response:
 async def _answer_http(_: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
     return JSONResponse({"error": str(error.detail), "hint": ""}, error.status_code)
+
+
+async def _answer_failure(_: Request, error: Exception) -> Response:
+    # The server still raises it, so that the terminal has the traceback.
+    return JSONResponse({"error": f"{type(error).__name__}: {error}; the terminal shows more.", "hint": ""}, 500)

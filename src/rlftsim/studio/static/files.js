@@ -85,7 +85,8 @@ function exportDialog(panel) {
   const kind = make("select", { id: "export-kind", "aria-label": "kind" }, ...kinds.map(([value, text]) => make("option", { value }, text)));
   const write = (name, replace) => {
     const one = state.variants.get(variant.value);
-    return post("api/export", { kind: kind.value, name, run: one.run, variant: one.index, rollout: state.rollout, replace });
+    // The one that the panel shows: it may have fewer rollouts than another one had.
+    return post("api/export", { kind: kind.value, name, run: one.run, variant: one.index, rollout: Math.min(state.rollout, one.rollouts.length - 1), replace });
   };
   const lines = commands();
   const parts = [

@@ -263,8 +263,10 @@ function takeProposal({ x, y, label }) {
 // ---- scenes ---------------------------------------------------------------------------------------------------------
 
 async function openScenario(id, { view = null, time = null } = {}) {
+  const turn = ++openings;
   let found;
   try { found = await get(`api/scenario/${encodeURIComponent(state.split)}/${encodeURIComponent(id)}`); } catch (error) { toast(error.message); return false; }
+  if (turn !== openings) return true; // another one was chosen meanwhile
   forget();
   Object.assign(state, {
     id, scene: found.scene, origin: found.origin, speeds: found.speeds, hasFuture: found.has_future, map: buildMap(found.scene.map),
@@ -296,7 +298,7 @@ async function stepScenario(by) {
       if (!known.total) continue;
       if (split !== state.split) await openSplit(split);
       await openScenario(id);
-      await list.find(id);
+      await list.find(state.id);
       return;
     }
   }
@@ -382,7 +384,7 @@ const stage = new Stage(byId("panels"));
 const timeline = new Timeline((stamp) => stage.frame(stamp));
 const list = new ScenarioList(byId("rows"), () => stage.colors(), (id) => openScenario(id));
 const actions = { place: startPlacing, find: selectNext, take: takeProposal };
-let drawing = 0, addressing = 0, finding = 0;
+let drawing = 0, addressing = 0, finding = 0, openings = 0;
 
 /** Draws once before the next frame, however many changes there are. */
 function drawSoon() {
@@ -490,7 +492,8 @@ async function start() {
   if (found.goals.length) { state.isQuiet = true; setGoals(found.goals.map((goal) => ({ ...goal, scenario: state.id })), { remember: false }); state.isQuiet = false; }
   if (stage.indexOf(found.agent) >= 0) select(found.agent);
   if (found.file) toast(`This address names a goals file: open ${found.file}.json.`);
-  if (found.run) { state.rollout = found.rollout ?? 0; await simulate(); }
+  // Refused goals are left out of the run, so they have to be known before.
+  if (found.run) { state.rollout = found.rollout ?? 0; await checkGoals(); await simulate(); }
   else if (found.step === undefined && !matchMedia("(prefers-reduced-motion: reduce)").matches) timeline.toggle(true);
   watchServer();
 }

@@ -5,7 +5,7 @@ import { byId, speak, toast } from "./dom.js";
 import { changed, ownGoals, state } from "./state.js";
 
 const TOTAL_STEPS = 91, QUICK_ROLLOUTS = 4, REST_MS = 1000;
-let end = () => {}, rest = 0, versions = 0;
+let end = () => {}, rest = 0, versions = 0, turns = 0;
 
 const modelOf = (key) => key.split("|")[0];
 
@@ -52,41 +52,45 @@ async function simulate(count = state.count) {
   if (!wantedModels().length) return toast("No panel shows a model: add one with C, then simulate.");
   end();
   delete byId("run-status").dataset.over;
+  // Whatever arrives after the next press, or after another scenario was opened, is of no use.
+  const turn = ++turns, isShown = () => turn === turns;
   let answer;
-  try { answer = await post("api/runs", request(count)); } catch (error) { toast(error.message); status(error.message); return; }
+  try { answer = await post("api/runs", request(count)); } catch (error) { if (isShown()) { toast(error.message); finish(error.message); } return; }
+  if (!isShown()) return;
   // Variants that the run holds under the names of the panels; old rollouts stay until the first new ones arrive.
   const hasGoals = answer.variants.some((variant) => variant.goals), names = answer.variants.map((variant) => {
     const model = state.session.models.find((one) => one.name === variant.model), isFree = hasGoals && model.takes_goals && !variant.goals;
     return isFree ? `${variant.model}|free` : variant.model;
   });
   state.run = answer.run; state.runName = names; state.isRunning = true;
-  const id = state.id, fresh = new Map(), started = performance.now();
+  const fresh = new Map(), started = performance.now();
   names.forEach((name, index) => fresh.set(name, { name: name.replace("|free", ", no goals"), run: answer.run, index, rollouts: [], chunks: new Map(), score: null, explained: null, version: 0 }));
   byId("progress").hidden = false; byId("cancel").hidden = false;
   status(`${answer.variants.length > 1 ? `${answer.variants.length} sets of ` : ""}${count} rollouts …`);
   let asked = 0, shown = 0, pending = Promise.resolve();
+  /** Jobs in the order of their events, as long as this run is shown. */
+  const next = (job) => { pending = pending.then(() => isShown() && job()).catch((error) => { if (error.status !== 404) toast(error.message); }); };
 
   const load = (data) => {
-    const turn = ++asked;
-    pending = pending.then(async () => {
-      if (turn < asked && data.steps < 80) return; // a later one has more
+    const place = ++asked;
+    next(async () => {
+      if (place < asked && data.steps < 80) return; // a later one has more
       const buffer = await bytes(`api/runs/${answer.run}/chunk/${data.k}`);
-      if (state.run !== answer.run || state.id !== id) return;
+      if (!isShown()) return;
       take(fresh, names[data.variant], data, buffer);
       if (!shown++) byId("run-status").dataset.first = String(Math.round(performance.now() - started));
-    }).catch((error) => { if (error.status !== 404) toast(error.message); });
+    });
   };
 
   end = follow(answer.run, (event, data) => {
-    if (state.run !== answer.run || state.id !== id) return;
     if (event === "progress") {
       byId("progress").value = (data.first + (data.count * data.decision) / data.of) / count;
       if (data.first === 0) load(data);
     } else if (event === "chunk") load(data);
-    else if (event === "score") pending = pending.then(() => { mark(fresh.get(names[data.variant]), data); publish(fresh, names[data.variant]); });
-    else if (event === "done") pending = pending.then(() => finish(`${count} rollouts in ${((performance.now() - started) / 1000).toFixed(1)} s`));
+    else if (event === "score") next(() => { mark(fresh.get(names[data.variant]), data); publish(fresh, names[data.variant]); });
+    else if (event === "done") next(() => finish(`${count} rollouts in ${((performance.now() - started) / 1000).toFixed(1)} s`));
     // A server that was started anew has lost the run: the same request gives the same rollouts.
-    else if (event === "failed") pending = pending.then(() => (data.isLost ? simulate(count) : finish(data.message)));
+    else if (event === "failed") next(() => (data.isLost ? simulate(count) : finish(data.message)));
   });
 }
 
@@ -136,6 +140,6 @@ function simulateSoon() {
   if (state.live) rest = setTimeout(() => simulate(), REST_MS);
 }
 
-function forget() { end(); clearTimeout(rest); state.run = null; state.isRunning = false; state.variants = new Map(); state.loss = null; byId("progress").hidden = true; byId("cancel").hidden = true; status(""); delete byId("run-status").dataset.over; }
+function forget() { end(); turns++; clearTimeout(rest); state.run = null; state.isRunning = false; state.variants = new Map(); state.loss = null; byId("progress").hidden = true; byId("cancel").hidden = true; status(""); delete byId("run-status").dataset.over; }
 
 export { IMPORTED, cancel, forget, loadImported, modelOf, simulate, simulateSoon, wantedModels };

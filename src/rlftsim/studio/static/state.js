@@ -1,5 +1,10 @@
 // What the page shows, as one object; goals with undo; the part of it that stands behind # in the address.
 const UNDO_STEPS = 50, LONGEST_URL = 2000;
+/** Numbers of an address: least, most, and whether they are whole. */
+const NUMBERS = {
+  seed: [0, Number.MAX_SAFE_INTEGER, true], count: [1, 128, true], temperature: [0, 10, false], topK: [1, Number.MAX_SAFE_INTEGER, true],
+  guidance: [0, 6, false], step: [0, 90, true], rollout: [0, 127, true], agent: [-Infinity, Infinity, true],
+};
 
 const state = {
   session: null, split: "", id: "", row: -1, total: 0, query: "",
@@ -69,9 +74,9 @@ function toHash() {
 function fromHash(hash) {
   const parts = new URLSearchParams(hash.slice(1)), found = {};
   for (const name of ["split", "id", "metric", "file"]) if (parts.get(name)) found[name] = parts.get(name);
-  for (const name of ["seed", "count", "temperature", "topK", "guidance", "step", "rollout", "agent"]) {
+  for (const [name, [least, most, isWhole]] of Object.entries(NUMBERS)) {
     const value = Number(parts.get(name));
-    if (parts.has(name) && Number.isFinite(value)) found[name] = value;
+    if (parts.has(name) && Number.isFinite(value)) found[name] = Math.min(Math.max(isWhole ? Math.round(value) : value, least), most);
   }
   if (parts.get("panels")) found.panels = parts.get("panels").split(",").slice(0, 4);
   if (parts.get("all") === "0") found.showAll = false;

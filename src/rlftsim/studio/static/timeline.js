@@ -75,7 +75,9 @@ class Timeline {
       for (const [kind, rollout, agent, start] of variant.score?.events ?? []) this.marks.push({ kind, rollout, agent, step: now + 1 + start });
       if (key.endsWith("|free")) continue;
       for (const goal of ownGoals()) {
-        const a = agents.findIndex(([id]) => id === goal.agent), x = goal.x - state.origin[0], y = goal.y - state.origin[1];
+        const a = agents.findIndex(([id]) => id === goal.agent);
+        if (a < 0) continue; // a file or an address may name agents that are not there
+        const x = goal.x - state.origin[0], y = goal.y - state.origin[1];
         variant.rollouts.forEach((rollout, n) => {
           for (let i = now + 1; i < LAST_STEP + 1 && rollout[a].valid[i]; i++) {
             if (Math.hypot(rollout[a].x[i] - x, rollout[a].y[i] - y) <= NEAR_M) { this.marks.push({ kind: "goal", rollout: n, agent: goal.agent, step: i }); break; }
