@@ -188,9 +188,7 @@ def _known_entries(folder: Path) -> dict[str, ShardEntry]:
     earlier = _earlier_manifest(folder)
     entries = {entry.file: entry for entry in earlier.shards} if earlier else {}
     for path in sorted((folder / SHARDS).rglob(_RECEIPTS)):
-        with suppress(
-            ValueError, KeyError, TypeError, AttributeError
-        ):  # a damaged one counts for nothing
+        with suppress(ValueError, KeyError, TypeError, AttributeError):  # a damaged one counts for nothing
             receipt = json.loads(path.read_text(encoding="utf-8"))
             if receipt.pop("schema_version") == SCHEMA_VERSION:
                 entry = shard_entry_from_json(receipt)
