@@ -2,6 +2,7 @@
 
 import errno
 import os
+import re
 import socket
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -13,6 +14,9 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from rlftsim.errors import DataError
+
+_TEMPORARY = re.compile(r"\..+\.\d+\.tmp")
+"""Names that `temporary_beside` gives."""
 
 
 @contextmanager
@@ -83,6 +87,13 @@ def remove_temporaries(path: Path) -> None:
     """Remove what killed processes left beside a file that they were writing. No process may be writing it now."""
     for leftover in path.parent.glob(f".{escape(path.name)}.*.tmp"):
         leftover.unlink(missing_ok=True)
+
+
+def remove_temporaries_below(folder: Path) -> None:
+    """Remove what killed processes left anywhere in a folder, and nothing else. No process may be writing there now."""
+    for path in folder.rglob(".*.tmp"):
+        if _TEMPORARY.fullmatch(path.name):
+            path.unlink(missing_ok=True)
 
 
 def write_text(path: Path, text: str) -> None:

@@ -72,7 +72,8 @@ class Lease:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         for file in self._files:
-            file.close()
+            with suppress(OSError):  # the owner's line does not fit on a full disk, which has been said
+                file.close()
 
     def finish(self, title: str) -> None:
         """Become the only driver, to put the result together.
@@ -85,7 +86,7 @@ class Lease:
         # The lock is let go before it is wanted whole. So of shares that end together the last to let go gets it.
         self._files.pop().close()
         try:
-            self._lock(self._path)
+            self._lock(self._path, must_exist=True)
         except NotYetError:
             raise Unfinished(
                 f"{title}: {self._share} is done, other shares are at work. The last one puts the result together."
@@ -98,27 +99,28 @@ class Lease:
             stray.unlink()
         self._path.unlink()
 
-    def _lock(self, path: Path, *, is_shared: bool = False, until: float = 0.0) -> None:
+    def _lock(self, path: Path, *, is_shared: bool = False, until: float = 0.0, must_exist: bool = False) -> None:
         """Open a file with a lock on it.
 
         Args:
             path: of the file.
             is_shared: others may have such a lock, too.
             until: moment at which waiting for another process ends, `time.monotonic`.
+            must_exist: the file was there; if it is gone, so is the work.
 
         Raises:
             NotYetError: another process has one.
             Unfinished: another process had one and has removed the file, at the end of all work.
         """
         with errors_name(path):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            has_waited = False
+            if not must_exist:
+                path.parent.mkdir(parents=True, exist_ok=True)
             while True:
                 try:
                     # A file that was there and is gone must not come back: its work is done.
-                    file = open(path, "r+" if has_waited else "a+", encoding="utf-8")  # noqa: SIM115 (stays open)
+                    file = open(path, "r+" if must_exist else "a+", encoding="utf-8")  # noqa: SIM115 (stays open)
                 except FileNotFoundError:
-                    if not has_waited:
+                    if not must_exist:
                         raise
                     raise Unfinished(
                         f"{path.parent}: another process has just finished this work: nothing is left to do."
@@ -133,7 +135,7 @@ class Lease:
                     with file:
                         if time.monotonic() >= until:
                             raise NotYetError(self._refusal(file)) from None
-                    has_waited = True
+                    must_exist = True
                     time.sleep(0.1)
                     continue
                 # The driver before this one may have removed the file in between: then it is no lock for others.
@@ -149,10 +151,10 @@ class Lease:
     def _refusal(self, file: TextIO) -> str:
         """Message with the owner and age of a lock."""
         file.seek(0)
-        owner, _, since = (file.read().splitlines() or [""])[-1].partition(" since ")
         try:
-            age = timedelta(seconds=int((datetime.now(UTC) - datetime.fromisoformat(since)).total_seconds()))
-            whom = f" ({owner}, for {age})"
-        except ValueError:  # it is only just beginning
+            owner, _, since = (file.read().splitlines() or [""])[-1].partition(" since ")
+            age = int((datetime.now(UTC) - datetime.fromisoformat(since)).total_seconds())
+            whom = f" ({owner}, for {timedelta(seconds=max(age, 0))})"  # its clock may be ahead of ours
+        except (ValueError, TypeError):  # it is only just beginning, or the file was damaged
             whom = ""
         return f"another process {self._doing} {self._path.parent}{whom}: wait for it or choose another destination."

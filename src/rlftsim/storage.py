@@ -7,11 +7,12 @@ import hashlib
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from fnmatch import fnmatchcase
 from glob import has_magic
 from pathlib import Path
 from typing import Any
 
-from rlftsim.atomic_io import write_text, write_whole
+from rlftsim.atomic_io import errors_name, write_text, write_whole
 from rlftsim.errors import ConfigError, DataError, RlftsimError
 
 ORIGIN = "origin.txt"
@@ -109,11 +110,13 @@ def fetch(url: str, path: Path, sha256: str | None = None) -> str:
     digest = hashlib.sha256()
 
     def write(temporary: Path) -> None:
-        with remote(url) as (files, place), temporary.open("wb") as copy:
+        # The copy is opened outside: a disk that is full is no trouble of the remote side.
+        with temporary.open("wb") as copy, remote(url) as (files, place):
             with files.open(place, "rb", block_size=BLOCK_BYTES, cache_type="readahead") as source:
                 while block := source.read(BLOCK_BYTES):
                     digest.update(block)
-                    copy.write(block)
+                    with errors_name(path):
+                        copy.write(block)
             if sha256 not in (None, digest.hexdigest()):
                 raise DataError(f"{url}: damaged or replaced: its checksum is not that of the manifest.")
 
@@ -190,8 +193,10 @@ def _evict(newest: Path) -> None:
 @contextmanager
 def _locked(path: Path) -> Iterator[None]:
     """Wait for a lock file, and hold it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a") as file:
+    with errors_name(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = path.open("a")
+    with file:
         try:
             import fcntl
 
@@ -239,7 +244,9 @@ def find_files(url: str, pattern: str) -> dict[str, int]:
         found = files.glob(place, detail=True) if has_magic(place) else {}
         if not found and files.isfile(place):
             found = {place: files.info(place)}
-        found = found or files.glob(f"{place.rstrip('/')}/**/{pattern}", detail=True)
+        # No glob: the name of a folder may look like a pattern, too.
+        below = {} if found else files.find(place, detail=True)
+        found = found or {name: below[name] for name in below if fnmatchcase(name.rpartition("/")[2], pattern)}
         sizes = {files.unstrip_protocol(name): info["size"] for name, info in sorted(found.items())}
     if not sizes:
         raise DataError(f"{url}: no {pattern} there.")

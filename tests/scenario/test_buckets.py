@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import rlftsim as rs
+from full_disk import limit_files_to
 from rlftsim import storage
 from rlftsim.cli.main import main
 from rlftsim.errors import ConfigError, DataError, NotYetError
@@ -276,3 +277,35 @@ def test_a_bucket_that_refuses_is_explained_with_a_way_out(bucket, data, tmp_pat
     said = capsys.readouterr().err
     assert said.count("\n") == 1
     assert "check the address, the network and the credentials of this machine" in said
+
+
+@pytest.mark.parametrize("name", ["womd", "a [1]? b%20"])
+def test_sources_at_a_file_address_are_converted_to_the_same_bytes(source, data, tmp_path, name):
+    place = source.rename(tmp_path / name)
+    convert(f"file://{place}", tmp_path / "converted", jobs=1, show_progress=False)
+    assert contents(tmp_path / "converted") == contents(data)
+
+
+def test_a_full_disk_is_not_blamed_on_the_bucket(tmp_path):
+    (tmp_path / "source").write_bytes(bytes(100_000))
+    with limit_files_to(20_000), pytest.raises(DataError, match=r"cannot write .*copy .*: make room or choose another"):
+        storage.fetch(f"file://{tmp_path}/source", tmp_path / "copy")
+    assert [path.name for path in tmp_path.iterdir()] == ["source"]
+
+
+def test_a_cache_that_cannot_be_written_to_is_named_with_a_way_out(data, tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("RLFTSIM_CACHE", str(tmp_path / "file"))
+    with pytest.raises(DataError, match="file is a file, not a folder: choose another place"):
+        pull_dataset(f"file://{data}", tmp_path / "back")
+
+
+def test_a_pull_removes_what_a_killed_one_was_fetching(data, tmp_path, monkeypatch):
+    monkeypatch.setenv("RLFTSIM_CACHE", str(tmp_path / "cache"))
+    with monkeypatch.context() as patch:
+        patch.setattr("rlftsim.scenario.transfer.fetch", lambda *_: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            pull_dataset(f"file://{data}", tmp_path / "back")
+    (tmp_path / "back" / ".index.parquet.machine.12.tmp").touch()
+    pull_dataset(f"file://{data}", tmp_path / "back", show_progress=False)
+    assert contents(tmp_path / "back") == contents(data)

@@ -16,6 +16,7 @@ from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.inspect import verify_dataset
 from rlftsim.scenario.sources import infer_split
 from rlftsim.scenario.womd import read_scenarios
+from rlftsim.workers import Inline, Share, Unfinished
 
 
 @pytest.fixture
@@ -302,3 +303,26 @@ def test_an_empty_file_is_named(tmp_path, capsys):
     with pytest.raises(DataError, match=r"not one scenario could be converted; .*empty\.tfrecord.*the file is empty"):
         run(tmp_path / "empty.tfrecord", tmp_path / "data", show_progress=True)
     assert "converting: 100%" in capsys.readouterr().err
+
+
+def test_only_temporaries_of_killed_conversions_are_removed(source, tmp_path):
+    run(source, tmp_path / "data")
+    expected = contents(tmp_path / "data")
+    for name in ("notes.tmp", "shards/.mine.tmp", "mine/.draft.2.txt.tmp"):
+        (tmp_path / "data" / name).parent.mkdir(exist_ok=True)
+        (tmp_path / "data" / name).write_text("of the user")
+        expected[name] = b"of the user"
+    (tmp_path / "data" / "shards" / "training" / ".a.arrow.machine.12.tmp").write_text("cut short")
+    run(source, tmp_path / "data")
+    assert contents(tmp_path / "data") == expected
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"schema_version": 1', "\0"])
+def test_a_damaged_receipt_costs_its_shard_alone(source, tmp_path, text):
+    with pytest.raises(Unfinished):
+        run(source, tmp_path / "data", runner=Share(1, 2, Inline()))
+    (receipt, *_) = sorted((tmp_path / "data").rglob("*.arrow.json"))
+    receipt.write_text(text)
+    run(source, tmp_path / "data")
+    run(source, tmp_path / "whole")
+    assert contents(tmp_path / "data") == contents(tmp_path / "whole")

@@ -2,17 +2,19 @@
 
 import importlib
 import os
+import shutil
 import threading
 import time
 from typing import get_type_hints
 
 import pytest
 
+from full_disk import limit_files_to
 from rlftsim import lease
 from rlftsim.cli.machines import Machines, Work
 from rlftsim.cli.main import HAVE_SHARES, VERBS, main
 from rlftsim.cli.submit import Build
-from rlftsim.errors import ConfigError, NotYetError
+from rlftsim.errors import ConfigError, DataError, NotYetError
 from rlftsim.evaluation.evaluate import EvaluateConfig, evaluate
 from rlftsim.lease import Lease
 from rlftsim.rollout.baselines import ConstantVelocity
@@ -168,3 +170,33 @@ def test_the_commands_that_join_takes_are_those_with_shares():
         verb for verb, cls in classes.items() if any(hint in (Machines, Work) for hint in get_type_hints(cls).values())
     }
     assert with_shares == set(HAVE_SHARES)
+
+
+@pytest.mark.parametrize(
+    ("text", "whom"),
+    [
+        (b"\nahead process 1 since 2999-01-01T00:00:00+00:00\n", r" \(ahead process 1, for 0:00:00\)"),
+        (b"\nhost process 1 since 2026-01-01T00:00:00\n", ""),  # no zone
+        (b"\xff\xfe since\n", ""),
+        (b"", ""),
+    ],
+)
+def test_a_lock_that_a_clock_or_disk_has_spoiled_is_refused_in_one_line(tmp_path, text, whom):
+    with Lease(tmp_path / "lock", Inline(), "works in"):
+        (tmp_path / "lock").write_bytes(text)
+        with pytest.raises(NotYetError, match=rf"works in {tmp_path}{whom}: wait for it"):
+            Lease(tmp_path / "lock", Inline(), "works in")
+
+
+def test_a_share_that_ends_when_all_is_put_together_brings_nothing_back(tmp_path):
+    folder = tmp_path / "a.parts"
+    with Lease(folder / ".lock", Share(1, 2, Inline()), "works in") as late:
+        shutil.rmtree(folder)  # by the share that took the lock as this one let it go
+        with pytest.raises(Unfinished, match="nothing is left to do"):
+            late.finish("work")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_disk_that_is_full_at_the_lock_is_named(tmp_path):
+    with limit_files_to(10), pytest.raises(DataError, match=r"cannot write .*lock \(File too large\): make room"):
+        Lease(tmp_path / "lock", Inline(), "works in")

@@ -236,8 +236,12 @@ def test_rounding_moves_nothing_by_more_than_half_a_step():
         assert float((after - before).abs().max()) <= step / 2
         assert float((after / step).frac().abs().max()) == 0
     assert round_states(states, None) is states
-    with pytest.raises(ConfigError, match="round=2 must be above 0"):
-        round_states(states, 2.0)
+
+
+@pytest.mark.parametrize("round_m", [0.0, -1.0, 1.0, float("nan")])
+def test_a_step_that_is_none_is_refused_before_a_folder_is_claimed(data, tmp_path, round_m):
+    with pytest.raises(ConfigError, match=r"round=.* must be above 0 and below 1 m"):
+        entries.make_job(data, tmp_path / "out", round_m=round_m)
 
 
 def test_a_split_with_a_missing_file_is_refused(tmp_path):
@@ -298,3 +302,11 @@ def test_a_test_split_alone_builds(tmp_path):
     found = check_archive(build(data, tmp_path / "out"), data, show_progress=False)
     assert found.findings.lines() == []
     assert found.num_checked == 2
+
+
+def test_an_archive_of_unknown_origin_is_not_taken_for_the_build(data, whole, tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "submission.tar.gz").write_bytes(whole)
+    with pytest.raises(DataError, match=r"submission\.tar\.gz is there without its plan\.json: name another --out"):
+        build(data, tmp_path / "out")
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["submission.tar.gz"]

@@ -1,7 +1,9 @@
 """Each reason for which entries were refused: a good archive is damaged in that way, and exactly that is found."""
 
 import gzip
+import json
 import re
+import time
 
 import entries
 import pytest
@@ -11,7 +13,8 @@ from rlftsim.evaluation.submission_pb2 import SimAgentsChallengeSubmission
 from rlftsim.submission import check
 from rlftsim.submission.check import check_archive
 from rlftsim.submission.findings import CHECKS
-from rlftsim.submission.report import SERVER_ERRORS
+from rlftsim.submission.messages import decode_rollouts
+from rlftsim.submission.report import SERVER_ERRORS, write_findings
 
 FIRST, SECOND = "submission.binproto-00000-of-00003", "submission.binproto-00001-of-00003"
 
@@ -286,3 +289,35 @@ def test_without_data_names_and_fields_are_checked(shards, tmp_path):
     assert (found.num_scenarios, found.metadata.unique_method_name) == (12, entries.ENTRY.method)
     with pytest.raises(DataError, match=r"nothing\.tar\.gz: there is no such archive"):
         check_archive(tmp_path / "nothing.tar.gz", None)
+
+
+def test_texts_that_are_none_are_named(data, tmp_path):
+    account = entries.METADATA.replace(b"jane.doe@university", b"jane.doe university")
+    account = account.replace(b"jane", b"j\xff\xfee")
+    scenario = b"\x0a\x04\x0a\x02\xff\xfe"
+    archive = entries.pack(tmp_path / "a.tar.gz", {"submission.binproto\x1b[2J\n\udcff": account + scenario})
+    found = check_archive(archive, data, show_progress=False)
+    lines = found.findings.lines()
+    assert all(line.isprintable() for line in lines)
+    assert any("account_name is no e-mail address" in line for line in lines)
+    assert any(r"submission.binproto\x1b[2J\n\udcff: no shard's name" in line for line in lines)
+    write_findings(found, tmp_path / "found.json")
+    assert "\ufffd\ufffd" in {
+        finding["scenario_id"] for finding in json.loads((tmp_path / "found.json").read_text())["findings"]
+    }
+
+
+def test_a_number_without_an_end_takes_no_time():
+    start = time.process_time()
+    with pytest.raises(DataError, match="not a ScenarioRollouts message"):
+        decode_rollouts(b"\x0a" + b"\xff" * 400_000)
+    assert time.process_time() - start < 1
+
+
+def test_damage_of_the_data_set_is_no_finding_about_the_archive(good, tmp_path):
+    data = entries.write_data(tmp_path / "set")
+    archive = entries.pack(tmp_path / "a.tar.gz", good)
+    for shard in (tmp_path / "set" / "shards").iterdir():
+        shard.unlink()
+    with pytest.raises(DataError, match=r"shard .*\.arrow is missing"):
+        check_archive(archive, data, show_progress=False)

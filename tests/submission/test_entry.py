@@ -32,6 +32,9 @@ def test_a_file_becomes_all_required_fields(read):
     [
         ("jane.doe@university.edu", "your_account@test.com", "your_account@test.com"),
         ("jane.doe@university.edu", "jane", "no e-mail address"),
+        ("jane.doe@university.edu", "jané@university.edu", "no e-mail address"),
+        ("jane.doe@university.edu", "jane@university..edu", "no e-mail address"),
+        ("A model.", "<what it does>", "no entry's"),
         ('"A method"', '"test"', "'test' is no entry's"),
         ('"A method"', f'"{"m" * 41}"', "1 to 40 printable ASCII characters, it has 41"),
         ('"A method"', '"Méthode"', "printable ASCII"),
@@ -57,3 +60,12 @@ def test_parameters_are_a_whole_number_and_a_suffix(count, text):
     policy.register_parameter("weight", nn.Parameter(torch.empty(count)))
     assert count_parameters(policy) == text
     assert count_parameters(object()) == "0"
+
+
+def test_an_account_of_bytes_that_are_no_text_is_refused(read):
+    with pytest.raises(ConfigError, match="no e-mail address"):
+        read(TOML, account="\udcff@university.edu")
+
+
+def test_a_comparison_is_no_placeholder(read):
+    assert read(TOML.replace("A model.", "ADE < 1 m")).description == "ADE < 1 m"

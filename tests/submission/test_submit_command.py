@@ -61,6 +61,10 @@ def test_an_archive_is_checked_described_cut_and_joined(place, capsys):
     archive = place / "out" / "submission.tar.gz"
     assert main([*CHECK, "--json", "found.json", "--sample", "0.5"]) == 0
     assert json.loads((place / "found.json").read_text())["scenarios"] == 4
+    for size in ("nan", "inf", "0", "-1"):
+        assert main(["submit", "info", str(archive), f"--split-gb={size}"]) == 2
+        assert "choose 1 to 1000 parts" in capsys.readouterr().err
+    main(["submit", "info", str(archive), "--split-gb", "0.000002"])  # finer, whose last parts must not be left
     assert main(["submit", "info", str(archive), "--split-gb", "0.00001"]) == 0
     assert "unique_method_name: A method" in capsys.readouterr().out
     parts = sorted((place / "out").glob("*.tar.gz.0*"))
@@ -71,6 +75,10 @@ def test_an_archive_is_checked_described_cut_and_joined(place, capsys):
     printed = capsys.readouterr().out
     assert "error, check 7: submission.tar.gz: cut off" in printed
     assert "error, check 17: submission.tar.gz: not the file that its report describes" in printed
+    assert main([*BUILD, "--i-comply"]) == 1
+    assert "cannot be uploaded: remove it and repeat the command" in capsys.readouterr().out
+    archive.unlink()
+    assert main([*BUILD, "--i-comply"]) == 0
 
 
 def test_the_rollouts_of_an_archive_score_as_its_unpacked_files(tmp_path, monkeypatch, capsys):

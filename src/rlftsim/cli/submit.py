@@ -121,9 +121,11 @@ class Build:
             estimate_realism(evaluation, fingerprint, config),
         )  # fmt: skip
         text, _ = report.write(archive)
-        if not check.findings.has_errors:
-            delete_parts(self.out)
         _print_findings(check)
+        if check.findings.has_errors:
+            print(f"{archive} cannot be uploaded: remove it and repeat the command, which builds it anew.")
+        else:
+            delete_parts(self.out)
         print(f"{archive}: {check.size} bytes, SHA-256 {check.sha256}\n{text}")
         return int(check.findings.has_errors)
 
@@ -175,9 +177,9 @@ class Info:
         _print_findings(check)
         if check.metadata is not None:
             for field, value in check.metadata.ListFields():
-                print(f"  {field.name}: {', '.join(value) if field.is_repeated else value}")
+                print(f"  {field.name}: {', '.join(map(str, value)) if field.is_repeated else value}")
         if self.split_gb is not None:
-            parts = split_file(self.archive, int(self.split_gb * 1e9))
+            parts = split_file(self.archive, self.split_gb)
             print(f"{len(parts)} parts; join them with: cat {self.archive.name}.??? > {self.archive.name}")
         return int(check.findings.has_errors)
 

@@ -12,10 +12,12 @@ import shutil
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 
+from rlftsim.atomic_io import remove_temporaries_below
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.lease import Lease
 from rlftsim.progress import progress_bar
@@ -158,7 +160,7 @@ def convert(
     # The folder is marked as unfinished until the mark is removed.
     with Lease(folder / INCOMPLETE, runner, "is converting to", _INCOMPLETE_TEXT) as lease:
         if lease.is_alone:
-            _remove_temporary(folder)
+            remove_temporaries_below(folder)
         known = _known_entries(folder)
         own = [replace(task, known=known.get(task.shard)) for task in runner.own(tasks)]
         total = sum(task.unit.size for task in own)
@@ -170,15 +172,10 @@ def convert(
         made = _known_entries(folder) | {outcome.entry.file: outcome.entry for outcome in outcomes}
         entries = [made[task.shard] for task in tasks if task.shard in made and _is_of(made[task.shard], task)]
         require_finished(runner, len(tasks) - len(entries), len(tasks), "convert")
-        _remove_temporary(folder)  # of processes that were killed
+        remove_temporaries_below(folder)  # of processes that were killed
         manifest = _finish(folder, entries, data_source, license_note, lease)
         lease.remove()
     return _report(folder, entries, outcomes, manifest)
-
-
-def _remove_temporary(folder: Path) -> None:
-    for leftover in folder.rglob("*.tmp"):
-        leftover.unlink()
 
 
 def _is_of(entry: ShardEntry, task: _Task) -> bool:
@@ -191,11 +188,11 @@ def _known_entries(folder: Path) -> dict[str, ShardEntry]:
     earlier = _earlier_manifest(folder)
     entries = {entry.file: entry for entry in earlier.shards} if earlier else {}
     for path in sorted((folder / SHARDS).rglob(_RECEIPTS)):
-        # receipts are written whole or not at all, so one that is there can be read
-        receipt = json.loads(path.read_text(encoding="utf-8"))
-        if receipt.pop("schema_version") == SCHEMA_VERSION:
-            entry = shard_entry_from_json(receipt)
-            entries[entry.file] = entry
+        with suppress(ValueError, KeyError, TypeError, AttributeError):  # a damaged one counts for nothing
+            receipt = json.loads(path.read_text(encoding="utf-8"))
+            if receipt.pop("schema_version") == SCHEMA_VERSION:
+                entry = shard_entry_from_json(receipt)
+                entries[entry.file] = entry
     return {file: entry for file, entry in entries.items() if (folder / file).exists()}
 
 

@@ -232,7 +232,7 @@ def units_of_urls(sizes: Mapping[str, int]) -> list[Unit]:
     Args:
         sizes: bytes of each file by its address; at least one.
     """
-    paths = {url: Path("/" + url.partition("://")[2]) for url in sizes}
+    paths = {url: Path("/" + url.partition("://")[2].lstrip("/")) for url in sizes}
     names = units_of_files(list(paths.values()))
     return [replace(unit, files=(), url=url, url_bytes=sizes[url]) for unit, url in zip(names, paths)]
 

@@ -4,6 +4,7 @@ import os
 import shutil
 from pathlib import Path
 
+from rlftsim.atomic_io import remove_temporaries_below
 from rlftsim.errors import DataError
 from rlftsim.lease import Lease
 from rlftsim.progress import progress_bar
@@ -68,6 +69,7 @@ def pull_dataset(url: str, folder: str | os.PathLike[str], *, show_progress: boo
     manifest = read_manifest(source := mirror(url, (INDEX, MANIFEST)))
     # The folder is marked as unfinished until the mark is removed.
     with Lease(mark, Inline(), "is copying to", note) as lease:
+        remove_temporaries_below(folder)
         with progress_bar("pull", len(manifest.shards), show=show_progress) as advance:
             for entry in manifest.shards:
                 path = folder / entry.file

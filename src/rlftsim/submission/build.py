@@ -87,6 +87,8 @@ def build_archive(
     numbers = range(len(job.plan.shards))
     runner = runner or on_this_machine(job.config.jobs, len(numbers))
     if archive.exists():
+        if not (job.folder / PLAN).exists():
+            raise DataError(f"{archive} is there without its {PLAN}: name another --out, or remove it.")
         job.plan.claim(job.folder)
         return archive
     with Lease(job.folder / _LOCK, runner, "builds in") as lease:

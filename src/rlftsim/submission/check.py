@@ -121,6 +121,8 @@ class _Pass:
     """Number and count in the names of shards."""
     whole_data: ScenarioDataset | None = None
     """All splits; opened where a scenario is not of the split."""
+    of_data: DataError | None = None
+    """Damage of the data set, which says nothing about the archive."""
 
     def read(self, reader: GzipReader, file: BinaryIO, advance: Callable[[int], None]) -> bool:
         """Read all shards; False if the archive is damaged."""
@@ -139,6 +141,8 @@ class _Pass:
             reader.finish()
             advance(reader.packed_size - done)
         except (DataError, tarfile.TarError) as error:
+            if error is self.of_data:
+                raise
             self._add(7, str(error), self.found.archive)
             return False
         return True
@@ -196,7 +200,11 @@ class _Pass:
         self.seen.add(name)
         if self.data is None or (self.sample < 1 and _place(name) >= self.sample):
             return
-        scenario = self.data.by_id(name)
+        try:
+            scenario = self.data.by_id(name)
+        except DataError as error:
+            self.of_data = error
+            raise
         checked = check_rollouts(decoded, scenario, file)
         self.found.num_checked += 1
         self.found.num_trajectories += checked.num_agents

@@ -11,6 +11,7 @@ from torch import nn
 
 from rlftsim.errors import ConfigError
 from rlftsim.evaluation.submission_pb2 import SimAgentsChallengeSubmission
+from rlftsim.submission.messages import as_text
 
 MAX_METHOD_LENGTH = 40
 PARAMETERS = re.compile(r"\d+[KMBT]?")
@@ -19,9 +20,11 @@ REQUIRED_FIELDS = (
     "uses_public_model_pretraining", "num_model_parameters", "acknowledge_complies_with_closed_loop_requirement",
 )  # fmt: skip
 _LISTS, _SWITCHES = ("authors", "public_models"), ("uses_lidar", "uses_camera", "uses_public_models")
-_EMAIL = re.compile(r"[^@\s]+@[^@\s]+\.[^@\s.]+")
+_EMAIL = re.compile(r"[^@\s]+@[^@\s.]+(\.[^@\s.]+)+")
 _PLACEHOLDERS = ("test", "todo", "none", "method", "example", "your name", "your affiliation")
-_PLACEHOLDER_PARTS = ("your_account", "your.account", "@test.", "@example.", "<", ">")
+_PLACEHOLDER_PARTS = ("your_account", "your.account", "@test.", "@example.")
+_BRACKETED = re.compile(r"<[^<>]*>")
+"""A text to be replaced, such as <your name>."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +54,7 @@ class Entry:
                 raise ConfigError(f"{name} = {value!r} is no entry's: write your own, the server refuses such texts.")
         if not self.authors or any(_is_placeholder(author) for author in self.authors):
             raise ConfigError(f"authors = {list(self.authors)} are no entry's: name at least one author.")
-        if not _EMAIL.fullmatch(self.account):
+        if not (_EMAIL.fullmatch(self.account) and self.account.isascii()):
             raise ConfigError(f"account = {self.account!r} is no e-mail address: give the one you registered with.")
         if len(self.method) > MAX_METHOD_LENGTH or not (self.method.isascii() and self.method.isprintable()):
             raise ConfigError(
@@ -136,14 +139,14 @@ def problems_of(message: SimAgentsChallengeSubmission) -> list[str]:
     problems = [f"{name} is missing" for name in REQUIRED_FIELDS if not message.HasField(name)]
     if message.HasField("submission_type") and message.submission_type != message.SIM_AGENTS_SUBMISSION:
         problems.append("submission_type is not SIM_AGENTS_SUBMISSION")
-    if message.HasField("num_model_parameters") and not PARAMETERS.fullmatch(message.num_model_parameters):
+    if message.HasField("num_model_parameters") and not PARAMETERS.fullmatch(as_text(message.num_model_parameters)):
         problems.append(
             f'num_model_parameters is "{message.num_model_parameters}", not a whole number and K, M, B or T'
         )
     closed_loop = "acknowledge_complies_with_closed_loop_requirement"
     if message.HasField(closed_loop) and not getattr(message, closed_loop):
         problems.append(f"{closed_loop} is false")
-    if message.HasField("account_name") and not _EMAIL.fullmatch(message.account_name):
+    if message.HasField("account_name") and not _EMAIL.fullmatch(as_text(message.account_name)):
         problems.append("account_name is no e-mail address")
     return problems
 
@@ -162,4 +165,8 @@ def _fitted(name: str, value: Any) -> Any:
 
 def _is_placeholder(text: str) -> bool:
     lower = text.strip().lower()
-    return lower in _PLACEHOLDERS or any(part in lower for part in _PLACEHOLDER_PARTS)
+    return (
+        lower in _PLACEHOLDERS
+        or _BRACKETED.search(lower) is not None
+        or any(part in lower for part in _PLACEHOLDER_PARTS)
+    )

@@ -49,7 +49,9 @@ class Finding:
             self.scenario_id and f"scenario {self.scenario_id}",
             None if self.object_id is None else f"object {self.object_id}",
         )
-        return f"{', '.join(place for place in places if place)}: {self.text}"
+        line = f"{', '.join(place for place in places if place)}: {self.text}"
+        # names in an archive may hold anything, such as control characters and bytes that are no text
+        return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
 
 
 @dataclass

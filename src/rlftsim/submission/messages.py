@@ -14,7 +14,7 @@ import torch
 from google.protobuf.message import DecodeError
 from jaxtyping import Float32
 
-from rlftsim.errors import ConfigError, DataError
+from rlftsim.errors import DataError
 from rlftsim.evaluation import submission_pb2
 from rlftsim.evaluation.rollout_files import AXES
 from rlftsim.realism import SimulatedStates
@@ -39,14 +39,9 @@ def round_states(states: SimulatedStates, round_m: float | None) -> SimulatedSta
     Args:
         states: of a scenario.
         round_m: largest step in meters, such as 0.001.
-
-    Raises:
-        ConfigError: not above zero.
     """
     if round_m is None:
         return states
-    if not 0 < round_m < 1:
-        raise ConfigError(f"round={round_m:g} must be above 0 and below 1 m, such as 0.001.")
     step = 2.0 ** math.floor(math.log2(round_m))
 
     def rounded(values: torch.Tensor, unit: float) -> torch.Tensor:
@@ -173,8 +168,7 @@ def _decode_alike(data: bytes) -> DecodedRollouts | None:
     for agent, own in enumerate(starts):
         for axis, start in enumerate(own):
             as_bytes[:, agent, axis] = rows[:, start : start + _ARRAY_BYTES]
-    scenario_id = data[name.start : name.stop].decode("utf-8", "replace")
-    return DecodedRollouts(scenario_id, (tuple(ids),) * num_scenes, (), values)
+    return DecodedRollouts(as_text(data[name.start : name.stop]), (tuple(ids),) * num_scenes, (), values)
 
 
 def _payload(data: bytes, position: int, key: bytes) -> tuple[range, int]:
@@ -189,17 +183,23 @@ def _payload(data: bytes, position: int, key: bytes) -> tuple[range, int]:
 
 def _varint(data: bytes, position: int) -> tuple[int, int]:
     """The number at a position, and the position after it."""
-    value = shift = 0
-    while True:
+    value = 0
+    for shift in range(0, 70, 7):
         byte = data[position]
         value |= (byte & 0x7F) << shift
-        position, shift = position + 1, shift + 7
+        position += 1
         if byte < 0x80:
             return value, position
+    raise ValueError  # no number has more than 10 bytes
 
 
 def _as_int32(number: int) -> int:
     return (number + (1 << 31)) % (1 << 32) - (1 << 31)
+
+
+def as_text(value: str | bytes) -> str:
+    """Text of a message; protobuf hands over bytes where they are not UTF-8."""
+    return value if isinstance(value, str) else value.decode("utf-8", "replace")
 
 
 def _decode_any(data: bytes) -> DecodedRollouts:
@@ -227,4 +227,4 @@ def _decode_any(data: bytes) -> DecodedRollouts:
     alike = all(len(arrays) == len(own) and arrays.keys() == scenes[0].keys() for arrays, own in zip(scenes, ids))
     if scenes and scenes[0] and alike:
         values = np.array([[arrays[object_id] for object_id in ids[0]] for arrays in scenes], np.float32)
-    return DecodedRollouts(message.scenario_id, tuple(ids), tuple(wrong), values)
+    return DecodedRollouts(as_text(message.scenario_id), tuple(ids), tuple(wrong), values)

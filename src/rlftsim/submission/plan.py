@@ -85,13 +85,15 @@ def make_plan(
         round_m: positions are rounded to this; None = not.
 
     Raises:
-        ConfigError: no shards, or another number of rollouts than the challenge wants.
+        ConfigError: no shards, a step of nothing or above 1 m, or another number of rollouts than the challenge wants.
     """
     agents = np.stack([data.index[name].to_numpy() for name in _AGENT_COLUMNS]).sum(0)  # [scenarios]
     if num_shards < 1:
         raise ConfigError(f"num_shards must be at least 1, got {num_shards}.")
     if config.num_rollouts != NUM_SCENES:
         raise ConfigError(f"an entry has {NUM_SCENES} rollouts of each scenario, not {config.num_rollouts}.")
+    if round_m is not None and not 0 < round_m < 1:
+        raise ConfigError(f"round={round_m:g} must be above 0 and below 1 m, such as 0.001.")
     num_shards = min(num_shards, len(agents))
     # Borders where the running number of agents passes multiples of its share; each shard keeps at least one scenario.
     total = np.concatenate([[0], np.cumsum(agents)])

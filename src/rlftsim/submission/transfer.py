@@ -1,5 +1,7 @@
 """Large archives cut into parts, for moving them about. The upload page takes the joined file."""
 
+import math
+from glob import escape
 from pathlib import Path
 
 from rlftsim.atomic_io import errors_name
@@ -8,21 +10,24 @@ from rlftsim.errors import ConfigError
 _CHUNK = 1 << 22
 
 
-def split_file(path: Path, part_bytes: int) -> list[Path]:
-    """Copy a file into parts named `<name>.000`, `<name>.001` and so on; `cat` joins them.
+def split_file(path: Path, part_gb: float) -> list[Path]:
+    """Copy a file into parts named `<name>.000`, `<name>.001` and so on; `cat` joins them. Older parts are removed.
 
     Args:
         path: of the file, which is kept.
-        part_bytes: size of a part.
+        part_gb: size of a part.
 
     Raises:
         ConfigError: more than 1000 parts.
         DataError: a part cannot be written.
     """
-    count = -(-path.stat().st_size // part_bytes) if part_bytes > 0 else 0
+    part_bytes = int(part_gb * 1e9) if 0 < part_gb < math.inf else 0
+    count = -(-path.stat().st_size // part_bytes) if part_bytes else 0
     if not 0 < count <= 1000:
-        raise ConfigError(f"{path} cannot be cut into parts of {part_bytes / 1e9:g} GB: choose 1 to 1000 parts.")
+        raise ConfigError(f"{path} cannot be cut into parts of {part_gb:g} GB: choose 1 to 1000 parts.")
     parts = [path.with_name(f"{path.name}.{number:03d}") for number in range(count)]
+    for old in path.parent.glob(f"{escape(path.name)}.[0-9][0-9][0-9]"):
+        old.unlink()  # `cat` would join those of an earlier, finer cut, too
     with path.open("rb") as source:
         for part in parts:
             with errors_name(part), part.open("wb") as out:

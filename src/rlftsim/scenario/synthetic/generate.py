@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from rlftsim.aliases import current_names
-from rlftsim.atomic_io import write_text
+from rlftsim.atomic_io import remove_temporaries_below, write_text
 from rlftsim.errors import ConfigError, DataError, RlftsimError
 from rlftsim.lease import Lease
 from rlftsim.progress import progress_bar
@@ -193,8 +193,7 @@ def generate(
         lease.finish("synthetic scenarios")
         num_missing = sum(not path.exists() for path in paths)
         require_finished(runner, num_missing, len(tasks), "synthetic scenarios")
-        for leftover in folder.rglob("*.tmp"):  # of processes that were killed
-            leftover.unlink()
+        remove_temporaries_below(folder)  # of processes that were killed
 
         # 3. Index and manifest.
         entries = [describe_shard(folder, path, len(ShardReader(path))) for path in paths]
