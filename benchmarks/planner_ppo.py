@@ -21,6 +21,7 @@ from stable_baselines3.common.vec_env import VecEnvWrapper
 from torch import Tensor
 
 from rlftsim.envs import EgoEnv
+from rlftsim.envs.actions import ACCELERATION_MPS2, STEERING_RAD
 from rlftsim.envs.drive import run_planner
 from rlftsim.envs.planners.registry import load_planner
 from rlftsim.envs.sb3 import SB3VecEnv
@@ -28,8 +29,6 @@ from rlftsim.evaluation.compare import compare_paired
 
 ROUTE_STEP_M = 2.0
 FAR_M = 60.0
-MAX_STEERING, MAX_BRAKING = 0.55, 4.0
-"""Front wheel angle (rad) and deceleration (m/s²) of an action of 1."""
 PARTS = ("nuplan_style", "no_at_fault_collision", "drivable_area", "making_progress", "progress", "comfort")
 
 
@@ -49,7 +48,7 @@ class DriverView(BaseFeaturesExtractor):
         index = torch.minimum((torch.clamp(0.8 * speed, min=3.0) / ROUTE_STEP_M).round().long(), last)
         point = route[torch.arange(len(ego)), index, :2]
         curvature = 2 * point[:, 1] / point.square().sum(-1).clamp(min=4.0)
-        steering = torch.where(last > 0, torch.atan(0.6 * length * curvature) / MAX_STEERING, 0.0)
+        steering = torch.where(last > 0, torch.atan(0.6 * length * curvature) / STEERING_RAD, 0.0)
 
         line = torch.where(known[..., None], route[..., :2], torch.full_like(route[..., :2], 1e4))
         is_red = lights[..., 2:4].sum(-1) > 0
@@ -61,9 +60,9 @@ class DriverView(BaseFeaturesExtractor):
         limit = torch.where(limit > 0, limit, 13.0)
         numbers = [
             steering,
-            closing * closing.abs() / (2 * gap) / MAX_BRAKING,
+            closing * closing.abs() / (2 * gap) / ACCELERATION_MPS2,
             1.5 * speed / gap,
-            speed.square() / (2 * stop) / MAX_BRAKING * (stop < FAR_M),
+            speed.square() / (2 * stop) / ACCELERATION_MPS2 * (stop < FAR_M),
             (speed - limit) / 10,
             speed / 10,
             speed.square() * curvature.abs() / 4,

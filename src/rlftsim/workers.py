@@ -207,6 +207,38 @@ def require_finished(runner: Runner, num_left: int, num_items: int, title: str) 
     raise NotYetError(f"{title}: finished pieces vanished meanwhile (another process in the same folder?): run again.")
 
 
+class Attempts:
+    """Items that wait for a process, and those set aside after ending theirs again and again.
+
+    Args:
+        items: of the work.
+        name_of: name of an item in messages.
+    """
+
+    def __init__(self, items: Sequence[Any], name_of: Callable[[Any], str]) -> None:
+        self._items, self._name_of = items, name_of
+        self._deaths = Counter[int]()
+        self.waiting = deque(range(len(items)))
+        self.set_aside: dict[str, str] = {}
+        """Name of the item -> reason."""
+
+    def again(self, number: int, reason: str, *, counts: bool = True) -> None:
+        """Try an item first of all again, or set it aside.
+
+        Args:
+            number: of the item.
+            reason: of the end of its process.
+            counts: False = the item had no part in it.
+        """
+        name = self._name_of(self._items[number])
+        self._deaths[number] += counts
+        if self._deaths[number] < ATTEMPTS:
+            log.warning(f"the process of {name} died ({reason}): trying again.")
+            self.waiting.appendleft(number)
+        else:
+            self.set_aside[name] = reason
+
+
 @dataclass(frozen=True)
 class Processes:
     """Several processes of this machine, each with one thread. They end with the process that started them.
@@ -230,11 +262,12 @@ class Processes:
         _refuse_unguarded_main()
         pickled = pickle_task(task)
         results: dict[int, Any] = {}
-        waiting, deaths, reasons = deque(range(len(items))), Counter[int](), dict[str, str]()
+        attempts = Attempts(items, name_of)
+        waiting = attempts.waiting
         crew: dict[Any, _Worker] = {}
         failed_starts = 0
         try:
-            while (num_left := len(items) - len(results) - len(reasons)) > 0:
+            while (num_left := len(items) - len(results) - len(attempts.set_aside)) > 0:
                 while len(crew) < min(self.jobs, num_left):
                     worker = _Worker()
                     crew[worker.line] = worker
@@ -262,23 +295,16 @@ class Processes:
                         failed_starts += not worker.was_ready
                         if failed_starts == ATTEMPTS or (self.on_death == "stop" and worker.item is not None):
                             raise DataError(_DIED.format(value))
-                        if worker.item is None:
-                            continue
-                        deaths[worker.item] += 1
-                        name = name_of(items[worker.item])
-                        if deaths[worker.item] < ATTEMPTS:
-                            log.warning(f"the process of {name} died ({value}): trying again.")
-                            waiting.appendleft(worker.item)
-                        else:
-                            reasons[name] = value
+                        if worker.item is not None:
+                            attempts.again(worker.item, value)
         finally:
             # A closed line is the sign to stop.
             for worker in crew.values():
                 worker.line.close()
             for worker in crew.values():
                 worker.process.join()
-        if reasons:
-            raise SetAside(reasons)
+        if attempts.set_aside:
+            raise SetAside(attempts.set_aside)
         return [results[number] for number in range(len(items))]
 
 

@@ -331,7 +331,7 @@ def test_a_line_that_cannot_be_read_is_explained(line, capsys):
             1,
             "rlftsim: the disk is full: free some",
         ),
-        (PermissionError(errno.EACCES, "Permission denied", "/root/x"), 1, "rlftsim: Permission denied: /root/x"),
+        (PermissionError(errno.EACCES, "Permission denied", "/data/x"), 1, "rlftsim: Permission denied: /data/x"),
         (torch.OutOfMemoryError("CUDA out of memory"), 1, "rlftsim: the GPU has too little memory: lower"),
     ],
 )

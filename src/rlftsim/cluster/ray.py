@@ -10,7 +10,7 @@ import os
 import pickle
 import socket
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -20,9 +20,9 @@ import rlftsim
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.progress import log
 from rlftsim.workers import (
-    ATTEMPTS,
     OUT_OF_MEMORY,
     Advance,
+    Attempts,
     OnDeath,
     SetAside,
     Task,
@@ -93,7 +93,8 @@ class RayRunner:
 
     def _run(self, pickled: bytes, items: Sequence[Any], advance: Advance, name_of: Callable[[Any], str]) -> list[Any]:
         results: dict[int, Any] = {}
-        waiting, deaths, reasons = deque(range(len(items))), Counter[int](), dict[str, str]()
+        attempts = Attempts(items, name_of)
+        waiting = attempts.waiting
         at_work: dict[Any, int] = {}
         is_waiting = False
         counted = Counter[int]()  # progress by item; a new process counts from zero
@@ -111,7 +112,7 @@ class RayRunner:
             counted[number] = total
 
         try:
-            while len(results) + len(reasons) < len(items):
+            while len(results) + len(attempts.set_aside) < len(items):
                 num_cores = int(ray.cluster_resources().get("CPU", 0))
                 while waiting and len(at_work) < AHEAD * max(num_cores, 1):
                     number = waiting.popleft()
@@ -132,17 +133,13 @@ class RayRunner:
                     try:
                         kind, value, total = pickle.loads(ray.get(ref))
                     except RayError as error:
-                        reason, name = _reason(error), name_of(items[number])
+                        reason = _reason(error)
                         if self.on_death == "stop":
+                            name = name_of(items[number])
                             raise DataError(
                                 f"the process of {name} died ({reason}): run the same command again, it resumes."
                             ) from None
-                        deaths[number] += not isinstance(error, NodeDiedError)
-                        if deaths[number] < ATTEMPTS:
-                            log.warning(f"the process of {name} died ({reason}): trying again.")
-                            waiting.appendleft(number)
-                        else:
-                            reasons[name] = reason
+                        attempts.again(number, reason, counts=not isinstance(error, NodeDiedError))
                         continue
                     if kind == "error":
                         raise value
@@ -150,8 +147,8 @@ class RayRunner:
                     count(number, total)
         finally:
             _cancel(list(at_work))
-        if reasons:
-            raise SetAside(reasons)
+        if attempts.set_aside:
+            raise SetAside(attempts.set_aside)
         return [results[number] for number in range(len(items))]
 
 
@@ -171,7 +168,7 @@ class _Board:
         self._totals[number] = total
 
     def take(self) -> dict[int, int]:
-        """What was reported since the last call."""
+        """Progress by item, as reported since the last call."""
         totals, self._totals = self._totals, {}
         return totals
 
