@@ -3,6 +3,7 @@ import math
 import shutil
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -161,19 +162,38 @@ def test_standing_tokens_count_less(vocabulary, drawn_scenarios):
     batch = collate(drawn_scenarios)
     dist = tiny.tiny_policy(vocabulary, tiny.WITHOUT_CHANCE).teacher_forced(batch, batch.agent_mask)
     logits, target = dist.logits[dist.target_mask], dist.target[dist.target_mask]
-    losses = torch.nn.functional.cross_entropy(logits, target, reduction="none")
     still = target == 0
     assert 0 < int(still.sum()) < len(still)
-    for weight in (0.0, 0.25, 1.0):
+    for weight in (0.25, 1.0):
+        weighed = logits.clone()
+        weighed[:, 0] += math.log(weight)
+        losses = torch.nn.functional.cross_entropy(weighed, target, reduction="none")
         found = summed_loss(dist, 0.0, still_weight=weight)
         expected = losses[~still].sum() + weight * losses[still].sum()
         assert float(found.loss.detach()) == pytest.approx(float(expected.detach()), rel=1e-5)
         assert float(found.count) == pytest.approx(int((~still).sum()) + weight * int(still.sum()))
-    # Smoothed targets of standing tokens count less, too: the loss is linear in the weight.
-    for nearby in (None, vocabulary):
-        low, mean, high = (float(summed_loss(dist, 0.2, nearby, w).loss.detach()) for w in (0.0, 0.5, 1.0))
-        assert low < mean < high
-        assert mean == pytest.approx((low + high) / 2, rel=1e-5)
+        # The metrics are of the model's own probabilities.
+        entropies = torch.distributions.Categorical(logits=logits).entropy()
+        entropy = entropies[~still].sum() + weight * entropies[still].sum()
+        assert float(found.sums["entropy"]) == pytest.approx(float(entropy.detach()), rel=1e-5)
+
+
+def test_the_weight_of_standing_tokens_leaves_their_learned_probability_alone():
+    """Without it a model says 0.15 * 0.9 / (0.15 * 0.9 + 0.1) = 57 % where 90 % of the data stand."""
+    target = torch.tensor([0] * 90 + [1] * 7 + [2] * 3)
+    counts, class_id = torch.ones(100, dtype=torch.bool), torch.zeros(100, dtype=torch.long)
+    logits = torch.zeros(3, requires_grad=True)
+    optimizer = torch.optim.LBFGS([logits], max_iter=100)
+
+    def loss():
+        optimizer.zero_grad()
+        dist = SimpleNamespace(logits=logits.expand(100, 3), target=target, target_mask=counts, class_id=class_id)
+        value = summed_loss(dist, 0.0, still_weight=0.15).loss
+        value.backward()
+        return value
+
+    optimizer.step(loss)
+    torch.testing.assert_close(logits.softmax(-1), torch.tensor([0.9, 0.07, 0.03]), atol=1e-3, rtol=0)
 
 
 def test_the_average_of_the_weights_is_saved_and_resumes(vocabulary, drawn_scenarios, tmp_path):
@@ -212,6 +232,7 @@ def test_the_average_of_the_weights_is_saved_and_resumes(vocabulary, drawn_scena
     ("setting", "message"),
     [
         ({"still_weight": 1.5}, "still_weight is a weight"),
+        ({"still_weight": 0.0}, "still_weight is a weight"),
         ({"ema_decay": 1.0}, "ema_decay is"),
         ({"mirror_probability": -0.1}, "mirror_probability is a probability"),
     ],

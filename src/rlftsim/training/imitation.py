@@ -87,7 +87,8 @@ class ImitationConfig:
     traffic on the other side of the road."""
     still_weight: float = 1.0
     """Weight of a prediction whose target stands still, in the loss and all metrics; others count 1. Three quarters of
-    all tokens stand and few turn, so a small weight teaches more per update. Needs a policy with a vocabulary."""
+    all tokens stand and few turn, so a small weight teaches more per update. The probability of standing that is learned
+    is that of the data, whatever the weight. Needs a policy with a vocabulary."""
     ema_decay: float | None = None
     """Validate and save an exponential moving average of the weights, with this fraction of it kept at each update,
     such as 0.999. Less is kept in the first updates. None = the weights themselves."""
@@ -113,8 +114,8 @@ class ImitationConfig:
             raise ConfigError(f"final_lr_ratio is a fraction in [0, 1], got {self.final_lr_ratio}.")
         if not 0 <= self.mirror_probability <= 1:
             raise ConfigError(f"mirror_probability is a probability in [0, 1], got {self.mirror_probability}.")
-        if not 0 <= self.still_weight <= 1:
-            raise ConfigError(f"still_weight is a weight in [0, 1], got {self.still_weight}.")
+        if not 0 < self.still_weight <= 1:
+            raise ConfigError(f"still_weight is a weight above 0 and at most 1, got {self.still_weight}.")
         if self.ema_decay is not None and not 0 < self.ema_decay < 1:
             raise ConfigError(f"ema_decay is a fraction between 0 and 1, or None, got {self.ema_decay}.")
         if not 0 <= self.label_smoothing < 1:
@@ -389,7 +390,15 @@ def summed_loss(
     """
     logits, target = prediction.logits[prediction.target_mask], prediction.target[prediction.target_mask]  # [r, V], [r]
     log_probs = functional.log_softmax(logits, -1)
+    measured_log_probs = log_probs.detach()
     weight = torch.where(target == STILL_TOKEN, still_weight, 1.0)  # [r]
+    if still_weight != 1.0:
+        # Weighted targets teach probabilities in proportion to weight times probability. They are compared with what
+        # the model would say of such data, so that its own probability of standing stays that of the data: else parked
+        # cars set off.
+        prior = torch.zeros(logits.shape[-1], device=logits.device)  # [V]
+        prior[STILL_TOKEN] = math.log(still_weight)
+        log_probs = functional.log_softmax(log_probs + prior, -1)
     if nearby is None:
         # Impossible tokens have log-probabilities of about -1e8, which would swamp the mean.
         exists = logits > IMPOSSIBLE
@@ -401,7 +410,7 @@ def summed_loss(
     of_target = log_probs.gather(-1, target[:, None])[:, 0]
     loss = -((1 - label_smoothing) * (weight * of_target).sum() + label_smoothing * elsewhere)
     hits = logits.detach().topk(min(5, logits.shape[-1]), dim=-1).indices == target[:, None]  # [r, 5]
-    entropy = -(log_probs.detach().exp() * log_probs.detach()).sum(-1)
+    entropy = -(measured_log_probs.exp() * measured_log_probs).sum(-1)
     measured = {"accuracy": hits[:, 0], "top5_accuracy": hits.any(-1), "entropy": entropy}  # [r] each
     sums = {name: (weight * values).sum() for name, values in measured.items()}
     return ImitationLoss(loss, weight.sum(), sums)
