@@ -87,8 +87,8 @@ class ImitationConfig:
     traffic on the other side of the road."""
     still_weight: float = 1.0
     """Weight of a prediction whose target stands still, in the loss and all metrics; others count 1. Three quarters of
-    all tokens stand and few turn, so a small weight teaches more per update. The probability of standing that is learned
-    is that of the data, whatever the weight. Needs a policy with a vocabulary."""
+    all tokens stand and few turn, so a small weight teaches more per update. The learned probability of standing is
+    that of the data, whatever the weight. Needs a policy with a vocabulary."""
     ema_decay: float | None = None
     """Validate and save an exponential moving average of the weights, with this fraction of it kept at each update,
     such as 0.999. Less is kept in the first updates. None = the weights themselves."""
