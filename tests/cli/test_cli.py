@@ -13,6 +13,7 @@ import torch
 from rlftsim import __version__
 from rlftsim.cli.goals import Choice
 from rlftsim.cli.main import VERBS, main
+from rlftsim.policies.registry import load_policy
 from rlftsim.policies.smart.config import smart_demo
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.rollout.baselines import ConstantVelocity
@@ -129,6 +130,10 @@ WRONG = {
     ),
     "a baseline to fine-tune": (
         "finetune smart-demo --model constant_velocity --data synthetic --out {tmp}/o",
+        "ConstantVelocity has no weights",
+    ),
+    "a baseline to pre-train": (
+        "pretrain smart-demo --data synthetic --out {tmp}/o --init-from constant_velocity",
         "ConstantVelocity has no weights",
     ),
     "a vocabulary that is not there": (
@@ -383,6 +388,12 @@ def test_pretraining_and_fine_tuning_by_command(vocabulary, tmp_path, capsys):
     card = (base / "model" / "README.md").read_text()
     assert "CC0" in card
     assert "40 scenarios" in card
+    # trained further, by a recipe of another size
+    further = ["pretrain", "smart-nano", *common, "--init-from", base, "--out", tmp_path / "further"]
+    assert run(capsys, *further, *once, *settings("pretrain", learning_rate=1e-9))[0] == 0
+    before, after = (load_policy(folder).state_dict() for folder in (base, tmp_path / "further"))
+    for name, value in before.items():
+        torch.testing.assert_close(after[name], value, atol=1e-6, rtol=0)
     once = settings("finetune", epochs=0.025, batch_size=1, num_rollouts=2)
     status, out, _ = run(capsys, "finetune", "smart-demo", "--model", base, *common, "--out", tuned, *once)
     assert status == 0
@@ -444,6 +455,13 @@ def test_settings_without_effect_are_refused(tmp_path, capsys):
     status, _, err = run(capsys, *words, "--finetune.reward", "rloo")
     assert status == 2
     assert "--finetune.reward has no effect here: the settings of pretrain are --model.* and --pretrain.*" in err
+    status, _, err = run(capsys, *words, "--init-from", "demo-base")
+    assert status == 2
+    assert f"--vocabulary {tmp_path / 'v'} has no effect: demo-base has one of its own" in err
+    words = ["pretrain", "smart-demo", "--data", "synthetic", "--init-from", "demo-base", "--out", tmp_path / "run"]
+    status, _, err = run(capsys, *words, "--model.dim", "16")
+    assert status == 2
+    assert "--model.dim has no effect with --init-from demo-base: that model has its own sizes" in err
 
 
 def test_what_has_no_effect_on_a_method_is_refused(tmp_path, vocabulary, capsys):

@@ -13,6 +13,7 @@ from rlftsim.cli.recipe_verb import Processes, RecipeVerb, refuse_settings, valu
 from rlftsim.errors import ConfigError, RlftsimError
 from rlftsim.evaluation.learning_curve import write_learning_curve
 from rlftsim.experiments.stages import GoalConditioning, finetune_model, pretrain_policy
+from rlftsim.policies.registry import load_policy
 from rlftsim.progress import log
 from rlftsim.recipes.registry import Recipe
 from rlftsim.scenario.dataset import ScenarioDataset
@@ -29,7 +30,8 @@ RecipeArgument = Annotated[Positional[str], tyro.conf.arg(metavar="RECIPE")]
 
 @dataclass(frozen=True)
 class Pretrain(RecipeVerb):
-    """Train a model from fresh weights to predict the next motion token of every agent along the logged tracks.
+    """Train a model to predict the next motion token of every agent along the logged tracks, from fresh weights or
+    further (--init-from).
 
     Writes checkpoints, metrics and the finished model, OUT/model. An interrupted run continues when the same
     command is repeated.
@@ -45,6 +47,9 @@ class Pretrain(RecipeVerb):
     """Folder of the run: configuration, metrics, checkpoints, model."""
     vocabulary: Path | None = None
     """File that `rlftsim tokens` wrote; needed by models with a vocabulary, such as SMART."""
+    init_from: str | None = None
+    """Model to train further, such as one of synthetic scenarios on logs: a run, a model folder or a registered name.
+    It brings its architecture and vocabulary. Left out: fresh weights."""
     processes: Processes = None
     """Processes that train, in short for --pretrain.device.processes."""
     split: str = "training"
@@ -58,20 +63,31 @@ class Pretrain(RecipeVerb):
     repeated from its own config.json, with the same recipe, flags of the model, vocabulary and data, gives the same
     weights bit for bit. Flags override the file."""
 
+    def refuse_useless(self, flags: Sequence[str]) -> None:
+        """Refuse what a model that is trained further brings along.
+
+        Raises:
+            ConfigError: one of the flags would have no effect.
+        """
+        if self.init_from is not None:
+            if self.vocabulary is not None:
+                raise ConfigError(f"--vocabulary {self.vocabulary} has no effect: {self.init_from} has one of its own.")
+            refuse_settings(flags, ["model"], f"with --init-from {self.init_from}: that model has its own sizes.")
+
     def run(self) -> int:
-        """Build the model and train it."""
+        """Build or load the model and train it."""
         recipe = self.settings
-        if self.vocabulary is None and recipe.tokens is not None:
+        if self.vocabulary is None and recipe.tokens is not None and self.init_from is None:
             raise ConfigError(
                 f"recipe {self.recipe} needs a vocabulary: build one with `rlftsim tokens`, then name it with "
-                "--vocabulary."
+                "--vocabulary, or train a model further with --init-from."
             )
         scenarios = open_dataset(self.data, self.split)
         vocabulary = Vocabulary.load(self.vocabulary) if self.vocabulary else None
         held_out = _held_out(self.data, self.validation_split, recipe.pretrain.validation.every)
         # The curve is drawn of interrupted runs, too.
         with _learning_curve(self.out):
-            policy = recipe.new_policy(vocabulary)
+            policy = recipe.new_policy(vocabulary) if self.init_from is None else load_policy(self.init_from)
             model = pretrain_policy(policy, scenarios, recipe.pretrain, self.out, held_out=held_out)
         print(f"model: {model}")
         return 0

@@ -61,7 +61,7 @@ def find_vocabulary(training: ScenarioDataset, config: TokensConfig, path: Path,
 
 
 def pretrain_policy(
-    policy: nn.Module,
+    policy: Any,
     training: ScenarioDataset,
     config: PretrainConfig,
     out: Path,
@@ -71,7 +71,7 @@ def pretrain_policy(
     """Folder of the model that pre-training makes of a policy.
 
     Args:
-        policy: with fresh weights, such as `recipe.new_policy(vocabulary)`; trained in place.
+        policy: such as `recipe.new_policy(vocabulary)`; trained in place.
         training: training scenarios.
         config: settings.
         out: folder of the run. A run that was stopped there is resumed, a finished one is not repeated.
@@ -81,8 +81,9 @@ def pretrain_policy(
         CheckpointError: `out` holds a run with other settings.
     """
     card = model_card("pre-trained", training.folder, len(training))
-    # Refuses a module that is not a `PretrainablePolicy`.
-    return pretrain(policy, training, out, config, held_out=held_out, card=card)  # type: ignore[arg-type]
+    if isinstance(policy, nn.Module):
+        policy.requires_grad_(True)  # weights of a loaded policy are frozen
+    return pretrain(policy, training, out, config, held_out=held_out, card=card)
 
 
 def finetune_model(

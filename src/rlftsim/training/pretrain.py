@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from rlftsim.rollout.policy import ImitatedPolicy, PretrainablePolicy
 from rlftsim.training.imitation import ImitationConfig, imitate, loss_along_log
 from rlftsim.training.run import TrainingScenarios, as_scenarios, require_trainable
 
@@ -16,7 +15,7 @@ class PretrainConfig(ImitationConfig):
 
 
 def pretrain(
-    model: PretrainablePolicy | ImitatedPolicy,
+    model: object,
     scenarios: TrainingScenarios,
     out: str | os.PathLike[str],
     config: PretrainConfig,
@@ -27,7 +26,8 @@ def pretrain(
     """Pre-train a model in place; resumes where a run in `out` was stopped.
 
     Args:
-        model: an nn.Module that is a PretrainablePolicy or an ImitatedPolicy; its own loss goes first.
+        model: an nn.Module that is a PretrainablePolicy or an ImitatedPolicy; its own loss goes first. Others are
+            refused.
         scenarios: a data set, a list or one scenario, with their futures.
         out: the run's folder.
         config: see its fields.
