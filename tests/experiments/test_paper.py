@@ -18,6 +18,7 @@ from rlftsim.experiments.paper import (
     benchmark,
     credit,
     finetune_curve,
+    kl_frontier,
     model_agnosticism,
     oracle,
     paired_ttest,
@@ -172,6 +173,54 @@ def test_every_reward_has_the_recipes_budget():
         if one.credit == "rollout" and one.method in ("mloo", "rloo"):
             config = finetune_config(one, TINY.finetune)
             assert (config.reward, config.epochs, config.batch_size, config.num_rollouts) == (one.method, 0.5, 1, 2)
+
+
+# ---- rewards at equal KL ---------------------------------------------------------------------------------------------
+
+
+def frontier(suite, gain_per_nat):
+    """Made-up runs that reach their targets but for minADE's, which stops at 0.03, and their evaluations."""
+    rows = {"base": row("base", EASE.tolist())}
+    for number, (name, spec) in enumerate(kl_frontier.REWARDS.items()):
+        for target in kl_frontier.TARGETS:
+            reached = min(target, 0.03) if name.startswith("minADE") else target
+            for one in over_seeds(replace(spec, kl_target=target), suite.num_seeds):
+                run = suite.model_folder(one)
+                run.mkdir(parents=True, exist_ok=True)
+                line = {"kl": reached, "entropy": 2.0, "diversity_m": 5.0, "speed_gap_mps": -1.0, "reward_std": 0.1}
+                (run / "metrics.jsonl").write_text(json.dumps({"update": 0, **line}) + "\n")
+            gain, noise = gain_per_nat[name] * reached, (number, number + 10)
+            rows[kl_frontier.point(name, target)] = row(name, *(around(gain, seed) for seed in noise))
+    return rows
+
+
+def test_rewards_are_compared_at_the_largest_kl_that_all_reach(suite):
+    slopes = dict(zip(kl_frontier.REWARDS, (5.0, 4.0, 2.0, 1.0, -1.0)))
+    found = kl_frontier.summarize(frontier(suite, slopes), suite)
+    assert found.numbers["kl"] == pytest.approx(0.03)
+    for name, slope in slopes.items():  # between the targets 0.015 and 0.045
+        gain = found.numbers["at_equal_kl"][name]["meta_metric"]["mean"] - EASE.mean()
+        assert gain == pytest.approx(0.03 * slope, abs=0.005)
+    assert found.verdicts[0].endswith("at a KL of 0.0300 nats and the 5% level: confirmed.")
+    assert "RLOO, KL 0.0450" in {cells[0] for cells in found.tables[2].rows}
+
+
+@pytest.mark.parametrize(
+    ("slopes", "verdict"),
+    [
+        ((4.0, 5.0, 2.0, 1.0, 0.0), "refuted: RLOO above MLOO by 0.0"),
+        ((5.0, 2.0, 2.0, 1.0, 0.0), "not decided: no difference between RLOO and minADE, RLOO"),
+    ],
+)
+def test_the_order_of_the_paper_may_be_refuted_or_open(suite, slopes, verdict):
+    found = kl_frontier.summarize(frontier(suite, dict(zip(kl_frontier.REWARDS, slopes))), suite)
+    assert verdict in found.verdicts[0]
+
+
+def test_a_run_at_a_target_kl_has_a_folder_and_settings_of_its_own():
+    spec = replace(kl_frontier.REWARDS["RLOO"], kl_target=0.015)
+    assert spec.name == "rloo-kl0.015-seed0"
+    assert finetune_config(spec, TINY.finetune).kl == replace(TINY.finetune.kl, target=0.015)
 
 
 # ---- paired t-test ---------------------------------------------------------------------------------------------------

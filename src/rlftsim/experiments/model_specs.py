@@ -73,6 +73,8 @@ class FineTuned:
     """Model that the fine-tuning starts from."""
     goals: GoalTraining | None = None
     """None = goal-free."""
+    kl_target: float | None = None
+    """Target KL of a reward's run, nats a decision. None = the recipe's."""
 
     @property
     def name(self) -> str:
@@ -81,7 +83,8 @@ class FineTuned:
         credit = "" if self.credit == "rollout" else f"-{self.credit}"
         base = "" if self.base == Base() else f"-from-{self.base.name}"
         goals = "" if self.goals is None else f"-{self.goals.name}"
-        return f"{self.method}{goals}{credit}{base}-seed{self.seed}"
+        kl = "" if self.kl_target is None else f"-kl{self.kl_target:g}"
+        return f"{self.method}{goals}{credit}{kl}{base}-seed{self.seed}"
 
     def training_config(self, recipe: Recipe) -> FinetuningConfig:
         """Settings of the training; their type is that of the method.
@@ -170,7 +173,8 @@ def finetune_config(spec: FineTuned, recipe: FinetuneConfig) -> FinetuneConfig:
         reward = f"{spec.method}(goal_weight={spec.goals.weight}, kind='{spec.goals.kind}')"
         goals = with_goals(recipe.goals)
     epochs = recipe.epochs * spec.epochs_fraction
-    return replace(recipe, reward=reward, seed=spec.seed, epochs=epochs, credit=spec.credit, goals=goals)
+    kl = recipe.kl if spec.kl_target is None else replace(recipe.kl, target=spec.kl_target)
+    return replace(recipe, reward=reward, seed=spec.seed, epochs=epochs, credit=spec.credit, goals=goals, kl=kl)
 
 
 def catk_config(spec: FineTuned, catk: CatkConfig, finetune: FinetuneConfig) -> CatkConfig:

@@ -11,7 +11,7 @@ from rlftsim.plugins import ExtensionPoint
 
 PAPER = (
     *("benchmark", "reward-ablation", "paired-ttest", "variance-scaling", "finetune-curve", "oracle", "credit"),
-    "model-agnosticism",
+    *("model-agnosticism", "kl-frontier"),
     *("qualitative", "goal-conditioning", "kinematic-controllability", "maneuver-controllability"),
 )
 """Names of the paper's experiments."""

@@ -66,12 +66,15 @@ class Row:
         return f"{line}; mean {mean.mean:+.4f}, 95% interval over seeds [{low:+.4f}, {high:+.4f}]."
 
 
-def mean_of_seeds(name: str, evaluations: Sequence[Evaluation]) -> Evaluation:
+def mean_of_seeds(
+    name: str, evaluations: Sequence[Evaluation], *, weights: Sequence[float] | None = None
+) -> Evaluation:
     """An evaluation whose scores are means over evaluations of the same scenarios, scenario by scenario.
 
     Args:
         name: of the mean.
         evaluations: one for each seed.
+        weights: of each evaluation, their sum is 1. None = all alike.
 
     Raises:
         DataError: they are of different scenarios.
@@ -82,6 +85,7 @@ def mean_of_seeds(name: str, evaluations: Sequence[Evaluation]) -> Evaluation:
     # Ids and numbers of agents are the same for all seeds; only scores are averaged. NaN in one seed stays NaN.
     table = first.table
     for column in SCORE_COLUMNS:
-        mean = np.mean([evaluation.values(column) for evaluation in evaluations], axis=0)  # [scenarios]
+        scores = [evaluation.values(column) for evaluation in evaluations]
+        mean = np.average(scores, axis=0, weights=weights)  # [scenarios]
         table = table.set_column(table.schema.get_field_index(column), SCHEMA.field(column), pa.array(mean))
     return Evaluation(name, first.provenance, table, first.skipped)

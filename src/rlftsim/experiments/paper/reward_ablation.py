@@ -1,6 +1,6 @@
 """Table 2 and the table of heuristic rewards: the same budget spent on different rewards."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -73,17 +73,24 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
 
 def _distances(suite: ExperimentSuite) -> tables.TextTable:
     """Distance of each fine-tuned model from the base model at the end of its runs; no rows where there are no runs."""
-    rows = []
-    for name, spec in REWARDS.items():
-        runs = [suite.model_folder(one) for one in over_seeds(spec, suite.num_seeds)]
-        metrics = [read_metrics(run) for run in runs if (run / "metrics.jsonl").exists()]
-        # The last part of every run, at least its last update.
-        ends = [line for lines in metrics for line in lines[-max(len(lines) // LAST_PART, 1) :]]
-        if ends:
-            means = (f"{np.mean([line[metric] for line in ends]):.3g}" for metric in DISTANCES)
-            rows.append((name, *means))
+    ends = {name: mean_at_end(suite, over_seeds(spec, suite.num_seeds)) for name, spec in REWARDS.items()}
+    rows = [(name, *(f"{end[metric]:.3g}" for metric in DISTANCES)) for name, end in ends.items() if end]
     note = f"Means over the last {100 // LAST_PART} % of the updates; training rollouts."
     return tables.TextTable("Distance from the base model", ("", *DISTANCES.values()), tuple(rows), note)
+
+
+def mean_at_end(suite: ExperimentSuite, specs: Sequence[FineTuned]) -> dict[str, float]:
+    """Mean of each of `DISTANCES` over the last part of runs; empty where there are no runs.
+
+    Args:
+        suite: where the runs are.
+        specs: one for each seed.
+    """
+    runs = [suite.model_folder(spec) for spec in specs]
+    metrics = [read_metrics(run) for run in runs if (run / "metrics.jsonl").exists()]
+    # The last part of every run, at least its last update.
+    ends = [line for lines in metrics for line in lines[-max(len(lines) // LAST_PART, 1) :]]
+    return {metric: float(np.mean([line[metric] for line in ends])) for metric in DISTANCES} if ends else {}
 
 
 EXPERIMENT = Experiment(
