@@ -285,8 +285,8 @@ def test_hindsight_counts_as_often_as_it_is_likelier(policy, experience, fabric)
     decides = rollouts.decision_mask.any(-1)
     weight = 0.5 * ratio / ratio[decides].mean()
     loss = 0.0
-    assert other.earned.abs().max() > 0
-    for seen, earned in ((rollouts, sampled.rewards.by_agent), (other.rollouts, weight * other.earned)):
+    assert other.rewards.by_agent.abs().max() > 0
+    for seen, earned in ((rollouts, sampled.rewards.by_agent), (other.rollouts, weight * other.rewards.by_agent)):
         log_prob = start.score(start.encode(batch), seen).log_prob(rollouts.decision)
         by_agent = agent_log_prob(log_prob, rollouts.decision_mask, "mean")
         loss = loss - (earned * by_agent).sum() / batch.num_scenarios

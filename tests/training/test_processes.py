@@ -23,6 +23,7 @@ from rlftsim.scenario.synthetic import pack_path
 from rlftsim.training import finetune as finetune_module
 from rlftsim.training import imitation as imitation_module
 from rlftsim.training import parallel
+from rlftsim.training.goals import GoalConfig
 from rlftsim.training.parallel import DeviceConfig, all_reduce_sum
 from rlftsim.training.processes import in_processes
 from rlftsim.training.run import TrainingRun
@@ -92,14 +93,60 @@ def test_two_processes_find_the_gradient_of_one_for_every_method(stage, vocabula
             assert b[name] == pytest.approx(a[name], rel=1e-5, abs=1e-6), name
 
 
+def test_tensors_of_all_processes_are_gathered_bit_for_bit():
+    def own(rank):
+        return {
+            "floats": torch.tensor([-0.0, torch.nan, 1 / 3])[rank:],
+            "numbers": torch.arange(2 * rank).view(2, rank).T * 2**40,
+            "flags": torch.tensor([rank == 1]),
+        }
+
+    def work(fabric):
+        everything = parallel.all_gather(own(fabric.global_rank), fabric)
+        for rank, found in enumerate(everything):
+            for name, expected in own(rank).items():
+                assert found[name].dtype == expected.dtype
+                assert found[name].numpy().tobytes() == expected.contiguous().numpy().tobytes()
+        return len(everything)
+
+    assert in_processes(work, replace(tiny.CPU, processes=3)) == 3
+
+
+def test_processes_that_are_more_than_scenarios_divide_their_rollouts(vocabulary, drawn_scenarios, tmp_path):
+    """Two updates with every term of the loss, each with a baseline over all rollouts of a scenario."""
+    model = replace(tiny.WITHOUT_CHANCE, goal="concat")
+    changes = {
+        "batch_size": 1, "epochs": 1.0, "num_rollouts": 4, "rollouts_per_pass": 3, "imitation_weight": 0.1,
+        "reward": "mloo + 0.5*rloo + 0.1*goal", "goals": GoalConfig(probability=1.0, hindsight=0.5),
+        "gradient_clip": 1e9, "learning_rate": 1e-4, "warmup_updates": 0,
+    }  # fmt: skip
+    policies = {}
+    for name, device in (("one", tiny.CPU), ("two", TWO)):
+        policies[name] = train("everything", vocabulary, drawn_scenarios[:2], tmp_path / name, device, model, **changes)
+    one, two = timeless(tmp_path / "one"), timeless(tmp_path / "two")
+    assert len(one) == len(two) == 2
+    assert {"hindsight_ratio", "imitation_loss", "goal_reached_rate"} <= one[0].keys()
+    assert one[0]["reward_std"] > 1e-4
+    for a, b in zip(one, two):
+        for name in a.keys() - {"score_gap"}:  # of a process
+            assert b[name] == pytest.approx(a[name], rel=1e-4, abs=1e-6), name
+    for name, gradient in tiny.gradients_of(policies["one"]).items():
+        torch.testing.assert_close(tiny.gradients_of(policies["two"])[name], gradient, atol=1e-5, rtol=1e-4, msg=name)
+    first, second = weights(tmp_path / "one"), weights(tmp_path / "two")
+    for name, weight in first.items():
+        torch.testing.assert_close(second[name], weight, atol=1e-5, rtol=1e-5, msg=name)
+
+
 # ---- the same bits ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("stage", "update"), [("pretrain", 3), ("everything", 3)])
+@pytest.mark.parametrize(
+    ("stage", "update", "batch_size"), [("pretrain", 3, 2), ("everything", 3, 2), ("everything", 3, 1)]
+)
 def test_a_run_of_two_processes_is_resumed_bit_for_bit(
-    stage, update, vocabulary, drawn_scenarios, tmp_path, monkeypatch
+    stage, update, batch_size, vocabulary, drawn_scenarios, tmp_path, monkeypatch
 ):
-    changes = {"epochs": 2.0, "batch_size": 2}  # four updates, checkpoints after 2 and 4
+    changes = {"epochs": float(batch_size), "batch_size": batch_size}  # four updates, checkpoints after 2 and 4
     train(stage, vocabulary, drawn_scenarios, tmp_path / "whole", **changes)
     module, name = {"pretrain": (imitation_module, "_update"), "everything": (finetune_module, "update_policy")}[stage]
     original, calls = getattr(module, name), []
@@ -285,6 +332,11 @@ def test_several_processes_are_refused_where_they_cannot_be_forked(monkeypatch):
     monkeypatch.undo()
     with pytest.raises(ConfigError, match=r"a batch of 1 scenarios cannot be spread over 2 processes"):
         in_processes(lambda fabric: parallel.local_indices([4], fabric), TWO)
+    three = replace(tiny.CPU, processes=3)
+    with pytest.raises(
+        ConfigError, match=r"of 2 scenarios .* over 3 .* to 2 at most, or to 4 or 8, which divide the rol"
+    ):
+        in_processes(lambda fabric: parallel.local_indices([4, 5], fabric, num_rollouts=4), three)
 
 
 UPDATES = 16

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import Any, Protocol, runtime_checkable
 
 import torch
@@ -20,7 +20,7 @@ from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import CURRENT_STEP, STEP_S
 from rlftsim.threads import one_thread
 from rlftsim.training.goals import GoalConfig, StoredGoals, choose_goals
-from rlftsim.training.parallel import Fabric, all_reduce_sum
+from rlftsim.training.parallel import Fabric, all_gather, all_reduce_sum
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,25 +33,19 @@ class Experience:
     rewards: Rewards
     context: Any = None
     """Of the batch, made without gradient by the policy that rolled out; None = there is none to share."""
+    own: range | None = None
+    """Rollouts that this process scores with gradient, where several have the same scenarios; None = all."""
 
     def slices(self, size: int) -> Iterator[tuple[Rollouts, Float[Tensor, "B n A"]]]:
-        """Yield the rollouts of every scenario, `size` at a time, with what each agent earned in them."""
-        return slices(self.rollouts, self.rewards.by_agent, size)
+        """Yield this process's rollouts of every scenario with what each agent earned in them.
 
-
-def slices(
-    rollouts: Rollouts, earned: Float[Tensor, "B N A"], size: int
-) -> Iterator[tuple[Rollouts, Float[Tensor, "B n A"]]]:
-    """Yield rollouts a few at a time, so that few are in memory with their gradient.
-
-    Args:
-        rollouts: N of each scenario.
-        earned: by each agent in each of them.
-        size: rollouts of every scenario in a slice; the last one may be smaller.
-    """
-    for start in range(0, rollouts.num_rollouts, size):
-        part = slice(start, start + size)
-        yield rollouts.select(part), earned[:, part]
+        Args:
+            size: rollouts of a scenario at a time, so that few are in memory with their gradient.
+        """
+        own = self.own or range(self.rollouts.num_rollouts)
+        for start in own[::size]:
+            part = slice(start, min(start + size, own.stop))
+            yield self.rollouts.select(part), self.rewards.by_agent[:, part]
 
 
 # ---- sampling and rewards ------------------------------------------------------------------------------------------
@@ -64,6 +58,7 @@ def sample_rollouts(
     augmented: StoredGoals | None,
     *,
     num_rollouts: int,
+    own: range,
     seed: int,
     update: int,
     fabric: Fabric,
@@ -76,18 +71,35 @@ def sample_rollouts(
         goals: probabilities of goals.
         augmented: goals beside the logged endpoints, if there are any.
         num_rollouts: N, of each scenario.
+        own: those of them that this process simulates; the others come from the processes that have the same scenarios.
         seed: of the run.
         update: counted from 0; with the seed it determines goals and rollouts.
-        fabric: precision of the pass.
+        fabric: precision of the pass, and the processes.
     """
     chosen = choose_goals(batch, goals, augmented, seed=derive_seed(seed, "goals", update))
     with fabric.autocast(), torch.no_grad(), one_thread():
         context = policy.encode(batch)
         rollouts = simulate(
-            policy, batch, num_rollouts=num_rollouts, seed=derive_seed(seed, "rollouts", update), context=context,
-            goals=chosen,
-        )  # fmt: skip
+            policy, batch, num_rollouts=own, seed=derive_seed(seed, "rollouts", update), context=context, goals=chosen
+        )
+    if len(own) < num_rollouts:
+        rollouts = _gather_rollouts(rollouts, num_rollouts, fabric)
     return context, rollouts
+
+
+def _gather_rollouts(own: Rollouts, num_rollouts: int, fabric: Fabric) -> Rollouts:
+    """All rollouts of the scenarios that several processes share, in their order and the same bits in each of them.
+
+    Rewards compare the rollouts of a scenario with each other, so each process needs them all. They are small.
+    """
+    names = [field.name for field in fields(own) if isinstance(getattr(own, field.name), Tensor)]
+    everything = all_gather({name: getattr(own, name) for name in names}, fabric)
+    sharing = num_rollouts // own.num_rollouts
+    first = fabric.global_rank - fabric.global_rank % sharing
+    parts = everything[first : first + sharing]
+    joined: dict[str, Any] = {name: torch.cat([part[name] for part in parts], 1) for name in names}
+    goals = own.goals and own.goals.rollouts(slice(1)).repeat(num_rollouts)
+    return replace(own, **joined, goals=goals)
 
 
 @runtime_checkable
@@ -140,8 +152,13 @@ def count_decisions(experiences: Sequence[Experience], fabric: Fabric) -> tuple[
         experiences: of this process.
         fabric: the processes.
     """
-    counts = [(e.batch.num_scenarios, int(e.rollouts.decision_mask.sum())) for e in experiences]
-    totals = torch.tensor(counts, device=fabric.device, dtype=torch.float64).sum(0)
+    totals = torch.zeros(2, device=fabric.device, dtype=torch.float64)
+    for experience in experiences:
+        own = experience.own or range(experience.rollouts.num_rollouts)
+        # Of processes with the same scenarios, the one with the first rollouts counts these.
+        num_scenarios = experience.batch.num_scenarios if own.start == 0 else 0
+        num_decisions = experience.rollouts.decision_mask[:, own.start : own.stop].sum()
+        totals += torch.stack([torch.tensor(num_scenarios, device=fabric.device), num_decisions])
     num_scenarios, num_decisions = all_reduce_sum(totals, fabric).tolist()
     return int(num_scenarios), num_decisions
 

@@ -29,7 +29,7 @@ from rlftsim.training.experience import (
 from rlftsim.training.freezing import TrainedParts, freeze_untrained, parameter_groups, set_learning_rate
 from rlftsim.training.goals import GoalConfig, StoredGoals, refuse_goals
 from rlftsim.training.hindsight import accumulate_hindsight, goal_terms
-from rlftsim.training.parallel import DeviceConfig, Fabric, all_reduce_gradients, num_sharing_memory
+from rlftsim.training.parallel import DeviceConfig, Fabric, all_reduce_gradients, local_rollouts, num_sharing_memory
 from rlftsim.training.policy_gradient import LossTerms, Reduction, accumulate_gradients
 from rlftsim.training.reference import KlConfig, RewardLearner, adapt_beta, sync_reference
 from rlftsim.training.run import (
@@ -154,7 +154,7 @@ def finetune(
     def train(config: FinetuneConfig, fabric: Fabric) -> Path:
         run = TrainingRun(
             policy, scenarios, out, config, fabric,
-            inputs={"augmented_goals": augmented.fingerprint} if augmented else {},
+            inputs={"augmented_goals": augmented.fingerprint} if augmented else {}, num_rollouts=config.num_rollouts,
             skip_rule=f"KL above max_kl={config.max_kl} or not finite",
             remedy="lower learning_rate or raise kl.initial_beta",
         )  # fmt: skip
@@ -216,16 +216,17 @@ def update_policy(
     """
     clock = UpdateClock(fabric.device)
     experiences: list[Experience] = []
+    own = local_rollouts(config.batch_size, config.num_rollouts, fabric)
     for part in batch.split(max(config.micro_batch_size // num_sharing_memory(fabric), 1)):
         # 1. Sample N rollouts of each scenario under this update's goals, without gradient.
         context, rollouts = sample_rollouts(
             learner.policy, part, config.goals, learner.augmented_goals,
-            num_rollouts=config.num_rollouts, seed=config.seed, update=learner.update, fabric=fabric,
+            num_rollouts=config.num_rollouts, own=own, seed=config.seed, update=learner.update, fabric=fabric,
         )  # fmt: skip
         clock.lap("rollout")
         # 2. Measure their realism and the reward that each rollout, or each agent in it, earns.
         realism, rewards = compute_reward(part, rollouts, config)
-        experiences.append(Experience(part, rollouts, realism, rewards, context))
+        experiences.append(Experience(part, rollouts, realism, rewards, context, own))
         clock.lap("reward")
     # 3. Score them under policy and reference: gradient of the policy-gradient loss with its KL penalty, and of the
     # pre-training loss where it has a weight.

@@ -10,8 +10,8 @@ before training.
 """
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -24,9 +24,8 @@ from rlftsim.rewards import Term
 from rlftsim.rewards.goal import goal_advantage
 from rlftsim.rollout.policy import encode_like
 from rlftsim.rollout.types import Rollouts
-from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.training.augment import ends_of, most_realistic
-from rlftsim.training.experience import Experience, slices
+from rlftsim.training.experience import Experience
 from rlftsim.training.parallel import Fabric, all_reduce_sum
 from rlftsim.training.policy_gradient import GradientSums, LossTerms, agent_log_prob, policy_gradient_loss
 
@@ -34,28 +33,12 @@ LARGEST_RATIO = 10.0
 """Importance ratios are clipped to it."""
 
 
-@dataclass(frozen=True, eq=False)
-class Relabelled:
-    """Rollouts under other goals than they were sampled under."""
-
-    batch: ScenarioBatch
-    rollouts: Rollouts
-    earned: Float[Tensor, "B N A"]
-    """By each agent for the new goals."""
-    context: Any = None
-    """See `Experience`."""
-
-    def slices(self, size: int) -> Iterator[tuple[Rollouts, Float[Tensor, "B n A"]]]:
-        """Yield the rollouts of every scenario, `size` at a time, with what each agent earned in them."""
-        return slices(self.rollouts, self.earned, size)
-
-
 def goal_terms(terms: Sequence[Term]) -> list[Term]:
     """The terms of a reward that depend on goals."""
     return [term for term in terms if term.name == "goal"]
 
 
-def relabel_with_hindsight(experiences: Sequence[Experience], terms: Sequence[Term]) -> list[Relabelled]:
+def relabel_with_hindsight(experiences: Sequence[Experience], terms: Sequence[Term]) -> list[Experience]:
     """The rollouts as if sampled under goals that the most realistic one has met, and what they earn by that.
 
     Only the reward's goal terms count: realism does not depend on goals and was rewarded before. Each agent earns
@@ -73,7 +56,8 @@ def relabel_with_hindsight(experiences: Sequence[Experience], terms: Sequence[Te
         for term in goal_terms(terms):
             options: dict[str, Any] = dict(term.options)
             earned = earned + term.weight * goal_advantage(rollouts, batch, **options)
-        relabelled.append(Relabelled(batch, rollouts, earned, experience.context))
+        rewards = replace(experience.rewards, by_agent=earned)
+        relabelled.append(replace(experience, rollouts=rollouts, rewards=rewards))
     return relabelled
 
 

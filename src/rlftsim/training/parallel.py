@@ -7,10 +7,11 @@ scenarios and agents are spread.
 On GPUs and under torchrun, lightning-fabric connects the processes; on a CPU see `training.processes`.
 """
 
+import io
 import multiprocessing
 import os
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol, cast, runtime_checkable
@@ -75,9 +76,9 @@ class DeviceConfig:
     """Kind of device; auto = CUDA if there is one."""
     processes: int | Literal["auto"] = "auto"
     """Processes on this machine, that is GPUs, or cores of a CPU. auto = one on a GPU, on a CPU one for each usable
-    core, but not more than scenarios in a batch or in memory at once, and one for a few scenarios. A run stores the
-    number in its config.json and is resumed with it: another one rounds otherwise. Under torchrun this and `num_nodes`
-    have no effect: torchrun decides."""
+    core, but not more than scenarios in a batch or in memory at once, and one for a few scenarios. In fine-tuning more
+    than scenarios divide the rollouts of each. A run stores the number in its config.json and is resumed with it:
+    another one rounds otherwise. Under torchrun this and `num_nodes` have no effect: torchrun decides."""
     num_nodes: int = 1
     """Machines."""
     precision: Literal["32-true", "bf16-mixed"] = "32-true"
@@ -173,25 +174,54 @@ def is_first_process() -> bool:
     return not several or torch.distributed.get_rank() == 0
 
 
-def local_indices(items: list[int], fabric: Fabric, costs: Sequence[float] | None = None) -> list[int]:
-    """This process's part of a global batch.
+def local_indices(
+    items: list[int], fabric: Fabric, costs: Sequence[float] | None = None, *, num_rollouts: int = 1
+) -> list[int]:
+    """This process's part of a global batch. Of fewer scenarios than processes, several processes have the same one.
 
     Args:
         items: scenario indices of the global batch.
         fabric: the processes.
         costs: of each item; the parts then cost about the same, else they are equally large.
+        num_rollouts: of each item, see `local_rollouts`.
 
     Raises:
-        ConfigError: there are fewer items than processes.
+        ConfigError: the processes cannot divide the scenarios, nor their rollouts, evenly.
     """
-    if len(items) < fabric.world_size:
-        raise ConfigError(
-            f"a batch of {len(items)} scenarios cannot be spread over {fabric.world_size} processes: raise batch_size, "
-            "or lower device.processes."
-        )
-    parts = balance_by_cost([1.0] * len(items) if costs is None else costs, fabric.world_size)
+    sharing = _num_sharing_scenario(len(items), num_rollouts, fabric)
+    parts = balance_by_cost([1.0] * len(items) if costs is None else costs, fabric.world_size // sharing)
     # The first part has the most expensive scenario, and rank 0 has more to do than others: it adds, logs and writes.
-    return [items[place] for place in parts[-1 - fabric.global_rank]]
+    return [items[place] for place in parts[-1 - fabric.global_rank // sharing]]
+
+
+def local_rollouts(num_items: int, num_rollouts: int, fabric: Fabric) -> range:
+    """Rollouts of its scenarios that this process simulates and scores: all, or a part where several share a scenario.
+
+    Args:
+        num_items: scenarios of the global batch.
+        num_rollouts: of each.
+        fabric: the processes.
+
+    Raises:
+        ConfigError: as `local_indices`.
+    """
+    sharing = _num_sharing_scenario(num_items, num_rollouts, fabric)
+    size = num_rollouts // sharing
+    return range(num_rollouts)[fabric.global_rank % sharing * size :][:size]
+
+
+def _num_sharing_scenario(num_items: int, num_rollouts: int, fabric: Fabric) -> int:
+    """Processes that have the same scenario and divide its rollouts: 1 if there are enough scenarios for all."""
+    if fabric.world_size <= num_items:
+        return 1
+    possible = [num_items * count for count in range(2, num_rollouts + 1) if num_rollouts % count == 0]
+    if fabric.world_size not in possible:
+        more = f", or to {' or '.join(map(str, possible))}, which divide the rollouts of a scenario" if possible else ""
+        raise ConfigError(
+            f"a batch of {num_items} scenarios cannot be spread over {fabric.world_size} processes: raise batch_size, "
+            f"or set device.processes to {num_items} at most{more}."
+        )
+    return fabric.world_size // num_items
 
 
 def num_sharing_memory(fabric: Fabric) -> int:
@@ -211,6 +241,27 @@ def all_reduce_sum(values: Tensor, fabric: Fabric) -> Tensor:
     if fabric.world_size == 1:
         return values
     return cast(Tensor, fabric.all_reduce(values, reduce_op="sum"))
+
+
+def all_gather(tensors: Mapping[str, Tensor], fabric: Fabric) -> list[dict[str, Tensor]]:
+    """The tensors of all processes, in the order of ranks, bit for bit and on this process's device.
+
+    Args:
+        tensors: of this process; those of others may have other shapes.
+        fabric: the processes.
+    """
+    file = io.BytesIO()
+    torch.save({name: tensor.contiguous() for name, tensor in tensors.items()}, file)
+    own = torch.frombuffer(file.getbuffer(), dtype=torch.uint8).to(fabric.device)
+    sizes = torch.zeros(fabric.world_size, dtype=torch.int64, device=fabric.device)
+    sizes[fabric.global_rank] = len(own)
+    sizes = all_reduce_sum(sizes, fabric)
+    # A sum is all that every kind of `Fabric` has: each process has a row of its own, and the others add zeros to it.
+    rows = torch.zeros(fabric.world_size, int(sizes.max()), dtype=torch.uint8, device=fabric.device)
+    rows[fabric.global_rank, : len(own)] = own
+    rows = all_reduce_sum(rows, fabric).cpu().numpy()
+    files = (io.BytesIO(row[:size].tobytes()) for row, size in zip(rows, sizes.tolist()))
+    return [torch.load(file, map_location=fabric.device, weights_only=True) for file in files]
 
 
 def all_reduce_gradients(parameters: Iterable[nn.Parameter], fabric: Fabric) -> None:

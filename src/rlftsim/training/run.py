@@ -211,6 +211,7 @@ class TrainingRun:
         config: settings of the method; stored in the folder.
         fabric: processes and device.
         inputs: further hashes of what the run starts from.
+        num_rollouts: of each scenario of an update; processes that are more than scenarios divide them.
         skip_rule: condition under which updates are skipped, for the message of a run that diverged.
         remedy: settings to change after a divergence, for the same message.
 
@@ -227,6 +228,7 @@ class TrainingRun:
         fabric: Fabric,
         *,
         inputs: Mapping[str, str] | None = None,
+        num_rollouts: int = 1,
         skip_rule: str = "their gradients are not finite",
         remedy: str = "lower learning_rate",
     ):
@@ -237,6 +239,7 @@ class TrainingRun:
         self.folder = RunFolder(Path(out), config, described, writes=fabric.is_global_zero)
         self._config = config
         self._fabric = fabric
+        self._num_rollouts = num_rollouts
         self._skip_rule = skip_rule
         self._remedy = remedy
         # Such a run ends with nearly its initial weights, which looks like a method that does not work.
@@ -260,7 +263,7 @@ class TrainingRun:
         chosen = scenarios_of_update(update, self._config.batch_size, len(self.scenarios), self._config.seed)
         # Costs of a list of scenarios are counted from the scenarios: not where nothing is divided.
         costs = self.costs[chosen].tolist() if self._fabric.world_size > 1 else None
-        return local_indices(chosen, self._fabric, costs)
+        return local_indices(chosen, self._fabric, costs, num_rollouts=self._num_rollouts)
 
     def train(self, learner: Learner, make_update: Callable[[], UpdateReport], *, title: str, card: str = "") -> Path:
         """Make all updates that are left, and save the trained policy.
