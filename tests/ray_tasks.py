@@ -24,3 +24,10 @@ def refuse(item, advance, is_stopped):
     from rlftsim.errors import DataError
 
     raise DataError(f"item {item} is broken")
+
+
+def reserved_memory(item, advance, is_stopped, weights=b""):
+    """Bytes that the cluster holds free for the process."""
+    import ray
+
+    return ray.get_runtime_context().get_assigned_resources()["memory"]

@@ -1,11 +1,13 @@
 """Work on a Ray cluster of two raylets on this machine: the same bytes as inline, whatever is killed."""
 
 import ast
+import json
 import os
 import pickle
 import shlex
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -78,6 +80,18 @@ def test_results_come_in_order_and_poison_is_set_aside(cluster):
         runner().run(ray_tasks.double_or_die, [1, "exit", 2], advance=ignore)
 
 
+def test_a_process_reserves_memory_by_the_size_of_the_model_and_leaves_a_line_of_json(cluster, tmp_path):
+    from rlftsim.cluster.ray import BYTES_OF_A_PROCESS, RayRunner
+
+    runner = RayRunner(item_log=tmp_path / "items.jsonl")
+    (small,) = runner.run(ray_tasks.reserved_memory, [0], advance=ignore)
+    (large,) = runner.run(partial(ray_tasks.reserved_memory, weights=bytes(5_000_000)), [0], advance=ignore)
+    assert BYTES_OF_A_PROCESS <= small < BYTES_OF_A_PROCESS + 1e6
+    assert large == pytest.approx(small + 1e8, rel=1e-3)
+    lines = [json.loads(line) for line in (tmp_path / "items.jsonl").read_text().splitlines()]
+    assert [line["item"] for line in lines] == ["0", "0"]
+
+
 def test_the_error_of_a_task_is_that_of_the_run(cluster):
     with pytest.raises(DataError, match=r"^item 1 is broken\n"):
         runner().run(ray_tasks.refuse, [1], advance=ignore)
@@ -114,7 +128,7 @@ def test_a_machine_with_another_version_or_without_the_folder_is_refused(cluster
         (("0.0", "."), r"the cluster has rlftsim .*, this machine 0\.0: install the same on all"),
         ((rlftsim.__version__, "/nowhere"), r"/nowhere \(.*\): give the command in a folder that all machines of the"),
     ):
-        kind, error, _ = pickle.loads(_work([None], "key", driver, b"", 0, None))
+        kind, error, *_ = pickle.loads(_work([None], "key", driver, b"", 0, None))
         assert kind == "error"
         with pytest.raises(ConfigError, match=message):
             raise error

@@ -1,7 +1,9 @@
 """Work in several processes, and plain scripts that start it."""
 
+import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -68,6 +70,17 @@ def die_once(path, advance, is_stopped):
         path.touch()
         os.kill(os.getpid(), signal.SIGKILL)
     return path.name
+
+
+def test_each_finished_item_leaves_a_line_of_json(tmp_path):
+    log = tmp_path / "items.jsonl"
+    for runner in (Inline(log), Processes(2, item_log=log)):
+        runner.run(double, [3, 1, 2], advance=lambda count: None, name_of=lambda item: f"item {item}")
+    lines = [json.loads(line) for line in log.read_text().splitlines()]
+    assert [line["item"] for line in lines[:3]] == ["item 3", "item 1", "item 2"]
+    assert sorted(line["item"] for line in lines[3:]) == ["item 1", "item 2", "item 3"]
+    assert {line["machine"] for line in lines} == {socket.gethostname()}
+    assert all(0 <= line["seconds"] < 60 for line in lines)
 
 
 @pytest.mark.parametrize(("quota", "cores"), [("max 100000", 6), ("250000 100000", 3), ("10000 100000", 1), ("", 6)])

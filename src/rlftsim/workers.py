@@ -11,23 +11,28 @@ done, nor how often: a run that was stopped in any way is resumed by doing the p
 
 import ast
 import inspect
+import json
 import math
 import multiprocessing
 import os
 import pickle
 import signal
+import socket
 import sys
 import threading
+import time
 import traceback
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any, Literal, Protocol, runtime_checkable
 
+from rlftsim.atomic_io import append_text
 from rlftsim.errors import ConfigError, DataError, NotYetError, RlftsimError
 from rlftsim.progress import log
 from rlftsim.threads import keep_freed_memory
@@ -101,9 +106,30 @@ def usable_cores() -> int:
     return min(cores, max(math.ceil(quota / period), 1))
 
 
+def log_item(path: Path | None, name: str, seconds: float, machine: str) -> None:
+    """Add a line of JSON about a finished item to a file.
+
+    Args:
+        path: of the file; None = there is none.
+        name: of the item.
+        seconds: that it took.
+        machine: that did it.
+
+    Raises:
+        DataError: the file cannot be written.
+    """
+    if path is not None:
+        done = datetime.now(UTC).isoformat(timespec="seconds")
+        values = {"item": name, "seconds": round(seconds, 2), "machine": machine, "done": done}
+        append_text(path, json.dumps(values) + "\n")
+
+
 @dataclass(frozen=True)
 class Inline:
     """This process, one item after another."""
+
+    item_log: Path | None = None
+    """See `log_item`."""
 
     def own(self, items: Sequence[Any]) -> Sequence[Any]:
         """All items, see `Runner`."""
@@ -113,7 +139,12 @@ class Inline:
         self, task: Task, items: Sequence[Any], *, advance: Advance, name_of: Callable[[Any], str] = str
     ) -> list[Any]:
         """Results of all items, see `Runner`."""
-        return [task(item, advance, lambda: False) for item in items]
+        results = []
+        for item in items:
+            start = time.monotonic()
+            results.append(task(item, advance, lambda: False))
+            log_item(self.item_log, name_of(item), time.monotonic() - start, socket.gethostname())
+        return results
 
 
 @dataclass(frozen=True)
@@ -248,6 +279,8 @@ class Processes:
 
     jobs: int
     on_death: OnDeath = "skip"
+    item_log: Path | None = None
+    """See `log_item`."""
 
     def own(self, items: Sequence[Any]) -> Sequence[Any]:
         """All items, see `Runner`."""
@@ -284,6 +317,8 @@ class Processes:
                         advance(value)
                     elif kind == "result" and worker.item is not None:
                         results[worker.item] = value
+                        seconds = time.monotonic() - worker.since
+                        log_item(self.item_log, name_of(items[worker.item]), seconds, socket.gethostname())
                         worker.item, worker.progress = None, 0
                     elif kind == "idle" and not worker.has_task:
                         worker.give(pickled, None)
@@ -345,10 +380,13 @@ class _Worker:
         self.item: int | None = None
         self.progress = 0
         """Reported since the item was begun."""
+        self.since = 0.0
+        """Moment at which the item was begun, `time.monotonic`."""
 
     def give(self, message: bytes, item: int | None) -> None:
         """Send the task, or an item of a number."""
         self.was_ready, self.has_task, self.is_idle, self.item = self.has_task, True, False, item
+        self.since = time.monotonic()
         with suppress(OSError):  # the process is gone: reading says so
             self.line.send_bytes(message)
 

@@ -1,6 +1,7 @@
 """Flags of the verbs whose work can be spread over processes and machines (docs/machines.md)."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 from rlftsim.errors import ConfigError
 from rlftsim.workers import Inline, OnDeath, Processes, Runner, Share
@@ -15,6 +16,8 @@ class Machines:
     result together."""
     ray: str | None = None
     """Work on a Ray cluster: its address, or "auto" (pip install "rlftsim[ray]")."""
+    item_log: Path | None = None
+    """Add a line of JSON to this file for each piece of the work that is finished: its name, seconds and machine."""
 
     def runner(self, jobs: int, on_death: OnDeath) -> Runner | None:
         """Runner of the flags; None = the verb's own choice of processes.
@@ -31,9 +34,11 @@ class Machines:
         if self.ray is not None:
             from rlftsim.cluster.ray import RayRunner
 
-            return RayRunner(self.ray, on_death)
-        here = Processes(jobs, on_death) if jobs > 1 else Inline()
-        return None if self.share is None else Share.parse(self.share, here)
+            return RayRunner(self.ray, on_death, self.item_log)
+        here = Processes(jobs, on_death, self.item_log) if jobs > 1 else Inline(self.item_log)
+        if self.share is None:
+            return here if self.item_log else None
+        return Share.parse(self.share, here)
 
 
 @dataclass(frozen=True)
@@ -47,4 +52,4 @@ class Work(Machines):
     def runner(self, jobs: int, on_death: OnDeath) -> Runner | None:
         """Runner of the flags, see `Machines`."""
         stops = on_death == "stop" and jobs > 1 and self.share is None and self.ray is None
-        return Processes(jobs, on_death) if stops else super().runner(jobs, on_death)
+        return Processes(jobs, on_death, self.item_log) if stops else super().runner(jobs, on_death)

@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import rlftsim
@@ -26,6 +27,7 @@ from rlftsim.workers import (
     OnDeath,
     SetAside,
     Task,
+    log_item,
     pickle_task,
     portable_error,
 )
@@ -37,6 +39,10 @@ try:
 except ImportError as error:
     raise ConfigError('Ray is not installed: pip install "rlftsim[ray]", or use --jobs or --share.') from error
 
+BYTES_OF_A_PROCESS = 6e8
+"""Python, torch and a large scenario with a small model."""
+BYTES_PER_BYTE_OF_A_TASK = 20.0
+"""More memory for a larger model, whose weights are most of a task: 1.2 GB for those of SMART-tiny, 28 MB."""
 AHEAD = 4
 """Items handed to Ray for each core of the cluster; more would make its scheduler and this process grow."""
 SECONDS_BETWEEN_REPORTS = 5.0
@@ -53,10 +59,12 @@ class RayRunner:
     Args:
         address: of the cluster, such as "10.0.0.1:6379"; "auto" = the one that runs on this machine.
         on_death: see `rlftsim.workers.OnDeath`.
+        item_log: see `rlftsim.workers.log_item`.
     """
 
     address: str = "auto"
     on_death: OnDeath = "skip"
+    item_log: Path | None = None
 
     def own(self, items: Sequence[Any]) -> Sequence[Any]:
         """All items, see `Runner`."""
@@ -104,7 +112,8 @@ class RayRunner:
         key, driver = hashlib.sha256(pickled).hexdigest(), (rlftsim.__version__, os.getcwd())
         board = ray.remote(_Board).options(num_cpus=0).remote()
         # No retries by Ray: it would try an item that eats all memory forever, and not tell.
-        work = ray.remote(_work).options(num_cpus=1, max_retries=0, scheduling_strategy="SPREAD")
+        memory = _expected_memory(len(pickled))
+        work = ray.remote(_work).options(num_cpus=1, memory=memory, max_retries=0, scheduling_strategy="SPREAD")
 
         def count(number: int, total: int) -> None:
             """Report what an item has done since it was last counted."""
@@ -131,7 +140,7 @@ class RayRunner:
                 for ref in done:
                     number = at_work.pop(ref)
                     try:
-                        kind, value, total = pickle.loads(ray.get(ref))
+                        kind, value, total, seconds, machine = pickle.loads(ray.get(ref))
                     except RayError as error:
                         reason = _reason(error)
                         if self.on_death == "stop":
@@ -145,11 +154,24 @@ class RayRunner:
                         raise value
                     results[number] = value
                     count(number, total)
+                    log_item(self.item_log, name_of(items[number]), seconds, machine)
         finally:
             _cancel(list(at_work))
         if attempts.set_aside:
             raise SetAside(attempts.set_aside)
         return [results[number] for number in range(len(items))]
+
+
+def _expected_memory(task_bytes: int) -> int:
+    """Bytes of memory that a process of the cluster is expected to need: no machine gets more of them than fit.
+
+    Args:
+        task_bytes: size of the task.
+    """
+    needed = BYTES_OF_A_PROCESS + BYTES_PER_BYTE_OF_A_TASK * task_bytes
+    # Where even the largest machine has less, the work is tried all the same; Ray would wait for a larger one.
+    has = [node["Resources"].get("memory", 0.0) for node in ray.nodes() if node["Resources"].get("CPU")]
+    return int(min(needed, max(has, default=needed)))
 
 
 class _Board:
@@ -174,8 +196,13 @@ class _Board:
 
 
 def _work(task: list[Any], key: str, driver: tuple[str, str], item: bytes, number: int, board: Any) -> bytes:
-    """Do an item in a process of the cluster; "result" or "error", its value, and the progress made, pickled."""
+    """Do an item in a process of the cluster.
+
+    Returns:
+        Pickled: "result" or "error", its value, the progress made, the seconds taken and the machine.
+    """
     total, last = 0, time.monotonic()
+    start, machine = last, ray.util.get_node_ip_address()
     version, folder = driver
 
     def advance(count: int) -> None:
@@ -200,13 +227,14 @@ def _work(task: list[Any], key: str, driver: tuple[str, str], item: bytes, numbe
                 ) from None
             _tasks.clear()
             _tasks[key] = pickle.loads(ray.get(task[0]))
-        return pickle.dumps(("result", _tasks[key](pickle.loads(item), advance, lambda: False), total))
+        value = _tasks[key](pickle.loads(item), advance, lambda: False)
+        return pickle.dumps(("result", value, total, time.monotonic() - start, machine))
     except MemoryError:
         os._exit(OUT_OF_MEMORY)  # a new process may have enough
     except Exception as error:
         error = portable_error(error)
-        error.add_note(f"on {ray.util.get_node_ip_address()}")
-        return pickle.dumps(("error", error, total))
+        error.add_note(f"on {machine}")
+        return pickle.dumps(("error", error, total, time.monotonic() - start, machine))
 
 
 def _reason(error: RayError) -> str:
