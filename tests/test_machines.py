@@ -34,8 +34,9 @@ def test_the_array_of_the_documents_runs_as_shell_processes(tmp_path):
 
     folder = tmp_path / "runs" / "evaluations"
     early = run(join + " --limit 5 --num-rollouts 2", 0)
-    assert b"2 of 2 pieces are missing: run the shares again" in early.communicate(timeout=240)[1]
+    assert b"is not there, so no share has begun: check the path" in early.communicate(timeout=240)[1]
     assert early.returncode == 1
+    assert not folder.exists()
     shares = [run(array, number) for number in (1, 2)]
     assert [(share.communicate(timeout=240), share.returncode)[1] for share in shares] == [0, 0]
     assert [path.name for path in folder.iterdir()] == ["constant_velocity.parquet"]

@@ -15,6 +15,8 @@ from torch import Tensor
 
 from rlftsim.errors import DataError
 
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""Errors of the operating system where a file does not fit."""
 _TEMPORARY = re.compile(r"\..+\.\d+\.tmp")
 """Names that `temporary_beside` gives."""
 
@@ -41,7 +43,7 @@ def cannot_write(path: Path, error: OSError) -> DataError:
     """
     remedy = "choose another place, then run the same command again."
     # safetensors tells no error number: a full disk is the likeliest cause there
-    if error.errno in (None, errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+    if error.errno in (None, *NO_ROOM):
         remedy = f"make room or {remedy}"
     elif isinstance(error, FileExistsError | NotADirectoryError):
         # the file stands where the path needs a folder

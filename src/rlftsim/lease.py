@@ -7,18 +7,25 @@ today carry such locks between machines.
 import os
 import socket
 import time
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from types import TracebackType
 from typing import TextIO
 
 from rlftsim.atomic_io import errors_name
-from rlftsim.errors import NotYetError
-from rlftsim.workers import Runner, Share, Unfinished
+from rlftsim.errors import DataError, NotYetError
+from rlftsim.progress import log
+from rlftsim.storage import get_text, put_text, remove
+from rlftsim.workers import Joining, Runner, Share, Unfinished
 
 SECONDS_TO_WAIT = 10.0
 """A share waits so long for a driver that may only be putting the result together, or for its predecessor to end."""
+REMOTE_LEASE = ".lease"
+"""File of a remote folder that is being written to."""
+SECONDS_OF_SILENCE = 600.0
+"""A remote lease that was not renewed for so long belongs to a process that is gone."""
 
 
 class Lease:
@@ -42,6 +49,8 @@ class Lease:
         self._path, self._doing, self._note = path, doing, note
         self._share = runner if isinstance(runner, Share) else None
         self._files: list[TextIO] = []
+        if isinstance(runner, Joining) and not path.parent.exists():
+            raise NotYetError(f"{path.parent} is not there, so no share has begun: check the path, or run the shares.")
         try:
             if self._share is None:
                 self._lock(path)
@@ -143,18 +152,65 @@ class Lease:
                     break
                 file.close()
             self._files.append(file)
-            now = datetime.now(UTC).isoformat(timespec="seconds")
             file.truncate(0)
-            file.write(f"{self._note}\n{socket.gethostname()} process {os.getpid()} since {now}\n")
+            file.write(f"{self._note}\n{_owner_line()}")
             file.flush()
 
     def _refusal(self, file: TextIO) -> str:
         """Message with the owner and age of a lock."""
         file.seek(0)
         try:
-            owner, _, since = (file.read().splitlines() or [""])[-1].partition(" since ")
-            age = int((datetime.now(UTC) - datetime.fromisoformat(since)).total_seconds())
-            whom = f" ({owner}, for {timedelta(seconds=max(age, 0))})"  # its clock may be ahead of ours
+            owner, age = _owner_and_age(file.read())
+            whom = f" ({owner}, for {age})"
         except (ValueError, TypeError):  # it is only just beginning, or the file was damaged
             whom = ""
         return f"another process {self._doing} {self._path.parent}{whom}: wait for it or choose another destination."
+
+
+def _owner_line() -> str:
+    """This process and the time."""
+    now = datetime.now(UTC).isoformat(timespec="seconds")
+    return f"{socket.gethostname()} process {os.getpid()} since {now}\n"
+
+
+def _owner_and_age(text: str) -> tuple[str, timedelta]:
+    """Process and age of a line of `_owner_line`, the last of a text; ValueError or TypeError where there is none."""
+    owner, _, since = (text.splitlines() or [""])[-1].partition(" since ")
+    age = int((datetime.now(UTC) - datetime.fromisoformat(since)).total_seconds())
+    return owner, timedelta(seconds=max(age, 0))  # its clock may be ahead of ours
+
+
+@contextmanager
+def remote_lease(url: str, doing: str) -> Iterator[Callable[[], object]]:
+    """Hold a remote folder for the time of a block; yields a function to be called every few minutes meanwhile.
+
+    Buckets have no locks. So the owner and the time are in a file that only one process can create, and that counts
+    until it is removed, or was not renewed for `SECONDS_OF_SILENCE`.
+
+    Args:
+        url: of the folder.
+        doing: verb of the work, for messages: "is copying to".
+
+    Raises:
+        NotYetError: another process holds the folder.
+        DataError: the folder cannot be written to.
+    """
+    place = f"{url}/{REMOTE_LEASE}"
+    while not put_text(place, _owner_line(), is_new=True):
+        text = get_text(place)
+        try:
+            owner, age = _owner_and_age(text)
+        except (ValueError, TypeError):  # it is only just beginning, or was damaged
+            owner, age = "unknown", timedelta()
+        if age.total_seconds() < SECONDS_OF_SILENCE:
+            raise NotYetError(
+                f"another process {doing} {url} ({owner}, last heard of {age} ago): wait for it, or remove {place} if "
+                "it is gone."
+            )
+        log.warning(f"{url}: taken over from {owner}, silent for {age}.")
+        remove(place)
+    try:
+        yield lambda: put_text(place, _owner_line(), is_new=False)
+    finally:
+        with suppress(DataError):  # taken over meanwhile
+            remove(place)

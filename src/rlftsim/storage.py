@@ -1,18 +1,27 @@
-"""Data in buckets: `s3://`, `gs://`, `file://` and whatever else fsspec knows.
+"""Data in buckets: `s3://`, `gs://`, `hf://`, `file://` and whatever else fsspec knows.
 
 Credentials are found by the libraries in their own ways; nothing here reads, keeps or prints them.
 """
 
 import hashlib
 import os
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from fnmatch import fnmatchcase
 from glob import has_magic
 from pathlib import Path
 from typing import Any
 
-from rlftsim.atomic_io import errors_name, write_text, write_whole
+from rlftsim.atomic_io import (
+    NO_ROOM,
+    errors_name,
+    remove_temporaries,
+    remove_temporaries_below,
+    temporary_beside,
+    write_text,
+    write_whole,
+)
 from rlftsim.errors import ConfigError, DataError, RlftsimError
 
 ORIGIN = "origin.txt"
@@ -20,7 +29,11 @@ ORIGIN = "origin.txt"
 BLOCK_BYTES = 1 << 24
 OBJECT_STORES = ("s3", "s3a", "gs", "gcs", "az", "abfs")
 """Protocols of stores without folders."""
-_EXTRAS = {"s3": "s3", "s3a": "s3", "gs": "gcs", "gcs": "gcs"}
+READ_ONLY = ("hf", "http", "https")
+"""Protocols that only read: what is written to a repository at Hugging Face is a commit of its own."""
+SECONDS_OF_A_TEMPORARY = 24 * 3600.0
+"""What a killed process left in the cache is removed after so long."""
+_EXTRAS = {"s3": "s3", "s3a": "s3", "gs": "gcs", "gcs": "gcs", "hf": "hf"}
 
 
 def is_url(place: object) -> bool:
@@ -37,6 +50,17 @@ def folder_address(url: str) -> str:
     if not is_url(url) or not url.partition("://")[2].strip("/"):
         raise ConfigError(f"{url} is no address of a folder: write one such as s3://bucket/folder.")
     return url.rstrip("/")
+
+
+def require_writable(url: str) -> None:
+    """Refuse an address that data is only read from.
+
+    Raises:
+        ConfigError: it is one.
+    """
+    protocol = url.partition("://")[0]
+    if protocol in READ_ONLY:
+        raise ConfigError(f"{url}: {protocol}:// is read only here: upload the folder with that site's own tools.")
 
 
 def require_folder(place: str | os.PathLike[str]) -> Path:
@@ -89,6 +113,10 @@ def remote(url: str) -> Iterator[tuple[Any, str]]:
         ) from None
     # Each library has errors of its own: no permission, no credentials, no connection, no such protocol.
     except Exception as error:
+        if isinstance(error, OSError) and error.errno in NO_ROOM:
+            raise DataError(
+                f"cannot write {url} ({error.strerror}): make room there, then run the same command again."
+            ) from None
         cause = (str(error).strip().splitlines() or [""])[0].rstrip(".")
         raise DataError(
             f"{url}: {type(error).__name__}: {cause}: check the address, the network and the credentials of this "
@@ -135,9 +163,50 @@ def publish(path: Path, url: str) -> None:
         DataError: it cannot be written there.
     """
     with remote(url) as (files, place):
-        if url.partition("://")[0] not in OBJECT_STORES:  # there this would make a bucket of a mistyped name
+        if url.partition("://")[0] in OBJECT_STORES:  # no folders: one would make a bucket of a mistyped name
+            files.put_file(str(path), place)
+            return
+        folder = files._parent(place)
+        files.makedirs(folder, exist_ok=True)
+        temporary = f"{folder}/{temporary_beside(Path(place)).name}"
+        try:
+            files.put_file(str(path), temporary)
+            files.mv(temporary, place)
+        finally:
+            if files.exists(temporary):
+                files.rm_file(temporary)
+
+
+def put_text(url: str, text: str, *, is_new: bool) -> bool:
+    """Write a small remote file; returns False where it should be new and is not. Of several processes one creates it.
+
+    Args:
+        url: of the file.
+        text: its content.
+        is_new: leave a file that is there as it is.
+
+    Raises:
+        DataError: it cannot be written there.
+    """
+    with remote(url) as (files, place):
+        if url.partition("://")[0] not in OBJECT_STORES:
             files.makedirs(files._parent(place), exist_ok=True)
-        files.put_file(str(path), place)
+        try:
+            with files.open(place, "xb" if is_new else "wb") as file:
+                file.write(text.encode())
+        except FileExistsError:
+            return False
+    return True
+
+
+def get_text(url: str) -> str:
+    """Content of a small remote file.
+
+    Raises:
+        DataError: it is not there or cannot be read.
+    """
+    with remote(url) as (files, place):
+        return files.cat_file(place).decode(errors="replace")
 
 
 def remove(url: str) -> None:
@@ -167,6 +236,7 @@ def fetch_shard(url: str, sha256: str) -> Path:
         if path.exists():
             os.utime(path)  # used now
         else:
+            remove_temporaries(path)  # of a process that was killed at this very shard
             fetch(url, path, sha256)
             _evict(path)
     return path
@@ -180,6 +250,10 @@ def _evict(newest: Path) -> None:
     except ValueError:
         raise ConfigError(f"RLFTSIM_CACHE_GB={given} is no number of gigabytes.") from None
     with _locked(newest.parent / "evict.lock"):  # one process at a time counts and removes
+        for path in newest.parent.glob(".*.tmp"):
+            with suppress(FileNotFoundError):  # another process has just finished it
+                if time.time() - path.stat().st_mtime > SECONDS_OF_A_TEMPORARY:
+                    path.unlink()
         shards = [path for path in newest.parent.iterdir() if not path.suffix]
         shards.sort(key=lambda path: path.stat().st_mtime, reverse=True)
         total = 0
@@ -218,6 +292,7 @@ def mirror(url: str, names: tuple[str, ...]) -> Path:
     """
     folder, url = local_copy(url, "data"), url.rstrip("/")
     with _locked(folder / ".lock"):
+        remove_temporaries_below(folder)
         new = folder / f"{names[-1]}.new"
         fetch(f"{url}/{names[-1]}", new)
         old = folder / names[-1]

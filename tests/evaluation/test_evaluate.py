@@ -325,6 +325,19 @@ def test_a_name_must_be_a_file_name(data, tmp_path):
         evaluate("oracle", data, tmp_path, CONFIG, name="a/b")
 
 
+def test_a_file_is_no_folder_and_a_folder_no_file_before_anything_is_simulated(data, tmp_path):
+    with pytest.raises(
+        ConfigError, match=r"a\.parquet is to be a folder, in which x\.parquet is written: name a folder"
+    ):
+        evaluate("oracle", data, tmp_path / "a.parquet", CONFIG, name="x")
+    (tmp_path / "x.parquet").mkdir()
+    with pytest.raises(
+        ConfigError, match=r"x\.parquet is a folder: pass another name for the evaluation, or remove it"
+    ):
+        evaluate("oracle", data, tmp_path, CONFIG, name="x")
+    assert [path.name for path in tmp_path.iterdir()] == ["x.parquet"]
+
+
 def test_a_fingerprint_follows_weights_and_settings_only():
     def build(bias=0.0, width=2):
         network = torch.nn.Linear(width, 1)

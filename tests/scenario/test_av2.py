@@ -34,6 +34,7 @@ from rlftsim.scenario.types import (
     MapFeatureType,
     ObjectType,
 )
+from rlftsim.workers import Inline, Joining, Share, Unfinished
 
 SAMPLE = "0a1e6f0a-1817-4a98-b02e-db8c9327d151"
 
@@ -260,6 +261,27 @@ def test_another_window_converts_again(files, tmp_path, window):
     assert report.shards_written == 2
     ids = ["aa01", "ab02"] if window == "first" else ["aa01-0", "aa01-19", "ab02-0", "ab02-19"]
     assert ScenarioDataset(tmp_path / "data").scenario_ids == ids
+
+
+def test_shares_with_other_options_are_refused_with_both_values(files, tmp_path):
+    def share(number, window):
+        runner = Joining() if number is None else Share(number, 2, Inline())
+        convert(files, tmp_path / "data", runner=runner, show_progress=False, options={"window": window})
+
+    with pytest.raises(Unfinished, match="share 1/2 is done"):
+        share(1, "last")
+    refusal = (
+        r'aa\.arrow was converted with other options \(window "last" there, "first" here\): give all shares the sam'
+    )
+    for number in (2, None):
+        with pytest.raises(ConfigError, match=refusal):
+            share(number, "first")
+    assert not list(tmp_path.rglob("ab.arrow"))
+    share(2, "last")
+    # of the finished data set, too
+    with pytest.raises(ConfigError, match=refusal):
+        share(2, "first")
+    assert ScenarioDataset(tmp_path / "data").scenario_ids == ["aa01", "ab02"]
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ from rlftsim import storage
 from rlftsim.cli.main import main
 from rlftsim.errors import ConfigError, DataError, NotYetError
 from rlftsim.evaluation.evaluate import EvaluateConfig, evaluate
-from rlftsim.lease import Lease
+from rlftsim.lease import Lease, remote_lease
 from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.scenario.convert import convert
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
@@ -162,6 +162,77 @@ def test_a_push_that_is_cut_short_leaves_no_data_set_and_goes_on(bucket, data, t
     assert pushed == ["index.parquet", "manifest.json"]  # the shards are there by the manifest
 
 
+@pytest.mark.parametrize("kind", ["s3", "file"])
+def test_two_pushes_to_one_place_do_not_mix_and_a_killed_one_is_taken_over(
+    kind, data, tmp_path, monkeypatch, request, capsys
+):
+    monkeypatch.setenv("RLFTSIM_CACHE", str(tmp_path / "cache"))
+    url = f"{request.getfixturevalue('bucket')}/set" if kind == "s3" else f"file://{tmp_path}/there"
+    owner = (
+        rf"another process is copying to {url} \(.* process {os.getpid()}, last heard of 0:00:0\d ago\): wait for it,"
+    )
+    with remote_lease(url, "is copying to") as renew:
+        renew()
+        with pytest.raises(NotYetError, match=owner + rf" or remove {url}/\.lease if it is gone"):
+            push_dataset(data, url, show_progress=False)
+    storage.put_text(f"{url}/.lease", "gone process 1 since 2026-01-01T00:00:00+00:00\n", is_new=True)
+    push_dataset(data, url, show_progress=False)
+    assert f"{url}: taken over from gone process 1, silent for " in capsys.readouterr().err
+    with pytest.raises(DataError, match="there is no such file"):
+        storage.get_text(f"{url}/.lease")
+    pull_dataset(url, tmp_path / "back", show_progress=False)
+    assert contents(tmp_path / "back") == contents(data)
+
+
+def test_a_push_to_a_folder_leaves_whole_files_or_none(data, tmp_path, monkeypatch):
+    monkeypatch.setenv("RLFTSIM_CACHE", str(tmp_path / "cache"))
+    there, manifest = tmp_path / "there", "manifest.json"
+    push_dataset(data, f"file://{there}", show_progress=False)
+    before = contents(there)
+    assert before == contents(data)
+    size = (data / manifest).stat().st_size
+    with (
+        limit_files_to(size // 2),
+        pytest.raises(DataError, match=r"^cannot write file://.* \(File too large\): make room there"),
+    ):
+        storage.publish(data / manifest, f"file://{there}/{manifest}")
+    assert contents(there) == before
+
+
+@pytest.fixture
+def hub(monkeypatch, tmp_path):
+    """A stand-in for the file system of Hugging Face."""
+    from fsspec.implementations.memory import MemoryFileSystem
+    from fsspec.registry import _registry
+
+    class Hub(MemoryFileSystem):
+        protocol = "hf"
+        store, pseudo_dirs = {}, [""]
+
+        @classmethod
+        def _strip_protocol(cls, path):
+            return super()._strip_protocol(path.removeprefix("hf://"))
+
+    monkeypatch.setenv("RLFTSIM_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setitem(_registry, "hf", Hub)
+    return Hub()
+
+
+def test_data_at_hugging_face_is_read_and_not_written(hub, data, source, tmp_path):
+    url = "hf://datasets/lab/womd"
+    for path in (data, source):
+        hub.put(str(path), f"datasets/lab/{path.name}", recursive=True)
+    assert ScenarioDataset("hf://datasets/lab/data").scenario_ids == ScenarioDataset(data).scenario_ids
+    pull_dataset("hf://datasets/lab/data", tmp_path / "back", show_progress=False)
+    assert contents(tmp_path / "back") == contents(data)
+    convert(url, tmp_path / "converted", jobs=1, show_progress=False)
+    assert contents(tmp_path / "converted") == contents(data)
+    before = dict(hub.store)
+    with pytest.raises(ConfigError, match=rf"^{url}: hf:// is read only here: upload the folder with that site's own"):
+        push_dataset(data, url, show_progress=False)
+    assert hub.store == before
+
+
 def test_a_pull_that_is_cut_short_goes_on_and_disturbs_no_other_work(bucket, data, tmp_path, monkeypatch):
     url, back = f"{bucket}/set", tmp_path / "back"
     push_dataset(data, url, show_progress=False)
@@ -225,6 +296,20 @@ def test_the_cache_keeps_what_was_used_last(tmp_path, monkeypatch):
     assert [number for number, path in sorted(kept.items()) if path.exists()] == [0, 2]
 
 
+def test_the_cache_gets_rid_of_what_killed_processes_left(tmp_path, monkeypatch):
+    monkeypatch.setenv("RLFTSIM_CACHE", str(tmp_path / "cache"))
+    (tmp_path / "file").write_bytes(b"shard")
+    sha = storage.fetch(f"file://{tmp_path}/file", tmp_path / "any")
+    shards = tmp_path / "cache" / "shards"
+    shards.mkdir(parents=True)
+    same, old, recent = (shards / f".{name}.machine.12.tmp" for name in (sha, "old", "recent"))
+    for path in (same, old, recent):
+        path.touch()
+    os.utime(old, (0, 0))
+    fetch_shard(f"file://{tmp_path}/file", sha)
+    assert [path.exists() for path in (same, old, recent)] == [False, False, True]
+
+
 def test_addresses_that_cannot_be_read_are_refused_in_one_line(tmp_path, monkeypatch):
     monkeypatch.setenv("RLFTSIM_CACHE", str(tmp_path / "cache"))
     with pytest.raises(DataError, match=r"^file:///nowhere/manifest\.json: there is no such file or bucket: check the"):
@@ -250,8 +335,10 @@ def test_addresses_that_cannot_be_read_are_refused_in_one_line(tmp_path, monkeyp
         raise ImportError("Install s3fs to access S3")
 
     monkeypatch.setattr("fsspec.core.url_to_fs", missing)
-    with pytest.raises(ConfigError, match=r's3:// needs another library: pip install "rlftsim\[s3\]"'):
-        ScenarioDataset("s3://x")
+    for protocol in ("s3", "hf"):
+        hint = rf'{protocol}:// needs another library: pip install "rlftsim\[{protocol}\]"'
+        with pytest.raises(ConfigError, match=hint):
+            ScenarioDataset(f"{protocol}://x")
 
 
 @pytest.mark.parametrize("credentials", ["wrong", "none"])

@@ -1,6 +1,7 @@
 """The same work by one driver and by shares of it: the same bytes, once each."""
 
 import importlib
+import json
 import os
 import shutil
 import threading
@@ -103,6 +104,24 @@ def test_a_source_that_changed_after_its_share_is_not_joined(source, tmp_path, m
     make_tfrecord(source / "training.tfrecord-00002-of-00007", make_message("new"))
     with pytest.raises(Unfinished, match="1 of 7 pieces are left"):
         convert(source, tmp_path / "data", runner=Share(2, 2, Inline()), show_progress=False)
+
+
+@pytest.mark.parametrize("where", [[], ["--share", "1/2"]])
+def test_a_line_for_each_piece_is_a_flag(where, tmp_path):
+    words = ["evaluate", "constant_velocity", "--data", "synthetic", "--limit", "5", "--num-rollouts", "2"]
+    places = ["--out", str(tmp_path / "out"), "--item-log", str(tmp_path / "items.jsonl")]
+    assert main([*words, *places, *where]) == 0
+    lines = [json.loads(line) for line in (tmp_path / "items.jsonl").read_text().splitlines()]
+    assert [line["item"] for line in lines] == ["scenarios 0 to 3", "scenarios 4 to 4"][: 1 if where else 2]
+
+
+def test_a_join_of_a_mistyped_folder_leaves_nothing_and_says_so(source, tmp_path, capsys):
+    settings = ["--data", "synthetic", "--limit", "5", "--num-rollouts", "2"]
+    assert main(["join", "evaluate", "constant_velocity", *settings, "--out", str(tmp_path / "ouT")]) == 1
+    assert "constant_velocity.parts is not there, so no share has begun: check the path" in capsys.readouterr().err
+    assert main(["join", "convert", str(source), str(tmp_path / "datA")]) == 1
+    assert "datA is not there, so no share has begun: check the path" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["womd"]
 
 
 @pytest.mark.parametrize(

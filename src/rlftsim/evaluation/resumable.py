@@ -172,6 +172,10 @@ class EvaluationParts(PartFiles[Mapping[str, object] | Skipped, Evaluation]):
     def __post_init__(self) -> None:
         if not self.name or Path(self.name).name != self.name:
             raise ConfigError(f"an evaluation's name becomes a file name, {self.name!r} cannot: pass another name.")
+        if self.out.suffix == ".parquet":
+            raise ConfigError(f"{self.out} is to be a folder, in which {self.name}.parquet is written: name a folder.")
+        if self.result_path.is_dir():
+            raise ConfigError(f"{self.result_path} is a folder: pass another name for the evaluation, or remove it.")
 
     @property
     def result_path(self) -> Path:

@@ -72,7 +72,20 @@ class _Task:
     split: str
     folder: Path
     on_error: OnError
-    known: ShardEntry | None = None
+    known: "_Known | None" = None
+
+
+@dataclass(frozen=True)
+class _Known:
+    """A shard that an earlier run or another share finished."""
+
+    entry: ShardEntry
+    settings: Mapping[str, object]
+    """Of the data source that it was read by, see `DataSource.describe`; those of other sources may be among them."""
+
+    def settings_of(self, source: Mapping[str, object]) -> dict[str, object]:
+        """The settings under the names that a source describes itself by."""
+        return {name: self.settings.get(name) for name in source}
 
 
 @dataclass(frozen=True)
@@ -122,7 +135,8 @@ def convert(
             be written to; under "stop" also the first bad file or record.
         SetAside: units that killed their process again and again; all others are converted.
         Unfinished: `runner` is a share, which is done, while others are not.
-        ConfigError: an unknown data source or option of it, fewer than one process, or a split without a name.
+        ConfigError: an unknown data source or option of it, fewer than one process, a split without a name, or shares
+            with other options.
     """
     if jobs is not None and jobs < 1:
         raise ConfigError(f"jobs must be at least 1, got {jobs}: leave it out for one per core.")
@@ -157,19 +171,26 @@ def convert(
 
     # 3. Make the shards that earlier runs have not finished, then index and manifest.
     runner = runner or on_this_machine(jobs or usable_cores(), len(tasks), on_death=on_error)
+    own = runner.own(tasks)
+    names = {task.shard for task in own}
+    others = [task for task in tasks if task.shard not in names]
+    _refuse_other_settings(others, _known_shards(folder), data_source)
     # The folder is marked as unfinished until the mark is removed.
     with Lease(folder / INCOMPLETE, runner, "is converting to", _INCOMPLETE_TEXT) as lease:
         if lease.is_alone:
             remove_temporaries_below(folder)
-        known = _known_entries(folder)
-        own = [replace(task, known=known.get(task.shard)) for task in runner.own(tasks)]
+        known = _known_shards(folder)
+        own = [replace(task, known=known.get(task.shard)) for task in own]
         total = sum(task.unit.size for task in own)
         with progress_bar("converting", total, unit="bytes", show=show_progress) as advance:
             convert_one = partial(_convert_unit, source=data_source)
             outcomes = runner.run(convert_one, own, advance=advance, name_of=lambda task: task.unit.name)
         lease.finish("convert")
         # Shards of other shares are taken over by size and split: each share has compared the checksums of its own.
-        made = _known_entries(folder) | {outcome.entry.file: outcome.entry for outcome in outcomes}
+        known = _known_shards(folder)
+        _refuse_other_settings(others, known, data_source)
+        made = {file: shard.entry for file, shard in known.items()}
+        made |= {outcome.entry.file: outcome.entry for outcome in outcomes}
         entries = [made[task.shard] for task in tasks if task.shard in made and _is_of(made[task.shard], task)]
         require_finished(runner, len(tasks) - len(entries), len(tasks), "convert")
         remove_temporaries_below(folder)  # of processes that were killed
@@ -183,17 +204,54 @@ def _is_of(entry: ShardEntry, task: _Task) -> bool:
     return (entry.split, entry.source_bytes) == (task.split, task.unit.size)
 
 
-def _known_entries(folder: Path) -> dict[str, ShardEntry]:
+def _known_shards(folder: Path) -> dict[str, _Known]:
     """Shards that earlier runs finished, by path: from the manifest and the receipts of runs that got no further."""
     earlier = _earlier_manifest(folder)
-    entries = {entry.file: entry for entry in earlier.shards} if earlier else {}
+    shards = {entry.file: _Known(entry, earlier.provenance) for entry in earlier.shards} if earlier else {}
     for path in sorted((folder / SHARDS).rglob(_RECEIPTS)):
         with suppress(ValueError, KeyError, TypeError, AttributeError):  # a damaged one counts for nothing
             receipt = json.loads(path.read_text(encoding="utf-8"))
+            settings = receipt.pop("settings")
             if receipt.pop("schema_version") == SCHEMA_VERSION:
                 entry = shard_entry_from_json(receipt)
-                entries[entry.file] = entry
-    return {file: entry for file, entry in entries.items() if (folder / file).exists()}
+                shards[entry.file] = _Known(entry, settings)
+    return {file: shard for file, shard in shards.items() if (folder / file).exists()}
+
+
+def _refuse_other_settings(tasks: list[_Task], known: Mapping[str, _Known], source: DataSource) -> None:
+    """Refuse to put shards of other shares together with these if they were read with other settings.
+
+    Raises:
+        ConfigError: there is such a shard.
+    """
+    wanted = _plain(source.describe())
+    for task in tasks:
+        shard = known.get(task.shard)
+        found = wanted if shard is None else shard.settings_of(wanted)
+        if found != wanted:
+            raise ConfigError(
+                f"{task.folder / task.shard} was converted with other options ({_difference(found, wanted)}): give all "
+                "shares the same, or another destination."
+            )
+
+
+def _difference(found: object, wanted: object, name: str = "") -> str:
+    """Values that differ between two trees of plain settings, in words.
+
+    Args:
+        found: of a shard.
+        wanted: of this command.
+        name: of the setting.
+    """
+    if not (isinstance(found, dict) and isinstance(wanted, dict)):
+        return f"{name} {json.dumps(found)} there, {json.dumps(wanted)} here"
+    names = [key for key in {**wanted, **found} if found.get(key) != wanted.get(key)]
+    return "; ".join(_difference(found.get(key), wanted.get(key), key) for key in names)
+
+
+def _plain(settings: Mapping[str, object]) -> dict[str, object]:
+    """Settings as JSON gives them back."""
+    return json.loads(json.dumps(settings))
 
 
 def _earlier_manifest(folder: Path) -> Manifest | None:
@@ -221,7 +279,8 @@ def _convert_unit(
     """
     # 1. Take over the shard of an earlier run if it is whole and made from these very files; remote ones are compared
     # by size alone, as their checksums would take as long as fetching them.
-    known = task.known
+    settings = _plain(source.describe())
+    known = task.known.entry if task.known is not None and task.known.settings_of(settings) == settings else None
     if task.unit.url:
         if known is not None and _is_of(known, task) and hash_file(task.folder / task.shard) == known.sha256:
             advance(task.unit.size)
@@ -231,7 +290,7 @@ def _convert_unit(
             fetch(task.unit.url, local)
             unit = replace(task.unit, files=(local,), url="", url_bytes=0)
             return _convert_unit(replace(task, unit=unit, known=None), advance, is_stopped, source=source)
-    size, digest = _fingerprint(task.unit.files, source.describe())
+    size, digest = _fingerprint(task.unit.files, settings)
     if (
         known is not None
         and (known.source_bytes, known.source_sha256, known.split) == (size, digest, task.split)
@@ -286,7 +345,8 @@ def _convert_unit(
         skipped=tuple(skipped),
         tallies=dict(sorted(tallies.items())),
     )
-    write_json(task.folder / f"{task.shard}.json", {**asdict(entry), "schema_version": SCHEMA_VERSION})
+    receipt = {**asdict(entry), "settings": settings, "schema_version": SCHEMA_VERSION}
+    write_json(task.folder / f"{task.shard}.json", receipt)
     return _Outcome(entry, reused=False)
 
 
@@ -307,7 +367,8 @@ def _finish(
 ) -> Manifest:
     """Write index and manifest of the new shards and those that were there, and remove the receipts."""
     # shards of earlier runs that this call does not touch stay in the data set
-    entries = {**_known_entries(folder), **{entry.file: entry for entry in new}}
+    earlier_shards = {file: shard.entry for file, shard in _known_shards(folder).items()}
+    entries = earlier_shards | {entry.file: entry for entry in new}
     if not any(entry.num_rows for entry in entries.values()):
         # leave nothing behind, as if the command had not been given
         shutil.rmtree(folder / SHARDS, ignore_errors=True)

@@ -6,11 +6,11 @@ from pathlib import Path
 
 from rlftsim.atomic_io import remove_temporaries_below
 from rlftsim.errors import DataError
-from rlftsim.lease import Lease
+from rlftsim.lease import Lease, remote_lease
 from rlftsim.progress import progress_bar
 from rlftsim.scenario.dataset import INCOMPLETE, INDEX, MANIFEST, Manifest, parse_manifest, read_manifest
 from rlftsim.scenario.shards import hash_file
-from rlftsim.storage import fetch, folder_address, mirror, publish, remove
+from rlftsim.storage import fetch, folder_address, mirror, publish, remove, require_writable
 from rlftsim.workers import Inline
 
 
@@ -26,24 +26,28 @@ def push_dataset(folder: str | os.PathLike[str], url: str, *, show_progress: boo
         show_progress: False = no progress bar.
 
     Raises:
-        ConfigError: no address of a folder.
+        ConfigError: no address of a folder, or one that is only read from.
         DataError: no finished data set in the folder, or the bucket cannot be written to.
+        NotYetError: another process copies a data set there.
     """
     folder, url = Path(folder), folder_address(url)
+    require_writable(url)
     manifest = read_manifest(folder)
-    try:
-        there = {(entry.file, entry.sha256) for entry in parse_manifest(mirror(url, (INDEX, MANIFEST))).shards}
-    except DataError:  # no data set there yet
-        there = set()
-    if there and any((entry.file, entry.sha256) not in there for entry in manifest.shards):
-        remove(f"{url}/{MANIFEST}")
-    with progress_bar("push", len(manifest.shards), show=show_progress) as advance:
-        for entry in manifest.shards:
-            if (entry.file, entry.sha256) not in there:
-                publish(folder / entry.file, f"{url}/{entry.file}")
-            advance(1)
-    for name in (INDEX, MANIFEST):
-        publish(folder / name, f"{url}/{name}")
+    with remote_lease(url, "is copying to") as renew:
+        try:
+            there = {(entry.file, entry.sha256) for entry in parse_manifest(mirror(url, (INDEX, MANIFEST))).shards}
+        except DataError:  # no data set there yet
+            there = set()
+        if there and any((entry.file, entry.sha256) not in there for entry in manifest.shards):
+            remove(f"{url}/{MANIFEST}")
+        with progress_bar("push", len(manifest.shards), show=show_progress) as advance:
+            for entry in manifest.shards:
+                if (entry.file, entry.sha256) not in there:
+                    publish(folder / entry.file, f"{url}/{entry.file}")
+                    renew()
+                advance(1)
+        for name in (INDEX, MANIFEST):
+            publish(folder / name, f"{url}/{name}")
     return manifest
 
 
