@@ -189,13 +189,18 @@ def put_text(url: str, text: str, *, is_new: bool) -> bool:
         DataError: it cannot be written there.
     """
     with remote(url) as (files, place):
-        if url.partition("://")[0] not in OBJECT_STORES:
+        has_folders = url.partition("://")[0] not in OBJECT_STORES
+        if has_folders:
             files.makedirs(files._parent(place), exist_ok=True)
         try:
             with files.open(place, "xb" if is_new else "wb") as file:
                 file.write(text.encode())
         except FileExistsError:
             return False
+        except OSError:
+            if has_folders and files.exists(place):  # an empty file, as on a full disk
+                files.rm_file(place)
+            raise
     return True
 
 

@@ -196,6 +196,11 @@ def test_a_push_to_a_folder_leaves_whole_files_or_none(data, tmp_path, monkeypat
         pytest.raises(DataError, match=r"^cannot write file://.* \(File too large\): make room there"),
     ):
         storage.publish(data / manifest, f"file://{there}/{manifest}")
+    with (
+        limit_files_to(10),
+        pytest.raises(DataError, match=r"^cannot write file://.*/\.lease \(File too large\): make room"),
+    ):
+        push_dataset(data, f"file://{there}", show_progress=False)
     assert contents(there) == before
 
 
