@@ -18,7 +18,7 @@ from rlftsim.atomic_io import errors_name
 from rlftsim.errors import DataError, NotYetError
 from rlftsim.progress import log
 from rlftsim.storage import get_text, put_text, remove
-from rlftsim.workers import Joining, Runner, Share, Unfinished
+from rlftsim.workers import Runner, Share, Unfinished, require_begun
 
 SECONDS_TO_WAIT = 10.0
 """A share waits so long for a driver that may only be putting the result together, or for its predecessor to end."""
@@ -49,8 +49,7 @@ class Lease:
         self._path, self._doing, self._note = path, doing, note
         self._share = runner if isinstance(runner, Share) else None
         self._files: list[TextIO] = []
-        if isinstance(runner, Joining) and not path.parent.exists():
-            raise NotYetError(f"{path.parent} is not there, so no share has begun: check the path, or run the shares.")
+        require_begun(runner, path.parent)
         try:
             if self._share is None:
                 self._lock(path)

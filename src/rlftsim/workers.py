@@ -210,6 +210,20 @@ def on_this_machine(jobs: int, num_items: int, on_death: OnDeath = "skip") -> Ru
     return Processes(jobs, on_death) if jobs > 1 else Inline()
 
 
+def require_begun(runner: Runner, folder: Path) -> None:
+    """Stop before a folder is made where there is nothing to put together.
+
+    Args:
+        runner: that is to do items.
+        folder: of the pieces.
+
+    Raises:
+        NotYetError: only finished pieces are wanted, and the folder is not there.
+    """
+    if isinstance(runner, Joining) and not folder.exists():
+        raise NotYetError(f"{folder} is not there, so no share has begun: check the path, or run the shares.")
+
+
 def require_finished(runner: Runner, num_left: int, num_items: int, title: str) -> None:
     """Stop before the result is put together where pieces of it are missing.
 

@@ -121,6 +121,8 @@ def test_a_join_of_a_mistyped_folder_leaves_nothing_and_says_so(source, tmp_path
     assert "constant_velocity.parts is not there, so no share has begun: check the path" in capsys.readouterr().err
     assert main(["join", "convert", str(source), str(tmp_path / "datA")]) == 1
     assert "datA is not there, so no share has begun: check the path" in capsys.readouterr().err
+    assert main(["join", "synthesize", str(tmp_path / "madE"), "--num-scenarios", "2"]) == 1
+    assert "madE is not there, so no share has begun: check the path" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["womd"]
 
 

@@ -196,11 +196,7 @@ class _Board:
 
 
 def _work(task: list[Any], key: str, driver: tuple[str, str], item: bytes, number: int, board: Any) -> bytes:
-    """Do an item in a process of the cluster.
-
-    Returns:
-        Pickled: "result" or "error", its value, the progress made, the seconds taken and the machine.
-    """
+    """Do an item in a process of the cluster; pickled "result" or "error", value, progress, seconds and machine."""
     total, last = 0, time.monotonic()
     start, machine = last, ray.util.get_node_ip_address()
     version, folder = driver

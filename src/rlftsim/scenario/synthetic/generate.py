@@ -29,7 +29,7 @@ from rlftsim.scenario.synthetic import sumo
 from rlftsim.scenario.synthetic.windows import cut_scenarios
 from rlftsim.scenario.synthetic.world import simulate_world
 from rlftsim.scenario.types import Scenario
-from rlftsim.workers import Advance, Runner, on_this_machine, require_finished
+from rlftsim.workers import Advance, Runner, on_this_machine, require_begun, require_finished
 
 GENERATOR_VERSION = 1
 LICENSE_NOTE = "CC0-1.0: synthetic scenarios, no rights reserved."
@@ -169,6 +169,8 @@ def generate(
         if dict(manifest.provenance) != provenance:
             raise DataError(f"{folder} holds scenarios made with other arguments or versions: choose another folder")
         return manifest
+    runner = runner or on_this_machine(jobs, len(tasks))
+    require_begun(runner, folder)
     marker = folder / INCOMPLETE
     if marker.exists():
         if current_names(json.loads(marker.read_text(encoding="utf-8") or "{}")) != provenance:
@@ -180,7 +182,6 @@ def generate(
         write_text(marker, json.dumps(provenance, indent=1))
 
     # 2. Make the shards that are not there yet.
-    runner = runner or on_this_machine(jobs, len(tasks))
     paths = [folder / SHARDS / task.shard_name for task in tasks]
     with Lease(folder / SHARDS / ".lock", runner, "makes scenarios in") as lease:
         own = runner.own(tasks)
