@@ -129,8 +129,12 @@ def smart_demo_long() -> SmartRecipe:
     return replace(
         recipe,
         # Scenarios that are seen a few times leave nothing to learn by heart, so the effort goes into reading the map:
-        # moving tokens, more map tokens, and a history that is often hidden.
-        model=replace(recipe.model, history_drop=0.2, max_agent_map_neighbors=32),
+        # moving tokens, more map tokens, and a history that is often hidden. Among parked cars the 8 nearest agents
+        # of the demo do not reach the car ahead.
+        model=replace(
+            recipe.model, history_drop=0.2, max_agent_neighbors=24, agent_radius_m=60.0,
+            max_agent_map_neighbors=64, agent_map_radius_m=50.0,
+        ),
         pretrain=replace(recipe.pretrain, epochs=6.0, still_weight=0.15, ema_decay=0.998, final_lr_ratio=0.0),
         road=replace(
             recipe.road, epochs=0.5, batch_size=2, learning_rate=5e-4, final_lr_ratio=0.0, warmup_updates=20,
