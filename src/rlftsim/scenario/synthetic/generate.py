@@ -151,11 +151,13 @@ def generate(
     """
     request = SyntheticRequest(num_scenarios, seed, scenarios_per_network, splits)
     folder = Path(destination)
+    tasks = plan_networks(request)
+    runner = runner or on_this_machine(jobs, len(tasks))
+    require_begun(runner, folder)
     if not sumo.is_available():
         raise ConfigError(sumo.INSTALL_HINT)
 
     # 1. Take over a finished data set of the same arguments, or claim the folder.
-    tasks = plan_networks(request)
     provenance = {
         "generator": "rlftsim.scenario.synthetic.generate",
         "generator_version": GENERATOR_VERSION,
@@ -169,8 +171,6 @@ def generate(
         if dict(manifest.provenance) != provenance:
             raise DataError(f"{folder} holds scenarios made with other arguments or versions: choose another folder")
         return manifest
-    runner = runner or on_this_machine(jobs, len(tasks))
-    require_begun(runner, folder)
     marker = folder / INCOMPLETE
     if marker.exists():
         if current_names(json.loads(marker.read_text(encoding="utf-8") or "{}")) != provenance:
