@@ -131,22 +131,26 @@ def blocks(request, monkeypatch):
     return tuple(blocks), leaves, sources
 
 
-def plain_gather(query, source, around, dropout):
+def plain_gather(queries, source, around, dropout):
     """`gather_edges` in operations that autograd knows."""
     sums, totals = [], []
+    query = torch.cat(queries, -1)
     for block, block_query in zip(around.blocks, query.split(around.sizes)):
         edges = block.edge_features if source is None else torch.cat([block.edge_features, source[block.neighbors]], -1)
         weights = torch.softmax(torch.einsum("rhc,rkc->rhk", block_query, edges) + block.bias, -1)
         weights = weights * module.draw_dropout(weights, dropout) if dropout else weights
         sums.append(torch.einsum("rhk,rkc->rhc", weights, edges))
         totals.append(weights.sum(-1, keepdim=True))
-    return torch.cat(sums), torch.cat(totals)
+    return torch.cat(sums).split([q.shape[-1] for q in queries], -1), torch.cat(totals)
 
 
-def draw_query(sources_are_shared):
+def draw_queries(sources_are_shared):
     generator = torch.Generator().manual_seed(4)
-    width = DIM if sources_are_shared else 2 * DIM
-    return torch.randn(7, NUM_HEADS, width, generator=generator, dtype=torch.float64, requires_grad=True)
+    count = 1 if sources_are_shared else 2
+    return tuple(
+        torch.randn(7, NUM_HEADS, DIM, generator=generator, dtype=torch.float64, requires_grad=True)
+        for _ in range(count)
+    )
 
 
 @pytest.mark.parametrize("dropout", [0.0, 0.3])
@@ -154,16 +158,16 @@ def draw_query(sources_are_shared):
 def test_layers_that_share_edges_have_the_gradients_of_plain_attention(sources_are_shared, dropout, blocks):
     around = Neighborhoods(torch.arange(7), blocks[0], EdgeGradients.of(list(blocks[0])))
     source = None if sources_are_shared else blocks[2]
-    query = draw_query(sources_are_shared)
-    trained = [*blocks[1], query, *([] if source is None else [source])]
+    queries = draw_queries(sources_are_shared)
+    trained = [*blocks[1], *queries, *([] if source is None else [source])]
 
     def three_layers(gather):
-        """Each layer's sums are the next one's query."""
-        total, current = torch.zeros((), dtype=torch.float64), query
+        """Each layer's sums are the next one's queries."""
+        total, current = torch.zeros((), dtype=torch.float64), queries
         for layer in range(1, 4):
             sums, weight = gather(current, source, around, dropout)
-            total = total + layer * (sums.square().sum() + (weight.square() * layer).sum())
-            current = query + sums
+            total = total + layer * (sum(part.square().sum() for part in sums) + (weight.square() * layer).sum())
+            current = tuple(query + part for query, part in zip(queries, sums))
         return total
 
     ours, plain = three_layers(gather_edges), three_layers(plain_gather)
@@ -178,12 +182,14 @@ def test_layers_that_share_edges_have_the_gradients_of_plain_attention(sources_a
 def test_gradients_of_gathered_edges_are_those_of_finite_differences(sources_are_shared, blocks):
     source = None if sources_are_shared else blocks[2]
 
-    def gather(edges, other_edges, query, own=None):
+    def gather(edges, other_edges, *tensors):
         renewed = tuple(replace(b, edge_features=e) for b, e in zip(blocks[0], (edges, other_edges)))
         around = Neighborhoods(torch.arange(7), renewed, EdgeGradients.of(list(renewed)))
-        return gather_edges(query, own, around, 0.3)
+        queries, own = (tensors, None) if source is None else (tensors[:-1], tensors[-1])
+        sums, weight = gather_edges(queries, own, around, 0.3)
+        return *sums, weight
 
-    inputs = [*blocks[1], draw_query(sources_are_shared), *([] if source is None else [source])]
+    inputs = [*blocks[1], *draw_queries(sources_are_shared), *([] if source is None else [source])]
     assert torch.autograd.gradcheck(gather, inputs, fast_mode=True)
 
 
@@ -192,8 +198,8 @@ def test_edge_features_go_with_the_backward_pass(blocks):
     first = replace(blocks[0][0], edge_features=edges)
     around = Neighborhoods(torch.arange(4), (first,), EdgeGradients.of([first]))
     memory = weakref.ref(edges.untyped_storage())
-    sums, _ = gather_edges(draw_query(True)[:4], None, around, 0.0)
-    loss = sums.sum()
+    sums, _ = gather_edges(tuple(q[:4] for q in draw_queries(True)), None, around, 0.0)
+    loss = sums[0].sum()
     del edges, first, around, sums
     assert memory() is not None
     loss.backward()

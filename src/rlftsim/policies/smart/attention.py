@@ -7,6 +7,7 @@ relations.
 
 import itertools
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -259,15 +260,15 @@ class _HandOver(Function):
 
 
 def gather_edges(
-    query: Float[Tensor, "n H W"],
+    queries: tuple[Float[Tensor, "n H _"], ...],
     source: Float[Tensor, "S D"] | None,
     neighborhoods: Neighborhoods,
     dropout: float,
-) -> tuple[Float[Tensor, "n H W"], Float[Tensor, "n H 1"]]:
-    """Attention-weighted sums of edge features, followed by those of sources if there are any, and sums of the weights.
+) -> tuple[tuple[Float[Tensor, "n H _"], ...], Float[Tensor, "n H 1"]]:
+    """Attention-weighted sums of edge features, those of sources if there are any, and sums of the weights.
 
     Args:
-        query: in the space of edge features, followed by that of sources.
+        queries: in the space of edge features [n, H, W], and in that of sources [n, H, D].
         source: features of all sources; None = they are in the edge features.
         neighborhoods: of the n rows.
         dropout: probability that a weight is zeroed.
@@ -275,19 +276,21 @@ def gather_edges(
     if torch.is_grad_enabled() or dropout:
         token = None if neighborhoods.gradients is None else neighborhoods.gradients.token
         # autocast would copy the edge features in each layer: here reading them costs more than computing with them
-        with torch.autocast(query.device.type, enabled=False):
-            tensors = (None if t is None else t.to(neighborhoods.dtype) for t in (source, query))
-            return _GatherEdges.apply(neighborhoods, dropout, token, *tensors)  # type: ignore
+        with torch.autocast(queries[0].device.type, enabled=False):
+            tensors = (None if t is None else t.to(neighborhoods.dtype) for t in (source, *queries))
+            *sums, total = _GatherEdges.apply(neighborhoods, dropout, token, *tensors)  # type: ignore
+        return tuple(sums), total
     # the fused kernel is faster, although relations and sources are copied together for it
     results = []
-    for block_query, block in zip(query.split(neighborhoods.sizes), neighborhoods.blocks):
-        edges = torch.cat(_parts(block.edge_features, block.neighbors, source), -1)[:, None]  # [r, 1, K, W]
+    for block_query, block in zip(torch.cat(queries, -1).split(neighborhoods.sizes), neighborhoods.blocks):
+        parts = _parts(block.edge_features, block.neighbors, source)
+        edges = (parts[0] if source is None else torch.cat(parts, -1))[:, None]  # [r, 1, K, 2D]
         bias = block.bias[:, None]
-        lists = _by_list(block_query, block.num_sharing * block_query.shape[1])[:, None]  # [r, 1, m H, W]
-        result = functional.scaled_dot_product_attention(lists, edges, edges, attn_mask=bias, scale=1.0)
+        query = _by_list(block_query, block.num_sharing * block_query.shape[1])[:, None]  # [r, 1, m H, 2D]
+        result = functional.scaled_dot_product_attention(query, edges, edges, attn_mask=bias, scale=1.0)
         results.append(result.view(block_query.shape))
-    gathered = torch.cat(results)  # [n, H, W]
-    return gathered, torch.ones_like(gathered[..., :1])
+    gathered = torch.cat(results)  # [n, H, 2D]
+    return gathered.split([q.shape[-1] for q in queries], -1), torch.ones_like(gathered[..., :1])
 
 
 class _GatherEdges(Function):
@@ -295,8 +298,7 @@ class _GatherEdges(Function):
 
     With edge features E, queries q and scores s = q E^T: the weights are A = dropout(P), P = softmax(s), and the sums
     G = A E. Backward dA = dG E^T + d(sum of A), ds = A dA - P sum(A dA), dq = ds E and dE = A^T dG + ds^T q, which is
-    one product of factors that lie side by side. Of each block P and A are stored. Products with E^T are computed as
-    those of E, which is much larger than the queries and would be copied for them.
+    one product of factors that lie side by side. Of each block P and A are stored.
     """
 
     @staticmethod
@@ -306,53 +308,57 @@ class _GatherEdges(Function):
         dropout: float,
         token: Tensor | None,
         source: Tensor | None,
-        query: Tensor,
-    ) -> tuple[Tensor, Tensor]:
-        sums, total = query.new_empty(query.shape), query.new_empty(*query.shape[:2], 1)
+        *queries: Tensor,
+    ) -> tuple[Tensor, ...]:
+        sums = [query.new_empty(query.shape) for query in queries]
+        total = queries[0].new_empty(*queries[0].shape[:2], 1)
         saved, sizes = [], neighborhoods.sizes
-        for block, *rows in zip(neighborhoods.blocks, *(values.split(sizes) for values in (query, sums, total))):
+        per_block = zip(neighborhoods.blocks, _cut_all(queries, sizes), _cut_all(sums, sizes), total.split(sizes))
+        for block, block_queries, block_sums, block_total in per_block:
             edges = block.edge_features.detach()
             parts = _parts(edges, block.neighbors, source)
-            block_query, block_sums, block_total = (_by_list(v, block.num_sharing * v.shape[1]) for v in rows)
-            scores = block.bias.mT.expand(-1, -1, block_query.shape[1])
-            for part, part_query in zip(parts, block_query.split(edges.shape[-1], -1)):
-                scores = torch.baddbmm(scores, part, part_query.mT)  # [r, K, m H]
-            softmax = torch.softmax(scores.mT, -1)
+            num_heads = block.num_sharing * total.shape[1]
+            scores = block.bias.expand(-1, num_heads, -1)
+            for part, query in zip(parts, block_queries):
+                scores = torch.baddbmm(scores, _by_list(query, num_heads), part.mT)  # [r, m H, K]
+            softmax = torch.softmax(scores, -1)
             weights = softmax * draw_dropout(softmax, dropout) if dropout else softmax
-            for part, result in zip(parts, block_sums.split(edges.shape[-1], -1)):
-                torch.bmm(weights, part, out=result)
-            torch.sum(weights, -1, keepdim=True, out=block_total)
+            for part, result in zip(parts, block_sums):
+                torch.bmm(weights, part, out=_by_list(result, num_heads))
+            torch.sum(weights, -1, keepdim=True, out=_by_list(block_total, num_heads))
             saved.append((edges, block.neighbors, softmax, weights))
         # saved in this way, edge features go as soon as the backward pass is through
-        ctx.save_for_backward(source, query, *itertools.chain(*saved))
+        ctx.save_for_backward(source, *queries, *itertools.chain(*saved))
         ctx.sizes, ctx.device_type = sizes, total.device.type
         ctx.buffers = None if neighborhoods.gradients is None else neighborhoods.gradients.buffers
-        return sums, total
+        return *sums, total
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, sums_grad: Tensor, total_grad: Tensor) -> tuple[Tensor | None, ...]:
-        source, query, *saved = ctx.saved_tensors
-        sums_grad = sums_grad.contiguous()
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        *sum_grads, total_grad = grads
+        source, *saved = ctx.saved_tensors
+        queries, saved = saved[: len(sum_grads)], saved[len(sum_grads) :]
         _, _, edges_need_grad, source_needs_grad, *_ = ctx.needs_input_grad
         source_grad = torch.zeros_like(source) if source_needs_grad else None
-        query_grad = query.new_empty(query.shape)
-        rows_of_blocks = (values.split(ctx.sizes) for values in (sums_grad, query, query_grad, total_grad))
+        query_grads = [query.new_empty(query.shape) for query in queries]
+        rows_of_blocks = (_cut_all(rows, ctx.sizes) for rows in (sum_grads, queries, query_grads))
+        per_block = zip(zip(*[iter(saved)] * 4), *rows_of_blocks, total_grad.split(ctx.sizes))
         # As in the forward pass: a backward pass may be called under autocast.
         with torch.autocast(ctx.device_type, enabled=False):
-            for index, (stored, *rows) in enumerate(zip(zip(*[iter(saved)] * 4), *rows_of_blocks)):
+            for index, (stored, block_sums, block_queries, block_grads, block_total) in enumerate(per_block):
                 edges, neighbors, softmax, weights = stored
                 parts, num_heads = _parts(edges, neighbors, source), weights.shape[1]
-                block_sums, block_query, block_grad, block_total = (_by_list(v, num_heads) for v in rows)
                 # factors of gradients of the edges [r, 2 m H, W] and of the sources [r, 2 m H, D]
-                factors = torch.cat([block_sums, block_query], 1).split(edges.shape[-1], -1)
-                weight_grad = block_total.mT.expand(-1, weights.shape[-1], -1)
+                pairs = ([_by_list(rows, num_heads) for rows in pair] for pair in zip(block_sums, block_queries))
+                factors = [torch.cat(pair, 1) for pair in pairs]
+                weight_grad = _by_list(block_total, num_heads).expand_as(weights)
                 for part, factor in zip(parts, factors):
-                    weight_grad = torch.baddbmm(weight_grad, part, factor[:, :num_heads].mT)  # [r, K, m H]
-                score_grad = weights * weight_grad.mT
+                    weight_grad = torch.baddbmm(weight_grad, factor[:, :num_heads], part.mT)  # [r, m H, K]
+                score_grad = weight_grad.mul_(weights)
                 score_grad = torch.addcmul(score_grad, softmax, score_grad.sum(-1, keepdim=True), value=-1)
-                for part, result in zip(parts, block_grad.split(edges.shape[-1], -1)):
-                    torch.bmm(score_grad, part, out=result)
+                for part, result in zip(parts, block_grads):
+                    torch.bmm(score_grad, part, out=_by_list(result, num_heads))
                 left = torch.cat([weights, score_grad], 1).mT  # [r, K, 2 m H]
                 if edges_need_grad:
                     buffer = ctx.buffers[index]
@@ -361,7 +367,7 @@ class _GatherEdges(Function):
                 if source_grad is not None:
                     source_grad.index_add_(0, neighbors.flatten(), (left @ factors[1]).flatten(0, 1))
         token_grad = total_grad.new_zeros(()) if edges_need_grad else None
-        return None, None, token_grad, source_grad, query_grad
+        return None, None, token_grad, source_grad, *query_grads
 
 
 def _parts(edges: Tensor, neighbors: Tensor, source: Tensor | None) -> tuple[Tensor, ...]:
@@ -372,6 +378,11 @@ def _parts(edges: Tensor, neighbors: Tensor, source: Tensor | None) -> tuple[Ten
 def _by_list(rows: Tensor, num_heads: int) -> Tensor:
     """Rows of a block [r m, H, _] as those of its lists [r, m H, _], which have m H heads; a view if it can be."""
     return rows.reshape(-1, num_heads, rows.shape[-1])
+
+
+def _cut_all(tensors: Sequence[Tensor], sizes: list[int]) -> Iterator[tuple[Tensor, ...]]:
+    """The rows of each block, of all tensors."""
+    return zip(*(tensor.split(sizes) for tensor in tensors))
 
 
 @dataclass(frozen=True, eq=False)
@@ -467,9 +478,11 @@ class RelationAttention(nn.Module):
         rows = neighborhoods.rows
         query = self.query(target if rows is None else target[rows])
         query = query.unflatten(-1, (self.num_heads, self.head_dim)).transpose(0, 1)
-        query = (query @ maps.to_key).transpose(0, 1).contiguous()  # [n, H, 2D]
-        sums, weight = gather_edges(query, source, neighborhoods, self.dropout if self.training else 0.0)
-        value = (sums.transpose(0, 1) @ maps.to_value).transpose(0, 1)  # [n, H, d]
+        spaces = 1 if source is None else 2
+        queries = tuple((query @ part).transpose(0, 1) for part in maps.to_key.chunk(spaces, -1))
+        sums, weight = gather_edges(queries, source, neighborhoods, self.dropout if self.training else 0.0)
+        projected = [part.transpose(0, 1) @ to_part for part, to_part in zip(sums, maps.to_value.chunk(spaces, 1))]
+        value = torch.stack(projected).sum(0).transpose(0, 1)  # [n, H, d]
         # weights sum to 1, unless dropout zeroed some
         value = value + weight * maps.constant
         # 2. back to all rows
