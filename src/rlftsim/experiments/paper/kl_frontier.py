@@ -8,7 +8,7 @@ import numpy as np
 from rlftsim.evaluation.columns import DRIFT_COLUMNS, SCORES
 from rlftsim.evaluation.compare import compare
 from rlftsim.experiments import tables
-from rlftsim.experiments.model_specs import BASE, over_seeds
+from rlftsim.experiments.model_specs import BASE, FineTuned, over_seeds
 from rlftsim.experiments.paper import paired_ttest, published, reward_ablation
 from rlftsim.experiments.paper.reward_ablation import MLOO, REFERENCE
 from rlftsim.experiments.results import Experiment, ExperimentResult
@@ -37,12 +37,13 @@ def point(reward: str, target: float) -> str:
 
 def run(suite: ExperimentSuite) -> dict[str, Row]:
     """Rows of the base model, and of a fine-tuning with each reward at each target."""
-    points = {
-        point(name, target): over_seeds(replace(spec, kl_target=target), suite.num_seeds)
-        for name, spec in REWARDS.items()
-        for target in TARGETS
-    }
+    points = {point(name, target): _runs(suite, name, target) for name in REWARDS for target in TARGETS}
     return suite.evaluate({REFERENCE: (BASE,), **points})
+
+
+def _runs(suite: ExperimentSuite, reward: str, target: float) -> tuple[FineTuned, ...]:
+    """Runs of a point, one for each seed."""
+    return over_seeds(replace(REWARDS[reward], kl_target=target), suite.num_seeds)
 
 
 def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResult:
@@ -53,11 +54,11 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
         suite: where the runs are, whose KL is read.
     """
     base, frontiers = rows[REFERENCE], {}
-    for name, spec in REWARDS.items():
+    for name in REWARDS:
         points = []
         for target in TARGETS:
-            specs = over_seeds(replace(spec, kl_target=target), suite.num_seeds)
-            points.append((reward_ablation.mean_at_end(suite, specs)["kl"], rows[point(name, target)]))
+            end = reward_ablation.mean_at_end(suite, _runs(suite, name, target))
+            points.append((end["kl"], rows[point(name, target)]))
         frontiers[name] = [(0.0, base), *sorted(points, key=lambda one: one[0])]
     # 1. All rewards at one distance: the largest that none of them has to be extrapolated to.
     kl = min(frontier[-1][0] for frontier in frontiers.values())
