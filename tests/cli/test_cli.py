@@ -134,7 +134,7 @@ WRONG = {
     ),
     "a baseline to pre-train": (
         "pretrain smart-demo --data synthetic --out {tmp}/o --init-from constant_velocity",
-        "ConstantVelocity has no weights",
+        "this recipe makes SMART policies, none like a ConstantVelocity",
     ),
     "a vocabulary that is not there": (
         "pretrain smart-demo --data synthetic --out {tmp}/o --vocabulary {tmp}/v",
@@ -390,10 +390,12 @@ def test_pretraining_and_fine_tuning_by_command(vocabulary, tmp_path, capsys):
     assert "40 scenarios" in card
     # trained further, by a recipe of another size
     further = ["pretrain", "smart-nano", *common, "--init-from", base, "--out", tmp_path / "further"]
+    further += ["--model.max-agent-neighbors", "3"]
     assert run(capsys, *further, *once, *settings("pretrain", learning_rate=1e-9))[0] == 0
     before, after = (load_policy(folder).state_dict() for folder in (base, tmp_path / "further"))
     for name, value in before.items():
         torch.testing.assert_close(after[name], value, atol=1e-6, rtol=0)
+    assert load_policy(tmp_path / "further").config == replace(load_policy(base).config, max_agent_neighbors=3)
     once = settings("finetune", epochs=0.025, batch_size=1, num_rollouts=2)
     status, out, _ = run(capsys, "finetune", "smart-demo", "--model", base, *common, "--out", tuned, *once)
     assert status == 0
@@ -459,9 +461,9 @@ def test_settings_without_effect_are_refused(tmp_path, capsys):
     assert status == 2
     assert f"--vocabulary {tmp_path / 'v'} has no effect: demo-base has one of its own" in err
     words = ["pretrain", "smart-demo", "--data", "synthetic", "--init-from", "demo-base", "--out", tmp_path / "run"]
-    status, _, err = run(capsys, *words, "--model.dim", "16")
+    status, _, err = run(capsys, *words, "--model.num-heads", "2")
     assert status == 2
-    assert "--model.dim has no effect with --init-from demo-base: that model has its own sizes" in err
+    assert "--init-from demo-base: 91 weights do not fit this model" in err
 
 
 def test_what_has_no_effect_on_a_method_is_refused(tmp_path, vocabulary, capsys):

@@ -7,12 +7,14 @@ from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
 import tyro
+from torch import nn
 from tyro.conf import Positional
 
 from rlftsim.cli.recipe_verb import Processes, RecipeVerb, refuse_settings, value_of
 from rlftsim.errors import ConfigError, RlftsimError
 from rlftsim.evaluation.learning_curve import write_learning_curve
 from rlftsim.experiments.stages import GoalConditioning, finetune_model, pretrain_policy
+from rlftsim.policies.checkpoint import load_strictly
 from rlftsim.policies.registry import load_policy
 from rlftsim.progress import log
 from rlftsim.recipes.registry import Recipe
@@ -49,7 +51,8 @@ class Pretrain(RecipeVerb):
     """File that `rlftsim tokens` wrote; needed by models with a vocabulary, such as SMART."""
     init_from: str | None = None
     """Model to train further, such as one of synthetic scenarios on logs: a run, a model folder or a registered name.
-    It brings its architecture and vocabulary. Left out: fresh weights."""
+    It brings its vocabulary and the settings --model.*; flags change those that its weights do not depend on, such as
+    the number of neighbors. Left out: fresh weights."""
     processes: Processes = None
     """Processes that train, in short for --pretrain.device.processes."""
     split: str = "training"
@@ -63,16 +66,25 @@ class Pretrain(RecipeVerb):
     repeated from its own config.json, with the same recipe, flags of the model, vocabulary and data, gives the same
     weights bit for bit. Flags override the file."""
 
+    @classmethod
+    def recipe_for(cls, name: str, words: Sequence[str]) -> Recipe:
+        """The recipe of a command line, for models like the one that is trained further, if there is one.
+
+        Args:
+            name: of the recipe.
+            words: the words behind the verb.
+        """
+        recipe, start = super().recipe_for(name, words), value_of("--init-from", words)
+        return recipe.like(load_policy(start)) if start else recipe
+
     def refuse_useless(self, flags: Sequence[str]) -> None:
         """Refuse what a model that is trained further brings along.
 
         Raises:
-            ConfigError: one of the flags would have no effect.
+            ConfigError: there are two vocabularies.
         """
-        if self.init_from is not None:
-            if self.vocabulary is not None:
-                raise ConfigError(f"--vocabulary {self.vocabulary} has no effect: {self.init_from} has one of its own.")
-            refuse_settings(flags, ["model"], f"with --init-from {self.init_from}: that model has its own sizes.")
+        if self.init_from is not None and self.vocabulary is not None:
+            raise ConfigError(f"--vocabulary {self.vocabulary} has no effect: {self.init_from} has one of its own.")
 
     def run(self) -> int:
         """Build or load the model and train it."""
@@ -83,11 +95,14 @@ class Pretrain(RecipeVerb):
                 "--vocabulary, or train a model further with --init-from."
             )
         scenarios = open_dataset(self.data, self.split)
-        vocabulary = Vocabulary.load(self.vocabulary) if self.vocabulary else None
+        start = load_policy(self.init_from) if self.init_from else None
+        vocabulary = Vocabulary.load(self.vocabulary) if self.vocabulary else getattr(start, "vocabulary", None)
         held_out = _held_out(self.data, self.validation_split, recipe.pretrain.validation.every)
         # The curve is drawn of interrupted runs, too.
         with _learning_curve(self.out):
-            policy = recipe.new_policy(vocabulary) if self.init_from is None else load_policy(self.init_from)
+            policy = recipe.new_policy(vocabulary)
+            if isinstance(start, nn.Module):
+                load_strictly(policy, start.state_dict(), source=f"--init-from {self.init_from}")
             model = pretrain_policy(policy, scenarios, recipe.pretrain, self.out, held_out=held_out)
         print(f"model: {model}")
         return 0

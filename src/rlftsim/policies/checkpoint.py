@@ -30,6 +30,9 @@ CONFIG, WEIGHTS, CARD = "config.json", "model.safetensors", "README.md"
 _FIRST_FORMAT = {"rlftsim-smart-1": "smart"}
 """Architecture of folders of release 0.1, which name a format instead."""
 
+SHOWN_PROBLEMS = 6
+"""Weights that a message names; a model of other sizes has a hundred that do not fit."""
+
 Loaded = TypeVar("Loaded")
 
 
@@ -194,7 +197,7 @@ def similar_model(folder: Path) -> str | None:
 
 
 def load_strictly(module: nn.Module, weights: Mapping[str, Tensor], *, source: str) -> None:
-    """Load weights; refuse, with the whole list, missing or unknown keys and wrong shapes.
+    """Load weights; refuse missing or unknown keys and wrong shapes, and name the first of them.
 
     Args:
         module: receives the weights.
@@ -213,5 +216,6 @@ def load_strictly(module: nn.Module, weights: Mapping[str, Tensor], *, source: s
         if own[k].shape != weights[k].shape
     ]
     if problems:
-        raise CheckpointError(f"{source}: {len(problems)} weights do not fit this model: {'; '.join(problems)}.")
+        shown = "; ".join(problems[:SHOWN_PROBLEMS]) + (" …" if len(problems) > SHOWN_PROBLEMS else "")
+        raise CheckpointError(f"{source}: {len(problems)} weights do not fit this model: {shown}.")
     module.load_state_dict(weights)
