@@ -191,10 +191,17 @@ def remote_lease(url: str, doing: str) -> Iterator[Callable[[], object]]:
         doing: verb of the work, for messages: "is copying to".
 
     Raises:
-        NotYetError: another process holds the folder.
+        NotYetError: another process holds the folder, or took it over after a long silence of this one.
         DataError: the folder cannot be written to.
     """
     place = f"{url}/{REMOTE_LEASE}"
+
+    def renew() -> None:
+        owner = get_text(place).partition(" since ")[0]
+        if owner != _owner_line().partition(" since ")[0]:
+            raise NotYetError(f"{owner} has taken over {url}, after a silence of this process: run the command again.")
+        put_text(place, _owner_line(), is_new=False)
+
     while not put_text(place, _owner_line(), is_new=True):
         text = get_text(place)
         try:
@@ -209,7 +216,8 @@ def remote_lease(url: str, doing: str) -> Iterator[Callable[[], object]]:
         log.warning(f"{url}: taken over from {owner}, silent for {age}.")
         remove(place)
     try:
-        yield lambda: put_text(place, _owner_line(), is_new=False)
+        yield renew
     finally:
-        with suppress(DataError):  # taken over meanwhile
+        with suppress(DataError):  # gone, or another's
+            renew()
             remove(place)

@@ -184,6 +184,15 @@ def test_two_pushes_to_one_place_do_not_mix_and_a_killed_one_is_taken_over(
     assert contents(tmp_path / "back") == contents(data)
 
 
+def test_a_push_that_was_taken_over_leaves_the_new_owner_alone(tmp_path):
+    url, other = f"file://{tmp_path}", "other process 1 since 2026-01-01T00:00:00+00:00\n"
+    with remote_lease(url, "is copying to") as renew:
+        storage.put_text(f"{url}/.lease", other, is_new=False)
+        with pytest.raises(NotYetError, match=f"other process 1 has taken over {url}"):
+            renew()
+    assert storage.get_text(f"{url}/.lease") == other
+
+
 def test_a_push_to_a_folder_leaves_whole_files_or_none(data, tmp_path, monkeypatch):
     monkeypatch.setenv("RLFTSIM_CACHE", str(tmp_path / "cache"))
     there, manifest = tmp_path / "there", "manifest.json"
