@@ -180,7 +180,7 @@ def test_gradients_do_not_depend_on_how_many_rollouts_are_scored_at_once(vocabul
 
 def test_gradients_do_not_depend_on_how_many_scenarios_are_in_memory_at_once(vocabulary, drawn_scenarios, fabric):
     batch, found = collate(drawn_scenarios), []  # of different sizes, one with gaps in its log
-    base = replace(CONFIG, num_rollouts=2, reward="mloo + 0.1*collision_offroad_ade", credit="agent")
+    base = replace(CONFIG, num_rollouts=2, reward="mloo + 0.1*collision_offroad_ade", credit="agent", hold_speed=True)
     for micro_batch_size in (8, 3, 1):
         config = replace(base, micro_batch_size=micro_batch_size)
         learner = prepare(tiny.tiny_policy(vocabulary), config, fabric.device)
@@ -193,6 +193,31 @@ def test_gradients_do_not_depend_on_how_many_scenarios_are_in_memory_at_once(voc
         for name in logged.keys() - {"score_gap"}:
             if not name.startswith("seconds"):
                 assert values[name] == pytest.approx(logged[name], rel=1e-4, abs=1e-5), name
+
+
+def test_with_hold_speed_an_agent_that_is_faster_or_slower_earns_nothing_by_it(learner, batch, fabric):
+    config = replace(CONFIG, credit="agent")
+    rollouts = simulate(learner.policy, batch, num_rollouts=4, seed=0)
+    realism, rewards = compute_reward(batch, rollouts, config)
+    steps, counted = experience.simulated_speeds(batch, rollouts)
+    speed = (steps * counted[:, None]).sum(-1) / counted.sum(-1).clamp(min=1)[:, None]  # [B, N, A]
+    assert speed[batch.agent_mask[:, None].expand_as(speed)].std() > 0.1
+    faster = speed - speed.mean(1, keepdim=True)
+
+    def held(by_agent):
+        all_of_them = experience.Experience(batch, rollouts, realism, replace(rewards, by_agent=by_agent.float()))
+        [one], slope = experience.hold_speed([all_of_them], fabric)
+        return one.rewards.by_agent, slope
+
+    nothing_left, slope = held(-0.3 * faster)
+    assert slope == pytest.approx(-0.3, rel=1e-5)
+    assert nothing_left.abs().max() < 1e-5
+    once, _ = held(rewards.by_agent)
+    assert (once * faster).sum() == pytest.approx(0.0, abs=1e-6)
+    both, _ = held(rewards.by_agent - 0.3 * faster)
+    torch.testing.assert_close(both, once, atol=1e-5, rtol=1e-4)
+    values = update_policy(learner, batch, replace(config, hold_speed=True), fabric)
+    assert math.isfinite(values["speed_slope"])
 
 
 def gradients_with(learner, batch, fabric, config, beta):

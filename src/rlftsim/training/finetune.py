@@ -24,6 +24,7 @@ from rlftsim.training.experience import (
     compute_reward,
     count_decisions,
     describe,
+    hold_speed,
     sample_rollouts,
 )
 from rlftsim.training.freezing import TrainedParts, freeze_untrained, parameter_groups, set_learning_rate
@@ -80,6 +81,9 @@ class FinetuneConfig:
     imitation_weight: float = 0.0
     """Weight of the pre-training loss on the same scenarios in the objective: it holds speeds and kinematics near the
     log while realism rises. 0 = the paper's objective."""
+    hold_speed: bool = False
+    """Take out of the rewards what an agent's mean speed explains, so that driving slowly earns nothing by itself.
+    False = the paper's objective."""
     log_prob_reduction: Reduction = "mean"
     """Over agents and decisions. The mean makes the size of an update independent of the number of agents."""
     trained: TrainedParts = "decoder"
@@ -228,6 +232,9 @@ def update_policy(
         realism, rewards = compute_reward(part, rollouts, config)
         experiences.append(Experience(part, rollouts, realism, rewards, context, own))
         clock.lap("reward")
+    speed = {}
+    if config.hold_speed:
+        experiences, speed["speed_slope"] = hold_speed(experiences, fabric)
     # 3. Score them under policy and reference: gradient of the policy-gradient loss with its KL penalty, and of the
     # pre-training loss where it has a weight.
     terms = LossTerms(
@@ -251,7 +258,7 @@ def update_policy(
     set_learning_rate(learner.optimizer, config.learning_rate * warmup)
     learner.finish_update(is_good=math.isfinite(norm) and sums.kl <= config.max_kl)
     values = {
-        **describe(experiences, fabric), "kl": sums.kl, "entropy": sums.entropy, **hindsight,
+        **describe(experiences, fabric), **speed, "kl": sums.kl, "entropy": sums.entropy, **hindsight,
         **sums.imitation, "score_gap": sums.score_gap, "beta": learner.beta, "gradient_norm": norm,
         "skipped": float(learner.skipped_in_a_row),
     }  # fmt: skip
