@@ -18,6 +18,7 @@ from tyro.conf import Positional
 
 import rlftsim as rs
 
+NAMES = ("demo-base", "demo-tuned", "demo-goals")
 FURTHER = {
     "model.max-agent-neighbors": 24,
     "model.agent-radius-m": 60,
@@ -82,13 +83,12 @@ def train(options: Options) -> dict[str, Path]:
         first = ("--vocabulary", vocabulary)
     else:
         first = ("--init-from", options.start, *(word for k, v in FURTHER.items() for word in (f"--{k}", v)))
-    run("pretrain", "smart-demo-long", *common, "--out", runs / "pretrained", *first, *epochs, *processes)
-    for name, start, method in (("demo-base", "pretrained", "road"), ("demo-tuned", "demo-base", "rlft")):
-        model = ("--model", runs / start, "--out", runs / name, "--method", method)
-        run("finetune", "smart-demo-long", *common, *model, *processes)
-    goals = ("--method", "gcsl", "--goal", "indication", "--model", runs / "demo-base", "--out", runs / "demo-goals")
-    run("finetune", "smart-demo", "--data", "synthetic", *goals, *processes)
-    return {name: runs / name for name in ("demo-base", "demo-tuned", "demo-goals")}
+    base, tuned, goals = (runs / name for name in NAMES)
+    run("pretrain", "smart-demo-long", *common, "--out", base, *first, *epochs, *processes)
+    run("finetune", "smart-demo-long", *common, "--model", base, "--out", tuned, *processes)
+    trained = ("--method", "gcsl", "--goal", "indication", "--model", base, "--out", goals)
+    run("finetune", "smart-demo", "--data", "synthetic", *trained, *processes)
+    return dict(zip(NAMES, (base, tuned, goals), strict=True))
 
 
 def evaluate(options: Options, models: dict[str, Path]) -> dict[str, list[rs.Evaluation]]:
@@ -128,8 +128,7 @@ def table(evaluations: list[rs.Evaluation], base: list[rs.Evaluation]) -> str:
 def ship(options: Options, models: dict[str, Path], evaluations: dict[str, list[rs.Evaluation]]) -> Path:
     """Write the models with their cards, weights in float16; returns their folder."""
     ours = {
-        "demo-base": "A SMART traffic model of 0.5 M weights, pre-trained on synthetic scenarios, then RoaD on its own "
-        "rollouts. Not fine-tuned by a reward.",
+        "demo-base": "A SMART traffic model of 0.5 M weights, pre-trained on synthetic scenarios. Not fine-tuned.",
         "demo-tuned": "`demo-base` fine-tuned by MLOO: policy gradient on the realism meta-metric.",
         "demo-goals": "`demo-base` with a trained goal encoder (`indication`, with a logit bias). Without goals it decides as "
         "`demo-base`, to the last bit; below, all evaluated agents had their logged ends as goals.",
