@@ -214,8 +214,7 @@ def catk(job: Job) -> Repeat:
     import torch
     from torch.nn.functional import cross_entropy
 
-    from rlftsim.training.catk import CatkConfig
-    from rlftsim.training.catk_rollouts import roll_out_closest
+    from rlftsim.training.catk import CatkConfig, roll_out_closest  # where older versions have it, too
     from rlftsim.training.closed_loop import predict_along
     from rlftsim.training.freezing import freeze_untrained
 
