@@ -20,8 +20,11 @@ def draw_dropout(x: Float[Tensor, "*shape"], probability: float) -> Float[Tensor
     """
     num_dropped = round(probability * CHANCES)
     words = torch.empty((x.numel() + 3) // 4, dtype=torch.int64, device=x.device).random_(-(1 << 63), None)
-    is_kept = words.view(torch.int16)[: x.numel()] >= num_dropped - CHANCES // 2
-    return is_kept.view(x.shape).to(x.dtype).mul_(CHANCES / (CHANCES - num_dropped))
+    values = words.view(torch.int16)[: x.numel()].view(x.shape)
+    factors = x.new_empty(x.shape)
+    # zeros and ones of the type of x at once: conversion of a boolean mask would take longer than drawing it
+    torch.ge(values, num_dropped - CHANCES // 2, out=factors)
+    return factors.mul_(CHANCES / (CHANCES - num_dropped))
 
 
 class Dropout(nn.Dropout):
