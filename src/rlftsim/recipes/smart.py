@@ -123,7 +123,7 @@ def smart_demo_rlftsim() -> SmartRecipe:
 
 
 def smart_demo_long() -> SmartRecipe:
-    """The demo's model, pre-trained for an hour of one core or more on thousands of scenarios, then RoaD, then MLOO."""
+    """The demo's model, pre-trained for an hour of two cores on thousands of scenarios, then MLOO that holds speed."""
     recipe = smart_demo_rlftsim()
     assert recipe.road is not None
     return replace(
