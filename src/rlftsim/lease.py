@@ -199,7 +199,10 @@ def remote_lease(url: str, doing: str) -> Iterator[Callable[[], object]]:
     def renew() -> None:
         owner = get_text(place).partition(" since ")[0]
         if owner != _owner_line().partition(" since ")[0]:
-            raise NotYetError(f"{owner} has taken over {url}, after a silence of this process: run the command again.")
+            raise NotYetError(
+                f"{owner or 'another process'} has taken over {url}, after a silence of this process: run the command "
+                "again."
+            )
         put_text(place, _owner_line(), is_new=False)
 
     while not put_text(place, _owner_line(), is_new=True):

@@ -56,6 +56,11 @@ class RecipeVerb:
         return recipe_by_name(name)
 
     @classmethod
+    def sections_in_file(cls, words: Sequence[str]) -> tuple[str, ...]:
+        """Sections that are read from the file of settings, of those that the recipe has."""
+        return cls.sections
+
+    @classmethod
     def run_section(cls, words: Sequence[str]) -> str:
         """Section that the config.json of a run of this command line holds."""
         return cls.sections[-1]
@@ -101,7 +106,8 @@ def with_settings(
     # 3. settings of a file are flags before the user's own, which therefore win; a flag ends a list of values,
     # which would otherwise go on with the recipe
     file = value_of("--config", words)
-    stored = flags_of_file(Path(file), recipe, tuple(shown), verb.run_section(words)) if file else []
+    in_file = tuple(name for name in shown if name in verb.sections_in_file(words))
+    stored = flags_of_file(Path(file), recipe, in_file, verb.run_section(words)) if file else []
     return complete, [*stored, "--config", file, *words] if file else list(words)
 
 
@@ -114,10 +120,9 @@ def value_of(flag: str, words: Sequence[str]) -> str | None:
     """
     found = None
     for word, after in pairwise([*words, ""]):
-        if word.startswith(f"{flag}="):
-            found = word.removeprefix(f"{flag}=")
-        elif word == flag and after:
-            found = after
+        name, equals, value = word.partition("=")
+        if name.replace("_", "-") == flag and name.startswith("--"):  # tyro takes both spellings
+            found = value if equals else after or found
     return found
 
 

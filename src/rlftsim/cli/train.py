@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal, cast
 
 import tyro
 from torch import nn
@@ -75,16 +75,32 @@ class Pretrain(RecipeVerb):
             words: the words behind the verb.
         """
         recipe, start = super().recipe_for(name, words), value_of("--init-from", words)
-        return recipe.like(load_policy(start)) if start else recipe
+        # A recipe of another package may know no models but its own: those are trained further as they are.
+        return recipe if start is None or type(recipe).like is Recipe.like else recipe.like(load_policy(start))
+
+    @classmethod
+    def sections_in_file(cls, words: Sequence[str]) -> tuple[str, ...]:
+        """Sections that are read from the file of settings; a model that is trained further has its own sizes."""
+        return ("pretrain",) if value_of("--init-from", words) else cls.sections
 
     def refuse_useless(self, flags: Sequence[str]) -> None:
         """Refuse what a model that is trained further brings along.
 
         Raises:
-            ConfigError: there are two vocabularies.
+            ConfigError: there are two vocabularies, or a flag would change what the weights are made for.
         """
-        if self.init_from is not None and self.vocabulary is not None:
+        if self.init_from is None:
+            return
+        if self.vocabulary is not None:
             raise ConfigError(f"--vocabulary {self.vocabulary} has no effect: {self.init_from} has one of its own.")
+        free = getattr(getattr(self.starting_recipe, "model", None), "free_fields", ())
+        for flag in flags:
+            name = flag.removeprefix("--model.").replace("-", "_")
+            if flag.startswith("--model.") and name not in free:
+                raise ConfigError(
+                    f"{flag} cannot be changed with --init-from {self.init_from}, whose weights are made for it; these "
+                    f"can: {', '.join('--model.' + one.replace('_', '-') for one in free) or 'none'}."
+                )
 
     def run(self) -> int:
         """Build or load the model and train it."""
@@ -100,9 +116,12 @@ class Pretrain(RecipeVerb):
         held_out = _held_out(self.data, self.validation_split, recipe.pretrain.validation.every)
         # The curve is drawn of interrupted runs, too.
         with _learning_curve(self.out):
-            policy = recipe.new_policy(vocabulary)
-            if isinstance(start, nn.Module):
-                load_strictly(policy, start.state_dict(), source=f"--init-from {self.init_from}")
+            if start is not None and getattr(recipe, "model", None) == getattr(self.starting_recipe, "model", None):
+                policy = start
+            else:
+                policy = recipe.new_policy(vocabulary)
+                if start is not None:  # with settings that its weights do not depend on
+                    load_strictly(policy, cast(nn.Module, start).state_dict(), source=f"--init-from {self.init_from}")
             model = pretrain_policy(policy, scenarios, recipe.pretrain, self.out, held_out=held_out)
         print(f"model: {model}")
         return 0

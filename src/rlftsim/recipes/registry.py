@@ -83,7 +83,7 @@ class Recipe:
         CAT-K and RoaD, if the recipe has them, then train the goal-conditioned weights alone.
         """
         # Goals that the recipe has chosen already stay: `with_goals` fills in what is off.
-        finetune = replace(self.finetune, goals=with_goals(self.finetune.goals), reward="gcft")
+        finetune = replace(self.finetune, goals=with_goals(self.finetune.goals), reward="gcft", hold_speed=False)
         catk, road = (
             method and replace(method, goal_probability=1.0, trained="goals") for method in (self.catk, self.road)
         )

@@ -46,6 +46,7 @@ def push_dataset(folder: str | os.PathLike[str], url: str, *, show_progress: boo
                     publish(folder / entry.file, f"{url}/{entry.file}")
                     renew()
                 advance(1)
+        renew()
         for name in (INDEX, MANIFEST):
             publish(folder / name, f"{url}/{name}")
     return manifest

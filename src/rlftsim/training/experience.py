@@ -149,7 +149,8 @@ def hold_speed(experiences: Sequence[Experience], fabric: Fabric) -> tuple[list[
     """Rewards without the part that an agent's mean speed explains, so that being slow earns nothing by itself.
 
     The part is a linear regression over all agents of the update, each compared with itself in the scenario's other
-    rollouts. Slow cars collide less and stay on the road, so without this the realism metric rewards driving slowly.
+    rollouts, in the steps that its log has. Slow cars collide less and stay on the road, so without this the realism
+    metric rewards driving slowly.
 
     Args:
         experiences: of this process.
@@ -163,7 +164,7 @@ def hold_speed(experiences: Sequence[Experience], fabric: Fabric) -> tuple[list[
     for experience in experiences:
         speed, logged_valid = simulated_speeds(experience.batch, experience.rollouts)
         mean_speed = (speed * logged_valid[:, None]).sum(-1) / logged_valid.sum(-1).clamp(min=1)[:, None]  # [B, N, A]
-        deviation = mean_speed - mean_speed.mean(1, keepdim=True)
+        deviation = torch.nan_to_num(mean_speed - mean_speed.mean(1, keepdim=True), 0.0, 0.0, 0.0)
         sums += torch.stack([(deviation * experience.rewards.by_agent).sum(), deviation.square().sum()])
         deviations.append(deviation)
     # One slope for all processes, or their gradients would not add up to that of one process.

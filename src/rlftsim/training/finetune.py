@@ -82,8 +82,8 @@ class FinetuneConfig:
     """Weight of the pre-training loss on the same scenarios in the objective: it holds speeds and kinematics near the
     log while realism rises. 0 = the paper's objective."""
     hold_speed: bool = False
-    """Take out of the rewards what an agent's mean speed explains, so that driving slowly earns nothing by itself.
-    False = the paper's objective."""
+    """Take out of the rewards what an agent's mean speed explains, so that driving slowly (or fast) earns nothing by
+    itself. Not with goals, which ask for a speed. False = the paper's objective."""
     log_prob_reduction: Reduction = "mean"
     """Over agents and decisions. The mean makes the size of an update independent of the number of agents."""
     trained: TrainedParts = "decoder"
@@ -121,6 +121,11 @@ class FinetuneConfig:
         depends_on_goals = bool(goal_terms(parse_reward(self.reward)))
         if depends_on_goals and not self.goals.probability:
             raise ConfigError(f"reward {self.reward!r} needs goals: set finetune.goals.probability above 0, such as 1.")
+        if self.hold_speed and depends_on_goals:
+            raise ConfigError(
+                f"finetune.hold_speed would take the speed out of reward {self.reward!r} that goals ask for: set "
+                "finetune.hold_speed to false."
+            )
         if self.goals.hindsight and not depends_on_goals:
             raise ConfigError(
                 f"goals.hindsight has no effect with reward {self.reward!r}: add a term, such as 0.1*goal."

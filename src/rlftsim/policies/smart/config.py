@@ -20,6 +20,11 @@ class SmartConfig:
     """Fields that were renamed after models had been stored, and their names in fingerprints."""
     added_fields: ClassVar[dict[str, Any]] = {"frequency_init": "normal"}
     """Fields that were added after models had been stored, and the values with which a model is as before."""
+    free_fields: ClassVar[tuple[str, ...]] = (
+        "map_radius_m", "agent_map_radius_m", "agent_radius_m", "max_map_neighbors", "max_agent_map_neighbors",
+        "max_agent_neighbors", "dropout", "history_drop",
+    )  # fmt: skip
+    """Fields that a trained model can be trained further with other values of."""
 
     dim: int = 128
     """Width of all features (D)."""

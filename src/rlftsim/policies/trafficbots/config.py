@@ -16,6 +16,12 @@ class TrafficBotsConfig:
     """TrafficBots' architecture. The defaults are TrafficBots V1.5 (7.9 M parameters without its unused ones)."""
 
     fingerprint_name: ClassVar[str] = "rlftsim.policies.trafficbots.config.TrafficBotsConfig"
+    free_fields: ClassVar[tuple[str, ...]] = (
+        "max_map_tokens", "map_neighbors", "light_neighbors", "agent_map_neighbors", "agent_light_neighbors",
+        "agent_neighbors", "radius_m", "light_radius_m", "dropout", "input_drop", "prior_probability", "free_nats",
+        "forced_fractions", "forcing_updates", "steps_per_pass",
+    )  # fmt: skip
+    """Fields that a trained model can be trained further with other values of."""
 
     dim: int = 128
     """Width of all features (D)."""
