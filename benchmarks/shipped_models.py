@@ -116,7 +116,7 @@ def table(evaluations: list[rs.Evaluation], base: list[rs.Evaluation]) -> str:
     lines = [f"| | {head} |", "|---|" + "--:|--:|" * len(evaluations)]
     for label, column, factor, digits in SCORES:
         cells = []
-        for one, reference in zip(evaluations, base):
+        for one, reference in zip(evaluations, base[: len(evaluations)], strict=True):
             mean = one.mean_and_error(column)
             cells.append(
                 f"{digits.format(factor * mean.mean)} ± {digits.format(factor * mean.standard_error).lstrip('+')}"

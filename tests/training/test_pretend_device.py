@@ -288,6 +288,7 @@ def test_counts_of_larger_pieces_are_bounded(vocabulary, batch):
         with device.count() as counts:
             finetune.update_policy(learner, batch, config, PretendFabric())
         assert_below(counts, launches=20_000, waits=60, copies=115)
+        finetune.update_policy(learner, batch, replace(config, hold_speed=True), PretendFabric())
 
 
 def assert_below(counts, launches, waits, copies):

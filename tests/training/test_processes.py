@@ -75,12 +75,13 @@ def test_all_processes_get_the_sum_of_all_in_the_order_of_ranks(tmp_path):
     assert [(tmp_path / str(rank)).read_text() for rank in range(3)] == [expected] * 3
 
 
-@pytest.mark.parametrize("stage", ["pretrain", "catk", "everything"])
+@pytest.mark.parametrize("stage", ["pretrain", "catk", "everything", "finetune"])
 def test_two_processes_find_the_gradient_of_one_for_every_method(stage, vocabulary, drawn_scenarios, tmp_path):
     gradients = []
+    changes = EXACT | ({"hold_speed": True} if stage == "finetune" else {})
     for device in (tiny.CPU, TWO):
         out = tmp_path / str(device.processes)
-        policy = train(stage, vocabulary, drawn_scenarios[:3], out, device, tiny.WITHOUT_CHANCE, **EXACT)
+        policy = train(stage, vocabulary, drawn_scenarios[:3], out, device, tiny.WITHOUT_CHANCE, **changes)
         gradients.append(tiny.gradients_of(policy))
     one, two = gradients
     assert one.keys() == two.keys()
