@@ -174,7 +174,17 @@ def finetune_config(spec: FineTuned, recipe: FinetuneConfig) -> FinetuneConfig:
         goals = with_goals(recipe.goals)
     epochs = recipe.epochs * spec.epochs_fraction
     kl = recipe.kl if spec.kl_target is None else replace(recipe.kl, target=spec.kl_target)
-    return replace(recipe, reward=reward, seed=spec.seed, epochs=epochs, credit=spec.credit, goals=goals, kl=kl)
+    hold_speed = recipe.hold_speed and spec.goals is None  # goals ask for a speed
+    return replace(
+        recipe,
+        reward=reward,
+        seed=spec.seed,
+        epochs=epochs,
+        credit=spec.credit,
+        goals=goals,
+        kl=kl,
+        hold_speed=hold_speed,
+    )
 
 
 def catk_config(spec: FineTuned, catk: CatkConfig, finetune: FinetuneConfig) -> CatkConfig:
