@@ -117,6 +117,7 @@ def commands(sources, out):
 
 def start(words, log):
     """Process id of a command that runs in a fork of this process."""
+    start_fork_server()  # again, where a command that was killed while it asked for a worker has ended it
     pid = os.fork()
     if pid:
         return pid
