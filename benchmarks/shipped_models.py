@@ -17,6 +17,7 @@ from safetensors.torch import load_file, save_file
 from tyro.conf import Positional
 
 import rlftsim as rs
+from rlftsim.evaluation.columns import DRIFT_COLUMNS, TERMINAL_GOAL_COLUMNS, Column
 
 NAMES = ("demo-base", "demo-tuned", "demo-goals")
 FURTHER = {
@@ -27,20 +28,11 @@ FURTHER = {
     "pretrain.learning-rate": 2.5e-3,
 }
 """Settings for a model that is trained further: the neighborhoods of the recipe, and smaller steps."""
-SCORES = (
-    ("RMM ↑", "meta_metric", 1, "{:.3f}"),
-    ("kinematic ↑", "kinematic", 1, "{:.3f}"),
-    ("interactive ↑", "interactive", 1, "{:.3f}"),
-    ("map-based ↑", "map_based", 1, "{:.3f}"),
-    ("minADE (m) ↓", "min_average_displacement_error", 1, "{:.2f}"),
-    ("collision (%) ↓", "collision_rate", 100, "{:.1f}"),
-    ("leaves the road (%) ↓", "unlogged_offroad_rate", 100, "{:.1f}"),
-    ("runs a red light (%) ↓", "traffic_light_violation_rate", 100, "{:.1f}"),
-    ("speed of moving agents minus the log's (m/s)", "speed_gap", 1, "{:+.2f}"),
-    ("stops that the log does not have (%) ↓", "unlogged_stop_rate", 100, "{:.1f}"),
-    ("goals missed in passing (%) ↓", "passing_miss_rate", 100, "{:.1f}"),
-)
-"""Row of a card, its column in an evaluation, factor and format."""
+SHOWN = (
+    "meta_metric", "kinematic", "interactive", "map_based", "min_average_displacement_error", "collision_rate",
+    "unlogged_offroad_rate", "traffic_light_violation_rate", "speed_gap", "unlogged_stop_rate", "passing_miss_rate",
+)  # fmt: skip
+"""Columns of an evaluation that a card shows."""
 
 
 @dataclass(frozen=True)
@@ -114,19 +106,20 @@ def table(evaluations: list[rs.Evaluation], base: list[rs.Evaluation]) -> str:
     """Scores of a model on each data set, with its paired difference to the base."""
     head = " | ".join(f"{len(one)} scenarios | to demo-base" for one in evaluations)
     lines = [f"| | {head} |", "|---|" + "--:|--:|" * len(evaluations)]
-    for label, column, factor, digits in SCORES:
+    columns = {column.source: column for column in (*TERMINAL_GOAL_COLUMNS, *DRIFT_COLUMNS)}
+    for column in map(columns.__getitem__, SHOWN):
         cells = []
         for one, reference in zip(evaluations, base[: len(evaluations)], strict=True):
-            mean = one.mean_and_error(column)
-            cells.append(
-                f"{digits.format(factor * mean.mean)} ± {digits.format(factor * mean.standard_error).lstrip('+')}"
-            )
-            difference = rs.compare(reference, one)[column]
-            low, high = (f"{factor * bound:+.3f}" for bound in difference.interval)
-            is_base = one.name == reference.name
-            cells.append("" if is_base else f"{factor * difference.difference:+.3f} [{low}, {high}]")
-        lines.append(f"| {label} | {' | '.join(cells)} |")
+            cells.append(column.cell(one.mean_and_error(column.source)))
+            difference = rs.compare(reference, one)[column.source]
+            gain, low, high = (_signed(column, one) for one in (difference.difference, *difference.interval))
+            cells.append("" if one.name == reference.name else f"{gain} [{low}, {high}]")
+        lines.append(f"| {column.label} | {' | '.join(cells)} |")
     return "\n".join(lines)
+
+
+def _signed(column: Column, number: float) -> str:
+    return f"{'+' if number > 0 else ''}{column.text(number)}"
 
 
 def ship(options: Options, models: dict[str, Path], evaluations: dict[str, list[rs.Evaluation]]) -> Path:

@@ -4,17 +4,15 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal, cast
+from typing import Annotated, ClassVar, Literal
 
 import tyro
-from torch import nn
 from tyro.conf import Positional
 
 from rlftsim.cli.recipe_verb import Processes, RecipeVerb, refuse_settings, value_of
 from rlftsim.errors import ConfigError, RlftsimError
 from rlftsim.evaluation.learning_curve import write_learning_curve
 from rlftsim.experiments.stages import GoalConditioning, finetune_model, pretrain_policy
-from rlftsim.policies.checkpoint import load_strictly
 from rlftsim.policies.registry import load_policy
 from rlftsim.progress import log
 from rlftsim.recipes.registry import Recipe
@@ -93,7 +91,7 @@ class Pretrain(RecipeVerb):
             return
         if self.vocabulary is not None:
             raise ConfigError(f"--vocabulary {self.vocabulary} has no effect: {self.init_from} has one of its own.")
-        free = getattr(getattr(self.starting_recipe, "model", None), "free_fields", ())
+        free = self.starting_recipe.free_fields
         for flag in flags:
             name = flag.removeprefix("--model.").replace("-", "_")
             if flag.startswith("--model.") and name not in free:
@@ -111,17 +109,12 @@ class Pretrain(RecipeVerb):
                 "--vocabulary, or train a model further with --init-from."
             )
         scenarios = open_dataset(self.data, self.split)
-        start = load_policy(self.init_from) if self.init_from else None
-        vocabulary = Vocabulary.load(self.vocabulary) if self.vocabulary else getattr(start, "vocabulary", None)
+        vocabulary = Vocabulary.load(self.vocabulary) if self.vocabulary else None
         held_out = _held_out(self.data, self.validation_split, recipe.pretrain.validation.every)
         # The curve is drawn of interrupted runs, too.
         with _learning_curve(self.out):
-            if start is not None and getattr(recipe, "model", None) == getattr(self.starting_recipe, "model", None):
-                policy = start
-            else:
-                policy = recipe.new_policy(vocabulary)
-                if start is not None:  # with settings that its weights do not depend on
-                    load_strictly(policy, cast(nn.Module, start).state_dict(), source=f"--init-from {self.init_from}")
+            start = load_policy(self.init_from) if self.init_from else None
+            policy = recipe.new_policy(vocabulary) if start is None else recipe.train_further(start)
             model = pretrain_policy(policy, scenarios, recipe.pretrain, self.out, held_out=held_out)
         print(f"model: {model}")
         return 0

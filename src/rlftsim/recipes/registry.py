@@ -76,6 +76,15 @@ class Recipe:
         """
         raise ConfigError(f"{type(self).__name__} describes no policy like a {type(policy).__name__}.")
 
+    @property
+    def free_fields(self) -> tuple[str, ...]:
+        """Settings of the section `model` that weights do not depend on."""
+        return ()
+
+    def train_further(self, policy: Policy) -> Policy:
+        """The policy that `rlftsim pretrain --init-from` trains: an existing one, with this recipe's `free_fields`."""
+        return policy
+
     def with_goals(self) -> "Recipe":
         """The same recipe for goal-conditioned fine-tuning: every agent's goal is its logged endpoint, the
         reward is `gcft`.

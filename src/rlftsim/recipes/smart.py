@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 import torch
 
 from rlftsim.errors import ConfigError
+from rlftsim.policies.checkpoint import load_strictly
 from rlftsim.policies.smart.config import SmartConfig, smart_demo, smart_mini, smart_nano, smart_tiny
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.recipes.registry import Recipe
@@ -61,6 +62,22 @@ class SmartRecipe(Recipe):
         if not isinstance(policy, SmartPolicy):
             raise ConfigError(f"this recipe makes SMART policies, none like a {type(policy).__name__}.")
         return replace(self, model=policy.config)
+
+    @property
+    def free_fields(self) -> tuple[str, ...]:
+        """Numbers and distances of neighbors, and what only training uses."""
+        return self.model.free_fields
+
+    def train_further(self, policy: Policy) -> SmartPolicy:
+        """A policy with the sizes of this recipe and the weights of an existing one.
+
+        Raises:
+            CheckpointError: the weights are of other sizes.
+        """
+        assert isinstance(policy, SmartPolicy)
+        further = self.new_policy(policy.vocabulary)
+        load_strictly(further, policy.state_dict(), source="the model to train further")
+        return further
 
     def with_goals(self) -> "SmartRecipe":
         """The same recipe for goal-conditioned fine-tuning; CAT-K then chooses among all tokens, not among the

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 import torch
 
 from rlftsim.errors import ConfigError
+from rlftsim.policies.checkpoint import load_strictly
 from rlftsim.policies.trafficbots.config import TrafficBotsConfig, trafficbots_demo, trafficbots_v15
 from rlftsim.policies.trafficbots.policy import TrafficBotsPolicy
 from rlftsim.recipes.registry import Recipe
@@ -55,6 +56,22 @@ class TrafficBotsRecipe(Recipe):
         if not isinstance(policy, TrafficBotsPolicy):
             raise ConfigError(f"this recipe makes TrafficBots policies, none like a {type(policy).__name__}.")
         return replace(self, model=policy.config)
+
+    @property
+    def free_fields(self) -> tuple[str, ...]:
+        """Numbers and distances of neighbors, and what only training uses."""
+        return self.model.free_fields
+
+    def train_further(self, policy: Policy) -> TrafficBotsPolicy:
+        """A policy with the sizes of this recipe and the weights of an existing one.
+
+        Raises:
+            CheckpointError: the weights are of other sizes.
+        """
+        assert isinstance(policy, TrafficBotsPolicy)
+        further = self.new_policy(None)
+        load_strictly(further, policy.state_dict(), source="the model to train further")
+        return further
 
 
 def trafficbots_v15_rlftsim() -> TrafficBotsRecipe:

@@ -238,7 +238,7 @@ def update_policy(
         experiences.append(Experience(part, rollouts, realism, rewards, context, own))
         clock.lap("reward")
     speed = {}
-    if config.hold_speed:
+    if config.hold_speed:  # over the whole batch, so not by part
         experiences, speed["speed_slope"] = hold_speed(experiences, fabric)
     # 3. Score them under policy and reference: gradient of the policy-gradient loss with its KL penalty, and of the
     # pre-training loss where it has a weight.
