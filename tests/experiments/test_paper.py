@@ -111,6 +111,12 @@ def test_two_architectures_are_in_one_table_with_a_gain_each(suite):
     assert sum("updates of" in note for note in found.notes) == 2
 
 
+def test_each_architecture_has_the_base_model_that_was_named_for_it(suite, tmp_path):
+    named = replace(suite, base_model="demo-base", counterpart_model="constant_velocity", out=tmp_path)
+    own, counterpart = model_agnosticism.suites(named)
+    assert (own.base(), counterpart.base()) == ("demo-base", "constant_velocity")
+
+
 def test_a_recipe_without_a_counterpart_is_refused(suite):
     with pytest.raises(ConfigError, match="names no recipe of another architecture"):
         model_agnosticism.suites(replace(suite, recipe=Recipe(), out=suite.out.parent / "plain"))

@@ -171,11 +171,17 @@ def test_a_model_that_is_handed_in_is_the_base(done, data, tmp_path):
     assert (tmp_path / "runs" / "base-0.5-epochs" / "model").is_dir()
 
 
+def test_a_shipped_model_is_the_base_by_its_name(data, tmp_path):
+    suite = ExperimentSuite(TINY, data, tmp_path, QUICK, base_model="demo-base")
+    assert suite.base() == "demo-base"
+    assert len(suite.evaluate({"base": (BASE,)})["base"].mean) == 2
+
+
 def test_a_recipe_without_the_models_architecture_cannot_pretrain_a_weaker_one(done, data, tmp_path):
     recipe = Recipe(pretrain=TINY.pretrain, finetune=TINY.finetune, catk=TINY.catk, gcsl=TINY.gcsl)
     base = str(done.model_folder(BASE))
     suite = ExperimentSuite(recipe, data, tmp_path, QUICK, base_model=base)
-    assert suite.base() == done.base()
+    assert suite.base() == base
     with pytest.raises(ConfigError, match=r"the recipe pre-trains no model like .*: leave the base model out"):
         suite.models([Base(0.5)])
 

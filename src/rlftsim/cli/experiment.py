@@ -42,7 +42,9 @@ class RunExperiment(RecipeVerb):
     data: str | None = None
     """Folder of a data set with the splits training and validation."""
     base_model: str | None = None
-    """Model to fine-tune. Left out, one is pre-trained by the recipe."""
+    """Model to fine-tune: a run, a model folder or a registered name. Left out, one is pre-trained by the recipe."""
+    counterpart_model: str | None = None
+    """The same for the other architecture of model-agnosticism."""
     seeds: int | None = None
     """Fine-tuning runs of each kind, with different seeds. Left out: as many as the experiment's table needs, 3
     for benchmark and credit, else 1."""
@@ -70,6 +72,10 @@ class RunExperiment(RecipeVerb):
         Raises:
             ConfigError: one of them is given.
         """
+        if self.counterpart_model is not None and self.name != "model-agnosticism":
+            raise ConfigError(
+                f"--counterpart-model {self.counterpart_model} has no effect: {self.name} has one architecture."
+            )
         for flag in flags:
             name = flag.removeprefix("--").replace("-", "_")
             if name in VARIED:
@@ -92,6 +98,7 @@ class RunExperiment(RecipeVerb):
             evaluation=EvaluateConfig(num_rollouts=self.num_rollouts, metric=self.metric, limit=self.limit, jobs=jobs),
             num_seeds=experiment.default_seeds if self.seeds is None else self.seeds,
             base_model=self.base_model,
+            counterpart_model=self.counterpart_model,
             device=self.device,
         )
         result = run_experiment(self.name, experiment, suite)

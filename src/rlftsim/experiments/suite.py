@@ -31,7 +31,7 @@ from rlftsim.experiments.stages import (
     pretrain_policy,
     start_from_shorter_run,
 )
-from rlftsim.policies.registry import Device, find_model, load_policy, load_policy_or_oracle, with_guidance
+from rlftsim.policies.registry import Device, load_policy, load_policy_or_oracle, with_guidance
 from rlftsim.progress import log
 from rlftsim.recipes.registry import Recipe
 from rlftsim.rollout.fingerprint import fingerprint_policy
@@ -62,7 +62,9 @@ class ExperimentSuite:
     num_seeds: int = 1
     """Of fine-tuning. More may be added later."""
     base_model: str | None = None
-    """Model folder to fine-tune, of any policy; None = one is pre-trained by the recipe."""
+    """Model to fine-tune, of any policy: a folder or a registered name; None = one is pre-trained by the recipe."""
+    counterpart_model: str | None = None
+    """The same for the recipe's counterpart, in experiments that compare two architectures."""
     device: Device = "cpu"
     """Of evaluations; training has its own in the recipe."""
 
@@ -136,9 +138,9 @@ class ExperimentSuite:
             log.warning(f"left out: {', '.join(left_out)} (the policy cannot be trained with {methods})")
         return {name: specs for name, specs in rows.items() if name not in left_out}
 
-    def base(self) -> Path:
-        """Folder of the base model, which is pre-trained if it is missing."""
-        return Path(self.models([BASE])[BASE])
+    def base(self) -> str:
+        """Name or folder of the base model, which is pre-trained if it is missing."""
+        return self.models([BASE])[BASE]
 
     def models(self, specs: Sequence[ModelSpec]) -> dict[ModelSpec, str]:
         """Names or folders of policies, for `load_policy_or_oracle`; models that are missing are trained."""
@@ -216,18 +218,18 @@ class ExperimentSuite:
             with progress.stage(self._training_title(needed)):
                 self._pretrain(needed) if isinstance(needed, Base) else self._finetune(needed)
         if not isinstance(spec, Guided):
-            return str(self._trained(spec))
+            return self._trained(spec)
         # Guidance scales a weight: the folder is written anew each time, nothing is trained.
         folder = self.model_folder(spec.of) / f"guided-{spec.scale:g}"
-        policy = with_guidance(load_policy(str(self._trained(spec.of))), spec.scale)
+        policy = with_guidance(load_policy(self._trained(spec.of)), spec.scale)
         policy.save_pretrained(folder, card=f"# {self.title(spec)}\n")
         return str(folder)
 
-    def _trained(self, spec: Base | FineTuned) -> Path:
+    def _trained(self, spec: Base | FineTuned) -> str:
         """Model folder of a finished run, or the base model that was given."""
         if spec == BASE and self.base_model:
-            return find_model(self.base_model)
-        return self.model_folder(spec) / "model"
+            return self.base_model
+        return str(self.model_folder(spec) / "model")
 
     def _pretrain(self, base: Base) -> None:
         recipe, vocabulary, folder = self.recipe, None, self.model_folder(base)

@@ -33,7 +33,7 @@ def run(suite: ExperimentSuite) -> dict[str, Row]:
         model = one.recipe.model_name
         rows |= one.evaluate({f"{model}, {name}": row for name, row in specs.items()})
         # A model of tokens at temperature 0 always drives the same, which no metric of distributions is made for.
-        if not hasattr(load_policy(one.models([BASE])[BASE]), "vocabulary"):
+        if not hasattr(load_policy(one.base()), "vocabulary"):
             rows |= {f"{model}, {name}{MEAN_ACTIONS}": _without_noise(one, name, row) for name, row in specs.items()}
     return rows
 
@@ -47,7 +47,8 @@ def suites(suite: ExperimentSuite) -> tuple[ExperimentSuite, ExperimentSuite]:
     name = suite.recipe.counterpart
     if name is None:
         raise ConfigError(f"{type(suite.recipe).__name__} names no recipe of another architecture to compare with.")
-    return suite, replace(suite, recipe=recipe_by_name(name), out=Path(suite.out) / name, base_model=None)
+    out, base = Path(suite.out) / name, suite.counterpart_model
+    return suite, replace(suite, recipe=recipe_by_name(name), out=out, base_model=base, counterpart_model=None)
 
 
 def _without_noise(suite: ExperimentSuite, name: str, specs: Sequence[ModelSpec]) -> Row:

@@ -22,7 +22,7 @@ CLAIMED_SLOPE = {"mloo": -2.0, "rloo": 0.0}
 
 def run(suite: ExperimentSuite) -> Variances:
     """Variances of the base model's rewards, see `measure_variances`."""
-    policy = load_policy(str(suite.base()), suite.device)
+    policy = load_policy(suite.base(), suite.device)
     return measure_variances(policy, suite.data, suite.out / "variances", suite.evaluation)
 
 
