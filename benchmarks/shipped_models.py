@@ -12,6 +12,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+import torch
 import tyro
 from safetensors.torch import load_file, save_file
 from tyro.conf import Positional
@@ -19,7 +20,36 @@ from tyro.conf import Positional
 import rlftsim as rs
 from rlftsim.evaluation.columns import DRIFT_COLUMNS, TERMINAL_GOAL_COLUMNS, Column
 
-NAMES = ("demo-base", "demo-tuned", "demo-goals")
+
+@dataclass(frozen=True)
+class Shipped:
+    """A model that ships."""
+
+    about: str
+    base: str | None = None
+    """Model it is fine-tuned from: only weights that differ from that one's are stored."""
+    options: tuple[str, ...] = ()
+    """Further words of its evaluation."""
+    is_quick: bool = True
+    """Fast enough to be evaluated on the larger data set, too."""
+
+
+MODELS = {
+    "demo-base": Shipped("A SMART traffic model of 0.5 M weights, pre-trained on synthetic scenarios. Not fine-tuned."),
+    "demo-tuned": Shipped("`demo-base` fine-tuned by MLOO: policy gradient on the realism meta-metric.", "demo-base"),
+    "demo-goals": Shipped(
+        "`demo-base` with a trained goal encoder (`indication`, with a logit bias). Without goals it decides as "
+        "`demo-base`, to the last bit; below, all evaluated agents had their logged ends as goals.",
+        "demo-base", ("--goals", "logged"), is_quick=False,
+    ),
+    "trafficbots-base": Shipped(
+        "A TrafficBots V1.5 model of 0.5 M weights, pre-trained on synthetic scenarios. Not fine-tuned.", is_quick=False
+    ),
+    "trafficbots-tuned": Shipped(
+        "`trafficbots-base` fine-tuned by MLOO: policy gradient on the realism meta-metric.", "trafficbots-base",
+        is_quick=False,
+    ),
+}  # fmt: skip
 FURTHER = {
     "model.max-agent-neighbors": 24,
     "model.agent-radius-m": 60,
@@ -49,6 +79,8 @@ class Options:
     """Of pre-training; None = the recipe's."""
     limit: int = 200
     """Held-out scenarios of that data set that models are evaluated on, beside the package's 40."""
+    only: tuple[str, ...] = tuple(MODELS)
+    """Models to make."""
     processes: str = "auto"
     """Processes that train, and jobs that evaluate."""
     ship: Path | None = None
@@ -64,47 +96,50 @@ def run(*words: object) -> None:
         sys.exit(status)
 
 
-def train(options: Options) -> dict[str, Path]:
-    """Folders of the shipped models' runs, by name."""
-    data, runs = options.work / "data", options.work / "runs"
-    common, processes = ("--data", data), ("--processes", options.processes)
+def train(options: Options, name: str) -> Path:
+    """Folder of a shipped model's run, after those that it starts from."""
+    data, out = options.work / "data", options.work / "runs" / name
     run("synthesize", data, "--num-scenarios", options.num_scenarios, "--seed", 101, "--jobs", 2)
-    epochs = () if options.epochs is None else ("--pretrain.epochs", options.epochs)
-    if options.start is None:
-        vocabulary = options.work / "vocabulary.safetensors"
-        run("tokens", *common, "--recipe", "smart-demo-long", "--out", vocabulary)
-        first = ("--vocabulary", vocabulary)
+    base = MODELS[name].base
+    common = ("--data", data, "--out", out, "--processes", options.processes)
+    tuned = () if base is None else (*common, "--model", train(options, base))
+    if name == "demo-base":
+        epochs = () if options.epochs is None else ("--pretrain.epochs", options.epochs)
+        if options.start is None:
+            vocabulary = options.work / "vocabulary.safetensors"
+            run("tokens", "--data", data, "--recipe", "smart-demo-long", "--out", vocabulary)
+            first = ("--vocabulary", vocabulary)
+        else:
+            first = ("--init-from", options.start, *(word for k, v in FURTHER.items() for word in (f"--{k}", v)))
+        run("pretrain", "smart-demo-long", *common, *first, *epochs)
+    elif name == "demo-tuned":
+        run("finetune", "smart-demo-long", *tuned)
+    elif name == "demo-goals":  # one scenario a batch, so one process
+        words = ("--data", "synthetic", "--processes", 1, "--method", "gcsl", "--goal", "indication")
+        run("finetune", "smart-demo", *tuned, *words)
+    elif name == "trafficbots-base":
+        run("pretrain", "trafficbots-demo", *common, "--pretrain.epochs", 1.5)
     else:
-        first = ("--init-from", options.start, *(word for k, v in FURTHER.items() for word in (f"--{k}", v)))
-    base, tuned, goals = (runs / name for name in NAMES)
-    run("pretrain", "smart-demo-long", *common, "--out", base, *first, *epochs, *processes)
-    run("finetune", "smart-demo-long", *common, "--model", base, "--out", tuned, *processes)
-    trained = ("--method", "gcsl", "--goal", "indication", "--model", base, "--out", goals)
-    run("finetune", "smart-demo", "--data", "synthetic", *trained, "--processes", 1)  # one scenario a batch
-    return dict(zip(NAMES, (base, tuned, goals), strict=True))
+        run("finetune", "trafficbots-demo", *tuned, "--finetune.epochs", 0.1)
+    return out
 
 
-def evaluate(options: Options, models: dict[str, Path]) -> dict[str, list[rs.Evaluation]]:
-    """Evaluations by model: on the package's held-out scenarios, then on those of the data set."""
-    found: dict[str, list[rs.Evaluation]] = {name: [] for name in models}
+def evaluate(options: Options, name: str) -> list[rs.Evaluation]:
+    """Evaluations of a model: on the package's held-out scenarios, then on those of the data set."""
     jobs = 2 if options.processes == "auto" else options.processes
-    for place, limit in (("synthetic", 40), (options.work / "data", options.limit)):
+    places = (("synthetic", 40), (options.work / "data", options.limit))
+    found = []
+    for place, limit in places if MODELS[name].is_quick else places[:1]:
         out = options.work / "evaluations" / f"{Path(place).name}-{limit}"
-        for name, model in models.items():
-            words = ("--data", place, "--limit", limit, "--name", name, "--out", out, "--jobs", jobs)
-            if name != "demo-goals":
-                run("evaluate", model, *words)
-            elif place == "synthetic":  # without goals it is the base
-                run("evaluate", model, *words, "--goals", "logged")
-            else:
-                continue
-            found[name].append(rs.Evaluation.read(out / f"{name}.parquet"))
+        words = ("--data", place, "--limit", limit, "--name", name, "--out", out, "--jobs", jobs)
+        run("evaluate", options.work / "runs" / name, *words, *MODELS[name].options)
+        found.append(rs.Evaluation.read(out / f"{name}.parquet"))
     return found
 
 
 def table(evaluations: list[rs.Evaluation], base: list[rs.Evaluation]) -> str:
     """Scores of a model on each data set, with its paired difference to the base."""
-    head = " | ".join(f"{len(one)} scenarios | to demo-base" for one in evaluations)
+    head = " | ".join(f"{len(one)} scenarios | to {base[0].name}" for one in evaluations)
     lines = [f"| | {head} |", "|---|" + "--:|--:|" * len(evaluations)]
     columns = {column.source: column for column in (*TERMINAL_GOAL_COLUMNS, *DRIFT_COLUMNS)}
     for column in map(columns.__getitem__, SHOWN):
@@ -122,44 +157,44 @@ def _signed(column: Column, number: float) -> str:
     return f"{'+' if number > 0 else ''}{column.text(number)}"
 
 
-def ship(options: Options, models: dict[str, Path], evaluations: dict[str, list[rs.Evaluation]]) -> Path:
-    """Write the models with their cards, weights in float16; returns their folder."""
-    ours = {
-        "demo-base": "A SMART traffic model of 0.5 M weights, pre-trained on synthetic scenarios. Not fine-tuned.",
-        "demo-tuned": "`demo-base` fine-tuned by MLOO: policy gradient on the realism meta-metric.",
-        "demo-goals": "`demo-base` with a trained goal encoder (`indication`, with a logit bias). Without goals it decides as "
-        "`demo-base`, to the last bit; below, all evaluated agents had their logged ends as goals.",
-    }
-    out = options.ship or options.work / "shipped"
-    base = load_file(models["demo-base"] / "model" / "model.safetensors")
-    for name, model in models.items():
-        folder, source = out / name, model / "model"
-        folder.mkdir(parents=True, exist_ok=True)
-        weights = load_file(source / "model.safetensors")
-        if name == "demo-goals":  # its other weights are those of the base
-            save_file({k: v for k, v in weights.items() if k not in base}, folder / "goals.safetensors")
-        else:
-            save_file({k: v.half() for k, v in weights.items()}, folder / "model.safetensors")
-        words = [f"--start {options.start}"] if options.start else []
-        words += [f"--epochs {options.epochs:g}"] if options.epochs else []
-        earlier = f", with the `{options.start}` of that time" if options.start else ""
-        command = f"Made by `{' '.join(('python benchmarks/shipped_models.py WORK', *words))}`{earlier}"
-        note = (
-            "Held-out synthetic scenarios (CC0-1.0): those of the package, and others of new streets; 32 rollouts, temperature 1, metric 2025, "
-            "before rounding to float16. Mean ± standard error; paired differences with their 95 % interval. "
-            "Numbers on synthetic traffic say nothing about real traffic."
-        )
-        text = f"# {name}\n\n{ours[name]} Weights: CC0-1.0. {command}.\n\n{note}\n\n"
-        (folder / "README.md").write_text(text + table(evaluations[name], evaluations["demo-base"]) + "\n")
-    for file in ("config.json", "vocabulary.safetensors"):  # the others have the base's
-        shutil.copy(models["demo-base"] / "model" / file, out / "demo-base")
-    return out
+def ship(options: Options, name: str) -> Path:
+    """Write a model with its card, weights in float16; returns its folder."""
+    base, model = MODELS[name].base, options.work / "runs" / name / "model"
+    evaluations = evaluate(options, name)
+    scores = table(evaluations, evaluations if base is None else evaluate(options, base))
+    folder = (options.ship or options.work / "shipped") / name
+    folder.mkdir(parents=True, exist_ok=True)
+    weights = {k: v.half() for k, v in load_file(model / "model.safetensors").items()}
+    if base is None:
+        save_file(weights, folder / "model.safetensors")
+        for file in ("config.json", "vocabulary.safetensors"):
+            if (model / file).exists():
+                shutil.copy(model / file, folder)
+    else:
+        before = {
+            k: v.half() for k, v in load_file(options.work / "runs" / base / "model" / "model.safetensors").items()
+        }
+        changed = {k: v for k, v in weights.items() if k not in before or not torch.equal(v, before[k])}
+        save_file(changed, folder / "changes.safetensors")
+    words = [f"--start {options.start}"] if options.start else []
+    words += [f"--epochs {options.epochs:g}"] if options.epochs else []
+    earlier = f", with the `{options.start}` of that time" if options.start else ""
+    command = f"Made by `{' '.join(('python benchmarks/shipped_models.py WORK', *words))}`{earlier}"
+    note = (
+        "Held-out synthetic scenarios (CC0-1.0): those of the package, and others of new streets; 32 rollouts, temperature 1, metric 2025, "
+        "before rounding to float16. Mean ± standard error; paired differences with their 95 % interval. "
+        "Numbers on synthetic traffic say nothing about real traffic."
+    )
+    text = f"# {name}\n\n{MODELS[name].about} Weights: CC0-1.0. {command}.\n\n{note}\n\n"
+    (folder / "README.md").write_text(text + scores + "\n")
+    return folder
 
 
 def main() -> None:
     options = tyro.cli(Options, description=__doc__)
-    models = train(options)
-    print(ship(options, models, evaluate(options, models)))
+    for name in options.only:
+        train(options, name)
+        print(ship(options, name))
 
 
 if __name__ == "__main__":

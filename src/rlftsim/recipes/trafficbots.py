@@ -92,9 +92,9 @@ def trafficbots_demo_rlftsim() -> TrafficBotsRecipe:
     return TrafficBotsRecipe(
         model=trafficbots_demo(),
         pretrain=PretrainConfig(
-            epochs=10.0, batch_size=2, micro_batch_size=2, learning_rate=1e-3, warmup_updates=40, betas=(0.9, 0.95),
-            weight_decay=0.1, gradient_clip=5.0, label_smoothing=0.0, context_radius_m=None,
-            trained_radius_m=1000.0, max_trained_agents=None, checkpoint_every=100,
+            epochs=10.0, batch_size=2, micro_batch_size=2, learning_rate=1e-3, warmup_updates=40, final_lr_ratio=0.0,
+            betas=(0.9, 0.95), weight_decay=0.1, gradient_clip=5.0, label_smoothing=0.0, context_radius_m=None,
+            trained_radius_m=1000.0, max_trained_agents=None, ema_decay=0.99, checkpoint_every=100,
         ),
         finetune=FinetuneConfig(
             epochs=1.0, batch_size=4, micro_batch_size=1, num_rollouts=8, rollouts_per_pass=1, learning_rate=1e-4,

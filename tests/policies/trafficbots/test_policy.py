@@ -157,6 +157,20 @@ def test_scenes_without_something_are_simulated_scored_and_trained_on(policy, sc
     policy.zero_grad()
 
 
+def test_the_yaw_rate_of_pedestrians_has_noise_of_its_own(policy):
+    movers = [scenes.Mover(kind, x_m=6.0 * k) for k, kind in enumerate(scenes.SIZES_M)]  # one of each class
+    batch = collate([scenes.build_scenario("mixed", movers)])
+    wide = TrafficBotsPolicy(replace(policy.config, noise_pedestrian_yaw_rate_radps=0.3))
+    stds = []
+    for one in (policy, wide):
+        context = one.encode(batch)
+        stds.append(one.decide(context, one.begin(context, 1, None, torch.full((1, 1, 3, 17), 0.5))).std[0, 0])
+    ratio = stds[1] / stds[0]
+    is_pedestrian = context.scene.agent_class[0] == 1
+    assert ratio[is_pedestrian].tolist() == [[1.0, pytest.approx(10.0)]]
+    assert (ratio[~is_pedestrian] == 1).all()
+
+
 def test_an_agent_that_leaves_the_map_goes_on_straight_and_decides_nothing(policy):
     batch = collate([scenes.bend("leaving", 3)])
     context = policy.encode(batch)

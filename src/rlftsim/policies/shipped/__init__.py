@@ -5,12 +5,15 @@ on and how it scores.
 """
 
 from pathlib import Path
+from typing import TypeVar
 
 from safetensors.torch import load_file
 
 from rlftsim.policies.checkpoint import load_strictly
 from rlftsim.policies.smart.policy import SmartPolicy
+from rlftsim.policies.trafficbots.policy import TrafficBotsPolicy
 
+Shipped = TypeVar("Shipped", SmartPolicy, TrafficBotsPolicy)
 FOLDER = Path(__file__).parent
 
 
@@ -21,16 +24,27 @@ def demo_base() -> SmartPolicy:
 
 def demo_tuned() -> SmartPolicy:
     """`demo_base` after MLOO that holds speed: fewer collisions and less driving off the road, as fast as before."""
-    return _with_weights(demo_base(), FOLDER / "demo-tuned" / "model.safetensors")
+    return _with_changes(demo_base(), FOLDER / "demo-tuned")
 
 
 def demo_goals() -> SmartPolicy:
     """`demo_base` with a trained goal encoder: 192 weights more, and without goals the same to the last bit."""
     policy = demo_base().with_goal_conditioning("indication", logit_bias=True)
-    return _with_weights(policy, FOLDER / "demo-goals" / "goals.safetensors")
+    return _with_changes(policy, FOLDER / "demo-goals")
 
 
-def _with_weights(policy: SmartPolicy, file: Path) -> SmartPolicy:
-    """The policy, with the weights that a file has."""
+def trafficbots_base() -> TrafficBotsPolicy:
+    """TrafficBots V1.5 in a small size, pre-trained on synthetic scenarios and not fine-tuned."""
+    return TrafficBotsPolicy.from_pretrained(FOLDER / "trafficbots-base")
+
+
+def trafficbots_tuned() -> TrafficBotsPolicy:
+    """`trafficbots_base` after MLOO."""
+    return _with_changes(trafficbots_base(), FOLDER / "trafficbots-tuned")
+
+
+def _with_changes(policy: Shipped, folder: Path) -> Shipped:
+    """The policy with the weights that fine-tuning changed, or added."""
+    file = folder / "changes.safetensors"
     load_strictly(policy.network, policy.network.state_dict() | load_file(file), source=str(file))
     return policy

@@ -1,7 +1,7 @@
 """Sizes, neighborhoods and training schedule of a TrafficBots model."""
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from rlftsim.errors import ConfigError, given, require_finite, require_positive
 
@@ -16,10 +16,13 @@ class TrafficBotsConfig:
     """TrafficBots' architecture. The defaults are TrafficBots V1.5 (7.9 M parameters without its unused ones)."""
 
     fingerprint_name: ClassVar[str] = "rlftsim.policies.trafficbots.config.TrafficBotsConfig"
+    added_fields: ClassVar[dict[str, Any]] = {"noise_pedestrian_yaw_rate_radps": None}
+    """Fields that were added after models had been stored, and the values with which a model is as before."""
     free_fields: ClassVar[tuple[str, ...]] = (
         "max_map_tokens", "map_neighbors", "light_neighbors", "agent_map_neighbors", "agent_light_neighbors",
         "agent_neighbors", "radius_m", "light_radius_m", "dropout", "input_drop", "prior_probability", "free_nats",
-        "forced_fractions", "forcing_updates", "steps_per_pass",
+        "forced_fractions", "forcing_updates", "steps_per_pass", "noise_acceleration_mps2", "noise_yaw_rate_radps",
+        "noise_pedestrian_yaw_rate_radps", "noise_correlation",
     )  # fmt: skip
     """Fields that a trained model can be trained further with other values of."""
 
@@ -50,6 +53,9 @@ class TrafficBotsConfig:
     would only shrink it."""
     noise_yaw_rate_radps: float = 0.03
     """Standard deviation of the yaw rate in sampled rollouts."""
+    noise_pedestrian_yaw_rate_radps: float | None = None
+    """The same for pedestrians; None = as for all. Their range of yaw rates is five times that of vehicles, so that the
+    same noise is five times narrower in the network's output."""
     noise_correlation: float = 0.9
     """Correlation of an agent's noise from one decision to the next; 0 = white."""
     dropout: float = 0.1
@@ -74,6 +80,7 @@ class TrafficBotsConfig:
         sizes = ("dim", "num_heads", "num_map_layers", "num_light_layers", "num_agent_layers")
         neighbors = ("map_neighbors", "light_neighbors", "agent_map_neighbors", "agent_light_neighbors")
         distances = ("radius_m", "light_radius_m", "noise_acceleration_mps2", "noise_yaw_rate_radps")
+        distances += given(self, ("noise_pedestrian_yaw_rate_radps",))
         counts = ("agent_neighbors", "forcing_updates", "steps_per_pass", *given(self, ("max_map_tokens",)))
         require_positive(self, (*sizes, *neighbors, *distances, *counts))
         require_finite(self, (*distances, "free_nats"))
@@ -98,5 +105,5 @@ def trafficbots_demo() -> TrafficBotsConfig:
     return TrafficBotsConfig(
         dim=48, num_heads=4, num_map_layers=2, num_light_layers=1, num_agent_layers=2,
         map_neighbors=12, light_neighbors=8, agent_map_neighbors=24, agent_light_neighbors=4, agent_neighbors=8,
-        radius_m=100.0, light_radius_m=100.0, dropout=0.0, forcing_updates=60, steps_per_pass=16,
+        radius_m=100.0, light_radius_m=100.0, dropout=0.0, forcing_updates=200, steps_per_pass=16,
     )  # fmt: skip

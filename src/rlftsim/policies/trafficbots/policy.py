@@ -17,6 +17,7 @@ from torch import Tensor
 from rlftsim.goals.types import Goals
 from rlftsim.policies.distributions import GaussianDistribution
 from rlftsim.policies.trafficbots.config import LATENT_SIZE
+from rlftsim.policies.trafficbots.destinations import PEDESTRIAN
 from rlftsim.policies.trafficbots.dynamics import max_action
 from rlftsim.policies.trafficbots.imitation import imitation_loss
 from rlftsim.policies.trafficbots.model import TrafficBotsModel
@@ -208,10 +209,14 @@ class TrafficBotsPolicy(TrafficBotsModel):
         alive: Bool[Tensor, "B N A *T"],
     ) -> GaussianDistribution:
         """Distributions around means; noise goes on from the residual of the decision before, where it continues."""
-        config = self.config
-        noise = torch.tensor([config.noise_acceleration_mps2, config.noise_yaw_rate_radps], device=mean.device)
-        std = noise / max_action(context.scene.agent_class)  # [B, A, 2]
-        std = std.view(std.shape[0], 1, std.shape[1], *[1] * (mean.dim() - 4), 2).expand_as(mean)
+        config, agent_class = self.config, context.scene.agent_class
+        yaw_rates = [config.noise_yaw_rate_radps] * 3
+        if config.noise_pedestrian_yaw_rate_radps is not None:
+            yaw_rates[PEDESTRIAN] = config.noise_pedestrian_yaw_rate_radps
+        noise = torch.tensor([[config.noise_acceleration_mps2, one] for one in yaw_rates], device=mean.device)
+        by_class = noise / max_action(torch.arange(3, device=mean.device))  # [3, 2]
+        shape = (len(agent_class), 1, agent_class.shape[1], *[1] * (mean.dim() - 4), 2)
+        std = by_class[agent_class].view(shape).expand_as(mean)
         if residual is not None and continues is not None:
             rho = config.noise_correlation
             mean = mean + rho * torch.where(continues[..., None], residual, 0.0)
