@@ -45,10 +45,6 @@ MODELS = {
     "trafficbots-base": Shipped(
         "A TrafficBots V1.5 model of 0.5 M weights, pre-trained on synthetic scenarios. Not fine-tuned.", is_quick=False
     ),
-    "trafficbots-tuned": Shipped(
-        "`trafficbots-base` fine-tuned by MLOO: policy gradient on the realism meta-metric.", "trafficbots-base",
-        is_quick=False,
-    ),
 }  # fmt: skip
 FURTHER = {
     "model.max-agent-neighbors": 24,
@@ -117,10 +113,8 @@ def train(options: Options, name: str) -> Path:
     elif name == "demo-goals":  # one scenario a batch, so one process
         words = ("--data", "synthetic", "--processes", 1, "--method", "gcsl", "--goal", "indication")
         run("finetune", "smart-demo", *tuned, *words)
-    elif name == "trafficbots-base":
-        run("pretrain", "trafficbots-demo", *common, "--pretrain.epochs", 1.5)
     else:
-        run("finetune", "trafficbots-demo", *tuned, "--finetune.epochs", 0.1)
+        run("pretrain", "trafficbots-demo", *common, "--pretrain.epochs", 1.5)
     return out
 
 

@@ -33,7 +33,6 @@ POLICIES: ExtensionPoint[Callable[..., Any]] = ExtensionPoint(
         "demo-tuned": "rlftsim.policies.shipped:demo_tuned",
         "demo-goals": "rlftsim.policies.shipped:demo_goals",
         "trafficbots-base": "rlftsim.policies.shipped:trafficbots_base",
-        "trafficbots-tuned": "rlftsim.policies.shipped:trafficbots_tuned",
     },
 )
 """Architecture name -> policy class. A class that can be called without arguments is a policy by its name alone."""

@@ -5,7 +5,6 @@ on and how it scores.
 """
 
 from pathlib import Path
-from typing import TypeVar
 
 from safetensors.torch import load_file
 
@@ -13,7 +12,6 @@ from rlftsim.policies.checkpoint import load_strictly
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.policies.trafficbots.policy import TrafficBotsPolicy
 
-Shipped = TypeVar("Shipped", SmartPolicy, TrafficBotsPolicy)
 FOLDER = Path(__file__).parent
 
 
@@ -38,12 +36,7 @@ def trafficbots_base() -> TrafficBotsPolicy:
     return TrafficBotsPolicy.from_pretrained(FOLDER / "trafficbots-base")
 
 
-def trafficbots_tuned() -> TrafficBotsPolicy:
-    """`trafficbots_base` after MLOO."""
-    return _with_changes(trafficbots_base(), FOLDER / "trafficbots-tuned")
-
-
-def _with_changes(policy: Shipped, folder: Path) -> Shipped:
+def _with_changes(policy: SmartPolicy, folder: Path) -> SmartPolicy:
     """The policy with the weights that fine-tuning changed, or added."""
     file = folder / "changes.safetensors"
     load_strictly(policy.network, policy.network.state_dict() | load_file(file), source=str(file))
