@@ -188,6 +188,13 @@ def workers():
     return found
 
 
+def wait_for_workers():
+    """Return when all workers have ended: those of a killed command end, and clear up, by themselves."""
+    latest = time.monotonic() + 60.0
+    while workers() and time.monotonic() < latest:
+        time.sleep(0.05)
+
+
 def kill(pid):
     """End a process; False if it had ended."""
     try:
@@ -290,14 +297,15 @@ def measure(options):
             while had < wanted:
                 dice = random.Random(f"{options.seed} {backend} {name} {number}")
                 kills = disturbed(words, backend, out, log, seconds, dice)
-                time.sleep(0.2)  # workers end with their command
+                wait_for_workers()
                 found = tree(out)
                 different = sorted(file for file in {*found, *expected} if found.get(file) != expected.get(file))
                 rounds.append({"backend": backend, "command": name, "kills": dict(kills), "different": different})
                 with kept.open("a") as file:
                     file.write(json.dumps(rounds[-1]) + "\n")
                 had, number = had + sum(kills.values()), number + 1
-                print(f"{backend}, {name}: {had} kills of {wanted}", file=sys.stderr)
+                differing = f", other bytes in {', '.join(different)}" if different else ""
+                print(f"{backend}, {name}: {had} kills of {wanted}{differing}", file=sys.stderr)
     return rounds
 
 
