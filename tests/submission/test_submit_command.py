@@ -102,7 +102,8 @@ def test_the_rollouts_of_an_archive_score_as_its_unpacked_files(tmp_path, monkey
 def test_the_card_of_a_model_is_part_of_the_report(tmp_path):
     save_model(tmp_path / "m", entries.Wanderer(), {}, card="# A model\n\ntrained on nothing\n")
     assert model_card(str(tmp_path / "m")) == "### A model\n\ntrained on nothing"
-    assert model_card("demo-base") == "demo-base is no model folder, so it has no card."
+    assert "RMM" in model_card("demo-tuned")
+    assert model_card("oracle") == "oracle is no model folder, so it has no card."
 
 
 def test_an_estimate_is_of_the_same_model_and_settings(tmp_path):

@@ -27,6 +27,8 @@ from rlftsim.atomic_io import save_tensors, write_text
 from rlftsim.errors import CheckpointError, ConfigError
 
 CONFIG, WEIGHTS, CARD = "config.json", "model.safetensors", "README.md"
+SHIPPED_MODELS = Path(__file__).parent / "shipped"
+"""A folder for each model in the box, by its registered name."""
 _FIRST_FORMAT = {"rlftsim-smart-1": "smart"}
 """Architecture of folders of release 0.1, which name a format instead."""
 

@@ -13,7 +13,7 @@ from typing import Any
 from rlftsim.atomic_io import remove_temporaries, write_text
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.results import EvaluateConfig, Evaluation
-from rlftsim.policies.checkpoint import CARD, find_model
+from rlftsim.policies.checkpoint import CARD, SHIPPED_MODELS, find_model
 from rlftsim.submission.check import ArchiveCheck
 from rlftsim.submission.findings import CHECKS, Finding
 
@@ -144,9 +144,11 @@ class Report:
 
 
 def model_card(name: str) -> str:
-    """Card in a model's folder, with its headings two levels down; a sentence where there is none."""
+    """Card of a model in the box or in a folder, its headings two levels down; a sentence where there is none."""
+    in_the_box = SHIPPED_MODELS / name
     try:
-        text = (find_model(name) / CARD).read_text(encoding="utf-8")
+        folder = in_the_box if (in_the_box / CARD).is_file() else find_model(name)
+        text = (folder / CARD).read_text(encoding="utf-8")
     except (ConfigError, OSError):
         return f"{name} is no model folder, so it has no card."
     return re.sub(r"^#", "###", text.strip(), flags=re.MULTILINE)

@@ -4,40 +4,36 @@ Their weights are stored in float16 and computed with in float32. A README in ea
 on and how it scores.
 """
 
-from pathlib import Path
-
 from safetensors.torch import load_file
 
-from rlftsim.policies.checkpoint import load_strictly
+from rlftsim.policies.checkpoint import SHIPPED_MODELS, load_strictly
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.policies.trafficbots.policy import TrafficBotsPolicy
-
-FOLDER = Path(__file__).parent
 
 
 def demo_base() -> SmartPolicy:
     """SMART of the demo's size, pre-trained on synthetic scenarios: it reads the map, and is not fine-tuned."""
-    return SmartPolicy.from_pretrained(FOLDER / "demo-base")
+    return SmartPolicy.from_pretrained(SHIPPED_MODELS / "demo-base")
 
 
 def demo_tuned() -> SmartPolicy:
     """`demo_base` after MLOO that holds speed: fewer collisions and less driving off the road, as fast as before."""
-    return _with_changes(demo_base(), FOLDER / "demo-tuned")
+    return _with_changes(demo_base(), "demo-tuned")
 
 
 def demo_goals() -> SmartPolicy:
     """`demo_base` with a trained goal encoder: 192 weights more, and without goals the same to the last bit."""
     policy = demo_base().with_goal_conditioning("indication", logit_bias=True)
-    return _with_changes(policy, FOLDER / "demo-goals")
+    return _with_changes(policy, "demo-goals")
 
 
 def trafficbots_base() -> TrafficBotsPolicy:
     """TrafficBots V1.5 in a small size, pre-trained on synthetic scenarios and not fine-tuned."""
-    return TrafficBotsPolicy.from_pretrained(FOLDER / "trafficbots-base")
+    return TrafficBotsPolicy.from_pretrained(SHIPPED_MODELS / "trafficbots-base")
 
 
-def _with_changes(policy: SmartPolicy, folder: Path) -> SmartPolicy:
-    """The policy with the weights that fine-tuning changed, or added."""
-    file = folder / "changes.safetensors"
+def _with_changes(policy: SmartPolicy, name: str) -> SmartPolicy:
+    """The policy with the weights that a model in the box changed, or added."""
+    file = SHIPPED_MODELS / name / "changes.safetensors"
     load_strictly(policy.network, policy.network.state_dict() | load_file(file), source=str(file))
     return policy
