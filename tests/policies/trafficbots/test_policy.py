@@ -1,5 +1,6 @@
 """TrafficBots as a policy: the contract, the noise, the draws, and scenes without one thing or another."""
 
+import copy
 import math
 from dataclasses import replace
 
@@ -14,7 +15,7 @@ from rlftsim.policies.trafficbots.config import TrafficBotsConfig, trafficbots_d
 from rlftsim.policies.trafficbots.dynamics import MAX_ACTION
 from rlftsim.policies.trafficbots.policy import TrafficBotsPolicy
 from rlftsim.rollout.check import check_policy
-from rlftsim.rollout.policy import ImitatedPolicy, PartlyTrainedPolicy, Sampling, TrainablePolicy
+from rlftsim.rollout.policy import ImitatedPolicy, PartlyTrainedPolicy, Sampling, SharingPolicy, TrainablePolicy
 from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import collate
 from rlftsim.training.freezing import freeze_untrained
@@ -101,6 +102,56 @@ def test_the_noise_has_its_size_and_correlation(policy, batch):
     assert lag.tolist() == pytest.approx([0.9, 0.9], abs=0.03)
     later, first = correlated.std[stays][:, 1:], correlated.std[stays][:, :1]
     assert torch.allclose(later, first * math.sqrt(1 - 0.81), rtol=1e-5)
+
+
+@pytest.mark.parametrize("fine_tuned", ["all", "vehicles"])
+def test_scoring_with_a_reference_is_scoring_twice(batch, fine_tuned):
+    """Where only vehicles' actions are trained the features of both models are computed once."""
+    torch.manual_seed(0)
+    learner = TrafficBotsPolicy(replace(TINY, fine_tuned=fine_tuned)).eval()
+    reference = copy.deepcopy(learner).requires_grad_(False)
+    freeze_untrained(learner, "decoder")
+    with torch.no_grad():
+        for weight in learner.parameters():
+            weight.add_(0.02 * torch.randn_like(weight) if weight.requires_grad else 0.0)
+    assert isinstance(learner, SharingPolicy)
+    assert learner.has_features_of(reference) == (fine_tuned == "vehicles")
+    with torch.no_grad():
+        rollouts = simulate(learner, batch, num_rollouts=2, seed=0)
+        ref_context = reference.encode(batch)
+        ref_alone = reference.score(ref_context, rollouts)
+    context = learner.encode(batch)
+    dist, ref_dist = learner.score_both(context, rollouts, reference, ref_context, rollouts)
+    gradients = []
+    for one in (dist, learner.score(context, rollouts)):
+        learner.zero_grad()
+        one.log_prob(rollouts.decision).sum().backward(retain_graph=True)
+        gradients.append([w.grad.clone() for w in learner.parameters() if w.grad is not None])
+    assert torch.allclose(dist.log_prob(rollouts.decision), rollouts.log_prob, atol=1e-4)
+    assert torch.allclose(ref_dist.mean, ref_alone.mean, atol=1e-6)
+    assert not ref_dist.mean.requires_grad
+    assert len(gradients[0]) == sum(w.requires_grad for w in learner.parameters())
+    for own, alone in zip(*gradients):
+        assert torch.allclose(own, alone, rtol=1e-3, atol=1e-3 * float(alone.abs().max()))
+
+
+def test_fine_tuning_vehicles_leaves_pedestrians_as_they_are(batch):
+    torch.manual_seed(0)
+    learner = TrafficBotsPolicy(replace(TINY, fine_tuned="vehicles")).eval()
+    reference = copy.deepcopy(learner).requires_grad_(False)
+    freeze_untrained(learner, "decoder")
+    with torch.no_grad():
+        rollouts = simulate(learner, batch, num_rollouts=1, seed=0)
+        for weight in learner.parameters():
+            weight.add_(0.1 if weight.requires_grad else 0.0)
+        context = learner.encode(batch)
+        dist, ref_dist = learner.score_both(context, rollouts, reference, context, rollouts)
+    is_vehicle = (context.scene.agent_class == 0)[:, None, :, None].expand(dist.mask.shape)
+    differs = (dist.mean != ref_dist.mean).any(-1)
+    assert differs[is_vehicle & dist.mask].all()
+    others = ~is_vehicle & dist.mask
+    assert others.any()
+    assert not differs[others].any()
 
 
 def test_the_score_function_has_mean_zero():

@@ -1,7 +1,7 @@
 """Sizes, neighborhoods and training schedule of a TrafficBots model."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 from rlftsim.errors import ConfigError, given, require_finite, require_positive
 
@@ -16,13 +16,13 @@ class TrafficBotsConfig:
     """TrafficBots' architecture. The defaults are TrafficBots V1.5 (7.9 M parameters without its unused ones)."""
 
     fingerprint_name: ClassVar[str] = "rlftsim.policies.trafficbots.config.TrafficBotsConfig"
-    added_fields: ClassVar[dict[str, Any]] = {"noise_pedestrian_yaw_rate_radps": None}
+    added_fields: ClassVar[dict[str, Any]] = {"noise_pedestrian_yaw_rate_radps": None, "fine_tuned": "all"}
     """Fields that were added after models had been stored, and the values with which a model is as before."""
     free_fields: ClassVar[tuple[str, ...]] = (
         "max_map_tokens", "map_neighbors", "light_neighbors", "agent_map_neighbors", "agent_light_neighbors",
         "agent_neighbors", "radius_m", "light_radius_m", "dropout", "input_drop", "prior_probability", "free_nats",
         "forced_fractions", "forcing_updates", "steps_per_pass", "noise_acceleration_mps2", "noise_yaw_rate_radps",
-        "noise_pedestrian_yaw_rate_radps", "noise_correlation",
+        "noise_pedestrian_yaw_rate_radps", "noise_correlation", "fine_tuned",
     )  # fmt: skip
     """Fields that a trained model can be trained further with other values of."""
 
@@ -71,6 +71,9 @@ class TrafficBotsConfig:
     """In pre-training: fraction of the agents that follow the log throughout, one after the other."""
     forcing_updates: int = 12_175
     """Updates that each of these fractions lasts: 0.2 passes over WOMD with 8 scenarios each."""
+    fine_tuned: Literal["all", "vehicles"] = "all"
+    """Fine-tuning changes everything that decides actions, or the last layer that decides those of vehicles alone:
+    pedestrians and cyclists then stay as they are, and an update takes half the time."""
     steps_per_pass: int = 8
     """Decisions that are scored with gradient at once; fewer need less memory, the result is the same."""
 
@@ -86,6 +89,8 @@ class TrafficBotsConfig:
         require_finite(self, (*distances, "free_nats"))
         if self.dim % 16 or self.dim % self.num_heads:
             raise ConfigError(f"dim={self.dim} must be a multiple of 16 and of num_heads={self.num_heads}.")
+        if self.fine_tuned not in ("all", "vehicles"):
+            raise ConfigError(f"fine_tuned is all or vehicles, got {self.fine_tuned!r}.")
         for name in ("dropout", "input_drop", "noise_correlation"):
             if not 0 <= getattr(self, name) < 1:
                 raise ConfigError(f"{name} is in [0, 1), got {getattr(self, name)}.")

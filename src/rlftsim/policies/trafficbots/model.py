@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from rlftsim.policies.checkpoint import load_strictly, read_model, save_model
 from rlftsim.policies.trafficbots.config import TrafficBotsConfig
+from rlftsim.policies.trafficbots.destinations import VEHICLE
 from rlftsim.policies.trafficbots.network import TrafficBotsNetwork
 from rlftsim.policies.trafficbots.scene import Scene
 from rlftsim.policies.trafficbots.state import TrafficBotsContext
@@ -32,14 +33,33 @@ class TrafficBotsModel(nn.Module):
         self.network = TrafficBotsNetwork(config)
 
     def fine_tuned_parts(self) -> tuple[nn.Module, ...]:
-        """Everything that decides actions.
+        """Everything that decides actions, or the last layer for vehicles alone, by `fine_tuned` of the settings.
 
         Map, lights, posterior and destination predictor stay as they are: personality and destination are drawn from
         them once per rollout, and what is drawn must not depend on trained weights.
         """
         network = self.network
+        if self.config.fine_tuned == "vehicles":
+            return (network.actions.of_class(VEHICLE)[-1],)
         destination = (network.destination_map, network.destination_pose, network.add_destination)
         return network.agents, *destination, network.add_personality, network.actions
+
+    def has_features_of(self, other: nn.Module) -> bool:
+        """True if another model, too, computes the features that `actions` decides by, without gradient in both.
+
+        Args:
+            other: any model.
+        """
+        if not isinstance(other, TrafficBotsModel) or self.config != other.config:
+            return False
+        pairs = [
+            (weight, other.network.get_parameter(name))
+            for name, weight in self.network.named_parameters()
+            if not name.startswith("actions.")
+        ]
+        if any(weight.requires_grad for pair in pairs for weight in pair):
+            return False
+        return all(own is others or torch.equal(own, others) for own, others in pairs)
 
     def encode_scene(self, scene: Scene) -> TrafficBotsContext:
         """Features of the map, and of the lights at all decisions.

@@ -385,6 +385,10 @@ class ActionHead(nn.Module):
         super().__init__()
         self.by_class = nn.ModuleList(mlp(dim, dim, dim, 2) for _ in range(NUM_CLASSES))
 
+    def of_class(self, agent_class: int) -> nn.Sequential:
+        """Network of a class: 0 vehicle, 1 pedestrian, 2 cyclist."""
+        return cast(nn.Sequential, self.by_class[agent_class])
+
     def forward(self, x: Float[Tensor, "*g A D"], agent_class: Int64[Tensor, "*#g A"]) -> Float[Tensor, "*g A 2"]:
         """Means, float32.
 
@@ -467,13 +471,31 @@ class TrafficBotsNetwork(nn.Module):
             given: personality and destination of each agent.
             active: True = the agent is still on its way to its destination.
         """
+        return self.actions(self.features(windows, scene, around, given, active), scene.agent_class[:, None, None])
+
+    def features(
+        self,
+        windows: Windows,
+        scene: Scene,
+        around: AgentSurroundings,
+        given: "Given",
+        active: Bool[Tensor, "B T N A"],
+    ) -> Float[Tensor, "B T N A D"]:
+        """Features of agents that `actions` decides by.
+
+        Args:
+            windows: [B, T, N, A, 11].
+            scene: map, lights, sizes and classes.
+            around: map and lights at the same decisions.
+            given: personality and destination of each agent.
+            active: True = the agent is still on its way to its destination.
+        """
         x = self.agents(windows, scene, around)
         now = windows.pose[..., -1, :]
         relative = relative_pose(given.destination_pose[:, None], now)  # [B, T, N, A, 3]
         pose = self.destination_pose(pose_embedding(relative, x.shape[-1]))
         x = self.add_destination(x, given.destination_feature[:, None] + pose, active)
-        x = self.add_personality(x, given.personality[:, None])
-        return self.actions(x, scene.agent_class[:, None, None])
+        return self.add_personality(x, given.personality[:, None])
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,9 @@ B scenarios, N rollouts, A agents, T decisions, M map tokens.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -23,7 +25,7 @@ from rlftsim.policies.trafficbots.imitation import imitation_loss
 from rlftsim.policies.trafficbots.model import TrafficBotsModel
 from rlftsim.policies.trafficbots.network import Given, history_windows
 from rlftsim.policies.trafficbots.scene import build_scene
-from rlftsim.policies.trafficbots.scoring import mean_actions_over_time
+from rlftsim.policies.trafficbots.scoring import over_time
 from rlftsim.policies.trafficbots.state import (
     TrafficBotsContext,
     TrafficBotsState,
@@ -31,7 +33,7 @@ from rlftsim.policies.trafficbots.state import (
     traffic_at_start,
     whole_history,
 )
-from rlftsim.rollout.policy import ImitationLoss
+from rlftsim.rollout.policy import DecisionDistribution, ImitationLoss
 from rlftsim.rollout.types import AgentStates, Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import HISTORY_STEPS
@@ -152,30 +154,44 @@ class TrafficBotsPolicy(TrafficBotsModel):
             context: of `encode`.
             rollouts: of the same scenarios.
         """
-        assert rollouts.draws is not None
-        # 1. Replay the decisions without the network.
-        state = self.start(context, rollouts.draws)
-        given, states = state.given, [state]
-        num_decisions = rollouts.decision.shape[3]
+        replay = self._replay(context, rollouts)
+        mean = self._over_time(self.network.mean_actions, context, replay)
+        return self._scored(context, replay, rollouts.decision, mean)
+
+    def encode_like(self, scenarios: ScenarioBatch, context: Any) -> TrafficBotsContext:
+        """`encode(scenarios)`: map and lights are encoded anew, which takes little beside rollouts.
+
+        Args:
+            scenarios: of the context.
+            context: of any policy.
+        """
+        return self.encode(scenarios)
+
+    def score_both(
+        self, context: TrafficBotsContext, rollouts: Rollouts, reference: Any, ref_context: Any, ref_rollouts: Rollouts
+    ) -> tuple[GaussianDistribution, DecisionDistribution]:
+        """Distributions along rollouts of this policy and, without gradient, of a reference.
+
+        The features of agents are computed once where only `actions` differs.
+
+        Args:
+            context: of this policy.
+            rollouts: of the same scenarios.
+            reference: any policy.
+            ref_context: of the reference.
+            ref_rollouts: the same rollouts, maybe with goals, which are ignored.
+        """
+        if not self.has_features_of(reference):
+            dist = self.score(context, rollouts)
+            with torch.no_grad():
+                return dist, reference.score(ref_context, ref_rollouts)
+        replay, agent_class = self._replay(context, rollouts), context.scene.agent_class[:, None, None]
         with torch.no_grad():
-            for index in range(num_decisions - 1):
-                forced = rollouts.forced and rollouts.forced.steps(index, index + 1)
-                state = self.advance(context, replace(state, before=None), rollouts.decision[:, :, :, index], forced)
-                states.append(state)
-        history = whole_history([one.traffic for one in states])
-        # 2. Mean actions of all decisions.
-        active = torch.stack([one.traffic.active for one in states], 3)
-        mean = mean_actions_over_time(
-            self.network, history, active, context.scene, context.around, given,
-            steps_per_pass=self.config.steps_per_pass,
-        )  # fmt: skip
-        # 3. Their noise, which the means of the decisions before are part of.
-        alive = torch.stack([one.traffic.alive for one in states], 3)  # [B, N, A, T]
-        residual = (rollouts.decision - mean)[:, :, :, :-1]
-        residual = torch.cat([torch.zeros_like(mean[:, :, :, :1]), residual], 3)
-        goes_on = [torch.zeros_like(alive[..., 0]), *(s.continues for s in states if s.continues is not None)]
-        continues = torch.stack(goes_on, 3)
-        return self._distribution(context, mean, residual, continues, alive)
+            features = self._over_time(self.network.features, context, replay)  # [B, T, N, A, D]
+            ref_mean = reference.network.actions(features, agent_class)
+        mean = self.network.actions(features, agent_class)
+        first, second = (self._scored(context, replay, rollouts.decision, one) for one in (mean, ref_mean))
+        return first, second
 
     # ---- pre-training -------------------------------------------------------------------------------------------
 
@@ -190,6 +206,41 @@ class TrafficBotsPolicy(TrafficBotsModel):
         return imitation_loss(self.network, self.config, scenarios, trained, update)
 
     # ---- parts ----------------------------------------------------------------------------------------------------
+
+    def _replay(self, context: TrafficBotsContext, rollouts: Rollouts) -> list[TrafficBotsState]:
+        """States before each of T decisions, without the network."""
+        assert rollouts.draws is not None
+        states = [self.start(context, rollouts.draws)]
+        with torch.no_grad():
+            for index in range(rollouts.decision.shape[3] - 1):
+                forced = rollouts.forced and rollouts.forced.steps(index, index + 1)
+                before = replace(states[-1], before=None)
+                states.append(self.advance(context, before, rollouts.decision[:, :, :, index], forced))
+        return states
+
+    def _over_time(
+        self, compute: Callable[..., Tensor], context: TrafficBotsContext, states: list[TrafficBotsState]
+    ) -> Float[Tensor, "B T N A F"]:
+        """Result of a part of the network in each of T states."""
+        return over_time(
+            compute, whole_history([one.traffic for one in states]),
+            torch.stack([one.traffic.active for one in states], 3), context.scene, context.around, states[0].given,
+            steps_per_pass=self.config.steps_per_pass,
+        )  # fmt: skip
+
+    def _scored(
+        self,
+        context: TrafficBotsContext,
+        states: list[TrafficBotsState],
+        decision: Float[Tensor, "B N A T 2"],
+        mean: Float[Tensor, "B T N A 2"],
+    ) -> GaussianDistribution:
+        """Distributions around the means of T decisions, whose noise the means of the decisions before are part of."""
+        mean = mean.movedim(1, 3)  # [B, N, A, T, 2]
+        alive = torch.stack([one.traffic.alive for one in states], 3)  # [B, N, A, T]
+        residual = torch.cat([torch.zeros_like(mean[:, :, :, :1]), (decision - mean)[:, :, :, :-1]], 3)
+        goes_on = [torch.zeros_like(alive[..., 0]), *(s.continues for s in states if s.continues is not None)]
+        return self._distribution(context, mean, residual, torch.stack(goes_on, 3), alive)
 
     def _mean(self, context: TrafficBotsContext, state: TrafficBotsState) -> Float[Tensor, "B N A 2"]:
         """Mean actions in a state, from its memo after the first call."""

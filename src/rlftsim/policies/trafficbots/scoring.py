@@ -1,9 +1,10 @@
-"""Mean actions at all decisions of known rollouts, in a few parallel passes.
+"""Mean actions, or the features that decide them, at all decisions of known rollouts, in a few parallel passes.
 
 The network has no state of its own: a decision depends on the last 11 steps alone, so that all decisions of a rollout
 can be computed at once. Shapes: B scenarios, N rollouts, A agents, T decisions, W = 11 steps of a window.
 """
 
+from collections.abc import Callable
 from typing import cast
 
 import torch
@@ -12,12 +13,12 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from rlftsim.policies.trafficbots.config import WINDOW
-from rlftsim.policies.trafficbots.network import AgentSurroundings, Given, TrafficBotsNetwork, Windows
+from rlftsim.policies.trafficbots.network import AgentSurroundings, Given, Windows
 from rlftsim.policies.trafficbots.scene import Scene
 
 
-def mean_actions_over_time(
-    network: TrafficBotsNetwork,
+def over_time(
+    compute: Callable[..., Tensor],
     history: Windows,
     active: Bool[Tensor, "B N A T"],
     scene: Scene,
@@ -25,11 +26,11 @@ def mean_actions_over_time(
     given: Given,
     *,
     steps_per_pass: int,
-) -> Float[Tensor, "B N A T 2"]:
-    """Mean actions at T decisions; differentiable.
+) -> Float[Tensor, "B T N A F"]:
+    """Result of a network at T decisions; differentiable.
 
     Args:
-        network: the weights.
+        compute: `mean_actions` or `features` of a `TrafficBotsNetwork`.
         history: agents [B, N, A, W - 1 + T] from the first step of the first decision's window on.
         active: True = the agent is on its way to its destination at this decision.
         scene: map, lights, sizes and classes.
@@ -43,7 +44,7 @@ def mean_actions_over_time(
     pose = history.pose.unfold(3, WINDOW, 1).movedim(3, 1).transpose(-1, -2)
     motion = history.motion.unfold(3, WINDOW, 1).movedim(3, 1).transpose(-1, -2)
     is_active = active.movedim(3, 1)
-    means = []
+    found = []
     for start in range(0, num_decisions, steps_per_pass):
         steps = slice(start, start + steps_per_pass)
         windows = Windows(valid[:, steps], pose[:, steps], motion[:, steps])
@@ -51,8 +52,8 @@ def mean_actions_over_time(
         inputs = (windows, scene, seen, given, is_active[:, steps])
         if torch.is_grad_enabled() and num_decisions > steps_per_pass:
             # Each pass is computed again in the backward pass, so that only one is in memory.
-            mean = checkpoint(network.mean_actions, *inputs, use_reentrant=False, preserve_rng_state=False)
+            one = checkpoint(compute, *inputs, use_reentrant=False, preserve_rng_state=False)
         else:
-            mean = network.mean_actions(*inputs)
-        means.append(cast(Tensor, mean))
-    return torch.cat(means, 1).movedim(1, 3)
+            one = compute(*inputs)
+        found.append(cast(Tensor, one))
+    return torch.cat(found, 1)
