@@ -103,9 +103,7 @@ class Lease:
 
     def remove(self) -> None:
         """Remove the lock files, at the end of all work. Only after `finish`."""
-        for stray in self._path.parent.glob(f"{self._path.name}.*-of-*"):
-            stray.unlink()
-        self._path.unlink()
+        remove_locks(self._path)
 
     def _lock(self, path: Path, *, is_shared: bool = False, until: float = 0.0, must_exist: bool = False) -> None:
         """Open a file with a lock on it.
@@ -164,6 +162,16 @@ class Lease:
         except (ValueError, TypeError):  # it is only just beginning, or the file was damaged
             whom = ""
         return f"another process {self._doing} {self._path.parent}{whom}: wait for it or choose another destination."
+
+
+def remove_locks(path: Path) -> None:
+    """Remove a lock file and those of its shares, where the work has ended. None may be there.
+
+    Args:
+        path: of the `Lease`.
+    """
+    for lock in (*path.parent.glob(f"{path.name}.*-of-*"), path):
+        lock.unlink(missing_ok=True)
 
 
 def _owner_line() -> str:

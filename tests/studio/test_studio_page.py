@@ -221,8 +221,7 @@ def test_a_dragged_goal_is_simulated_and_a_refused_one_is_not(page):
     assert moved == pytest.approx(page.state("-40 / studio.stage.panels[0].scale"), abs=1.6)  # on the nearest lane
     page.simulated()
     assert len(page.state("studio.state.variants.get('goals').score.outcomes")) == 1
-    page.page.get_by_label("goal x, meters, world frame").select_text()
-    page.page.keyboard.type("9000")
+    page.page.get_by_label("goal x, meters, world frame").fill("9000")
     page.press("Tab")
     page.page.get_by_text("out of reach in 8 s").wait_for()
     page.simulated()

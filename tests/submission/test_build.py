@@ -304,6 +304,16 @@ def test_a_test_split_alone_builds(tmp_path):
     assert found.num_checked == 2
 
 
+def test_locks_of_a_process_killed_after_the_archive_was_whole_go_with_the_next_call(data, whole, tmp_path):
+    archive = build(data, tmp_path)
+    left = [tmp_path / name for name in (".lock", ".lock.1-of-2", ".lock.2-of-2")]
+    for lock in left:
+        lock.write_text("host process 1 since 2026-01-01T00:00:00+00:00")
+    assert build(data, tmp_path) == archive
+    assert archive.read_bytes() == whole
+    assert not any(lock.exists() for lock in left)
+
+
 def test_an_archive_of_unknown_origin_is_not_taken_for_the_build(data, whole, tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "submission.tar.gz").write_bytes(whole)

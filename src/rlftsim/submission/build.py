@@ -20,7 +20,7 @@ from rlftsim.atomic_io import errors_name, remove_temporaries, temporary_beside,
 from rlftsim.errors import DataError
 from rlftsim.evaluation.evaluate import check_jobs, simulate_states
 from rlftsim.evaluation.results import EvaluateConfig
-from rlftsim.lease import Lease
+from rlftsim.lease import Lease, remove_locks
 from rlftsim.progress import log, progress_bar
 from rlftsim.rollout.policy import Policy, device_of
 from rlftsim.scenario.dataset import ScenarioDataset
@@ -90,6 +90,7 @@ def build_archive(
         if not (job.folder / PLAN).exists():
             raise DataError(f"{archive} is there without its {PLAN}: name another --out, or remove it.")
         job.plan.claim(job.folder)
+        remove_locks(job.folder / _LOCK)  # of a process that was killed between the archive and its end
         return archive
     with Lease(job.folder / _LOCK, runner, "builds in") as lease:
         job.plan.claim(job.folder)
