@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from rlftsim.errors import CheckpointError, ConfigError
 from rlftsim.policies.checkpoint import load_strictly, read_model, save_model
 from rlftsim.policies.distributions import CategoricalDistribution, LazyTokenDistribution, TokenDistribution
+from rlftsim.policies.sharing import are_frozen_alike
 from rlftsim.policies.smart.config import GoalEncoding, SmartConfig
 from rlftsim.policies.smart.embeddings import normalize
 from rlftsim.policies.smart.goal_conditioning import GoalEmbedding
@@ -80,12 +81,7 @@ class SmartModel(nn.Module):
             return False
         if (self.config, self.vocabulary) != (other.config, other.vocabulary):
             return False
-        pairs = list(zip(self.network.seeing_weights(), other.network.seeing_weights(), strict=True))
-        if any(weight.requires_grad for pair in pairs for weight in pair):
-            return False
-        # one answer, which the host waits for once
-        differs = [(own != others).any() for own, others in pairs if own is not others]
-        return not differs or not torch.stack(differs).any()
+        return are_frozen_alike(self.network.seeing_weights(), other.network.seeing_weights())
 
     # ---- goals ----------------------------------------------------------------------------------------------------
 

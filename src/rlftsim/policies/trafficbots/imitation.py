@@ -26,7 +26,7 @@ from rlftsim.policies.trafficbots.destinations import NO_DESTINATION, destinatio
 from rlftsim.policies.trafficbots.dynamics import max_action, move
 from rlftsim.policies.trafficbots.network import AgentSurroundings, Given, TrafficBotsNetwork, Windows, history_windows
 from rlftsim.policies.trafficbots.scene import Scene, build_scene
-from rlftsim.policies.trafficbots.scoring import over_time
+from rlftsim.policies.trafficbots.scoring import features_over_time
 from rlftsim.policies.trafficbots.state import Imposed, traffic_at_start, whole_history
 from rlftsim.rollout.policy import ImitationLoss
 from rlftsim.scenario.batch import ScenarioBatch
@@ -141,9 +141,10 @@ def loss_of_scene(
     # 2. Roll out without gradient, differentiate the dynamics, score with gradient.
     rolled = _roll_out(network, scene, around, given, destination[:, None], draws.forced)
     value, grad = _loss_of_actions(scene, rolled, trained)
-    actions = over_time(
-        network.mean_actions, rolled.history, rolled.active, scene, around, given, steps_per_pass=config.steps_per_pass
-    ).movedim(1, 3)  # [B, 1, A, T, 2]
+    features = features_over_time(
+        network, rolled.history, rolled.active, scene, around, given, steps_per_pass=config.steps_per_pass
+    )  # [B, T, 1, A, D]
+    actions = network.actions(features, scene.agent_class[:, None, None]).movedim(1, 3)  # [B, 1, A, T, 2]
     gradient_of_actions = (actions * grad).sum()
     # The value of the imitation loss with the gradient of the sum.
     imitation = value + (gradient_of_actions - gradient_of_actions.detach())
@@ -227,7 +228,8 @@ def _roll_out(
     for index in range(FUTURE_STEPS):
         before.append(traffic)
         windows, seen = traffic.windows.as_one_decision(), around.steps(index, index + 1)
-        action = network.mean_actions(windows, scene, seen, given, traffic.active[:, None])[:, 0]
+        features = network.features(windows, scene, seen, given, traffic.active[:, None])  # [B, 1, 1, A, D]
+        action = network.actions(features, scene.agent_class[:, None, None])[:, 0]
         step = CURRENT_STEP + index + 1
         logged = scene.valid[:, None, :, step]
         imposed = Imposed(logged & forced[:, None], scene.pose[:, None, :, step], scene.motion[:, None, :, step])

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from rlftsim.policies.checkpoint import load_strictly, read_model, save_model
+from rlftsim.policies.sharing import are_frozen_alike
 from rlftsim.policies.trafficbots.config import TrafficBotsConfig
 from rlftsim.policies.trafficbots.destinations import VEHICLE
 from rlftsim.policies.trafficbots.network import TrafficBotsNetwork
@@ -52,14 +53,11 @@ class TrafficBotsModel(nn.Module):
         """
         if not isinstance(other, TrafficBotsModel) or self.config != other.config:
             return False
-        pairs = [
-            (weight, other.network.get_parameter(name))
-            for name, weight in self.network.named_parameters()
-            if not name.startswith("actions.")
-        ]
-        if any(weight.requires_grad for pair in pairs for weight in pair):
-            return False
-        return all(own is others or torch.equal(own, others) for own, others in pairs)
+        before_actions = (
+            (weight for name, weight in one.network.named_parameters() if not name.startswith("actions."))
+            for one in (self, other)
+        )
+        return are_frozen_alike(*before_actions)
 
     def encode_scene(self, scene: Scene) -> TrafficBotsContext:
         """Features of the map, and of the lights at all decisions.

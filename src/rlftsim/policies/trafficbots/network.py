@@ -390,7 +390,7 @@ class ActionHead(nn.Module):
         return cast(nn.Sequential, self.by_class[agent_class])
 
     def forward(self, x: Float[Tensor, "*g A D"], agent_class: Int64[Tensor, "*#g A"]) -> Float[Tensor, "*g A 2"]:
-        """Means, float32.
+        """Means, float32: the actions of an agent without exploration noise.
 
         Args:
             x: features of agents.
@@ -453,25 +453,6 @@ class TrafficBotsNetwork(nn.Module):
     def next_light_logits(self, light_features: Float[Tensor, "*g D"]) -> Float[Tensor, "*g 5"]:
         """Logits of a light's next state; they do not train the features."""
         return self.light_state(light_features.detach()).float().clamp(-LIGHT_LOGIT_LIMIT, LIGHT_LOGIT_LIMIT)
-
-    def mean_actions(
-        self,
-        windows: Windows,
-        scene: Scene,
-        around: AgentSurroundings,
-        given: "Given",
-        active: Bool[Tensor, "B T N A"],
-    ) -> Float[Tensor, "B T N A 2"]:
-        """Means of the actions before tanh, float32: what an agent without exploration noise does.
-
-        Args:
-            windows: [B, T, N, A, 11].
-            scene: map, lights, sizes and classes.
-            around: map and lights at the same decisions.
-            given: personality and destination of each agent.
-            active: True = the agent is still on its way to its destination.
-        """
-        return self.actions(self.features(windows, scene, around, given, active), scene.agent_class[:, None, None])
 
     def features(
         self,

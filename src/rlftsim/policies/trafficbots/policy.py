@@ -8,7 +8,6 @@ B scenarios, N rollouts, A agents, T decisions, M map tokens.
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -25,7 +24,7 @@ from rlftsim.policies.trafficbots.imitation import imitation_loss
 from rlftsim.policies.trafficbots.model import TrafficBotsModel
 from rlftsim.policies.trafficbots.network import Given, history_windows
 from rlftsim.policies.trafficbots.scene import build_scene
-from rlftsim.policies.trafficbots.scoring import over_time
+from rlftsim.policies.trafficbots.scoring import features_over_time
 from rlftsim.policies.trafficbots.state import (
     TrafficBotsContext,
     TrafficBotsState,
@@ -155,8 +154,7 @@ class TrafficBotsPolicy(TrafficBotsModel):
             rollouts: of the same scenarios.
         """
         replay = self._replay(context, rollouts)
-        mean = self._over_time(self.network.mean_actions, context, replay)
-        return self._scored(context, replay, rollouts.decision, mean)
+        return self._scored(context, replay, rollouts.decision, self._features(context, replay))
 
     def encode_like(self, scenarios: ScenarioBatch, context: Any) -> TrafficBotsContext:
         """`encode(scenarios)`: map and lights are encoded anew, which takes little beside rollouts.
@@ -185,13 +183,11 @@ class TrafficBotsPolicy(TrafficBotsModel):
             dist = self.score(context, rollouts)
             with torch.no_grad():
                 return dist, reference.score(ref_context, ref_rollouts)
-        replay, agent_class = self._replay(context, rollouts), context.scene.agent_class[:, None, None]
+        replay = self._replay(context, rollouts)
         with torch.no_grad():
-            features = self._over_time(self.network.features, context, replay)  # [B, T, N, A, D]
-            ref_mean = reference.network.actions(features, agent_class)
-        mean = self.network.actions(features, agent_class)
-        first, second = (self._scored(context, replay, rollouts.decision, one) for one in (mean, ref_mean))
-        return first, second
+            features = self._features(context, replay)
+            ref_dist = reference._scored(ref_context, replay, rollouts.decision, features)
+        return self._scored(context, replay, rollouts.decision, features), ref_dist
 
     # ---- pre-training -------------------------------------------------------------------------------------------
 
@@ -218,12 +214,10 @@ class TrafficBotsPolicy(TrafficBotsModel):
                 states.append(self.advance(context, before, rollouts.decision[:, :, :, index], forced))
         return states
 
-    def _over_time(
-        self, compute: Callable[..., Tensor], context: TrafficBotsContext, states: list[TrafficBotsState]
-    ) -> Float[Tensor, "B T N A F"]:
-        """Result of a part of the network in each of T states."""
-        return over_time(
-            compute, whole_history([one.traffic for one in states]),
+    def _features(self, context: TrafficBotsContext, states: list[TrafficBotsState]) -> Float[Tensor, "B T N A D"]:
+        """Features of agents in each of T states."""
+        return features_over_time(
+            self.network, whole_history([one.traffic for one in states]),
             torch.stack([one.traffic.active for one in states], 3), context.scene, context.around, states[0].given,
             steps_per_pass=self.config.steps_per_pass,
         )  # fmt: skip
@@ -233,10 +227,10 @@ class TrafficBotsPolicy(TrafficBotsModel):
         context: TrafficBotsContext,
         states: list[TrafficBotsState],
         decision: Float[Tensor, "B N A T 2"],
-        mean: Float[Tensor, "B T N A 2"],
+        features: Float[Tensor, "B T N A D"],
     ) -> GaussianDistribution:
         """Distributions around the means of T decisions, whose noise the means of the decisions before are part of."""
-        mean = mean.movedim(1, 3)  # [B, N, A, T, 2]
+        mean = self.network.actions(features, context.scene.agent_class[:, None, None]).movedim(1, 3)  # [B, N, A, T, 2]
         alive = torch.stack([one.traffic.alive for one in states], 3)  # [B, N, A, T]
         residual = torch.cat([torch.zeros_like(mean[:, :, :, :1]), (decision - mean)[:, :, :, :-1]], 3)
         goes_on = [torch.zeros_like(alive[..., 0]), *(s.continues for s in states if s.continues is not None)]
@@ -244,12 +238,13 @@ class TrafficBotsPolicy(TrafficBotsModel):
 
     def _mean(self, context: TrafficBotsContext, state: TrafficBotsState) -> Float[Tensor, "B N A 2"]:
         """Mean actions in a state, from its memo after the first call."""
-        if state.memo.mean is None:
+        mean = state.memo.mean
+        if mean is None:
             traffic, index = state.traffic, state.num_decisions
             windows, around = traffic.windows.as_one_decision(), context.around.steps(index, index + 1)
-            mean = self.network.mean_actions(windows, context.scene, around, state.given, traffic.active[:, None])
-            state.memo.mean = mean[:, 0]
-        return state.memo.mean
+            features = self.network.features(windows, context.scene, around, state.given, traffic.active[:, None])
+            state.memo.mean = mean = self.network.actions(features, context.scene.agent_class[:, None, None])[:, 0]
+        return mean
 
     def _distribution(
         self,

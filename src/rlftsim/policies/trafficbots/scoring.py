@@ -1,10 +1,9 @@
-"""Mean actions, or the features that decide them, at all decisions of known rollouts, in a few parallel passes.
+"""Features that decide the actions, at all decisions of known rollouts, in a few parallel passes.
 
 The network has no state of its own: a decision depends on the last 11 steps alone, so that all decisions of a rollout
 can be computed at once. Shapes: B scenarios, N rollouts, A agents, T decisions, W = 11 steps of a window.
 """
 
-from collections.abc import Callable
 from typing import cast
 
 import torch
@@ -13,12 +12,12 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from rlftsim.policies.trafficbots.config import WINDOW
-from rlftsim.policies.trafficbots.network import AgentSurroundings, Given, Windows
+from rlftsim.policies.trafficbots.network import AgentSurroundings, Given, TrafficBotsNetwork, Windows
 from rlftsim.policies.trafficbots.scene import Scene
 
 
-def over_time(
-    compute: Callable[..., Tensor],
+def features_over_time(
+    network: TrafficBotsNetwork,
     history: Windows,
     active: Bool[Tensor, "B N A T"],
     scene: Scene,
@@ -26,11 +25,11 @@ def over_time(
     given: Given,
     *,
     steps_per_pass: int,
-) -> Float[Tensor, "B T N A F"]:
-    """Result of a network at T decisions; differentiable.
+) -> Float[Tensor, "B T N A D"]:
+    """Features of agents at T decisions; differentiable.
 
     Args:
-        compute: `mean_actions` or `features` of a `TrafficBotsNetwork`.
+        network: the weights.
         history: agents [B, N, A, W - 1 + T] from the first step of the first decision's window on.
         active: True = the agent is on its way to its destination at this decision.
         scene: map, lights, sizes and classes.
@@ -52,8 +51,8 @@ def over_time(
         inputs = (windows, scene, seen, given, is_active[:, steps])
         if torch.is_grad_enabled() and num_decisions > steps_per_pass:
             # Each pass is computed again in the backward pass, so that only one is in memory.
-            one = checkpoint(compute, *inputs, use_reentrant=False, preserve_rng_state=False)
+            one = checkpoint(network.features, *inputs, use_reentrant=False, preserve_rng_state=False)
         else:
-            one = compute(*inputs)
+            one = network.features(*inputs)
         found.append(cast(Tensor, one))
     return torch.cat(found, 1)
