@@ -98,7 +98,7 @@ def trafficbots_demo_rlftsim() -> TrafficBotsRecipe:
         ),
         finetune=FinetuneConfig(
             epochs=1.6, batch_size=4, micro_batch_size=1, num_rollouts=8, rollouts_per_pass=8, credit="agent",
-            hold_speed=True, learning_rate=3e-3, warmup_updates=5, checkpoint_every=16,
+            hold_speed=True, trained="head", learning_rate=3e-3, warmup_updates=5, checkpoint_every=16,
             kl=KlConfig(target=0.05, initial_beta=0.01),
         ),
     )  # fmt: skip

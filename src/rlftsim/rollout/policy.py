@@ -8,6 +8,7 @@ it is optional and opens one more door:
 | `Policy` | simulated, scored, evaluated |
 | `TrainablePolicy` (an nn.Module) | fine-tuned with rewards, saved, loaded by folder |
 | `PartlyTrainedPolicy` | fine-tuned in chosen parts, with the rest frozen |
+| `PolicyWithHead` | fine-tuned in its last layers alone |
 | `SharingPolicy` | fine-tuned faster, because passes over the same scenarios share what they have in common |
 | `PretrainablePolicy` | pre-trained on logged tracks, token by token |
 | `ImitatedPolicy` | pre-trained on logged tracks with a loss of its own |
@@ -79,6 +80,9 @@ class DecisionDistribution(Protocol):
 
     Leading axes are [B, N, A] while simulating and [B, N, A, L] when scored.
     `policies.distributions.TokenDistribution` is one for decisions that are token ids.
+
+    It may have a `mask` of the leading axes. Where that is False the agent decides nothing, such as padding or an agent
+    that has left the map: log-probability, KL and entropy are 0 there and left out of every mean.
     """
 
     def sample(self, sampling: Sampling, noise: Float[Tensor, "... noise"]) -> Tensor:
@@ -278,6 +282,15 @@ class PartlyTrainedPolicy(Protocol):
 
     def fine_tuned_parts(self) -> tuple[nn.Module, ...]:
         """Submodules to be trained by default; the others are frozen unless `trained="all"`."""
+        ...
+
+
+@runtime_checkable
+class PolicyWithHead(Protocol):
+    """A policy that can be fine-tuned in its last layers alone, by `trained="head"`: for few rollouts."""
+
+    def head_parts(self) -> tuple[nn.Module, ...]:
+        """Submodules to be trained; what they decide by stays as it is."""
         ...
 
 

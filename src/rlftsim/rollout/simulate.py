@@ -91,7 +91,7 @@ def simulate(
     context = policy.encode(batch) if context is None else context
     state = policy.begin(context, len(rollout_ids), goals, initial)
     draws = state.draws
-    poses, decisions, log_probs, forces = [], [], [], []
+    poses, decisions, log_probs, forces, masks = [], [], [], [], []
     for step, decision_noise in zip(range(0, FUTURE_STEPS, stride), noise.unbind(-2)):
         distribution = policy.decide(context, state)
         decision = choose(distribution, state, sampling, decision_noise)
@@ -100,14 +100,17 @@ def simulate(
         poses.append(state.poses)
         decisions.append(decision)
         log_probs.append(distribution.log_prob(decision, sampling))
+        masks.append(getattr(distribution, "mask", None))
         forces.append(forced)
         if observe is not None:
             observe(torch.cat(poses, dim=3))
 
-    # 3. one value. A decision counts unless the agent is padding or was forced through all of its steps
+    # 3. one value. A decision counts unless the agent is padding, decides nothing any more or was forced through all of
+    #    its steps
     path = torch.cat(poses, dim=3)  # [B, N, A, 80, 3]
     all_forced = _join(forces, path)
-    mask = batch.agent_mask[:, None, :, None].expand(*path.shape[:3], num_decisions)
+    present = batch.agent_mask[:, None].expand(path.shape[:3])  # [B, N, A]
+    mask = torch.stack([present if one is None else present & one for one in masks], 3)  # [B, N, A, L]
     if all_forced is not None:
         mask = mask & ~all_forced.valid.unflatten(-1, (num_decisions, -1)).all(-1)
     return Rollouts(

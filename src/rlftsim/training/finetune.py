@@ -87,7 +87,8 @@ class FinetuneConfig:
     log_prob_reduction: Reduction = "mean"
     """Over agents and decisions. The mean makes the size of an update independent of the number of agents."""
     trained: TrainedParts = "decoder"
-    """The parts a policy names for fine-tuning, its goal encoder, or everything."""
+    """The parts a policy names for fine-tuning, its last layers (of TrafficBots: for vehicles), its goal encoder, or
+    everything."""
     kl: KlConfig = field(default_factory=KlConfig)
     max_kl: float = 5.0
     """Nats per decision; an update that exceeds it, or is not finite, is skipped."""
@@ -244,7 +245,7 @@ def update_policy(
     # pre-training loss where it has a weight.
     terms = LossTerms(
         *count_decisions(experiences, fabric), learner.beta, config.entropy_bonus, config.log_prob_reduction,
-        config.kl.condition_reference, config.imitation_weight, learner.update,
+        config.kl.condition_reference, config.imitation_weight, learner.update, config.seed,
     )  # fmt: skip
     learner.optimizer.zero_grad(set_to_none=True)
     sums = accumulate_gradients(

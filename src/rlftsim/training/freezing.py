@@ -9,7 +9,7 @@ from rlftsim.errors import ConfigError
 from rlftsim.rollout.policy import is_goal_conditioned
 from rlftsim.training.goals import NOT_CONDITIONED
 
-TrainedParts = Literal["decoder", "goals", "all"]
+TrainedParts = Literal["decoder", "head", "goals", "all"]
 
 
 def freeze_untrained(policy: nn.Module, trained: TrainedParts) -> None:
@@ -18,10 +18,11 @@ def freeze_untrained(policy: nn.Module, trained: TrainedParts) -> None:
     Args:
         policy: changed in place.
         trained: "decoder" = the parts that the policy names in `fine_tuned_parts`, all of it where it names none.
-            "goals" = the goal encoder only, so that agents without a goal go on deciding as before. "all" = everything.
+            "head" = what it names in `head_parts`, its last layers. "goals" = the goal encoder only, so that agents
+            without a goal go on deciding as before. "all" = everything.
 
     Raises:
-        ConfigError: the policy is not goal-conditioned, or has no part that only goals use.
+        ConfigError: the policy is not goal-conditioned, has no part that only goals use, or names no head.
     """
     if trained == "goals":
         parts = _goal_parts(policy)
@@ -31,6 +32,10 @@ def freeze_untrained(policy: nn.Module, trained: TrainedParts) -> None:
             )
         if not parts:
             raise ConfigError(f"trained=goals, but {NOT_CONDITIONED}")
+    elif trained == "head":
+        if not hasattr(policy, "head_parts"):
+            raise ConfigError(f"trained=head, but {type(policy).__name__} names no head_parts: set trained=decoder.")
+        parts = policy.head_parts()  # type: ignore[operator]
     else:
         named = getattr(policy, "fine_tuned_parts", None)
         parts = (policy,) if trained == "all" or named is None else named()

@@ -340,7 +340,7 @@ def loss_along_log(
 
 
 def accumulate_imitation(
-    model: Any, batches: Sequence[ScenarioBatch], weight: float, fabric: Fabric, *, update: int
+    model: Any, batches: Sequence[ScenarioBatch], weight: float, fabric: Fabric, *, update: int, seed: int
 ) -> float:
     """Set the model's gradient to that of `weight` times the mean pre-training loss along the log.
 
@@ -353,10 +353,12 @@ def accumulate_imitation(
         weight: of the loss.
         fabric: precision, and the processes that the mean is over.
         update: counted from 0.
+        seed: of what an own loss draws, which depends on it, the update and the process alone.
 
     Returns:
         The mean loss, nats per prediction for policies over tokens.
     """
+    torch.manual_seed(derive_seed(seed, "imitation", update, fabric.global_rank) % 2**63)
     sums = torch.zeros(2, device=fabric.device, dtype=torch.float64)  # loss, number of predictions
     for batch in batches:
         all_agents = trained_agents(batch, update, radius_m=math.inf, limit=None, seed=0)

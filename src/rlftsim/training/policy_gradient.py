@@ -78,6 +78,8 @@ class LossTerms:
     """Of the pre-training loss on the same scenarios."""
     update: int
     """Counted from 0."""
+    seed: int
+    """Of what the pre-training loss draws."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +130,9 @@ def accumulate_gradients(
     imitation: dict[str, float] = {}
     if terms.imitation_weight:
         batches = [experience.batch for experience in experiences]
-        loss = accumulate_imitation(policy, batches, terms.imitation_weight, fabric, update=terms.update)
+        loss = accumulate_imitation(
+            policy, batches, terms.imitation_weight, fabric, update=terms.update, seed=terms.seed
+        )
         imitation["imitation_loss"] = loss
     for experience in experiences:
         by_experience.append([])

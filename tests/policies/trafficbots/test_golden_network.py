@@ -71,7 +71,7 @@ def test_features_at_the_current_step(golden, small, scene, name):
     theirs, scene, network = golden.arrays(f"scenario_{name}/forward"), scene(name), small.network
     map_features = network.map(scene, scene.node_mask)
     assert gap(map_features[0], theirs["map/feature"]) <= FEATURE
-    around = network.lights.surroundings(scene, map_features)
+    around = network.lights.neighborhoods(scene, map_features)
     lights = network.lights(scene.light_state[:, None], around)
     assert gap(lights[0, 0], theirs["light/feature"]) <= FEATURE
     log_prob = torch.log_softmax(network.next_light_logits(lights), -1)
@@ -82,7 +82,7 @@ def test_features_at_the_current_step(golden, small, scene, name):
     pooled = network.destination_predictor.windows(history, agent_attributes(scene))
     assert gap(pooled[0], theirs["destination/pooled"]) <= FEATURE
     windows = Windows(scene.valid[:, None, None], scene.pose[:, None, None], scene.motion[:, None, None])
-    agents = network.agents(windows, scene, network.agents.surroundings(map_features, lights))
+    agents = network.agents(windows, scene, network.agents.neighborhoods(map_features, lights))
     assert gap(agents[0, 0, 0], theirs["agent/feature"]) <= FEATURE
 
 

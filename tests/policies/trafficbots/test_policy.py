@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import pytest
 import torch
+from tiny_trafficbots import TINY
 
 import scenes
 from rlftsim.errors import CheckpointError, ConfigError
-from rlftsim.policies.distributions import GaussianDistribution
 from rlftsim.policies.registry import load_policy
-from rlftsim.policies.trafficbots.config import TrafficBotsConfig, trafficbots_demo
+from rlftsim.policies.trafficbots.config import trafficbots_demo
 from rlftsim.policies.trafficbots.dynamics import MAX_ACTION
 from rlftsim.policies.trafficbots.policy import TrafficBotsPolicy
 from rlftsim.rollout.check import check_policy
@@ -19,12 +19,6 @@ from rlftsim.rollout.policy import ImitatedPolicy, PartlyTrainedPolicy, Sampling
 from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import collate
 from rlftsim.training.freezing import freeze_untrained
-
-TINY = TrafficBotsConfig(
-    dim=32, num_heads=2, num_map_layers=1, num_light_layers=1, num_agent_layers=1, map_neighbors=4,
-    light_neighbors=2, agent_map_neighbors=8, agent_light_neighbors=2, agent_neighbors=4, radius_m=100.0,
-    light_radius_m=100.0, steps_per_pass=40,
-)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -104,26 +98,27 @@ def test_the_noise_has_its_size_and_correlation(policy, batch):
     assert torch.allclose(later, first * math.sqrt(1 - 0.81), rtol=1e-5)
 
 
-@pytest.mark.parametrize("fine_tuned", ["all", "vehicles"])
-def test_scoring_with_a_reference_is_scoring_twice(batch, fine_tuned):
-    """Where only vehicles' actions are trained the features of both models are computed once."""
+@pytest.mark.parametrize("trained", ["decoder", "head"])
+def test_scoring_with_a_reference_is_scoring_twice(batch, trained):
+    """Where only the head is trained the features of both models are computed once."""
     torch.manual_seed(0)
-    learner = TrafficBotsPolicy(replace(TINY, fine_tuned=fine_tuned)).eval()
+    learner = TrafficBotsPolicy(TINY).eval()
     reference = copy.deepcopy(learner).requires_grad_(False)
-    freeze_untrained(learner, "decoder")
+    freeze_untrained(learner, trained)
     with torch.no_grad():
         for weight in learner.parameters():
             weight.add_(0.02 * torch.randn_like(weight) if weight.requires_grad else 0.0)
     assert isinstance(learner, SharingPolicy)
-    assert learner.has_features_of(reference) == (fine_tuned == "vehicles")
+    assert learner.has_features_of(reference) == (trained == "head")
     with torch.no_grad():
         rollouts = simulate(learner, batch, num_rollouts=2, seed=0)
         ref_context = reference.encode(batch)
         ref_alone = reference.score(ref_context, rollouts)
-    context = learner.encode(batch)
+    context = learner.encode_like(batch, ref_context)
+    assert context.map_features is ref_context.map_features
     dist, ref_dist = learner.score_both(context, rollouts, reference, ref_context, rollouts)
     gradients = []
-    for one in (dist, learner.score(context, rollouts)):
+    for one in (dist, learner.score(learner.encode(batch), rollouts)):
         learner.zero_grad()
         one.log_prob(rollouts.decision).sum().backward(retain_graph=True)
         gradients.append([w.grad.clone() for w in learner.parameters() if w.grad is not None])
@@ -135,11 +130,27 @@ def test_scoring_with_a_reference_is_scoring_twice(batch, fine_tuned):
         assert torch.allclose(own, alone, rtol=1e-3, atol=1e-3 * float(alone.abs().max()))
 
 
-def test_fine_tuning_vehicles_leaves_pedestrians_as_they_are(batch):
+def test_nothing_is_shared_in_training_mode_or_with_other_settings(batch):
     torch.manual_seed(0)
-    learner = TrafficBotsPolicy(replace(TINY, fine_tuned="vehicles")).eval()
+    learner = TrafficBotsPolicy(TINY).requires_grad_(False).eval()
+    same, other = copy.deepcopy(learner), TrafficBotsPolicy(replace(TINY, map_neighbors=2)).requires_grad_(False).eval()
+    assert learner.sees_as(same)
+    assert learner.has_features_of(same)
+    assert not learner.sees_as(other)
+    # Dropout would give each model features of its own.
+    same.train()
+    assert not learner.sees_as(same)
+    assert not learner.has_features_of(same)
+    context = same.eval().encode(batch)
+    same.network.map.requires_grad_(True)
+    assert learner.encode_like(batch, context).map_features is not context.map_features
+
+
+def test_fine_tuning_the_head_leaves_pedestrians_as_they_are(batch):
+    torch.manual_seed(0)
+    learner = TrafficBotsPolicy(TINY).eval()
     reference = copy.deepcopy(learner).requires_grad_(False)
-    freeze_untrained(learner, "decoder")
+    freeze_untrained(learner, "head")
     with torch.no_grad():
         rollouts = simulate(learner, batch, num_rollouts=1, seed=0)
         for weight in learner.parameters():
@@ -154,33 +165,33 @@ def test_fine_tuning_vehicles_leaves_pedestrians_as_they_are(batch):
     assert not differs[others].any()
 
 
-def test_the_score_function_has_mean_zero():
-    """E[grad log pi] = 0: of many draws of two correlated decisions, within five standard errors."""
+def test_the_score_function_has_mean_zero_and_pays_each_decision_for_itself():
+    """E[grad log pi] = 0 over 80 decisions with correlated noise, within five standard errors.
+
+    The first acceleration rises by as much as the head's bias does, so that rewarding it has the gradient 1. A score
+    that missed the correlation of the noise would pay the bias for the decisions after it, too: about 10.
+    """
     torch.manual_seed(0)
-    weight = torch.tensor(0.3, requires_grad=True)
-    count, rho, sigma = 20_000, 0.9, 0.1
-    mask = torch.ones(count, dtype=torch.bool)
-    first_mean = weight.expand(count, 1)
-    first = GaussianDistribution(first_mean, torch.full((count, 1), sigma), mask)
-    u0 = first.sample(Sampling(), torch.rand(count, 1))
-    second_mean = weight.square() * (1 + u0) + rho * (u0 - first_mean)
-    second = GaussianDistribution(second_mean, torch.full((count, 1), sigma * math.sqrt(1 - rho**2)), mask)
-    u1 = second.sample(Sampling(), torch.rand(count, 1))
-    # One gradient for each draw: of copies of the weight.
-    copies = weight.detach().expand(count).clone().requires_grad_(True)
-    mean0 = copies[:, None]
-    mean1 = copies.square()[:, None] * (1 + u0) + rho * (u0 - mean0)
-    log_prob = (
-        GaussianDistribution(mean0, first.std, mask).log_prob(u0)
-        + GaussianDistribution(mean1, second.std, mask).log_prob(u1)
-    ).sum()
-    (grad,) = torch.autograd.grad(log_prob, copies)
-    assert float(grad.mean().abs()) < 5 * float(grad.std()) / math.sqrt(count)
-    # The reward u0 + u1 has the gradient 1 + 2w(1 + w) + w² in expectation.
-    reward = (u0 + u1)[:, 0]
-    estimate = (reward - reward.mean()) * grad
-    expected = 1 + 2 * 0.3 * 1.3 + 0.3**2
-    assert float(estimate.mean()) == pytest.approx(expected, abs=5 * float(estimate.std()) / math.sqrt(count))
+    policy, batch, size = TrafficBotsPolicy(TINY).eval(), collate([scenes.lone_agent()]), 16
+    freeze_untrained(policy, "head")
+    bias = policy.head_parts()[0].bias
+    with torch.no_grad():
+        rollouts = simulate(policy, batch, num_rollouts=512, seed=0)
+    reward = rollouts.decision[0, :, 0, 0, 0]
+    reward = reward - reward.mean()  # [512]
+    scores, estimates = [], []
+    for start in range(0, 512, size):
+        own = slice(start, start + size)
+        part = rollouts.select(own)
+        by_rollout = scored(policy, batch, part).log_prob(part.decision).sum(-1)[0, :, 0]  # [size]
+        for values, weight in ((scores, torch.ones(size)), (estimates, reward[own])):
+            (grad,) = torch.autograd.grad((by_rollout * weight).mean(), bias, retain_graph=True)
+            values.append(grad)
+    scores, estimates = torch.stack(scores), torch.stack(estimates)  # [32, 2]
+    assert (scores.mean(0).abs() < 5 * scores.std(0) / math.sqrt(len(scores))).all()
+    error = float(estimates[:, 0].std()) / math.sqrt(len(estimates))
+    assert error < 0.3
+    assert float(estimates[:, 0].mean()) == pytest.approx(1.0, abs=5 * error)
 
 
 @pytest.mark.parametrize(
@@ -228,6 +239,14 @@ def test_an_agent_that_leaves_the_map_goes_on_straight_and_decides_nothing(polic
     box = context.scene.map_box.clone()
     box[:, 1] = 5.0  # x: the ego passes it soon
     context = replace(context, scene=replace(context.scene, map_box=box))
+    # Its decisions leave every mean once it has left.
+    rollouts = simulate(policy, batch, num_rollouts=1, seed=0, context=context)
+    decides = rollouts.decision_mask[0, 0, 0]
+    assert decides[0]
+    assert not decides[-1]
+    assert (rollouts.log_prob[0, 0, 0][~decides] == 0).all()
+    assert torch.equal(policy.score(context, rollouts).mask[0, 0, 0], decides)
+
     state = policy.begin(context, 1, None, torch.full((1, 1, 3, 17), 0.5))
     for _ in range(20):
         dist = policy.decide(context, state)

@@ -15,7 +15,9 @@ from rlftsim.policies.trafficbots.destinations import (
     destination_labels,
 )
 from rlftsim.policies.trafficbots.map_tokens import cut_line, light_tokens, map_pieces, sides_of_polygon
+from rlftsim.policies.trafficbots.scene import build_scene
 from rlftsim.policies.trafficbots.tracks import agent_motions
+from rlftsim.scenario.batch import collate
 from rlftsim.scenario.types import HISTORY_STEPS, TOTAL_STEPS, LightStates
 
 both = pytest.mark.parametrize("name", ["A", "B"])
@@ -85,6 +87,13 @@ def test_all_destinations_at_forks_are_those_of_the_public_walk(golden, records,
         found = places.destinations(goal, int(kind))
         assert set(found) == set(theirs["dest_possible"][starts[k] : starts[k + 1]].tolist())
         assert sum(found.values()) == pytest.approx(1)
+
+
+@pytest.mark.official
+@both
+def test_the_box_of_the_map_is_the_packed_one(golden, records, name):
+    scene = build_scene(collate([records(name)]), HISTORY_STEPS, None)
+    np.testing.assert_allclose(scene.map_box[0], golden.arrays(f"scenario_{name}/inputs")["mp_boundary"], atol=1e-3)
 
 
 @pytest.mark.official

@@ -76,4 +76,5 @@ def test_a_tracker_follows_logged_vehicles_through_the_dynamics(golden, scene):
         speed = motion[:, 0]
         errors.append((pose[:, :2] - target[:, :2]).norm(dim=-1))
     assert len(errors[0]) >= 4
-    assert float(torch.stack(errors).mean()) < 0.5
+    # The specification measured 0.22 m.
+    assert float(torch.stack(errors).mean()) < 0.242

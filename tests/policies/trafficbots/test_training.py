@@ -4,22 +4,26 @@ from dataclasses import replace
 
 import pytest
 import torch
+from tiny_trafficbots import TINY
 
 import scenes
 import tiny
 from rlftsim.errors import ConfigError
-from rlftsim.policies.trafficbots.config import TrafficBotsConfig
+from rlftsim.policies.trafficbots.destinations import NO_DESTINATION, destination_labels
+from rlftsim.policies.trafficbots.dynamics import max_action, move
+from rlftsim.policies.trafficbots.imitation import draw_training, imitation_terms, loss_of_scene
+from rlftsim.policies.trafficbots.network import Windows
 from rlftsim.policies.trafficbots.policy import TrafficBotsPolicy
+from rlftsim.policies.trafficbots.scene import build_scene
+from rlftsim.policies.trafficbots.state import Imposed, traffic_at_start
 from rlftsim.recipes.registry import recipe_by_name
+from rlftsim.scenario.batch import collate
+from rlftsim.scenario.types import TOTAL_STEPS
 from rlftsim.training.finetune import finetune
 from rlftsim.training.pretrain import pretrain
 from rlftsim.training.run_folder import read_metrics
 
-TINY = TrafficBotsConfig(
-    dim=32, num_heads=2, num_map_layers=1, num_light_layers=1, num_agent_layers=1, map_neighbors=4,
-    light_neighbors=2, agent_map_neighbors=8, agent_light_neighbors=2, agent_neighbors=4, radius_m=100.0,
-    light_radius_m=100.0, steps_per_pass=80, forcing_updates=2,
-)  # fmt: skip
+SETTINGS = replace(TINY, steps_per_pass=80, forcing_updates=2)
 PRETRAIN = replace(
     tiny.PRETRAIN, batch_size=2, epochs=2.0, context_radius_m=None, trained_radius_m=1000.0, max_trained_agents=None
 )
@@ -32,7 +36,7 @@ def scenarios():
 
 def new_policy(**changes):
     torch.manual_seed(0)
-    return TrafficBotsPolicy(replace(TINY, **changes))
+    return TrafficBotsPolicy(replace(SETTINGS, **changes))
 
 
 def weights_of(policy):
@@ -70,13 +74,16 @@ def test_the_gradient_does_not_depend_on_the_number_of_decisions_in_memory(scena
     assert norms[0] == pytest.approx(norms[1], rel=1e-5)
 
 
-def test_mixed_precision_gives_nearly_the_same_loss(scenarios, tmp_path):
-    losses = []
+def test_mixed_precision_gives_nearly_the_same_loss_and_gradient(scenarios, tmp_path):
+    losses, norms = [], []
     for precision in ("32-true", "bf16-mixed"):
         config = replace(PRETRAIN, epochs=1.0, device=replace(tiny.CPU, precision=precision))
         pretrain(new_policy(dropout=0.0), scenarios, tmp_path / precision, config)
-        losses.append(read_metrics(tmp_path / precision)[0]["loss"])
+        first = read_metrics(tmp_path / precision)[0]
+        losses.append(first["loss"])
+        norms.append(first["gradient_norm"])
     assert losses[0] == pytest.approx(losses[1], rel=0.05)
+    assert norms[0] == pytest.approx(norms[1], rel=0.05)
 
 
 def test_rewards_train_what_decides_and_nothing_that_draws(scenarios, tmp_path):
@@ -88,6 +95,87 @@ def test_rewards_train_what_decides_and_nothing_that_draws(scenarios, tmp_path):
     lines = read_metrics(tmp_path)
     assert all(line["score_gap"] < 1e-3 for line in lines)
     assert all(line["kl"] >= 0 for line in lines)
+
+
+def test_imitation_beside_rewards_draws_the_same_in_every_run(scenarios, tmp_path):
+    config, ends = replace(tiny.FINETUNE, epochs=2.0, imitation_weight=0.1), []
+    for name in ("first", "second"):
+        policy = new_policy()
+        torch.manual_seed(len(name))  # what else draws does not matter
+        finetune(policy, scenarios, tmp_path / name, config)
+        ends.append(weights_of(policy))
+    assert all(torch.equal(value, ends[1][name]) for name, value in ends[0].items())
+
+
+def test_imitation_beside_rewards_forces_as_at_the_end_of_pretraining(scenarios):
+    batch = collate(scenarios)
+    values = []
+    for fractions in ((1.0, 0.0), (0.0,)):
+        policy = new_policy(forced_fractions=fractions).eval()
+        torch.manual_seed(0)
+        values.append(float(policy.imitation_loss(batch, batch.agent_mask, 0).loss.detach()))
+    assert values[0] == values[1]
+
+
+def test_two_passes_have_the_gradient_of_one(scenarios):
+    """Rolling out without gradient and scoring in parallel is plain back-propagation, to 1e-5."""
+    policy, batch = new_policy(dropout=0.0), collate([scenarios[0], scenes.junction_with_light("two")])
+    network, weights = policy.network, list(policy.parameters())
+    scene = build_scene(batch, TOTAL_STEPS, None)
+    labels = torch.full(scene.agent_mask.shape, NO_DESTINATION)
+    for row, scenario in zip(labels, batch.scenarios):
+        own = torch.from_numpy(destination_labels(scenario, None))
+        row[: len(own)] = own
+    draws = replace(draw_training(scene, SETTINGS, 0.3, hide=False), from_prior=False)
+    found = loss_of_scene(network, SETTINGS, scene, labels, scene.agent_mask, draws)
+    two_passes = torch.autograd.grad(found.loss, weights, allow_unused=True)
+
+    # The imitation loss alone, step by step with gradient; the other terms are the same in both.
+    map_features = network.map(scene, draws.node_mask)
+    steps = torch.arange(90)[:, None]
+    padded = torch.nn.functional.pad(scene.light_state, (10, 0))
+    windows = padded.unfold(2, 11, 1)[:, :, :-1].transpose(1, 2)
+    exists = steps + torch.arange(-10, 1) >= 0
+    lights = network.lights(windows, network.lights.neighborhoods(scene, map_features), exists)
+    logged = Windows(*(v[:, None, None, :, ::5] for v in (scene.valid, scene.pose, scene.motion)))
+    mean = network.posterior(logged, scene.light_state[:, None, :, ::5], scene, map_features)
+    personality = mean + network.posterior.log_std.exp() * draws.noise
+    given = network.conditioning(scene, map_features, personality[:, None], labels[:, None])
+    around = network.agents.neighborhoods(map_features, lights[:, 10:])
+    traffic, limit = traffic_at_start(scene, labels[:, None]), max_action(scene.agent_class)[:, None]
+    pose, speed = traffic.windows.pose[..., -1, :], traffic.windows.motion[..., -1, 0]
+    losses, counted = [], []
+    for step in range(11, 91):
+        now = around.steps(step - 11, step - 10)
+        features = network.features(traffic.windows.as_one_decision(), scene, now, given, traffic.active[:, None])
+        action = network.mean_actions(features, scene)[:, 0]
+        pose, motion = move(pose, speed, torch.where(traffic.alive[..., None], action, 0.0), limit)
+        own_pose, own_motion = scene.pose[:, None, :, step], scene.motion[:, None, :, step]
+        losses.append(sum(imitation_terms(pose, motion[..., 0], own_pose, own_motion[..., 0])))
+        is_logged = scene.valid[:, None, :, step]
+        counted.append(traffic.alive & is_logged)
+        is_put = is_logged & draws.forced[:, None]
+        pose, speed = (
+            torch.where(is_put[..., None], own_pose, pose),
+            torch.where(is_put, own_motion[..., 0], motion[..., 0]),
+        )
+        with torch.no_grad():
+            traffic = traffic.after(action.detach(), scene, Imposed(is_put, own_pose, own_motion), staying=is_logged)
+    mask = torch.stack(counted, -1)
+    total = (torch.stack(losses, -1) * mask).flatten(1).sum(1) / mask.flatten(1).sum(1).clamp(min=1)
+    assert float(total.sum().detach()) == pytest.approx(float(found.sums["imitation_loss"]), rel=1e-6)
+    one_pass = torch.autograd.grad(total.sum(), weights, allow_unused=True)
+    # Weights that only the imitation loss trains: all that decide actions.
+    compared = [
+        name.startswith("network.actions.") or name.startswith("network.agents.")
+        for name, _ in policy.named_parameters()
+    ]
+    ours, plain = (
+        torch.cat([grad.flatten() for grad, is_one in zip(grads, compared) if is_one and grad is not None])
+        for grads in (two_passes, one_pass)
+    )
+    assert len(ours) == len(plain) > 1000
+    assert float((ours - plain).norm() / plain.norm()) < 1e-5
 
 
 def test_goals_are_refused_in_words(scenarios, tmp_path):
@@ -102,6 +190,6 @@ def test_recipes_make_their_policy_and_name_a_counterpart(name):
     policy = recipe.new_policy(None)
     assert isinstance(policy, TrafficBotsPolicy)
     assert recipe.tokens is recipe.catk is recipe.gcsl is None
-    assert recipe.like(new_policy()).model == TINY
+    assert recipe.like(new_policy()).model == SETTINGS
     back = recipe_by_name(recipe_by_name(recipe.counterpart).counterpart)
     assert type(back) is type(recipe)

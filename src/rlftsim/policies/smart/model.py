@@ -67,6 +67,10 @@ class SmartModel(nn.Module):
         decoder = self.network.decoder
         return decoder.time_layers, decoder.map_layers, decoder.agent_layers, decoder.head, *self.goal_parts()
 
+    def head_parts(self) -> tuple[nn.Module, ...]:
+        """The layers that turn an agent's features into logits of tokens."""
+        return (self.network.decoder.head,)
+
     def goal_parts(self) -> tuple[nn.Module, ...]:
         """Goal encoder and goal logit bias; empty in a goal-free model."""
         return self.network.decoder.goal_parts()

@@ -1,9 +1,9 @@
 """Sizes, neighborhoods and training schedule of a TrafficBots model."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
-from rlftsim.errors import ConfigError, given, require_finite, require_positive
+from rlftsim.errors import ConfigError, given, require_finite, require_not_negative, require_positive, require_types
 
 WINDOW = 11
 """Steps of 0.1 s that an agent or a light is seen for, the current one included."""
@@ -16,13 +16,13 @@ class TrafficBotsConfig:
     """TrafficBots' architecture. The defaults are TrafficBots V1.5 (7.9 M parameters without its unused ones)."""
 
     fingerprint_name: ClassVar[str] = "rlftsim.policies.trafficbots.config.TrafficBotsConfig"
-    added_fields: ClassVar[dict[str, Any]] = {"noise_pedestrian_yaw_rate_radps": None, "fine_tuned": "all"}
+    added_fields: ClassVar[dict[str, Any]] = {"noise_pedestrian_yaw_rate_radps": None}
     """Fields that were added after models had been stored, and the values with which a model is as before."""
     free_fields: ClassVar[tuple[str, ...]] = (
         "max_map_tokens", "map_neighbors", "light_neighbors", "agent_map_neighbors", "agent_light_neighbors",
         "agent_neighbors", "radius_m", "light_radius_m", "dropout", "input_drop", "prior_probability", "free_nats",
         "forced_fractions", "forcing_updates", "steps_per_pass", "noise_acceleration_mps2", "noise_yaw_rate_radps",
-        "noise_pedestrian_yaw_rate_radps", "noise_correlation", "fine_tuned",
+        "noise_pedestrian_yaw_rate_radps", "noise_correlation",
     )  # fmt: skip
     """Fields that a trained model can be trained further with other values of."""
 
@@ -64,22 +64,18 @@ class TrafficBotsConfig:
     input_drop: float = 0.1
     """In pre-training: probability that a map node or a history step is hidden."""
     prior_probability: float = 0.1
-    """In pre-training: probability that an update draws personalities from the prior instead of the posterior."""
+    """In pre-training: probability that a micro batch draws personalities from the prior instead of the posterior."""
     free_nats: float = 1.0
     """A personality's KL from the prior below which it is not pulled towards it."""
     forced_fractions: tuple[float, ...] = (0.3, 0.2, 0.1, 0.0)
     """In pre-training: fraction of the agents that follow the log throughout, one after the other."""
     forcing_updates: int = 12_175
     """Updates that each of these fractions lasts: 0.2 passes over WOMD with 8 scenarios each."""
-    fine_tuned: Literal["all", "vehicles"] = "all"
-    """Fine-tuning changes everything that decides actions, or the last layer that decides those of vehicles alone:
-    pedestrians and cyclists then stay as they are, and an update takes half the time."""
     steps_per_pass: int = 8
     """Decisions that are scored with gradient at once; fewer need less memory, the result is the same."""
 
     def __post_init__(self) -> None:
-        # A list in a stored config.json.
-        object.__setattr__(self, "forced_fractions", tuple(self.forced_fractions))
+        require_types(self)
         sizes = ("dim", "num_heads", "num_map_layers", "num_light_layers", "num_agent_layers")
         neighbors = ("map_neighbors", "light_neighbors", "agent_map_neighbors", "agent_light_neighbors")
         distances = ("radius_m", "light_radius_m", "noise_acceleration_mps2", "noise_yaw_rate_radps")
@@ -87,10 +83,9 @@ class TrafficBotsConfig:
         counts = ("agent_neighbors", "forcing_updates", "steps_per_pass", *given(self, ("max_map_tokens",)))
         require_positive(self, (*sizes, *neighbors, *distances, *counts))
         require_finite(self, (*distances, "free_nats"))
+        require_not_negative(self, ("free_nats",))
         if self.dim % 16 or self.dim % self.num_heads:
             raise ConfigError(f"dim={self.dim} must be a multiple of 16 and of num_heads={self.num_heads}.")
-        if self.fine_tuned not in ("all", "vehicles"):
-            raise ConfigError(f"fine_tuned is all or vehicles, got {self.fine_tuned!r}.")
         for name in ("dropout", "input_drop", "noise_correlation"):
             if not 0 <= getattr(self, name) < 1:
                 raise ConfigError(f"{name} is in [0, 1), got {getattr(self, name)}.")
@@ -111,5 +106,5 @@ def trafficbots_demo() -> TrafficBotsConfig:
         dim=48, num_heads=4, num_map_layers=2, num_light_layers=1, num_agent_layers=2,
         map_neighbors=12, light_neighbors=8, agent_map_neighbors=24, agent_light_neighbors=4, agent_neighbors=8,
         radius_m=100.0, light_radius_m=100.0, noise_acceleration_mps2=0.6, dropout=0.0, forcing_updates=200,
-        fine_tuned="vehicles", steps_per_pass=16,
+        steps_per_pass=16,
     )  # fmt: skip

@@ -21,10 +21,17 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 from torch.nn.functional import pad, smooth_l1_loss
 
-from rlftsim.policies.trafficbots.config import TrafficBotsConfig
+from rlftsim.policies.trafficbots.config import LATENT_SIZE, TrafficBotsConfig
 from rlftsim.policies.trafficbots.destinations import NO_DESTINATION, destination_labels
 from rlftsim.policies.trafficbots.dynamics import max_action, move
-from rlftsim.policies.trafficbots.network import AgentSurroundings, Given, TrafficBotsNetwork, Windows, history_windows
+from rlftsim.policies.trafficbots.network import (
+    POSTERIOR_STRIDE,
+    AgentConditioning,
+    AgentNeighborhoods,
+    TrafficBotsNetwork,
+    Windows,
+    history_windows,
+)
 from rlftsim.policies.trafficbots.scene import Scene, build_scene
 from rlftsim.policies.trafficbots.scoring import features_over_time
 from rlftsim.policies.trafficbots.state import Imposed, traffic_at_start, whole_history
@@ -33,7 +40,6 @@ from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, HISTORY_STEPS, TOTAL_STEPS
 
 POSITION_WEIGHT, HEADING_WEIGHT, SPEED_WEIGHT, PERSONALITY_WEIGHT = 0.1, 10.0, 0.1, 0.2
-POSTERIOR_STRIDE = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,18 +68,20 @@ def imitation_loss(
     """Loss of an update, a sum of means over each scenario.
 
     Args:
-        network: in training or evaluation mode; only in training mode inputs are hidden.
+        network: in training mode inputs are hidden and agents forced by schedule; in evaluation mode neither.
         config: schedule of forcing, and probabilities.
         batch: with futures.
         trained: True = the agent counts; the others are context.
-        update: counted from 0.
+        update: of pre-training, counted from 0.
     """
     scene = build_scene(batch, TOTAL_STEPS, config.max_map_tokens)
     labels = np.full(trained.shape, NO_DESTINATION)
     for row, scenario in zip(labels, batch.scenarios):
         own = destination_labels(scenario, config.max_map_tokens)
         row[: len(own)] = own
-    stage = min(update // config.forcing_updates, len(config.forced_fractions) - 1)
+    # Beside rewards, in evaluation mode, the schedule of pre-training is at its end.
+    stages = len(config.forced_fractions) - 1
+    stage = min(update // config.forcing_updates, stages) if network.training else stages
     draws = draw_training(scene, config, config.forced_fractions[stage], hide=network.training)
     destination = torch.from_numpy(labels).to(trained.device)
     return loss_of_scene(network, config, scene, destination, trained & scene.agent_mask, draws)
@@ -94,7 +102,7 @@ def draw_training(scene: Scene, config: TrafficBotsConfig, fraction: float, *, h
         # Always from the generator of the CPU, so that devices draw the same.
         return torch.rand(*shape).to(scene.pose.device)
 
-    noise = torch.randn(*agents, 16).to(scene.pose.device)
+    noise = torch.randn(*agents, LATENT_SIZE).to(scene.pose.device)
     from_prior = bool(torch.rand(()) < config.prior_probability)
     forced = uniform(*agents) < fraction
     node_mask, history_mask = scene.node_mask, scene.valid[..., :HISTORY_STEPS]
@@ -120,7 +128,7 @@ def loss_of_scene(
 
     Args:
         network: the weights.
-        config: weights of the terms and sizes of the passes.
+        config: KL that costs nothing, and size of a pass.
         scene: with all 91 steps.
         destination: label of each agent, negative = none.
         trained: True = the agent counts.
@@ -132,11 +140,8 @@ def loss_of_scene(
     mean = network.posterior(*_posterior_inputs(scene), scene, map_features)
     log_std = network.posterior.log_std
     personality = draws.noise if draws.from_prior else mean + log_std.exp() * draws.noise
-    token = destination.clamp(min=0)[:, None]  # [B, 1, A]
-    rows = torch.arange(len(token), device=token.device)[:, None, None]
-    features = network.destination_map(map_features.detach())[rows, token]
-    given = Given(personality[:, None], features, scene.map_pose[rows, token])
-    around = network.agents.surroundings(map_features, light_features[:, CURRENT_STEP:])
+    given = network.conditioning(scene, map_features, personality[:, None], destination[:, None])
+    around = network.agents.neighborhoods(map_features, light_features[:, CURRENT_STEP:])
 
     # 2. Roll out without gradient, differentiate the dynamics, score with gradient.
     rolled = _roll_out(network, scene, around, given, destination[:, None], draws.forced)
@@ -144,7 +149,7 @@ def loss_of_scene(
     features = features_over_time(
         network, rolled.history, rolled.active, scene, around, given, steps_per_pass=config.steps_per_pass
     )  # [B, T, 1, A, D]
-    actions = network.actions(features, scene.agent_class[:, None, None]).movedim(1, 3)  # [B, 1, A, T, 2]
+    actions = network.mean_actions(features, scene).movedim(1, 3)  # [B, 1, A, T, 2]
     gradient_of_actions = (actions * grad).sum()
     # The value of the imitation loss with the gradient of the sum.
     imitation = value + (gradient_of_actions - gradient_of_actions.detach())
@@ -153,8 +158,9 @@ def loss_of_scene(
     taking_part = trained & rolled.alive.any(-1)[:, 0]
     kl = personality_kl(mean, log_std, config.free_nats)
     personality_loss = _mean_by_scenario(kl, taking_part)
-    windows, seen = history_windows(scene), draws.history_mask
-    log_prob = network.destination_predictor(windows, scene, map_features, seen)  # [B, A, M]
+    log_prob = network.destination_predictor(
+        history_windows(scene), scene, map_features, draws.history_mask
+    )  # [B, A, M]
     chosen = -log_prob.gather(-1, destination.clamp(min=0)[..., None])[..., 0]
     destination_loss = _mean_by_scenario(chosen, taking_part & (destination >= 0) & chosen.isfinite())
     losses = {
@@ -218,8 +224,8 @@ class _RolledOut:
 def _roll_out(
     network: TrafficBotsNetwork,
     scene: Scene,
-    around: AgentSurroundings,
-    given: Given,
+    around: AgentNeighborhoods,
+    given: AgentConditioning,
     destination: Int64[Tensor, "B 1 A"],
     forced: Bool[Tensor, "B A"],
 ) -> _RolledOut:
@@ -227,9 +233,9 @@ def _roll_out(
     before, actions, put = [], [], []
     for index in range(FUTURE_STEPS):
         before.append(traffic)
-        windows, seen = traffic.windows.as_one_decision(), around.steps(index, index + 1)
-        features = network.features(windows, scene, seen, given, traffic.active[:, None])  # [B, 1, 1, A, D]
-        action = network.actions(features, scene.agent_class[:, None, None])[:, 0]
+        windows, around_now = traffic.windows.as_one_decision(), around.steps(index, index + 1)
+        features = network.features(windows, scene, around_now, given, traffic.active[:, None])  # [B, 1, 1, A, D]
+        action = network.mean_actions(features, scene)[:, 0]
         step = CURRENT_STEP + index + 1
         logged = scene.valid[:, None, :, step]
         imposed = Imposed(logged & forced[:, None], scene.pose[:, None, :, step], scene.motion[:, None, :, step])
@@ -280,8 +286,8 @@ def _lights_along_log(
     padded = pad(scene.light_state, (encoder.window - 1, 0))  # the log begins at step 0
     windows = padded.unfold(2, encoder.window, 1)[:, :, :-1].transpose(1, 2)  # [B, 90, L, W]
     steps = torch.arange(windows.shape[1], device=padded.device)[:, None]
-    known = steps + torch.arange(1 - encoder.window, 1, device=padded.device) >= 0  # [90, W]
-    features = encoder(windows, encoder.surroundings(scene, map_features), known)
+    step_mask = steps + torch.arange(1 - encoder.window, 1, device=padded.device) >= 0  # [90, W]
+    features = encoder(windows, encoder.neighborhoods(scene, map_features), step_mask)
     log_prob = torch.log_softmax(network.next_light_logits(features), -1)
     target = scene.light_state[:, :, 1:].transpose(1, 2)[..., None]  # [B, 90, L, 1]
     loss = -log_prob.gather(-1, target)[..., 0]

@@ -4,6 +4,7 @@ B scenarios, A agents, L lights, M map tokens, D width.
 """
 
 import os
+from collections.abc import Callable
 from dataclasses import asdict
 from typing import TypeVar
 
@@ -34,30 +35,43 @@ class TrafficBotsModel(nn.Module):
         self.network = TrafficBotsNetwork(config)
 
     def fine_tuned_parts(self) -> tuple[nn.Module, ...]:
-        """Everything that decides actions, or the last layer for vehicles alone, by `fine_tuned` of the settings.
+        """Everything that decides actions.
 
         Map, lights, posterior and destination predictor stay as they are: personality and destination are drawn from
         them once per rollout, and what is drawn must not depend on trained weights.
         """
         network = self.network
-        if self.config.fine_tuned == "vehicles":
-            return (network.actions.of_class(VEHICLE)[-1],)
         destination = (network.destination_map, network.destination_pose, network.add_destination)
         return network.agents, *destination, network.add_personality, network.actions
 
-    def has_features_of(self, other: nn.Module) -> bool:
-        """True if another model, too, computes the features that `actions` decides by, without gradient in both.
+    def head_parts(self) -> tuple[nn.Module, ...]:
+        """The last layer that decides the actions of vehicles; pedestrians and cyclists stay as they are."""
+        return (self.network.actions.of_class(VEHICLE)[-1],)
+
+    def sees_as(self, other: nn.Module) -> bool:
+        """True if map and lights have the same features in another model, without gradient in both.
 
         Args:
             other: any model.
         """
-        if not isinstance(other, TrafficBotsModel) or self.config != other.config:
+        return self._shares(other, lambda name: name.startswith(("map.", "lights.", "light_state.")))
+
+    def has_features_of(self, other: nn.Module) -> bool:
+        """True if the features that actions are decided by are the same in another model, without gradient in both.
+
+        Args:
+            other: any model.
+        """
+        return self._shares(other, lambda name: not name.startswith("actions."))
+
+    def _shares(self, other: nn.Module, belongs: Callable[[str], bool]) -> bool:
+        """True if the weights of such names are frozen alike, and nothing is dropped out."""
+        if type(other) is not type(self) or self.config != other.config or self.training or other.training:
             return False
-        before_actions = (
-            (weight for name, weight in one.network.named_parameters() if not name.startswith("actions."))
-            for one in (self, other)
+        own, others = (
+            [weight for name, weight in one.network.named_parameters() if belongs(name)] for one in (self, other)
         )
-        return are_frozen_alike(*before_actions)
+        return are_frozen_alike(own, others)
 
     def encode_scene(self, scene: Scene) -> TrafficBotsContext:
         """Features of the map, and of the lights at all decisions.
@@ -66,8 +80,9 @@ class TrafficBotsModel(nn.Module):
             scene: only its history is used.
         """
         map_features = self.network.map(scene, scene.node_mask)
-        lights = self._roll_lights(scene, map_features)
-        return TrafficBotsContext(scene, map_features, self.network.agents.surroundings(map_features, lights))
+        light_features = self._roll_lights(scene, map_features)
+        around = self.network.agents.neighborhoods(map_features, light_features)
+        return TrafficBotsContext(scene, map_features, light_features, around, self)
 
     def _roll_lights(self, scene: Scene, map_features: Float[Tensor, "B M D"]) -> Float[Tensor, "B T L D"]:
         """Features of the lights at all 80 decisions; each next state is the most likely one.
@@ -75,7 +90,7 @@ class TrafficBotsModel(nn.Module):
         Lights do not see agents, so that they are the same in all rollouts of a scene.
         """
         encoder = self.network.lights
-        around = encoder.surroundings(scene, map_features)
+        around = encoder.neighborhoods(scene, map_features)
         window = scene.light_state[:, None, :, -encoder.window :]  # [B, 1, L, W]
         features = []
         for _ in range(FUTURE_STEPS):

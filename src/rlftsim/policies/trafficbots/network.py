@@ -17,11 +17,13 @@ from torch.nn import functional
 
 from rlftsim.policies.trafficbots.attention import DecoderLayer, KeyValues, PolylineEncoder, SelfLayer
 from rlftsim.policies.trafficbots.config import LATENT_SIZE, WINDOW, TrafficBotsConfig
-from rlftsim.policies.trafficbots.map_tokens import NUM_LIGHT_STATES, NUM_NODES, MapTokenType
+from rlftsim.policies.trafficbots.map_tokens import NUM_LIGHT_STATES, NUM_NODES, VEHICLE_LANES, MapTokenType
 from rlftsim.policies.trafficbots.poses import Neighbors, find_neighbors, pose_embedding, relative_pose
 from rlftsim.policies.trafficbots.scene import Scene
+from rlftsim.scenario.types import TOTAL_STEPS
 
-POSTERIOR_WINDOW = 19
+POSTERIOR_STRIDE = 5
+POSTERIOR_WINDOW = len(range(0, TOTAL_STEPS, POSTERIOR_STRIDE))
 """Steps 0, 5, ..., 90 of the log."""
 LIGHT_LOGIT_LIMIT = 3.0
 NUM_CLASSES, NUM_GEOMETRY, NUM_MOTION = 3, 7, 3
@@ -106,7 +108,7 @@ def segment_features(pose: Float[Tensor, "*g 3"]) -> Float[Tensor, "*g 7"]:
 
 
 @dataclass(frozen=True, eq=False)
-class LightSurroundings:
+class LightNeighborhoods:
     """Lights and their neighbors."""
 
     base: Float[Tensor, "B L D"]
@@ -132,7 +134,7 @@ class LightEncoder(nn.Module):
             DecoderLayer(dim, config.num_heads, config.dropout) for _ in range(config.num_light_layers)
         )
 
-    def surroundings(self, scene: Scene, map_features: Float[Tensor, "B M D"]) -> LightSurroundings:
+    def neighborhoods(self, scene: Scene, map_features: Float[Tensor, "B M D"]) -> LightNeighborhoods:
         """The part that the states of lights do not change, computed once.
 
         Args:
@@ -142,7 +144,7 @@ class LightEncoder(nn.Module):
         config, map_features = self.config, map_features.detach()
         lights = scene.light_pose
         find = partial(find_neighbors, count=config.light_neighbors, radius_m=config.light_radius_m, size=config.dim)
-        return LightSurroundings(
+        return LightNeighborhoods(
             base=map_features.gather(1, scene.light_token[..., None].expand(-1, -1, config.dim)),
             mask=scene.light_mask,
             own=find(lights, lights, scene.light_mask),
@@ -151,14 +153,14 @@ class LightEncoder(nn.Module):
         )
 
     def forward(
-        self, state: Int64[Tensor, "B T L W"], around: LightSurroundings, known: Bool[Tensor, "T W"] | None = None
+        self, state: Int64[Tensor, "B T L W"], around: LightNeighborhoods, step_mask: Bool[Tensor, "T W"] | None = None
     ) -> Float[Tensor, "B T L D"]:
         """Features of all lights at T decisions, 0 for padding.
 
         Args:
             state: the window's states, the newest last.
-            around: of `surroundings`.
-            known: True = the step of the window exists; None = all do.
+            around: of `neighborhoods`.
+            step_mask: True = the step of the window exists; None = all do.
         """
         num_decisions = state.shape[1]
         place = torch.eye(self.window, device=state.device).expand(*state.shape, -1)
@@ -166,7 +168,7 @@ class LightEncoder(nn.Module):
         mask = around.mask[:, None].expand(state.shape[:3])  # [B, T, L]
         x = self.states(attributes) + around.base[:, None, :, None]
         steps = mask[..., None].expand(state.shape)
-        x = self.polyline(x, steps if known is None else steps & known[:, None])
+        x = self.polyline(x, steps if step_mask is None else steps & step_mask[:, None])
         own, around_map = around.own.over_time(num_decisions), around.map.over_time(num_decisions)
         for layer, map_tokens in zip(self.layers, around.map_tokens):
             x = layer(x, mask, own, [(map_tokens, around_map)])
@@ -208,14 +210,14 @@ class WindowEncoder(nn.Module):
         self.polyline = PolylineEncoder(dim, dropout)
 
     def forward(
-        self, windows: Windows, agents: Float[Tensor, "*#g A 6"], seen: Bool[Tensor, "*g A W"] | None = None
+        self, windows: Windows, agents: Float[Tensor, "*#g A 6"], step_mask: Bool[Tensor, "*g A W"] | None = None
     ) -> Float[Tensor, "*g A D"]:
         """Features of windows, 0 for those without a valid step.
 
         Args:
             windows: of agents.
             agents: size and class (one-hot) of each.
-            seen: steps to look at; None = all valid ones.
+            step_mask: steps to look at; None = all valid ones.
         """
         shape = windows.valid.shape
         place = torch.eye(self.window, device=windows.pose.device).expand(*shape, -1)
@@ -223,7 +225,7 @@ class WindowEncoder(nn.Module):
         hidden = self.steps(attributes)  # [*g, A, W, D/2]
         relative = relative_pose(windows.pose, windows.token_pose[..., None, :])
         x = torch.cat([hidden, pose_embedding(relative, hidden.shape[-1]).to(hidden.dtype)], -1)
-        return self.polyline(x, windows.valid if seen is None else seen)
+        return self.polyline(x, windows.valid if step_mask is None else step_mask)
 
 
 def history_windows(scene: Scene) -> Windows:
@@ -237,7 +239,7 @@ def agent_attributes(scene: Scene) -> Float[Tensor, "B A 6"]:
 
 
 @dataclass(frozen=True, eq=False)
-class AgentSurroundings:
+class AgentNeighborhoods:
     """Map and lights as an agent encoder sees them, by layer."""
 
     map_tokens: tuple[KeyValues, ...]
@@ -245,9 +247,9 @@ class AgentSurroundings:
     light_tokens: tuple[KeyValues, ...]
     """[B, T, H, L, d] each."""
 
-    def steps(self, start: int, stop: int) -> "AgentSurroundings":
+    def steps(self, start: int, stop: int) -> "AgentNeighborhoods":
         """The same with the lights of some decisions."""
-        return AgentSurroundings(self.map_tokens, tuple(one.steps(start, stop) for one in self.light_tokens))
+        return AgentNeighborhoods(self.map_tokens, tuple(one.steps(start, stop) for one in self.light_tokens))
 
 
 class AgentEncoder(nn.Module):
@@ -261,27 +263,27 @@ class AgentEncoder(nn.Module):
             DecoderLayer(config.dim, config.num_heads, dropout) for _ in range(config.num_agent_layers)
         )
 
-    def surroundings(
+    def neighborhoods(
         self, map_features: Float[Tensor, "B M D"], light_features: Float[Tensor, "B T L D"]
-    ) -> AgentSurroundings:
+    ) -> AgentNeighborhoods:
         """Keys and values of map and lights for each layer, computed once for all rollouts.
 
         Args:
             map_features: of `MapEncoder`.
             light_features: of `LightEncoder`.
         """
-        return AgentSurroundings(
+        return AgentNeighborhoods(
             tuple(layer.project(map_features) for layer in decoder_layers(self.layers)),
             tuple(layer.project(light_features) for layer in decoder_layers(self.layers)),
         )
 
-    def forward(self, windows: Windows, scene: Scene, around: AgentSurroundings) -> Float[Tensor, "B T N A D"]:
+    def forward(self, windows: Windows, scene: Scene, around: AgentNeighborhoods) -> Float[Tensor, "B T N A D"]:
         """Features of all agents at T decisions of N rollouts, 0 for those without a valid step in their window.
 
         Args:
             windows: [B, T, N, A, W].
             scene: poses of map and lights, sizes and classes of agents.
-            around: of `surroundings`, for the same decisions.
+            around: of `neighborhoods`, for the same decisions.
         """
         config, mask, pose = self.config, windows.token_mask, windows.token_pose
         num_decisions = mask.shape[1]
@@ -334,7 +336,7 @@ class DestinationPredictor(nn.Module):
         windows: Windows,
         scene: Scene,
         map_features: Float[Tensor, "B M D"],
-        seen: Bool[Tensor, "B A W"] | None = None,
+        step_mask: Bool[Tensor, "B A W"] | None = None,
     ) -> Float[Tensor, "B A M"]:
         """Log-probabilities; -inf for tokens that are no destination of the agent's class.
 
@@ -344,9 +346,9 @@ class DestinationPredictor(nn.Module):
             windows: history of the agents [B, A, W].
             scene: its map and agents.
             map_features: of `MapEncoder`; the predictor does not train them.
-            seen: steps to look at; None = all valid ones.
+            step_mask: steps to look at; None = all valid ones.
         """
-        agents = self.windows(windows, agent_attributes(scene), seen)  # [B, A, D]
+        agents = self.windows(windows, agent_attributes(scene), step_mask)  # [B, A, D]
         relative = relative_pose(scene.map_pose[:, None], windows.token_pose[:, :, None])  # [B, A, M, 3]
         # The first layer of [agent, map token, relative pose] in three parts: only the last is one of pairs.
         first, *rest = self.pairs
@@ -369,9 +371,8 @@ def admissible(scene: Scene) -> Bool[Tensor, "B A M"]:
     """True = a map token that agents of this class may be on their way to."""
     kind = MapTokenType
     edges, bikes = (kind.EDGE_BOUNDARY,), (kind.BIKE_LANE,)
-    lanes = (kind.FREEWAY, kind.STREET, kind.STOP_SIGN_LANE)
     table = torch.zeros(NUM_CLASSES, len(kind), dtype=torch.bool, device=scene.map_type.device)
-    for row, types in zip(table, ((*lanes, *edges), edges, (*bikes, *edges))):
+    for row, types in zip(table, ((*VEHICLE_LANES, *edges), edges, (*bikes, *edges))):
         row[list(types)] = True
     of_class = table[scene.agent_class]  # [B, A, 11]
     index = scene.map_type[:, None].expand(-1, of_class.shape[1], -1)
@@ -390,7 +391,7 @@ class ActionHead(nn.Module):
         return cast(nn.Sequential, self.by_class[agent_class])
 
     def forward(self, x: Float[Tensor, "*g A D"], agent_class: Int64[Tensor, "*#g A"]) -> Float[Tensor, "*g A 2"]:
-        """Means, float32: the actions of an agent without exploration noise.
+        """Means, float32.
 
         Args:
             x: features of agents.
@@ -426,9 +427,19 @@ class Posterior(nn.Module):
             scene: map, sizes and classes.
             map_features: of `MapEncoder`; agents train them, lights do not.
         """
-        lights = self.lights(light_state, self.lights.surroundings(scene, map_features))
-        around = self.agents.surroundings(map_features, lights)
+        lights = self.lights(light_state, self.lights.neighborhoods(scene, map_features))
+        around = self.agents.neighborhoods(map_features, lights)
         return self.mean(self.agents(windows, scene, around)[:, 0, 0]).float()
+
+
+@dataclass(frozen=True, eq=False)
+class AgentConditioning:
+    """Values that the agents of N rollouts get once."""
+
+    personality: Float[Tensor, "B N A 16"]
+    destination_feature: Float[Tensor, "B N A D"]
+    """Projected feature of the destination's map token."""
+    destination_pose: Float[Tensor, "B N A 3"]
 
 
 class TrafficBotsNetwork(nn.Module):
@@ -450,6 +461,27 @@ class TrafficBotsNetwork(nn.Module):
         self.add_personality = Conditioning(LATENT_SIZE, dim)
         self.actions = ActionHead(dim)
 
+    def conditioning(
+        self,
+        scene: Scene,
+        map_features: Float[Tensor, "B M D"],
+        personality: Float[Tensor, "B N A 16"],
+        destination: Int64[Tensor, "B N A"],
+    ) -> AgentConditioning:
+        """Personalities and destinations of agents, as the features are conditioned on them.
+
+        Args:
+            scene: its map.
+            map_features: of `MapEncoder`; they are not trained from here.
+            personality: of each agent.
+            destination: map token of each agent, negative = none.
+        """
+        token = destination.clamp(min=0)
+        rows = torch.arange(len(token), device=token.device)[:, None, None]
+        # Projected before it is gathered: a scene has fewer map tokens than rollouts have agents.
+        projected = self.destination_map(map_features.detach())
+        return AgentConditioning(personality, projected[rows, token], scene.map_pose[rows, token])
+
     def next_light_logits(self, light_features: Float[Tensor, "*g D"]) -> Float[Tensor, "*g 5"]:
         """Logits of a light's next state; they do not train the features."""
         return self.light_state(light_features.detach()).float().clamp(-LIGHT_LOGIT_LIMIT, LIGHT_LOGIT_LIMIT)
@@ -458,11 +490,11 @@ class TrafficBotsNetwork(nn.Module):
         self,
         windows: Windows,
         scene: Scene,
-        around: AgentSurroundings,
-        given: "Given",
+        around: AgentNeighborhoods,
+        given: AgentConditioning,
         active: Bool[Tensor, "B T N A"],
     ) -> Float[Tensor, "B T N A D"]:
-        """Features of agents that `actions` decides by.
+        """Features of agents that `mean_actions` decides by.
 
         Args:
             windows: [B, T, N, A, 11].
@@ -478,12 +510,11 @@ class TrafficBotsNetwork(nn.Module):
         x = self.add_destination(x, given.destination_feature[:, None] + pose, active)
         return self.add_personality(x, given.personality[:, None])
 
+    def mean_actions(self, features: Float[Tensor, "B T N A D"], scene: Scene) -> Float[Tensor, "B T N A 2"]:
+        """Means of the actions before tanh, float32: what an agent does without exploration noise.
 
-@dataclass(frozen=True, eq=False)
-class Given:
-    """Values that the agents of N rollouts get once."""
-
-    personality: Float[Tensor, "B N A 16"]
-    destination_feature: Float[Tensor, "B N A D"]
-    """Projected feature of the destination's map token."""
-    destination_pose: Float[Tensor, "B N A 3"]
+        Args:
+            features: of `features`.
+            scene: classes of agents.
+        """
+        return self.actions(features, scene.agent_class[:, None, None])

@@ -22,7 +22,7 @@ from rlftsim.policies.trafficbots.destinations import PEDESTRIAN
 from rlftsim.policies.trafficbots.dynamics import max_action
 from rlftsim.policies.trafficbots.imitation import imitation_loss
 from rlftsim.policies.trafficbots.model import TrafficBotsModel
-from rlftsim.policies.trafficbots.network import Given, history_windows
+from rlftsim.policies.trafficbots.network import history_windows
 from rlftsim.policies.trafficbots.scene import build_scene
 from rlftsim.policies.trafficbots.scoring import features_over_time
 from rlftsim.policies.trafficbots.state import (
@@ -86,15 +86,9 @@ class TrafficBotsPolicy(TrafficBotsModel):
             context: of `encode`.
             draws: personality (16 numbers) and map token of the destination, -1 = none.
         """
-        scene, features = context.scene, context.map_features.detach()
-        destination = draws[..., LATENT_SIZE].long()
-        token = destination.clamp(min=0)
-        batch = torch.arange(len(token), device=token.device)[:, None, None]
-        # Projected before it is gathered: a scene has fewer map tokens than rollouts have agents.
-        given = Given(
-            draws[..., :LATENT_SIZE], self.network.destination_map(features)[batch, token], scene.map_pose[batch, token]
-        )
-        return TrafficBotsState(traffic_at_start(scene, destination), given, draws)
+        personality, destination = draws[..., :LATENT_SIZE], draws[..., LATENT_SIZE].long()
+        given = self.network.conditioning(context.scene, context.map_features, personality, destination)
+        return TrafficBotsState(traffic_at_start(context.scene, destination), given, draws)
 
     def decide(self, context: TrafficBotsContext, state: TrafficBotsState) -> GaussianDistribution:
         """Distributions [B, N, A] of the next action.
@@ -157,13 +151,16 @@ class TrafficBotsPolicy(TrafficBotsModel):
         return self._scored(context, replay, rollouts.decision, self._features(context, replay))
 
     def encode_like(self, scenarios: ScenarioBatch, context: Any) -> TrafficBotsContext:
-        """`encode(scenarios)`: map and lights are encoded anew, which takes little beside rollouts.
+        """`encode(scenarios)`, with map and lights taken over from a context of a model that sees alike.
 
         Args:
             scenarios: of the context.
-            context: of any policy.
+            context: of any policy, whose weights are still those that made it.
         """
-        return self.encode(scenarios)
+        if not isinstance(context, TrafficBotsContext) or not self.sees_as(context.model):
+            return self.encode(scenarios)
+        around = self.network.agents.neighborhoods(context.map_features, context.light_features)
+        return replace(context, around=around, model=self)
 
     def score_both(
         self, context: TrafficBotsContext, rollouts: Rollouts, reference: Any, ref_context: Any, ref_rollouts: Rollouts
@@ -230,7 +227,7 @@ class TrafficBotsPolicy(TrafficBotsModel):
         features: Float[Tensor, "B T N A D"],
     ) -> GaussianDistribution:
         """Distributions around the means of T decisions, whose noise the means of the decisions before are part of."""
-        mean = self.network.actions(features, context.scene.agent_class[:, None, None]).movedim(1, 3)  # [B, N, A, T, 2]
+        mean = self.network.mean_actions(features, context.scene).movedim(1, 3)  # [B, N, A, T, 2]
         alive = torch.stack([one.traffic.alive for one in states], 3)  # [B, N, A, T]
         residual = torch.cat([torch.zeros_like(mean[:, :, :, :1]), (decision - mean)[:, :, :, :-1]], 3)
         goes_on = [torch.zeros_like(alive[..., 0]), *(s.continues for s in states if s.continues is not None)]
@@ -243,7 +240,7 @@ class TrafficBotsPolicy(TrafficBotsModel):
             traffic, index = state.traffic, state.num_decisions
             windows, around = traffic.windows.as_one_decision(), context.around.steps(index, index + 1)
             features = self.network.features(windows, context.scene, around, state.given, traffic.active[:, None])
-            state.memo.mean = mean = self.network.actions(features, context.scene.agent_class[:, None, None])[:, 0]
+            state.memo.mean = mean = self.network.mean_actions(features, context.scene)[:, 0]
         return mean
 
     def _distribution(

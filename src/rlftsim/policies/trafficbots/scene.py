@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from rlftsim.geometry import rotate
+from rlftsim.geometry import rotate, wrap_angle
 from rlftsim.policies.trafficbots.map_tokens import NUM_NODES, UNKNOWN_LIGHT, ego_pose, light_tokens, map_pieces
 from rlftsim.policies.trafficbots.tracks import agent_motions
 from rlftsim.scenario.batch import ScenarioBatch
@@ -67,17 +67,13 @@ class Scene:
         """Poses of the ego frame in the frame of the batch, headings in [-pi, pi)."""
         origin = self.origin[:, None, None]  # [B, 1, 1, 3]
         position = rotate(pose[..., :2], origin[..., 2]) + origin[..., :2]
-        return torch.cat([position, _wrap(pose[..., 2] + origin[..., 2])[..., None]], -1)
+        return torch.cat([position, wrap_angle(pose[..., 2] + origin[..., 2])[..., None]], -1)
 
     def to_ego_frame(self, pose: Float[Tensor, "B N A 3"]) -> Float[Tensor, "B N A 3"]:
         """Poses of the batch's frame in the ego frame."""
         origin = self.origin[:, None, None]
         position = rotate(pose[..., :2] - origin[..., :2], -origin[..., 2])
         return torch.cat([position, (pose[..., 2] - origin[..., 2])[..., None]], -1)
-
-
-def _wrap(angle: Tensor) -> Tensor:
-    return torch.remainder(angle + torch.pi, 2 * torch.pi) - torch.pi
 
 
 def build_scene(batch: ScenarioBatch, num_steps: int, max_map_tokens: int | None) -> Scene:

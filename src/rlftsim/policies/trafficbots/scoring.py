@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from rlftsim.policies.trafficbots.config import WINDOW
-from rlftsim.policies.trafficbots.network import AgentSurroundings, Given, TrafficBotsNetwork, Windows
+from rlftsim.policies.trafficbots.network import AgentConditioning, AgentNeighborhoods, TrafficBotsNetwork, Windows
 from rlftsim.policies.trafficbots.scene import Scene
 
 
@@ -21,8 +21,8 @@ def features_over_time(
     history: Windows,
     active: Bool[Tensor, "B N A T"],
     scene: Scene,
-    around: AgentSurroundings,
-    given: Given,
+    around: AgentNeighborhoods,
+    given: AgentConditioning,
     *,
     steps_per_pass: int,
 ) -> Float[Tensor, "B T N A D"]:
@@ -47,8 +47,8 @@ def features_over_time(
     for start in range(0, num_decisions, steps_per_pass):
         steps = slice(start, start + steps_per_pass)
         windows = Windows(valid[:, steps], pose[:, steps], motion[:, steps])
-        seen = around.steps(start, start + steps_per_pass)
-        inputs = (windows, scene, seen, given, is_active[:, steps])
+        around_then = around.steps(start, start + steps_per_pass)
+        inputs = (windows, scene, around_then, given, is_active[:, steps])
         if torch.is_grad_enabled() and num_decisions > steps_per_pass:
             # Each pass is computed again in the backward pass, so that only one is in memory.
             one = checkpoint(network.features, *inputs, use_reentrant=False, preserve_rng_state=False)

@@ -8,11 +8,11 @@ from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Bool, Float, Int64
-from torch import Tensor
+from torch import Tensor, nn
 
 from rlftsim.geometry import heading_vector, wrap_angle
 from rlftsim.policies.trafficbots.dynamics import leaves_map, max_action, move, reaches_destination
-from rlftsim.policies.trafficbots.network import AgentSurroundings, Given, Windows, history_windows
+from rlftsim.policies.trafficbots.network import AgentConditioning, AgentNeighborhoods, Windows, history_windows
 from rlftsim.policies.trafficbots.scene import Scene
 from rlftsim.rollout.types import AgentStates
 from rlftsim.scenario.types import STEP_S
@@ -24,8 +24,12 @@ class TrafficBotsContext:
 
     scene: Scene
     map_features: Float[Tensor, "B M D"]
-    around: AgentSurroundings
+    light_features: Float[Tensor, "B T L D"]
+    """Of all 80 decisions."""
+    around: AgentNeighborhoods
     """Map, and lights at all decisions."""
+    model: nn.Module
+    """The model that made it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +155,7 @@ class TrafficBotsState:
     """State of N simulations of each scene."""
 
     traffic: Traffic
-    given: Given
+    given: AgentConditioning
     draws: Float[Tensor, "B N A 17"]
     """Personality (16 numbers) and index of the destination, -1 where there is none."""
     num_decisions: int = 0
