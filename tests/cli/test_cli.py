@@ -243,6 +243,14 @@ WRONG = {
         "simulate constant_velocity --data synthetic --out {tmp}/o --temperature -1",
         "temperature must be >= 0",
     ),
+    "an infinite temperature": (
+        "simulate constant_velocity --data synthetic --out {tmp}/o --temperature inf",
+        "temperature must be >= 0 and finite",
+    ),
+    "an export of another architecture": (
+        "model export trafficbots-base --to catk {tmp}/x.safetensors",
+        "trafficbots-base: a TrafficBotsPolicy cannot be exported",
+    ),
     "top-k of a policy without categories": (
         "simulate constant_velocity --data synthetic --out {tmp}/o --top-k 3",
         "top_k=3 needs a policy with categories",

@@ -143,7 +143,7 @@ BAD = [
     ([*FINETUNE, "--finetune.kl.goal", "1"], "no flag --finetune.kl.goal"),
     ([*FINETUNE, "--finetune.betas", "0.9"], "--finetune.betas needs 2 values"),
     ([*FINETUNE, "--finetune.betas", "0.9", "2"], r"finetune: betas are .* in \[0, 1\)"),
-    ([*FINETUNE, "--finetune.trained", "some"], "--finetune.trained some: expected one of 'decoder', 'goals', 'all'"),
+    ([*FINETUNE, "--finetune.trained", "some"], "--finetune.trained some: expected one of 'decoder', 'head'"),
     ([*FINETUNE, "--finetune.reward", "joy"], "unknown reward 'joy'"),
     ([*FINETUNE, "--finetune.num-rollouts", "1"], "at least 2 rollouts"),
     ([*FINETUNE, "--finetune.kl.target", "0"], "finetune.kl: target must be positive"),
@@ -344,5 +344,5 @@ def test_a_recipe_without_a_method_has_no_flags_of_it_and_refuses_it(monkeypatch
     assert verb.settings.catk is None
     with pytest.raises(ConfigError, match=r"no flag --catk\.num-candidates"):
         parse(["finetune", *words, "--catk.num-candidates", "4", "--method", "catk"])
-    with pytest.raises(ConfigError, match="recipe without has no section catk: its models cannot be trained so"):
+    with pytest.raises(ConfigError, match=r"recipe without has no section catk: .* --method rlft"):
         parse(["finetune", *words, "--method", "catk"]).run()

@@ -27,7 +27,7 @@ from rlftsim.experiments.paper import (
     variance_scaling,
 )
 from rlftsim.experiments.registry import EXPERIMENTS, PAPER
-from rlftsim.experiments.results import ExperimentResult, finite_or_none
+from rlftsim.experiments.results import ExperimentResult, finite_or_none, run_experiment
 from rlftsim.experiments.rows import mean_of_seeds
 from rlftsim.experiments.stage_progress import StageProgress
 from rlftsim.experiments.suite import ExperimentSuite
@@ -112,9 +112,20 @@ def test_two_architectures_are_in_one_table_with_a_gain_each(suite):
 
 
 def test_each_architecture_has_the_base_model_that_was_named_for_it(suite, tmp_path):
-    named = replace(suite, base_model="demo-base", counterpart_model="constant_velocity", out=tmp_path)
+    named = replace(suite, base_model="demo-base", counterpart_model="trafficbots-base", out=tmp_path)
     own, counterpart = model_agnosticism.suites(named)
-    assert (own.base(), counterpart.base()) == ("demo-base", "constant_velocity")
+    assert (own.base(), counterpart.base()) == ("demo-base", "trafficbots-base")
+    # Rows are named after the recipes, so a model of the other architecture would stand under a wrong name.
+    with pytest.raises(ConfigError, match="makes SMART policies, none like a TrafficBotsPolicy"):
+        model_agnosticism.suites(replace(named, base_model="trafficbots-base", out=tmp_path / "swapped"))
+
+
+@pytest.mark.parametrize("name", ["goal-conditioning", "kinematic-controllability", "maneuver-controllability"])
+def test_a_model_that_cannot_be_given_goals_is_refused_before_it_is_trained(suite, tmp_path, name):
+    named = replace(suite, base_model="trafficbots-base", out=tmp_path)
+    with pytest.raises(ConfigError, match="trafficbots-base cannot be given goals"):
+        run_experiment(name, EXPERIMENTS.get(name), named)
+    assert not list(tmp_path.glob("runs/*"))
 
 
 def test_a_recipe_without_a_counterpart_is_refused(suite):

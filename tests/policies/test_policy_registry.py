@@ -4,6 +4,7 @@ import itertools
 
 import pytest
 import torch
+from safetensors.torch import load_file, save_file
 
 import scenes
 from rlftsim.errors import CheckpointError, ConfigError
@@ -178,6 +179,16 @@ def test_a_run_without_a_model_yet_says_so(tmp_path):
     (tmp_path / "checkpoints").mkdir()
     (tmp_path / "config.json").write_text('{"epochs": 1}')
     with pytest.raises(CheckpointError, match="the run has not finished"):
+        load_policy(tmp_path)
+
+
+def test_weights_that_are_not_finite_are_refused_by_name(smart, tmp_path):
+    smart.save_pretrained(tmp_path)
+    weights = load_file(tmp_path / "model.safetensors")
+    name = sorted(weights)[0]
+    weights[name].view(-1)[0] = torch.nan
+    save_file(weights, tmp_path / "model.safetensors")
+    with pytest.raises(CheckpointError, match=rf"not finite \({name}\)"):
         load_policy(tmp_path)
 
 

@@ -343,6 +343,14 @@ def test_a_run_whose_kl_exploded_says_so_and_stops(vocabulary, drawn_scenarios, 
     assert "nats per decision is above max_kl=1e-09 (1 in a row, the run stops at 2)" in warnings[0]
 
 
+def test_a_short_run_that_skipped_every_update_has_not_succeeded(vocabulary, drawn_scenarios, tmp_path, monkeypatch):
+    poison_from(monkeypatch, 1)
+    config = replace(tiny.FINETUNE, epochs=0.5, max_skipped_in_a_row=5)  # two updates
+    with pytest.raises(CheckpointError, match="2 updates in a row were skipped"):
+        finetune(tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path, config)
+    assert not (tmp_path / "model").exists()
+
+
 def test_the_reference_moves_every_so_many_updates(learner, batch, fabric):
     config = replace(CONFIG, kl=KlConfig(reference_sync_every=2, reference_ema=0.25))
     first = snapshot(learner.reference)

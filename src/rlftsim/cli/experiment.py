@@ -16,7 +16,7 @@ from rlftsim.experiments.registry import EXPERIMENTS, PAPER
 from rlftsim.experiments.results import run_experiment
 from rlftsim.experiments.suite import ExperimentSuite
 from rlftsim.policies.registry import Device, find_device
-from rlftsim.progress import print_wide
+from rlftsim.progress import log, print_wide
 from rlftsim.recipes.registry import SECTIONS
 from rlftsim.scenario.open import SYNTHETIC, dataset_folder
 from rlftsim.workers import usable_cores
@@ -75,6 +75,12 @@ class RunExperiment(RecipeVerb):
         if self.counterpart_model is not None and self.name != "model-agnosticism":
             raise ConfigError(
                 f"--counterpart-model {self.counterpart_model} has no effect: {self.name} has one architecture."
+            )
+        of_recipe = [flag for flag in flags if "." in flag]
+        if self.name == "model-agnosticism" and of_recipe:
+            log.warning(
+                f"{' '.join(of_recipe)}: for recipe {self.recipe} alone, the other architecture is trained as its own "
+                "recipe says (name that one with --recipe to set it instead)."
             )
         for flag in flags:
             name = flag.removeprefix("--").replace("-", "_")

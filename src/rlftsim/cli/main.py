@@ -53,7 +53,7 @@ usage: rlftsim VERB ...      rlftsim VERB --help explains a verb
 
   recipe       list the recipes (models and training settings), or print one
   tokens       build a vocabulary of motion and map tokens, or measure its coverage
-  pretrain     train a model to predict the next motion token
+  pretrain     train a model on logged tracks
   finetune     fine-tune a model in closed loop with a realism reward, also with goals
   augment      sample further goals for goal-conditioned fine-tuning
   model        import a checkpoint of the public CAT-K code, or export one

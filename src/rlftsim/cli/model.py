@@ -10,6 +10,7 @@ from tyro.conf import Positional
 
 from rlftsim import __version__
 from rlftsim.errors import ConfigError
+from rlftsim.policies.registry import load_policy
 from rlftsim.policies.smart.catk_checkpoint import CatkImport, import_catk, write_catk
 from rlftsim.policies.smart.catk_vocabulary import write_catk_vocabulary
 from rlftsim.policies.smart.policy import SmartPolicy
@@ -54,8 +55,8 @@ class Export:
     Importing them again gives the same bits.
     """
 
-    model: Positional[Path]
-    """Folder of a SMART model."""
+    model: Positional[str]
+    """A SMART model: a run, a model folder or a registered name."""
     out: Positional[Path]
     """File for the weights, .safetensors; the tables go to the same name with .vocabulary.npz."""
     format: Annotated[Format, tyro.conf.arg(name="to")] = "catk"
@@ -65,8 +66,12 @@ class Export:
         """Read the model folder, write both files."""
         if self.out.suffix != ".safetensors":
             raise ConfigError(f"{self.out}: weights are written as .safetensors: name the file so.")
-        # The keys are SMART's, so no other architecture can be exported.
-        policy = SmartPolicy.from_pretrained(self.model)
+        policy = load_policy(self.model)
+        if not isinstance(policy, SmartPolicy):
+            raise ConfigError(
+                f"{self.model}: a {type(policy).__name__} cannot be exported, the public CAT-K code has SMART models "
+                "alone."
+            )
         tables = self.out.with_suffix(".vocabulary.npz")
         write_catk(policy, self.out)
         write_catk_vocabulary(policy.vocabulary, tables)

@@ -30,7 +30,7 @@ RecipeArgument = Annotated[Positional[str], tyro.conf.arg(metavar="RECIPE")]
 
 @dataclass(frozen=True)
 class Pretrain(RecipeVerb):
-    """Train a model to predict the next motion token of every agent along the logged tracks, from fresh weights or
+    """Train a model on logged tracks (SMART: to predict the next motion token of every agent), from fresh weights or
     further (--init-from).
 
     Writes checkpoints, metrics and the finished model, OUT/model. An interrupted run continues when the same
@@ -203,7 +203,10 @@ class Finetune(RecipeVerb):
         """Load the model and fine-tune it."""
         config = getattr(self.settings, SECTION_OF_METHOD[self.method])
         if config is None:
-            raise ConfigError(f"recipe {self.recipe} has no section {self.method}: its models cannot be trained so.")
+            raise ConfigError(
+                f"recipe {self.recipe} has no section {self.method}: its models have no tokens to learn by it. "
+                "Train them with --method rlft."
+            )
         scenarios = open_dataset(self.data, self.split)
         # Of the methods of fine-tuning only CAT-K and RoaD validate.
         every = config.validation.every if self.method in ("catk", "road") else 0

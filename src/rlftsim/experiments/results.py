@@ -54,6 +54,8 @@ class Experiment(Generic[Found]):
     summarize: Callable[[Found, ExperimentSuite], ExperimentResult]
     """Computes from stored results alone."""
     default_seeds: int = 1
+    needs_goals: bool = False
+    """True = it trains goal-conditioned models, so a model that cannot be given goals is refused at once."""
 
 
 def run_experiment(name: str, experiment: Experiment[Any], suite: ExperimentSuite) -> ExperimentResult:
@@ -70,6 +72,8 @@ def run_experiment(name: str, experiment: Experiment[Any], suite: ExperimentSuit
     Raises:
         RlftsimError: a stage failed; the message says which and why.
     """
+    if experiment.needs_goals:
+        suite.require_goals()
     # 1. Train and evaluate what is missing, then make tables of stored results alone.
     result = experiment.summarize(experiment.run(suite), suite)
     # 2. Figure and films, before the page that shows them.

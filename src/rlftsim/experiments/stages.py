@@ -18,6 +18,7 @@ from rlftsim.rollout.policy import ConditionablePolicy
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
 from rlftsim.tokens.vocabulary import Vocabulary
+from rlftsim.training.goals import not_conditioned
 from rlftsim.training.methods import FinetuningConfig, describe_method, finetune_policy
 from rlftsim.training.pretrain import PretrainConfig, pretrain
 
@@ -113,7 +114,7 @@ def finetune_model(
     policy: Any = load_policy(str(base))
     if conditioning is not None:
         if not isinstance(policy, ConditionablePolicy):
-            raise ConfigError(f"{base} cannot be goal-conditioned: its policy has no with_goal_conditioning.")
+            raise ConfigError(f"{base}: {not_conditioned(policy)}")
         torch.manual_seed(config.seed)  # of the weights that encode goals; the base model brings the others
         policy = policy.with_goal_conditioning(conditioning.encoding, logit_bias=conditioning.logit_bias)
 

@@ -35,7 +35,7 @@ from rlftsim.policies.registry import Device, load_policy, load_policy_or_oracle
 from rlftsim.progress import log
 from rlftsim.recipes.registry import Recipe
 from rlftsim.rollout.fingerprint import fingerprint_policy
-from rlftsim.rollout.policy import Policy
+from rlftsim.rollout.policy import ConditionablePolicy, Policy
 from rlftsim.scenario.dataset import MANIFEST, ScenarioDataset
 from rlftsim.scenario.shards import hash_file
 from rlftsim.training.run_folder import RunFolder, default_settings, flatten, may_change, to_plain
@@ -114,6 +114,19 @@ class ExperimentSuite:
                 # An evaluation that is finished is read from its file.
                 found[spec] = evaluate(policy, self.data, folder, config, name=self.evaluation_name(spec, goals))
         return {name: Row(name, tuple(found[spec] for spec in row)) for name, row in rows.items()}
+
+    def require_goals(self) -> None:
+        """Refuse a recipe or a base model that cannot be given goals, before anything is trained.
+
+        Raises:
+            ConfigError: it cannot.
+        """
+        conditionable = self.base_model is None or isinstance(load_policy(self.base_model), ConditionablePolicy)
+        if self.recipe.gcsl is None or not conditionable:
+            raise ConfigError(
+                f"{self.base_model or self.recipe.model_name} cannot be given goals, which this experiment is about: "
+                "take a model that can, such as --recipe smart-demo --base-model demo-base."
+            )
 
     def feasible(self, rows: Mapping[str, Sequence[ModelSpec]]) -> dict[str, Sequence[ModelSpec]]:
         """The rows without those of methods that cannot train the suite's policies; a warning names these rows.

@@ -199,7 +199,7 @@ def similar_model(folder: Path) -> str | None:
 
 
 def load_strictly(module: nn.Module, weights: Mapping[str, Tensor], *, source: str) -> None:
-    """Load weights; refuse missing or unknown keys and wrong shapes, and name the first of them.
+    """Load weights; refuse missing or unknown keys, wrong shapes and NaN, and name the first of them.
 
     Args:
         module: receives the weights.
@@ -207,7 +207,7 @@ def load_strictly(module: nn.Module, weights: Mapping[str, Tensor], *, source: s
         source: place they come from, for the message.
 
     Raises:
-        CheckpointError: anything differs.
+        CheckpointError: anything differs, or a weight is not finite.
     """
     own = module.state_dict()
     problems = [f"missing {k}" for k in sorted(own.keys() - weights.keys())]
@@ -220,4 +220,8 @@ def load_strictly(module: nn.Module, weights: Mapping[str, Tensor], *, source: s
     if problems:
         shown = "; ".join(problems[:SHOWN_PROBLEMS]) + (" …" if len(problems) > SHOWN_PROBLEMS else "")
         raise CheckpointError(f"{source}: {len(problems)} weights do not fit this model: {shown}.")
+    broken = [name for name, values in weights.items() if not values.isfinite().all()]
+    if broken:
+        shown = ", ".join(broken[:SHOWN_PROBLEMS]) + (" …" if len(broken) > SHOWN_PROBLEMS else "")
+        raise CheckpointError(f"{source}: weights are not finite ({shown}): take an earlier checkpoint or train again.")
     module.load_state_dict(weights)

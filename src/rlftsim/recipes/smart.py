@@ -60,7 +60,10 @@ class SmartRecipe(Recipe):
             ConfigError: the policy is no SMART policy.
         """
         if not isinstance(policy, SmartPolicy):
-            raise ConfigError(f"this recipe makes SMART policies, none like a {type(policy).__name__}.")
+            raise ConfigError(
+                f"this recipe makes SMART policies, none like a {type(policy).__name__}: name a recipe that does, "
+                "`rlftsim recipe` lists them."
+            )
         return replace(self, model=policy.config)
 
     @property

@@ -54,7 +54,10 @@ class TrafficBotsRecipe(Recipe):
             ConfigError: the policy is no TrafficBots policy.
         """
         if not isinstance(policy, TrafficBotsPolicy):
-            raise ConfigError(f"this recipe makes TrafficBots policies, none like a {type(policy).__name__}.")
+            raise ConfigError(
+                f"this recipe makes TrafficBots policies, none like a {type(policy).__name__}: name a recipe that "
+                "does, `rlftsim recipe` lists them."
+            )
         return replace(self, model=policy.config)
 
     @property

@@ -34,6 +34,7 @@ decisions between the rollout and its score.
 Shapes: B scenarios, N rollouts, A agents, L decisions, t steps of 0.1 s per decision, V tokens, R selected elements.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -61,9 +62,9 @@ class Sampling:
 
     def __post_init__(self) -> None:
         require_types(self)
-        if not self.temperature >= 0:
+        if not 0 <= self.temperature < math.inf:
             raise ConfigError(
-                f"sampling temperature must be >= 0, got {self.temperature}: 1 samples, 0 takes the mode."
+                f"sampling temperature must be >= 0 and finite, got {self.temperature}: 1 samples, 0 takes the mode."
             )
         if self.top_k is not None and self.top_k < 1:
             raise ConfigError(f"sampling top_k must be >= 1, got {self.top_k}: leave it out to keep all decisions.")

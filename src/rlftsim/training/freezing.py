@@ -7,7 +7,7 @@ from torch.optim import Optimizer
 
 from rlftsim.errors import ConfigError
 from rlftsim.rollout.policy import is_goal_conditioned
-from rlftsim.training.goals import NOT_CONDITIONED
+from rlftsim.training.goals import not_conditioned
 
 TrainedParts = Literal["decoder", "head", "goals", "all"]
 
@@ -31,7 +31,7 @@ def freeze_untrained(policy: nn.Module, trained: TrainedParts) -> None:
                 f"trained=goals, but {type(policy).__name__} has no part that only goals use: set trained=all."
             )
         if not parts:
-            raise ConfigError(f"trained=goals, but {NOT_CONDITIONED}")
+            raise ConfigError(f"trained=goals, but {not_conditioned(policy)}")
     elif trained == "head":
         if not hasattr(policy, "head_parts"):
             raise ConfigError(f"trained=head, but {type(policy).__name__} names no head_parts: set trained=decoder.")

@@ -27,7 +27,7 @@ from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.tokens.vocabulary import class_of_type
 from rlftsim.training.closed_loop import TargetedRollouts, predict_along
 from rlftsim.training.freezing import freeze_untrained
-from rlftsim.training.goals import NOT_CONDITIONED
+from rlftsim.training.goals import not_conditioned
 from rlftsim.training.imitation import ImitationConfig, Prediction, imitate
 from rlftsim.training.run import TrainingScenarios, as_scenarios, require_trainable
 
@@ -81,7 +81,7 @@ def gcsl_finetune(
     scenarios = as_scenarios(scenarios)
     model = require_trainable(policy, scenarios, "gcsl", needs=("vocabulary",))
     if not is_goal_conditioned(model):
-        raise ConfigError(NOT_CONDITIONED)
+        raise ConfigError(not_conditioned(model))
     freeze_untrained(model, "goals")
 
     def predict_along_own_rollouts(batch: ScenarioBatch, trained: Bool[Tensor, "B A"], update: int) -> Prediction:

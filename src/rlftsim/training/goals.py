@@ -9,11 +9,9 @@ from rlftsim.goals.stored import StoredGoals
 from rlftsim.goals.types import Goals
 from rlftsim.progress import log
 from rlftsim.rollout.noise import draw_noise
-from rlftsim.rollout.policy import Policy, is_goal_conditioned
+from rlftsim.rollout.policy import ConditionablePolicy, Policy, is_goal_conditioned
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import Scenarios, scenario_ids_of
-
-NOT_CONDITIONED = "this model is not goal-conditioned: add --goal concat or --goal indication."
 
 
 @dataclass(frozen=True)
@@ -85,7 +83,14 @@ def refuse_goals(policy: Policy, probability: float) -> None:
         ConfigError: the policy is not goal-conditioned.
     """
     if probability and not is_goal_conditioned(policy):
-        raise ConfigError(f"goals with probability {probability:g}, but {NOT_CONDITIONED}")
+        raise ConfigError(f"goals with probability {probability:g}, but {not_conditioned(policy)}")
+
+
+def not_conditioned(policy: object) -> str:
+    """The reason why a policy has no goals, and the way out, for a message."""
+    if isinstance(policy, ConditionablePolicy):
+        return "this model is not goal-conditioned: add --goal concat or --goal indication."
+    return f"a {type(policy).__name__} cannot be given goals: take a model that can, such as demo-goals."
 
 
 def choose_goals(batch: ScenarioBatch, config: GoalConfig, augmented: StoredGoals | None, *, seed: int) -> Goals | None:

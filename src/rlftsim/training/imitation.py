@@ -205,7 +205,7 @@ def imitate(
         if config.still_weight != 1.0:
             raise ConfigError(f"{name} has no vocabulary, so no token is known to stand still: set still_weight=1.")
     if held_out is not None and config.validation.every:
-        refuse_to_validate(model, held_out)
+        refuse_to_validate(model, held_out, config.validation)
     train = partial(
         _imitate, model, scenarios, out, predict, title=title, held_out=held_out, kept=kept or {}, card=card
     )

@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from rlftsim.errors import ConfigError
 from rlftsim.rollout.policy import decision_statistics, encode_like, score_both
 from rlftsim.training.experience import Experience
 from rlftsim.training.imitation import accumulate_imitation
@@ -146,6 +147,11 @@ def accumulate_gradients(
                 context = encode_like(policy, experience.batch, experience.context)
                 dist, ref_dist = score_both(policy, context, rollouts, reference, ref_context, ref_rollouts)
             found = decision_statistics(dist, rollouts.decision, ref_dist)  # [B, n, A, L] each
+            if terms.entropy_bonus and not found.entropy.requires_grad:
+                raise ConfigError(
+                    f"finetune.entropy_bonus={terms.entropy_bonus:g} has no effect: the entropy of this policy's "
+                    "decisions depends on no trained weight, set it to 0."
+                )
             kl, entropy = masked_sum(found.kl, mask), masked_sum(found.entropy, mask)
             by_agent = agent_log_prob(found.log_prob, mask, terms.reduction)  # [B, n, A]
             loss = policy_gradient_loss(reward, by_agent, terms.num_scenarios)

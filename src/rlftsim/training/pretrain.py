@@ -11,7 +11,7 @@ from rlftsim.training.run import TrainingScenarios, as_scenarios, require_traina
 
 @dataclass(frozen=True)
 class PretrainConfig(ImitationConfig):
-    """Pre-training. The defaults are those of the published SMART-tiny on WOMD."""
+    """Pre-training. The defaults, which recipes change, are those of the published SMART-tiny on WOMD."""
 
 
 def pretrain(

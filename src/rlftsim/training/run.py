@@ -317,7 +317,7 @@ class TrainingRun:
 
     def _refuse_divergence(self, learner: Learner, report: UpdateReport, *, check_weights: bool) -> None:
         """Raise where more updates make no sense; on every process, or the others would wait forever."""
-        if learner.skipped_in_a_row >= self._config.max_skipped_in_a_row:
+        if learner.skipped_in_a_row >= min(self._config.max_skipped_in_a_row, self.total):
             cause = f"{learner.skipped_in_a_row} updates in a row were skipped, {self._skip_rule}"
             raise self.folder.diverged(cause, self._remedy)
         # Not after every update: reading all weights makes a GPU wait.

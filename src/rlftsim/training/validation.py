@@ -17,6 +17,7 @@ from rlftsim.realism import metric_by_name, score_batch
 from rlftsim.realism.from_rollouts import states_of_rollouts
 from rlftsim.rollout.policy import Policy, Sampling
 from rlftsim.rollout.simulate import simulate
+from rlftsim.scenario.batch import collate
 from rlftsim.scenario.types import Scenarios
 from rlftsim.training.data import batch_with_futures
 from rlftsim.training.map_use import MapUse, measure_map_use, predicts_tokens
@@ -75,20 +76,24 @@ class ValidationConfig:
         return sorted(order[: self.num_scenarios].tolist())
 
 
-def refuse_to_validate(model: object, scenarios: Scenarios) -> None:
+def refuse_to_validate(model: object, scenarios: Scenarios, config: ValidationConfig) -> None:
     """Refuse before a run what would end it at its first validation.
 
     Args:
         model: in training.
         scenarios: to validate on.
+        config: sampling.
 
     Raises:
-        ConfigError: the model cannot simulate, or there is no scenario.
+        ConfigError: the model cannot simulate, or not with this sampling, or there is no scenario.
     """
     if not isinstance(model, Policy):
         raise ConfigError(f"{type(model).__name__} cannot simulate, so it cannot be validated: set validation.every=0.")
     if not len(scenarios):
         raise ConfigError("no scenario to validate on: name another split, or set validation.every=0.")
+    if config.top_k is not None:  # only a draw shows whether there are categories to choose from
+        with torch.no_grad():
+            simulate(model, collate([scenarios[0]]), num_rollouts=1, seed=0, sampling=Sampling(top_k=config.top_k))
 
 
 @torch.no_grad()

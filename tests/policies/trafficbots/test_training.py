@@ -22,6 +22,7 @@ from rlftsim.scenario.types import TOTAL_STEPS
 from rlftsim.training.finetune import finetune
 from rlftsim.training.pretrain import pretrain
 from rlftsim.training.run_folder import read_metrics
+from rlftsim.training.validation import ValidationConfig
 
 SETTINGS = replace(TINY, steps_per_pass=80, forcing_updates=2)
 PRETRAIN = replace(
@@ -180,8 +181,17 @@ def test_two_passes_have_the_gradient_of_one(scenarios):
 
 def test_goals_are_refused_in_words(scenarios, tmp_path):
     config = replace(tiny.FINETUNE, goals=replace(tiny.FINETUNE.goals, probability=1.0), reward="gcft")
-    with pytest.raises(ConfigError, match="not goal-conditioned"):
+    with pytest.raises(ConfigError, match="a TrafficBotsPolicy cannot be given goals"):
         finetune(new_policy(), scenarios, tmp_path, config)
+
+
+def test_settings_that_change_nothing_are_refused(scenarios, tmp_path):
+    with pytest.raises(ConfigError, match=r"entropy_bonus=0\.1 has no effect"):
+        finetune(new_policy(), scenarios, tmp_path / "bonus", replace(tiny.FINETUNE, entropy_bonus=0.1))
+    validation = ValidationConfig(every=100, num_scenarios=1, num_rollouts=2, top_k=3)
+    with pytest.raises(ConfigError, match="top_k=3 needs a policy with categories"):
+        pretrain(new_policy(), scenarios, tmp_path / "k", replace(PRETRAIN, validation=validation), held_out=scenarios)
+    assert not (tmp_path / "k" / "metrics.jsonl").exists()
 
 
 @pytest.mark.parametrize("name", ["trafficbots", "trafficbots-demo"])

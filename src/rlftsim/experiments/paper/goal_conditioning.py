@@ -127,5 +127,8 @@ def _misses_line(start: Row, row: Row) -> str:
 
 
 EXPERIMENT = Experiment(
-    "Do goal-conditioned agents follow their goals, and what does it cost in realism?", run, summarize
+    "Do goal-conditioned agents follow their goals, and what does it cost in realism?",
+    run,
+    summarize,
+    needs_goals=True,
 )

@@ -149,5 +149,8 @@ def _table(heading: str, curves: Mapping[str, list[MeanInterval]]) -> TextTable:
 
 
 EXPERIMENT = Experiment(
-    "Can the ego be given goals that lie earlier or later on its path than its logged endpoint?", run, summarize
+    "Can the ego be given goals that lie earlier or later on its path than its logged endpoint?",
+    run,
+    summarize,
+    needs_goals=True,
 )

@@ -165,4 +165,6 @@ def _plain(rate: MeanInterval) -> dict[str, object]:
     return {name: getattr(rate, name) for name in names}
 
 
-EXPERIMENT = Experiment("Can the ego be given a maneuver as its goal, even one that it did not make?", run, summarize)
+EXPERIMENT = Experiment(
+    "Can the ego be given a maneuver as its goal, even one that it did not make?", run, summarize, needs_goals=True
+)

@@ -42,13 +42,17 @@ def suites(suite: ExperimentSuite) -> tuple[ExperimentSuite, ExperimentSuite]:
     """The suite, and one for its recipe's counterpart in a folder inside of it.
 
     Raises:
-        ConfigError: the recipe names no counterpart.
+        ConfigError: the recipe names no counterpart, or a base model is not of its recipe's architecture.
     """
     name = suite.recipe.counterpart
     if name is None:
         raise ConfigError(f"{type(suite.recipe).__name__} names no recipe of another architecture to compare with.")
     out, base = Path(suite.out) / name, suite.counterpart_model
-    return suite, replace(suite, recipe=recipe_by_name(name), out=out, base_model=base, counterpart_model=None)
+    both = suite, replace(suite, recipe=recipe_by_name(name), out=out, base_model=base, counterpart_model=None)
+    for one in both:
+        if one.base_model is not None:
+            one.recipe.like(load_policy(one.base_model))  # rows are named after recipes
+    return both
 
 
 def _without_noise(suite: ExperimentSuite, name: str, specs: Sequence[ModelSpec]) -> Row:

@@ -92,11 +92,11 @@ class TrafficBotsModel(nn.Module):
         encoder = self.network.lights
         around = encoder.neighborhoods(scene, map_features)
         window = scene.light_state[:, None, :, -encoder.window :]  # [B, 1, L, W]
+        if not scene.light_mask.any():
+            return encoder(window, around).expand(-1, FUTURE_STEPS, -1, -1)
         features = []
         for _ in range(FUTURE_STEPS):
             features.append(encoder(window, around))
-            if not scene.light_mask.any():
-                return features[0].expand(-1, FUTURE_STEPS, -1, -1)
             state = self.network.next_light_logits(features[-1]).argmax(-1)
             window = torch.cat([window[..., 1:], state[..., None]], -1)
         return torch.cat(features, 1)

@@ -22,7 +22,7 @@ from rlftsim.policies.trafficbots.destinations import PEDESTRIAN
 from rlftsim.policies.trafficbots.dynamics import max_action
 from rlftsim.policies.trafficbots.imitation import imitation_loss
 from rlftsim.policies.trafficbots.model import TrafficBotsModel
-from rlftsim.policies.trafficbots.network import history_windows
+from rlftsim.policies.trafficbots.network import NUM_CLASSES, history_windows
 from rlftsim.policies.trafficbots.scene import build_scene
 from rlftsim.policies.trafficbots.scoring import features_over_time
 from rlftsim.policies.trafficbots.state import (
@@ -253,11 +253,11 @@ class TrafficBotsPolicy(TrafficBotsModel):
     ) -> GaussianDistribution:
         """Distributions around means; noise goes on from the residual of the decision before, where it continues."""
         config, agent_class = self.config, context.scene.agent_class
-        yaw_rates = [config.noise_yaw_rate_radps] * 3
+        yaw_rates = [config.noise_yaw_rate_radps] * NUM_CLASSES
         if config.noise_pedestrian_yaw_rate_radps is not None:
             yaw_rates[PEDESTRIAN] = config.noise_pedestrian_yaw_rate_radps
         noise = torch.tensor([[config.noise_acceleration_mps2, one] for one in yaw_rates], device=mean.device)
-        by_class = noise / max_action(torch.arange(3, device=mean.device))  # [3, 2]
+        by_class = noise / max_action(torch.arange(NUM_CLASSES, device=mean.device))  # [3, 2]
         shape = (len(agent_class), 1, agent_class.shape[1], *[1] * (mean.dim() - 4), 2)
         std = by_class[agent_class].view(shape).expand_as(mean)
         if residual is not None and continues is not None:
