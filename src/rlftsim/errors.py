@@ -150,9 +150,14 @@ def _fitted(value: Any, hint: Any) -> Any:
     if get_origin(hint) is Literal:
         return value if isinstance(value, str) and value in get_args(hint) else _MISFIT
     if get_origin(hint) is tuple:
-        parts, kinds = (tuple(value), get_args(hint)) if isinstance(value, tuple | list) else ((), (None,))
-        is_fit = len(parts) == len(kinds) and all(_fitted(p, k) is not _MISFIT for p, k in zip(parts, kinds))
-        return value if is_fit or ... in kinds else _MISFIT
+        if not isinstance(value, tuple | list):
+            return _MISFIT
+        kinds = get_args(hint)
+        if ... in kinds:
+            kinds = kinds[:1] * len(value)
+        is_fit = len(value) == len(kinds) and all(_fitted(p, k) is not _MISFIT for p, k in zip(value, kinds))
+        # A list of a stored config.json becomes what it was, so that configurations are equal.
+        return (value if isinstance(value, tuple) else tuple(value)) if is_fit else _MISFIT
     if hint is int:
         return _MISFIT if isinstance(value, bool) else _converted(value, operator.index)
     if hint is float:

@@ -67,7 +67,7 @@ class RunExperiment(RecipeVerb):
         return value_of("--recipe", words) or SYNTHETIC
 
     def refuse_useless(self, flags: Sequence[str]) -> None:
-        """Refuse settings that the experiments set themselves.
+        """Refuse settings that the experiments set themselves, and warn of those that reach one of two recipes.
 
         Raises:
             ConfigError: one of them is given.
@@ -76,7 +76,7 @@ class RunExperiment(RecipeVerb):
             raise ConfigError(
                 f"--counterpart-model {self.counterpart_model} has no effect: {self.name} has one architecture."
             )
-        of_recipe = [flag for flag in flags if "." in flag]
+        of_recipe = [flag for flag in flags if "." in flag or flag == "--processes"]
         if self.name == "model-agnosticism" and of_recipe:
             log.warning(
                 f"{' '.join(of_recipe)}: for recipe {self.recipe} alone, the other architecture is trained as its own "

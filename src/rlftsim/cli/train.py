@@ -204,8 +204,7 @@ class Finetune(RecipeVerb):
         config = getattr(self.settings, SECTION_OF_METHOD[self.method])
         if config is None:
             raise ConfigError(
-                f"recipe {self.recipe} has no section {self.method}: its models have no tokens to learn by it. "
-                "Train them with --method rlft."
+                f"recipe {self.recipe} has no section {self.method}: name another recipe, or train by --method rlft."
             )
         scenarios = open_dataset(self.data, self.split)
         # Of the methods of fine-tuning only CAT-K and RoaD validate.

@@ -83,7 +83,15 @@ class ExperimentSuite:
         # trained on: both are opened before anything is written.
         _ = self.training
         ScenarioDataset(self.data, self.evaluation.split)
-        RunFolder(self.out, self._what_counts(), defaults={"recipe": default_settings(self.recipe)})
+        self._open_folder(writes=False)
+
+    def _open_folder(self, *, writes: bool) -> None:
+        """Refuse a folder of a suite with other settings; with `writes` make it this suite's.
+
+        It is written when the first stage begins, so that what is refused before has not claimed the folder.
+        """
+        defaults = {"recipe": default_settings(self.recipe)}
+        RunFolder(self.out, self._what_counts(), defaults=defaults, writes=writes)
 
     @cached_property
     def training(self) -> ScenarioDataset:
@@ -104,6 +112,7 @@ class ExperimentSuite:
             goals: goals of the evaluated agents: none, or their logged endpoints.
         """
         # A model that is in several rows is trained and evaluated once.
+        self._open_folder(writes=True)
         specs = list(dict.fromkeys(spec for row in rows.values() for spec in row))
         progress = StageProgress(self._stages(specs, goals=goals))
         config, folder, found = replace(self.evaluation, goals=goals), self.out / "evaluations", {}
@@ -121,11 +130,17 @@ class ExperimentSuite:
         Raises:
             ConfigError: it cannot.
         """
-        conditionable = self.base_model is None or isinstance(load_policy(self.base_model), ConditionablePolicy)
-        if self.recipe.gcsl is None or not conditionable:
+        if self.recipe.gcsl is None:
             raise ConfigError(
-                f"{self.base_model or self.recipe.model_name} cannot be given goals, which this experiment is about: "
-                "take a model that can, such as --recipe smart-demo --base-model demo-base."
+                "this experiment is about goals, and the recipe has no section gcsl to teach them: name another "
+                "recipe, such as smart-demo."
+            )
+        base = None if self.base_model is None else load_policy(self.base_model)
+        # Goals are taught by relabelling, which learns tokens.
+        if base is not None and not (isinstance(base, ConditionablePolicy) and hasattr(base, "vocabulary")):
+            raise ConfigError(
+                f"this experiment is about goals, and {self.base_model} cannot be given any: take a model that can, "
+                "such as demo-base."
             )
 
     def feasible(self, rows: Mapping[str, Sequence[ModelSpec]]) -> dict[str, Sequence[ModelSpec]]:
@@ -157,6 +172,7 @@ class ExperimentSuite:
 
     def models(self, specs: Sequence[ModelSpec]) -> dict[ModelSpec, str]:
         """Names or folders of policies, for `load_policy_or_oracle`; models that are missing are trained."""
+        self._open_folder(writes=True)
         progress = StageProgress(self._stages(specs, evaluated=False))
         return {spec: self._model(spec, progress) for spec in specs}
 

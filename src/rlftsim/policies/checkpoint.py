@@ -220,7 +220,8 @@ def load_strictly(module: nn.Module, weights: Mapping[str, Tensor], *, source: s
     if problems:
         shown = "; ".join(problems[:SHOWN_PROBLEMS]) + (" …" if len(problems) > SHOWN_PROBLEMS else "")
         raise CheckpointError(f"{source}: {len(problems)} weights do not fit this model: {shown}.")
-    broken = [name for name, values in weights.items() if not values.isfinite().all()]
+    # Buffers may hold infinities, such as a mask.
+    broken = [name for name, _ in module.named_parameters() if name in own and not weights[name].isfinite().all()]
     if broken:
         shown = ", ".join(broken[:SHOWN_PROBLEMS]) + (" …" if len(broken) > SHOWN_PROBLEMS else "")
         raise CheckpointError(f"{source}: weights are not finite ({shown}): take an earlier checkpoint or train again.")

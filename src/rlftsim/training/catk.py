@@ -57,8 +57,7 @@ class CatkConfig(ImitationConfig):
     max_distance_lengths: float | None = None
     """A decision from farther off the log than so many lengths of its class's box does not count. None = all count."""
     trained: TrainedParts = "decoder"
-    """The parts a policy names for fine-tuning, its last layers (of TrafficBots: for vehicles), its goal encoder, or
-    everything."""
+    """The parts a policy names for fine-tuning, its last layers, its goal encoder, or everything."""
     goal_probability: float = 0.0
     """Probability of an agent to have its logged endpoint as a goal; for a goal-conditioned policy."""
 

@@ -27,7 +27,13 @@ from rlftsim.training.experience import (
     hold_speed,
     sample_rollouts,
 )
-from rlftsim.training.freezing import TrainedParts, freeze_untrained, parameter_groups, set_learning_rate
+from rlftsim.training.freezing import (
+    TrainedParts,
+    freeze_untrained,
+    parameter_groups,
+    refuse_constant_entropy,
+    set_learning_rate,
+)
 from rlftsim.training.goals import GoalConfig, StoredGoals, refuse_goals
 from rlftsim.training.hindsight import accumulate_hindsight, goal_terms
 from rlftsim.training.parallel import DeviceConfig, Fabric, all_reduce_gradients, local_rollouts, num_sharing_memory
@@ -160,6 +166,8 @@ def finetune(
     model = require_trainable(policy, scenarios, "rewards", imitated=config.imitation_weight > 0)
     refuse_goals(policy, config.goals.probability)
     augmented = config.goals.open_augmented(scenarios)
+    if config.entropy_bonus:
+        refuse_constant_entropy(model, scenarios[0], config.trained)
 
     def train(config: FinetuneConfig, fabric: Fabric) -> Path:
         run = TrainingRun(

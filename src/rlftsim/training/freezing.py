@@ -1,12 +1,16 @@
 """The weights that a training method trains, and their learning rates."""
 
+import copy
 from typing import Any, Literal
 
 from torch import nn
 from torch.optim import Optimizer
 
 from rlftsim.errors import ConfigError
-from rlftsim.rollout.policy import is_goal_conditioned
+from rlftsim.rollout.noise import draw_noise
+from rlftsim.rollout.policy import PolicyWithHead, device_of, is_goal_conditioned
+from rlftsim.scenario.batch import collate
+from rlftsim.scenario.types import Scenario
 from rlftsim.training.goals import not_conditioned
 
 TrainedParts = Literal["decoder", "head", "goals", "all"]
@@ -33,9 +37,9 @@ def freeze_untrained(policy: nn.Module, trained: TrainedParts) -> None:
         if not parts:
             raise ConfigError(f"trained=goals, but {not_conditioned(policy)}")
     elif trained == "head":
-        if not hasattr(policy, "head_parts"):
+        if not isinstance(policy, PolicyWithHead):
             raise ConfigError(f"trained=head, but {type(policy).__name__} names no head_parts: set trained=decoder.")
-        parts = policy.head_parts()  # type: ignore[operator]
+        parts = policy.head_parts()
     else:
         named = getattr(policy, "fine_tuned_parts", None)
         parts = (policy,) if trained == "all" or named is None else named()
@@ -43,6 +47,29 @@ def freeze_untrained(policy: nn.Module, trained: TrainedParts) -> None:
     policy.requires_grad_(False)
     for part in parts:
         part.requires_grad_(True)
+
+
+def refuse_constant_entropy(policy: nn.Module, scenario: Scenario, trained: TrainedParts) -> None:
+    """Refuse an entropy bonus for a policy whose entropy no trained weight moves, such as one with fixed noise.
+
+    Args:
+        policy: left as it is.
+        scenario: to decide in once.
+        trained: see `freeze_untrained`.
+
+    Raises:
+        ConfigError: the entropy of its decisions has no gradient.
+    """
+    tried: Any = copy.deepcopy(policy).eval()
+    freeze_untrained(tried, trained)
+    batch = collate([scenario]).to(device_of(tried))
+    context = tried.encode(batch)
+    noise = draw_noise(batch, range(1), seed=0, purpose="begin", per_agent=tried.initial_noise_size)
+    if not tried.decide(context, tried.begin(context, 1, None, noise)).entropy().requires_grad:
+        raise ConfigError(
+            "finetune.entropy_bonus has no effect: the entropy of this policy's decisions depends on no trained "
+            "weight, set it to 0."
+        )
 
 
 def parameter_groups(model: nn.Module, goal_scale: float) -> list[dict[str, Any]]:

@@ -15,7 +15,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from rlftsim.errors import ConfigError
 from rlftsim.rollout.policy import decision_statistics, encode_like, score_both
 from rlftsim.training.experience import Experience
 from rlftsim.training.imitation import accumulate_imitation
@@ -32,11 +31,14 @@ def agent_log_prob(
     Args:
         log_prob: of each decision, nats.
         mask: True = the decision counts.
-        reduction: "sum" over all decisions of the rollout, or their "mean".
+        reduction: "sum" over all decisions of the rollout, or their "mean": the sum over L decisions of each agent that
+            decides at all.
     """
     total = torch.where(mask, log_prob, 0.0).sum(-1)  # [B, N, A]
-    # The mean is over all agents' decisions of the rollout, so an agent with few decisions weighs less.
-    return total if reduction == "sum" else total / mask.sum((-1, -2)).clamp(min=1)[..., None]
+    # Not over the decisions that were made: where they depend on the rollout, as of agents that leave the map, dividing
+    # by their number would weigh rollouts by their outcome and bias the gradient.
+    deciding = mask.any(-1).sum(-1, keepdim=True)  # [B, N, 1]
+    return total if reduction == "sum" else total / (deciding * mask.shape[-1]).clamp(min=1)
 
 
 def policy_gradient_loss(
@@ -147,11 +149,6 @@ def accumulate_gradients(
                 context = encode_like(policy, experience.batch, experience.context)
                 dist, ref_dist = score_both(policy, context, rollouts, reference, ref_context, ref_rollouts)
             found = decision_statistics(dist, rollouts.decision, ref_dist)  # [B, n, A, L] each
-            if terms.entropy_bonus and not found.entropy.requires_grad:
-                raise ConfigError(
-                    f"finetune.entropy_bonus={terms.entropy_bonus:g} has no effect: the entropy of this policy's "
-                    "decisions depends on no trained weight, set it to 0."
-                )
             kl, entropy = masked_sum(found.kl, mask), masked_sum(found.entropy, mask)
             by_agent = agent_log_prob(found.log_prob, mask, terms.reduction)  # [B, n, A]
             loss = policy_gradient_loss(reward, by_agent, terms.num_scenarios)

@@ -306,6 +306,11 @@ class TrainingRun:
             learner.result.eval().save_pretrained(self.folder.model, card=card)
         return self.folder.model
 
+    @property
+    def _max_skipped(self) -> int:
+        """Skipped updates in a row that end the run: never more than it has."""
+        return min(self._config.max_skipped_in_a_row, self.total)
+
     def _report(self, learner: Learner, report: UpdateReport) -> None:
         if not self._fabric.is_global_zero:
             return
@@ -317,7 +322,7 @@ class TrainingRun:
 
     def _refuse_divergence(self, learner: Learner, report: UpdateReport, *, check_weights: bool) -> None:
         """Raise where more updates make no sense; on every process, or the others would wait forever."""
-        if learner.skipped_in_a_row >= min(self._config.max_skipped_in_a_row, self.total):
+        if learner.skipped_in_a_row >= self._max_skipped:
             cause = f"{learner.skipped_in_a_row} updates in a row were skipped, {self._skip_rule}"
             raise self.folder.diverged(cause, self._remedy)
         # Not after every update: reading all weights makes a GPU wait.

@@ -15,7 +15,7 @@ from torch import nn
 from rlftsim.errors import ConfigError, given, require_not_negative, require_positive, require_types
 from rlftsim.realism import metric_by_name, score_batch
 from rlftsim.realism.from_rollouts import states_of_rollouts
-from rlftsim.rollout.policy import Policy, Sampling
+from rlftsim.rollout.policy import Policy, Sampling, device_of
 from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.types import Scenarios
@@ -92,8 +92,9 @@ def refuse_to_validate(model: object, scenarios: Scenarios, config: ValidationCo
     if not len(scenarios):
         raise ConfigError("no scenario to validate on: name another split, or set validation.every=0.")
     if config.top_k is not None:  # only a draw shows whether there are categories to choose from
-        with torch.no_grad():
-            simulate(model, collate([scenarios[0]]), num_rollouts=1, seed=0, sampling=Sampling(top_k=config.top_k))
+        frozen: Any = copy.deepcopy(model).eval().requires_grad_(False) if isinstance(model, nn.Module) else model
+        batch = collate([scenarios[0]]).to(device_of(frozen))
+        simulate(frozen, batch, num_rollouts=1, seed=0, sampling=Sampling(top_k=config.top_k))
 
 
 @torch.no_grad()

@@ -82,7 +82,7 @@ def test_features_at_the_current_step(golden, small, scene, name):
     pooled = network.destination_predictor.windows(history, agent_attributes(scene))
     assert gap(pooled[0], theirs["destination/pooled"]) <= FEATURE
     windows = Windows(scene.valid[:, None, None], scene.pose[:, None, None], scene.motion[:, None, None])
-    agents = network.agents(windows, scene, network.agents.neighborhoods(map_features, lights))
+    agents = network.agents(windows, scene, network.agents.context(map_features, lights))
     assert gap(agents[0, 0, 0], theirs["agent/feature"]) <= FEATURE
 
 

@@ -134,6 +134,7 @@ def test_nothing_is_shared_in_training_mode_or_with_other_settings(batch):
     torch.manual_seed(0)
     learner = TrafficBotsPolicy(TINY).requires_grad_(False).eval()
     same, other = copy.deepcopy(learner), TrafficBotsPolicy(replace(TINY, map_neighbors=2)).requires_grad_(False).eval()
+    other.load_state_dict(learner.state_dict())
     assert learner.sees_as(same)
     assert learner.has_features_of(same)
     assert not learner.sees_as(other)

@@ -142,7 +142,7 @@ def test_two_passes_have_the_gradient_of_one(scenarios):
     mean = network.posterior(logged, scene.light_state[:, None, :, ::5], scene, map_features)
     personality = mean + network.posterior.log_std.exp() * draws.noise
     given = network.conditioning(scene, map_features, personality[:, None], labels[:, None])
-    around = network.agents.neighborhoods(map_features, lights[:, 10:])
+    around = network.agents.context(map_features, lights[:, 10:])
     traffic, limit = traffic_at_start(scene, labels[:, None]), max_action(scene.agent_class)[:, None]
     pose, speed = traffic.windows.pose[..., -1, :], traffic.windows.motion[..., -1, 0]
     losses, counted = [], []
@@ -186,8 +186,9 @@ def test_goals_are_refused_in_words(scenarios, tmp_path):
 
 
 def test_settings_that_change_nothing_are_refused(scenarios, tmp_path):
-    with pytest.raises(ConfigError, match=r"entropy_bonus=0\.1 has no effect"):
+    with pytest.raises(ConfigError, match="entropy_bonus has no effect"):
         finetune(new_policy(), scenarios, tmp_path / "bonus", replace(tiny.FINETUNE, entropy_bonus=0.1))
+    assert not (tmp_path / "bonus").exists()
     validation = ValidationConfig(every=100, num_scenarios=1, num_rollouts=2, top_k=3)
     with pytest.raises(ConfigError, match="top_k=3 needs a policy with categories"):
         pretrain(new_policy(), scenarios, tmp_path / "k", replace(PRETRAIN, validation=validation), held_out=scenarios)

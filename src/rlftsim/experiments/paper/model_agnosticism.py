@@ -24,8 +24,9 @@ ALPHA = 1e-3
 
 def run(suite: ExperimentSuite) -> dict[str, Row]:
     """Rows of both architectures; twice for models without tokens: with their exploration noise, and without."""
+    both = suites(suite)  # first, which refuses models of the wrong kind
     rows = suite.evaluate({FLOOR: (CONSTANT_VELOCITY,)})
-    for one in suites(suite):
+    for one in both:
         specs: dict[str, Sequence[ModelSpec]] = {
             BEFORE: (BASE,),
             AFTER: over_seeds(FineTuned("mloo"), suite.num_seeds),
@@ -48,11 +49,12 @@ def suites(suite: ExperimentSuite) -> tuple[ExperimentSuite, ExperimentSuite]:
     if name is None:
         raise ConfigError(f"{type(suite.recipe).__name__} names no recipe of another architecture to compare with.")
     out, base = Path(suite.out) / name, suite.counterpart_model
-    both = suite, replace(suite, recipe=recipe_by_name(name), out=out, base_model=base, counterpart_model=None)
-    for one in both:
-        if one.base_model is not None:
-            one.recipe.like(load_policy(one.base_model))  # rows are named after recipes
-    return both
+    recipe = recipe_by_name(name)
+    # Rows are named after recipes, so a model of the other kind would stand under a wrong name.
+    for own, model in ((suite.recipe, suite.base_model), (recipe, base)):
+        if model is not None:
+            own.like(load_policy(model))
+    return suite, replace(suite, recipe=recipe, out=out, base_model=base, counterpart_model=None)
 
 
 def _without_noise(suite: ExperimentSuite, name: str, specs: Sequence[ModelSpec]) -> Row:

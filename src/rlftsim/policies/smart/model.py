@@ -68,8 +68,8 @@ class SmartModel(nn.Module):
         return decoder.time_layers, decoder.map_layers, decoder.agent_layers, decoder.head, *self.goal_parts()
 
     def head_parts(self) -> tuple[nn.Module, ...]:
-        """The layers that turn an agent's features into logits of tokens."""
-        return (self.network.decoder.head,)
+        """The layers that turn an agent's features into logits of tokens, and everything for goals."""
+        return self.network.decoder.head, *self.goal_parts()
 
     def goal_parts(self) -> tuple[nn.Module, ...]:
         """Goal encoder and goal logit bias; empty in a goal-free model."""

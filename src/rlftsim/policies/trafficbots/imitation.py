@@ -27,7 +27,7 @@ from rlftsim.policies.trafficbots.dynamics import max_action, move
 from rlftsim.policies.trafficbots.network import (
     POSTERIOR_STRIDE,
     AgentConditioning,
-    AgentNeighborhoods,
+    AgentContext,
     TrafficBotsNetwork,
     Windows,
     history_windows,
@@ -141,7 +141,7 @@ def loss_of_scene(
     log_std = network.posterior.log_std
     personality = draws.noise if draws.from_prior else mean + log_std.exp() * draws.noise
     given = network.conditioning(scene, map_features, personality[:, None], destination[:, None])
-    around = network.agents.neighborhoods(map_features, light_features[:, CURRENT_STEP:])
+    around = network.agents.context(map_features, light_features[:, CURRENT_STEP:])
 
     # 2. Roll out without gradient, differentiate the dynamics, score with gradient.
     rolled = _roll_out(network, scene, around, given, destination[:, None], draws.forced)
@@ -224,7 +224,7 @@ class _RolledOut:
 def _roll_out(
     network: TrafficBotsNetwork,
     scene: Scene,
-    around: AgentNeighborhoods,
+    around: AgentContext,
     given: AgentConditioning,
     destination: Int64[Tensor, "B 1 A"],
     forced: Bool[Tensor, "B A"],

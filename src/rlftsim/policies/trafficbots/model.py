@@ -81,7 +81,7 @@ class TrafficBotsModel(nn.Module):
         """
         map_features = self.network.map(scene, scene.node_mask)
         light_features = self._roll_lights(scene, map_features)
-        around = self.network.agents.neighborhoods(map_features, light_features)
+        around = self.network.agents.context(map_features, light_features)
         return TrafficBotsContext(scene, map_features, light_features, around, self)
 
     def _roll_lights(self, scene: Scene, map_features: Float[Tensor, "B M D"]) -> Float[Tensor, "B T L D"]:

@@ -239,17 +239,17 @@ def agent_attributes(scene: Scene) -> Float[Tensor, "B A 6"]:
 
 
 @dataclass(frozen=True, eq=False)
-class AgentNeighborhoods:
-    """Map and lights as an agent encoder sees them, by layer."""
+class AgentContext:
+    """Map and lights as keys and values of an agent encoder, by layer."""
 
     map_tokens: tuple[KeyValues, ...]
     """[B, H, M, d] each."""
     light_tokens: tuple[KeyValues, ...]
     """[B, T, H, L, d] each."""
 
-    def steps(self, start: int, stop: int) -> "AgentNeighborhoods":
+    def steps(self, start: int, stop: int) -> "AgentContext":
         """The same with the lights of some decisions."""
-        return AgentNeighborhoods(self.map_tokens, tuple(one.steps(start, stop) for one in self.light_tokens))
+        return AgentContext(self.map_tokens, tuple(one.steps(start, stop) for one in self.light_tokens))
 
 
 class AgentEncoder(nn.Module):
@@ -263,27 +263,25 @@ class AgentEncoder(nn.Module):
             DecoderLayer(config.dim, config.num_heads, dropout) for _ in range(config.num_agent_layers)
         )
 
-    def neighborhoods(
-        self, map_features: Float[Tensor, "B M D"], light_features: Float[Tensor, "B T L D"]
-    ) -> AgentNeighborhoods:
+    def context(self, map_features: Float[Tensor, "B M D"], light_features: Float[Tensor, "B T L D"]) -> AgentContext:
         """Keys and values of map and lights for each layer, computed once for all rollouts.
 
         Args:
             map_features: of `MapEncoder`.
             light_features: of `LightEncoder`.
         """
-        return AgentNeighborhoods(
+        return AgentContext(
             tuple(layer.project(map_features) for layer in decoder_layers(self.layers)),
             tuple(layer.project(light_features) for layer in decoder_layers(self.layers)),
         )
 
-    def forward(self, windows: Windows, scene: Scene, around: AgentNeighborhoods) -> Float[Tensor, "B T N A D"]:
+    def forward(self, windows: Windows, scene: Scene, around: AgentContext) -> Float[Tensor, "B T N A D"]:
         """Features of all agents at T decisions of N rollouts, 0 for those without a valid step in their window.
 
         Args:
             windows: [B, T, N, A, W].
             scene: poses of map and lights, sizes and classes of agents.
-            around: of `neighborhoods`, for the same decisions.
+            around: of `context`, for the same decisions.
         """
         config, mask, pose = self.config, windows.token_mask, windows.token_pose
         num_decisions = mask.shape[1]
@@ -428,7 +426,7 @@ class Posterior(nn.Module):
             map_features: of `MapEncoder`; agents train them, lights do not.
         """
         lights = self.lights(light_state, self.lights.neighborhoods(scene, map_features))
-        around = self.agents.neighborhoods(map_features, lights)
+        around = self.agents.context(map_features, lights)
         return self.mean(self.agents(windows, scene, around)[:, 0, 0]).float()
 
 
@@ -490,7 +488,7 @@ class TrafficBotsNetwork(nn.Module):
         self,
         windows: Windows,
         scene: Scene,
-        around: AgentNeighborhoods,
+        around: AgentContext,
         given: AgentConditioning,
         active: Bool[Tensor, "B T N A"],
     ) -> Float[Tensor, "B T N A D"]:

@@ -159,7 +159,7 @@ class TrafficBotsPolicy(TrafficBotsModel):
         """
         if not isinstance(context, TrafficBotsContext) or not self.sees_as(context.model):
             return self.encode(scenarios)
-        around = self.network.agents.neighborhoods(context.map_features, context.light_features)
+        around = self.network.agents.context(context.map_features, context.light_features)
         return replace(context, around=around, model=self)
 
     def score_both(

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from rlftsim.policies.trafficbots.config import WINDOW
-from rlftsim.policies.trafficbots.network import AgentConditioning, AgentNeighborhoods, TrafficBotsNetwork, Windows
+from rlftsim.policies.trafficbots.network import AgentConditioning, AgentContext, TrafficBotsNetwork, Windows
 from rlftsim.policies.trafficbots.scene import Scene
 
 
@@ -21,7 +21,7 @@ def features_over_time(
     history: Windows,
     active: Bool[Tensor, "B N A T"],
     scene: Scene,
-    around: AgentNeighborhoods,
+    around: AgentContext,
     given: AgentConditioning,
     *,
     steps_per_pass: int,

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from rlftsim.geometry import heading_vector, wrap_angle
 from rlftsim.policies.trafficbots.dynamics import leaves_map, max_action, move, reaches_destination
-from rlftsim.policies.trafficbots.network import AgentConditioning, AgentNeighborhoods, Windows, history_windows
+from rlftsim.policies.trafficbots.network import AgentConditioning, AgentContext, Windows, history_windows
 from rlftsim.policies.trafficbots.scene import Scene
 from rlftsim.rollout.types import AgentStates
 from rlftsim.scenario.types import STEP_S
@@ -26,7 +26,7 @@ class TrafficBotsContext:
     map_features: Float[Tensor, "B M D"]
     light_features: Float[Tensor, "B T L D"]
     """Of all 80 decisions."""
-    around: AgentNeighborhoods
+    around: AgentContext
     """Map, and lights at all decisions."""
     model: nn.Module
     """The model that made it."""
