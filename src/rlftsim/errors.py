@@ -192,5 +192,8 @@ def _in_words(hint: Any) -> str:
     if get_origin(hint) is Literal:
         return f"one of {', '.join(get_args(hint))}"
     if get_origin(hint) is tuple:
-        return "a list" if ... in get_args(hint) else f"{len(get_args(hint))} numbers"
+        kinds = get_args(hint)
+        if get_origin(kinds[0]) is Literal:
+            return f"{_in_words(kinds[0])}, or several of them in a list"
+        return "a list" if ... in kinds else f"{len(kinds)} numbers"
     return _WORDS.get(hint) or f"a {hint.__name__}"

@@ -337,7 +337,7 @@ def test_a_conditioned_policy_without_parts_for_goals_alone_is_trained_as_a_whol
     native.is_goal_conditioned = True
     with pytest.raises(ConfigError, match="Linear has no part that only goals use: set trained=all"):
         freeze_untrained(native, "goals")
-    with pytest.raises(ConfigError, match="this model is not goal-conditioned"):
+    with pytest.raises(ConfigError, match="a Linear cannot be given goals: take a model that can"):
         freeze_untrained(torch.nn.Linear(1, 1), "goals")
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal, get_args
+from typing import Literal
 
 from rlftsim.envs.actions import ActionKind, Tracker
 from rlftsim.envs.drivers import Rules, Traffic
@@ -61,12 +61,6 @@ class EnvConfig:
 
     def __post_init__(self) -> None:
         require_types(self)
-        object.__setattr__(self, "stop_on", tuple(self.stop_on))
-        if isinstance(self.route, list):
-            object.__setattr__(self, "route", tuple(self.route))
-        for reason in self.stop_on:
-            if reason not in get_args(StopReason):
-                raise ConfigError(f"stop_on must be one of {', '.join(get_args(StopReason))}, got {in_short(reason)}.")
         if not isinstance(self.drivers, Mapping):
             raise ConfigError(f"drivers must be {{who: driver}}, got {in_short(self.drivers)}.")
         parse_terms(self.reward)
