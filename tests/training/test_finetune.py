@@ -89,6 +89,14 @@ def test_an_update_moves_the_decoder_and_nothing_else(learner, batch, fabric):
     assert moved(learner.reference, reference) == []
 
 
+def test_a_run_says_how_many_weights_it_trains(vocabulary, drawn_scenarios, tmp_path, capsys):
+    policy = tiny.tiny_policy(vocabulary)
+    total = sum(value.numel() for value in policy.parameters())
+    head = sum(value.numel() for value in policy.network.decoder.head.parameters())
+    finetune(policy, drawn_scenarios, tmp_path, replace(tiny.FINETUNE, trained="head"))
+    assert f" updates of {head:,} of {total:,} weights.\n" in capsys.readouterr().err
+
+
 def test_training_everything_reaches_the_map_encoder(vocabulary, batch, fabric):
     config = replace(CONFIG, trained="all")
     learner = prepare(tiny.tiny_policy(vocabulary), config, fabric.device)

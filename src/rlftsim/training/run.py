@@ -113,6 +113,13 @@ class Learner:
             self.skipped_in_a_row += 1
 
 
+def _number_of_weights(learner: Learner) -> str:
+    """How many weights are trained, for a message: 98 of 152,341 weights."""
+    trained = sum(p.numel() for p in learner.parameters)
+    total = sum(p.numel() for p in learner.policy.parameters())
+    return f"{trained:,} weights" if trained == total else f"{trained:,} of {total:,} weights"
+
+
 @dataclass(frozen=True, eq=False)
 class UpdateReport:
     """The outcome of one update."""
@@ -287,6 +294,9 @@ class TrainingRun:
             learner.load_numbers(progress.numbers)
         # Metrics of updates behind the checkpoint would appear twice.
         self.folder.continue_from(learner.update)
+        if self._fabric.is_global_zero and learner.update < self.total:
+            begun = f"goes on behind update {learner.update}" if learner.update else "begins"
+            log.info(f"{title} {begun}: {self.total} updates of {_number_of_weights(learner)}.")
         with progress_bar(title, self.total, learner.update, show=self._fabric.is_global_zero) as advance:
             while learner.update < self.total:
                 report = make_update()
