@@ -240,7 +240,7 @@ def _gap(a: Tensor, b: Tensor) -> float:
     """Largest absolute difference; infinite where shapes differ or a value is not finite."""
     if a.shape != b.shape or not (a.isfinite().all() and b.isfinite().all()):
         return math.inf
-    return float((a.double() - b.double()).abs().max()) if a.numel() else 0.0
+    return float((a.detach().double() - b.detach().double()).abs().max()) if a.numel() else 0.0
 
 
 def _lead_some(batch: ScenarioBatch, stride: int) -> Callable[[object, int], AgentStates]:

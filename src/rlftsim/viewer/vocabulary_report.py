@@ -216,6 +216,8 @@ def _draw_ticks(axis: Axes, poses: np.ndarray, size: float, *, values=None, norm
 
 def _draw_errors(axis: Axes, coverage: ClassCoverage) -> None:
     """Draw cumulative distributions of errors, with mean, 95 % and maximum in the legend."""
+    # Limits before any data: errors of zero, as where everything stands, leave a logarithmic axis nothing to go by.
+    axis.set(xlim=(0.05, 1000), ylim=(0, 102), xscale="log")
     for spread, color, name in ((coverage.rolling_m, ROLLING, "tracks"), (coverage.single_m, SINGLE, "motions")):
         if not spread.count:
             continue
@@ -226,7 +228,6 @@ def _draw_errors(axis: Axes, coverage: ClassCoverage) -> None:
         axis.plot(values[shown] * 100, fraction[shown] * 100, color=color, lw=1.8, label=label)
         axis.plot(spread.p95 * 100, 95, "o", color=color, ms=5)
         axis.plot(spread.mean * 100, np.interp(spread.mean, values, fraction) * 100, "D", color=color, ms=5)
-    axis.set(xscale="log", xlim=(0.05, 1000), ylim=(0, 102))
     axis.set_xticks([0.1, 1, 10, 100, 1000], ["0.1", "1", "10", "100", "1000"])
     axis.grid(alpha=0.25)
     axis.set_title("error", loc="left", fontsize=11, color=INK)
