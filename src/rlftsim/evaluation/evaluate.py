@@ -24,7 +24,7 @@ from rlftsim.realism import SimulatedStates, metric_by_name, scenario_log, score
 from rlftsim.realism.from_rollouts import logged_states, states_of_rollouts
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import Policy, device_of, is_goal_conditioned
-from rlftsim.rollout.simulate import simulate
+from rlftsim.rollout.simulate import refuse_sampling, simulate
 from rlftsim.scenario.batch import ScenarioBatch, collate
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.types import Scenario
@@ -85,6 +85,9 @@ def evaluate(
     dataset, config = open_held_out(data, config)
     positions = choose_scenarios(dataset, config)
     check_jobs(config, device_of(policy))
+    frozen: Policy | Oracle = frozen_copy(policy)
+    if frozen != "oracle":
+        refuse_sampling(frozen, dataset[positions[0]], config.sampling)
     provenance = Provenance(
         config=replace(config, jobs=1),  # the same bytes from any number of processes
         policy=kind,
@@ -95,7 +98,7 @@ def evaluate(
         guessed=dataset.guessed,
     )
     return resume_evaluation(
-        partial(_evaluate_scenario, _Job(frozen_copy(policy), dataset, config)),
+        partial(_evaluate_scenario, _Job(frozen, dataset, config)),
         dataset.scenario_ids[: len(positions)],
         name,
         provenance,

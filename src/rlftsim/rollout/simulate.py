@@ -10,10 +10,10 @@ from torch import Tensor
 from rlftsim.errors import ConfigError
 from rlftsim.goals.types import Goals
 from rlftsim.rollout.noise import draw_noise
-from rlftsim.rollout.policy import DecisionDistribution, Policy, Sampling
+from rlftsim.rollout.policy import DecisionDistribution, Policy, Sampling, device_of
 from rlftsim.rollout.types import AgentStates, Rollouts
-from rlftsim.scenario.batch import ScenarioBatch
-from rlftsim.scenario.types import FUTURE_STEPS
+from rlftsim.scenario.batch import ScenarioBatch, collate
+from rlftsim.scenario.types import FUTURE_STEPS, Scenario
 from rlftsim.threads import one_thread
 
 Choose = Callable[[DecisionDistribution, Any, Sampling, Tensor], Tensor]
@@ -123,6 +123,28 @@ def simulate(
         goals=goals,
         forced=all_forced,
     )
+
+
+@torch.no_grad()
+def refuse_sampling(policy: Policy, scenario: Scenario, sampling: Sampling) -> None:
+    """Refuse, before long work, a truncation that the policy's decisions do not have.
+
+    Args:
+        policy: in evaluation mode.
+        scenario: any, to decide in once.
+        sampling: of the work.
+
+    Raises:
+        ConfigError: `sampling.top_k` is set, and decisions are not categories.
+    """
+    if sampling.top_k is None:
+        return
+    batch = collate([scenario]).to(device_of(policy))
+    # Only a draw shows whether there are categories to choose from.
+    initial = draw_noise(batch, range(1), seed=0, purpose="begin", per_agent=policy.initial_noise_size)
+    noise = draw_noise(batch, range(1), seed=0, purpose="decide", per_agent=policy.noise_size)
+    context = policy.encode(batch)
+    policy.decide(context, policy.begin(context, 1, None, initial)).sample(sampling, noise)
 
 
 def _join(forces: list[AgentStates | None], path: Float[Tensor, "B N A T 3"]) -> AgentStates | None:

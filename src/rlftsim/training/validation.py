@@ -15,9 +15,8 @@ from torch import nn
 from rlftsim.errors import ConfigError, given, require_not_negative, require_positive, require_types
 from rlftsim.realism import metric_by_name, score_batch
 from rlftsim.realism.from_rollouts import states_of_rollouts
-from rlftsim.rollout.policy import Policy, Sampling, device_of
-from rlftsim.rollout.simulate import simulate
-from rlftsim.scenario.batch import collate
+from rlftsim.rollout.policy import Policy, Sampling
+from rlftsim.rollout.simulate import refuse_sampling, simulate
 from rlftsim.scenario.types import Scenarios
 from rlftsim.training.data import batch_with_futures
 from rlftsim.training.map_use import MapUse, measure_map_use, predicts_tokens
@@ -91,10 +90,9 @@ def refuse_to_validate(model: object, scenarios: Scenarios, config: ValidationCo
         raise ConfigError(f"{type(model).__name__} cannot simulate, so it cannot be validated: set validation.every=0.")
     if not len(scenarios):
         raise ConfigError("no scenario to validate on: name another split, or set validation.every=0.")
-    if config.top_k is not None:  # only a draw shows whether there are categories to choose from
-        frozen: Any = copy.deepcopy(model).eval().requires_grad_(False) if isinstance(model, nn.Module) else model
-        batch = collate([scenarios[0]]).to(device_of(frozen))
-        simulate(frozen, batch, num_rollouts=1, seed=0, sampling=Sampling(top_k=config.top_k))
+    if config.top_k is not None:
+        frozen: Any = copy.deepcopy(model).eval() if isinstance(model, nn.Module) else model
+        refuse_sampling(frozen, scenarios[0], Sampling(top_k=config.top_k))
 
 
 @torch.no_grad()

@@ -9,6 +9,7 @@ from tiny_trafficbots import TINY
 import scenes
 import tiny
 from rlftsim.errors import ConfigError
+from rlftsim.evaluation.evaluate import EvaluateConfig, evaluate
 from rlftsim.policies.trafficbots.destinations import NO_DESTINATION, destination_labels
 from rlftsim.policies.trafficbots.dynamics import max_action, move
 from rlftsim.policies.trafficbots.imitation import draw_training, imitation_terms, loss_of_scene
@@ -195,6 +196,12 @@ def test_settings_that_change_nothing_are_refused(scenarios, tmp_path):
     with pytest.raises(ConfigError, match="top_k=3 needs a policy with categories"):
         pretrain(new_policy(), scenarios, tmp_path / "k", replace(PRETRAIN, validation=validation), held_out=scenarios)
     assert not (tmp_path / "k" / "metrics.jsonl").exists()
+
+
+def test_top_k_is_refused_before_an_evaluation_leaves_anything(tmp_path):
+    with pytest.raises(ConfigError, match="top_k=3 needs a policy with categories"):
+        evaluate(new_policy(), "synthetic", tmp_path / "out", EvaluateConfig(top_k=3, limit=1))
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("name", ["trafficbots", "trafficbots-demo"])
