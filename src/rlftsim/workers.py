@@ -414,8 +414,9 @@ class _Worker:
 
 
 def portable_error(error: Exception) -> Exception:
-    """The error that is being handled as another process can read it, with its traceback as a note."""
-    error.add_note(traceback.format_exc())
+    """The error that is being handled as another process can read it; a bug's has its traceback as a note."""
+    if not isinstance(error, RlftsimError):
+        error.add_note(traceback.format_exc())
     try:
         pickle.loads(pickle.dumps(error))  # some errors can be pickled and not be read back
     except Exception:

@@ -303,7 +303,7 @@ def test_an_error_of_any_process_is_raised_in_the_first(capfd):
         in_processes(failing(DataError("scenario 7 has no future")), three)
     with pytest.raises(ZeroDivisionError) as caught:  # a bug: where it happened is part of the report
         in_processes(failing(ZeroDivisionError("a bug")), three)
-    assert "in process 2 of the run" in caught.value.__notes__[0]
+    assert "in process 2 of the run" in caught.value.__notes__
     assert "in work" in caught.value.__notes__[0]
     with pytest.raises(RuntimeError, match="Unsendable: a b"):
         in_processes(failing(Unsendable("a", "b")), three)

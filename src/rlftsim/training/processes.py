@@ -6,11 +6,9 @@ notebook may train with the rewards and policies that its cells define, and scen
 
 import multiprocessing
 import os
-import pickle
 import signal
 import sys
 import threading
-import traceback
 import warnings
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, suppress
@@ -24,7 +22,7 @@ from torch import Tensor
 
 from rlftsim.errors import ConfigError, DataError, RlftsimError
 from rlftsim.training.parallel import DeviceConfig, Fabric, can_fork, start_fabric
-from rlftsim.workers import exit_with_parent
+from rlftsim.workers import exit_with_parent, portable_error
 
 Result = TypeVar("Result")
 
@@ -96,19 +94,11 @@ def _help(work: Callable[[Fabric], object], process: "LinkedProcess", inherited:
     except LostProcessError:
         pass  # rank 0 has ended and knows why
     except Exception as error:
+        sent = portable_error(error)
         if not isinstance(error, RlftsimError):
-            error.add_note(f"in process {process.global_rank} of the run:\n{traceback.format_exc()}")
+            sent.add_note(f"in process {process.global_rank} of the run")
         with suppress(OSError):
-            process.links[0].send(_picklable(error))
-
-
-def _picklable(error: Exception) -> Exception:
-    """The error, or its text where it cannot be handed to another process."""
-    try:
-        pickle.loads(pickle.dumps(error))
-    except Exception:
-        return RuntimeError("\n".join([f"{type(error).__name__}: {error}", *getattr(error, "__notes__", ())]))
-    return error
+            process.links[0].send(sent)
 
 
 class LostProcessError(DataError):
