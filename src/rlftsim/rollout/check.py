@@ -319,7 +319,7 @@ def scores_of_some_rollouts_equal_slices_of_all(subject: _Subject) -> str:
 def kl_from_itself_is_zero(subject: _Subject) -> str:
     """The KL divergence of a policy from itself is 0."""
     scored = subject.score(subject.batch, subject.rollouts)
-    return _within(float(scored.kl(scored).abs().max()), 1e-6, "largest KL")
+    return _within(float(scored.kl(scored).detach().abs().max()), 1e-6, "largest KL")
 
 
 def kl_from_another_policy_is_positive(subject: _Subject) -> str:
