@@ -34,7 +34,9 @@ def main() -> None:
     torch.set_num_threads(1)
     scenarios = ScenarioDataset(arguments.data, "training")
     for name in arguments.models:
-        by_row = gradients(name, scenarios, arguments.num_scenarios)  # [scenarios, rows, weights of a row]
+        by_row = gradients(
+            name, scenarios, min(arguments.num_scenarios, len(scenarios))
+        )  # [scenarios, rows, weights of a row]
         for row in range(by_row.shape[1]):
             signal, noise, error = signal_and_noise(by_row[:, row])
             print(

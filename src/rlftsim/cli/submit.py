@@ -96,7 +96,7 @@ class Build:
         if not self.partial:
             refuse_incomplete(data)
         refuse_open_loop(policy, data[0])
-        refuse_sampling(policy, data[0], config.sampling)
+        refuse_sampling(policy, data, config.sampling)
         closed_loop = statement(policy, config.sampling)
         print(closed_loop)
         if not self.i_comply:

@@ -87,7 +87,7 @@ def evaluate(
     check_jobs(config, device_of(policy))
     frozen: Policy | Oracle = frozen_copy(policy)
     if frozen != "oracle":
-        refuse_sampling(frozen, dataset[positions[0]], config.sampling)
+        refuse_sampling(frozen, dataset, config.sampling)
     provenance = Provenance(
         config=replace(config, jobs=1),  # the same bytes from any number of processes
         policy=kind,

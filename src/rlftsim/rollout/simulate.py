@@ -13,7 +13,7 @@ from rlftsim.rollout.noise import draw_noise
 from rlftsim.rollout.policy import DecisionDistribution, Policy, Sampling, device_of
 from rlftsim.rollout.types import AgentStates, Rollouts
 from rlftsim.scenario.batch import ScenarioBatch, collate
-from rlftsim.scenario.types import FUTURE_STEPS, Scenario
+from rlftsim.scenario.types import FUTURE_STEPS, Scenarios
 from rlftsim.threads import one_thread
 
 Choose = Callable[[DecisionDistribution, Any, Sampling, Tensor], Tensor]
@@ -125,26 +125,19 @@ def simulate(
     )
 
 
-@torch.no_grad()
-def refuse_sampling(policy: Policy, scenario: Scenario, sampling: Sampling) -> None:
+def refuse_sampling(policy: Policy, scenarios: Scenarios, sampling: Sampling) -> None:
     """Refuse, before long work, a truncation that the policy's decisions do not have.
 
     Args:
         policy: in evaluation mode.
-        scenario: any, to decide in once.
+        scenarios: of the work; the first is simulated once if there is a truncation.
         sampling: of the work.
 
     Raises:
         ConfigError: `sampling.top_k` is set, and decisions are not categories.
     """
-    if sampling.top_k is None:
-        return
-    batch = collate([scenario]).to(device_of(policy))
-    # Only a draw shows whether there are categories to choose from.
-    initial = draw_noise(batch, range(1), seed=0, purpose="begin", per_agent=policy.initial_noise_size)
-    noise = draw_noise(batch, range(1), seed=0, purpose="decide", per_agent=policy.noise_size)
-    context = policy.encode(batch)
-    policy.decide(context, policy.begin(context, 1, None, initial)).sample(sampling, noise)
+    if sampling.top_k is not None:  # only a draw shows whether there are categories to choose from
+        simulate(policy, collate([scenarios[0]]).to(device_of(policy)), num_rollouts=1, seed=0, sampling=sampling)
 
 
 def _join(forces: list[AgentStates | None], path: Float[Tensor, "B N A T 3"]) -> AgentStates | None:

@@ -92,7 +92,7 @@ def refuse_to_validate(model: object, scenarios: Scenarios, config: ValidationCo
         raise ConfigError("no scenario to validate on: name another split, or set validation.every=0.")
     if config.top_k is not None:
         frozen: Any = copy.deepcopy(model).eval() if isinstance(model, nn.Module) else model
-        refuse_sampling(frozen, scenarios[0], Sampling(top_k=config.top_k))
+        refuse_sampling(frozen, scenarios, Sampling(top_k=config.top_k))
 
 
 @torch.no_grad()
