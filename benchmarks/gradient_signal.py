@@ -1,11 +1,11 @@
-"""How much rollouts say about the weights of a policy's last layers: signal and noise of the reward's gradient.
+"""How much rollouts say about the last layers of TrafficBots' vehicles: signal and noise of the reward's gradient.
 
 python benchmarks/gradient_signal.py DATA MODEL [MODEL ...] [--num-scenarios 120]
 
 Split training. The gradient of the MLOO objective, credit by agent, over 8 rollouts of each scenario, at the model
 itself. Signal: squared length of its mean over scenarios, less what chance adds; noise: the squared standard error of
 that mean. Both in units of each weight's own deviation over scenarios. A ratio of 1: that many rollouts point as much
-to the right as to anywhere. Rows: outputs of the layer, such as acceleration and yaw rate of TrafficBots.
+to the right as to anywhere.
 """
 
 import argparse
@@ -13,9 +13,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from rlftsim.policies.registry import load_policy
+from rlftsim.policies.trafficbots.destinations import VEHICLE
+from rlftsim.policies.trafficbots.policy import TrafficBotsPolicy
 from rlftsim.progress import progress_bar
 from rlftsim.recipes.registry import recipe_by_name
 from rlftsim.scenario.batch import collate
@@ -34,40 +36,43 @@ def main() -> None:
     torch.set_num_threads(1)
     scenarios = ScenarioDataset(arguments.data, "training")
     for name in arguments.models:
-        by_row = gradients(
-            name, scenarios, min(arguments.num_scenarios, len(scenarios))
-        )  # [scenarios, rows, weights of a row]
-        for row in range(by_row.shape[1]):
-            signal, noise, error = signal_and_noise(by_row[:, row])
-            print(
-                f"{name}, output {row}: signal {signal:.4f} ± {error:.4f}, noise {noise:.4f}, ratio {signal / noise:.2f}"
-            )
+        by_layer = gradients(name, scenarios, min(arguments.num_scenarios, len(scenarios)))
+        for output, samples in by_layer.items():
+            signal, noise, error = signal_and_noise(samples)
+            ratio = signal / noise
+            print(f"{name}, {output}: signal {signal:.4f} ± {error:.4f}, noise {noise:.4f}, ratio {ratio:.2f}")
 
 
-def gradients(model: str, scenarios: ScenarioDataset, count: int) -> Tensor:
-    """Gradient of each scenario's rollouts, by output of the layer; the model stays as it is.
+def gradients(model: str, scenarios: ScenarioDataset, count: int) -> dict[str, Tensor]:
+    """Gradient of each scenario's rollouts for the layers of acceleration and yaw rate; the model stays as it is.
 
     Args:
-        model: path or name; its head is one linear layer.
+        model: path or name of a TrafficBots model.
         scenarios: with their futures.
         count: scenarios used, from the first.
+
+    Returns:
+        By output, [scenarios, weights].
     """
     config = replace(
         recipe_by_name("trafficbots-demo").finetune, batch_size=1, num_rollouts=8, rollouts_per_pass=8,
-        trained="head", hold_speed=False, learning_rate=1e-30, weight_decay=0.0, gradient_clip=1e9,
+        trained="decoder", hold_speed=False, learning_rate=1e-30, weight_decay=0.0, gradient_clip=1e9,
     )  # fmt: skip
     fabric = start_fabric(DeviceConfig(accelerator="cpu", processes=1))
     policy = load_policy(model)
-    assert isinstance(policy, nn.Module)
+    assert isinstance(policy, TrafficBotsPolicy)
     learner = prepare(policy, config, fabric.device)
-    found = []
+    head = policy.network.actions
+    layers = {"acceleration": head.acceleration[VEHICLE], "yaw rate": head.yaw_rate[VEHICLE]}
+    found: dict[str, list[Tensor]] = {output: [] for output in layers}
     with progress_bar(model, count) as advance:
         for index in range(count):
             update_policy(learner, collate([scenarios[index]]), config, fabric)
-            rows = [p.grad.reshape(len(p), -1) for p in learner.parameters if p.grad is not None]  # weight and bias
-            found.append(torch.cat(rows, -1).double())
+            for output, layer in layers.items():
+                parts = [p.grad.flatten() for p in layer.parameters() if p.grad is not None]  # weight and bias
+                found[output].append(torch.cat(parts).double())
             advance()
-    return torch.stack(found)
+    return {output: torch.stack(samples) for output, samples in found.items()}
 
 
 def signal_and_noise(samples: Tensor) -> tuple[float, float, float]:

@@ -100,8 +100,8 @@ def trafficbots_demo_rlftsim() -> TrafficBotsRecipe:
             trained_radius_m=1000.0, max_trained_agents=None, ema_decay=0.99, checkpoint_every=100,
         ),
         finetune=FinetuneConfig(
-            epochs=1.6, batch_size=4, micro_batch_size=1, num_rollouts=8, rollouts_per_pass=8, credit="agent",
-            hold_speed=True, trained="head", learning_rate=3e-3, warmup_updates=5, checkpoint_every=16,
+            epochs=2.4, batch_size=4, micro_batch_size=1, num_rollouts=8, rollouts_per_pass=8, credit="agent",
+            hold_speed=True, trained="head", learning_rate=6e-3, warmup_updates=5, checkpoint_every=16,
             kl=KlConfig(target=0.05, initial_beta=0.01),
         ),
     )  # fmt: skip

@@ -33,7 +33,7 @@ NAMES = (
     (r"navi_predictor\.(input|temp)", r"destination_predictor.windows.\1"),
     (r"input_encoder\.mlp\.fc_layers", "steps"),
     (r"temp_encoder\.mlp_layers\.(\d)\.fc_layers\.0", r"polyline.layers.\1"),
-    (r"action_head\.mlp_mean\.(\d)\.fc_layers", r"actions.by_class.\1"),
+    (r"action_head\.mlp_mean\.(\d)\.fc_layers", r"actions.features.\1"),
     (r"norm_src", "own_norm"),
     (r"norm_tgt", "target_norm"),
     (r"norm1", "norm"),
@@ -48,8 +48,8 @@ NAMES = (
 UNUSED = re.compile(r"encoder_prior|latent_dist_prior|action_head\.log_std|tf_mp2mp.*norm_tgt")
 
 
-def our_name(name: str) -> str:
-    """Name of a parameter in `TrafficBotsNetwork`; in_proj keeps its own."""
+def our_names(name: str) -> list[str]:
+    """Names in `TrafficBotsNetwork` of the parameters that a public one holds, in the order of its rows."""
     for pattern, ours in NAMES:
         name = re.sub(pattern, ours, name)
     match = re.fullmatch(r"add_(navi|latent)\.(mlp_in|mlp)\.fc_layers\.(\d)\.(\w+)", name)
@@ -57,7 +57,12 @@ def our_name(name: str) -> str:
         given, part, layer, kind = match.groups()
         block = {"navi": "add_destination", "latent": "add_personality"}[given]
         name = f"{block}.{'given' if part == 'mlp_in' else 'joint'}.{int(layer) // 3 * 2}.{kind}"
-    return name
+    if "in_proj_" in name:
+        return [name.replace("in_proj_", "query."), name.replace("in_proj_", "key_value.")]
+    match = re.fullmatch(r"actions\.features\.(\d)\.4\.(\w+)", name)
+    if match:
+        return [f"actions.{output}.{match[1]}.{match[2]}" for output in ("acceleration", "yaw_rate")]
+    return [name]
 
 
 def our_weights(public: dict[str, np.ndarray]) -> dict[str, torch.Tensor]:
@@ -66,13 +71,12 @@ def our_weights(public: dict[str, np.ndarray]) -> dict[str, torch.Tensor]:
     for name, value in public.items():
         if UNUSED.search(name):
             continue
-        own, tensor = our_name(name), torch.tensor(np.asarray(value))
-        if "in_proj_" in own:
-            third = len(tensor) // 3
-            ours[own.replace("in_proj_", "query.")] = tensor[:third]
-            ours[own.replace("in_proj_", "key_value.")] = tensor[third:]
+        own, tensor = our_names(name), torch.tensor(np.asarray(value))
+        if len(own) == 1:
+            ours[own[0]] = tensor
         else:
-            ours[own] = tensor
+            first = len(tensor) // (3 if "in_proj_" in name else 2)
+            ours.update(zip(own, tensor.split([first, len(tensor) - first])))
     return ours
 
 

@@ -174,8 +174,8 @@ def test_the_score_function_has_mean_zero_and_pays_each_decision_for_itself():
     """
     torch.manual_seed(0)
     policy, batch, size = TrafficBotsPolicy(TINY).eval(), collate([scenes.lone_agent()]), 16
-    freeze_untrained(policy, "head")
-    bias = policy.head_parts()[0].bias
+    head = policy.requires_grad_(False).network.actions
+    biases = [layers[0].bias.requires_grad_() for layers in (head.acceleration, head.yaw_rate)]
     with torch.no_grad():
         rollouts = simulate(policy, batch, num_rollouts=512, seed=0)
     reward = rollouts.decision[0, :, 0, 0, 0]
@@ -186,8 +186,7 @@ def test_the_score_function_has_mean_zero_and_pays_each_decision_for_itself():
         part = rollouts.select(own)
         by_rollout = scored(policy, batch, part).log_prob(part.decision).sum(-1)[0, :, 0]  # [size]
         for values, weight in ((scores, torch.ones(size)), (estimates, reward[own])):
-            (grad,) = torch.autograd.grad((by_rollout * weight).mean(), bias, retain_graph=True)
-            values.append(grad)
+            values.append(torch.cat(torch.autograd.grad((by_rollout * weight).mean(), biases, retain_graph=True)))
     scores, estimates = torch.stack(scores), torch.stack(estimates)  # [32, 2]
     assert (scores.mean(0).abs() < 5 * scores.std(0) / math.sqrt(len(scores))).all()
     error = float(estimates[:, 0].std()) / math.sqrt(len(estimates))

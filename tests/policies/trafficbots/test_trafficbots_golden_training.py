@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from public_names import UNUSED, our_name
+from public_names import UNUSED, our_names
 
 from rlftsim.policies.trafficbots.dynamics import max_action, move
 from rlftsim.policies.trafficbots.imitation import TrainingDraws, imitation_terms, loss_of_scene, personality_kl
@@ -44,9 +44,7 @@ def test_loss_and_every_gradient(golden, small, scene, name, case):
     for public, norm in numbers["grad_norm"].items():
         if UNUSED.search(public):
             continue
-        own = our_name(public)
-        parts = [own] if "in_proj_" not in own else [own.replace("in_proj_", p) for p in ("query.", "key_value.")]
-        grad = torch.cat([ours[part].flatten() for part in parts])
+        grad = torch.cat([ours[own].flatten() for own in our_names(public)])
         assert float(grad.norm()) == pytest.approx(norm, rel=1e-3, abs=1e-6), public
     small.zero_grad()
 

@@ -378,24 +378,29 @@ def admissible(scene: Scene) -> Bool[Tensor, "B A M"]:
 
 
 class ActionHead(nn.Module):
-    """Means of the actions before tanh, by a network for each class."""
+    """Means of the actions before tanh, by a network for each class: vehicles, pedestrians, cyclists.
+
+    Acceleration and yaw rate have a last layer each, so that one can be trained without the other.
+    """
 
     def __init__(self, dim: int):
         super().__init__()
-        self.by_class = nn.ModuleList(mlp(dim, dim, dim, 2) for _ in range(NUM_CLASSES))
-
-    def of_class(self, agent_class: int) -> nn.Sequential:
-        """Network of a class: 0 vehicle, 1 pedestrian, 2 cyclist."""
-        return cast(nn.Sequential, self.by_class[agent_class])
+        self.features = nn.ModuleList(mlp(dim, dim, dim, end_activation=True) for _ in range(NUM_CLASSES))
+        self.acceleration = nn.ModuleList(nn.Linear(dim, 1) for _ in range(NUM_CLASSES))
+        self.yaw_rate = nn.ModuleList(nn.Linear(dim, 1) for _ in range(NUM_CLASSES))
 
     def forward(self, x: Float[Tensor, "*g A D"], agent_class: Int64[Tensor, "*#g A"]) -> Float[Tensor, "*g A 2"]:
-        """Means, float32.
+        """Means of acceleration and yaw rate, float32.
 
         Args:
             x: features of agents.
             agent_class: of each.
         """
-        means = torch.stack([one(x).float() for one in self.by_class], -2)  # [*g, A, 3, 2]
+        by_class = []
+        for features, acceleration, yaw_rate in zip(self.features, self.acceleration, self.yaw_rate):
+            hidden = features(x)
+            by_class.append(torch.cat([acceleration(hidden), yaw_rate(hidden)], -1).float())
+        means = torch.stack(by_class, -2)  # [*g, A, 3, 2]
         index = agent_class.expand(x.shape[:-1])[..., None, None].expand(*x.shape[:-1], 1, 2)
         return means.gather(-2, index)[..., 0, :]
 
