@@ -1,6 +1,7 @@
 import os
 import shutil
 import sys
+import tarfile
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,10 @@ BROWSER = os.environ.get("RLFTSIM_BROWSER", "chromium")
 # slow machines are no failure; the same examples every time
 settings.register_profile("rlftsim", deadline=None, derandomize=True)
 settings.load_profile("rlftsim")
+
+# Archives are unpacked alike by all versions: Python 3.11.0 to 3.11.3 have no filters, 3.12 warns where none is set.
+if hasattr(tarfile, "data_filter"):
+    tarfile.TarFile.extraction_filter = staticmethod(tarfile.data_filter)
 
 
 @pytest.fixture(scope="session")

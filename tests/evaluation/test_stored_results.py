@@ -33,7 +33,7 @@ LOGGED = replace(QUICK, goals="logged")
 def unpacked(tmp_path_factory):
     folder = tmp_path_factory.mktemp("stored")
     with tarfile.open(STORED / "stored.tar.xz") as archive:
-        archive.extractall(folder, filter="data")
+        archive.extractall(folder)
     return folder
 
 

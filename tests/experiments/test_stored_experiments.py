@@ -69,7 +69,7 @@ def suite(tmp_path_factory):
     """The stored folder, opened by today's code with its working directory as it was."""
     folder, before, threads = tmp_path_factory.mktemp("stored"), Path.cwd(), torch.get_num_threads()
     with tarfile.open(STORED / "stored.tar.xz") as tar:
-        tar.extractall(folder, filter="data")
+        tar.extractall(folder)
     os.chdir(folder)
     evaluation = EvaluateConfig(num_rollouts=4, limit=2)
     yield ExperimentSuite(RECIPE, Path("data"), Path("experiments"), evaluation, base_model="models/base")

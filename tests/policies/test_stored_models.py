@@ -27,7 +27,7 @@ TOLERANCE_M = 1e-3
 def stored(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("stored")
     with tarfile.open(STORED / "stored.tar.xz") as archive:
-        archive.extractall(folder, filter="data")
+        archive.extractall(folder)
     return folder
 
 

@@ -86,7 +86,7 @@ def test_a_folder_may_be_a_text_and_the_embedded_data_set_has_a_name(folder):
 def test_a_data_set_of_release_0_1_opens_under_the_names_of_today(tmp_path):
     """Its index has a column `ego_manoeuvre`, its manifest a `licence_note`."""
     with tarfile.open(STORED) as stored:
-        stored.extractall(tmp_path, [m for m in stored if m.name.startswith("data/")], filter="data")
+        stored.extractall(tmp_path, [m for m in stored if m.name.startswith("data/")])
     assert "licence_note" in (tmp_path / "data" / "manifest.json").read_text()
     dataset = ScenarioDataset(tmp_path / "data")
     assert len(dataset) == len({scenario.scenario_id for scenario in dataset}) == 9

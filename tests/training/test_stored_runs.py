@@ -73,7 +73,7 @@ CATK = CatkConfig(
 def unpacked(tmp_path_factory):
     folder = tmp_path_factory.mktemp("stored")
     with tarfile.open(STORED / "stored.tar.xz") as tar:
-        tar.extractall(folder, filter="data")
+        tar.extractall(folder)
     return folder
 
 
