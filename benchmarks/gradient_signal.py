@@ -64,6 +64,9 @@ def gradients(model: str, scenarios: ScenarioDataset, count: int) -> dict[str, T
     learner = prepare(policy, config, fabric.device)
     head = policy.network.actions
     layers = {"acceleration": head.acceleration[VEHICLE], "yaw rate": head.yaw_rate[VEHICLE]}
+    policy.requires_grad_(False)  # what is not measured costs no backward pass
+    for layer in layers.values():
+        layer.requires_grad_(True)
     found: dict[str, list[Tensor]] = {output: [] for output in layers}
     with progress_bar(model, count) as advance:
         for index in range(count):

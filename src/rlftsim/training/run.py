@@ -114,7 +114,7 @@ class Learner:
 
 
 def _number_of_weights(learner: Learner) -> str:
-    """Number of weights that are trained, and of all if they are more, for a message: 98 of 152,341 weights."""
+    """Number of weights that are trained, and of all if they are more, for a message: 49 of 462,696 weights."""
     trained = sum(p.numel() for p in learner.parameters)
     total = sum(p.numel() for p in learner.policy.parameters())
     return f"{trained:,} weights" if trained == total else f"{trained:,} of {total:,} weights"
