@@ -154,8 +154,8 @@ class ExtensionPoint(Generic[Value]):
         except Exception as error:
             package = f" of package {entry.dist.name} {entry.dist.version}" if entry.dist else ""
             return (
-                f"{self.kind} {entry.name!r}{package} ({entry.value}) cannot be imported ({error}): repair or "
-                "uninstall the package."
+                f"{self.kind} {entry.name!r}{package} ({entry.value}) cannot be imported "
+                f"({type(error).__name__}: {error}): repair or uninstall the package."
             )
         if not isinstance(value, ModuleType):  # a module has registered its things itself
             try:

@@ -81,7 +81,9 @@ def load_planner(name: str) -> Planner:
         try:
             found = getattr(importlib.import_module(module), attribute)
         except Exception as error:  # a file of others may fail in any way
-            raise ConfigError(f"planner {name!r} cannot be imported ({error}): name package.module:Class.") from None
+            raise ConfigError(
+                f"planner {name!r} cannot be imported ({type(error).__name__}: {error}): name package.module:Class."
+            ) from None
     else:
         found = PLANNERS.get(name)
     try:
