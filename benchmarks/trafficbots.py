@@ -22,6 +22,7 @@ from rlftsim.policies.trafficbots.config import TrafficBotsConfig
 from rlftsim.policies.trafficbots.imitation import draw_training, loss_of_scene
 from rlftsim.policies.trafficbots.policy import TrafficBotsPolicy
 from rlftsim.policies.trafficbots.scene import Scene
+from rlftsim.policies.trafficbots.state import Memo
 
 NUM_AGENTS, NUM_MAP_TOKENS, NUM_LIGHTS, NUM_STEPS = 40, 700, 24, 91
 NUM_DECISIONS = 80
@@ -167,7 +168,7 @@ def main() -> None:
 
                 def decide(state=state) -> None:
                     # A fresh memo, so that the network runs.
-                    fresh = replace(state, memo=type(state.memo)())
+                    fresh = replace(state, memo=Memo())
                     policy.advance(context, fresh, policy.decide(context, fresh).mean)
 
                 for _ in range(3):

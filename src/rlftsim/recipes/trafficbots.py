@@ -62,7 +62,7 @@ class TrafficBotsRecipe(Recipe):
 
     @property
     def free_fields(self) -> tuple[str, ...]:
-        """Numbers and distances of neighbors, and what only training uses."""
+        """Neighborhoods, exploration noise, and what only training uses."""
         return self.model.free_fields
 
     def train_further(self, policy: Policy) -> TrafficBotsPolicy:

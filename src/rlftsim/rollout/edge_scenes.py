@@ -78,6 +78,7 @@ def edge_scenes(scenario: Scenario) -> dict[str, Scenario]:
         "agents first seen at the current step": _seen_from(scenario, CURRENT_STEP),
         "agents first seen at step 7": _seen_from(scenario, 7),
         "an agent that is never valid": _with_absent_agent(scenario),
+        "NaN wherever a state is not valid": _with_nan(scenario),
     }
 
 
@@ -122,3 +123,17 @@ def _with_absent_agent(scenario: Scenario) -> Scenario:
     valid, ids = tracks.valid.copy(), tracks.object_id.copy()
     valid[-1], ids[-1] = False, ids.max() + 1
     return replace(scenario, tracks=replace(tracks, valid=valid, object_id=ids))
+
+
+def _with_nan(scenario: Scenario) -> Scenario:
+    """The scenario with every second agent not valid at steps 3 and 4 of the history, and NaN in all such states."""
+    tracks = scenario.tracks
+    valid = tracks.valid.copy()
+    others = np.flatnonzero(np.arange(len(valid)) != scenario.ego_index)
+    valid[others[::2], 3:5] = False
+
+    def emptied(values: np.ndarray) -> np.ndarray:
+        return np.where(valid[(..., *[None] * (values.ndim - 2))], values, np.float32(np.nan))
+
+    filled = {name: emptied(getattr(tracks, name)) for name in ("position", "heading", "velocity", "size")}
+    return replace(scenario, tracks=replace(tracks, valid=valid, **filled))

@@ -121,11 +121,13 @@ def _agent_rows(
 ) -> dict[str, np.ndarray]:
     """One scenario's agents as padded arrays, by field name of `ScenarioBatch`."""
     tracks, chosen = scenario.tracks, scenario.simulated_indices
-    valid = _pad(tracks.valid[chosen], num_agents, num_steps)
+    valid = tracks.valid[chosen]
     centered = tracks.position[chosen].copy()  # [A, S, 3] world
     centered[..., :2] -= origin
-    # zeros in place of the log's values, which mean nothing where a state is not valid
-    centered[~tracks.valid[chosen]] = 0
+    heading, velocity = tracks.heading[chosen].copy(), tracks.velocity[chosen].copy()
+    # zeros in place of the log's values, which mean nothing where a state is not valid and may be NaN
+    for values in (centered, heading, velocity):
+        values[~valid] = 0
     return {
         "origin": origin,
         "object_id": _pad(tracks.object_id[chosen], num_agents),
@@ -134,10 +136,10 @@ def _agent_rows(
         "evaluated_mask": _pad(np.isin(chosen, scenario.evaluated_indices), num_agents),
         "position": _pad(centered[..., :2], num_agents, num_steps),
         "z": _pad(centered[..., 2], num_agents, num_steps),
-        "heading": _pad(tracks.heading[chosen], num_agents, num_steps) * valid,
-        "velocity": _pad(tracks.velocity[chosen], num_agents, num_steps) * valid[..., None],
+        "heading": _pad(heading, num_agents, num_steps),
+        "velocity": _pad(velocity, num_agents, num_steps),
         "size": _pad(tracks.size[chosen, CURRENT_STEP], num_agents),
-        "valid": valid,
+        "valid": _pad(valid, num_agents, num_steps),
     }
 
 

@@ -1,9 +1,6 @@
 """Features, decisions and rollouts against the public code with the same weights."""
 
 import json
-import os
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -21,10 +18,6 @@ both = pytest.mark.parametrize("name", ["A", "B"])
 pytestmark = [pytest.mark.official, pytest.mark.usefixtures("without_gradients")]
 
 FEATURE, LOG_PROB, ACTION, POSE_M = 1e-5, 3e-5, 1e-6, 5e-3
-# Eighty decisions amplify rounding, and vectors of 512 bits round otherwise than the machine that the numbers are from:
-# rollouts then end 0.056 m away, and with 256 bits 0.003 m.
-NARROW = {"ATEN_CPU_CAPABILITY": "avx2"}
-HAS_WIDE_VECTORS = torch.backends.cpu.get_cpu_capability() == "AVX512"
 
 
 def gap(ours, theirs):
@@ -88,37 +81,62 @@ def test_features_at_the_current_step(golden, small, scene, name):
 
 @both
 @pytest.mark.parametrize("case", ["greedy", "drawn"])
-def test_rollouts_of_eighty_decisions(golden, small, scene, request, name, case):
-    if HAS_WIDE_VECTORS:
-        this = f"{request.path}::{request.node.name}"
-        again = [sys.executable, "-m", "pytest", "-rA", "-p", "no:cacheprovider", this]
-        done = subprocess.run(again, env=os.environ | NARROW, capture_output=True, text=True)
-        assert "PASSED" in done.stdout, done.stdout + done.stderr
-        return
-    theirs, scene = golden.arrays(f"scenario_{name}/rollouts"), scene(name)
-    theirs = {k.split("/")[1]: v for k, v in theirs.items() if k.startswith(case)}
-    if case == "drawn":
-        scene = replace(scene, map_box=torch.from_numpy(theirs["boundary"])[None])
+def test_eighty_decisions_from_stored_states(rollout, name, case):
+    policy, context, state, theirs = rollout(name, case)
+    for step in range(10, 90):
+        valid, later = theirs["valid"][:, step], theirs["valid"][:, step + 1]
+        action = policy.decide(context, state).mean
+        assert gap(action[0, 0][valid], theirs["u"][:, step][valid]) <= ACTION
+        state = policy.advance(context, state, action)
+        windows = state.traffic.windows
+        windows.pose[0, 0, later, -1] = torch.from_numpy(theirs["pose"][:, step + 1][later])
+        windows.motion[0, 0, later, -1] = torch.from_numpy(theirs["motion"][:, step + 1][later])
+
+
+@both
+@pytest.mark.parametrize("case", ["greedy", "drawn"])
+def test_rollouts_of_eighty_decisions(rollout, name, case):
+    policy, context, state, theirs = rollout(name, case)
     num_agents = len(theirs["dest"])
-    personality = theirs.get("z", np.zeros((num_agents, 16), np.float32))
-    draws = torch.from_numpy(np.concatenate([personality, theirs["dest"][:, None]], 1)).float()[None, None]
-    context = small.encode_scene(scene)
     if case == "greedy":
+        scene = context.scene
         history = Windows(scene.valid, scene.pose, scene.motion)
-        predicted = small.network.destination_predictor(history, scene, context.map_features)
+        predicted = policy.network.destination_predictor(history, scene, context.map_features)
         assert np.array_equal(predicted[0].argmax(-1), theirs["dest"])
-    state = small.start(context, draws)
     for step in range(10, 91):
         traffic, valid = state.traffic, theirs["valid"][:, step]
         assert np.array_equal(traffic.windows.valid[0, 0, :, -1], valid)
-        assert gap(traffic.windows.pose[0, 0, :, -1][valid], theirs["pose"][:, step][valid]) <= POSE_M
+        distance = torch.from_numpy(theirs["pose"][:, step]) - traffic.windows.pose[0, 0, :, -1]
+        distance = distance[torch.from_numpy(valid)].abs().amax(-1)  # [valid]
+        # Rounding grows by a tenth with each decision. From step 75 on it depends on the processor's rounding which way
+        # agent 5 of A goes: 0.003 or 0.06 m at the end, and a few others with it.
+        assert (distance > POSE_M).sum() <= (0 if step <= 70 else 0.2 * num_agents)
+        assert distance.max() <= (POSE_M if step <= 70 else 0.1)
         assert np.array_equal(traffic.active[0, 0][valid], theirs["dest_active"][:, step][valid])
         if step < 90:
             noise = torch.rand(1, 1, num_agents, 2)
-            action = small.decide(context, state).sample(Sampling(temperature=0.0), noise)
-            assert gap(action[0, 0], theirs["u"][:, step]) <= (ACTION if step == 10 else 5e-3)
-            state = small.advance(context, state, action)
+            action = policy.decide(context, state).sample(Sampling(temperature=0.0), noise)
+            if step <= 70:
+                assert gap(action[0, 0], theirs["u"][:, step]) <= (ACTION if step == 10 else 5e-3)
+            state = policy.advance(context, state, action)
     assert (~valid).sum() >= (5 if case == "drawn" else 1)  # some have left the map
+
+
+@pytest.fixture
+def rollout(golden, small, scene):
+    """Policy, context, first state, and the public code's numbers of a rollout."""
+
+    def start(name, case):
+        theirs, here = golden.arrays(f"scenario_{name}/rollouts"), scene(name)
+        theirs = {k.split("/")[1]: v for k, v in theirs.items() if k.startswith(case)}
+        if case == "drawn":
+            here = replace(here, map_box=torch.from_numpy(theirs["boundary"])[None])
+        personality = theirs.get("z", np.zeros((len(theirs["dest"]), 16), np.float32))
+        draws = torch.from_numpy(np.concatenate([personality, theirs["dest"][:, None]], 1)).float()[None, None]
+        context = small.encode_scene(here)
+        return small, context, small.start(context, draws), theirs
+
+    return start
 
 
 def test_the_default_size(golden, default, scene):

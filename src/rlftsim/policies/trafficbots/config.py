@@ -13,7 +13,8 @@ LATENT_SIZE = 16
 
 @dataclass(frozen=True)
 class TrafficBotsConfig:
-    """TrafficBots' architecture. The defaults are TrafficBots V1.5 (7.9 M parameters without its unused ones)."""
+    """Sizes, neighborhoods, exploration noise, training schedule. The defaults are TrafficBots V1.5 (7.9 M parameters
+    without its unused ones)."""
 
     fingerprint_name: ClassVar[str] = "rlftsim.policies.trafficbots.config.TrafficBotsConfig"
     added_fields: ClassVar[dict[str, Any]] = {"noise_pedestrian_yaw_rate_radps": None}
@@ -68,7 +69,8 @@ class TrafficBotsConfig:
     free_nats: float = 1.0
     """A personality's KL from the prior below which it is not pulled towards it."""
     forced_fractions: tuple[float, ...] = (0.3, 0.2, 0.1, 0.0)
-    """In pre-training: fraction of the agents that follow the log throughout, one after the other."""
+    """In pre-training: fraction of the agents that follow the log throughout, one after the other. The last one holds
+    beside rewards, too."""
     forcing_updates: int = 12_175
     """Updates that each of these fractions lasts: 0.2 passes over WOMD with 8 scenarios each."""
     steps_per_pass: int = 8

@@ -68,7 +68,8 @@ def imitation_loss(
     """Loss of an update, a sum of means over each scenario.
 
     Args:
-        network: in training mode inputs are hidden and agents forced by schedule; in evaluation mode neither.
+        network: in training mode inputs are hidden and agents forced by schedule; in evaluation mode nothing is hidden,
+            and the last of `forced_fractions` holds.
         config: schedule of forcing, and probabilities.
         batch: with futures.
         trained: True = the agent counts; the others are context.

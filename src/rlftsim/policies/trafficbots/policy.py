@@ -26,6 +26,7 @@ from rlftsim.policies.trafficbots.network import NUM_CLASSES, history_windows
 from rlftsim.policies.trafficbots.scene import build_scene
 from rlftsim.policies.trafficbots.scoring import features_over_time
 from rlftsim.policies.trafficbots.state import (
+    Memo,
     TrafficBotsContext,
     TrafficBotsState,
     imposed_after,
@@ -36,6 +37,7 @@ from rlftsim.rollout.policy import DecisionDistribution, ImitationLoss
 from rlftsim.rollout.types import AgentStates, Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import HISTORY_STEPS
+from rlftsim.tokens.vocabulary import table_on_device
 
 
 class TrafficBotsPolicy(TrafficBotsModel):
@@ -137,7 +139,7 @@ class TrafficBotsPolicy(TrafficBotsModel):
             before=replace(state, before=None, decision=None),
             decision=decision,
             continues=continues,
-            memo=type(state.memo)(),
+            memo=Memo(),
         )
 
     def score(self, context: TrafficBotsContext, rollouts: Rollouts) -> GaussianDistribution:
@@ -194,7 +196,7 @@ class TrafficBotsPolicy(TrafficBotsModel):
         Args:
             scenarios: with their futures.
             trained: True = the agent counts; the others are context.
-            update: counted from 0; the fraction of agents that follow the log falls with it.
+            update: counted from 0; in training mode the fraction of agents that follow the log falls with it.
         """
         return imitation_loss(self.network, self.config, scenarios, trained, update)
 
@@ -253,13 +255,12 @@ class TrafficBotsPolicy(TrafficBotsModel):
     ) -> GaussianDistribution:
         """Distributions around means; noise goes on from the residual of the decision before, where it continues."""
         config, agent_class = self.config, context.scene.agent_class
-        yaw_rates = [config.noise_yaw_rate_radps] * NUM_CLASSES
+        noise = [(config.noise_acceleration_mps2, config.noise_yaw_rate_radps)] * NUM_CLASSES
         if config.noise_pedestrian_yaw_rate_radps is not None:
-            yaw_rates[PEDESTRIAN] = config.noise_pedestrian_yaw_rate_radps
-        noise = torch.tensor([[config.noise_acceleration_mps2, one] for one in yaw_rates], device=mean.device)
-        by_class = noise / max_action(torch.arange(NUM_CLASSES, device=mean.device))  # [3, 2]
+            noise[PEDESTRIAN] = (config.noise_acceleration_mps2, config.noise_pedestrian_yaw_rate_radps)
+        by_agent = table_on_device(tuple(noise), mean.device)[agent_class] / max_action(agent_class)  # [B, A, 2]
         shape = (len(agent_class), 1, agent_class.shape[1], *[1] * (mean.dim() - 4), 2)
-        std = by_class[agent_class].view(shape).expand_as(mean)
+        std = by_agent.view(shape).expand_as(mean)
         if residual is not None and continues is not None:
             rho = config.noise_correlation
             mean = mean + rho * torch.where(continues[..., None], residual, 0.0)

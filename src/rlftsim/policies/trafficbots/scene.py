@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from rlftsim.geometry import rotate, wrap_angle
-from rlftsim.policies.trafficbots.map_tokens import NUM_NODES, UNKNOWN_LIGHT, ego_pose, light_tokens, map_pieces
+from rlftsim.policies.trafficbots.map_tokens import ego_pose, light_tokens, map_pieces
 from rlftsim.policies.trafficbots.tracks import agent_motions
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import Scenario
@@ -113,10 +113,9 @@ def _rows(
     pieces, lights = map_pieces(scenario, max_map_tokens), light_tokens(scenario, max_map_tokens)
     motions, origin = agent_motions(scenario, num_steps), ego_pose(scenario)
     heading = np.arctan2(pieces.direction[..., 1], pieces.direction[..., 0])  # [M, 20]
-    state = np.where(lights.observed, lights.state, UNKNOWN_LIGHT)[:, :num_steps]
+    state = lights.state[:, :num_steps]
     nodes = pieces.position[pieces.node_mask]
     low, high = (nodes.min(0), nodes.max(0)) if len(nodes) else (np.full(3, -np.inf), np.full(3, np.inf))
-    assert heading.shape[1] == NUM_NODES
     return {
         "node_pose": np.concatenate([pieces.position[..., :2], heading[..., None]], -1),
         "node_mask": pieces.node_mask,

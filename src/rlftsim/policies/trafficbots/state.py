@@ -101,6 +101,7 @@ class Traffic:
             ended = ended if kept is None else ended & ~kept
         alive = self.alive & ~ended
         if imposed is not None:
+            alive = alive | imposed.mask  # also one that had left the map before
             pose = torch.where(imposed.mask[..., None], imposed.pose, pose)
             motion = torch.where(imposed.mask[..., None], imposed.motion, motion)
         windows = Windows(

@@ -56,7 +56,8 @@ def agent_motions(scenario: Scenario, num_steps: int) -> AgentMotions:
         valid[agent, span] = True
         # Speed and heading differ from one step to the next; nothing is known before the first one.
         rates[agent, known[0] + 1 : known[-1] + 1] = np.diff(filled[agent, span][:, [4, 3]], axis=0) / STEP_S
-    size = tracks.size[chosen, :num_steps].astype(np.float64) * logged[..., None]
+    # Not a product with `logged`: values of steps that are not valid may be NaN.
+    size = np.where(logged[..., None], tracks.size[chosen, :num_steps].astype(np.float64), 0.0)
     return AgentMotions(
         position=filled[..., :3],
         heading=filled[..., 3],
