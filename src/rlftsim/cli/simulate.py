@@ -47,7 +47,7 @@ class Simulate:
     """Seed of the rollouts. The same seed gives the same rollouts."""
     temperature: float = 1.0
     """Sampling temperature: below 1 likely motions become more likely; 0 always takes the most likely one,
-    of TrafficBots the mean action."""
+    of continuous actions the mean."""
     top_k: int | None = None
     """Sample among the TOP_K most likely motions only."""
     goal: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)

@@ -601,7 +601,7 @@ def rollouts_are_independent_of_batch_composition(subject: _Subject) -> str:
 
 
 def edge_cases_can_be_simulated_and_scored(subject: _Subject) -> str:
-    """One agent, no map, no lights, 128 agents, agents first seen now or never: all are simulated and scored."""
+    """All are simulated and scored: one agent, no map, no lights, 128 agents, agents first seen now or never, NaN."""
     gaps = {}
     for name, scenario in edge_scenes(subject.scenarios[0]).items():
         batch = subject.collate([scenario])

@@ -122,9 +122,9 @@ def _agent_rows(
     """One scenario's agents as padded arrays, by field name of `ScenarioBatch`."""
     tracks, chosen = scenario.tracks, scenario.simulated_indices
     valid = tracks.valid[chosen]
-    centered = tracks.position[chosen].copy()  # [A, S, 3] world
+    centered = tracks.position[chosen]  # [A, S, 3] world
     centered[..., :2] -= origin
-    heading, velocity = tracks.heading[chosen].copy(), tracks.velocity[chosen].copy()
+    heading, velocity = tracks.heading[chosen], tracks.velocity[chosen]
     # zeros in place of the log's values, which mean nothing where a state is not valid and may be NaN
     for values in (centered, heading, velocity):
         values[~valid] = 0

@@ -38,23 +38,18 @@ def class_of_type(object_type: Int64[Tensor, "..."]) -> Int64[Tensor, "..."]:
     """Class index of WOMD object types; other and unset types count as vehicles."""
     # The challenge requires agents of every type to be simulated. A box that can drive is the least wrong model of
     # them.
-    return table_on_device(_CLASS_OF_TYPE, object_type.device)[object_type.clamp(0, ObjectType.OTHER)]
+    return _on_device(_CLASS_OF_TYPE, object_type.device)[object_type.clamp(0, ObjectType.OTHER)]
 
 
 def box_of_class(class_id: Int64[Tensor, "..."]) -> tuple[Float[Tensor, "..."], Float[Tensor, "..."]]:
     """Length and width of the box of a class, which tokens are matched with, m."""
-    table = table_on_device(CLASS_BOXES_M, class_id.device)[class_id]
+    table = _on_device(CLASS_BOXES_M, class_id.device)[class_id]
     return table[..., 0], table[..., 1]
 
 
 @cache
-def table_on_device(table: tuple[Any, ...], device: torch.device) -> Tensor:
-    """A table as a tensor; kept, because the host waits while it copies one to a device.
-
-    Args:
-        table: numbers, in tuples of tuples where it has more dimensions than one.
-        device: of the tensor.
-    """
+def _on_device(table: tuple[Any, ...], device: torch.device) -> Tensor:
+    """A table as a tensor; kept, because the host waits while it copies one to a device."""
     return torch.tensor(table, device=device)
 
 

@@ -93,8 +93,7 @@ class FinetuneConfig:
     log_prob_reduction: Reduction = "mean"
     """Over agents and decisions. The mean makes the size of an update independent of the number of agents."""
     trained: TrainedParts = "decoder"
-    """The parts a policy names for fine-tuning, its last layers (of TrafficBots: how vehicles accelerate), its goal
-    encoder, or everything."""
+    """The parts a policy names for fine-tuning, its last layers, its goal encoder, or everything."""
     kl: KlConfig = field(default_factory=KlConfig)
     max_kl: float = 5.0
     """Nats per decision; an update that exceeds it, or is not finite, is skipped."""

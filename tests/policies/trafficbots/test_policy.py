@@ -15,8 +15,10 @@ from rlftsim.policies.trafficbots.config import trafficbots_demo
 from rlftsim.policies.trafficbots.dynamics import MAX_ACTION
 from rlftsim.policies.trafficbots.policy import TrafficBotsPolicy
 from rlftsim.rollout.check import check_policy
+from rlftsim.rollout.edge_scenes import edge_scenes
 from rlftsim.rollout.policy import ImitatedPolicy, PartlyTrainedPolicy, Sampling, SharingPolicy, TrainablePolicy
 from rlftsim.rollout.simulate import simulate
+from rlftsim.rollout.types import AgentStates
 from rlftsim.scenario.batch import collate
 from rlftsim.training.freezing import freeze_untrained
 
@@ -194,20 +196,16 @@ def test_the_score_function_has_mean_zero_and_pays_each_decision_for_itself():
     assert float(estimates[:, 0].mean()) == pytest.approx(1.0, abs=5 * error)
 
 
-@pytest.mark.parametrize(
-    "scenario",
-    [
-        scenes.lone_agent(),
-        scenes.without_map(),
-        scenes.build_scenario("walkers", [scenes.Mover(scenes.ObjectType.PEDESTRIAN, x_m=3.0 * k) for k in range(3)]),
-        scenes.without_road_edges(),
-        scenes.straight_road("unlit"),
-        scenes.crowd(num_agents=128),
-    ],
-    ids=["one agent", "no map", "only pedestrians", "no edges", "no lights", "128 agents"],
-)
-def test_scenes_without_something_are_simulated_scored_and_trained_on(policy, scenario):
-    batch = collate([scenario])
+WALKERS = [scenes.Mover(scenes.ObjectType.PEDESTRIAN, x_m=3.0 * k) for k in range(3)]
+AWKWARD = edge_scenes(scenes.bend("x", 3)) | {
+    "only pedestrians": scenes.build_scenario("walkers", WALKERS),
+    "no road edges": scenes.without_road_edges(),
+}
+
+
+@pytest.mark.parametrize("name", AWKWARD)
+def test_scenes_without_something_are_simulated_scored_and_trained_on(policy, name):
+    batch = collate([AWKWARD[name]])
     rollouts = simulate(policy, batch, num_rollouts=1, seed=0)
     assert rollouts.position.isfinite().all()
     assert float((scored(policy, batch, rollouts).log_prob(rollouts.decision) - rollouts.log_prob).abs().max()) < 1e-4
@@ -260,6 +258,27 @@ def test_an_agent_that_leaves_the_map_goes_on_straight_and_decides_nothing(polic
         0.1 * abs(float(state.traffic.windows.motion[0, 0, 0, -1, 0])), rel=1e-3
     )
     assert float(moved[2].detach()) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_an_agent_that_is_put_back_onto_the_map_decides_again_and_padding_never(policy):
+    batch = collate([scenes.bend("leaving", 3), scenes.lone_agent()])
+    context = policy.encode(batch)
+    box = context.scene.map_box.clone()
+    box[0, 1] = 5.0  # x: the ego passes it soon
+    context = replace(context, scene=replace(context.scene, map_box=box))
+    state = first = policy.begin(context, 1, None, torch.full((2, 1, 3, 17), 0.5))
+    for _ in range(20):
+        state = policy.advance(context, state, policy.decide(context, state).mean)
+    assert not state.traffic.alive[0, 0, 0]
+
+    heading = state.poses[..., 2]  # [B, N, A, 1]
+    back = AgentStates(torch.zeros(2, 1, 3, 1, 2), heading, torch.ones(2, 1, 3, 1, dtype=torch.bool))
+    state = policy.advance(context, state, policy.decide(context, state).mean, back)
+    assert torch.equal(state.traffic.alive, batch.agent_mask[:, None])
+    # Its noise begins anew: no part of the residual before, and the whole standard deviation.
+    dist, begun = policy.decide(context, state), policy.decide(context, first)
+    assert torch.equal(dist.mean, state.memo.mean)
+    assert torch.equal(dist.std, begun.std)
 
 
 def test_it_is_saved_and_loaded_by_folder(policy, batch, tmp_path):

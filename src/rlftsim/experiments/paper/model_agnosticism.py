@@ -34,7 +34,7 @@ def run(suite: ExperimentSuite) -> dict[str, Row]:
         model = one.recipe.model_name
         rows |= one.evaluate({f"{model}, {name}": row for name, row in specs.items()})
         # A model of tokens at temperature 0 always drives the same, which no metric of distributions is made for.
-        if not hasattr(load_policy(one.base()), "vocabulary"):
+        if one.recipe.tokens is None:
             rows |= {f"{model}, {name}{MEAN_ACTIONS}": _without_noise(one, name, row) for name, row in specs.items()}
     return rows
 
@@ -81,7 +81,7 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
         notes=(
             *(f"{one.recipe.model_name}: {one.budget}." for one in suites(suite)),
             f"Gains are tested at level {ALPHA:g}, scenarios paired.",
-            "Mean actions: rollouts without exploration noise, as the public TrafficBots code makes them.",
+            "Mean actions: rollouts at temperature 0, without exploration noise.",
         ),
         numbers={
             "rows": tables.numbers(rows.values(), SCORES),

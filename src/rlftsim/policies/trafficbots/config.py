@@ -65,7 +65,8 @@ class TrafficBotsConfig:
     input_drop: float = 0.1
     """In pre-training: probability that a map node or a history step is hidden."""
     prior_probability: float = 0.1
-    """In pre-training: probability that a micro batch draws personalities from the prior instead of the posterior."""
+    """In imitation, also beside rewards: probability that a micro batch draws personalities from the prior instead of
+    the posterior."""
     free_nats: float = 1.0
     """A personality's KL from the prior below which it is not pulled towards it."""
     forced_fractions: tuple[float, ...] = (0.3, 0.2, 0.1, 0.0)

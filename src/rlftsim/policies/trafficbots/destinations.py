@@ -97,13 +97,14 @@ class DestinationMap:
 
 
 @cached_on_scenario
-def destination_labels(scenario: Scenario, max_tokens: int | None, seed: int = 0) -> Int64[np.ndarray, "A"]:
+def destination_labels(scenario: Scenario, max_tokens: int | None) -> Int64[np.ndarray, "A"]:
     """Destination of each simulated agent at the end of its log; `NO_DESTINATION` where there is none.
+
+    The choice at forks depends on the scenario and the agent alone.
 
     Args:
         scenario: with its future.
         max_tokens: of `map_pieces`.
-        seed: of the choice at forks, which also depends on the scenario and the agent.
     """
     motions = agent_motions(scenario, TOTAL_STEPS)
     places = DestinationMap(map_pieces(scenario, max_tokens), _successors(scenario))
@@ -117,7 +118,7 @@ def destination_labels(scenario: Scenario, max_tokens: int | None, seed: int = 0
         )
         found = places.destinations(last, agent_class)
         if found:
-            key = derive_seed(seed, "destination", scenario.scenario_id, scenario.tracks.object_id[index])
+            key = derive_seed(0, "destination", scenario.scenario_id, scenario.tracks.object_id[index])
             rng = np.random.Generator(np.random.Philox(key=key))
             labels[agent] = rng.choice(list(found), p=np.array(list(found.values())) / sum(found.values()))
     return labels

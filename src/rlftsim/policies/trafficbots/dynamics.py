@@ -13,7 +13,6 @@ from rlftsim.geometry import heading_vector
 from rlftsim.policies.trafficbots.map_tokens import MapTokenType
 from rlftsim.policies.trafficbots.scene import Scene
 from rlftsim.scenario.types import STEP_S
-from rlftsim.tokens.vocabulary import table_on_device
 
 MAX_ACTION = ((5.0, 1.5), (7.0, 7.0), (6.0, 3.0))
 """Largest acceleration (m/s²) and yaw rate (rad/s) of vehicles, pedestrians and cyclists."""
@@ -23,7 +22,7 @@ LANE_REACHED_RAD = math.radians(30.0)
 
 def max_action(agent_class: Int64[Tensor, "*g"]) -> Float[Tensor, "*g 2"]:
     """Largest acceleration and yaw rate of each agent."""
-    return table_on_device(MAX_ACTION, agent_class.device)[agent_class]
+    return torch.tensor(MAX_ACTION, device=agent_class.device)[agent_class]
 
 
 def move(

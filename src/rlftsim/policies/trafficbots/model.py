@@ -37,8 +37,8 @@ class TrafficBotsModel(nn.Module):
     def fine_tuned_parts(self) -> tuple[nn.Module, ...]:
         """Everything that decides actions.
 
-        Map, lights, posterior and destination predictor stay as they are: personality and destination are drawn from
-        them once per rollout, and what is drawn must not depend on trained weights.
+        The destination predictor and the map stay as they are: destinations are drawn from them once per rollout, and
+        what is drawn must not depend on trained weights. Lights stay with the map; the posterior is of pre-training.
         """
         network = self.network
         destination = (network.destination_map, network.destination_pose, network.add_destination)
@@ -94,7 +94,7 @@ class TrafficBotsModel(nn.Module):
         """
         encoder = self.network.lights
         around = encoder.neighborhoods(scene, map_features)
-        window = scene.light_state[:, None, :, -encoder.window :]  # [B, 1, L, W]
+        window = scene.light_state[:, None, :, : encoder.window]  # [B, 1, L, W]
         if not scene.light_mask.any():
             return encoder(window, around).expand(-1, FUTURE_STEPS, -1, -1)
         features = []

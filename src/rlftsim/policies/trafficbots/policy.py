@@ -17,7 +17,7 @@ from torch import Tensor
 
 from rlftsim.goals.types import Goals
 from rlftsim.policies.distributions import GaussianDistribution
-from rlftsim.policies.trafficbots.config import LATENT_SIZE
+from rlftsim.policies.trafficbots.config import LATENT_SIZE, TrafficBotsConfig
 from rlftsim.policies.trafficbots.destinations import PEDESTRIAN
 from rlftsim.policies.trafficbots.dynamics import max_action
 from rlftsim.policies.trafficbots.imitation import imitation_loss
@@ -37,7 +37,6 @@ from rlftsim.rollout.policy import DecisionDistribution, ImitationLoss
 from rlftsim.rollout.types import AgentStates, Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import HISTORY_STEPS
-from rlftsim.tokens.vocabulary import table_on_device
 
 
 class TrafficBotsPolicy(TrafficBotsModel):
@@ -50,6 +49,15 @@ class TrafficBotsPolicy(TrafficBotsModel):
     steps_per_decision = 1
     noise_size = 2
     initial_noise_size = LATENT_SIZE + 1
+    noise_std: Tensor
+    """[3, 2] exploration noise of each class, before tanh."""
+
+    def __init__(self, config: TrafficBotsConfig):
+        super().__init__(config)
+        noise = torch.tensor([[config.noise_acceleration_mps2, config.noise_yaw_rate_radps]] * NUM_CLASSES)
+        if config.noise_pedestrian_yaw_rate_radps is not None:
+            noise[PEDESTRIAN, 1] = config.noise_pedestrian_yaw_rate_radps
+        self.register_buffer("noise_std", noise / max_action(torch.arange(NUM_CLASSES)), persistent=False)
 
     # ---- the policy interface -------------------------------------------------------------------------------------
 
@@ -254,15 +262,11 @@ class TrafficBotsPolicy(TrafficBotsModel):
         alive: Bool[Tensor, "B N A *T"],
     ) -> GaussianDistribution:
         """Distributions around means; noise goes on from the residual of the decision before, where it continues."""
-        config, agent_class = self.config, context.scene.agent_class
-        noise = [(config.noise_acceleration_mps2, config.noise_yaw_rate_radps)] * NUM_CLASSES
-        if config.noise_pedestrian_yaw_rate_radps is not None:
-            noise[PEDESTRIAN] = (config.noise_acceleration_mps2, config.noise_pedestrian_yaw_rate_radps)
-        by_agent = table_on_device(tuple(noise), mean.device)[agent_class] / max_action(agent_class)  # [B, A, 2]
+        agent_class = context.scene.agent_class
         shape = (len(agent_class), 1, agent_class.shape[1], *[1] * (mean.dim() - 4), 2)
-        std = by_agent.view(shape).expand_as(mean)
+        std = self.noise_std[agent_class].view(shape).expand_as(mean)
         if residual is not None and continues is not None:
-            rho = config.noise_correlation
+            rho = self.config.noise_correlation
             mean = mean + rho * torch.where(continues[..., None], residual, 0.0)
             std = torch.where(continues[..., None], std * math.sqrt(1 - rho**2), std)
         return GaussianDistribution(mean, std, alive)

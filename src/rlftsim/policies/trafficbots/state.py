@@ -69,7 +69,7 @@ class Traffic:
     windows: Windows
     """[B, N, A, W]. An agent that has ended goes on in them, marked as not valid."""
     alive: Bool[Tensor, "B N A"]
-    """False = padding, or has left the map: it decides nothing any more and keeps its speed and heading."""
+    """False = padding, or has left the map: it goes on straight ahead and decides nothing until it is put somewhere."""
     destination: Int64[Tensor, "B N A"]
     active: Bool[Tensor, "B N A"]
     """False = there is no destination, or it has been reached."""
@@ -95,13 +95,14 @@ class Traffic:
             now.pose[..., -1, :], now.motion[..., -1, 0], action, max_action(scene.agent_class)[:, None]
         )
         # Both rules look at the pose that the action leads to, also where another one is imposed.
-        active = self.active & ~reaches_destination(pose, self.destination.clamp(min=0), scene)
+        # One that has left the map may be put back onto it, and has reached nothing meanwhile.
+        reached = self.alive & reaches_destination(pose, self.destination.clamp(min=0), scene)
         ended = leaves_map(pose, scene)
         for kept in (staying, None if imposed is None else imposed.mask):
             ended = ended if kept is None else ended & ~kept
         alive = self.alive & ~ended
         if imposed is not None:
-            alive = alive | imposed.mask  # also one that had left the map before
+            alive = alive | (imposed.mask & scene.agent_mask[:, None])  # also one that had left the map before
             pose = torch.where(imposed.mask[..., None], imposed.pose, pose)
             motion = torch.where(imposed.mask[..., None], imposed.motion, motion)
         windows = Windows(
@@ -109,7 +110,7 @@ class Traffic:
             torch.cat([now.pose[..., 1:, :], pose[..., None, :]], -2),
             torch.cat([now.motion[..., 1:, :], motion[..., None, :]], -2),
         )
-        return replace(self, windows=windows, alive=alive, active=active)
+        return replace(self, windows=windows, alive=alive, active=self.active & ~reached)
 
 
 def traffic_at_start(scene: Scene, destination: Int64[Tensor, "B N A"]) -> Traffic:
