@@ -195,5 +195,5 @@ def _in_words(hint: Any) -> str:
         kinds = get_args(hint)
         if get_origin(kinds[0]) is Literal:
             return f"{_in_words(kinds[0])}, or several of them in a list"
-        return "a list" if ... in kinds else f"{len(kinds)} numbers"
+        return f"a list, each {_in_words(kinds[0])}" if ... in kinds else f"{len(kinds)} numbers"
     return _WORDS.get(hint) or f"a {hint.__name__}"

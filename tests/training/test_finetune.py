@@ -469,6 +469,22 @@ def test_a_policy_without_weights_is_refused(drawn_scenarios, tmp_path):
         finetune(ConstantVelocity(), drawn_scenarios, tmp_path, tiny.FINETUNE)
 
 
+def test_parts_that_a_policy_does_not_have_are_refused_before_the_folder_is_claimed(
+    vocabulary, drawn_scenarios, tmp_path
+):
+    policy = tiny.tiny_policy(vocabulary)
+    with pytest.raises(ConfigError, match="trained=goals, but"):
+        finetune(policy, drawn_scenarios, tmp_path / "run", replace(tiny.FINETUNE, trained="goals"))
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_run_says_that_its_first_update_has_no_reward(vocabulary, drawn_scenarios, tmp_path, capsys, reward_of):
+    reward = reward_of(lambda realism, rollouts, batch: realism.single_meta_metric * torch.nan)
+    config = replace(tiny.FINETUNE, reward=reward, epochs=1e-3)
+    finetune(tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path, config)
+    assert "update 1, no reward reached a trained weight" in capsys.readouterr().err
+
+
 def test_no_scenario_is_refused(vocabulary, tmp_path):
     with pytest.raises(ConfigError, match="no scenario to train on"):
         finetune(tiny.tiny_policy(vocabulary), [], tmp_path, tiny.FINETUNE)

@@ -18,7 +18,7 @@ from rlftsim.progress import log, progress_bar
 from rlftsim.rollout.files import write_rollouts
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import Sampling, device_of, is_goal_conditioned
-from rlftsim.rollout.simulate import simulate
+from rlftsim.rollout.simulate import refuse_sampling, simulate
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.open import open_dataset, refuse_unknown
 
@@ -93,6 +93,7 @@ class Simulate:
                 warn_of_doubts(entries, scenarios.by_id(scenario_id))
             elif given.goals:
                 log.info(f"  scenario {scenario_id} has no goals: it is simulated without.")
+        refuse_sampling(policy, scenarios, sampling)
         # 2. describe the rollouts; a folder of other rollouts is refused
         about = {
             "model": self.model,

@@ -108,6 +108,8 @@ class Pretrain(RecipeVerb):
                 f"recipe {self.recipe} needs a vocabulary: build one with `rlftsim tokens`, then name it with "
                 "--vocabulary, or train a model further with --init-from."
             )
+        if self.vocabulary is not None and recipe.tokens is None:
+            raise ConfigError(f"recipe {self.recipe} makes a model without a vocabulary: leave --vocabulary out.")
         scenarios = open_dataset(self.data, self.split)
         vocabulary = Vocabulary.load(self.vocabulary) if self.vocabulary else None
         held_out = _held_out(self.data, self.validation_split, recipe.pretrain.validation.every)

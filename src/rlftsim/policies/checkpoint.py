@@ -14,7 +14,7 @@ import difflib
 import json
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -65,16 +65,31 @@ class StoredModel:
         """Call a class with the stored settings as keyword arguments.
 
         Raises:
-            CheckpointError: settings that it does not take, or takes in other types.
+            CheckpointError: settings that it does not take, takes in other types, or cannot do without.
         """
         # JSON has lists where settings have tuples.
         settings = {name: tuple(v) if isinstance(v, list) else v for name, v in self.config.items()}
+        file = self.folder / CONFIG
+        kind: Any = make
+        if is_dataclass(kind):
+            names, added = {one.name for one in fields(kind)}, getattr(kind, "added_fields", {})
+            # A default in place of a value that is not there would make another model of the same weights.
+            lacking, unknown = names - settings.keys() - added.keys(), settings.keys() - names
+            if lacking:
+                raise CheckpointError(f"{file}: settings are missing ({', '.join(sorted(lacking))}): write it again.")
+            if unknown:
+                raise CheckpointError(
+                    f"{file}: unknown settings ({', '.join(sorted(unknown))}): of a newer version, or a slip; upgrade "
+                    "rlftsim or take them out."
+                )
         try:
             return make(**settings)
+        except ConfigError as error:
+            raise CheckpointError(f"{file}: {error}") from None
         except TypeError as error:
             # a wrong call, not a damaged file: the folder may be of a newer version, or was edited
             cause = " ".join(str(error).split())
-            raise CheckpointError(f"{self.folder / CONFIG}: settings do not fit {make.__name__} ({cause}).") from error
+            raise CheckpointError(f"{file}: settings do not fit {make.__name__} ({cause}).") from error
 
     def load(self, make: Callable[..., Loaded]) -> Loaded:
         """Build a policy from the stored settings and load its weights, if it has any.

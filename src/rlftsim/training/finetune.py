@@ -33,6 +33,7 @@ from rlftsim.training.freezing import (
     parameter_groups,
     refuse_constant_entropy,
     set_learning_rate,
+    trained_parts,
 )
 from rlftsim.training.goals import GoalConfig, StoredGoals, refuse_goals
 from rlftsim.training.hindsight import accumulate_hindsight, goal_terms
@@ -163,6 +164,7 @@ def finetune(
     """
     scenarios = as_scenarios(scenarios)
     model = require_trainable(policy, scenarios, "rewards", imitated=config.imitation_weight > 0)
+    trained_parts(model, config.trained)  # refuses what the policy does not have, before the folder is claimed
     refuse_goals(policy, config.goals.probability)
     augmented = config.goals.open_augmented(scenarios)
     if config.entropy_bonus:
@@ -181,6 +183,8 @@ def finetune(
             batch = run.local_batch(learner.update).to(fabric.device)
             values = update_policy(learner, batch, config, fabric)
             levels, alarms = learner.alarms.watch(values, config.alarms)
+            if learner.update == 1 and (values["reward_zero_rate"] == 1 or values["gradient_norm"] == 0):
+                alarms.append(f"no reward reached a trained weight (RMM {values['rmm']:.3f})")
             cause = f"KL {values['kl']:.3g} nats per decision is above max_kl={config.max_kl:g}"
             if not math.isfinite(values["gradient_norm"]):
                 cause = "its gradient is not finite"

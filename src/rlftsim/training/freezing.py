@@ -16,11 +16,11 @@ from rlftsim.training.goals import not_conditioned
 TrainedParts = Literal["decoder", "head", "goals", "all"]
 
 
-def freeze_untrained(policy: nn.Module, trained: TrainedParts) -> None:
-    """Require a gradient of the weights that are trained, and of no others.
+def trained_parts(policy: nn.Module, trained: TrainedParts) -> tuple[nn.Module, ...]:
+    """The parts of a policy that are trained.
 
     Args:
-        policy: changed in place.
+        policy: any.
         trained: "decoder" = the parts that the policy names in `fine_tuned_parts`, all of it where it names none.
             "head" = what it names in `head_parts`, its last layers. "goals" = the goal encoder only, so that agents
             without a goal go on deciding as before. "all" = everything.
@@ -43,6 +43,20 @@ def freeze_untrained(policy: nn.Module, trained: TrainedParts) -> None:
     else:
         named = getattr(policy, "fine_tuned_parts", None)
         parts = (policy,) if trained == "all" or named is None else named()
+    return parts
+
+
+def freeze_untrained(policy: nn.Module, trained: TrainedParts) -> None:
+    """Require a gradient of the weights that are trained, and of no others.
+
+    Args:
+        policy: changed in place.
+        trained: see `trained_parts`.
+
+    Raises:
+        ConfigError: of `trained_parts`.
+    """
+    parts = trained_parts(policy, trained)
     # First nothing, then the parts: a run that trained other parts before leaves no trace.
     policy.requires_grad_(False)
     for part in parts:
@@ -55,7 +69,7 @@ def refuse_constant_entropy(policy: nn.Module, scenario: Scenario, trained: Trai
     Args:
         policy: left as it is.
         scenario: to decide in once.
-        trained: see `freeze_untrained`.
+        trained: see `trained_parts`.
 
     Raises:
         ConfigError: the entropy of its decisions has no gradient.

@@ -1,6 +1,7 @@
 """TrafficBots as a policy: the contract, the noise, the draws, and scenes without one thing or another."""
 
 import copy
+import json
 import math
 from dataclasses import replace
 
@@ -286,9 +287,17 @@ def test_it_is_saved_and_loaded_by_folder(policy, batch, tmp_path):
     again = load_policy(tmp_path / "model")
     assert again.config == TINY
     assert all(torch.equal(v, again.state_dict()[k]) for k, v in policy.state_dict().items())
-    (tmp_path / "model" / "config.json").write_text('{"architecture": "trafficbots", "dim": 48}')
-    with pytest.raises(CheckpointError, match="weights do not fit this model"):
-        load_policy(tmp_path / "model")
+    config = json.loads((tmp_path / "model" / "config.json").read_text())
+    lacking = {k: v for k, v in config.items() if k not in ("noise_correlation", "noise_pedestrian_yaw_rate_radps")}
+    for change, words in (
+        (config | {"dim": 48}, "weights do not fit this model"),
+        (config | {"num_head": 2}, r"unknown settings \(num_head\)"),
+        (config | {"noise_acceleration_mps2": -1}, r"config.json: noise_acceleration_mps2 must be positive, got -1"),
+        (lacking, r"settings are missing \(noise_correlation\)"),  # the other one was added later
+    ):
+        (tmp_path / "model" / "config.json").write_text(json.dumps(change))
+        with pytest.raises(CheckpointError, match=words):
+            load_policy(tmp_path / "model")
 
 
 @pytest.mark.parametrize(
@@ -296,7 +305,8 @@ def test_it_is_saved_and_loaded_by_folder(policy, batch, tmp_path):
     [
         ({"dim": 40}, "multiple of 16"),
         ({"noise_correlation": 1.0}, r"noise_correlation is in \[0, 1\)"),
-        ({"forced_fractions": (1.5,)}, "forced_fractions are fractions"),
+        ({"forced_fractions": ()}, r"one or more fractions in \[0, 1\], got \(\)"),
+        ({"forced_fractions": (1.5,)}, "forced_fractions are one or more fractions"),
     ],
 )
 def test_wrong_sizes_are_refused(changes, message):

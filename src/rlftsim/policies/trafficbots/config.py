@@ -95,7 +95,7 @@ class TrafficBotsConfig:
         if not 0 <= self.prior_probability <= 1:
             raise ConfigError(f"prior_probability is in [0, 1], got {self.prior_probability}.")
         if not self.forced_fractions or not all(0 <= one <= 1 for one in self.forced_fractions):
-            raise ConfigError(f"forced_fractions are fractions in [0, 1], got {self.forced_fractions}.")
+            raise ConfigError(f"forced_fractions are one or more fractions in [0, 1], got {self.forced_fractions}.")
 
 
 def trafficbots_v15() -> TrafficBotsConfig:
