@@ -82,6 +82,30 @@ def test_mean_actions_differ_by_draws_alone(policy, batch):
         state = policy.advance(context, state, taken)
 
 
+def test_along_its_own_rollouts_a_policy_with_a_trained_head_computes_no_features_again(batch, monkeypatch):
+    torch.manual_seed(0)
+    learner = TrafficBotsPolicy(TINY).eval()
+    reference = copy.deepcopy(learner).requires_grad_(False)
+    freeze_untrained(learner, "head")
+    with torch.no_grad():
+        context = learner.encode(batch)
+        others = simulate(learner, batch, num_rollouts=2, seed=1, context=context)
+        rollouts = simulate(learner, batch, num_rollouts=2, seed=0, context=context)
+    counted = []
+    features = learner.network.features
+    monkeypatch.setattr(learner.network, "features", lambda *inputs: counted.append(1) or features(*inputs))
+    for number, one in enumerate((rollouts, others, rollouts.select(slice(0, 1)))):
+        own = learner.encode_like(batch, context)
+        dist, ref_dist = learner.score_both(own, one, reference, reference.encode_like(batch, context), one)
+        assert bool(counted) == (number > 0)  # others than those of the record, or a part of them
+        assert torch.allclose(dist.log_prob(one.decision), one.log_prob, atol=1e-4)
+        assert torch.allclose(ref_dist.mean, dist.mean, atol=1e-6)
+    # A policy that has learned other features has no use for the record.
+    with torch.no_grad():
+        next(learner.network.agents.parameters()).add_(0.1)
+    assert learner.encode_like(batch, replace(context, model=reference)).record is not context.record
+
+
 @torch.no_grad()
 def test_the_noise_has_its_size_and_correlation(policy, batch):
     rollouts = simulate(policy, batch, num_rollouts=8, seed=1)

@@ -67,6 +67,11 @@ class TrafficBotsModel(nn.Module):
         """
         return self._shares(other, lambda name: not name.startswith("actions."))
 
+    @property
+    def trains_actions_alone(self) -> bool:
+        """True if weights behind the agents' features require a gradient, and none before them."""
+        return self.has_features_of(self) and any(w.requires_grad for w in self.network.actions.parameters())
+
     def _shares(self, other: nn.Module, belongs: Callable[[str], bool]) -> bool:
         """True if the weights of such names are frozen alike, and nothing is dropped out."""
         if type(other) is not type(self) or self.config != other.config or self.training or other.training:

@@ -27,6 +27,7 @@ from rlftsim.policies.trafficbots.scene import build_scene
 from rlftsim.policies.trafficbots.scoring import features_over_time
 from rlftsim.policies.trafficbots.state import (
     Memo,
+    Record,
     TrafficBotsContext,
     TrafficBotsState,
     imposed_after,
@@ -170,14 +171,16 @@ class TrafficBotsPolicy(TrafficBotsModel):
         if not isinstance(context, TrafficBotsContext) or not self.sees_as(context.model):
             return self.encode(scenarios)
         around = self.network.agents.context(context.map_features, context.light_features)
-        return replace(context, around=around, model=self)
+        record = context.record if self.has_features_of(context.model) else Record()
+        return replace(context, around=around, model=self, record=record)
 
     def score_both(
         self, context: TrafficBotsContext, rollouts: Rollouts, reference: Any, ref_context: Any, ref_rollouts: Rollouts
     ) -> tuple[GaussianDistribution, DecisionDistribution]:
         """Distributions along rollouts of this policy and, without gradient, of a reference.
 
-        The features of agents are computed once where only `actions` differs.
+        The features of agents are computed once where only `actions` differs, and not at all along rollouts that the
+        context has a record of.
 
         Args:
             context: of this policy.
@@ -192,7 +195,8 @@ class TrafficBotsPolicy(TrafficBotsModel):
                 return dist, reference.score(ref_context, ref_rollouts)
         replay = self._replay(context, rollouts)
         with torch.no_grad():
-            features = self._features(context, replay)
+            features = context.record.along(replay)
+            features = self._features(context, replay) if features is None else features
             ref_dist = reference._scored(ref_context, replay, rollouts.decision, features)
         return self._scored(context, replay, rollouts.decision, features), ref_dist
 
@@ -251,6 +255,8 @@ class TrafficBotsPolicy(TrafficBotsModel):
             windows, around = traffic.windows.as_one_decision(), context.around.steps(index, index + 1)
             features = self.network.features(windows, context.scene, around, state.given, traffic.active[:, None])
             state.memo.mean = mean = self.network.mean_actions(features, context.scene)[:, 0]
+            if self.trains_actions_alone:
+                context.record.add(state, features)
         return mean
 
     def _distribution(
