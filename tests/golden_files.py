@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 
 
 @dataclass(frozen=True)
@@ -16,6 +17,10 @@ class Golden:
     def arrays(self, name: str) -> dict[str, np.ndarray]:
         with np.load(self.folder / f"{name}.npz") as file:
             return dict(file)
+
+    def unit(self, group: str) -> dict[str, torch.Tensor]:
+        """Arrays of a group of `unit`, by their names in it."""
+        return {k.split("/", 1)[1]: torch.from_numpy(v) for k, v in self.arrays("unit").items() if k.startswith(group)}
 
     def scalars(self, name: str) -> dict:
         return json.loads((self.folder / "scalars.json").read_text())[name]

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import torch
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 
 from rlftsim.policies.token_rows import TokenRows, row_statistics
@@ -157,6 +157,12 @@ class LazyTokenDistribution(CategoricalDistribution):
         return DecisionStatistics(*(self._dense(values) for values in found))
 
 
+def standard_normal(noise: Float[Tensor, "*shape"]) -> Float64[Tensor, "*shape"]:
+    """Draws of N(0, 1), by the inverse of its cumulative distribution at noise that is uniform in [0, 1)."""
+    # The noise is a multiple of 2^-24: kept from 0, where the inverse is infinite, by half of that.
+    return math.sqrt(2) * torch.erfinv(2 * noise.clamp(min=2**-25).double() - 1)
+
+
 @dataclass(frozen=True, eq=False)
 class GaussianDistribution:
     """Diagonal Gaussians, float32. Elements whose mask is False (padding) decide 0 with probability 1."""
@@ -177,8 +183,7 @@ class GaussianDistribution:
             ConfigError: `sampling.top_k` is set, and there are no categories.
         """
         refuse_top_k(sampling)
-        # The noise is a multiple of 2^-24: kept from 0, where the inverse is infinite, by half of that.
-        drawn = math.sqrt(2 * sampling.temperature) * torch.erfinv(2 * noise.clamp(min=2**-25).double() - 1)
+        drawn = math.sqrt(sampling.temperature) * standard_normal(noise)
         return self._masked(self.mean + self.std * drawn.to(self.mean.dtype))
 
     def log_prob(

@@ -26,10 +26,6 @@ def gap(ours, theirs):
     return float(torch.where(same, 0.0, ours - theirs).abs().max())
 
 
-def unit(golden, group):
-    return {k.split("/", 1)[1]: torch.from_numpy(v) for k, v in golden.arrays("unit").items() if k.startswith(group)}
-
-
 def count(module):
     return sum(p.numel() for p in module.parameters())
 
@@ -166,7 +162,7 @@ def test_the_default_size(golden, default, scene):
 
 @pytest.mark.parametrize("kind", ["vehicle", "pedestrian", "cyclist"])
 def test_dynamics(golden, kind):
-    theirs = unit(golden, f"dynamics/{kind}")
+    theirs = golden.unit(f"dynamics/{kind}")
     theirs = {k.split("/")[1]: v for k, v in theirs.items()}
     limit = max_action(torch.tensor(["vehicle", "pedestrian", "cyclist"].index(kind)))
     pose, speed = theirs["pose0"], theirs["motion0"][:, 0]
@@ -191,12 +187,12 @@ def test_a_constant_action_follows_the_closed_form():
 
 
 def test_pose_embeddings_segments_and_neighbors(golden):
-    theirs = unit(golden, "pose_embedding")
+    theirs = golden.unit("pose_embedding")
     for size in (32, 64, 128):
         assert gap(pose_embedding(theirs["pose"], size), theirs[f"out{size}"]) <= 1e-6
-    theirs = unit(golden, "segment")
+    theirs = golden.unit("segment")
     assert gap(segment_features(theirs["pose"]), theirs["out"]) <= 2e-5
-    theirs = unit(golden, "relative")
+    theirs = golden.unit("relative")
     assert gap(relative_pose(theirs["target"][None], theirs["source"][:, None]), theirs["pose"]) <= 2e-5
     found = find_neighbors(
         theirs["source"][None], theirs["target"][None], ~theirs["target_invalid"][None], count=6, radius_m=45.0, size=16
@@ -207,7 +203,7 @@ def test_pose_embeddings_segments_and_neighbors(golden):
 
 
 def test_attention(golden):
-    theirs = unit(golden, "attention")
+    theirs = golden.unit("attention")
     attention = PoseAttention(64, 4, dropout=0.0)
     own = {k.removeprefix("weights/"): v for k, v in theirs.items() if k.startswith("weights/")}
     for part, rows in ((attention.query, slice(0, 64)), (attention.key_value, slice(64, None))):
@@ -225,7 +221,7 @@ def test_attention(golden):
 
 
 def test_polylines(golden):
-    theirs = unit(golden, "polyline")
+    theirs = golden.unit("polyline")
     encoder = PolylineEncoder(64, dropout=0.0)
     own = {k.removeprefix("weights/mlp_").replace("fc_layers.0.", ""): v for k, v in theirs.items() if "weights" in k}
     encoder.load_state_dict(own)
@@ -235,7 +231,7 @@ def test_polylines(golden):
 
 
 def test_rules(golden, scene):
-    theirs, packed = unit(golden, "rules"), golden.arrays("scenario_A/preprocessed")
+    theirs, packed = golden.unit("rules"), golden.arrays("scenario_A/preprocessed")
     heading = np.arctan2(packed["map_dir"][..., 1], packed["map_dir"][..., 0])
     scene = replace(
         scene("A"),

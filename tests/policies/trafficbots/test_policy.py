@@ -316,7 +316,7 @@ def test_it_is_saved_and_loaded_by_folder(policy, batch, tmp_path):
     for change, words in (
         (config | {"dim": 48}, "weights do not fit this model"),
         (config | {"num_head": 2}, r"unknown settings \(num_head\)"),
-        (config | {"noise_acceleration_mps2": -1}, r"config.json: noise_acceleration_mps2 must be positive, got -1"),
+        (config | {"noise_acceleration_mps2": -1.0}, r"config.json: noise_acceleration_mps2 must be positive, got -1"),
         (lacking, r"settings are missing \(noise_correlation\)"),  # the other one was added later
     ):
         (tmp_path / "model" / "config.json").write_text(json.dumps(change))

@@ -12,10 +12,6 @@ pytestmark = [pytest.mark.official, pytest.mark.usefixtures("without_gradients")
 TERMS = ("imitation", "personality", "destination", "light")
 
 
-def unit(golden, group):
-    return {k.split("/", 1)[1]: torch.from_numpy(v) for k, v in golden.arrays("unit").items() if k.startswith(group)}
-
-
 @pytest.mark.parametrize(("name", "case"), [("A", "default"), ("A", "free"), ("B", "default")])
 def test_loss_and_every_gradient(golden, small, scene, name, case):
     theirs, numbers = golden.arrays(f"scenario_{name}/train_{case}"), golden.scalars("train")[f"{name}_{case}"]
@@ -50,11 +46,11 @@ def test_loss_and_every_gradient(golden, small, scene, name, case):
 
 
 def test_terms_of_a_step_and_of_the_personality(golden):
-    theirs = unit(golden, "imitation")
+    theirs = golden.unit("imitation")
     found = imitation_terms(theirs["pose"], theirs["speed"], theirs["gt_pose"], theirs["gt_speed"])
     for ours, name in zip(found, ("pos", "rot", "speed")):
         np.testing.assert_allclose(ours, theirs[f"loss_{name}"], atol=2e-6)
-    theirs = unit(golden, "kl")
+    theirs = golden.unit("kl")
     np.testing.assert_allclose(personality_kl(theirs["mean"], theirs["log_std"], 1.0), theirs["loss"], rtol=1e-5)
 
 

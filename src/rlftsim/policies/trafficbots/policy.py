@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from rlftsim.goals.types import Goals
-from rlftsim.policies.distributions import GaussianDistribution
+from rlftsim.policies.distributions import GaussianDistribution, standard_normal
 from rlftsim.policies.trafficbots.config import LATENT_SIZE, TrafficBotsConfig
 from rlftsim.policies.trafficbots.destinations import PEDESTRIAN
 from rlftsim.policies.trafficbots.dynamics import max_action
@@ -86,8 +86,7 @@ class TrafficBotsPolicy(TrafficBotsModel):
             repeated = cumulative.expand(-1, num_rollouts, -1, -1).contiguous()
             index = torch.searchsorted(repeated, level, right=True).clamp(max=log_prob.shape[-1] - 1)
             index = torch.where(total > 0, index, -1)
-            uniform = noise[..., :LATENT_SIZE].clamp(min=2**-25).double()
-            personality = math.sqrt(2) * torch.erfinv(2 * uniform - 1)
+            personality = standard_normal(noise[..., :LATENT_SIZE])
         return self.start(context, torch.cat([personality, index], -1).float())
 
     def start(self, context: TrafficBotsContext, draws: Float[Tensor, "B N A 17"]) -> TrafficBotsState:
