@@ -69,27 +69,15 @@ class StoredModel:
         """
         # JSON has lists where settings have tuples.
         settings = {name: tuple(v) if isinstance(v, list) else v for name, v in self.config.items()}
-        file = self.folder / CONFIG
         kind: Any = make
-        if is_dataclass(kind):
-            names, added = {one.name for one in fields(kind)}, getattr(kind, "added_fields", {})
-            # A default in place of a value that is not there would make another model of the same weights.
-            lacking, unknown = names - settings.keys() - added.keys(), settings.keys() - names
-            if lacking:
-                raise CheckpointError(f"{file}: settings are missing ({', '.join(sorted(lacking))}): write it again.")
-            if unknown:
-                raise CheckpointError(
-                    f"{file}: unknown settings ({', '.join(sorted(unknown))}): of a newer version, or a slip; upgrade "
-                    "rlftsim or take them out."
-                )
         try:
+            if is_dataclass(kind):
+                _require_same_names(settings, kind)
             return make(**settings)
-        except ConfigError as error:
-            raise CheckpointError(f"{file}: {error}") from None
-        except TypeError as error:
+        except (ConfigError, TypeError) as error:
             # a wrong call, not a damaged file: the folder may be of a newer version, or was edited
             cause = " ".join(str(error).split())
-            raise CheckpointError(f"{file}: settings do not fit {make.__name__} ({cause}).") from error
+            raise CheckpointError(f"{self.folder / CONFIG}: settings do not fit {make.__name__} ({cause}).") from error
 
     def load(self, make: Callable[..., Loaded]) -> Loaded:
         """Build a policy from the stored settings and load its weights, if it has any.
@@ -101,6 +89,19 @@ class StoredModel:
         if isinstance(policy, nn.Module):
             load_strictly(policy, self.read_weights(), source=str(self.folder))
         return policy
+
+
+def _require_same_names(settings: Mapping[str, Any], kind: Any) -> None:
+    """Refuse settings that a dataclass does not have, or that are missing though they were stored from the first."""
+    names = {one.name for one in fields(kind)}
+    # A default in place of a value that is not there would make another model of the same weights.
+    missing = sorted(names - settings.keys() - getattr(kind, "added_fields", {}).keys())
+    unknown = sorted(settings.keys() - names)
+    if missing or unknown:
+        raise ConfigError(
+            f"missing: {', '.join(missing) or 'none'}; unknown: {', '.join(unknown) or 'none'}; upgrade rlftsim if the "
+            "folder is of a newer version, else write it again"
+        )
 
 
 def save_model(

@@ -315,9 +315,12 @@ def test_it_is_saved_and_loaded_by_folder(policy, batch, tmp_path):
     lacking = {k: v for k, v in config.items() if k not in ("noise_correlation", "noise_pedestrian_yaw_rate_radps")}
     for change, words in (
         (config | {"dim": 48}, "weights do not fit this model"),
-        (config | {"num_head": 2}, r"unknown settings \(num_head\)"),
-        (config | {"noise_acceleration_mps2": -1.0}, r"config.json: noise_acceleration_mps2 must be positive, got -1"),
-        (lacking, r"settings are missing \(noise_correlation\)"),  # the other one was added later
+        (config | {"num_head": 2}, r"missing: none; unknown: num_head"),
+        (
+            config | {"noise_acceleration_mps2": -1.0},
+            r"config.json: .*noise_acceleration_mps2 must be pos.*got -1",
+        ),
+        (lacking, r"missing: noise_correlation; unknown: none"),  # the other one was added later
     ):
         (tmp_path / "model" / "config.json").write_text(json.dumps(change))
         with pytest.raises(CheckpointError, match=words):

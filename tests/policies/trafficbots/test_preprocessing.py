@@ -14,13 +14,7 @@ from rlftsim.policies.trafficbots.destinations import (
     _successors,
     destination_labels,
 )
-from rlftsim.policies.trafficbots.map_tokens import (
-    UNKNOWN_LIGHT,
-    cut_line,
-    light_tokens,
-    map_pieces,
-    sides_of_polygon,
-)
+from rlftsim.policies.trafficbots.map_tokens import cut_line, light_tokens, map_pieces, sides_of_polygon
 from rlftsim.policies.trafficbots.scene import build_scene
 from rlftsim.policies.trafficbots.tracks import agent_motions
 from rlftsim.scenario.batch import collate
@@ -50,6 +44,7 @@ def test_map_tokens_are_the_packed_ones(golden, records, name):
 def test_lights_are_the_packed_ones(golden, records, name):
     ours, theirs = light_tokens(records(name), of_history=False), packed(golden, name)
     assert np.array_equal(ours.token, theirs["tl_token"])
+    assert np.array_equal(ours.observed, theirs["tl_valid"])
     assert np.array_equal(ours.state, np.maximum(theirs["tl_state"], 0))
 
 
@@ -142,7 +137,7 @@ def test_tokens_far_from_the_agents_go_first_where_there_are_too_many():
 
 def test_lights_first_seen_after_the_current_step_are_left_out():
     scenario = scenes.junction_with_light()
-    assert (light_tokens(scenario).state != UNKNOWN_LIGHT).all()
+    assert light_tokens(scenario).observed.all()
     later = scenario.lights.step >= HISTORY_STEPS
     lights = LightStates(**{k: v[later] for k, v in vars(scenario.lights).items()})
     late = replace(scenario, lights=lights)

@@ -107,6 +107,7 @@ class LightTokens:
 
     token: Int64[np.ndarray, "L"]
     """Index of the map token."""
+    observed: Bool[np.ndarray, "L S"]
     state: Int64[np.ndarray, "L S"]
     """0 unknown or not observed, 1 stop, 2 caution, 3 go, 4 flashing."""
 
@@ -210,7 +211,7 @@ def light_tokens(scenario: Scenario, max_tokens: int | None = 1024, *, of_histor
         of_history: leave out lights that were not observed up to the current step, as a simulation must.
     """
     lights, pieces = scenario.lights, map_pieces(scenario, max_tokens)
-    tokens, states = [], []
+    tokens, observed, states = [], [], []
     for lane in np.unique(lights.lane_id):
         own = (lights.lane_id == lane) & (lights.step < scenario.num_steps)
         seen, state = np.zeros(scenario.num_steps, bool), np.full(scenario.num_steps, UNKNOWN_LIGHT)
@@ -220,8 +221,12 @@ def light_tokens(scenario: Scenario, max_tokens: int | None = 1024, *, of_histor
             continue
         for token in np.flatnonzero(pieces.feature_id == lane):
             tokens.append(token)
+            observed.append(seen)
             states.append(state)
-    return LightTokens(np.array(tokens, np.int64), np.array(states, np.int64).reshape(len(tokens), scenario.num_steps))
+    shape = (len(tokens), scenario.num_steps)
+    return LightTokens(
+        np.array(tokens, np.int64), np.array(observed, bool).reshape(shape), np.array(states, np.int64).reshape(shape)
+    )
 
 
 def _fill(mask: Bool[np.ndarray, "M 20"], pieces: list[np.ndarray]) -> Float64[np.ndarray, "M 20 3"]:

@@ -18,6 +18,36 @@ from rlftsim.rollout.types import AgentStates
 from rlftsim.scenario.types import STEP_S
 
 
+@dataclass(eq=False)
+class Record:
+    """Features of agents along rollouts as they were made, so that scoring need not compute them again."""
+
+    states: list["TrafficBotsState"] = field(default_factory=list)
+    features: list[Float[Tensor, "B 1 N A D"]] = field(default_factory=list)
+
+    def add(self, state: "TrafficBotsState", features: Float[Tensor, "B 1 N A D"]) -> None:
+        """Add the next decision; a first one begins anew.
+
+        Args:
+            state: before the decision.
+            features: of the agents in it.
+        """
+        if state.num_decisions == 0:
+            self.states, self.features = [], []
+        if state.num_decisions == len(self.states):
+            self.states.append(replace(state, before=None))
+            self.features.append(features)
+
+    def along(self, states: Sequence["TrafficBotsState"]) -> Float[Tensor, "B T N A D"] | None:
+        """Features at T decisions, if these states are the recorded ones."""
+        if len(self.states) != len(states) or not torch.equal(self.states[0].draws, states[0].draws):
+            return None
+        for own, one in zip(self.states, states):
+            if not torch.equal(own.traffic.windows.pose[..., -1, :], one.traffic.windows.pose[..., -1, :]):
+                return None
+        return torch.cat(self.features, 1)
+
+
 @dataclass(frozen=True, eq=False)
 class TrafficBotsContext:
     """Everything about a scene that agents do not change."""
@@ -30,7 +60,7 @@ class TrafficBotsContext:
     """Map, and lights at all decisions."""
     model: nn.Module
     """The model that made it."""
-    record: "Record" = field(default_factory=lambda: Record(), repr=False)
+    record: Record = field(default_factory=Record, repr=False)
     """Of the last rollouts, while only the layers behind the agents' features are trained."""
 
 
@@ -152,36 +182,6 @@ class Memo:
     """The network's result in a state, so that it is computed once."""
 
     mean: Float[Tensor, "B N A 2"] | None = None
-
-
-@dataclass(eq=False)
-class Record:
-    """Features of agents along rollouts as they were made, so that scoring need not compute them again."""
-
-    states: list["TrafficBotsState"] = field(default_factory=list)
-    features: list[Float[Tensor, "B 1 N A D"]] = field(default_factory=list)
-
-    def add(self, state: "TrafficBotsState", features: Float[Tensor, "B 1 N A D"]) -> None:
-        """Add the next decision; a first one begins anew.
-
-        Args:
-            state: before the decision.
-            features: of the agents in it.
-        """
-        if state.num_decisions == 0:
-            self.states, self.features = [], []
-        if state.num_decisions == len(self.states):
-            self.states.append(replace(state, before=None))
-            self.features.append(features)
-
-    def along(self, states: Sequence["TrafficBotsState"]) -> Float[Tensor, "B T N A D"] | None:
-        """Features at T decisions, if these states are the recorded ones."""
-        if len(self.states) != len(states) or not torch.equal(self.states[0].draws, states[0].draws):
-            return None
-        for own, one in zip(self.states, states):
-            if not torch.equal(own.traffic.windows.pose[..., -1, :], one.traffic.windows.pose[..., -1, :]):
-                return None
-        return torch.cat(self.features, 1)
 
 
 @dataclass(frozen=True, eq=False)
