@@ -11,16 +11,17 @@ from rlftsim.cli.main import VERBS, main
 from rlftsim.cli.mistakes import FLAG
 
 OVERVIEW_SECONDS = 0.3
-VERB_SECONDS = 1.5
+VERB_SHARE = 0.8
+"""Of the time that importing torch takes on this processor, measured in the same run."""
 ACTIONS = {"data": ["verify"], "goals": ["propose"], "model": ["import"]}
 """Verbs whose flags are those of an action."""
 
 
 def run_for(*arguments: str) -> tuple[float, str]:
-    """Processor time of a command in seconds (user and system), and its output."""
+    """Processor time of the interpreter with these arguments in seconds (user and system), and its output."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    command = [sys.executable, "-m", "rlftsim", *arguments]
+    command = [sys.executable, *arguments]
     output = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, output
@@ -30,8 +31,14 @@ def shortest(*arguments: str, limit: float) -> float:
     """Least processor time of a few tries: the first one may compile Python files, others share a busy machine."""
     times: list[float] = []
     while len(times) < 3 and not (times and min(times) <= limit):
-        times.append(run_for(*arguments)[0])
+        times.append(run_for("-m", "rlftsim", *arguments)[0])
     return min(times)
+
+
+@pytest.fixture(scope="module")
+def torch_seconds() -> float:
+    """Least processor time of importing torch: the first try may read it from a cold disk."""
+    return min(run_for("-c", "import torch")[0] for _ in range(2))
 
 
 def test_the_overview_is_there_at_once():
@@ -39,8 +46,9 @@ def test_the_overview_is_there_at_once():
 
 
 @pytest.mark.parametrize("verb", VERBS)
-def test_the_help_of_a_verb_takes_no_longer_than_a_second_or_two(verb):
-    assert shortest(verb, *ACTIONS.get(verb, []), "--help", limit=VERB_SECONDS) <= VERB_SECONDS
+def test_the_help_of_a_verb_is_there_before_torch_would_be(verb, torch_seconds):
+    limit = VERB_SHARE * torch_seconds
+    assert shortest(verb, *ACTIONS.get(verb, []), "--help", limit=limit) <= limit
 
 
 @pytest.mark.parametrize("line", [["--help"], ["finetune", "--help"], ["evaluate", "--help"]])
@@ -61,4 +69,4 @@ def test_help_without_torch_is_the_help_with_torch(capsys):
     real = set(FLAG.findall(capsys.readouterr().out))
     assert "torch" in sys.modules
     assert len(real) > 60
-    assert set(FLAG.findall(run_for("finetune", "smart-demo", "--help")[1])) == real
+    assert set(FLAG.findall(run_for("-m", "rlftsim", "finetune", "smart-demo", "--help")[1])) == real

@@ -92,10 +92,12 @@ class StoredModel:
 
 
 def _require_same_names(settings: Mapping[str, Any], kind: Any) -> None:
-    """Refuse settings that a dataclass does not have, or that are missing though they were stored from the first."""
+    """Refuse settings that a dataclass does not have, or that are missing and may have been another value than today's
+    default."""
     names = {one.name for one in fields(kind)}
-    # A default in place of a value that is not there would make another model of the same weights.
-    missing = sorted(names - settings.keys() - getattr(kind, "added_fields", {}).keys())
+    # Models from before a switch was there have it off, and a field that was added says how they were.
+    off = {one.name for one in fields(kind) if one.default is None or one.default is False}
+    missing = sorted(names - settings.keys() - off - getattr(kind, "added_fields", {}).keys())
     unknown = sorted(settings.keys() - names)
     if missing or unknown:
         raise ConfigError(
