@@ -1,7 +1,8 @@
 """Features, decisions and rollouts against the public code with the same weights."""
 
+import copy
 import json
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from rlftsim.policies.trafficbots.attention import KeyValues, PolylineEncoder, P
 from rlftsim.policies.trafficbots.dynamics import leaves_map, max_action, move, reaches_destination
 from rlftsim.policies.trafficbots.network import Windows, agent_attributes, segment_features
 from rlftsim.policies.trafficbots.poses import Neighbors, find_neighbors, pose_embedding, relative_pose
+from rlftsim.policies.trafficbots.scene import Scene
 from rlftsim.rollout.policy import Sampling
 
 both = pytest.mark.parametrize("name", ["A", "B"])
@@ -92,7 +94,9 @@ def test_eighty_decisions_from_stored_states(rollout, name, case):
 @both
 @pytest.mark.parametrize("case", ["greedy", "drawn"])
 def test_rollouts_of_eighty_decisions(rollout, name, case):
-    policy, context, state, theirs = rollout(name, case)
+    # Rounding grows by a tenth with each decision. In float32 it depends on the processor from step 75 on which way
+    # agent 5 of A goes, so this policy rounds less than the public code did.
+    policy, context, state, theirs = rollout(name, case, torch.float64)
     num_agents = len(theirs["dest"])
     if case == "greedy":
         scene = context.scene
@@ -102,18 +106,12 @@ def test_rollouts_of_eighty_decisions(rollout, name, case):
     for step in range(10, 91):
         traffic, valid = state.traffic, theirs["valid"][:, step]
         assert np.array_equal(traffic.windows.valid[0, 0, :, -1], valid)
-        distance = torch.from_numpy(theirs["pose"][:, step]) - traffic.windows.pose[0, 0, :, -1]
-        distance = distance[torch.from_numpy(valid)].abs().amax(-1)  # [valid]
-        # Rounding grows by a tenth with each decision. From step 75 on it depends on the processor's rounding which way
-        # agent 5 of A goes: 0.003 or 0.06 m at the end, and a few others with it.
-        assert (distance > POSE_M).sum() <= (0 if step <= 70 else 0.2 * num_agents)
-        assert distance.max() <= (POSE_M if step <= 70 else 0.1)
+        assert gap(traffic.windows.pose[0, 0, :, -1][torch.from_numpy(valid)], theirs["pose"][:, step][valid]) <= POSE_M
         assert np.array_equal(traffic.active[0, 0][valid], theirs["dest_active"][:, step][valid])
         if step < 90:
             noise = torch.rand(1, 1, num_agents, 2)
             action = policy.decide(context, state).sample(Sampling(temperature=0.0), noise)
-            if step <= 70:
-                assert gap(action[0, 0], theirs["u"][:, step]) <= (ACTION if step == 10 else 5e-3)
+            assert gap(action[0, 0], theirs["u"][:, step]) <= (ACTION if step == 10 else 5e-3)
             state = policy.advance(context, state, action)
     assert (~valid).sum() >= (5 if case == "drawn" else 1)  # some have left the map
 
@@ -122,15 +120,18 @@ def test_rollouts_of_eighty_decisions(rollout, name, case):
 def rollout(golden, small, scene):
     """Policy, context, first state, and the public code's numbers of a rollout."""
 
-    def start(name, case):
+    def start(name, case, dtype=torch.float32):
         theirs, here = golden.arrays(f"scenario_{name}/rollouts"), scene(name)
         theirs = {k.split("/")[1]: v for k, v in theirs.items() if k.startswith(case)}
         if case == "drawn":
             here = replace(here, map_box=torch.from_numpy(theirs["boundary"])[None])
         personality = theirs.get("z", np.zeros((len(theirs["dest"]), 16), np.float32))
-        draws = torch.from_numpy(np.concatenate([personality, theirs["dest"][:, None]], 1)).float()[None, None]
-        context = small.encode_scene(here)
-        return small, context, small.start(context, draws), theirs
+        draws = torch.from_numpy(np.concatenate([personality, theirs["dest"][:, None]], 1))[None, None].to(dtype)
+        policy = small if dtype == torch.float32 else copy.deepcopy(small).to(dtype)
+        values = {one.name: getattr(here, one.name) for one in fields(here)}
+        here = Scene(**{name: v.to(dtype) if v.is_floating_point() else v for name, v in values.items()})
+        context = policy.encode_scene(here)
+        return policy, context, policy.start(context, draws), theirs
 
     return start
 

@@ -77,7 +77,7 @@ class MapEncoder(nn.Module):
             node_mask: True = the node is looked at.
         """
         config = self.config
-        kind = functional.one_hot(scene.map_type, len(MapTokenType)).float()[..., None, :]  # [B, M, 1, 11]
+        kind = functional.one_hot(scene.map_type, len(MapTokenType)).to(scene.map_pose)[..., None, :]  # [B, M, 1, 11]
         place = torch.eye(NUM_NODES, device=kind.device)
         shape = scene.node_mask.shape
         attributes = torch.cat([kind.expand(*shape, -1), place.expand(*shape, -1)], -1)  # [B, M, 20, 31]
@@ -164,7 +164,7 @@ class LightEncoder(nn.Module):
         """
         num_decisions = state.shape[1]
         place = torch.eye(self.window, device=state.device).expand(*state.shape, -1)
-        attributes = torch.cat([functional.one_hot(state, NUM_LIGHT_STATES).float(), place], -1)
+        attributes = torch.cat([functional.one_hot(state, NUM_LIGHT_STATES).to(around.base), place], -1)
         mask = around.mask[:, None].expand(state.shape[:3])  # [B, T, L]
         x = self.states(attributes) + around.base[:, None, :, None]
         steps = mask[..., None].expand(state.shape)
@@ -233,9 +233,14 @@ def history_windows(scene: Scene) -> Windows:
     return Windows(scene.valid[..., :WINDOW], scene.pose[..., :WINDOW, :], scene.motion[..., :WINDOW, :])
 
 
+def at_least_float32(x: Float[Tensor, "*g"]) -> Float[Tensor, "*g"]:
+    """The same numbers, in float32 where mixed precision has made them coarser."""
+    return x.to(torch.promote_types(x.dtype, torch.float32))
+
+
 def agent_attributes(scene: Scene) -> Float[Tensor, "B A 6"]:
     """Size and class (one-hot) of each agent."""
-    return torch.cat([scene.size, functional.one_hot(scene.agent_class, NUM_CLASSES).float()], -1)
+    return torch.cat([scene.size, functional.one_hot(scene.agent_class, NUM_CLASSES).to(scene.size)], -1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -360,7 +365,7 @@ class DestinationPredictor(nn.Module):
         )
         for layer in rest:
             x = layer(x)
-        logits = x[..., 0].float().masked_fill(~admissible(scene), NEVER)
+        logits = at_least_float32(x[..., 0]).masked_fill(~admissible(scene), NEVER)
         none = logits.isneginf().all(-1, keepdim=True)
         return torch.log_softmax(logits.masked_fill(none, 0.0), -1).masked_fill(none, NEVER)
 
@@ -390,7 +395,7 @@ class ActionHead(nn.Module):
         self.yaw_rate = nn.ModuleList(nn.Linear(dim, 1) for _ in range(NUM_CLASSES))
 
     def forward(self, x: Float[Tensor, "*g A D"], agent_class: Int64[Tensor, "*#g A"]) -> Float[Tensor, "*g A 2"]:
-        """Means of acceleration and yaw rate, float32.
+        """Means of acceleration and yaw rate, in float32 or better.
 
         Args:
             x: features of agents.
@@ -399,7 +404,7 @@ class ActionHead(nn.Module):
         by_class = []
         for features, acceleration, yaw_rate in zip(self.features, self.acceleration, self.yaw_rate):
             hidden = features(x)
-            by_class.append(torch.cat([acceleration(hidden), yaw_rate(hidden)], -1).float())
+            by_class.append(at_least_float32(torch.cat([acceleration(hidden), yaw_rate(hidden)], -1)))
         means = torch.stack(by_class, -2)  # [*g, A, 3, 2]
         index = agent_class.expand(x.shape[:-1])[..., None, None].expand(*x.shape[:-1], 1, 2)
         return means.gather(-2, index)[..., 0, :]
@@ -432,7 +437,7 @@ class Posterior(nn.Module):
         """
         lights = self.lights(light_state, self.lights.neighborhoods(scene, map_features))
         around = self.agents.context(map_features, lights)
-        return self.mean(self.agents(windows, scene, around)[:, 0, 0]).float()
+        return at_least_float32(self.mean(self.agents(windows, scene, around)[:, 0, 0]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -487,7 +492,8 @@ class TrafficBotsNetwork(nn.Module):
 
     def next_light_logits(self, light_features: Float[Tensor, "*g D"]) -> Float[Tensor, "*g 5"]:
         """Logits of a light's next state; they do not train the features."""
-        return self.light_state(light_features.detach()).float().clamp(-LIGHT_LOGIT_LIMIT, LIGHT_LOGIT_LIMIT)
+        logits = at_least_float32(self.light_state(light_features.detach()))
+        return logits.clamp(-LIGHT_LOGIT_LIMIT, LIGHT_LOGIT_LIMIT)
 
     def features(
         self,
@@ -514,7 +520,7 @@ class TrafficBotsNetwork(nn.Module):
         return self.add_personality(x, given.personality[:, None])
 
     def mean_actions(self, features: Float[Tensor, "B T N A D"], scene: Scene) -> Float[Tensor, "B T N A 2"]:
-        """Means of the actions before tanh, float32: what an agent does without exploration noise.
+        """Means of the actions before tanh, in float32 or better: what an agent does without exploration noise.
 
         Args:
             features: of `features`.

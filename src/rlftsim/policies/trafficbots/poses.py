@@ -49,9 +49,9 @@ def pose_embedding(pose: Float[Tensor, "*g 3"], size: int) -> Float[Tensor, "*g 
         pose: relative poses.
         size: E, a multiple of 8.
     """
-    step = torch.arange(size // 8, device=pose.device, dtype=torch.float32)
+    step = torch.arange(size // 8, device=pose.device, dtype=pose.dtype)
     frequency = 1.0 / 1000.0 ** (2 * step / (size // 4))  # from 1 rad/m down to about 1 rad/km
-    harmonic = torch.arange(1, size // 4 + 1, device=pose.device, dtype=torch.float32)
+    harmonic = torch.arange(1, size // 4 + 1, device=pose.device, dtype=pose.dtype)
     x, y, heading = (
         pose[..., 0, None] * frequency,
         pose[..., 1, None] * frequency,
