@@ -87,7 +87,7 @@ class TrafficBotsPolicy(TrafficBotsModel):
             index = torch.searchsorted(repeated, level, right=True).clamp(max=log_prob.shape[-1] - 1)
             index = torch.where(total > 0, index, -1)
             personality = standard_normal(noise[..., :LATENT_SIZE])
-        return self.start(context, torch.cat([personality, index], -1))
+        return self.start(context, torch.cat([personality, index], -1).to(log_prob.dtype))
 
     def start(self, context: TrafficBotsContext, draws: Float[Tensor, "B N A 17"]) -> TrafficBotsState:
         """The current step, with given personalities and destinations.
