@@ -35,7 +35,7 @@ from rlftsim.policies.registry import Device, load_policy, load_policy_or_oracle
 from rlftsim.progress import log
 from rlftsim.recipes.registry import Recipe
 from rlftsim.rollout.fingerprint import fingerprint_policy
-from rlftsim.rollout.policy import ConditionablePolicy, Policy
+from rlftsim.rollout.policy import ConditionablePolicy, Policy, TokenPolicy
 from rlftsim.scenario.dataset import MANIFEST, ScenarioDataset
 from rlftsim.scenario.shards import hash_file
 from rlftsim.training.run_folder import RunFolder, default_settings, flatten, may_change, to_plain
@@ -137,7 +137,7 @@ class ExperimentSuite:
             )
         base = None if self.base_model is None else load_policy(self.base_model)
         # Goals are taught by relabelling, which learns tokens.
-        if base is not None and not (isinstance(base, ConditionablePolicy) and hasattr(base, "vocabulary")):
+        if base is not None and not (isinstance(base, ConditionablePolicy) and isinstance(base, TokenPolicy)):
             raise ConfigError(
                 f"this experiment is about goals, and {self.base_model} cannot be given any: take a model that can, "
                 "such as demo-base."
@@ -153,7 +153,7 @@ class ExperimentSuite:
         if self.base_model is None:
             has_tokens = self.recipe.tokens is not None
         else:
-            has_tokens = hasattr(load_policy(self.base_model), "vocabulary")
+            has_tokens = isinstance(load_policy(self.base_model), TokenPolicy)
         sections = {CATK: self.recipe.catk, ROAD: self.recipe.road, GCSL: self.recipe.gcsl}
         refused = {method for method, section in sections.items() if section is None or not has_tokens}
 

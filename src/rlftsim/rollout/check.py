@@ -326,7 +326,7 @@ def kl_from_another_policy_is_positive(subject: _Subject) -> str:
     """The KL divergence from another policy is not negative, and somewhere positive."""
     reference = subject.reference
     scored = subject.score(subject.batch, subject.rollouts)
-    kl = scored.kl(subject.score(subject.batch, subject.rollouts, reference))
+    kl = scored.kl(subject.score(subject.batch, subject.rollouts, reference)).detach()
     if subject.is_random and not float(kl.max()) > 0:
         raise _Broken("the KL from another policy is 0 everywhere")
     return _within(-float(kl.min()), 1e-6, "most negative KL: minus")

@@ -22,7 +22,9 @@ from rlftsim.scenario.types import STEP_S
 class Record:
     """Features of agents along rollouts as they were made, so that scoring need not compute them again."""
 
-    states: list["TrafficBotsState"] = field(default_factory=list)
+    draws: Float[Tensor, "B N A 17"] | None = None
+    poses: list[Float[Tensor, "B N A 3"]] = field(default_factory=list)
+    """Before each decision."""
     features: list[Float[Tensor, "B 1 N A D"]] = field(default_factory=list)
 
     def add(self, state: "TrafficBotsState", features: Float[Tensor, "B 1 N A D"]) -> None:
@@ -33,17 +35,17 @@ class Record:
             features: of the agents in it.
         """
         if state.num_decisions == 0:
-            self.states, self.features = [], []
-        if state.num_decisions == len(self.states):
-            self.states.append(replace(state, before=None))
+            self.draws, self.poses, self.features = state.draws, [], []
+        if state.num_decisions == len(self.poses):
+            self.poses.append(state.traffic.windows.pose[..., -1, :].clone())  # a view would keep the window
             self.features.append(features)
 
     def along(self, states: Sequence["TrafficBotsState"]) -> Float[Tensor, "B T N A D"] | None:
         """Features at T decisions, if these states are the recorded ones."""
-        if len(self.states) != len(states) or not torch.equal(self.states[0].draws, states[0].draws):
+        if self.draws is None or len(self.poses) != len(states) or not torch.equal(self.draws, states[0].draws):
             return None
-        for own, one in zip(self.states, states):
-            if not torch.equal(own.traffic.windows.pose[..., -1, :], one.traffic.windows.pose[..., -1, :]):
+        for pose, state in zip(self.poses, states):
+            if not torch.equal(pose, state.traffic.windows.pose[..., -1, :]):
                 return None
         return torch.cat(self.features, 1)
 
