@@ -18,7 +18,7 @@ from rlftsim.policies.trafficbots.config import TrafficBotsConfig
 from rlftsim.policies.trafficbots.destinations import VEHICLE
 from rlftsim.policies.trafficbots.network import TrafficBotsNetwork
 from rlftsim.policies.trafficbots.scene import Scene
-from rlftsim.policies.trafficbots.state import TrafficBotsContext
+from rlftsim.policies.trafficbots.state import Record, TrafficBotsContext
 from rlftsim.scenario.types import FUTURE_STEPS
 
 Model = TypeVar("Model", bound="TrafficBotsModel")
@@ -90,7 +90,8 @@ class TrafficBotsModel(nn.Module):
         map_features = self.network.map(scene, scene.node_mask)
         light_features = self._roll_lights(scene, map_features)
         around = self.network.agents.context(map_features, light_features)
-        return TrafficBotsContext(scene, map_features, light_features, around, self)
+        record = Record() if self.trains_actions_alone else None
+        return TrafficBotsContext(scene, map_features, light_features, around, self, record)
 
     def _roll_lights(self, scene: Scene, map_features: Float[Tensor, "B M D"]) -> Float[Tensor, "B T L D"]:
         """Features of the lights at all 80 decisions; each next state is the most likely one.

@@ -27,7 +27,6 @@ from rlftsim.policies.trafficbots.scene import build_scene
 from rlftsim.policies.trafficbots.scoring import features_over_time
 from rlftsim.policies.trafficbots.state import (
     Memo,
-    Record,
     TrafficBotsContext,
     TrafficBotsState,
     imposed_after,
@@ -170,7 +169,7 @@ class TrafficBotsPolicy(TrafficBotsModel):
         if not isinstance(context, TrafficBotsContext) or not self.sees_as(context.model):
             return self.encode(scenarios)
         around = self.network.agents.context(context.map_features, context.light_features)
-        record = context.record if self.has_features_of(context.model) else Record()
+        record = context.record if self.has_features_of(context.model) else None
         return replace(context, around=around, model=self, record=record)
 
     def score_both(
@@ -194,7 +193,7 @@ class TrafficBotsPolicy(TrafficBotsModel):
                 return dist, reference.score(ref_context, ref_rollouts)
         replay = self._replay(context, rollouts)
         with torch.no_grad():
-            features = context.record.along(replay)
+            features = None if context.record is None else context.record.along(replay)
             features = self._features(context, replay) if features is None else features
             ref_dist = reference._scored(ref_context, replay, rollouts.decision, features)
         return self._scored(context, replay, rollouts.decision, features), ref_dist
@@ -254,7 +253,7 @@ class TrafficBotsPolicy(TrafficBotsModel):
             windows, around = traffic.windows.as_one_decision(), context.around.steps(index, index + 1)
             features = self.network.features(windows, context.scene, around, state.given, traffic.active[:, None])
             state.memo.mean = mean = self.network.mean_actions(features, context.scene)[:, 0]
-            if self.trains_actions_alone:
+            if context.record is not None:
                 context.record.add(state, features)
         return mean
 

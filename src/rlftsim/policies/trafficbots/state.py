@@ -62,8 +62,8 @@ class TrafficBotsContext:
     """Map, and lights at all decisions."""
     model: nn.Module
     """The model that made it."""
-    record: Record = field(default_factory=Record, repr=False)
-    """Of the last rollouts, while only the layers behind the agents' features are trained."""
+    record: Record | None = field(default=None, repr=False)
+    """Of the last rollouts, where only the layers behind the agents' features are trained."""
 
 
 @dataclass(frozen=True, eq=False)
