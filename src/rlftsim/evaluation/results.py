@@ -90,7 +90,8 @@ class EvaluateConfig:
     limit: int | None = None
     """Only the first so many scenarios."""
     rollouts_per_pass: int = 8
-    """Rollouts simulated together: bounds memory, and small passes stay in the processor's cache. Changes no result."""
+    """Rollouts simulated together. Bounds memory and changes no result. A small model, such as those that ship, is a
+    quarter to a third faster with 32; SMART-tiny is not."""
     jobs: int = 1
     """Processes, each with one thread. Changes no result."""
     goals: GoalsGiven = "none"
