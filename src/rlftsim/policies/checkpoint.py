@@ -72,6 +72,8 @@ class StoredModel:
         kind: Any = make
         try:
             if is_dataclass(kind):
+                # Folders from before a field was there say how the model was by not having it.
+                settings = {**getattr(kind, "added_fields", {}), **getattr(kind, "later_stored", {}), **settings}
                 _require_same_names(settings, kind)
             return make(**settings)
         except (ConfigError, TypeError) as error:
@@ -92,12 +94,10 @@ class StoredModel:
 
 
 def _require_same_names(settings: Mapping[str, Any], kind: Any) -> None:
-    """Refuse settings that a dataclass does not have, or that are missing and may have been another value than today's
-    default."""
-    names = {one.name for one in fields(kind)}
-    # Models from before a switch was there have it off, and a field that was added says how they were.
-    off = {one.name for one in fields(kind) if one.default is None or one.default is False}
-    missing = sorted(names - settings.keys() - off - getattr(kind, "added_fields", {}).keys())
+    """Refuse settings that a dataclass does not have or that are missing."""
+    names = {one.name for one in fields(kind) if one.init}
+    # A default in place of a value that is not there would make another model of the same weights.
+    missing = sorted(names - settings.keys())
     unknown = sorted(settings.keys() - names)
     if missing or unknown:
         raise ConfigError(

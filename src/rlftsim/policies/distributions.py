@@ -165,7 +165,7 @@ def standard_normal(noise: Float[Tensor, "*shape"]) -> Float64[Tensor, "*shape"]
 
 @dataclass(frozen=True, eq=False)
 class GaussianDistribution:
-    """Diagonal Gaussians, float32. Elements whose mask is False (padding) decide 0 with probability 1."""
+    """Diagonal Gaussians, in float32 or better. Elements whose mask is False (padding) decide 0 with probability 1."""
 
     mean: Float[Tensor, "*batch D"]
     std: Float[Tensor, "*batch D"]

@@ -266,6 +266,8 @@ class LoadablePolicy(Protocol):
     * `first_names: ClassVar[dict[str, str]]`, in a dataclass: present name -> first name of each renamed field.
     * `added_fields: ClassVar[dict[str, Any]]`, in a dataclass: name of each field that was added after models had been
       stored -> the value with which the model is as before.
+
+    `later_stored` is like `added_fields`, but such a field counts in fingerprints with every value.
     """
 
     architecture: ClassVar[str]

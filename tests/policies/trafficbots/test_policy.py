@@ -100,6 +100,12 @@ def test_along_its_own_rollouts_a_policy_with_a_trained_head_computes_no_feature
         assert bool(counted) == (number > 0)  # others than those of the record, or a part of them
         assert torch.allclose(dist.log_prob(one.decision), one.log_prob, atol=1e-4)
         assert torch.allclose(ref_dist.mean, dist.mean, atol=1e-6)
+    # Of rollouts that take turns, the record is of the last that began.
+    with torch.no_grad():
+        first, second = (learner.start(context, one.draws) for one in (rollouts, others))
+        first, *_ = (learner.advance(context, s, learner.decide(context, s).mean) for s in (first, second))
+        learner.decide(context, first)
+    assert torch.equal(context.record.draws, others.draws) and len(context.record.poses) == 1
     # A policy that has learned other features has no use for the record.
     with torch.no_grad():
         next(learner.network.agents.parameters()).add_(0.1)

@@ -15,6 +15,7 @@ from rlftsim.experiments.rows import Row
 from rlftsim.experiments.suite import ExperimentSuite
 from rlftsim.policies.registry import load_policy
 from rlftsim.recipes.registry import recipe_by_name
+from rlftsim.training.finetune import FinetuneConfig
 
 FLOOR = "constant velocity"
 BEFORE, AFTER, MEAN_ACTIONS = "base", "RLFTSim (MLOO)", ", mean actions"
@@ -29,7 +30,7 @@ def run(suite: ExperimentSuite) -> dict[str, Row]:
     for one in both:
         specs: dict[str, Sequence[ModelSpec]] = {
             BEFORE: (BASE,),
-            AFTER: over_seeds(FineTuned("mloo"), suite.num_seeds),
+            AFTER: over_seeds(FineTuned("mloo", credit=one.recipe.finetune.credit), suite.num_seeds),
         }
         model = one.recipe.model_name
         rows |= one.evaluate({f"{model}, {name}": row for name, row in specs.items()})
@@ -79,7 +80,7 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
             *(verdict for before, after in pairs for verdict in _gain(before, after)),
         ),
         notes=(
-            *(f"{one.recipe.model_name}: {one.budget}." for one in suites(suite)),
+            *(f"{one.recipe.model_name}: {one.budget}; {_objective(one.recipe.finetune)}." for one in suites(suite)),
             f"Gains are tested at level {ALPHA:g}, scenarios paired.",
             "Mean actions: rollouts at temperature 0, without exploration noise.",
         ),
@@ -89,6 +90,11 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
         },
         figure=tables.draw_gains(rows[FLOOR], [row for name, row in rows.items() if name != FLOOR]),
     )
+
+
+def _objective(config: FinetuneConfig) -> str:
+    """The settings in words that each recipe chooses for itself."""
+    return f"credit by {config.credit}, speed {'held' if config.hold_speed else 'not held'}"
 
 
 def _gain(before: Row, after: Row) -> tuple[str, ...]:

@@ -20,6 +20,8 @@ class SmartConfig:
     """Fields that were renamed after models had been stored, and their names in fingerprints."""
     added_fields: ClassVar[dict[str, Any]] = {"frequency_init": "normal"}
     """Fields that were added after models had been stored, and the values with which a model is as before."""
+    later_stored: ClassVar[dict[str, Any]] = {"goal_logit_bias": False}
+    """The same of fields that count in fingerprints with every value."""
     free_fields: ClassVar[tuple[str, ...]] = (
         "map_radius_m", "agent_map_radius_m", "agent_radius_m", "max_map_neighbors", "max_agent_map_neighbors",
         "max_agent_neighbors", "dropout", "history_drop",

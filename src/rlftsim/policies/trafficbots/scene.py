@@ -1,4 +1,4 @@
-"""A batch of scenarios as padded tensors in their ego frames, float32: the network's input.
+"""A batch of scenarios as padded tensors in their ego frames: the network's input, float32 as it is built.
 
 Shapes: B scenarios, M map tokens, L light tokens, A agents, S steps of 0.1 s. There is always at least one map token
 and one light token, which may be padding.

@@ -28,7 +28,7 @@ class Record:
     features: list[Float[Tensor, "B 1 N A D"]] = field(default_factory=list)
 
     def add(self, state: "TrafficBotsState", features: Float[Tensor, "B 1 N A D"]) -> None:
-        """Add the next decision; a first one begins anew.
+        """Add the next decision of the rollouts whose first one was added last; a first one begins anew.
 
         Args:
             state: before the decision.
@@ -36,7 +36,7 @@ class Record:
         """
         if state.num_decisions == 0:
             self.draws, self.poses, self.features = state.draws, [], []
-        if state.num_decisions == len(self.poses):
+        if state.draws is self.draws and state.num_decisions == len(self.poses):
             self.poses.append(state.traffic.windows.pose[..., -1, :].clone())  # a view would keep the window
             self.features.append(features)
 
