@@ -105,7 +105,8 @@ def test_along_its_own_rollouts_a_policy_with_a_trained_head_computes_no_feature
         first, second = (learner.start(context, one.draws) for one in (rollouts, others))
         first, *_ = (learner.advance(context, s, learner.decide(context, s).mean) for s in (first, second))
         learner.decide(context, first)
-    assert torch.equal(context.record.draws, others.draws) and len(context.record.poses) == 1
+    assert torch.equal(context.record.draws, others.draws)
+    assert len(context.record.poses) == 1
     # A policy that has learned other features has no use for the record.
     with torch.no_grad():
         next(learner.network.agents.parameters()).add_(0.1)
