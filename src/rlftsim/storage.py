@@ -121,7 +121,7 @@ def remote(url: str) -> Iterator[tuple[Any, str]]:
         raise DataError(
             f"{url}: {type(error).__name__}: {cause}: check the address, the network and the credentials of this "
             "machine (docs/machines.md, Buckets)."
-        ) from None
+        ) from error
 
 
 def fetch(url: str, path: Path, sha256: str | None = None) -> str:

@@ -15,6 +15,8 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 
+from rlftsim.policies.precision import at_least_float32
+
 NEVER = -1e9
 """Logit of a token that does not exist."""
 ROWS_PER_BLOCK = {"cpu": 256}
@@ -68,7 +70,7 @@ def _logits(
 ) -> Float[Tensor, "r V"]:
     """Logits of rows, at least float32 also where autocast multiplies in bfloat16."""
     logits = torch.addmm(offset.index_select(0, class_id), hidden, weight.mT)
-    return logits.to(torch.promote_types(logits.dtype, torch.float32))
+    return at_least_float32(logits)
 
 
 class _RowStatistics(torch.autograd.Function):

@@ -325,7 +325,7 @@ def test_it_is_saved_and_loaded_by_folder(policy, batch, tmp_path):
         (config | {"num_head": 2}, r"missing: none; unknown: num_head"),
         (
             config | {"noise_acceleration_mps2": -1.0},
-            r"config.json: .*noise_acceleration_mps2 must be pos.*got -1",
+            r"config.json: settings do not fit .*noise_acceleration_mps2 must be positive, got -1",
         ),
         (lacking, r"missing: noise_correlation; unknown: none"),  # the other one was added later
     ):

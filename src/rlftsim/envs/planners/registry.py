@@ -83,7 +83,7 @@ def load_planner(name: str) -> Planner:
         except Exception as error:  # a file of others may fail in any way
             raise ConfigError(
                 f"planner {name!r} cannot be imported ({type(error).__name__}: {error}): name package.module:Class."
-            ) from None
+            ) from error
     else:
         found = PLANNERS.get(name)
     try:

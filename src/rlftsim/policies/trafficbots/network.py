@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 from torch.nn import functional
 
+from rlftsim.policies.precision import at_least_float32
 from rlftsim.policies.trafficbots.attention import DecoderLayer, KeyValues, PolylineEncoder, SelfLayer
 from rlftsim.policies.trafficbots.config import LATENT_SIZE, WINDOW, TrafficBotsConfig
 from rlftsim.policies.trafficbots.map_tokens import NUM_LIGHT_STATES, NUM_NODES, VEHICLE_LANES, MapTokenType
@@ -231,11 +232,6 @@ class WindowEncoder(nn.Module):
 def history_windows(scene: Scene) -> Windows:
     """Windows [B, A, 11] of the agents up to the current step."""
     return Windows(scene.valid[..., :WINDOW], scene.pose[..., :WINDOW, :], scene.motion[..., :WINDOW, :])
-
-
-def at_least_float32(x: Float[Tensor, "*g"]) -> Float[Tensor, "*g"]:
-    """The same numbers, in float32 where mixed precision has made them coarser."""
-    return x.to(torch.promote_types(x.dtype, torch.float32))
 
 
 def agent_attributes(scene: Scene) -> Float[Tensor, "B A 6"]:
