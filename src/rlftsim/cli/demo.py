@@ -30,7 +30,7 @@ class Demo:
         """Run the stages; print the table and the path of the report."""
         # More processes than this only compete for memory bandwidth on the machines that the demo is made for.
         jobs = min(usable_cores(), 4) if self.processes == "auto" else self.processes
-        # All rollouts in one pass: so small a model is a third faster with it.
+        # All rollouts in one pass: so small a model takes a quarter less time with it.
         evaluation = EvaluateConfig(rollouts_per_pass=32, jobs=jobs)
         config = DemoConfig(
             (smart_demo_quick() if self.quick else smart_demo_rlftsim()).with_processes(self.processes),
