@@ -197,18 +197,18 @@ def test_every_reward_has_the_recipes_budget():
 
 
 def frontier(suite, gain_per_nat):
-    """Made-up runs that reach their targets but for minADE's, which stops at 0.03, and their evaluations."""
-    rows = {"base": row("base", EASE.tolist())}
-    for number, (name, spec) in enumerate(kl_frontier.REWARDS.items()):
-        for target in kl_frontier.TARGETS:
-            reached = min(target, 0.03) if name.startswith("minADE") else target
-            for one in over_seeds(replace(spec, kl_target=target), suite.num_seeds):
+    """Made-up runs that end at a KL of 0.045, but for minADE's, which ends at 0.03, and their evaluations."""
+    rows, specs = {"base": row("base", EASE.tolist())}, kl_frontier.specs(suite.num_seeds)
+    for number, name in enumerate(kl_frontier.REWARDS):
+        for part in kl_frontier.PARTS:
+            reached = min(0.045 * part, 0.03 if name.startswith("minADE") else 0.045)
+            for one in specs[kl_frontier.point(name, part)]:
                 run = suite.model_folder(one)
                 run.mkdir(parents=True, exist_ok=True)
                 line = {"kl": reached, "entropy": 2.0, "diversity_m": 5.0, "speed_gap_mps": -1.0, "reward_std": 0.1}
                 (run / "metrics.jsonl").write_text(json.dumps({"update": 0, **line}) + "\n")
             gain, noise = gain_per_nat[name] * reached, (number, number + 10)
-            rows[kl_frontier.point(name, target)] = row(name, *(around(gain, seed) for seed in noise))
+            rows[kl_frontier.point(name, part)] = row(name, *(around(gain, seed) for seed in noise))
     return rows
 
 
@@ -216,7 +216,7 @@ def test_rewards_are_compared_at_the_largest_kl_that_all_reach(suite):
     slopes = dict(zip(kl_frontier.REWARDS, (5.0, 4.0, 2.0, 1.0, -1.0)))
     found = kl_frontier.summarize(frontier(suite, slopes), suite)
     assert found.numbers["kl"] == pytest.approx(0.03)
-    for name, slope in slopes.items():  # between the targets 0.015 and 0.045
+    for name, slope in slopes.items():  # between 0.0225 and 0.045
         gain = found.numbers["at_equal_kl"][name]["meta_metric"]["mean"] - EASE.mean()
         assert gain == pytest.approx(0.03 * slope, abs=0.005)
     assert found.verdicts[0].endswith("at a KL of 0.0300 nats and the 5% level: confirmed.")
@@ -235,10 +235,11 @@ def test_the_order_of_the_paper_may_be_refuted_or_open(suite, slopes, verdict):
     assert verdict in found.verdicts[0]
 
 
-def test_a_run_at_a_target_kl_has_a_folder_and_settings_of_its_own():
-    spec = replace(kl_frontier.REWARDS["RLOO"], kl_target=0.015)
-    assert spec.name == "rloo-kl0.015-seed0"
-    assert finetune_config(spec, TINY.finetune).kl == replace(TINY.finetune.kl, target=0.015)
+def test_the_points_of_a_reward_are_those_of_one_run():
+    *_, whole = kl_frontier.specs(2)[kl_frontier.point("RLOO", 1.0)]
+    assert whole == replace(reward_ablation.REWARDS["RLOO"], seed=1)  # the run of the ablation itself
+    halves = kl_frontier.specs(2)[kl_frontier.point("RLOO", 0.5)]
+    assert [one.epochs_fraction for one in halves] == [0.5, 0.5]
 
 
 # ---- paired t-test ---------------------------------------------------------------------------------------------------

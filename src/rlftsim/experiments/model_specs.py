@@ -73,8 +73,6 @@ class FineTuned:
     """Model that the fine-tuning starts from."""
     goals: GoalTraining | None = None
     """None = goal-free."""
-    kl_target: float | None = None
-    """Target KL of a reward's run, nats a decision. None = the recipe's."""
 
     @property
     def name(self) -> str:
@@ -83,8 +81,7 @@ class FineTuned:
         credit = "" if self.credit == "rollout" else f"-{self.credit}"
         base = "" if self.base == Base() else f"-from-{self.base.name}"
         goals = "" if self.goals is None else f"-{self.goals.name}"
-        kl = "" if self.kl_target is None else f"-kl{self.kl_target:g}"
-        return f"{self.method}{goals}{credit}{kl}{base}-seed{self.seed}"
+        return f"{self.method}{goals}{credit}{base}-seed{self.seed}"
 
     def training_config(self, recipe: Recipe) -> FinetuningConfig:
         """Settings of the training; their type is that of the method.
@@ -173,7 +170,6 @@ def finetune_config(spec: FineTuned, recipe: FinetuneConfig) -> FinetuneConfig:
         reward = f"{spec.method}(goal_weight={spec.goals.weight}, kind='{spec.goals.kind}')"
         goals = with_goals(recipe.goals)
     epochs = recipe.epochs * spec.epochs_fraction
-    kl = recipe.kl if spec.kl_target is None else replace(recipe.kl, target=spec.kl_target)
     hold_speed = recipe.hold_speed and spec.goals is None  # goals ask for a speed
     return replace(
         recipe,
@@ -182,7 +178,6 @@ def finetune_config(spec: FineTuned, recipe: FinetuneConfig) -> FinetuneConfig:
         epochs=epochs,
         credit=spec.credit,
         goals=goals,
-        kl=kl,
         hold_speed=hold_speed,
     )
 

@@ -16,8 +16,8 @@ from rlftsim.experiments.rows import RMM, Row, mean_of_seeds
 from rlftsim.experiments.suite import ExperimentSuite
 from rlftsim.viewer.figure import Band, draw_bands
 
-TARGETS = (0.005, 0.015, 0.045)
-"""Target KL of a run with each reward, nats a decision."""
+PARTS = (0.25, 0.5, 1.0)
+"""Where a run is evaluated on its way, as fractions of the recipe's fine-tuning epochs."""
 HEURISTICS = ("minADE, RLOO", "collision + off-road + ADE", "collision + off-road")
 REWARDS = {name: reward_ablation.REWARDS[name] for name in (MLOO, "RLOO", *HEURISTICS)}
 ORDER = ((MLOO, "RLOO"), *(("RLOO", heuristic) for heuristic in HEURISTICS))
@@ -25,25 +25,33 @@ ORDER = ((MLOO, "RLOO"), *(("RLOO", heuristic) for heuristic in HEURISTICS))
 COLUMNS = (*SCORES, DRIFT_COLUMNS[0])
 
 
-def point(reward: str, target: float) -> str:
-    """Row of a reward at a target KL.
+def point(reward: str, part: float) -> str:
+    """Row of a point on the way of a reward's runs.
 
     Args:
         reward: its name in `REWARDS`.
-        target: nats a decision.
+        part: of the runs, one of `PARTS`.
     """
-    return f"{reward}, target {target:g}"
+    return f"{reward}, {part:.0%} of the run"
+
+
+def specs(num_seeds: int) -> dict[str, tuple[FineTuned, ...]]:
+    """Specifications of the points of all rewards.
+
+    Args:
+        num_seeds: of every point.
+    """
+    # Shorter runs first: longer ones continue them, so a reward's points are one run a seed.
+    return {
+        point(name, part): over_seeds(replace(spec, epochs_fraction=part), num_seeds)
+        for name, spec in REWARDS.items()
+        for part in PARTS
+    }
 
 
 def run(suite: ExperimentSuite) -> dict[str, Row]:
-    """Rows of the base model, and of a fine-tuning with each reward at each target."""
-    points = {point(name, target): _runs(suite, name, target) for name in REWARDS for target in TARGETS}
-    return suite.evaluate({REFERENCE: (BASE,), **points})
-
-
-def _runs(suite: ExperimentSuite, reward: str, target: float) -> tuple[FineTuned, ...]:
-    """Runs of a point, one for each seed."""
-    return over_seeds(replace(REWARDS[reward], kl_target=target), suite.num_seeds)
+    """Rows of the base model and of all points."""
+    return suite.evaluate({REFERENCE: (BASE,), **specs(suite.num_seeds)})
 
 
 def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResult:
@@ -53,12 +61,10 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
         rows: of `run`.
         suite: where the runs are, whose KL is read.
     """
-    base, frontiers = rows[REFERENCE], {}
+    base, runs, frontiers = rows[REFERENCE], specs(suite.num_seeds), {}
     for name in REWARDS:
-        points = []
-        for target in TARGETS:
-            end = reward_ablation.mean_at_end(suite, _runs(suite, name, target))
-            points.append((end["kl"], rows[point(name, target)]))
+        names = [point(name, part) for part in PARTS]
+        points = [(reward_ablation.mean_at_end(suite, runs[one])["kl"], rows[one]) for one in names]
         frontiers[name] = [(0.0, base), *sorted(points, key=lambda one: one[0])]
     # 1. All rewards at one distance: the largest that none of them has to be extrapolated to.
     kl = min(frontier[-1][0] for frontier in frontiers.values())
@@ -82,9 +88,10 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
         ),
         verdicts=(_verdict_on_the_order(equal, kl), *(row.against(base) for row in equal.values()), *matrix.verdicts),
         notes=(
-            f"{suite.budget.note} Targets of the KL: {', '.join(f'{target:g}' for target in TARGETS)} nats a decision.",
-            "KL: to the base model, nats a decision, training rollouts of the last fifth of a run. Between two points, "
-            "and between the base model at 0 and the first, each scenario's scores are interpolated.",
+            f"{suite.budget.note} The points of a run are its evaluations at "
+            f"{', '.join(f'{part:.0%}' for part in PARTS)} of the updates.",
+            "KL: to the base model, nats a decision, training rollouts of the last fifth of the updates until there. "
+            "Between two points, and between the base model and the first, each scenario's scores are interpolated.",
         ),
         numbers={
             "kl": kl,
