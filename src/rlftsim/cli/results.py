@@ -106,13 +106,14 @@ class Score:
     work: Annotated[Work, tyro.conf.arg(name="")] = field(default_factory=Work)
 
     def run(self) -> int:
-        """Score, print, explain."""
+        """Score, explain, print."""
         scenarios = dataset_folder(self.scenarios)
         runner = self.work.runner(self.config.num_jobs, self.work.on_error)
+        result = score_rollouts(self.rollouts, scenarios, self.out, self.config, name=self.name, runner=runner)
+        # After the scores: what they refuse, such as a name or a share, is refused before a page is written.
         if self.explain is not None:
             pages = explain_rollouts(self.rollouts, scenarios, self.explain, self.config, runner=runner)
             print(f"{self.explain}: {len(pages)} pages", file=sys.stderr)
-        result = score_rollouts(self.rollouts, scenarios, self.out, self.config, name=self.name, runner=runner)
         if self.json:
             print(json.dumps(to_json(result), allow_nan=False))
         else:

@@ -9,9 +9,11 @@ where it applies.
 
 import copy
 import math
+import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -123,7 +125,11 @@ def check_policy(policy: Policy, scenarios: Sequence[Scenario], *, reference: Po
         except _Broken as measured:
             outcome, detail = "failed", str(measured)
         except Exception as error:  # whatever a policy raises is an outcome of the test
-            outcome, detail = "failed", f"raised {type(error).__name__}: {error}"
+            *_, place = traceback.extract_tb(error.__traceback__)
+            outcome = "failed"
+            detail = (
+                f"raised {type(error).__name__}: {error} ({Path(place.filename).name}:{place.lineno} in {place.name})"
+            )
         results.append(CheckResult(check.__name__.replace("_", " "), outcome, detail))
     return CheckReport(type(policy).__name__, tuple(results))
 
