@@ -3,6 +3,7 @@
 import pytest
 import torch
 from torch import nn
+from torch.nn import functional
 
 from rlftsim.policies import token_rows
 from rlftsim.policies.distributions import LazyTokenDistribution, TokenDistribution
@@ -16,7 +17,9 @@ def random_rows(seed, class_id=None, exists=None, dtype=torch.float64):
     last = nn.Linear(WIDTH, NUM_TOKENS, dtype=dtype)
     hidden = torch.randn(NUM_ROWS, WIDTH, dtype=dtype, requires_grad=True)
     class_id = torch.randint(3, (NUM_ROWS,)) if class_id is None else class_id
-    return TokenRows(hidden, last, class_id, torch.rand(3, NUM_TOKENS) < 0.8 if exists is None else exists)
+    return TokenRows(
+        hidden, last.weight, last.bias, class_id, torch.rand(3, NUM_TOKENS) < 0.8 if exists is None else exists
+    )
 
 
 @pytest.fixture
@@ -41,13 +44,16 @@ def small_blocks(monkeypatch):
 
 
 def inputs(rows):
-    return rows.hidden, rows.last.weight, rows.last.bias
+    return rows.hidden, rows.weight, rows.bias
 
 
 def by_autograd(rows, reference, chosen):
     """Log-probability, KL and entropy by their definitions, token after token."""
     exists = rows.exists[rows.class_id]
-    log_p, log_q = (r.last(r.hidden).masked_fill(~exists, -torch.inf).log_softmax(-1) for r in (rows, reference))
+    log_p, log_q = (
+        functional.linear(r.hidden, r.weight, r.bias).masked_fill(~exists, -torch.inf).log_softmax(-1)
+        for r in (rows, reference)
+    )
     p = log_p.exp()
     # what does not exist has probability 0 and no part in a sum
     log_p, log_q = (torch.where(exists, values, 0.0) for values in (log_p, log_q))
@@ -88,7 +94,7 @@ def test_gradients_of_float32_are_as_exact_as_those_of_autograd(chosen):
             for value, wanted in zip(inputs(rows), inputs(doubled)):
                 value.copy_(wanted)
                 wanted.copy_(value)  # the same numbers, rounded
-    other = TokenRows(other.hidden, other.last, exact.class_id, exact.exists)
+    other = TokenRows(other.hidden, other.weight, other.bias, exact.class_id, exact.exists)
     truth, found, usual = (
         torch.autograd.grad(sum(value.sum() for value in statistics), inputs(rows))
         for rows, statistics in (

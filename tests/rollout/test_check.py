@@ -44,8 +44,12 @@ def test_constant_velocity_keeps_the_contract():
 @pytest.mark.parametrize(
     "limits",
     # map pieces are 5 m apart both ways: a limit to their neighbors would cut between equally near ones
-    [{"max_map_neighbors": None}, {"max_agent_neighbors": 3, "max_agent_map_neighbors": 7, "max_map_neighbors": None}],
-    ids=["all neighbors", "few neighbors"],
+    [
+        {"max_map_neighbors": None},
+        {"max_agent_neighbors": 3, "max_agent_map_neighbors": 7, "max_map_neighbors": None},
+        {"token_key_dim": 6, "max_map_neighbors": None},
+    ],
+    ids=["all neighbors", "few neighbors", "keys of tokens"],
 )
 def test_smart_keeps_the_contract(limits):
     policy = small_smart(small_vocabulary(BENDING), **limits).train()

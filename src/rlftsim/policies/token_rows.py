@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int64
-from torch import Tensor, nn
+from torch import Tensor
 
 from rlftsim.policies.precision import at_least_float32
 
@@ -30,19 +30,21 @@ class TokenRows:
 
     hidden: Float[Tensor, "R D"]
     """Features that the last map of the head reads."""
-    last: nn.Linear
-    """Last map of the head, to V logits."""
+    weight: Float[Tensor, "V D"]
+    """Of the last map of the head."""
+    bias: Float[Tensor, "V"]
+    """Likewise."""
     class_id: Int64[Tensor, "R"]
     exists: Bool[Tensor, "C V"]
     """True = a token of that class; the others get the logit `NEVER`."""
 
     def logits(self) -> Float[Tensor, "R V"]:
         """float32 logits of all tokens of all rows."""
-        return _logits(self.hidden, self.last.weight, self.offset(), self.class_id)
+        return _logits(self.hidden, self.weight, self.offset(), self.class_id)
 
     def offset(self) -> Float[Tensor, "C V"]:
         """The part of the logits that depends on the class alone: the bias of the last map, and `NEVER`."""
-        return self.last.bias.masked_fill(~self.exists, NEVER)
+        return self.bias.masked_fill(~self.exists, NEVER)
 
 
 def row_statistics(
@@ -57,8 +59,8 @@ def row_statistics(
         chosen: token of each row.
         reference: distributions over the same tokens; None = the policy itself, so that the KL is zero.
     """
-    others = () if reference is None else (reference.hidden, reference.last.weight, reference.offset())
-    own, others = (rows.hidden, rows.last.weight, rows.offset()), [value.detach() for value in others]
+    others = () if reference is None else (reference.hidden, reference.weight, reference.offset())
+    own, others = (rows.hidden, rows.weight, rows.offset()), [value.detach() for value in others]
     return _RowStatistics.apply(*own, rows.class_id, chosen, *others)  # type: ignore[return-value]
 
 

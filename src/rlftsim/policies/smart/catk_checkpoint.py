@@ -94,7 +94,7 @@ def export_catk(policy: SmartPolicy) -> dict[str, Tensor]:
     """Copies of a model's weights under the public code's names, on the CPU; importing them again gives the same bits.
 
     Raises:
-        CheckpointError: the model has a head for each class, the public code has one for all.
+        CheckpointError: the model is goal-conditioned, or its head is none of the public code.
     """
     if policy.is_goal_conditioned:
         raise CheckpointError(
@@ -104,6 +104,10 @@ def export_catk(policy: SmartPolicy) -> dict[str, Tensor]:
         raise CheckpointError(
             "a model with head_per_class has no form in the public CAT-K code, which has one head for all classes: "
             "train one with model.head_per_class=false."
+        )
+    if policy.config.token_key_dim:
+        raise CheckpointError(
+            "a model with keys of tokens has no form in the public CAT-K code: train one with model.token_key_dim=0."
         )
     named = {catk_name(k): v.detach().cpu().clone() for k, v in policy.network.state_dict().items()}
     return named | {second: named[first].clone() for second, first in aliases(named).items()}

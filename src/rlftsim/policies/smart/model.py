@@ -65,11 +65,11 @@ class SmartModel(nn.Module):
     def fine_tuned_parts(self) -> tuple[nn.Module, ...]:
         """The decoder's attention and head, as in the public CAT-K code, and everything for goals."""
         decoder = self.network.decoder
-        return decoder.time_layers, decoder.map_layers, decoder.agent_layers, decoder.head, *self.goal_parts()
+        return decoder.time_layers, decoder.map_layers, decoder.agent_layers, *decoder.head_parts(), *self.goal_parts()
 
     def head_parts(self) -> tuple[nn.Module, ...]:
         """The layers that turn an agent's features into logits of tokens, and everything for goals."""
-        return self.network.decoder.head, *self.goal_parts()
+        return *self.network.decoder.head_parts(), *self.goal_parts()
 
     def goal_parts(self) -> tuple[nn.Module, ...]:
         """Goal encoder and goal logit bias; empty in a goal-free model."""
@@ -187,6 +187,7 @@ class SmartModel(nn.Module):
             class_id=class_id,
             agent_features=decoder.embed_agents(class_id, scenarios.size),
             token_features=decoder.embed_tokens(self.vocabulary.end_corners()),
+            token_keys=decoder.token_keys(self.vocabulary.poses[:, :, -1]),
             relations=decoder.relations(),
             most_map_tokens=self._most_map_tokens(tokens),
         )
@@ -204,14 +205,23 @@ class SmartModel(nn.Module):
         return logged_steps(tokens, steps, catk_compat=self.config.catk_compat)
 
     def _predict(
-        self, features: Float[Tensor, "R D"], token_class: Int64[Tensor, "B A"], mask: Bool[Tensor, "B N A *L"]
+        self,
+        scene: Scene,
+        features: Float[Tensor, "R D"],
+        token_class: Int64[Tensor, "B A"],
+        mask: Bool[Tensor, "B N A *L"],
     ) -> CategoricalDistribution:
         """Distributions of the elements of a mask; tokens that a class lacks get the logit `NEVER`."""
         place = row_places(mask, has_all=len(features) == mask.numel())
         class_id = token_class[place[0], place[2]]  # [R]
-        head, exists = self.network.decoder.head, self.vocabulary.class_tokens
+        head, scores, exists = self.network.decoder.head, self.network.decoder.scores, self.vocabulary.class_tokens
         if isinstance(head, ClassHeads):
             return TokenDistribution(head(features, class_id).masked_fill(~exists[class_id], NEVER), mask)
         *first, last = head
         assert isinstance(last, nn.Linear)
-        return LazyTokenDistribution(TokenRows(nn.Sequential(*first)(features), last, class_id, exists), mask)
+        hidden, weight = nn.Sequential(*first)(features), last.weight
+        if scores is not None and scene.token_keys is not None:
+            # both terms of the logits in one product
+            hidden = torch.cat([hidden, scores.queries(hidden, class_id)], -1)
+            weight = torch.cat([weight, scene.token_keys], -1)
+        return LazyTokenDistribution(TokenRows(hidden, weight, last.bias, class_id, exists), mask)

@@ -46,7 +46,7 @@ from rlftsim.policies.smart.goal_conditioning import (
     goal_encoder,
     rows_where,
 )
-from rlftsim.policies.smart.heads import ClassHeads
+from rlftsim.policies.smart.heads import ClassHeads, MotionScores
 from rlftsim.policies.smart.neighbors import Neighbors, Poses, group_rows, relative_pose, within
 from rlftsim.policies.smart.token_steps import TokenSteps
 from rlftsim.rollout.rows import place_rows, row_places
@@ -71,6 +71,8 @@ class Scene:
     """Embedding of an agent's class and size."""
     token_features: Float[Tensor, "C V D"]
     """Embedding of every motion token."""
+    token_keys: Float[Tensor, "V CK"] | None
+    """Keys of all tokens; None = the head has no `MotionScores`."""
     relations: "Relations"
     most_map_tokens: int | None = None
     """No agent has more map tokens within reach, wherever it goes. None on the CPU, which counts them at every step."""
@@ -233,6 +235,7 @@ class AgentDecoder(nn.Module):
         self.map_layers = nn.ModuleList(RelationAttention(*sizes, separate_source_norm=True) for _ in layers)
         self.agent_layers = nn.ModuleList(RelationAttention(*sizes) for _ in layers)
         self.head = ClassHeads(dim, class_sizes, num_tokens) if class_sizes else MlpLayer(dim, dim, num_tokens)
+        self.scores = MotionScores(dim, config.token_key_dim) if config.token_key_dim else None
         # the names `goal` and `aim` are keys of stored weights
         self.goal = goal_encoder(config.goal, dim, frequencies)
         self.aim = GoalLogitBias() if config.goal_logit_bias else None
@@ -263,6 +266,18 @@ class AgentDecoder(nn.Module):
     def embed_tokens(self, end_corners: Float[Tensor, "C V 4 2"]) -> Float[Tensor, "C V D"]:
         """Embedding of every motion token of every class."""
         return torch.stack([embed(table.flatten(1)) for embed, table in zip(self.tokens, end_corners)])
+
+    def token_keys(self, poses: Float[Tensor, "C V 3"]) -> Float[Tensor, "V CK"] | None:
+        """Keys of every motion token; None without `MotionScores`.
+
+        Args:
+            poses: where each token leads (x, y, heading), meters and radians, in the agent's frame.
+        """
+        return None if self.scores is None else self.scores.keys(poses)
+
+    def head_parts(self) -> tuple[nn.Module, ...]:
+        """What turns features into logits: the head and the queries for the keys of tokens, which stay as they are."""
+        return (self.head,) if self.scores is None else (self.head, self.scores.query)
 
     def fold(self) -> tuple[AttentionMaps, ...]:
         """Maps of the layers' attention, in the order in which the layers are applied."""
@@ -468,6 +483,7 @@ class SmartNetwork(nn.Module):
     def seeing_weights(self) -> list[Tensor]:
         """Weights that scenes and views are made of: all but those of the decoder's layers, head and goal parts."""
         decoder = self.decoder
-        reading = (decoder.time_layers, decoder.map_layers, decoder.agent_layers, decoder.head, *decoder.goal_parts())
+        layers = (decoder.time_layers, decoder.map_layers, decoder.agent_layers)
+        reading = (*layers, *decoder.head_parts(), *decoder.goal_parts())
         ids = {id(weight) for part in reading for weight in part.parameters()}
         return [weight for weight in self.parameters() if id(weight) not in ids]

@@ -249,7 +249,7 @@ class SmartPolicy(SmartModel):
         decides[..., : HISTORY_TOKENS - 1] = False
         counts = (tokens.valid[..., 1:] & trained[..., None])[:, None][decides]
         class_id = class_of_type(scenarios.object_type)
-        logits = self._predict(rows[decides[steps.valid]], class_id, decides).logits
+        logits = self._predict(scene, rows[decides[steps.valid]], class_id, decides).logits
         class_id = class_id[:, None, :, None].expand(decides.shape)[decides]
         return TeacherForced(logits, tokens.next_token_id[:, None, :, :-1][decides], counts, class_id)
 
@@ -280,7 +280,7 @@ class SmartPolicy(SmartModel):
         num_left: Int64[Tensor, "*batch"],
     ) -> CategoricalDistribution:
         """Distributions of the elements of a mask. Poses before each decision are needed where agents have goals."""
-        dist = self._predict(features, context.token_class, mask)
+        dist = self._predict(context.scene, features, context.token_class, mask)
         bias = self.network.decoder.aim
         if bias is None or state.goals is None or poses is None:
             return dist
