@@ -126,6 +126,7 @@ def evaluate(options: Options, name: str) -> list[rs.Evaluation]:
     for place, limit in places if MODELS[name].is_quick else places[:1]:
         out = options.work / "evaluations" / f"{Path(place).name}-{limit}"
         words = ("--data", place, "--limit", limit, "--name", name, "--out", out, "--jobs", jobs)
+        words += ("--rollouts-per-pass", 32)
         run("evaluate", options.work / "runs" / name, *words, *MODELS[name].options)
         found.append(rs.Evaluation.read(out / f"{name}.parquet"))
     return found

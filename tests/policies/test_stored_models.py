@@ -65,6 +65,6 @@ def test_saving_a_stored_model_again_changes_no_weight_and_names_its_architectur
     assert after.pop("architecture") == "smart"
     assert before.pop("format") == "rlftsim-smart-1"
     # later settings, which 0.1 did not have
-    assert (after.pop("frequency_init"), after.pop("token_key_dim")) == ("normal", 0)
+    assert (after.pop("frequency_init"), after.pop("continuation_scores")) == ("normal", False)
     assert list(before.values()) == list(after.values())  # some fields have other names
     assert SmartPolicy.from_pretrained(tmp_path).config == SmartPolicy.from_pretrained(old).config

@@ -1,4 +1,4 @@
-"""A head for each class, and keys of tokens: routed by class, padded, saved, and unknown to the public code."""
+"""Heads of each class, and continuation scores: routed by class, padded, saved, and unknown to the public code."""
 
 from dataclasses import replace
 
@@ -9,13 +9,13 @@ import scenes
 from rlftsim.errors import CheckpointError, ConfigError
 from rlftsim.policies.smart.catk_checkpoint import write_catk
 from rlftsim.policies.smart.config import SmartConfig
-from rlftsim.policies.smart.heads import NEVER, ClassHeads, MotionScores
+from rlftsim.policies.smart.heads import NEVER, ClassHeads, ContinuationScores
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import collate
 from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
 from rlftsim.tokens.trajtok import TrajTokConfig
-from rlftsim.tokens.vocabulary import PADDING_CLASS, class_of_type
+from rlftsim.tokens.vocabulary import CLASS_BOXES_M, PADDING_CLASS, class_of_type
 
 SMALL = SmartConfig(
     dim=16, num_heads=2, head_dim=8, num_map_layers=1, num_decoder_layers=1, num_frequencies=4,
@@ -90,79 +90,67 @@ def test_the_public_code_has_no_form_for_it(policy, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-# ---- keys of tokens --------------------------------------------------------------------------------------------------
+# ---- continuation scores ---------------------------------------------------------------------------------------------
 
-KEYED = replace(SMALL, head_per_class=False, token_key_dim=6)
+CONTINUING = replace(SMALL, head_per_class=False, continuation_scores=True)
 
 
 @pytest.fixture(scope="module")
-def keyed(batch):
+def continuing(batch):
     vocabulary = build_vocabulary(batch.scenarios, TokensConfig(num_tokens=48, num_map_prototypes=8))[0]
     torch.manual_seed(0)
-    return SmartPolicy(KEYED, vocabulary).eval()
+    return SmartPolicy(CONTINUING, vocabulary).eval()
 
 
-def test_a_query_meets_the_keys_of_its_class_alone():
+@pytest.fixture(scope="module")
+def scores():
     torch.manual_seed(0)
-    scores = MotionScores(8, 3)
-    hidden, class_id = torch.randn(4, 8), torch.tensor([2, 0, 1, PADDING_CLASS])
-    keys = torch.randn(5, 3, 3)  # [V, C, K]
-    products = scores.queries(hidden, class_id) @ keys.flatten(1).mT  # [R, V]
+    return ContinuationScores(8)
+
+
+@torch.no_grad()
+def test_a_token_is_scored_by_its_difference_to_the_last_one(scores):
+    ends, hidden, last = torch.randn(3, 20, 3), torch.randn(4, 8), torch.randn(4, 3)
+    class_id = torch.tensor([2, 0, 1, PADDING_CLASS])
+    found = scores.queries(hidden, last, class_id) @ scores.keys(ends).mT  # [R, V]
+    a, b = scores.query(hidden).chunk(2, -1)
     for row, index in enumerate(class_id.tolist()[:3]):
-        torch.testing.assert_close(products[row], keys[:, index] @ scores.query(hidden[row]))
-    assert not products[3].any()
+        length = CLASS_BOXES_M[index][0]
+        change = (ends[index] - last[row]) / torch.tensor([length, length, 1.0])  # [V, 3]
+        angle = change[:, scores.axis] * scores.frequency
+        expected = (a[row] * angle.cos() + b[row] * angle.sin()).sum(-1)
+        torch.testing.assert_close(found[row], expected, atol=1e-4, rtol=0)
+    assert not found[3].any()  # padding
 
 
 @torch.no_grad()
-def test_tokens_that_lead_nearly_to_the_same_place_have_nearly_the_same_key():
-    torch.manual_seed(0)
-    poses = torch.randn(3, 50, 3)
-    near, far = poses + 1e-3, poses + torch.tensor([2.0, 0.5, 0.3])
-    scores = MotionScores(8, 4)
-    keys, beside, elsewhere = (scores.keys(one) for one in (poses, near, far))
-    assert keys.shape == (50, 12)
-    assert (keys - beside).abs().mean() < 0.05 * (keys - elsewhere).abs().mean()
+def test_what_is_learned_at_one_speed_holds_at_any(scores):
+    hidden, class_id = torch.randn(1, 8), torch.tensor([0])
+    ends = torch.randn(3, 20, 3)
+    slow, fast = torch.tensor([[1.0, 0.0, 0.0]]), torch.tensor([[15.0, 0.0, 0.0]])
+    shifted = ends + (fast - slow)
+    at_slow = scores.queries(hidden, slow, class_id) @ scores.keys(ends).mT
+    at_fast = scores.queries(hidden, fast, class_id) @ scores.keys(shifted).mT
+    torch.testing.assert_close(at_slow, at_fast, atol=1e-4, rtol=0)
+    assert at_slow.std() > 0.1
 
 
 @torch.no_grad()
-def test_the_logits_are_those_of_the_head_and_of_the_keys(keyed, batch):
-    decoder, vocabulary = keyed.network.decoder, keyed.vocabulary
-    found = keyed.teacher_forced(batch, batch.agent_mask)
-    head_alone = SmartPolicy(replace(KEYED, token_key_dim=0), vocabulary).eval()
-    own = {k: v for k, v in keyed.network.state_dict().items() if ".scores." not in k}
-    head_alone.network.load_state_dict(own)
-    added = found.logits - head_alone.teacher_forced(batch, batch.agent_mask).logits  # [R, V]
-    keys = decoder.token_keys(vocabulary.poses[:, :, -1]).unflatten(1, (3, -1))  # [V, C, K]
-    for class_id in found.class_id.unique().tolist():
-        rows = added[found.class_id == class_id][:, vocabulary.token_mask[class_id]]
-        # a row adds a combination of the six keys of its class: no more dimensions than that
-        assert torch.linalg.matrix_rank(rows, atol=1e-3) <= min(len(rows), 6)
-        combination = torch.linalg.lstsq(keys[vocabulary.token_mask[class_id], class_id], rows.mT).solution
-        torch.testing.assert_close(
-            keys[vocabulary.token_mask[class_id], class_id] @ combination, rows.mT, atol=1e-4, rtol=0
-        )
-        assert rows.abs().max() > 0.1
-
-
-@torch.no_grad()
-def test_a_saved_model_with_keys_says_the_same(keyed, batch, tmp_path):
-    keyed.save_pretrained(tmp_path)
+def test_a_saved_model_with_continuation_scores_says_the_same(continuing, batch, tmp_path):
+    continuing.save_pretrained(tmp_path)
     again = SmartPolicy.from_pretrained(tmp_path).eval()
-    prediction, same = (p.teacher_forced(batch, batch.agent_mask).logits for p in (keyed, again))
+    prediction, same = (p.teacher_forced(batch, batch.agent_mask).logits for p in (continuing, again))
     assert torch.equal(prediction, same)
 
 
-def test_queries_are_fine_tuned_and_keys_are_not(keyed):
-    trained = {id(weight) for part in keyed.fine_tuned_parts() for weight in part.parameters()}
-    scores = keyed.network.decoder.scores
-    assert id(scores.query.weight) in trained
-    assert not any(id(weight) in trained for weight in scores.key.parameters())
+def test_continuation_scores_are_fine_tuned_with_the_head(continuing):
+    weight = continuing.network.decoder.scores.query.weight
+    for parts in (continuing.fine_tuned_parts(), continuing.head_parts()):
+        assert any(weight is one for part in parts for one in part.parameters())
 
 
-def test_keys_need_one_head_for_all_classes_and_are_unknown_to_the_public_code(keyed, tmp_path):
-    with pytest.raises(ConfigError, match=r"token_key_dim=6 needs one head for all classes"):
-        replace(KEYED, head_per_class=True)
-    with pytest.raises(ConfigError, match=r"token_key_dim must not be negative, got -1"):
-        replace(KEYED, token_key_dim=-1)
-    with pytest.raises(CheckpointError, match=r"keys of tokens has no form in the public CAT-K code"):
-        write_catk(keyed, tmp_path / "out.safetensors")
+def test_continuation_scores_need_one_head_for_all_classes_and_are_unknown_to_the_public_code(continuing, tmp_path):
+    with pytest.raises(ConfigError, match=r"continuation_scores=True needs one head for all classes"):
+        replace(CONTINUING, head_per_class=True)
+    with pytest.raises(CheckpointError, match=r"continuation_scores has no form in the public CAT-K code"):
+        write_catk(continuing, tmp_path / "out.safetensors")

@@ -105,9 +105,10 @@ def export_catk(policy: SmartPolicy) -> dict[str, Tensor]:
             "a model with head_per_class has no form in the public CAT-K code, which has one head for all classes: "
             "train one with model.head_per_class=false."
         )
-    if policy.config.token_key_dim:
+    if policy.config.continuation_scores:
         raise CheckpointError(
-            "a model with keys of tokens has no form in the public CAT-K code: train one with model.token_key_dim=0."
+            "a model with continuation_scores has no form in the public CAT-K code: train one with "
+            "model.continuation_scores=false."
         )
     named = {catk_name(k): v.detach().cpu().clone() for k, v in policy.network.state_dict().items()}
     return named | {second: named[first].clone() for second, first in aliases(named).items()}

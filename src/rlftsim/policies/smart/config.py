@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal, get_args
 
-from rlftsim.errors import ConfigError, given, require_finite, require_not_negative, require_positive, require_types
+from rlftsim.errors import ConfigError, given, require_finite, require_positive, require_types
 
 GoalEncoding = Literal["concat", "indication"]
 """Encoding of an agent's goal, see `goal_conditioning`."""
@@ -18,7 +18,7 @@ class SmartConfig:
     fingerprint_name: ClassVar[str] = "rlftsim.policies.smart.config.SmartConfig"
     first_names: ClassVar[dict[str, str]] = {"goal_logit_bias": "goal_aim", "catk_compat": "public_code_quirks"}
     """Fields that were renamed after models had been stored, and their names in fingerprints."""
-    added_fields: ClassVar[dict[str, Any]] = {"frequency_init": "normal", "token_key_dim": 0}
+    added_fields: ClassVar[dict[str, Any]] = {"frequency_init": "normal", "continuation_scores": False}
     """Fields that were added after models had been stored, and the values with which a model is as before."""
     later_stored: ClassVar[dict[str, Any]] = {"goal_logit_bias": False}
     """The same of fields that count in fingerprints with every value."""
@@ -61,9 +61,9 @@ class SmartConfig:
     head_per_class: bool = False
     """Each class has a head of its own, as large as its vocabulary. False = one head as wide as the largest
     vocabulary; an index then means a different motion in each class."""
-    token_key_dim: int = 0
-    """Width of the keys by which the head also scores tokens, see `heads.MotionScores`: with them a model learns from
-    far fewer scenarios. 0 = none, as in the public code."""
+    continuation_scores: bool = False
+    """The head also scores tokens by how they change the agent's last motion, see `heads.ContinuationScores`: so a
+    model learns from far fewer scenarios, and keeps its speed. False = the public code's head."""
     goal: GoalEncoding | None = None
     """Encoding of goals; None = goal-free, goals have no effect."""
     goal_logit_bias: bool = False
@@ -104,11 +104,10 @@ class SmartConfig:
             raise ConfigError(f"goal={self.goal!r} is no goal encoding: known are {', '.join(get_args(GoalEncoding))}.")
         if self.goal_logit_bias and self.goal is None:
             raise ConfigError("goal_logit_bias=True, but the model is goal-free: set goal to concat or indication.")
-        require_not_negative(self, ("token_key_dim",))
-        if self.token_key_dim and self.head_per_class:
+        if self.continuation_scores and self.head_per_class:
             raise ConfigError(
-                f"token_key_dim={self.token_key_dim} needs one head for all classes: set head_per_class=False, or "
-                "token_key_dim=0."
+                "continuation_scores=True needs one head for all classes: set head_per_class=False, or "
+                "continuation_scores=False."
             )
         if not 0 <= self.dropout < 1 or not 0 <= self.history_drop < 1:
             raise ConfigError(
@@ -164,5 +163,5 @@ def smart_demo() -> SmartConfig:
         dim=48, num_heads=4, head_dim=12, num_map_layers=1, num_decoder_layers=2, num_frequencies=8,
         map_radius_m=11.0, agent_map_radius_m=30.0, agent_radius_m=30.0, history_tokens=4, frequency_init="log_spaced",
         max_map_neighbors=8, max_agent_map_neighbors=16, max_agent_neighbors=8, dropout=0.0, history_drop=0.0,
-        token_key_dim=16,
+        continuation_scores=True,
     )  # fmt: skip

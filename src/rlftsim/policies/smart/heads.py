@@ -1,21 +1,20 @@
 """Heads beside SMART's own: one per agent class, for vocabularies whose classes have different sizes, and scores of
-tokens by where they lead."""
+tokens by how they continue a motion."""
+
+import math
 
 import torch
 from jaxtyping import Float, Int64
 from torch import Tensor, nn
 from torch.nn import functional
 
-from rlftsim.policies.smart.embeddings import FourierEmbedding, MlpLayer
+from rlftsim.policies.smart.embeddings import MlpLayer
 from rlftsim.policies.token_rows import NEVER
 from rlftsim.tokens.vocabulary import CLASS_BOXES_M
 
-KEY_FREQUENCIES = 16
-"""Learned frequencies per input of a token's key."""
-UNITS_PER_BOX = 20.0
-"""Keys see positions in twentieths of the length of the class's box: log-spaced periods are then 1/20 to 3 lengths."""
-UNITS_PER_RAD = 4.0
-"""Likewise: from 1/4 rad on."""
+PERIODS = ((12.8, 0.1, 12), (3.2, 0.1, 8), (6.25, 0.25, 8))
+"""Longest and shortest period and number of the frequencies of `ContinuationScores`: along and across the agent's
+heading in lengths of its class's box, and of its heading in radians."""
 
 
 class ClassHeads(nn.ModuleList):
@@ -48,37 +47,58 @@ class ClassHeads(nn.ModuleList):
         return logits
 
 
-class MotionScores(nn.Module):
-    """A second term of the logits: the product of a query, made of an agent's features, and a key of each token.
+class ContinuationScores(nn.Module):
+    """A second term of the logits: scores of tokens by how they change the agent's last motion.
 
-    SMART's head has a free vector for each token, which is learned from the times that the token is chosen; most of a
-    thousand tokens are rare. A key is a smooth function of where a token leads, so tokens that lead to nearly the same
-    place are scored alike and learned together.
+    SMART's head has a free vector for each token and learns from every speed anew that agents mostly go on as they
+    went; speeds that few training scenarios have stay unknown, and agents fall back to those that are common. Here
+    token v is scored by the difference of its end m_v = (x, y, heading) to that of the last token u,
+
+        sum over frequencies w of  a_w cos(w (m_v - m_u)) + b_w sin(w (m_v - m_u)),
+
+    with a and b linear in the agent's features: whatever is learned about accelerating or turning holds at any speed.
+    By the addition theorems this is the product of a key, which depends on v alone, and of a query that is turned by
+    the phase of u, as in rotary position embeddings.
     """
 
-    def __init__(self, dim: int, key_dim: int):
-        super().__init__()
-        self.query = nn.Linear(dim, key_dim, bias=False)
-        self.key = FourierEmbedding(3, key_dim, KEY_FREQUENCIES)
+    frequency: Float[Tensor, "F"]
+    axis: Int64[Tensor, "F"]
 
-    def keys(self, poses: Float[Tensor, "C V 3"]) -> Float[Tensor, "V CK"]:
+    def __init__(self, dim: int):
+        super().__init__()
+        spaced = [torch.logspace(-math.log10(longest), -math.log10(shortest), n) for longest, shortest, n in PERIODS]
+        axis = [torch.full_like(one, index, dtype=torch.int64) for index, one in enumerate(spaced)]
+        self.register_buffer("frequency", 2 * math.pi * torch.cat(spaced), persistent=False)
+        self.register_buffer("axis", torch.cat(axis), persistent=False)
+        self.query = nn.Linear(dim, 2 * len(self.frequency), bias=False)
+
+    def keys(self, ends: Float[Tensor, "C V 3"]) -> Float[Tensor, "V CK"]:
         """Keys of all tokens, those of the classes side by side.
 
         Args:
-            poses: where each token leads (x, y, heading), meters and radians, in the agent's frame.
+            ends: pose (x, y, heading) that each token leads to, meters and radians, in the agent's frame.
         """
-        per_m = [UNITS_PER_BOX / length for length, _ in CLASS_BOXES_M]
-        unit = poses.new_tensor([(one, one, UNITS_PER_RAD) for one in per_m])  # [C, 3]
-        keys = self.key((poses * unit[:, None]).flatten(0, 1)).unflatten(0, poses.shape[:2])  # [C, V, K]
-        return keys.transpose(0, 1).flatten(1)
+        phase = self._phase(ends, torch.arange(len(ends), device=ends.device)[:, None])  # [C, V, F]
+        return torch.cat([phase.cos(), phase.sin()], -1).transpose(0, 1).flatten(1)
 
-    def queries(self, hidden: Float[Tensor, "R D"], class_id: Int64[Tensor, "R"]) -> Float[Tensor, "R CK"]:
-        """Queries, zero for the keys of other classes; all zero for padding, whose class has no keys.
+    def queries(
+        self, hidden: Float[Tensor, "R D"], last_end: Float[Tensor, "R 3"], class_id: Int64[Tensor, "R"]
+    ) -> Float[Tensor, "R CK"]:
+        """Queries, zero at the keys of other classes; all zero for padding, whose class has no keys.
 
         Args:
             hidden: features that the last map of SMART's head reads.
+            last_end: pose that the token before the decision led to, in the agent's frame before that token.
             class_id: of the agents.
         """
-        classes = torch.arange(len(CLASS_BOXES_M), device=class_id.device)
-        query = self.query(hidden)
-        return ((class_id[:, None] == classes)[..., None] * query[:, None]).flatten(1)
+        phase = self._phase(last_end, class_id)
+        a, b = self.query(hidden).chunk(2, -1)  # [R, F]
+        cos, sin = phase.cos(), phase.sin()
+        query = torch.cat([a * cos - b * sin, a * sin + b * cos], -1)
+        own = class_id[:, None] == torch.arange(len(CLASS_BOXES_M), device=class_id.device)
+        return (own[..., None] * query[:, None]).flatten(1)
+
+    def _phase(self, ends: Float[Tensor, "*n 3"], class_id: Int64[Tensor, "..."]) -> Float[Tensor, "*n F"]:
+        lengths = ends.new_tensor([*(length for length, _ in CLASS_BOXES_M), 1.0])[class_id]  # 1.0: padding
+        unit = torch.stack([lengths, lengths, torch.ones_like(lengths)], -1)
+        return (ends / unit)[..., self.axis] * self.frequency

@@ -46,7 +46,7 @@ from rlftsim.policies.smart.goal_conditioning import (
     goal_encoder,
     rows_where,
 )
-from rlftsim.policies.smart.heads import ClassHeads, MotionScores
+from rlftsim.policies.smart.heads import ClassHeads, ContinuationScores
 from rlftsim.policies.smart.neighbors import Neighbors, Poses, group_rows, relative_pose, within
 from rlftsim.policies.smart.token_steps import TokenSteps
 from rlftsim.rollout.rows import place_rows, row_places
@@ -71,8 +71,8 @@ class Scene:
     """Embedding of an agent's class and size."""
     token_features: Float[Tensor, "C V D"]
     """Embedding of every motion token."""
-    token_keys: Float[Tensor, "V CK"] | None
-    """Keys of all tokens; None = the head has no `MotionScores`."""
+    token_ends: Float[Tensor, "C V 3"]
+    """Pose (x, y, heading) that each motion token leads to, in the agent's frame."""
     relations: "Relations"
     most_map_tokens: int | None = None
     """No agent has more map tokens within reach, wherever it goes. None on the CPU, which counts them at every step."""
@@ -235,7 +235,7 @@ class AgentDecoder(nn.Module):
         self.map_layers = nn.ModuleList(RelationAttention(*sizes, separate_source_norm=True) for _ in layers)
         self.agent_layers = nn.ModuleList(RelationAttention(*sizes) for _ in layers)
         self.head = ClassHeads(dim, class_sizes, num_tokens) if class_sizes else MlpLayer(dim, dim, num_tokens)
-        self.scores = MotionScores(dim, config.token_key_dim) if config.token_key_dim else None
+        self.scores = ContinuationScores(dim) if config.continuation_scores else None
         # the names `goal` and `aim` are keys of stored weights
         self.goal = goal_encoder(config.goal, dim, frequencies)
         self.aim = GoalLogitBias() if config.goal_logit_bias else None
@@ -267,17 +267,9 @@ class AgentDecoder(nn.Module):
         """Embedding of every motion token of every class."""
         return torch.stack([embed(table.flatten(1)) for embed, table in zip(self.tokens, end_corners)])
 
-    def token_keys(self, poses: Float[Tensor, "C V 3"]) -> Float[Tensor, "V CK"] | None:
-        """Keys of every motion token; None without `MotionScores`.
-
-        Args:
-            poses: where each token leads (x, y, heading), meters and radians, in the agent's frame.
-        """
-        return None if self.scores is None else self.scores.keys(poses)
-
     def head_parts(self) -> tuple[nn.Module, ...]:
-        """What turns features into logits: the head and the queries for the keys of tokens, which stay as they are."""
-        return (self.head,) if self.scores is None else (self.head, self.scores.query)
+        """The parts that turn features into logits."""
+        return (self.head,) if self.scores is None else (self.head, self.scores)
 
     def fold(self) -> tuple[AttentionMaps, ...]:
         """Maps of the layers' attention, in the order in which the layers are applied."""
@@ -345,7 +337,7 @@ class AgentDecoder(nn.Module):
         view: View | None = None,
         goals: EncodedGoals | None = None,
         maps: tuple[AttentionMaps, ...] | None = None,
-    ) -> tuple[Float[Tensor, "R D"], Past]:
+    ) -> tuple[Float[Tensor, "R E"], Past]:
         """Features of the valid (agent, step) pairs of a block, and the new past.
 
         Args:
@@ -357,7 +349,8 @@ class AgentDecoder(nn.Module):
             maps: `fold()` of weights that get no gradient, computed once for many blocks.
 
         Returns:
-            Features in the order of `steps.valid.nonzero()`; and the past, followed by the block.
+            Features in the order of `steps.valid.nonzero()`, with continuation scores followed by the end of the token
+            that led to the step (E = D + 3); and the past, followed by the block.
         """
         view = self.look(scene, steps, past) if view is None else view
         x = self._embed_steps(scene, steps, view.rows, view.poses, goals)
@@ -372,6 +365,10 @@ class AgentDecoder(nn.Module):
             x = time_layer(x, source, view.own_history, maps=next(folded))
             x = map_layer(x, None, view.map_tokens, goal_edges=goal_edges, maps=next(folded))
             x = agent_layer(x, normalize(x), view.agents, maps=next(folded))
+        if self.scores is not None:
+            scenario, _, agent, _ = view.rows
+            last_end = scene.token_ends[scene.class_id[scenario, agent], steps.token_id[view.rows]]  # [R, 3]
+            x = torch.cat([x, last_end], -1)
         return x, replace(view.past, sources=tuple(sources))
 
     def _embed_steps(
