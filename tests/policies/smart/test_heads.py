@@ -108,11 +108,17 @@ def scores():
     return ContinuationScores(8)
 
 
+def scored(scores, hidden, last, class_id, ends):
+    """Scores [R, V] of tokens with these ends; the last one led to `last`."""
+    last_key = scores.keys(last.expand(3, -1, -1))[class_id.clamp(max=2), torch.arange(len(last))]
+    return scores.queries(hidden, last_key, class_id) @ scores.keys(ends).transpose(0, 1).flatten(1).mT
+
+
 @torch.no_grad()
 def test_a_token_is_scored_by_its_difference_to_the_last_one(scores):
     ends, hidden, last = torch.randn(3, 20, 3), torch.randn(4, 8), torch.randn(4, 3)
     class_id = torch.tensor([2, 0, 1, PADDING_CLASS])
-    found = scores.queries(hidden, last, class_id) @ scores.keys(ends).mT  # [R, V]
+    found = scored(scores, hidden, last, class_id, ends)
     a, b = scores.query(hidden).chunk(2, -1)
     for row, index in enumerate(class_id.tolist()[:3]):
         length = CLASS_BOXES_M[index][0]
@@ -129,8 +135,8 @@ def test_what_is_learned_at_one_speed_holds_at_any(scores):
     ends = torch.randn(3, 20, 3)
     slow, fast = torch.tensor([[1.0, 0.0, 0.0]]), torch.tensor([[15.0, 0.0, 0.0]])
     shifted = ends + (fast - slow)
-    at_slow = scores.queries(hidden, slow, class_id) @ scores.keys(ends).mT
-    at_fast = scores.queries(hidden, fast, class_id) @ scores.keys(shifted).mT
+    at_slow = scored(scores, hidden, slow, class_id, ends)
+    at_fast = scored(scores, hidden, fast, class_id, shifted)
     torch.testing.assert_close(at_slow, at_fast, atol=1e-4, rtol=0)
     assert at_slow.std() > 0.1
 

@@ -10,7 +10,7 @@ from torch.nn import functional
 
 from rlftsim.policies.smart.embeddings import MlpLayer
 from rlftsim.policies.token_rows import NEVER
-from rlftsim.tokens.vocabulary import CLASS_BOXES_M
+from rlftsim.tokens.vocabulary import CLASS_BOXES_M, box_of_class
 
 PERIODS = ((12.8, 0.1, 12), (3.2, 0.1, 8), (6.25, 0.25, 8))
 """Longest and shortest period and number of the frequencies of `ContinuationScores`: along and across the agent's
@@ -72,33 +72,29 @@ class ContinuationScores(nn.Module):
         self.register_buffer("axis", torch.cat(axis), persistent=False)
         self.query = nn.Linear(dim, 2 * len(self.frequency), bias=False)
 
-    def keys(self, ends: Float[Tensor, "C V 3"]) -> Float[Tensor, "V CK"]:
-        """Keys of all tokens, those of the classes side by side.
+    def keys(self, ends: Float[Tensor, "C V 3"]) -> Float[Tensor, "C V K"]:
+        """Cosines and sines of the phases of all tokens (K = 2F).
 
         Args:
             ends: pose (x, y, heading) that each token leads to, meters and radians, in the agent's frame.
         """
-        phase = self._phase(ends, torch.arange(len(ends), device=ends.device)[:, None])  # [C, V, F]
-        return torch.cat([phase.cos(), phase.sin()], -1).transpose(0, 1).flatten(1)
+        length, _ = box_of_class(torch.arange(len(ends), device=ends.device))
+        unit = torch.stack([length, length, torch.ones_like(length)], -1)  # [C, 3]
+        phase = (ends / unit[:, None])[..., self.axis] * self.frequency  # [C, V, F]
+        return torch.cat([phase.cos(), phase.sin()], -1)
 
     def queries(
-        self, hidden: Float[Tensor, "R D"], last_end: Float[Tensor, "R 3"], class_id: Int64[Tensor, "R"]
+        self, hidden: Float[Tensor, "R D"], last_key: Float[Tensor, "R K"], class_id: Int64[Tensor, "R"]
     ) -> Float[Tensor, "R CK"]:
-        """Queries, zero at the keys of other classes; all zero for padding, whose class has no keys.
+        """Queries for the keys of all classes side by side, zero at those of other classes, and for padding at all.
 
         Args:
             hidden: features that the last map of SMART's head reads.
-            last_end: pose that the token before the decision led to, in the agent's frame before that token.
+            last_key: key of the token that led to the current step.
             class_id: of the agents.
         """
-        phase = self._phase(last_end, class_id)
         a, b = self.query(hidden).chunk(2, -1)  # [R, F]
-        cos, sin = phase.cos(), phase.sin()
+        cos, sin = last_key.chunk(2, -1)
         query = torch.cat([a * cos - b * sin, a * sin + b * cos], -1)
         own = class_id[:, None] == torch.arange(len(CLASS_BOXES_M), device=class_id.device)
         return (own[..., None] * query[:, None]).flatten(1)
-
-    def _phase(self, ends: Float[Tensor, "*n 3"], class_id: Int64[Tensor, "..."]) -> Float[Tensor, "*n F"]:
-        lengths = ends.new_tensor([*(length for length, _ in CLASS_BOXES_M), 1.0])[class_id]  # 1.0: padding
-        unit = torch.stack([lengths, lengths, torch.ones_like(lengths)], -1)
-        return (ends / unit)[..., self.axis] * self.frequency

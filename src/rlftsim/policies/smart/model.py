@@ -187,7 +187,7 @@ class SmartModel(nn.Module):
             class_id=class_id,
             agent_features=decoder.embed_agents(class_id, scenarios.size),
             token_features=decoder.embed_tokens(self.vocabulary.end_corners()),
-            token_ends=self.vocabulary.poses[:, :, -1],
+            token_keys=None if decoder.scores is None else decoder.scores.keys(self.vocabulary.poses[:, :, -1]),
             relations=decoder.relations(),
             most_map_tokens=self._most_map_tokens(tokens),
         )
@@ -219,10 +219,10 @@ class SmartModel(nn.Module):
             return TokenDistribution(head(features, class_id).masked_fill(~exists[class_id], NEVER), mask)
         *first, last = head
         assert isinstance(last, nn.Linear)
-        features, last_end = features.split([self.config.dim, features.shape[1] - self.config.dim], -1)
-        hidden, weight = nn.Sequential(*first)(features), last.weight
-        if scores is not None:
+        hidden, weight = nn.Sequential(*first)(features[:, : self.config.dim]), last.weight
+        if scores is not None and scene.token_keys is not None:
             # both terms of the logits in one product
-            hidden = torch.cat([hidden, scores.queries(hidden, last_end, class_id)], -1)
-            weight = torch.cat([weight, scores.keys(scene.token_ends)], -1)
+            last_key = features[:, self.config.dim :]
+            hidden = torch.cat([hidden, scores.queries(hidden, last_key, class_id)], -1)
+            weight = torch.cat([weight, scene.token_keys.transpose(0, 1).flatten(1)], -1)
         return LazyTokenDistribution(TokenRows(hidden, weight, last.bias, class_id, exists), mask)

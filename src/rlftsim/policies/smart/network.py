@@ -71,8 +71,8 @@ class Scene:
     """Embedding of an agent's class and size."""
     token_features: Float[Tensor, "C V D"]
     """Embedding of every motion token."""
-    token_ends: Float[Tensor, "C V 3"]
-    """Pose (x, y, heading) that each motion token leads to, in the agent's frame."""
+    token_keys: Float[Tensor, "C V K"] | None
+    """Keys of every motion token for `ContinuationScores`; None = the head has none."""
     relations: "Relations"
     most_map_tokens: int | None = None
     """No agent has more map tokens within reach, wherever it goes. None on the CPU, which counts them at every step."""
@@ -349,8 +349,8 @@ class AgentDecoder(nn.Module):
             maps: `fold()` of weights that get no gradient, computed once for many blocks.
 
         Returns:
-            Features in the order of `steps.valid.nonzero()`, with continuation scores followed by the end of the token
-            that led to the step (E = D + 3); and the past, followed by the block.
+            Features in the order of `steps.valid.nonzero()`, with continuation scores followed by the key of the token
+            that led to the step (E = D + K); and the past, followed by the block.
         """
         view = self.look(scene, steps, past) if view is None else view
         x = self._embed_steps(scene, steps, view.rows, view.poses, goals)
@@ -365,10 +365,9 @@ class AgentDecoder(nn.Module):
             x = time_layer(x, source, view.own_history, maps=next(folded))
             x = map_layer(x, None, view.map_tokens, goal_edges=goal_edges, maps=next(folded))
             x = agent_layer(x, normalize(x), view.agents, maps=next(folded))
-        if self.scores is not None:
+        if scene.token_keys is not None:
             scenario, _, agent, _ = view.rows
-            last_end = scene.token_ends[scene.class_id[scenario, agent], steps.token_id[view.rows]]  # [R, 3]
-            x = torch.cat([x, last_end], -1)
+            x = torch.cat([x, scene.token_keys[scene.class_id[scenario, agent], steps.token_id[view.rows]]], -1)
         return x, replace(view.past, sources=tuple(sources))
 
     def _embed_steps(
