@@ -144,7 +144,7 @@ def smart_demo_rlftsim() -> SmartRecipe:
 
 
 def smart_demo_long() -> SmartRecipe:
-    """The demo's model, pre-trained for an hour of two cores on thousands of scenarios, then MLOO that holds speed."""
+    """The demo's model, pre-trained for half an hour of a core on thousands of scenarios, then MLOO that holds speed."""
     recipe = smart_demo_rlftsim()
     assert recipe.road is not None
     return replace(
@@ -156,7 +156,7 @@ def smart_demo_long() -> SmartRecipe:
             recipe.model, history_drop=0.2, max_agent_neighbors=24, agent_radius_m=60.0,
             max_agent_map_neighbors=64, agent_map_radius_m=50.0,
         ),
-        pretrain=replace(recipe.pretrain, epochs=6.0, ema_decay=0.998, final_lr_ratio=0.0),
+        pretrain=replace(recipe.pretrain, epochs=4.0, ema_decay=0.998, final_lr_ratio=0.0),
         road=replace(
             recipe.road, epochs=0.5, batch_size=2, learning_rate=5e-4, final_lr_ratio=0.0, warmup_updates=20,
             still_weight=0.15, ema_decay=0.99, trained="all",
