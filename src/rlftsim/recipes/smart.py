@@ -144,7 +144,7 @@ def smart_demo_rlftsim() -> SmartRecipe:
 
 
 def smart_demo_long() -> SmartRecipe:
-    """The demo's model, pre-trained for half an hour of a core on thousands of scenarios, then MLOO that holds speed."""
+    """The demo's model, pre-trained for half an hour of a core on thousands of scenarios; MLOO that holds speed."""
     recipe = smart_demo_rlftsim()
     assert recipe.road is not None
     return replace(

@@ -110,19 +110,20 @@ def scores():
 
 def scored(scores, hidden, last, class_id, ends):
     """Scores [R, V] of tokens with these ends; the last one led to `last`."""
-    last_key = scores.keys(last.expand(3, -1, -1))[class_id.clamp(max=2), torch.arange(len(last))]
-    return scores.queries(hidden, last_key, class_id) @ scores.keys(ends).transpose(0, 1).flatten(1).mT
+    before = scores.keys(last.expand(3, -1, -1)).phase_before[class_id.clamp(max=2), torch.arange(len(last))]
+    return scores.queries(hidden, before, class_id) @ scores.keys(ends).keys.mT
 
 
 @torch.no_grad()
-def test_a_token_is_scored_by_its_difference_to_the_last_one(scores):
+def test_a_token_is_scored_by_its_change_of_speed_and_where_it_turns(scores):
     ends, hidden, last = torch.randn(3, 20, 3), torch.randn(4, 8), torch.randn(4, 3)
     class_id = torch.tensor([2, 0, 1, PADDING_CLASS])
     found = scored(scores, hidden, last, class_id, ends)
     a, b = scores.query(hidden).chunk(2, -1)
     for row, index in enumerate(class_id.tolist()[:3]):
         length = CLASS_BOXES_M[index][0]
-        change = (ends[index] - last[row]) / torch.tensor([length, length, 1.0])  # [V, 3]
+        along, across, turn = ends[index].unbind(-1)  # [V]
+        change = torch.stack([(along - last[row, 0]) / length, across / length, turn], -1)
         angle = change[:, scores.axis] * scores.frequency
         expected = (a[row] * angle.cos() + b[row] * angle.sin()).sum(-1)
         torch.testing.assert_close(found[row], expected, atol=1e-4, rtol=0)
@@ -133,8 +134,8 @@ def test_a_token_is_scored_by_its_difference_to_the_last_one(scores):
 def test_what_is_learned_at_one_speed_holds_at_any(scores):
     hidden, class_id = torch.randn(1, 8), torch.tensor([0])
     ends = torch.randn(3, 20, 3)
-    slow, fast = torch.tensor([[1.0, 0.0, 0.0]]), torch.tensor([[15.0, 0.0, 0.0]])
-    shifted = ends + (fast - slow)
+    slow, fast = torch.tensor([[1.0, 0.3, 0.1]]), torch.tensor([[15.0, -0.2, 0.2]])
+    shifted = ends + (fast - slow) * torch.tensor([1.0, 0.0, 0.0])
     at_slow = scored(scores, hidden, slow, class_id, ends)
     at_fast = scored(scores, hidden, fast, class_id, shifted)
     torch.testing.assert_close(at_slow, at_fast, atol=1e-4, rtol=0)

@@ -62,8 +62,9 @@ class SmartConfig:
     """Each class has a head of its own, as large as its vocabulary. False = one head as wide as the largest
     vocabulary; an index then means a different motion in each class."""
     continuation_scores: bool = False
-    """The head also scores tokens by how they change the agent's last motion, see `heads.ContinuationScores`: so a
-    model learns from far fewer scenarios, and keeps its speed. False = the public code's head."""
+    """The head also scores tokens by how they change the agent's speed and where they turn, see
+    `heads.ContinuationScores`: so a model learns from far fewer scenarios, and keeps its speed. False = the public
+    code's head."""
     goal: GoalEncoding | None = None
     """Encoding of goals; None = goal-free, goals have no effect."""
     goal_logit_bias: bool = False

@@ -2,6 +2,7 @@
 tokens by how they continue a motion."""
 
 import math
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int64
@@ -12,9 +13,11 @@ from rlftsim.policies.smart.embeddings import MlpLayer
 from rlftsim.policies.token_rows import NEVER
 from rlftsim.tokens.vocabulary import CLASS_BOXES_M, box_of_class
 
-PERIODS = ((12.8, 0.1, 12), (3.2, 0.1, 8), (6.25, 0.25, 8))
+PERIODS = ((12.8, 0.05, 12), (3.2, 0.03, 10), (6.25, 0.06, 10))
 """Longest and shortest period and number of the frequencies of `ContinuationScores`: along and across the agent's
 heading in lengths of its class's box, and of its heading in radians."""
+ALONG = 0
+"""Axis along the heading."""
 
 
 class ClassHeads(nn.ModuleList):
@@ -48,17 +51,19 @@ class ClassHeads(nn.ModuleList):
 
 
 class ContinuationScores(nn.Module):
-    """A second term of the logits: scores of tokens by how they change the agent's last motion.
+    """A second term of the logits: scores of tokens by how they change the agent's speed, and by where they turn.
 
     SMART's head has a free vector for each token and learns from every speed anew that agents mostly go on as they
     went; speeds that few training scenarios have stay unknown, and agents fall back to those that are common. Here
-    token v is scored by the difference of its end m_v = (x, y, heading) to that of the last token u,
+    token v is scored by how much farther its end m_v lies along the heading than that of the last token u did, and by
+    its end across the heading and its turn, which the road decides and not the last turn: a Fourier series
 
-        sum over frequencies w of  a_w cos(w (m_v - m_u)) + b_w sin(w (m_v - m_u)),
+        sum over frequencies w of  a_w cos(w d) + b_w sin(w d),
 
-    with a and b linear in the agent's features: whatever is learned about accelerating or turning holds at any speed.
-    By the addition theorems this is the product of a key, which depends on v alone, and of a query that is turned by
-    the phase of u, as in rotary position embeddings.
+    where d = m_v - m_u along the heading and d = m_v across it and in heading, and a and b are linear in the agent's
+    features. What is learned about accelerating holds at any speed, and tokens that lead to nearly the same place are
+    learned together. By the addition theorems this is the product of a key, which depends on v alone, and of a query
+    that is turned by the phase of u, as in rotary position embeddings.
     """
 
     frequency: Float[Tensor, "F"]
@@ -72,8 +77,8 @@ class ContinuationScores(nn.Module):
         self.register_buffer("axis", torch.cat(axis), persistent=False)
         self.query = nn.Linear(dim, 2 * len(self.frequency), bias=False)
 
-    def keys(self, ends: Float[Tensor, "C V 3"]) -> Float[Tensor, "C V K"]:
-        """Cosines and sines of the phases of all tokens (K = 2F).
+    def keys(self, ends: Float[Tensor, "C V 3"]) -> "TokenKeys":
+        """Keys of all tokens; no weight takes part.
 
         Args:
             ends: pose (x, y, heading) that each token leads to, meters and radians, in the agent's frame.
@@ -81,20 +86,33 @@ class ContinuationScores(nn.Module):
         length, _ = box_of_class(torch.arange(len(ends), device=ends.device))
         unit = torch.stack([length, length, torch.ones_like(length)], -1)  # [C, 3]
         phase = (ends / unit[:, None])[..., self.axis] * self.frequency  # [C, V, F]
-        return torch.cat([phase.cos(), phase.sin()], -1)
+        return TokenKeys(
+            keys=torch.cat([phase.cos(), phase.sin()], -1).transpose(0, 1).flatten(1),
+            phase_before=torch.where(self.axis == ALONG, phase, 0.0),
+        )
 
     def queries(
-        self, hidden: Float[Tensor, "R D"], last_key: Float[Tensor, "R K"], class_id: Int64[Tensor, "R"]
+        self, hidden: Float[Tensor, "R D"], phase_before: Float[Tensor, "R F"], class_id: Int64[Tensor, "R"]
     ) -> Float[Tensor, "R CK"]:
         """Queries for the keys of all classes side by side, zero at those of other classes, and for padding at all.
 
         Args:
             hidden: features that the last map of SMART's head reads.
-            last_key: key of the token that led to the current step.
+            phase_before: of the token that led to the current step, from `TokenKeys`.
             class_id: of the agents.
         """
         a, b = self.query(hidden).chunk(2, -1)  # [R, F]
-        cos, sin = last_key.chunk(2, -1)
+        cos, sin = phase_before.cos(), phase_before.sin()
         query = torch.cat([a * cos - b * sin, a * sin + b * cos], -1)
         own = class_id[:, None] == torch.arange(len(CLASS_BOXES_M), device=class_id.device)
         return (own[..., None] * query[:, None]).flatten(1)
+
+
+@dataclass(frozen=True, eq=False)
+class TokenKeys:
+    """What `ContinuationScores` knows of the tokens of a vocabulary (K = 2F)."""
+
+    keys: Float[Tensor, "V CK"]
+    """Cosines and sines of the phases of a token, the classes side by side."""
+    phase_before: Float[Tensor, "C V F"]
+    """Phase by which a token turns the query of the next decision: zero but along the heading."""

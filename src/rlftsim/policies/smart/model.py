@@ -222,7 +222,7 @@ class SmartModel(nn.Module):
         hidden, weight = nn.Sequential(*first)(features[:, : self.config.dim]), last.weight
         if scores is not None and scene.token_keys is not None:
             # both terms of the logits in one product
-            last_key = features[:, self.config.dim :]
-            hidden = torch.cat([hidden, scores.queries(hidden, last_key, class_id)], -1)
-            weight = torch.cat([weight, scene.token_keys.transpose(0, 1).flatten(1)], -1)
+            phase_before = features[:, self.config.dim :]
+            hidden = torch.cat([hidden, scores.queries(hidden, phase_before, class_id)], -1)
+            weight = torch.cat([weight, scene.token_keys.keys], -1)
         return LazyTokenDistribution(TokenRows(hidden, weight, last.bias, class_id, exists), mask)

@@ -46,7 +46,7 @@ from rlftsim.policies.smart.goal_conditioning import (
     goal_encoder,
     rows_where,
 )
-from rlftsim.policies.smart.heads import ClassHeads, ContinuationScores
+from rlftsim.policies.smart.heads import ClassHeads, ContinuationScores, TokenKeys
 from rlftsim.policies.smart.neighbors import Neighbors, Poses, group_rows, relative_pose, within
 from rlftsim.policies.smart.token_steps import TokenSteps
 from rlftsim.rollout.rows import place_rows, row_places
@@ -71,8 +71,8 @@ class Scene:
     """Embedding of an agent's class and size."""
     token_features: Float[Tensor, "C V D"]
     """Embedding of every motion token."""
-    token_keys: Float[Tensor, "C V K"] | None
-    """Keys of every motion token for `ContinuationScores`; None = the head has none."""
+    token_keys: TokenKeys | None
+    """For `ContinuationScores`; None = the head has none."""
     relations: "Relations"
     most_map_tokens: int | None = None
     """No agent has more map tokens within reach, wherever it goes. None on the CPU, which counts them at every step."""
@@ -349,8 +349,8 @@ class AgentDecoder(nn.Module):
             maps: `fold()` of weights that get no gradient, computed once for many blocks.
 
         Returns:
-            Features in the order of `steps.valid.nonzero()`, with continuation scores followed by the key of the token
-            that led to the step (E = D + K); and the past, followed by the block.
+            Features in the order of `steps.valid.nonzero()`, with continuation scores followed by the phase of the
+            token that led to the step (E = D + F); and the past, followed by the block.
         """
         view = self.look(scene, steps, past) if view is None else view
         x = self._embed_steps(scene, steps, view.rows, view.poses, goals)
@@ -367,7 +367,8 @@ class AgentDecoder(nn.Module):
             x = agent_layer(x, normalize(x), view.agents, maps=next(folded))
         if scene.token_keys is not None:
             scenario, _, agent, _ = view.rows
-            x = torch.cat([x, scene.token_keys[scene.class_id[scenario, agent], steps.token_id[view.rows]]], -1)
+            class_id, token_id = scene.class_id[scenario, agent], steps.token_id[view.rows]
+            x = torch.cat([x, scene.token_keys.phase_before[class_id, token_id]], -1)
         return x, replace(view.past, sources=tuple(sources))
 
     def _embed_steps(
