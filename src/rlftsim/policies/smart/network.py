@@ -71,11 +71,11 @@ class Scene:
     """Embedding of an agent's class and size."""
     token_features: Float[Tensor, "C V D"]
     """Embedding of every motion token."""
-    token_keys: TokenKeys | None
-    """For `ContinuationScores`; None = the head has none."""
     relations: "Relations"
     most_map_tokens: int | None = None
     """No agent has more map tokens within reach, wherever it goes. None on the CPU, which counts them at every step."""
+    token_keys: TokenKeys | None = None
+    """For `ContinuationScores`; None = the head has none."""
 
     @property
     def map_poses(self) -> Poses:
