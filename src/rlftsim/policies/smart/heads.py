@@ -110,7 +110,7 @@ class ContinuationScores(nn.Module):
 
 @dataclass(frozen=True, eq=False)
 class TokenKeys:
-    """What `ContinuationScores` knows of the tokens of a vocabulary (K = 2F)."""
+    """Tokens of a vocabulary as `ContinuationScores` reads them (K = 2F)."""
 
     keys: Float[Tensor, "V CK"]
     """Cosines and sines of the phases of a token, the classes side by side."""

@@ -64,8 +64,7 @@ class SmartModel(nn.Module):
 
     def fine_tuned_parts(self) -> tuple[nn.Module, ...]:
         """The decoder's attention and head, as in the public CAT-K code, and everything for goals."""
-        decoder = self.network.decoder
-        return decoder.time_layers, decoder.map_layers, decoder.agent_layers, *decoder.head_parts(), *self.goal_parts()
+        return self.network.decoder.reading_parts()
 
     def head_parts(self) -> tuple[nn.Module, ...]:
         """The layers that turn an agent's features into logits of tokens, and everything for goals."""
@@ -220,7 +219,8 @@ class SmartModel(nn.Module):
         *first, last = head
         assert isinstance(last, nn.Linear)
         hidden, weight = nn.Sequential(*first)(features[:, : self.config.dim]), last.weight
-        if scores is not None and scene.token_keys is not None:
+        if scores is not None:
+            assert scene.token_keys is not None
             # both terms of the logits in one product
             phase_before = features[:, self.config.dim :]
             hidden = torch.cat([hidden, scores.queries(hidden, phase_before, class_id)], -1)

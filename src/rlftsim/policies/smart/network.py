@@ -271,6 +271,10 @@ class AgentDecoder(nn.Module):
         """The parts that turn features into logits."""
         return (self.head,) if self.scores is None else (self.head, self.scores)
 
+    def reading_parts(self) -> tuple[nn.Module, ...]:
+        """Layers, head and goal parts: all that scenes and views are not made of."""
+        return self.time_layers, self.map_layers, self.agent_layers, *self.head_parts(), *self.goal_parts()
+
     def fold(self) -> tuple[AttentionMaps, ...]:
         """Maps of the layers' attention, in the order in which the layers are applied."""
         layers = zip(self.time_layers, self.map_layers, self.agent_layers)
@@ -478,9 +482,6 @@ class SmartNetwork(nn.Module):
             part.zero_init()
 
     def seeing_weights(self) -> list[Tensor]:
-        """Weights that scenes and views are made of: all but those of the decoder's layers, head and goal parts."""
-        decoder = self.decoder
-        layers = (decoder.time_layers, decoder.map_layers, decoder.agent_layers)
-        reading = (*layers, *decoder.head_parts(), *decoder.goal_parts())
-        ids = {id(weight) for part in reading for weight in part.parameters()}
+        """Weights that scenes and views are made of: all but those of the decoder's `reading_parts`."""
+        ids = {id(weight) for part in self.decoder.reading_parts() for weight in part.parameters()}
         return [weight for weight in self.parameters() if id(weight) not in ids]
