@@ -2,6 +2,8 @@
 
 import math
 import operator
+import os
+import traceback
 from dataclasses import fields, is_dataclass
 from types import UnionType
 from typing import Any, ClassVar, Literal, Union, get_args, get_origin, get_type_hints
@@ -42,6 +44,15 @@ class CheckpointError(RlftsimError):
 def in_short(value: object) -> str:
     """A value as a message shows it: numbers and text as they are, anything else by its type."""
     return repr(value) if isinstance(value, str | int | float | None) else type(value).__name__
+
+
+def place_of(error: Exception) -> str:
+    """File, line and function where an error that was raised began; torch's code and Python's import are left out."""
+    # A wrong shape is noticed inside torch, but made by the code that called it.
+    foreign = (f"{os.sep}site-packages{os.sep}torch{os.sep}", "<frozen ")
+    frames = traceback.extract_tb(error.__traceback__)
+    place = [one for one in frames if not any(part in one.filename for part in foreign)][-1]
+    return f"{os.path.basename(place.filename)}:{place.lineno} in {place.name}"
 
 
 def whole_number(name: str, value: object, least: int | None = None) -> int:

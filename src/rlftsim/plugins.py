@@ -24,7 +24,7 @@ from importlib.metadata import EntryPoint, entry_points
 from types import ModuleType
 from typing import Generic, TypeVar
 
-from rlftsim.errors import ConfigError
+from rlftsim.errors import ConfigError, place_of
 
 POINTS = {
     "rlftsim.policies": "rlftsim.policies.registry:POLICIES",
@@ -155,7 +155,7 @@ class ExtensionPoint(Generic[Value]):
             package = f" of package {entry.dist.name} {entry.dist.version}" if entry.dist else ""
             return (
                 f"{self.kind} {entry.name!r}{package} ({entry.value}) cannot be imported "
-                f"({type(error).__name__}: {error}): repair or uninstall the package."
+                f"({type(error).__name__}: {error}, {place_of(error)}): repair or uninstall the package."
             )
         if not isinstance(value, ModuleType):  # a module has registered its things itself
             try:

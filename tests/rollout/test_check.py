@@ -139,9 +139,14 @@ def test_an_error_inside_a_policy_is_a_failed_rule():
         def score(self, context, rollouts):
             raise ValueError("cannot score")
 
+    class Misshapen(ConstantVelocity):
+        def score(self, context, rollouts):
+            return torch.nn.functional.linear(torch.zeros(1, 2), torch.zeros(3, 5))  # raises inside torch
+
     report = check_policy(Crashing(), STRAIGHT)
     detail = report.failures[0].detail
     assert re.fullmatch(r"raised ValueError: cannot score \(test_check\.py:\d+ in score\)", detail)
+    assert re.search(r"\(test_check\.py:\d+ in score\)$", check_policy(Misshapen(), STRAIGHT).failures[0].detail)
 
 
 def test_rules_have_names_without_docstrings():

@@ -9,18 +9,16 @@ where it applies.
 
 import copy
 import math
-import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from rlftsim.errors import RlftsimError
+from rlftsim.errors import RlftsimError, place_of
 from rlftsim.geometry import rotate, wrap_angle
 from rlftsim.goals.types import Goals
 from rlftsim.rollout.edge_scenes import EXACT_TURN_RAD, GRID_M, edge_scenes, move_scenario, place_on_grid
@@ -125,11 +123,7 @@ def check_policy(policy: Policy, scenarios: Sequence[Scenario], *, reference: Po
         except _Broken as measured:
             outcome, detail = "failed", str(measured)
         except Exception as error:  # whatever a policy raises is an outcome of the test
-            *_, place = traceback.extract_tb(error.__traceback__)
-            outcome = "failed"
-            detail = (
-                f"raised {type(error).__name__}: {error} ({Path(place.filename).name}:{place.lineno} in {place.name})"
-            )
+            outcome, detail = "failed", f"raised {type(error).__name__}: {error} ({place_of(error)})"
         results.append(CheckResult(check.__name__.replace("_", " "), outcome, detail))
     return CheckReport(type(policy).__name__, tuple(results))
 
