@@ -393,6 +393,17 @@ def test_rollouts_of_other_scenarios_are_refused(data):
 # ---- agents by object id, provenance --------------------------------------------------------------------------------
 
 
+def test_rollouts_that_are_not_finite_have_no_score(base, data):
+    rollouts = rs.simulate(base, data, num_rollouts=2)
+    rollouts.position[1, 1, 0, 40] = np.nan
+    scenario_id = data[1].scenario_id
+    refuse(
+        lambda: rs.score(data, rollouts),
+        f"object id {rollouts.object_ids(scenario_id)[0]} of scenario {scenario_id} in rollout 1 at future step 40 is "
+        "not finite",
+    )
+
+
 def test_rollouts_know_where_they_come_from(base, data):
     rollouts = rs.simulate(base, list(data), num_rollouts=3, seed=11, sampling=rs.Sampling(temperature=0.5))
     about = rollouts.provenance

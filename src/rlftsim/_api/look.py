@@ -27,7 +27,7 @@ def score(scenarios: AnyScenarios, rollouts: Rollouts, metric: str | int = "2025
 
     Raises:
         ConfigError: rollouts of other scenarios, or no such metric.
-        DataError: a scenario that cannot be scored, e.g. one without its future.
+        DataError: a scenario that cannot be scored, e.g. one without its future, or a pose that is not finite.
     """
     require_rollouts("score", scenarios, rollouts)
     batch = batch_of(scenarios, rollouts.position.device)
@@ -44,6 +44,8 @@ def score(scenarios: AnyScenarios, rollouts: Rollouts, metric: str | int = "2025
         )
     # 2. Score, in the world frame and without padding.
     states, config = states_of_rollouts(batch, rollouts), metric_by_name(str(metric))
+    for scenario, simulated in zip(batch.scenarios, states):
+        simulated.check_finite(scenario.scenario_id)
     if isinstance(scenarios, Scenario):
         return score_scenario(scenarios, states[0], config)
     return score_batch(batch.scenarios, states, config)
