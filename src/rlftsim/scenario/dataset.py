@@ -327,8 +327,9 @@ def write_dataset(
 
     Raises:
         ConfigError: there is no scenario, or something else is among them.
-        DataError: the folder is not empty or cannot be written to, an id occurs twice, an array has another dtype than
-            `types.py` says, or a valid state or map point is not finite (names scenario, agent and step).
+        DataError: the folder is not empty or cannot be written to, a scenario id occurs twice, an array has another
+            dtype than `types.py` says, a valid state or map point is not finite (names scenario, agent and step), an
+            object id occurs twice, a type is unknown, a size is not above zero, or the ego is no track.
     """
     with DatasetWriter(folder, license_note=license_note, provenance=provenance) as writer:
         is_empty = True
