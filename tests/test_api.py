@@ -9,6 +9,7 @@ import subprocess
 import sys
 import warnings
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
 
 import jaxtyping
@@ -586,6 +587,20 @@ ORDER = r"write rs\.\w+\(scenario, rollouts\), got"
 def test_a_wrong_argument_is_refused_in_one_line(call, message, data, unchecked):
     refuse(lambda: call(data), message)
     assert not Path("empty").exists()
+
+
+def test_a_scenario_made_in_python_is_checked_by_every_function(data, unchecked):
+    tracks = data[0].tracks
+    lost, wide = tracks.position.copy(), tracks.position.astype(np.float64)
+    lost[data[0].ego_index, 10, 0] = np.nan
+    good = rs.simulate(CV, data[0], num_rollouts=2)
+    calls = [partial(call, CV) for call in (rs.simulate, rs.evaluate, rs.finetune, rs.pretrain, rs.check_policy)]
+    for position, message in ((lost, "NaN or infinite position at step 10"), (wide, "is float64, it must be float32")):
+        broken = replace(data[0], tracks=replace(tracks, position=position))
+        for call in (*calls, rs.show, lambda one: rs.score(one, good)):
+            refuse(lambda call=call, broken=broken: call(broken), f"scenario {broken.scenario_id}: .*{message}")
+    batch = replace(collate([data[0]]), scenarios=(replace(data[0], ego_index=-1),))
+    refuse(lambda: rs.simulate(CV, batch), "ego_index names track index -1")
 
 
 @pytest.mark.parametrize(

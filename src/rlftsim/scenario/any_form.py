@@ -8,6 +8,7 @@ from rlftsim.errors import ConfigError, in_short
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.open import open_dataset
+from rlftsim.scenario.shards import refuse_unsound
 from rlftsim.scenario.types import Scenario, Scenarios
 
 Name: TypeAlias = str | os.PathLike[str]
@@ -32,11 +33,12 @@ def scenarios_of(scenarios: Any) -> Scenarios:
     wanted = "hand over one, a list of them, a batch or a data set."
     if not isinstance(found, Scenarios) or isinstance(found, Mapping):
         raise ConfigError(f"{in_short(scenarios)}: not scenarios: {wanted}")
-    # A data set reads its scenarios from files, and has nothing else.
+    # A data set reads its scenarios from files, and has nothing else: they were checked when they were written.
     items = () if isinstance(found, ScenarioDataset) else (found[position] for position in range(len(found)))
     for one in items:
         if not isinstance(one, Scenario):
             raise ConfigError(f"{type(scenarios).__name__} with {in_short(one)}: not scenarios: {wanted}")
+        refuse_unsound(one)
     if not len(found):
         raise ConfigError("no scenario: hand over at least one.")
     return found
