@@ -475,6 +475,15 @@ def test_scenarios_without_goals_are_simulated_without(follower, data):
 # ---- looking at things --------------------------------------------------------------------------------------------
 
 
+def test_a_scenario_without_agents_has_empty_rollouts(base, follower, data):
+    tracks = data[0].tracks
+    empty = replace(data[0], tracks=replace(tracks, valid=np.zeros_like(tracks.valid)))
+    for policy in (base, follower, CV):
+        assert rs.simulate(policy, empty, num_rollouts=2).position.shape == (1, 2, 0, 80, 2)
+    goals = {int(tracks.object_id[data[0].ego_index]): (0.0, 0.0)}
+    refuse(lambda: rs.simulate(follower, empty, goals=goals), "not simulated|not valid")
+
+
 def test_scenarios_and_rollouts_play_in_a_cell(base, data, tmp_path):
     scenario = data[0]
     rollouts = rs.simulate(base, scenario, num_rollouts=8)
