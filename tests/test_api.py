@@ -366,6 +366,27 @@ def test_one_several_a_batch_and_a_data_set_are_alike(base, data):
         assert float(rs.score(scenario, rollouts).meta_metric) == float(scores[0][row])
 
 
+def test_a_bare_name_stands_for_the_split_of_the_command(base, data):
+    ids, training = tuple(data.scenario_ids), rs.load_dataset(SMALL, "training")
+    rollouts = rs.simulate(base, SMALL, num_rollouts=2)
+    assert rollouts.provenance is not None
+    assert rollouts.provenance.scenario_ids == ids
+    assert rs.score(SMALL, rollouts).scenario_ids == ids
+    assert "iframe" in rs.show(SMALL, rollouts)._repr_html_()
+    assert tuple(rs.evaluate(rs.ConstantVelocity(), SMALL, num_rollouts=2).scenario_ids) == ids
+    for train in (partial(rs.finetune, config=few_updates()), partial(rs.pretrain, config=TINY.pretrain)):
+        assert fingerprint_policy(train(base, SMALL)) == fingerprint_policy(train(base, training))
+
+
+@pytest.mark.parametrize(
+    ("call", "split"),
+    [(rs.simulate, "validation"), (rs.evaluate, "validation"), (rs.finetune, "training"), (rs.pretrain, "training")],
+)
+def test_a_data_set_without_the_split_of_the_command_is_refused(call, split, base, data):
+    rs.write_dataset(data[0], "one")
+    refuse(lambda: call(base, "one"), rf"no split '{split}', only unknown: .* by load_dataset\(name, split\)")
+
+
 def test_the_closed_loop_itself_gives_the_same_rollouts(base, data):
     rollouts = rs.simulate(base, data[0], num_rollouts=2, seed=1)
     plain = simulate_batch(base, collate([data[0]]), num_rollouts=2, seed=1)
@@ -661,7 +682,7 @@ def test_a_data_set_is_read_like_a_list(data):
         assert [one.scenario_id for one in chosen] == ids
     rs.write_dataset(scenario, "one")
     assert rs.load_dataset("one").scenario_ids == ids[:1]
-    assert "iframe" in rs.show("one")._repr_html_()
+    assert "iframe" in rs.show(rs.load_dataset("one"))._repr_html_()
 
 
 def test_goals_of_another_batch_are_refused(follower, data):

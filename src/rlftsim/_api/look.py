@@ -18,7 +18,8 @@ def score(scenarios: AnyScenarios, rollouts: Rollouts, metric: str | int = "2025
     """Score rollouts with the realism meta-metric of the Waymo Open Sim Agents Challenge.
 
     Args:
-        scenarios: the scenarios of the rollouts with their logged futures, in the same order.
+        scenarios: the scenarios of the rollouts with their logged futures, in the same order; a name of a data set
+            stands for its split validation.
         rollouts: of `simulate`.
         metric: year of the challenge.
 
@@ -60,7 +61,8 @@ def check_policy(
 
     Args:
         policy: a policy, or a name for `load_policy`.
-        scenarios: at least one, on which everything is tried; best of different sizes and with all kinds of agents.
+        scenarios: at least one, on which everything is tried; best of different sizes and with all kinds of agents. A
+            name of a data set stands for its split validation.
         reference: another policy of the same kind for KL divergences; None = a copy with perturbed weights.
 
     Returns:

@@ -36,8 +36,8 @@ def simulate(
 
     Args:
         policy: a policy, or a name for `load_policy`.
-        scenarios: one scenario, several, a batch or a data set, all of which are in memory at once; only history, map
-            and lights are used.
+        scenarios: one scenario, several, a batch or a data set, all of which are in memory at once; a name of a data
+            set stands for its split validation. Only history, map and lights are used.
         num_rollouts: N, futures of every scenario.
         seed: of all randomness.
         goals: points that agents drive to, meters in the world frame: {object_id: (x, y)}, and for several scenarios

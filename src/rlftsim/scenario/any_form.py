@@ -13,19 +13,24 @@ from rlftsim.scenario.types import Scenario, Scenarios
 
 Name: TypeAlias = str | os.PathLike[str]
 AnyScenarios: TypeAlias = Scenario | ScenarioBatch | Scenarios | Name
-"""One scenario, several, a batch, a data set, or the name of a data set."""
+"""One scenario, several, a batch, a data set, or the name of a data set for the split that a function is about:
+training to train, validation else, as on the command line."""
 
 
-def scenarios_of(scenarios: Any) -> Scenarios:
+def scenarios_of(scenarios: Any, split: str | None = "validation") -> Scenarios:
     """Scenarios by position, in whatever form they were handed over.
+
+    Args:
+        scenarios: in any form.
+        split: opened of a data set that is given by its name; None = all.
 
     Raises:
         ConfigError: there is none, or something else was handed over.
-        DataError: no data set of this name.
+        DataError: no data set of this name, it has no such split, or a scenario that was made in Python is unsound.
     """
     # A string has a length and items too, so names are looked at first.
     if isinstance(scenarios, str | os.PathLike):
-        found: Any = open_dataset(scenarios)
+        found: Any = open_dataset(scenarios, split)
     elif isinstance(scenarios, Scenario):
         found = (scenarios,)
     else:

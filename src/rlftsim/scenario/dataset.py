@@ -121,7 +121,10 @@ class ScenarioDataset:
             raise DataError(f"{self.folder / INDEX} does not belong to {MANIFEST}: convert again")
         if split is not None and split not in self.manifest.counts:
             known = ", ".join(self.manifest.counts) or "none"
-            raise DataError(f"{self.folder} has no split {split!r}, only {known}: name one of these as the split")
+            raise DataError(
+                f"{self.folder} has no split {split!r}, only {known}: name one of these as the split, in Python "
+                "by load_dataset(name, split)"
+            )
         self.index = index if split is None else index.filter(pc.field("split") == split)
         """Table with the columns of `INDEX_SCHEMA`, one row per scenario, in the order of positions."""
         self.scenario_ids: list[str] = self.index["scenario_id"].to_pylist()
