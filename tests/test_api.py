@@ -9,6 +9,7 @@ import subprocess
 import sys
 import warnings
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
 
 import jaxtyping
@@ -365,6 +366,27 @@ def test_one_several_a_batch_and_a_data_set_are_alike(base, data):
         assert float(rs.score(scenario, rollouts).meta_metric) == float(scores[0][row])
 
 
+def test_a_bare_name_stands_for_the_split_of_the_command(base, data):
+    ids, training = tuple(data.scenario_ids), rs.load_dataset(SMALL, "training")
+    rollouts = rs.simulate(base, SMALL, num_rollouts=2)
+    assert rollouts.provenance is not None
+    assert rollouts.provenance.scenario_ids == ids
+    assert rs.score(SMALL, rollouts).scenario_ids == ids
+    assert "iframe" in rs.show(SMALL, rollouts)._repr_html_()
+    assert tuple(rs.evaluate(rs.ConstantVelocity(), SMALL, num_rollouts=2).scenario_ids) == ids
+    for train in (partial(rs.finetune, config=few_updates()), partial(rs.pretrain, config=TINY.pretrain)):
+        assert fingerprint_policy(train(base, SMALL)) == fingerprint_policy(train(base, training))
+
+
+@pytest.mark.parametrize(
+    ("call", "split"),
+    [(rs.simulate, "validation"), (rs.evaluate, "validation"), (rs.finetune, "training"), (rs.pretrain, "training")],
+)
+def test_a_data_set_without_the_split_of_the_command_is_refused(call, split, base, data):
+    rs.write_dataset(data[0], "one")
+    refuse(lambda: call(base, "one"), rf"no split '{split}', only unknown: .* by load_dataset\(name, split\)")
+
+
 def test_the_closed_loop_itself_gives_the_same_rollouts(base, data):
     rollouts = rs.simulate(base, data[0], num_rollouts=2, seed=1)
     plain = simulate_batch(base, collate([data[0]]), num_rollouts=2, seed=1)
@@ -391,6 +413,17 @@ def test_rollouts_of_other_scenarios_are_refused(data):
 
 
 # ---- agents by object id, provenance --------------------------------------------------------------------------------
+
+
+def test_rollouts_that_are_not_finite_have_no_score(base, data):
+    rollouts = rs.simulate(base, data, num_rollouts=2)
+    rollouts.position[1, 1, 0, 40] = np.nan
+    scenario_id = data[1].scenario_id
+    refuse(
+        lambda: rs.score(data, rollouts),
+        f"object id {rollouts.object_ids(scenario_id)[0]} of scenario {scenario_id} in rollout 1 at future step 40 is "
+        "not finite",
+    )
 
 
 def test_rollouts_know_where_they_come_from(base, data):
@@ -461,6 +494,15 @@ def test_scenarios_without_goals_are_simulated_without(follower, data):
 
 
 # ---- looking at things --------------------------------------------------------------------------------------------
+
+
+def test_a_scenario_without_agents_has_empty_rollouts(base, follower, data):
+    tracks = data[0].tracks
+    empty = replace(data[0], tracks=replace(tracks, valid=np.zeros_like(tracks.valid)))
+    for policy in (base, follower, CV):
+        assert rs.simulate(policy, empty, num_rollouts=2).position.shape == (1, 2, 0, 80, 2)
+    goals = {int(tracks.object_id[data[0].ego_index]): (0.0, 0.0)}
+    refuse(lambda: rs.simulate(follower, empty, goals=goals), "not simulated|not valid")
 
 
 def test_scenarios_and_rollouts_play_in_a_cell(base, data, tmp_path):
@@ -577,6 +619,20 @@ def test_a_wrong_argument_is_refused_in_one_line(call, message, data, unchecked)
     assert not Path("empty").exists()
 
 
+def test_a_scenario_made_in_python_is_checked_by_every_function(data, unchecked):
+    tracks = data[0].tracks
+    lost, wide = tracks.position.copy(), tracks.position.astype(np.float64)
+    lost[data[0].ego_index, 10, 0] = np.nan
+    good = rs.simulate(CV, data[0], num_rollouts=2)
+    calls = [partial(call, CV) for call in (rs.simulate, rs.evaluate, rs.finetune, rs.pretrain, rs.check_policy)]
+    for position, message in ((lost, "NaN or infinite position at step 10"), (wide, "is float64, it must be float32")):
+        broken = replace(data[0], tracks=replace(tracks, position=position))
+        for call in (*calls, rs.show, lambda one: rs.score(one, good)):
+            refuse(lambda call=call, broken=broken: call(broken), f"scenario {broken.scenario_id}: .*{message}")
+    batch = replace(collate([data[0]]), scenarios=(replace(data[0], ego_index=-1),))
+    refuse(lambda: rs.simulate(CV, batch), "ego_index names track index -1")
+
+
 @pytest.mark.parametrize(
     ("kind", "values", "message"),
     [
@@ -626,7 +682,7 @@ def test_a_data_set_is_read_like_a_list(data):
         assert [one.scenario_id for one in chosen] == ids
     rs.write_dataset(scenario, "one")
     assert rs.load_dataset("one").scenario_ids == ids[:1]
-    assert "iframe" in rs.show("one")._repr_html_()
+    assert "iframe" in rs.show(rs.load_dataset("one"))._repr_html_()
 
 
 def test_goals_of_another_batch_are_refused(follower, data):

@@ -262,6 +262,26 @@ def test_nan_in_a_valid_state_is_refused(data, tmp_path, monkeypatch):
         evaluate("oracle", data, tmp_path, CONFIG, name="oracle")
 
 
+@dataclass(frozen=True)
+class Loses(ConstantVelocity):
+    """Constant velocity that loses one agent's poses: they are NaN from the first decision on."""
+
+    agent: int = 0
+
+    def advance(self, context, state, decision, forced=None):
+        after = super().advance(context, state, decision, forced)
+        after.poses[:, :, self.agent] = np.nan
+        return after
+
+
+@pytest.mark.parametrize("agent", [0, 2])
+def test_a_policy_whose_poses_are_not_finite_is_refused(data, agent):
+    ids = scenes.straight_road().tracks.object_id
+    message = f"object id {ids[agent]} of scenario straight in rollout 0 at future step 0 is not finite"
+    with pytest.raises(DataError, match=message):
+        evaluate(Loses(agent=agent), data, None, replace(CONFIG, limit=1), name="loses")
+
+
 def test_work_in_parts_is_joined_in_order_and_skipped_scenarios_are_kept(data, tmp_path):
     provenance = evaluate("oracle", data, None, replace(CONFIG, limit=1), name="o").provenance
     row = dict.fromkeys(("num_agents", "num_evaluated"), 1) | dict.fromkeys(SCORE_COLUMNS, 0.5)

@@ -176,6 +176,36 @@ def test_a_valid_state_that_is_no_number_is_refused_by_name(tmp_path, scenarios,
     write_dataset(scenarios, tmp_path / "data")
 
 
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"scenario_id": 5}, "scenario id 5 is no file name, .*: write it as text"),
+        ({"ego_index": -1}, "scenario id1: ego_index names track index -1, but there are 2 tracks"),
+        ({"ego_index": 999}, "scenario id1: ego_index names track index 999, but there are 2 tracks"),
+        ({"tracks_to_predict": np.array([2], np.int32)}, "tracks_to_predict names track index 2, but there are 2"),
+        ({"object_id": np.array([7, 7])}, "object id 7 belongs to 2 tracks"),
+        ({"object_type": np.array([1, 9], np.int8)}, "track 101: type 9 is none of 0 unset, 1 vehicle"),
+        ({"size": np.full((2, 91, 3), (4, 0, 2), np.float32)}, "track 100: width is 0 at the current step"),
+        ({"size": np.full((2, 91, 3), (4, 2, -1), np.float32)}, "track 100: height is -1 at the current step"),
+    ],
+)
+def test_a_scenario_that_breaks_the_contract_is_refused(tmp_path, scenarios, changes, message):
+    scenario, tracks = replace(scenarios[1]), replace(scenarios[1].tracks)
+    object.__setattr__(scenario, "tracks", tracks)
+    for name, value in changes.items():  # past run-time checks of types
+        object.__setattr__(tracks if hasattr(tracks, name) else scenario, name, value)
+    with pytest.raises(DataError, match=message):
+        write_dataset([scenario], tmp_path / "data")
+    assert not (tmp_path / "data").exists()
+
+
+def test_a_size_of_zero_is_fine_where_a_track_is_not_valid_now(tmp_path, scenarios):
+    scenarios[1].tracks.size[0, 10] = 0
+    scenarios[1].tracks.valid[0, 10] = False
+    scenarios[1].tracks.size[1, 11:] = 0
+    assert write_dataset(scenarios, tmp_path / "data").num_scenarios == 5
+
+
 def test_a_wrong_dtype_is_refused_before_it_is_written(tmp_path, scenarios):
     tracks = replace(scenarios[0].tracks)
     object.__setattr__(tracks, "heading", tracks.heading.astype(np.float64))  # past run-time checks of types

@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import pytest
 
@@ -63,6 +64,15 @@ def test_a_state_that_is_no_number_is_found_and_never_written(make_dataset, make
     (finding,) = verify_dataset(tmp_path / "data")
     assert str(finding).startswith("not finite: a: track 100 has a NaN or infinite position at step 30, ")
     assert str(finding).endswith("correct the value or mark the state as not valid")
+
+
+def test_a_scenario_that_breaks_the_contract_is_found(make_message, tmp_path, monkeypatch):
+    scenario = scenario_from_bytes(make_message("a").SerializeToString())
+    with monkeypatch.context() as other_writer:
+        other_writer.setattr(Scenario, "refuse_broken", lambda _: None)
+        write_dataset([replace(scenario, ego_index=-1)], tmp_path / "data")
+    (finding,) = verify_dataset(tmp_path / "data")
+    assert str(finding) == "broken scenario: a: ego_index names track index -1, but there are 3 tracks"
 
 
 def test_missing_map_and_no_agent_to_evaluate_are_found(make_dataset, make_message):

@@ -11,9 +11,9 @@ import third_party
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.scenario.convert import convert
 from rlftsim.scenario.dataset import ScenarioDataset, read_manifest, write_dataset
-from rlftsim.scenario.sources import SOURCES, DataSource, Unit, find_source, infer_split, units_of_files
+from rlftsim.scenario.sources import SOURCES, DataSource, Unit, find_source, infer_split, read_unit, units_of_files
 from rlftsim.scenario.tfrecord import SkippedRecord, write_records
-from rlftsim.scenario.womd import WomdSource
+from rlftsim.scenario.womd import WomdSource, scenario_from_bytes
 
 DRIVES = '''
 """A recorder of straight drives: one text file each, a line "id x_m speed_mps" per scenario."""
@@ -130,6 +130,32 @@ def test_other_processes_have_the_source_too(tmp_path, recordings):
 def test_stop_ends_at_the_first_bad_record_of_any_source(tmp_path, recordings):
     with pytest.raises(DataError, match=r"a\.drive: record 0: 'nonsense' is no drive"):
         run(recordings, tmp_path / "data", reader="drives", on_error="stop")
+
+
+def test_an_unsound_scenario_of_any_source_is_a_bad_record(make_message):
+    good, bad = (scenario_from_bytes(make_message(name).SerializeToString()) for name in ("good", "bad"))
+    bad.tracks.object_id[:] = 7
+    lost = scenario_from_bytes(make_message("lost").SerializeToString())
+    lost.tracks.heading[0, 3] = np.nan
+
+    class Yields:
+        license_note = "CC0-1.0"
+
+        def find(self, path):
+            return [Unit("x", ())]
+
+        def read(self, unit):
+            yield from (bad, good, lost)
+
+        def describe(self):
+            return {}
+
+    skipped = []
+    read = list(read_unit(Yields(), Unit("x", ()), on_error="skip", report=skipped.append))
+    assert read == [(1, good)]
+    assert [one.record for one in skipped] == [0, 2]
+    assert "scenario bad: object id 7 belongs to 3 tracks" in str(skipped[0])
+    assert "scenario lost: track 100 has a NaN or infinite heading at step 3" in str(skipped[1])
 
 
 @pytest.mark.usefixtures("drives")

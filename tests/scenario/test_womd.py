@@ -78,7 +78,7 @@ def test_every_kind_of_map_feature_gets_its_type_and_points():
     ]
     message = womd_pb2.Scenario(scenario_id="a", sdc_track_index=0)
     message.timestamps_seconds.extend([0.0] * 11)
-    message.tracks.add(id=1).states.extend([womd_pb2.ObjectState(valid=True)] * 11)
+    message.tracks.add(id=1).states.extend([womd_pb2.ObjectState(length=4, width=2, height=2, valid=True)] * 11)
     for number, (feature, _, path) in enumerate(features):
         kind, points = path.split(".")
         for j in range(number):
@@ -212,6 +212,14 @@ def spoil_current(m):
     m.current_time_index = 50
 
 
+def spoil_ids(m):
+    m.tracks[1].id = 100
+
+
+def spoil_width(m):
+    m.tracks[1].states[10].width = 0
+
+
 def spoil_tracks(m):
     m.ClearField("tracks")
 
@@ -231,6 +239,8 @@ BAD = [
     (spoil_timestamps, "50 timestamps for 91 steps"),
     (spoil_prediction, "track index 7, but there are 3 tracks"),
     (spoil_current, "current_time_index is 50 instead of 10"),
+    (spoil_ids, "object id 100 belongs to 2 tracks"),
+    (spoil_width, "track 101: width is 0 at the current step"),
     (spoil_tracks, "it has no tracks"),
 ]
 

@@ -189,12 +189,12 @@ def test_two_builds_do_not_share_a_folder(data, tmp_path):
     build(data, tmp_path / "out")
 
 
-def test_rollouts_that_the_server_refuses_stop_the_build(data, tmp_path):
+def test_poses_that_are_not_finite_stop_the_build(data, tmp_path):
     class Lost(entries.Wanderer):
         def advance(self, context, state, decision, forced=None):
             return super().advance(context, state, decision * float("nan"), forced)
 
-    with pytest.raises(DataError, match=r"check 10: submission\.binproto-00000-of-00006, scenario a0, object 100: x"):
+    with pytest.raises(DataError, match=r"object id 100 of scenario a0 in rollout 0 at future step 0 is not finite"):
         build(data, tmp_path, policy=Lost())
     assert not list((tmp_path / "shards").glob("*"))
 

@@ -54,6 +54,13 @@ def test_light_has_a_state_for_every_step(scenario):
     assert light.states == "6" * 20 + "4" * 70 + "-"
 
 
+def test_lights_that_are_known_for_longer_than_the_tracks_end_with_them(scenario):
+    tracks = scenario.tracks
+    short = {name: getattr(tracks, name)[:, :50] for name in ("position", "heading", "velocity", "size", "valid")}
+    (light,) = build_scene(replace(scenario, tracks=replace(tracks, **short))).lights
+    assert light.states == "6" * 20 + "4" * 30
+
+
 def test_logged_trajectories_equal_the_record(scenario):
     log = logged_trajectories(scenario)
     assert log.position.shape == (1, 3, 91, 2)

@@ -43,7 +43,8 @@ def evaluate(
 
     Args:
         policy: a policy, a name for `load_policy`, or "oracle" for the log itself (the ceiling).
-        data: a data set or one of its splits (`load_dataset`), or scenarios in any other form.
+        data: a data set or one of its splits (`load_dataset`), or scenarios in any other form; a name of a data set
+            stands for its split validation.
         name: of the row in tables and of the file; left out, the model's name, or the class of the policy with the
             beginning of its fingerprint.
         out: folder that keeps the result as `NAME.parquet`; an interrupted evaluation goes on there. None keeps none.
@@ -60,7 +61,8 @@ def evaluate(
 
     Raises:
         ConfigError: a setting out of range, or goals for a policy that is not goal-conditioned.
-        DataError: no scenario with a logged future.
+        DataError: no such data set or split, no scenario with a logged future, an unsound scenario, or a pose of the
+            policy that is not finite.
     """
     # 1. Settings first: they are refused before anything is loaded.
     sampling = sampling_of(sampling)

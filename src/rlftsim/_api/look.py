@@ -18,7 +18,8 @@ def score(scenarios: AnyScenarios, rollouts: Rollouts, metric: str | int = "2025
     """Score rollouts with the realism meta-metric of the Waymo Open Sim Agents Challenge.
 
     Args:
-        scenarios: the scenarios of the rollouts with their logged futures, in the same order.
+        scenarios: the scenarios of the rollouts with their logged futures, in the same order; a name of a data set
+            stands for its split validation.
         rollouts: of `simulate`.
         metric: year of the challenge.
 
@@ -27,7 +28,7 @@ def score(scenarios: AnyScenarios, rollouts: Rollouts, metric: str | int = "2025
 
     Raises:
         ConfigError: rollouts of other scenarios, or no such metric.
-        DataError: a scenario that cannot be scored, e.g. one without its future.
+        DataError: a scenario that cannot be scored, e.g. one without its future, or a pose that is not finite.
     """
     require_rollouts("score", scenarios, rollouts)
     batch = batch_of(scenarios, rollouts.position.device)
@@ -44,6 +45,8 @@ def score(scenarios: AnyScenarios, rollouts: Rollouts, metric: str | int = "2025
         )
     # 2. Score, in the world frame and without padding.
     states, config = states_of_rollouts(batch, rollouts), metric_by_name(str(metric))
+    for scenario, simulated in zip(batch.scenarios, states):
+        simulated.check_finite(scenario.scenario_id)
     if isinstance(scenarios, Scenario):
         return score_scenario(scenarios, states[0], config)
     return score_batch(batch.scenarios, states, config)
@@ -58,7 +61,8 @@ def check_policy(
 
     Args:
         policy: a policy, or a name for `load_policy`.
-        scenarios: at least one, on which everything is tried; best of different sizes and with all kinds of agents.
+        scenarios: at least one, on which everything is tried; best of different sizes and with all kinds of agents. A
+            name of a data set stands for its split validation.
         reference: another policy of the same kind for KL divergences; None = a copy with perturbed weights.
 
     Returns:

@@ -36,8 +36,8 @@ def simulate(
 
     Args:
         policy: a policy, or a name for `load_policy`.
-        scenarios: one scenario, several, a batch or a data set, all of which are in memory at once; only history, map
-            and lights are used.
+        scenarios: one scenario, several, a batch or a data set, all of which are in memory at once; a name of a data
+            set stands for its split validation. Only history, map and lights are used.
         num_rollouts: N, futures of every scenario.
         seed: of all randomness.
         goals: points that agents drive to, meters in the world frame: {object_id: (x, y)}, and for several scenarios
@@ -73,13 +73,14 @@ def simulate(
             f"goals of {rollouts_with_goals} rollouts do not fit num_rollouts={num_rollouts}: give goals of one "
             "rollout or of as many."
         )
-    _refuse_far(placed, batch)
     has_goals = placed.goal_mask.any(-1).any(-1).tolist()  # [B]
-    if any(has_goals) and not is_goal_conditioned(policy):
-        raise ConfigError(
-            f"goals have no effect: {type(policy).__name__} is not goal-conditioned: load a model that was fine-tuned "
-            "with goals, or leave goals out."
-        )
+    if any(has_goals):  # else there may be no agent at all
+        _refuse_far(placed, batch)
+        if not is_goal_conditioned(policy):
+            raise ConfigError(
+                f"goals have no effect: {type(policy).__name__} is not goal-conditioned: load a model that was "
+                "fine-tuned with goals, or leave goals out."
+            )
     # One scenario at a time, as the command line does: memory does not grow with the number of scenarios that are in
     # the loop, and no result depends on the company of a scenario.
     parts = []

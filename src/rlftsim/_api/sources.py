@@ -85,8 +85,12 @@ def batch_of(scenarios: Any, device: torch.device | str = "cpu") -> ScenarioBatc
     Args:
         scenarios: in any form.
         device: place of the tensors.
+
+    Raises:
+        ConfigError: there is none, or something else was handed over.
+        DataError: no data set of this name, or an unsound scenario.
     """
+    found = scenarios_of(scenarios)
     if not isinstance(scenarios, ScenarioBatch):
-        found = scenarios_of(scenarios)
         scenarios = collate([found[position] for position in range(len(found))])
     return scenarios.to(device)

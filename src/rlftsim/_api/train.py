@@ -56,20 +56,22 @@ def pretrain(
     Args:
         policy: a recipe or its name, for a policy with fresh weights and a vocabulary built from the scenarios. Or a
             policy, or a name for `load_policy`, whose weights are trained further; it stays as it is.
-        scenarios: training scenarios with their logged futures.
+        scenarios: training scenarios with their logged futures; a name of a data set stands for its split training.
         out: folder of the run; an interrupted run goes on there, a finished one is not repeated. None keeps no files.
         config: settings; None stands for those of the recipe, or the defaults.
-        held_out: scenarios for validation in closed loop, see `config.validation`.
+        held_out: scenarios for validation in closed loop, see `config.validation`; a name of a data set stands for its
+            split validation.
 
     Returns:
         The pre-trained policy, ready to simulate.
 
     Raises:
         ConfigError: the policy cannot be pre-trained, no scenario, or no such recipe.
+        DataError: no such data set, or it has no such split.
         CheckpointError: `out` holds another run, or the run diverged.
     """
     _require_config(config, "pretrain", PretrainConfig)
-    training = scenarios_of(scenarios)
+    training = scenarios_of(scenarios, "training")
     if isinstance(policy, str) and policy in RECIPES.names():
         policy = recipe_by_name(policy)
     if isinstance(policy, Recipe):
@@ -100,7 +102,7 @@ def finetune(
 
     Args:
         policy: a policy, or a name for `load_policy`.
-        scenarios: training scenarios with their logged futures.
+        scenarios: training scenarios with their logged futures; a name of a data set stands for its split training.
         out: folder of the run; an interrupted run goes on there, a finished one is not repeated. None keeps no files.
         config: settings, such as `FinetuneConfig(reward="mloo", epochs=0.5)` or `recipe("smart-demo").finetune`; those
             of a recipe's `catk` or `gcsl` choose that method. None stands for the paper's settings.
@@ -110,10 +112,11 @@ def finetune(
 
     Raises:
         ConfigError: a policy without weights, or no scenario.
+        DataError: no such data set, or it has no split training.
         CheckpointError: `out` holds another run, or the run diverged (the message names its last good checkpoint).
     """
     _require_config(config, "finetune", FinetuneConfig, CatkConfig, GcslConfig)
-    training, settings = scenarios_of(scenarios), config or FinetuneConfig()
+    training, settings = scenarios_of(scenarios, "training"), config or FinetuneConfig()
     base = policy if isinstance(policy, str | os.PathLike) else type(policy).__name__
 
     card = _card(f"fine-tuned ({describe_method(settings)}) from {base}", training)

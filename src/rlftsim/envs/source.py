@@ -16,7 +16,6 @@ from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import Policy, device_of, is_goal_conditioned
 from rlftsim.scenario.any_form import AnyScenarios, scenarios_of
 from rlftsim.scenario.batch import collate
-from rlftsim.scenario.open import open_dataset
 from rlftsim.scenario.types import Scenario, Scenarios, scenario_ids_of
 from rlftsim.threads import one_thread
 
@@ -29,7 +28,7 @@ class Source:
 
     Args:
         config: settings.
-        scenarios: in place of the data set that the settings name.
+        scenarios: in place of the data set that the settings name; of another name the same split.
         policy: in place of the model that the settings name.
         controlled: rules of the planner-driven agents, which come first.
 
@@ -48,9 +47,7 @@ class Source:
         if policy is not None and not isinstance(policy, Policy):
             raise ConfigError(f"policy is {in_short(policy)}, not a policy: name a stored one as `model`.")
         self.config = config
-        self.scenarios: Scenarios = (
-            scenarios_of(scenarios) if scenarios is not None else open_dataset(config.data, config.split)
-        )
+        self.scenarios: Scenarios = scenarios_of(scenarios if scenarios is not None else config.data, config.split)
         self.scenario_ids = list(scenario_ids_of(self.scenarios))
         self.rules = {**(controlled or {"ego": "planner"}), **config.drivers}
         self.rules.setdefault("*", config.traffic)

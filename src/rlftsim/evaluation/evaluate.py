@@ -72,7 +72,8 @@ def evaluate(
         show_progress: False = no progress and time left on stderr.
 
     Raises:
-        DataError: no such data set or split, scenarios whose future is withheld (a test split), or one with a NaN.
+        DataError: no such data set or split, scenarios whose future is withheld (a test split), a scenario with a NaN,
+            or a policy whose poses are not finite.
         ConfigError: an impossible name, several processes for a policy on a GPU, goals for a policy that is not
             goal-conditioned, or a limit that would replace a result of more scenarios.
     """
@@ -160,6 +161,7 @@ def simulate_states(
 
     Raises:
         ConfigError: the policy cannot sample as `config` says, e.g. top-k without categories.
+        DataError: a pose of the policy is not finite.
     """
     batch = collate([scenario]).to(device)
     with torch.no_grad():
@@ -178,6 +180,9 @@ def simulate_encoded(
         context: `policy.encode(batch)`.
         config: rollouts, seed, sampling.
         goals: of a single rollout, the same in all; None = goal-free.
+
+    Raises:
+        DataError: a pose of the policy is not finite.
     """
     is_random = policy.initial_noise_size or (policy.noise_size and config.temperature > 0)
     ids = range(config.num_rollouts if is_random else 1)
@@ -191,6 +196,8 @@ def simulate_encoded(
         passes.append(states_of_rollouts(batch, rollouts)[0])
     x, y, z, heading = (torch.cat([getattr(p, axis) for p in passes]) for axis in ("x", "y", "z", "heading"))
     joined = SimulatedStates(passes[0].object_id, x, y, z, heading)  # each [N, A, T]
+    # The metric would count NaN in a last bin, as no collision and no way off the road: a better score for nothing.
+    joined.check_finite(batch.scenarios[0].scenario_id)
     # Equal rollouts of a deterministic policy are counted by the metric as often as rollouts were wanted.
     return joined if is_random else replace(joined, repeat=config.num_rollouts)
 
@@ -208,6 +215,7 @@ def _evaluate_scenario(job: _Job, position: int) -> dict[str, object] | Skipped:
     """Row of one scenario, or why there is none."""
     scenario, config, device = job.dataset[position], job.config, device_of(job.policy)
     try:
+        scenario.refuse_broken()
         scenario.refuse_not_finite()
     except DataError as error:
         # An error, not a skipped scenario: NaN would lie in a histogram's last bin and look like a bad score.

@@ -61,10 +61,13 @@ class SimulatedStates:
         """Number of rollouts, N x repeat."""
         return self.x.shape[0] * self.repeat
 
-    def check_finite(self) -> None:
+    def check_finite(self, scenario_id: str | None = None) -> None:
         """Refuse rollouts with values that are not finite. It waits for the device, so callers choose when.
 
         The metric itself follows the official rules, which count NaN in a histogram's last bin.
+
+        Args:
+            scenario_id: for the message; None where the caller names the scenario.
 
         Raises:
             DataError: a value is NaN or infinite: names its rollout, object id and step.
@@ -72,9 +75,10 @@ class SimulatedStates:
         finite = torch.stack([self.x, self.y, self.z, self.heading]).isfinite().all(0)
         if not finite.all():
             rollout, agent, step = (~finite).nonzero()[0].tolist()
+            name = f"{self.object_id[agent]} of scenario {scenario_id}" if scenario_id else self.object_id[agent]
             raise DataError(
-                f"Simulated state of object id {self.object_id[agent]} in rollout {rollout} at future step {step} is "
-                "not finite: positions in meters and headings in radians must be numbers."
+                f"Simulated state of object id {name} in rollout {rollout} at future step {step} is not finite: "
+                "positions in meters and headings in radians must be numbers."
             )
 
 

@@ -121,7 +121,10 @@ class ScenarioDataset:
             raise DataError(f"{self.folder / INDEX} does not belong to {MANIFEST}: convert again")
         if split is not None and split not in self.manifest.counts:
             known = ", ".join(self.manifest.counts) or "none"
-            raise DataError(f"{self.folder} has no split {split!r}, only {known}: name one of these as the split")
+            raise DataError(
+                f"{self.folder} has no split {split!r}, only {known}: name one of these as the split, in Python "
+                "by load_dataset(name, split)"
+            )
         self.index = index if split is None else index.filter(pc.field("split") == split)
         """Table with the columns of `INDEX_SCHEMA`, one row per scenario, in the order of positions."""
         self.scenario_ids: list[str] = self.index["scenario_id"].to_pylist()
@@ -327,8 +330,9 @@ def write_dataset(
 
     Raises:
         ConfigError: there is no scenario, or something else is among them.
-        DataError: the folder is not empty or cannot be written to, an id occurs twice, an array has another dtype than
-            `types.py` says, or a valid state or map point is not finite (names scenario, agent and step).
+        DataError: the folder is not empty or cannot be written to, a scenario id occurs twice, an array has another
+            dtype than `types.py` says, a valid state or map point is not finite (names scenario, agent and step), an
+            object id occurs twice, a type is unknown, a size is not above zero, or the ego is no track.
     """
     with DatasetWriter(folder, license_note=license_note, provenance=provenance) as writer:
         is_empty = True

@@ -41,6 +41,7 @@ class Problem(StrEnum):
     TELEPORT = "teleport"
     MISSING_MAP = "missing map"
     NOT_FINITE = "not finite"
+    BROKEN = "broken scenario"
     NO_EVALUATED_AGENTS = "no evaluated agents"
 
     @property
@@ -99,8 +100,9 @@ def verify_dataset(folder: str | os.PathLike[str]) -> list[Finding]:
     """Check every shard and every scenario of a data set.
 
     Damage: shards missing or not as the manifest has them, index and manifest that do not belong together. Doubtful
-    content: NaN or infinite states or map points, a lane with two states at a step, consecutive valid positions that
-    imply more than 60 m/s, no lanes or no road edges, no agent to evaluate beside the ego.
+    content: impossible ids, types, sizes or track indices, NaN or infinite states or map points, a lane with two states
+    at a step, consecutive valid positions that imply more than 60 m/s, no lanes or no road edges, no agent to evaluate
+    beside the ego.
 
     Args:
         folder: the data set, or "synthetic".
@@ -171,6 +173,12 @@ def dataset_stats(
 def check_scenario(scenario: Scenario) -> Iterator[Finding]:
     """Doubtful content of one scenario, at most one finding of each kind."""
     where, tracks, lights = scenario.scenario_id, scenario.tracks, scenario.lights
+    try:
+        scenario.refuse_broken()
+    except DataError as error:
+        # The other checks rely on these.
+        yield Finding(Problem.BROKEN, where, str(error))
+        return
     try:
         scenario.refuse_not_finite()
     except DataError as error:

@@ -111,26 +111,16 @@ class ShardWriter:
         """Append a scenario.
 
         Args:
-            scenario: one whose valid states and map points are finite.
+            scenario: a sound one, see `refuse_unsound`.
             split: name of its split.
             source_record: number of its record in the file it was converted from; None if there is none.
 
         Raises:
-            DataError: its id is no file name, an array of the scenario has another dtype than `types.py` declares, a
-                valid state or map point is not finite, or the file cannot be written (a full disk, say).
+            DataError: the scenario is unsound, or the file cannot be written (a full disk, say).
         """
-        scenario.refuse_bad_id()
-        arrays = _to_arrays(scenario)
-        for name, dtype in _ARRAY_DTYPES.items():
-            array = arrays[name]
-            if array is not None and array.dtype != dtype:
-                raise DataError(f"scenario {scenario.scenario_id}: {name} is {array.dtype}, it must be {dtype}")
-        try:
-            scenario.refuse_not_finite()
-        except DataError as error:
-            raise DataError(f"scenario {scenario.scenario_id}: {error}") from None
+        refuse_unsound(scenario)
         # every array by itself: each gets the encoding that suits its values
-        encoded = {name: None if array is None else encode_array(array) for name, array in arrays.items()}
+        encoded = {name: None if array is None else encode_array(array) for name, array in _to_arrays(scenario).items()}
         row = {
             **asdict(compute_index_row(scenario, split)),
             "source_record": source_record,
@@ -238,6 +228,24 @@ class ShardReader:
 
 
 _WAY_OUT = "delete the file and run the conversion or generation that made it again"
+
+
+def refuse_unsound(scenario: Scenario) -> None:
+    """Check that a scenario is what `types.py` declares, so that it can be stored, simulated and scored.
+
+    Raises:
+        DataError: its id is no file name, an array has another dtype, a valid state or map point is not finite, or what
+            `Scenario.refuse_broken` finds; names the scenario and the value.
+    """
+    scenario.refuse_bad_id()
+    try:
+        for name, array in _to_arrays(scenario).items():
+            if array is not None and array.dtype != _ARRAY_DTYPES[name]:
+                raise DataError(f"{name} is {array.dtype}, it must be {_ARRAY_DTYPES[name]}")
+        scenario.refuse_broken()
+        scenario.refuse_not_finite()
+    except DataError as error:
+        raise DataError(f"scenario {scenario.scenario_id}: {error}") from None
 
 
 def hash_file(path: str | os.PathLike[str]) -> str:

@@ -31,6 +31,7 @@ from typing import Any, Protocol, runtime_checkable
 
 from rlftsim.errors import BadRecordError, ConfigError, DataError
 from rlftsim.plugins import ExtensionPoint
+from rlftsim.scenario.shards import refuse_unsound
 from rlftsim.scenario.tfrecord import OnError, SkippedRecord
 from rlftsim.scenario.types import Scenario
 
@@ -198,7 +199,7 @@ def read_unit(
                 continue
             if isinstance(item, Scenario):
                 try:
-                    item.refuse_bad_id()
+                    refuse_unsound(item)
                 except DataError as error:
                     item = SkippedRecord(unit.name, record, str(error))
             if isinstance(item, Scenario):

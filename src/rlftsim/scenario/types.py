@@ -220,12 +220,48 @@ class Scenario:
         """Check that the id can be a file name: films and rollouts are named after their scenario.
 
         Raises:
-            DataError: it is empty, or has a slash or a control character.
+            DataError: it is no text or empty, or has a slash or a control character.
         """
-        if not re.fullmatch(r"[^/\\\x00-\x1f]+", self.scenario_id) or self.scenario_id in (".", ".."):
+        name = self.scenario_id
+        if not isinstance(name, str) or not re.fullmatch(r"[^/\\\x00-\x1f]+", name) or name in (".", ".."):
             raise DataError(
-                f"scenario id {self.scenario_id!r} is no file name, and files are named after it: write it without "
+                f"scenario id {name!r} is no file name, and files are named after it: write it as text without "
                 "slashes and control characters"
+            )
+
+    def refuse_broken(self) -> None:
+        """Check what every reader relies on: number of steps, track indices, object ids and types, sizes.
+
+        Sizes are those at the current step: simulation and metric read no others, and logs hold zeros where a state is
+        not valid.
+
+        Raises:
+            DataError: names the track or the index, and its value.
+        """
+        tracks = self.tracks
+        if self.num_steps < HISTORY_STEPS:
+            raise DataError(f"{self.num_steps} steps, the history alone has {HISTORY_STEPS}")
+        for name, indices in (("ego_index", [self.ego_index]), ("tracks_to_predict", self.tracks_to_predict)):
+            for index in indices:
+                if not 0 <= index < len(tracks.object_id):
+                    raise DataError(f"{name} names track index {index}, but there are {len(tracks.object_id)} tracks")
+        ids, count = np.unique(tracks.object_id, return_counts=True)
+        if (count > 1).any():
+            raise DataError(f"object id {ids[count.argmax()]} belongs to {count.max()} tracks: give each its own")
+        wrong = np.flatnonzero(~np.isin(tracks.object_type, list(ObjectType)))
+        if len(wrong):
+            kinds = ", ".join(f"{kind.value} {kind.name.lower()}" for kind in ObjectType)
+            raise DataError(
+                f"track {tracks.object_id[wrong[0]]}: type {tracks.object_type[wrong[0]]} is none of {kinds}"
+            )
+        size = tracks.size[:, CURRENT_STEP]
+        flat = np.argwhere((size <= 0) & tracks.valid[:, CURRENT_STEP, None])
+        if len(flat):
+            track, side = flat[0]
+            name = ("length", "width", "height")[side]
+            raise DataError(
+                f"track {tracks.object_id[track]}: {name} is {size[track, side]:g} at the current step "
+                f"({CURRENT_STEP}), it must be above zero"
             )
 
     def refuse_not_finite(self) -> None:

@@ -150,7 +150,8 @@ def scenario_from_bytes(record: bytes) -> Scenario:
 
     Raises:
         DataError: the bytes are no such message; there is no ego or it is not valid at step 10; a valid state or a map
-            point is not finite; the number of steps is another one; a track to predict does not exist.
+            point is not finite; the number of steps is another one; a track to predict does not exist; an object id
+            occurs twice; a type is unknown; a size at step 10 is not above zero.
     """
     try:
         message = womd_pb2.Scenario.FromString(record)
@@ -177,9 +178,6 @@ def scenario_from_bytes(record: bytes) -> Scenario:
         raise DataError(f"the ego (track {tracks.object_id[ego]}) is not valid at the current step ({CURRENT_STEP})")
     if len(message.timestamps_seconds) < num_steps:
         raise DataError(f"{len(message.timestamps_seconds)} timestamps for {num_steps} steps")
-    predicted = np.array([item.track_index for item in message.tracks_to_predict], np.int32)
-    for index in predicted[(predicted < 0) | (predicted >= len(message.tracks))]:
-        raise DataError(f"tracks_to_predict names track index {index}, but there are {len(message.tracks)} tracks")
     scenario = Scenario(
         scenario_id=message.scenario_id,
         timestamps_s=np.array(message.timestamps_seconds[:num_steps], np.float64),
@@ -187,11 +185,12 @@ def scenario_from_bytes(record: bytes) -> Scenario:
         map_features=_read_map(message.map_features),
         lights=_read_lights(message.dynamic_map_states[:num_steps]),
         ego_index=ego,
-        tracks_to_predict=predicted,
+        tracks_to_predict=np.array([item.track_index for item in message.tracks_to_predict], np.int32),
         difficulty=np.array([item.difficulty for item in message.tracks_to_predict], np.int8),
         objects_of_interest=np.array(message.objects_of_interest, np.int64),
         source="womd",
     )
+    scenario.refuse_broken()
     scenario.refuse_not_finite()
     return scenario
 

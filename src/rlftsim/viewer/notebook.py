@@ -77,7 +77,8 @@ def show(scenario: AnyScenarios, *rollouts: Rollouts, titles: Sequence[str] = ()
     Boxes that overlap are marked; the first rollouts of each kind can be played.
 
     Args:
-        scenario: one scenario; of several, a batch or a data set the first few are shown.
+        scenario: one scenario; of several, a batch or a data set the first few are shown. A name of a data set stands
+            for its split validation.
         rollouts: of the same scenarios, such as those of a base model and of a tuned one.
         titles: of the panels with rollouts, in their order; left out, "rollouts" or "rollouts 1", "rollouts 2", ...
 
@@ -86,7 +87,7 @@ def show(scenario: AnyScenarios, *rollouts: Rollouts, titles: Sequence[str] = ()
 
     Raises:
         ConfigError: rollouts of other scenarios, more titles than rollouts, or no scenario.
-        DataError: no data set of this name.
+        DataError: no data set of this name, or without this split.
     """
     require_rollouts("show", scenario, *rollouts)
     if len(titles) > len(rollouts):

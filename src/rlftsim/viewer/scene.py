@@ -320,7 +320,9 @@ def _lights(lights: LightStates, origin: np.ndarray, num_steps: int) -> tuple[Li
         rows = np.flatnonzero(lights.lane_id == lane_id)
         states = [UNSEEN_LIGHT] * num_steps
         for step, state in zip(lights.step[rows], lights.state[rows]):
-            states[int(step)] = str(int(state))
+            # Lights may be known for longer than the tracks.
+            if step < num_steps:
+                states[int(step)] = str(int(state))
         stop_point = lights.stop_point[rows[0], :2].astype(np.float64) - origin
         if np.isfinite(stop_point).all():
             found.append(Light(stop_point, "".join(states)))
