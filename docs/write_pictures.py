@@ -152,7 +152,7 @@ def simulate(model: str, scenario: str, out: str, more: str = " --export page") 
 
 
 LEFT, CROWD, WALKERS, CORNER = "e77410beaa9f1e75", "4978b9a8e3f6368b", "1dc59c7592914940", "c7f74c372249ae91"
-BRANCH, SEVEN, RISE = "0827749d3c33a3d1", "c4b1a5f56a185145", "c4b1a5f56a185145"
+BRANCH, SEVEN, RISE = "0827749d3c33a3d1", "c4b1a5f56a185145", "7bf0e301b4cd6d1b"
 PROPOSE = f"rlftsim goals propose synthetic --scenario {BRANCH} --agent 98 99 --out goals.json --picture goals.png"
 AHEAD, RIGHT = (-191.2, -238.1), (-133.5, -185.9)
 ASK = " --goal 191={},{} --guidance-scale 3 --export page"
@@ -201,13 +201,13 @@ PIECES = (
     ),
     Piece(
         "turn", "A goal against habit",
-        "Car 99 comes at 12 m/s and is asked to turn left. Most of its 32 futures do so, "
-        "6 come within 2 m of the goal.",
+        "Car 99 comes at 12 m/s and is asked to turn left. Ten of its 32 futures do so, "
+        "3 come within 2 m of the goal.",
         (TURN,), drawn(TURN, picture=f"turn/{BRANCH}.png"), is_film=False,
     ),
     Piece(
         "tuned", "Before and after fine-tuning",
-        "Of the 40 held-out scenarios the one where the score rises most, from 0.63 to 0.75 (32 rollouts). The same "
+        "Of the 40 held-out scenarios the one where the score rises most, from 0.59 to 0.69 (32 rollouts). The same "
         "random numbers in both.",
         (simulate("demo-base", RISE, "base"), simulate("demo-tuned", RISE, "tuned")),
         film(RISE, {"demo-base": Simulated("demo-base"), "demo-tuned": Simulated()}),
