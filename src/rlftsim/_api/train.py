@@ -67,6 +67,7 @@ def pretrain(
     Raises:
         ConfigError: the policy cannot be pre-trained, no scenario, or no such recipe.
         CheckpointError: `out` holds another run, or the run diverged.
+        NotYetError: another run is at work in `out`.
     """
     _require_config(config, "pretrain", PretrainConfig)
     training = scenarios_of(scenarios)
@@ -111,6 +112,7 @@ def finetune(
     Raises:
         ConfigError: a policy without weights, or no scenario.
         CheckpointError: `out` holds another run, or the run diverged (the message names its last good checkpoint).
+        NotYetError: another run is at work in `out`.
     """
     _require_config(config, "finetune", FinetuneConfig, CatkConfig, GcslConfig)
     training, settings = scenarios_of(scenarios), config or FinetuneConfig()

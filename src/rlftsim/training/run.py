@@ -6,18 +6,21 @@ does the rest, and leaves files through `training.run_folder` and `training.chec
 
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
+import torch
 from jaxtyping import Float
 from torch import nn
 from torch.optim import Optimizer
 
-from rlftsim.errors import ConfigError
+from rlftsim.errors import ConfigError, DataError, NotYetError
+from rlftsim.lease import Lease
 from rlftsim.progress import log, progress_bar
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.dataset import ScenarioDataset
@@ -25,9 +28,10 @@ from rlftsim.scenario.types import Scenario, Scenarios
 from rlftsim.training.batches import scenario_costs
 from rlftsim.training.checkpoint import Progress, newest_checkpoint, read_checkpoint, write_checkpoint
 from rlftsim.training.data import batch_with_futures, scenarios_of_update
-from rlftsim.training.parallel import DeviceConfig, Fabric, local_indices, num_sharing_memory
+from rlftsim.training.parallel import DeviceConfig, Fabric, all_reduce_sum, local_indices, num_sharing_memory
 from rlftsim.training.processes import in_processes
 from rlftsim.training.run_folder import RunFolder, describe_inputs, flatten, stored_settings
+from rlftsim.workers import Inline
 
 TrainingScenarios = Scenarios | Scenario
 """Scenarios that a training function takes: a data set, a list, or a single scenario."""
@@ -192,13 +196,42 @@ def train_in_processes(
     Raises:
         CheckpointError: the folder holds a damaged run.
         ConfigError: several processes cannot be started here.
-        DataError: a process died.
+        NotYetError: another run is at work in the folder.
+        DataError: a process died, or the folder cannot be written to.
     """
     device: DeviceConfig = config.device
     begun_with = flatten(stored_settings(Path(out))).get("device.processes")
     processes = device.num_processes(num_scenarios, config.batch_size, config.micro_batch_size, begun_with)
     device = replace(device, processes=processes)
-    return in_processes(partial(train, replace(config, device=device)), device)
+    return in_processes(partial(_train_alone, train, replace(config, device=device), Path(out)), device)
+
+
+def _train_alone(train: Callable[[Any, Fabric], Path], config: Any, out: Path, fabric: Fabric) -> Path:
+    """Result of `train` in one of the processes of a run, of which no other run is at work in the folder."""
+    with _sole_run_in(out, fabric):
+        return train(config, fabric)
+
+
+@contextmanager
+def _sole_run_in(out: Path, fabric: Fabric) -> Iterator[None]:
+    """Hold the folder of a run, by the process that writes.
+
+    Raises:
+        NotYetError: another run is at work there.
+        DataError: the folder cannot be written to.
+    """
+    refusal = None
+    with ExitStack() as held:
+        if fabric.is_global_zero:
+            try:
+                lease = held.enter_context(Lease(out / ".lock", Inline(), "works in"))
+                held.callback(lease.remove)
+            except DataError as error:
+                refusal = error
+        # Refused in every process, or the others would wait for this one.
+        if all_reduce_sum(torch.tensor(float(refusal is not None), device=fabric.device), fabric):
+            raise refusal or NotYetError(f"{out}: the first process of this run cannot work there, and says why.")
+        yield
 
 
 def _with_shared_cache(scenarios: Scenarios, sharing: int) -> Scenarios:
