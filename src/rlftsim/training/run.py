@@ -26,8 +26,9 @@ from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.types import Scenario, Scenarios
 from rlftsim.training.batches import scenario_costs
-from rlftsim.training.checkpoint import Progress, newest_checkpoint, read_checkpoint, write_checkpoint
+from rlftsim.training.checkpoint import Progress, newest_checkpoint, read_checkpoint, update_of, write_checkpoint
 from rlftsim.training.data import batch_with_futures, scenarios_of_update
+from rlftsim.training.interruption import ctrl_c_waits
 from rlftsim.training.parallel import DeviceConfig, Fabric, all_reduce_sum, local_indices, num_sharing_memory
 from rlftsim.training.processes import in_processes
 from rlftsim.training.run_folder import RunFolder, describe_inputs, flatten, stored_settings
@@ -319,6 +320,7 @@ class TrainingRun:
 
         Raises:
             CheckpointError: the run diverged (its last good checkpoint is named), or a checkpoint is damaged.
+            KeyboardInterrupt: Ctrl-C; says from where the run goes on.
         """
         newest = newest_checkpoint(self.folder.checkpoints)
         if newest:
@@ -330,24 +332,46 @@ class TrainingRun:
         if self._fabric.is_global_zero and learner.update < self.total:
             begun = f"goes on behind update {learner.update}" if learner.update else "begins"
             log.info(f"{title} {begun}: {self.total} updates of {_number_of_weights(learner)}.")
-        with progress_bar(title, self.total, learner.update, show=self._fabric.is_global_zero) as advance:
+        try:
+            self._make_updates(learner, make_update, title)
+        except KeyboardInterrupt:
+            newest = newest_checkpoint(self.folder.checkpoints)
+            # The command line says what the same command does next.
+            what_next = f"continues behind update {update_of(newest)}" if newest else "starts anew"
+            raise KeyboardInterrupt(what_next) from None
+        self.folder.close()
+        if self._fabric.is_global_zero:
+            learner.result.eval().save_pretrained(self.folder.model, card=card)
+        return self.folder.model
+
+    def _make_updates(self, learner: Learner, make_update: Callable[[], UpdateReport], title: str) -> None:
+        """Make all updates that are left, with their lines of metrics and checkpoints.
+
+        Ctrl-C waits for the end of an update, which becomes a checkpoint. Not where lightning-fabric or torchrun
+        started several processes: it reaches each at another update, and one that goes on would wait for one that
+        stopped.
+        """
+        waits = self._fabric.world_size == 1 or self._config.device.forks
+        with (
+            progress_bar(title, self.total, learner.update, show=self._fabric.is_global_zero) as advance,
+            ctrl_c_waits(enabled=waits) as is_stopped,
+        ):
             while learner.update < self.total:
                 report = make_update()
                 # The line is written first, so that a run that ends here shows why.
                 self.folder.log(learner.update, report.values)
                 self._report(learner, report)
                 # A checkpoint is always the state after a good update, so that a run resumes from sound weights.
-                is_due = learner.update % self._config.checkpoint_every == 0 or learner.update == self.total
+                is_last = learner.update == self.total or is_stopped()
+                is_due = learner.update % self._config.checkpoint_every == 0 or is_last
                 is_due = is_due and not learner.skipped_in_a_row
                 self._refuse_divergence(learner, report, check_weights=is_due)
                 if is_due and self._fabric.is_global_zero:
                     progress = Progress(learner.update, learner.to_numbers())
                     write_checkpoint(self.folder.checkpoints, progress, learner.modules, learner.optimizer)
                 advance(note=report.note)
-        self.folder.close()
-        if self._fabric.is_global_zero:
-            learner.result.eval().save_pretrained(self.folder.model, card=card)
-        return self.folder.model
+                if is_last:
+                    break
 
     @property
     def _max_skipped(self) -> int:
