@@ -1,9 +1,10 @@
 """One driver at a time for a folder of results, or the shares of one run: any other is refused.
 
 A lock belongs to an open file, so it ends with the process that holds it, however that ends. Network file systems of
-today carry such locks between machines.
+today carry such locks between machines. On a file system without them two drivers at a time are not noticed.
 """
 
+import errno
 import os
 import socket
 import time
@@ -26,6 +27,8 @@ REMOTE_LEASE = ".lease"
 """File of a remote folder that is being written to."""
 SECONDS_OF_SILENCE = 600.0
 """A remote lease that was not renewed for so long belongs to a process that is gone."""
+WITHOUT_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.ENOLCK)
+"""Errors of file systems that have no locks, such as Lustre mounted without `flock`."""
 
 
 class Lease:
@@ -144,6 +147,10 @@ class Lease:
                     must_exist = True
                     time.sleep(0.1)
                     continue
+                except OSError as error:
+                    if error.errno not in WITHOUT_LOCKS:
+                        file.close()
+                        raise
                 # The driver before this one may have removed the file in between: then it is no lock for others.
                 if path.exists() and os.fstat(file.fileno()).st_ino == path.stat().st_ino:
                     break

@@ -337,6 +337,11 @@ def test_a_line_that_cannot_be_read_is_explained(line, capsys):
     [
         (KeyboardInterrupt(), 130, "rlftsim: stopped. The same command starts anew."),
         (
+            KeyboardInterrupt("continues behind update 3"),
+            130,
+            "rlftsim: stopped. The same command continues behind update 3.",
+        ),
+        (
             OSError(errno.ENOSPC, "No space left on device", "/data/x"),
             1,
             "rlftsim: the disk is full, writing /data/x: free",

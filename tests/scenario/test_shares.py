@@ -1,5 +1,7 @@
 """The same work by one driver and by shares of it: the same bytes, once each."""
 
+import errno
+import fcntl
 import importlib
 import json
 import os
@@ -221,3 +223,12 @@ def test_a_share_that_ends_when_all_is_put_together_brings_nothing_back(tmp_path
 def test_a_disk_that_is_full_at_the_lock_is_named(tmp_path):
     with limit_files_to(10), pytest.raises(DataError, match=r"cannot write .*lock \(File too large\): make room"):
         Lease(tmp_path / "lock", Inline(), "works in")
+
+
+def test_a_file_system_without_locks_notices_no_second_driver(tmp_path, monkeypatch):
+    def refuse(*_):
+        raise OSError(errno.ENOSYS, "Function not implemented")
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    with Lease(tmp_path / "lock", Inline(), "works in"), Lease(tmp_path / "lock", Inline(), "works in"):
+        pass

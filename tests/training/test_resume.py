@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -43,8 +44,8 @@ def train(stage, vocabulary, scenarios, out, **changes):
     return tiny.train(stage, tiny.tiny_policy(vocabulary), scenarios, out, **changes)
 
 
-def stop_at(monkeypatch, stage, update):
-    """Let a run be interrupted in the middle of its n-th update."""
+def stop_at(monkeypatch, stage, update, *, presses=None):
+    """Let a run be interrupted in the middle of its n-th update: by an exception, or by Ctrl-C so many times."""
     module = MODULES[stage]
     name = WORK[module]
     original, calls = getattr(module, name), []
@@ -52,8 +53,10 @@ def stop_at(monkeypatch, stage, update):
     def interrupted(*args, **options):
         calls.append(1)
         result = original(*args, **options)  # the weights have moved, nothing is written yet
-        if len(calls) == update:
+        if len(calls) == update and presses is None:
             raise KeyboardInterrupt
+        for _ in range((presses or 0) if len(calls) == update else 0):
+            signal.raise_signal(signal.SIGINT)
         return result
 
     monkeypatch.setattr(module, name, interrupted)
@@ -82,6 +85,57 @@ def test_a_run_interrupted_inside_an_update_ends_as_if_it_never_was(
     timeless = {k for k in lines[0] if k != "time" and not k.startswith("seconds")}
     for mine, other in zip(lines, read_metrics(tmp_path / "whole")):
         assert {k: mine[k] for k in timeless} == {k: other[k] for k in timeless}
+
+
+@pytest.mark.parametrize(
+    ("stage", "update", "processes"),
+    # Checkpoints are due after every second update. In its second epoch RoaD's rollouts are of an earlier policy.
+    [("pretrain", 1, 1), ("pretrain", 3, 2), ("road", 5, 1), ("everything", 3, 1)],
+)
+def test_ctrl_c_keeps_the_update_that_has_begun(
+    stage, update, processes, vocabulary, drawn_scenarios, tmp_path, monkeypatch, capsys
+):
+    changes = {
+        "epochs": (1.75 if stage == "road" else 1.25) * processes, "batch_size": processes,
+        "device": replace(tiny.CPU, processes=processes),
+    }  # fmt: skip
+    train(stage, vocabulary, drawn_scenarios, tmp_path / "whole", **changes)
+    with monkeypatch.context() as patch:
+        stop_at(patch, stage, update, presses=1)
+        with pytest.raises(KeyboardInterrupt, match=f"continues behind update {update}"):
+            train(stage, vocabulary, drawn_scenarios, tmp_path / "stopped", **changes)
+    assert "stopping at the end of this update; Ctrl-C once more stops at once" in capsys.readouterr().err
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert len(read_metrics(tmp_path / "stopped")) == update
+    train(stage, vocabulary, drawn_scenarios, tmp_path / "stopped", **changes)
+    assert f"goes on behind update {update}:" in capsys.readouterr().err
+    assert_same_weights(tmp_path / "whole", tmp_path / "stopped")
+    assert len(read_metrics(tmp_path / "stopped")) == len(read_metrics(tmp_path / "whole"))
+
+
+@pytest.mark.parametrize(
+    ("update", "what_next"), [(1, "starts anew"), (3, "continues behind update 2"), (5, "continues behind update 4")]
+)
+def test_a_second_ctrl_c_stops_at_once_and_says_what_is_kept(
+    update, what_next, vocabulary, drawn_scenarios, tmp_path, monkeypatch
+):
+    stop_at(monkeypatch, "pretrain", update, presses=2)
+    with pytest.raises(KeyboardInterrupt, match=what_next):
+        train("pretrain", vocabulary, drawn_scenarios, tmp_path, epochs=1.25, batch_size=1)
+    assert len(read_metrics(tmp_path)) == update - 1
+
+
+def test_ctrl_c_in_the_last_update_leaves_the_model_to_the_next_call(
+    vocabulary, drawn_scenarios, tmp_path, monkeypatch
+):
+    with monkeypatch.context() as patch:
+        stop_at(patch, "pretrain", 2, presses=1)
+        with pytest.raises(KeyboardInterrupt, match="continues behind update 2"):
+            train("pretrain", vocabulary, drawn_scenarios, tmp_path, epochs=0.5, batch_size=1)
+    assert not (tmp_path / "model").exists()
+    train("pretrain", vocabulary, drawn_scenarios, tmp_path, epochs=0.5, batch_size=1)
+    assert len(read_metrics(tmp_path)) == 2
+    assert (tmp_path / "model").exists()
 
 
 @pytest.mark.parametrize("stage", STAGES)

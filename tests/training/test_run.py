@@ -7,12 +7,14 @@ import pytest
 import torch
 
 import tiny
-from rlftsim.errors import CheckpointError, ConfigError
+from rlftsim.errors import CheckpointError, ConfigError, NotYetError
+from rlftsim.lease import Lease
 from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.training import imitation
 from rlftsim.training.goal_relabeling import GcslConfig, gcsl_finetune
 from rlftsim.training.run import require_trainable
 from rlftsim.training.run_folder import read_metrics
+from rlftsim.workers import Inline
 
 GCSL = GcslConfig(epochs=1.0, batch_size=1, num_rollouts=2, device=tiny.CPU)
 
@@ -31,6 +33,35 @@ def test_one_scenario_and_a_path_as_text_are_enough(stage, vocabulary, drawn_sce
         model = tiny.train(stage, tiny.tiny_policy(vocabulary), scenario, out, epochs=1.0)
     assert model == tmp_path / "run" / "model"
     assert len(read_metrics(tmp_path / "run")) == 1
+
+
+@pytest.mark.parametrize(
+    ("stage", "processes"),
+    [*((stage, 1) for stage in ("pretrain", "catk", "road", "finetune", "gcsl")), ("pretrain", 2), ("finetune", 2)],
+)
+def test_a_second_run_in_a_folder_is_refused_until_the_first_has_ended(
+    stage, processes, vocabulary, drawn_scenarios, tmp_path
+):
+    def train():
+        device = replace(tiny.CPU, processes=processes)
+        if stage == "gcsl":
+            return gcsl_finetune(goal_conditioned(vocabulary), drawn_scenarios[:2], tmp_path, GCSL)
+        policy, changes = tiny.tiny_policy(vocabulary), {"epochs": 1.0, "batch_size": 2, "device": device}
+        return tiny.train(stage, policy, drawn_scenarios[:2], tmp_path, **changes)
+
+    with Lease(tmp_path / ".lock", Inline(), "works in"):
+        with pytest.raises(NotYetError, match=rf"another process works in {tmp_path} \(.*, for 0:00:"):
+            train()
+        assert [path.name for path in tmp_path.iterdir()] == [".lock"]
+    assert train() == tmp_path / "model"
+    assert not (tmp_path / ".lock").exists()
+
+
+def test_a_run_that_ends_with_an_error_lets_its_folder_go(vocabulary, drawn_scenarios, tmp_path):
+    for _ in range(2):  # a notebook keeps the first error and all that it holds
+        with pytest.raises(CheckpointError, match="not finite"):
+            tiny.train("pretrain", tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path, learning_rate=1e30)
+    assert not (tmp_path / ".lock").exists()
 
 
 @pytest.mark.parametrize("stage", ["pretrain", "catk", "finetune"])

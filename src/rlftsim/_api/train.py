@@ -69,6 +69,7 @@ def pretrain(
         ConfigError: the policy cannot be pre-trained, no scenario, or no such recipe.
         DataError: no such data set, or it has no such split.
         CheckpointError: `out` holds another run, or the run diverged.
+        NotYetError: another run is at work in `out`.
     """
     _require_config(config, "pretrain", PretrainConfig)
     training = scenarios_of(scenarios, "training")
@@ -114,6 +115,7 @@ def finetune(
         ConfigError: a policy without weights, or no scenario.
         DataError: no such data set, or it has no split training.
         CheckpointError: `out` holds another run, or the run diverged (the message names its last good checkpoint).
+        NotYetError: another run is at work in `out`.
     """
     _require_config(config, "finetune", FinetuneConfig, CatkConfig, GcslConfig)
     training, settings = scenarios_of(scenarios, "training"), config or FinetuneConfig()

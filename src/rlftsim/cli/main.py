@@ -101,8 +101,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except RlftsimError as error:
         print(f"rlftsim: {error}", file=sys.stderr)
         return error.exit_status
-    except KeyboardInterrupt:
-        what_next = "starts anew" if verb in STARTS_ANEW else "continues where this one stopped"
+    except KeyboardInterrupt as stop:
+        # Training says where it goes on.
+        what_next = str(stop) or ("starts anew" if verb in STARTS_ANEW else "continues where this one stopped")
         print(f"\nrlftsim: stopped. The same command {what_next}.", file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:

@@ -106,6 +106,7 @@ def catk_finetune(
     Raises:
         ConfigError: the policy has no weights or no tokens, or there is no scenario.
         CheckpointError: `out` holds another run, or the run diverged.
+        NotYetError: another run is at work in `out`.
     """
     scenarios = as_scenarios(scenarios)
     method = "RoaD" if isinstance(config, RoadConfig) else "CAT-K"

@@ -69,6 +69,11 @@ def newest_checkpoint(folder: Path) -> Path | None:
     return max(folder.glob(f"{PREFIX}*"), default=None)
 
 
+def update_of(path: Path) -> int:
+    """Updates that a run had done at a checkpoint."""
+    return int(path.name.removeprefix(PREFIX))
+
+
 def read_checkpoint(path: Path, modules: dict[str, nn.Module], optimizer: Optimizer) -> Progress:
     """Load weights and moments in place.
 

@@ -161,6 +161,7 @@ def finetune(
     Raises:
         ConfigError: the policy has no weights or is not goal-conditioned as the settings want, or there is no scenario.
         CheckpointError: `out` holds another run, or the run diverged (its last good checkpoint is named).
+        NotYetError: another run is at work in `out`.
     """
     scenarios = as_scenarios(scenarios)
     model = require_trainable(policy, scenarios, "rewards", imitated=config.imitation_weight > 0)

@@ -77,6 +77,7 @@ def gcsl_finetune(
     Raises:
         ConfigError: the policy has no weights or no tokens or no goal encoder, or there is no scenario.
         CheckpointError: `out` holds another run, or the run diverged.
+        NotYetError: another run is at work in `out`.
     """
     scenarios = as_scenarios(scenarios)
     model = require_trainable(policy, scenarios, "gcsl", needs=("vocabulary",))

@@ -195,6 +195,7 @@ def imitate(
         ConfigError: the model cannot be validated, or has no vocabulary, which spatial label smoothing and a weight of
             standing tokens need.
         CheckpointError: `out` holds another run, or the run diverged.
+        NotYetError: another run is at work in `out`.
     """
     if not isinstance(getattr(model, "vocabulary", None), Vocabulary):
         name = type(model).__name__

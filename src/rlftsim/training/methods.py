@@ -40,6 +40,7 @@ def finetune_policy(
     Raises:
         ConfigError: the policy cannot be trained so, or the method has no validation.
         CheckpointError: `out` holds another run, or the run diverged.
+        NotYetError: another run is at work in `out`.
     """
     if held_out is not None and not isinstance(config, CatkConfig):
         raise ConfigError("held_out has no effect: of the methods of fine-tuning only CAT-K and RoaD validate.")

@@ -40,6 +40,7 @@ def pretrain(
     Raises:
         ConfigError: the model cannot be pre-trained, or there is no scenario.
         CheckpointError: `out` holds another run, or the run diverged.
+        NotYetError: another run is at work in `out`.
     """
     scenarios = as_scenarios(scenarios)
     policy = require_trainable(model, scenarios, "pre-training", imitated=True)

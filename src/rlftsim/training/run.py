@@ -6,28 +6,33 @@ does the rest, and leaves files through `training.run_folder` and `training.chec
 
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
+import torch
 from jaxtyping import Float
 from torch import nn
 from torch.optim import Optimizer
 
-from rlftsim.errors import ConfigError
+from rlftsim.errors import ConfigError, DataError, NotYetError
+from rlftsim.lease import Lease
 from rlftsim.progress import log, progress_bar
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.types import Scenario, Scenarios
 from rlftsim.training.batches import scenario_costs
-from rlftsim.training.checkpoint import Progress, newest_checkpoint, read_checkpoint, write_checkpoint
+from rlftsim.training.checkpoint import Progress, newest_checkpoint, read_checkpoint, update_of, write_checkpoint
 from rlftsim.training.data import batch_with_futures, scenarios_of_update
-from rlftsim.training.parallel import DeviceConfig, Fabric, local_indices, num_sharing_memory
+from rlftsim.training.interruption import ctrl_c_waits
+from rlftsim.training.parallel import DeviceConfig, Fabric, all_reduce_sum, local_indices, num_sharing_memory
 from rlftsim.training.processes import in_processes
 from rlftsim.training.run_folder import RunFolder, describe_inputs, flatten, stored_settings
+from rlftsim.workers import Inline
 
 TrainingScenarios = Scenarios | Scenario
 """Scenarios that a training function takes: a data set, a list, or a single scenario."""
@@ -192,13 +197,42 @@ def train_in_processes(
     Raises:
         CheckpointError: the folder holds a damaged run.
         ConfigError: several processes cannot be started here.
-        DataError: a process died.
+        NotYetError: another run is at work in the folder.
+        DataError: a process died, or the folder cannot be written to.
     """
     device: DeviceConfig = config.device
     begun_with = flatten(stored_settings(Path(out))).get("device.processes")
     processes = device.num_processes(num_scenarios, config.batch_size, config.micro_batch_size, begun_with)
     device = replace(device, processes=processes)
-    return in_processes(partial(train, replace(config, device=device)), device)
+    return in_processes(partial(_train_alone, train, replace(config, device=device), Path(out)), device)
+
+
+def _train_alone(train: Callable[[Any, Fabric], Path], config: Any, out: Path, fabric: Fabric) -> Path:
+    """Result of `train` in one of the processes of a run, of which no other run is at work in the folder."""
+    with _sole_run_in(out, fabric):
+        return train(config, fabric)
+
+
+@contextmanager
+def _sole_run_in(out: Path, fabric: Fabric) -> Iterator[None]:
+    """Hold the folder of a run, by the process that writes.
+
+    Raises:
+        NotYetError: another run is at work there.
+        DataError: the folder cannot be written to.
+    """
+    refusal = None
+    with ExitStack() as held:
+        if fabric.is_global_zero:
+            try:
+                lease = held.enter_context(Lease(out / ".lock", Inline(), "works in"))
+                held.callback(lease.remove)
+            except DataError as error:
+                refusal = error
+        # Refused in every process, or the others would wait for this one.
+        if all_reduce_sum(torch.tensor(float(refusal is not None), device=fabric.device), fabric):
+            raise refusal or NotYetError(f"{out}: the first process of this run cannot work there, and says why.")
+        yield
 
 
 def _with_shared_cache(scenarios: Scenarios, sharing: int) -> Scenarios:
@@ -286,6 +320,7 @@ class TrainingRun:
 
         Raises:
             CheckpointError: the run diverged (its last good checkpoint is named), or a checkpoint is damaged.
+            KeyboardInterrupt: Ctrl-C; says from where the run goes on.
         """
         newest = newest_checkpoint(self.folder.checkpoints)
         if newest:
@@ -297,24 +332,46 @@ class TrainingRun:
         if self._fabric.is_global_zero and learner.update < self.total:
             begun = f"goes on behind update {learner.update}" if learner.update else "begins"
             log.info(f"{title} {begun}: {self.total} updates of {_number_of_weights(learner)}.")
-        with progress_bar(title, self.total, learner.update, show=self._fabric.is_global_zero) as advance:
+        try:
+            self._make_updates(learner, make_update, title)
+        except KeyboardInterrupt:
+            newest = newest_checkpoint(self.folder.checkpoints)
+            # The command line says what the same command does next.
+            what_next = f"continues behind update {update_of(newest)}" if newest else "starts anew"
+            raise KeyboardInterrupt(what_next) from None
+        self.folder.close()
+        if self._fabric.is_global_zero:
+            learner.result.eval().save_pretrained(self.folder.model, card=card)
+        return self.folder.model
+
+    def _make_updates(self, learner: Learner, make_update: Callable[[], UpdateReport], title: str) -> None:
+        """Make all updates that are left, with their lines of metrics and checkpoints.
+
+        Ctrl-C waits for the end of an update, which becomes a checkpoint. Not where lightning-fabric or torchrun
+        started several processes: it reaches each at another update, and one that goes on would wait for one that
+        stopped.
+        """
+        waits = self._fabric.world_size == 1 or self._config.device.forks
+        with (
+            progress_bar(title, self.total, learner.update, show=self._fabric.is_global_zero) as advance,
+            ctrl_c_waits(enabled=waits) as is_stopped,
+        ):
             while learner.update < self.total:
                 report = make_update()
                 # The line is written first, so that a run that ends here shows why.
                 self.folder.log(learner.update, report.values)
                 self._report(learner, report)
                 # A checkpoint is always the state after a good update, so that a run resumes from sound weights.
-                is_due = learner.update % self._config.checkpoint_every == 0 or learner.update == self.total
+                is_last = learner.update == self.total or is_stopped()
+                is_due = learner.update % self._config.checkpoint_every == 0 or is_last
                 is_due = is_due and not learner.skipped_in_a_row
                 self._refuse_divergence(learner, report, check_weights=is_due)
                 if is_due and self._fabric.is_global_zero:
                     progress = Progress(learner.update, learner.to_numbers())
                     write_checkpoint(self.folder.checkpoints, progress, learner.modules, learner.optimizer)
                 advance(note=report.note)
-        self.folder.close()
-        if self._fabric.is_global_zero:
-            learner.result.eval().save_pretrained(self.folder.model, card=card)
-        return self.folder.model
+                if is_last:
+                    break
 
     @property
     def _max_skipped(self) -> int:
