@@ -6,9 +6,11 @@ import entries
 import pytest
 
 import made_up
+import scenes
 from rlftsim.cli.main import main
 from rlftsim.evaluation.results import EvaluateConfig
 from rlftsim.policies.checkpoint import save_model
+from rlftsim.scenario.dataset import write_dataset
 from rlftsim.submission.report import estimate_realism, model_card
 
 
@@ -97,6 +99,13 @@ def test_the_rollouts_of_an_archive_score_as_its_unpacked_files(tmp_path, monkey
     of_tables = [[line.split() for line in some if "0." in line and "likelihood" in line] for some in (lines, expected)]
     assert len(of_tables[0]) > 8
     assert of_tables[0] == of_tables[1]
+
+
+def test_scores_of_an_archive_need_logged_futures(place, capsys):
+    write_dataset([scenes.without_future()], place / "held", split="testing")
+    assert main(["submit", "build", "constant_velocity", "--data", "held", *BUILD[5:], "--i-comply"]) == 0
+    assert main([*CHECK[:3], "--data", "held", "--score"]) == 2
+    assert "no scenario of split testing of held could be scored (has no logged future)" in capsys.readouterr().err
 
 
 def test_the_card_of_a_model_is_part_of_the_report(tmp_path):

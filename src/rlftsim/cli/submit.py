@@ -9,8 +9,9 @@ import tyro
 from tyro.conf import Positional
 
 from rlftsim.cli.machines import Work
-from rlftsim.errors import ConfigError
+from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.evaluate import EvaluateConfig, evaluation_name, frozen_copy
+from rlftsim.evaluation.score_files import format_scores
 from rlftsim.policies.registry import Device, load_policy
 from rlftsim.progress import print_wide
 from rlftsim.rollout.fingerprint import fingerprint_policy
@@ -150,7 +151,11 @@ class Check:
     """Score the rollouts, too; for an archive of the validation split."""
 
     def run(self) -> int:
-        """Print the findings; exit status 1 if there is an error."""
+        """Print the findings; exit status 1 if there is an error.
+
+        Raises:
+            DataError: `score`, and none of the scenarios has a logged future and a road edge.
+        """
         data = open_dataset(self.data, self.split, cache_size=CACHED_SCENARIOS)
         scores = ArchiveScores() if self.score else None
         check = check_archive(
@@ -160,7 +165,14 @@ class Check:
         if self.json is not None:
             write_findings(check, self.json)
         if scores is not None:
-            print_wide(scores.table(check.archive, data, check.sha256))
+            evaluation = scores.evaluation(check.archive, data, check.sha256)
+            if not len(evaluation):
+                reason = evaluation.skipped[0].reason if evaluation.skipped else "the archive has none without an error"
+                raise DataError(
+                    f"--score: no scenario of split {self.split} of {self.data} could be scored ({reason}): "
+                    "it is for an archive of the validation split, --split validation."
+                )
+            print_wide(format_scores(evaluation))
         return int(check.findings.has_errors)
 
 

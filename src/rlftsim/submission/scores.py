@@ -3,11 +3,10 @@
 import numpy as np
 import pyarrow as pa
 import torch
-from rich.table import Table
 
 from rlftsim.evaluation.results import SCHEMA, EvaluateConfig, Evaluation, Provenance, Skipped, row_of_result
 from rlftsim.evaluation.rollout_files import AXES
-from rlftsim.evaluation.score_files import format_scores, has_road_edge
+from rlftsim.evaluation.score_files import has_road_edge
 from rlftsim.realism import SimulatedStates, metric_by_name, scenario_log, score
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.types import Scenario
@@ -38,10 +37,6 @@ class ArchiveScores:
         states = SimulatedStates(np.array(decoded.object_ids[0], np.int64), x, y, z, heading)
         result = score(scenario_log(scenario), states, self._metric)
         self._rows.append(row_of_result(result, scenario, states))
-
-    def table(self, name: str, data: ScenarioDataset, sha256: str) -> Table:
-        """Means and standard errors of all scores, see `evaluation`."""
-        return format_scores(self.evaluation(name, data, sha256))
 
     def evaluation(self, name: str, data: ScenarioDataset, sha256: str) -> Evaluation:
         """The scores, in the order of the archive.
