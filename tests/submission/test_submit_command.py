@@ -102,10 +102,20 @@ def test_the_rollouts_of_an_archive_score_as_its_unpacked_files(tmp_path, monkey
 
 
 def test_scores_of_an_archive_need_logged_futures(place, capsys):
-    write_dataset([scenes.without_future()], place / "held", split="testing")
-    assert main(["submit", "build", "constant_velocity", "--data", "held", *BUILD[5:], "--i-comply"]) == 0
+    write_dataset([scenes.without_future("one"), scenes.without_future("two")], place / "held", split="testing")
+    # before the archive is read, which is not even there
     assert main([*CHECK[:3], "--data", "held", "--score"]) == 2
-    assert "no scenario of split testing of held could be scored (has no logged future)" in capsys.readouterr().err
+    printed = capsys.readouterr()
+    assert "--score is for the validation split: " in printed.err
+    assert "held (split testing): 2 of 2 scenarios withhold their future" in printed.err
+    assert not printed.out
+
+
+def test_scores_of_an_archive_need_a_scenario_without_an_error(place, capsys):
+    assert main([*BUILD, "--i-comply"]) == 0
+    write_dataset([scenes.straight_road()], place / "other", split="testing")
+    assert main([*CHECK[:3], "--data", "other", "--score"]) == 2
+    assert "none of 1 scenarios of split testing of other could be scored" in capsys.readouterr().err
 
 
 def test_the_card_of_a_model_is_part_of_the_report(tmp_path):

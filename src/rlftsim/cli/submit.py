@@ -11,6 +11,7 @@ from tyro.conf import Positional
 from rlftsim.cli.machines import Work
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.evaluate import EvaluateConfig, evaluation_name, frozen_copy
+from rlftsim.evaluation.scenario_source import choose_scenarios
 from rlftsim.evaluation.score_files import format_scores
 from rlftsim.policies.registry import Device, load_policy
 from rlftsim.progress import print_wide
@@ -154,9 +155,14 @@ class Check:
         """Print the findings; exit status 1 if there is an error.
 
         Raises:
-            DataError: `score`, and none of the scenarios has a logged future and a road edge.
+            DataError: `score`, and the scenarios have no logged future, or the archive no scenario that can be scored.
         """
         data = open_dataset(self.data, self.split, cache_size=CACHED_SCENARIOS)
+        if self.score:
+            try:
+                choose_scenarios(data, EvaluateConfig(split=self.split))
+            except DataError as error:
+                raise DataError(f"--score is for the validation split: {error}") from None
         scores = ArchiveScores() if self.score else None
         check = check_archive(
             self.archive, data, sample=self.sample, expected_sha256=reported_sha256(self.archive), see=scores
@@ -169,8 +175,8 @@ class Check:
             if not len(evaluation):
                 reason = evaluation.skipped[0].reason if evaluation.skipped else "the archive has none without an error"
                 raise DataError(
-                    f"--score: no scenario of split {self.split} of {self.data} could be scored ({reason}): "
-                    "it is for an archive of the validation split, --split validation."
+                    f"--score: none of {len(data)} scenarios of split {self.split} of {self.data} could be scored "
+                    f"({reason}): give the data set and split that the archive is for."
                 )
             print_wide(format_scores(evaluation))
         return int(check.findings.has_errors)

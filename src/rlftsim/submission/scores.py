@@ -28,9 +28,8 @@ class ArchiveScores:
             scenario: with its future.
             decoded: rollouts without an error.
         """
-        if not scenario.has_future or not has_road_edge(scenario):
-            reason = "has no road edge" if scenario.has_future else "has no logged future"
-            self._skipped.append(Skipped(scenario.scenario_id, reason))
+        if not has_road_edge(scenario):
+            self._skipped.append(Skipped(scenario.scenario_id, "has no road edge"))
             return
         assert decoded.values is not None
         x, y, z, heading = (torch.from_numpy(decoded.values[:, :, axis].copy()) for axis in range(len(AXES)))
