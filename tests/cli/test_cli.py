@@ -1,12 +1,14 @@
 """The command line as a user meets it: help for every verb, one line for every mistake."""
 
 import errno
+import io
 import json
 import re
 import shutil
 import typing
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -458,6 +460,23 @@ def test_simulating_again_keeps_what_is_there(tmp_path, capsys):
     assert file.stat().st_mtime_ns == stamp
 
 
+@pytest.mark.parametrize("size", [0, 100, 1000])
+def test_rollouts_that_are_cut_off_are_simulated_again(tmp_path, capsys, size):
+    arguments = ["simulate", "constant_velocity", "--data", "synthetic", "--out", tmp_path, "--num-rollouts", "2"]
+    names = open_dataset("synthetic", "validation").scenario_ids[:2]
+    assert run(capsys, *arguments, "--scenario", *names)[0] == 0
+    cut, kept = (tmp_path / f"{name}.npz" for name in names)
+    whole, stamp = cut.read_bytes(), kept.stat().st_mtime_ns
+    cut.write_bytes(whole[:size])
+    status, _, err = run(capsys, *arguments, "--scenario", *names)
+    assert status == 0
+    assert f"{cut} is no npz archive, or cut off: it is simulated again." in err
+    with np.load(cut) as again, np.load(io.BytesIO(whole)) as before:
+        assert again.files == before.files
+        assert all(np.array_equal(again[name], before[name]) for name in again.files)
+    assert kept.stat().st_mtime_ns == stamp
+
+
 def test_a_folder_of_other_rollouts_is_refused(tmp_path, capsys):
     arguments = ["simulate", "constant_velocity", "--data", "synthetic", "--out", tmp_path, "--num-rollouts", "2"]
     name = open_dataset("synthetic", "validation").scenario_ids[0]
@@ -697,7 +716,9 @@ def test_rollouts_that_are_damaged_or_of_an_unknown_model_are_refused(tmp_path, 
     arguments = ["--scenario", SCENARIO, "--goal", f"{TURNS}=-74.19,19.77"]
     assert simulated(*arguments)[0] == 0
     path = tmp_path / "o" / f"{SCENARIO}.npz"
-    path.write_bytes(path.read_bytes()[:1000])
+    damaged = bytearray(path.read_bytes())
+    damaged[500:1000] = bytes(500)  # of an array: the list of contents is whole
+    path.write_bytes(damaged)
     status, _, err = simulated(*arguments)
     assert (status, err.count("\n")) == (2, 2)  # the doubt, and the cause
     assert f"{path} (scenario {SCENARIO})" in err

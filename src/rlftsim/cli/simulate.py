@@ -9,7 +9,7 @@ from tyro.conf import Positional
 
 from rlftsim.cli.goal_outcomes import read_rollouts, report_outcomes
 from rlftsim.cli.goals import given_goals, warn_of_doubts
-from rlftsim.cli.rollout_folder import claim_folder
+from rlftsim.cli.rollout_folder import claim_folder, left_to_simulate
 from rlftsim.errors import ConfigError
 from rlftsim.evaluation.exporters import EXPORTERS
 from rlftsim.goals.placement import goals_of_batch
@@ -28,7 +28,8 @@ class Simulate:
     """Simulate futures of scenarios: the model moves every agent, the ego included, for 8 seconds.
 
     Writes one npz file per scenario: scenario_id, object_ids [A], x y z heading [N, A, 80], world frame.
-    Existing files are kept, so an interrupted simulation continues when the same command is repeated.
+    Existing files are kept, so an interrupted simulation continues when the same command is repeated; one that is cut
+    off is simulated again.
     """
 
     model: Annotated[Positional[str], tyro.conf.arg(metavar="MODEL")]
@@ -107,7 +108,7 @@ class Simulate:
             about["goals"] = [[e.scenario_id, e.agent_id, e.x, e.y] for e in given.goals]
         claim_folder(self.out, about)
         # 3. simulate what is missing
-        left = [i for i in ids if not (self.out / f"{i}.npz").exists()]
+        left = left_to_simulate(self.out, ids)
         with progress_bar("simulate", len(ids), len(ids) - len(left)) as advance:
             for scenario_id in left:
                 batch = collate([scenarios.by_id(scenario_id)]).to(device_of(policy))
