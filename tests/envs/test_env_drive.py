@@ -7,6 +7,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from full_disk import limit_files_to
 from rlftsim.cli import main
 from rlftsim.envs import EgoEnv
 from rlftsim.envs.drive import DriveConfig, drive, run_planner
@@ -175,6 +176,76 @@ def test_drive_writes_a_row_per_scenario_and_compare_reads_them(tmp_path, capsys
     assert "unknown planner 'walk'" in errors[0]
     assert "is a file, not a folder" in errors[5]
     assert "names one twice: x, x" in errors[6]
+
+
+def test_a_smaller_drive_never_replaces_a_larger_result(tmp_path):
+    config = DriveConfig("constant_velocity", traffic=("replay", "constant_velocity"), limit=2)
+    (larger,) = drive(replace(config, traffic=("replay",), limit=3), tmp_path)
+    before = (tmp_path / "constant_velocity-replay.parquet").read_bytes()
+    chosen = replace(config, limit=None, scenarios=(larger.table["scenario_id"][0].as_py(),))
+    for fewer, choice in ((config, "limit=2"), (replace(config, seed=1), "limit=2"), (chosen, "this choice")):
+        with pytest.raises(ConfigError, match=f"replay.parquet holds 3 scenarios and {choice} would replace them by"):
+            drive(fewer, tmp_path)
+    assert (tmp_path / "constant_velocity-replay.parquet").read_bytes() == before
+    assert [path.name for path in tmp_path.iterdir()] == ["constant_velocity-replay.parquet"]  # nothing was driven
+
+
+FAILING_PLANNER = """
+from pathlib import Path
+import numpy as np
+LOG = Path(__file__).with_name("driven")
+class Fails:
+    def reset(self, info):
+        with LOG.open("a") as file:
+            file.write(info["scenario"] + "\\n")
+        if LOG.with_name("fail").exists() and len(LOG.read_text().split()) == 4:
+            raise RuntimeError("no more")
+    def act(self, observation):
+        return np.zeros(2, np.float32)
+"""
+
+
+def test_an_interrupted_drive_goes_on_and_a_changed_planner_starts_anew(tmp_path, monkeypatch, caplog):
+    (tmp_path / "fails.py").write_text(FAILING_PLANNER)
+    monkeypatch.syspath_prepend(tmp_path)
+    ids = tuple(open_dataset("synthetic", "validation").scenario_ids[:2])
+    config = DriveConfig("fails:Fails", traffic=("replay", "constant_velocity"), scenarios=ids)
+    expected = drive(config, tmp_path / "whole")
+
+    def driven_by(config):
+        (tmp_path / "driven").unlink(missing_ok=True)
+        results = drive(config, tmp_path / "out")
+        for result, other in zip(results, expected):
+            np.testing.assert_equal(result.table.to_pydict(), other.table.to_pydict())
+            assert result.table.schema.equals(other.table.schema)
+        return (tmp_path / "driven").read_text().split() if (tmp_path / "driven").exists() else []
+
+    # 1. the second scenario of the second kind of traffic fails
+    (tmp_path / "fail").touch()
+    with pytest.raises(RuntimeError, match="no more"):
+        driven_by(config)
+    (tmp_path / "fail").unlink()
+    assert driven_by(config) == list(ids[1:])
+    # 2. all is there
+    assert driven_by(config) == []
+    assert "fails.Fails-replay.parquet is finished and is read: remove it to drive anew" in caplog.text
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        "fails.Fails-replay.parquet", "fails.Fails-constant_velocity.parquet"
+    }  # fmt: skip
+    # 3. another planner under the same name, and a damaged file
+    (tmp_path / "fails.py").write_text(FAILING_PLANNER + "# changed\n")
+    assert driven_by(config) == [*ids, *ids]
+    assert "is of another planner_code: it will be replaced" in caplog.text
+    damaged = tmp_path / "out" / "fails.Fails-replay.parquet"
+    damaged.write_bytes(damaged.read_bytes()[:100])
+    assert driven_by(config) == list(ids)
+
+
+def test_a_full_disk_is_noticed_before_anything_is_driven(tmp_path, monkeypatch):
+    monkeypatch.setattr("rlftsim.envs.drive.run_planner", None)
+    config = DriveConfig("constant_velocity", traffic=("replay",), limit=1)
+    with limit_files_to(10), pytest.raises(DataError, match=r"cannot write .*\.lock .*: make room or choose another"):
+        drive(config, tmp_path / "out")
 
 
 def test_a_rollout_without_a_value_leaves_it_to_the_others(monkeypatch):

@@ -17,7 +17,8 @@ class Drive:
     """Let a planner drive the ego of every scenario, and score the planner and the traffic around it.
 
     Writes OUT/PLANNER-TRAFFIC.parquet for each kind of traffic, a row per scenario. `rlftsim compare` reads two of
-    them. Needs the extra env: pip install 'rlftsim[env]'.
+    them. An interrupted drive continues when the same command is repeated. Needs the extra env: pip install
+    'rlftsim[env]'.
     """
 
     planner: Annotated[Positional[str], tyro.conf.arg(metavar="PLANNER")]

@@ -71,7 +71,7 @@ usage: rlftsim VERB ...      rlftsim VERB --help explains a verb
   join VERB .. put the shares of a command together that ran on several machines (--share K/N)
 """
 
-STARTS_ANEW = ("doctor", "plugins", "data", "recipe", "tokens", "model", "goals", "drive", "studio", "compare")
+STARTS_ANEW = ("doctor", "plugins", "data", "recipe", "tokens", "model", "goals", "studio", "compare")
 """Verbs that keep nothing of an interrupted run."""
 JOIN = "join"
 HAVE_SHARES = ("convert", "evaluate", "score", "submit build", "synthesize")

@@ -1,5 +1,11 @@
-"""Planners measured: every scenario driven in several kinds of traffic, scores in one file for each kind."""
+"""Planners measured: every scenario driven in several kinds of traffic, scores in one file for each kind.
 
+Interrupted in any way, the same call goes on where it was, see `evaluation.resumable`.
+"""
+
+import shutil
+import tempfile
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -8,20 +14,22 @@ from typing import Any, cast
 import numpy as np
 
 import rlftsim
-from rlftsim.atomic_io import errors_name
 from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.drivers import TRAFFIC, Traffic
 from rlftsim.envs.ego_env import EgoEnv
-from rlftsim.envs.planners.registry import Planner, action_of, horizon_of, load_planner
+from rlftsim.envs.planners.registry import Planner, action_of, hash_code, horizon_of, load_planner
 from rlftsim.envs.result import Result, animation_of
 from rlftsim.envs.source import Source
 from rlftsim.envs.traffic_scores import blamed_others_rate, realism_of_others
 from rlftsim.errors import ConfigError, whole_number
 from rlftsim.evaluation.drive_results import DriveResult, DriveSettings
-from rlftsim.progress import progress_bar
+from rlftsim.evaluation.resumable import JsonParts, map_scenarios, read_if_readable, refuse_fewer
+from rlftsim.evaluation.scenario_source import hash_manifest
+from rlftsim.lease import Lease
+from rlftsim.progress import log
+from rlftsim.scenario.open import dataset_folder
 from rlftsim.scenario.types import Scenario
 from rlftsim.statistics import mean_interval
-from rlftsim.threads import one_thread
 from rlftsim.viewer.film import to_film
 from rlftsim.workers import on_this_machine
 
@@ -73,36 +81,39 @@ class DriveConfig:
 def drive(config: DriveConfig, out: Path | None = None) -> list[DriveResult]:
     """Scores of a planner in each kind of traffic, written to OUT/PLANNER-TRAFFIC.parquet.
 
+    Interrupted in any way, the same call goes on where it was. A kind of traffic that is finished is read from its
+    file, with a message. A planner whose file has changed is driven anew.
+
     Args:
         config: what is driven.
-        out: folder for the files; None writes none.
+        out: folder for the files; None keeps none.
 
     Raises:
-        ConfigError: an unknown planner, kind of traffic or scenario.
-        DataError: no such data, or a scenario that the planner cannot drive.
+        ConfigError: an unknown planner, kind of traffic or scenario, or a result of more scenarios that a limit or a
+            choice would replace.
+        DataError: no such data, a scenario that the planner cannot drive, or a folder that cannot be written to.
     """
-    environments = [_environment(config, traffic) for traffic in config.traffic]  # refuses before anything is driven
+    # everything that can be refused is refused before anything is driven
+    environments = [_environment(config, traffic) for traffic in config.traffic]
     ids = list(config.scenarios or environments[0].source.scenario_ids)[: config.limit]
     for scenario_id in ids:
         environments[0].source.scenario(scenario_id)
-    if out is not None:
-        with errors_name(out):
-            out.mkdir(parents=True, exist_ok=True)
-    name = config.planner.replace(":", ".")
-    results = []
-    for traffic, env in zip(config.traffic, environments):
-        with progress_bar(f"{name} in {traffic}", len(ids)) as advance, one_thread():
-            runner = on_this_machine(config.jobs, len(ids))
-            found = runner.run(partial(_drive_scenario, config, traffic), ids, advance=advance)
-        settings = DriveSettings(
-            planner=config.planner, traffic=traffic, model=env.source.fingerprint, dataset=config.data,
-            split=config.split, num_rollouts=config.num_rollouts, seed=config.seed, rlftsim_version=rlftsim.__version__,
-        )  # fmt: skip
-        result = DriveResult.of(settings, [row for row, _ in found], {row["scenario_id"]: why for row, why in found})
-        if out is not None:
-            result.write(out / f"{name}-{traffic}.parquet")
-        results.append(result)
-    return results
+    common = {
+        "planner": config.planner, "dataset": config.data, "split": config.split, "num_rollouts": config.num_rollouts,
+        "seed": config.seed, "rlftsim_version": rlftsim.__version__,
+        "planner_code": hash_code(load_planner(config.planner)),
+        "manifest_sha256": hash_manifest(dataset_folder(config.data)),
+    }  # fmt: skip
+    kinds = [
+        DriveSettings(traffic=traffic, model=env.source.fingerprint, **common)
+        for traffic, env in zip(config.traffic, environments)
+    ]
+    # processes hand their rows over in files, so even results that are not kept need a folder
+    with tempfile.TemporaryDirectory() as nowhere:
+        name = config.planner.replace(":", ".")
+        paths = [(out or Path(nowhere)) / f"{name}-{traffic}.parquet" for traffic in config.traffic]
+        finished = [_read_finished(config, kind, ids, path) for kind, path in zip(kinds, paths)]
+        return [result or _drive_traffic(config, kind, ids, path) for kind, path, result in zip(kinds, paths, finished)]
 
 
 def run_planner(env: EgoEnv, planner: Planner, scenario: Scenario, *, seed: int, rollout: int = 0) -> Result:
@@ -122,12 +133,68 @@ def run_planner(env: EgoEnv, planner: Planner, scenario: Scenario, *, seed: int,
     return env.result()
 
 
-def _drive_scenario(
-    config: DriveConfig, traffic: str, scenario_id: str, advance: Any, stop: Any
-) -> tuple[dict[str, Any], dict[str, str]]:
+def _read_finished(config: DriveConfig, settings: DriveSettings, ids: Sequence[str], path: Path) -> DriveResult | None:
+    """The result of an earlier call for the same scenarios in one kind of traffic; None if there is none.
+
+    Args:
+        config: of the call.
+        settings: of the result.
+        ids: its scenarios.
+        path: of its file.
+
+    Raises:
+        ConfigError: a result of more scenarios is there, which a limit or a choice would replace.
+    """
+    found = read_if_readable(path, DriveResult.read)
+    if found is None:
+        return None
+    choice = f"limit={config.limit}" if config.limit is not None else "this choice" if config.scenarios else ""
+    if choice:
+        refuse_fewer(path, len(found.table), len(ids), choice, "name another --out, or drive all scenarios.")
+    stored, wanted = asdict(found.settings), asdict(settings)
+    differing = [name for name in wanted if stored[name] != wanted[name]]
+    if differing:
+        log.info(f"{path} is of another {', '.join(differing)}: it will be replaced.")
+    if differing or found.table["scenario_id"].to_pylist() != list(ids):
+        return None
+    # code beside the planner's file, or its weights, may have changed
+    log.info(f"{path} is finished and is read: remove it to drive anew.")
+    return found
+
+
+def _drive_traffic(config: DriveConfig, settings: DriveSettings, ids: Sequence[str], path: Path) -> DriveResult:
+    """Drive what is missing in one kind of traffic and write the result.
+
+    Args:
+        config: of the call.
+        settings: of the result.
+        ids: its scenarios.
+        path: of its file; finished scenarios lie beside it until all are there.
+    """
+    identity = {scenario_id: {"settings": asdict(settings)} for scenario_id in ids}
+    files = JsonParts(path.with_suffix(".parts"), ids, identity, {}, _row_and_missing)
+    runner = on_this_machine(config.jobs, len(ids))
+    # the first file that is written: on a full disk nothing is driven
+    with Lease(files.folder / ".lock", runner, "drives in"):
+        found = map_scenarios(
+            partial(_drive_scenario, config, settings.traffic, ids), len(ids), files,
+            runner=runner, title=f"{config.planner} in {settings.traffic}",
+        )  # fmt: skip
+        result = DriveResult.of(settings, [row for row, _ in found], {row["scenario_id"]: why for row, why in found})
+        result.write(path)
+        shutil.rmtree(files.folder, ignore_errors=True)
+    return result
+
+
+def _row_and_missing(scenario_id: str, values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
+    """Row of a scenario, and the scores that it cannot give."""
+    return values["row"], values["missing"]
+
+
+def _drive_scenario(config: DriveConfig, traffic: str, ids: Sequence[str], position: int) -> dict[str, object]:
     """Row of one scenario, and the scores that it cannot give."""
     env, planner = _environment(config, traffic), load_planner(config.planner)
-    scenario = env.source.scenario(scenario_id)
+    scenario = env.source.scenario(ids[position])
     results = [
         run_planner(env, planner, scenario, seed=config.seed, rollout=rollout) for rollout in range(config.num_rollouts)
     ]
@@ -136,8 +203,8 @@ def _drive_scenario(
     means = {name: mean_interval(np.array([row[name] for row in rows])).mean for name in rows[0]}
     means["blamed_others_rate"] = blamed_others_rate([one for result in results for one in result.record.collisions])
     realism = realism_of_others([result.record for result in results])
-    advance(1)
-    return {"scenario_id": scenario_id, "traffic": traffic, **means, "others_realism": realism}, results[0].missing
+    row = {"scenario_id": ids[position], "traffic": traffic, **means, "others_realism": realism}
+    return {"row": row, "missing": results[0].missing}
 
 
 @lru_cache(maxsize=8)

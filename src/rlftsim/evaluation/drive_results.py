@@ -39,6 +39,10 @@ class DriveSettings:
     num_rollouts: int
     seed: int
     rlftsim_version: str
+    planner_code: str = ""
+    """Hash of the file that defines the planner."""
+    manifest_sha256: str = ""
+    """Of the data set."""
 
 
 @dataclass(frozen=True, eq=False)

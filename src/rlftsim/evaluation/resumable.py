@@ -1,7 +1,7 @@
 """Interruptible measurements of many scenarios: finished groups are kept in files, a later call does the rest.
 
-`map_scenarios` is the loop, shared by evaluations, scores of rollout files, goal attainment and reward variances. They
-differ in the work on one scenario and in their files: `EvaluationParts` (Parquet) or `JsonParts`.
+`map_scenarios` is the loop, shared by evaluations, scores of rollout files, goal attainment, reward variances and
+planners. They differ in the work on one scenario and in their files: `EvaluationParts` (Parquet) or `JsonParts`.
 """
 
 import json
@@ -29,6 +29,8 @@ Result = TypeVar("Result")
 """Result of one scenario, as the work on it returns it."""
 Part = TypeVar("Part")
 """Results of a group of scenarios, as they are read back."""
+Stored = TypeVar("Stored")
+"""A finished result."""
 
 
 class PartFiles(ABC, Generic[Result, Part]):
@@ -200,7 +202,7 @@ class EvaluationParts(PartFiles[Mapping[str, object] | Skipped, Evaluation]):
 
     def read(self, group: range) -> Evaluation | None:
         """The rows of a group, see `PartFiles`."""
-        found = _read_if_readable(self.part_path(group))
+        found = read_if_readable(self.part_path(group), Evaluation.read)
         return found if found is not None and self._is_ours(found, self.part_path(group), "discarded") else None
 
     def read_finished(self, scenario_ids: Sequence[str]) -> Evaluation | None:
@@ -209,16 +211,15 @@ class EvaluationParts(PartFiles[Mapping[str, object] | Skipped, Evaluation]):
         Raises:
             ConfigError: a result of more scenarios is there, which a limit would replace.
         """
-        found = _read_if_readable(self.result_path)
+        found = read_if_readable(self.result_path, Evaluation.read)
         if found is None:
             return None
         # Before anything else: also a result of another policy or setting is worth more than a quick look.
-        num_found, limit = len(found) + len(found.skipped), self.provenance.config.limit
-        if limit is not None and num_found > len(scenario_ids):
-            raise ConfigError(
-                f"{self.result_path} holds {num_found} scenarios and limit={limit} would replace them by fewer: "
-                "name this one apart with --name, or leave the limit out."
-            )
+        limit = self.provenance.config.limit
+        if limit is not None:
+            num_found = len(found) + len(found.skipped)
+            way_out = "name this one apart with --name, or leave the limit out."
+            refuse_fewer(self.result_path, num_found, len(scenario_ids), f"limit={limit}", way_out)
         if not self._is_ours(found, self.result_path, "it will be replaced"):
             return None
         # as a set: a scenario may have several sets of rollouts
@@ -227,7 +228,7 @@ class EvaluationParts(PartFiles[Mapping[str, object] | Skipped, Evaluation]):
 
     def has_only_ours(self) -> bool:
         """True if no part of an evaluation with other settings is there."""
-        found = (_read_if_readable(path) for path in self.parts_folder.glob("*.parquet"))
+        found = (read_if_readable(path, Evaluation.read) for path in self.parts_folder.glob("*.parquet"))
         return not any(part is not None and part.provenance.differences(self.provenance) for part in found)
 
     def _is_ours(self, found: Evaluation, path: Path, fate: str) -> bool:
@@ -289,11 +290,34 @@ def resume_evaluation(
     return finished
 
 
-def _read_if_readable(path: Path) -> Evaluation | None:
+def refuse_fewer(path: Path, num_stored: int, num_wanted: int, choice: str, way_out: str) -> None:
+    """Refuse to replace a result by one of fewer scenarios that were chosen for a quick look.
+
+    Args:
+        path: of the stored result.
+        num_stored: scenarios in it.
+        num_wanted: scenarios of the new result.
+        choice: setting that left the others out.
+        way_out: end of the message.
+
+    Raises:
+        ConfigError: the stored result has more.
+    """
+    if num_stored > num_wanted:
+        raise ConfigError(f"{path} holds {num_stored} scenarios and {choice} would replace them by fewer: {way_out}")
+
+
+def read_if_readable(path: Path, read: Callable[[Path], Stored]) -> Stored | None:
+    """A stored result; None if there is none, or a damaged one, which a message names.
+
+    Args:
+        path: of the result.
+        read: raises a DataError with the way out, which is to do the work again.
+    """
     if not path.exists():
         return None
     try:
-        return Evaluation.read(path)
+        return read(path)
     except DataError as error:
         log.info(f"{error} Doing so.")
         return None

@@ -5,12 +5,15 @@ mine = "my_package:MyPlanner"
 """
 
 import importlib
+import inspect
+import secrets
 from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
 from rlftsim.envs.actions import LEAST_HORIZON, ActionKind
 from rlftsim.errors import ConfigError
 from rlftsim.plugins import ExtensionPoint
+from rlftsim.scenario.shards import hash_file
 
 PLANNERS: ExtensionPoint[Callable[..., Any]] = ExtensionPoint(
     "planner",
@@ -95,6 +98,16 @@ def load_planner(name: str) -> Planner:
     if callable(planner):
         return CallablePlanner(planner)
     raise ConfigError(f"planner {name!r} is a {type(planner).__name__}: give it reset(info) and act(observation).")
+
+
+def hash_code(planner: Planner) -> str:
+    """SHA-256 of the file that defines a planner; of one without a file, as in a notebook, another value each time."""
+    code = planner.function if isinstance(planner, CallablePlanner) else type(planner)
+    try:
+        return hash_file(inspect.getfile(code))
+    except (TypeError, OSError):
+        # it may be other code than the last time
+        return secrets.token_hex(32)
 
 
 def action_of(planner: Planner | Callable[..., Any]) -> ActionKind:
