@@ -460,6 +460,16 @@ def test_simulating_again_keeps_what_is_there(tmp_path, capsys):
     assert file.stat().st_mtime_ns == stamp
 
 
+def test_a_limit_takes_the_first_scenarios_and_a_higher_one_adds_to_them(tmp_path, capsys):
+    arguments = ["simulate", "constant_velocity", "--data", "synthetic", "--out", tmp_path, "--num-rollouts", "2"]
+    ids = open_dataset("synthetic", "validation").scenario_ids
+    for limit in (1, 3):
+        assert f"2 rollouts of {limit} scenarios" in run(capsys, *arguments, "--limit", limit)[1]
+        assert {path.stem for path in tmp_path.glob("*.npz")} == set(ids[:limit])
+    status, _, err = run(capsys, *arguments, "--limit", "0")
+    assert (status, "--limit must be at least 1, got 0" in err) == (2, True)
+
+
 @pytest.mark.parametrize("size", [0, 100, 1000])
 def test_rollouts_that_are_cut_off_are_simulated_again(tmp_path, capsys, size):
     arguments = ["simulate", "constant_velocity", "--data", "synthetic", "--out", tmp_path, "--num-rollouts", "2"]

@@ -67,7 +67,9 @@ def nearest(flag: str, known: Sequence[str]) -> str | None:
         return next(flag for flag, name in by_last.items() if name == close[0])
     if group and siblings:  # the group is right: a flag of another one would be a wild guess
         return None
-    return next(iter(difflib.get_close_matches(flag, known, n=1)), None)
+    # without the hyphens, which all have in common: "--limit" is not "--split"
+    names = [name.removeprefix("--") for name in known]
+    return next((f"--{name}" for name in difflib.get_close_matches(flag.removeprefix("--"), names, 1, 0.65)), None)
 
 
 def _one_line(complaint: str) -> str:

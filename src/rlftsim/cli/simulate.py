@@ -42,6 +42,8 @@ class Simulate:
     """Split of the data set."""
     scenario: list[str] | None = None
     """Simulate only the scenarios with these ids."""
+    limit: int | None = None
+    """Only the first so many scenarios."""
     num_rollouts: int = 32
     """Rollouts of each scenario."""
     seed: int = 0
@@ -84,7 +86,7 @@ class Simulate:
             raise ConfigError(
                 f"--guidance-scale {self.guidance_scale:g} has no effect without goals: add --goal or --goals."
             )
-        ids = list(dict.fromkeys(self.scenario or given.scenario_ids or scenarios.scenario_ids))
+        ids = list(dict.fromkeys(self.scenario or given.scenario_ids or scenarios.scenario_ids))[: self.limit]
         for scenario_id in ids:
             entries = given.of_scenario(scenario_id)
             refuse_unknown(
