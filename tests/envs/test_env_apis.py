@@ -246,6 +246,12 @@ def test_bad_input_of_several_environments_is_one_line(unchecked):
     vector.reset(seed=(1, 2))
     with pytest.raises(ConfigError, match="slot 1, agent 100 in scenario straight at entry 0 is nan"):
         vector.step(np.array([[0.0, 0.0], [np.nan, 0.0]]))
+    with pytest.raises(
+        ConfigError, match=r"^actions have shape \(3, 2\), they must have \(2, 2\): one for each of 2\.$"
+    ):
+        vector.step(np.zeros((3, 2)))
+    with pytest.raises(ConfigError, match=r"slot 0.* has shape \(3,\), it must have \(2,\)"):
+        vector.step(np.zeros((2, 3)))
     ego = EgoEnv(**log)
     ego.reset(seed=0)
     with pytest.raises(ConfigError, match="noise must be one of"):

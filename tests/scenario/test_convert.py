@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from rlftsim.cli.main import main
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.scenario.convert import convert
 from rlftsim.scenario.dataset import ScenarioDataset
@@ -100,7 +101,7 @@ def test_other_files_are_added_to_a_data_set(source, tmp_path):
     assert report.counts == {"training": 4, "validation": 2}
 
 
-def test_bad_records_are_skipped_and_reported(source, tmp_path, make_message, make_tfrecord):
+def test_bad_records_are_skipped_and_reported(source, tmp_path, make_message, make_tfrecord, capsys):
     path = source / "training" / "training.tfrecord-00001-of-00002"
     bad = make_message("bad")
     bad.tracks[0].states[20].center_x = float("nan")
@@ -119,6 +120,11 @@ def test_bad_records_are_skipped_and_reported(source, tmp_path, make_message, ma
         ("training/training.tfrecord-00001-of-00002", 2, "truncated"),
     ]
     assert run(source, tmp_path / "data").skipped == report.skipped  # the second run knows it from the first
+    assert main(["convert", str(source), str(tmp_path / "data"), "--jobs", "1"]) == 0
+    printed = capsys.readouterr().out
+    assert "5 scenarios converted, at least 3 lost" in printed
+    assert "bytes, the file has" in printed
+    assert printed.count("the rest of the file is lost") == 1
 
 
 @pytest.mark.parametrize("jobs", [1, 2])

@@ -237,7 +237,7 @@ def test_a_truncated_shard_is_refused(folder):
 
 def test_a_missing_shard_is_named(folder):
     shard_of(folder).unlink()
-    with pytest.raises(DataError, match=r"00000\.arrow is missing"):
+    with pytest.raises(DataError, match=r"00000\.arrow is missing: run the conversion or generation that made it"):
         ScenarioDataset(folder)[0]
 
 

@@ -1,11 +1,12 @@
 import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from rlftsim.errors import DataError
 from rlftsim.scenario.dataset import DatasetWriter, write_dataset
-from rlftsim.scenario.inspect import Problem, dataset_stats, verify_dataset
+from rlftsim.scenario.inspect import Problem, check_scenario, dataset_stats, verify_dataset
 from rlftsim.scenario.types import Scenario
 from rlftsim.scenario.womd import scenario_from_bytes
 
@@ -86,7 +87,14 @@ def test_missing_map_and_no_agent_to_evaluate_are_found(make_dataset, make_messa
         (Problem.MISSING_MAP, "b"),
         (Problem.NO_EVALUATED_AGENTS, "c"),
     ]
-    assert [finding.detail for finding in verify_dataset(folder)][:2] == ["no map features", "no road edges"]
+    only_ego = "no track to predict is valid at the current step, only the ego is evaluated"
+    details = [finding.detail for finding in verify_dataset(folder)]
+    assert details == ["no map features", "no road edges", only_ego]
+    # other sources may have an ego that is not valid either
+    whole = scenario_from_bytes(make_message("d").SerializeToString())
+    empty = replace(whole, tracks=replace(whole.tracks, valid=np.zeros_like(whole.tracks.valid)))
+    (finding,) = check_scenario(empty)
+    assert finding.detail == only_ego.replace("only the ego is evaluated", "nor is the ego: nothing is evaluated")
 
 
 def test_a_flipped_byte_and_a_missing_shard_are_found(make_dataset, make_message):

@@ -3,7 +3,7 @@ import struct
 import pytest
 
 from rlftsim.errors import DataError
-from rlftsim.scenario.tfrecord import masked_crc32c, read_records, write_records
+from rlftsim.scenario.tfrecord import count_lost, masked_crc32c, read_records, write_records
 
 RECORDS = [b"first", b"", b"third record" * 100, b"last"]
 # start of record k: 16 bytes of framing for each record before it
@@ -45,6 +45,7 @@ def test_a_flipped_data_byte_costs_one_record(file):
         list(read_records(file))
     records, skipped = read_skipping(file)
     assert [number for number, _ in records] == [0, 1, 3]
+    assert count_lost(skipped) == "1"
     assert [(s.file, s.record) for s in skipped] == [(str(file), 2)]
 
 
@@ -65,6 +66,8 @@ def test_a_truncated_file_keeps_the_records_before(file, cut):
     records, skipped = read_skipping(file)
     assert len(records) == 3
     assert "truncated" in skipped[0].cause
+    assert skipped[0].cause.endswith("; the rest of the file is lost")
+    assert count_lost(skipped) == "at least 1"
 
 
 def test_a_length_with_a_good_checksum_beyond_the_end_is_a_truncation(tmp_path):

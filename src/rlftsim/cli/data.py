@@ -15,6 +15,7 @@ from rlftsim.scenario.convert import convert
 from rlftsim.scenario.inspect import DatasetStats, dataset_stats, verify_dataset
 from rlftsim.scenario.open import dataset_folder
 from rlftsim.scenario.synthetic.generate import generate
+from rlftsim.scenario.tfrecord import count_lost
 from rlftsim.scenario.transfer import pull_dataset, push_dataset
 from rlftsim.storage import is_url
 from rlftsim.workers import usable_cores
@@ -66,7 +67,7 @@ class Convert:
             options={name: value for name, value in options.items() if value is not None},
         )
         by_split = ", ".join(f"{count} {split}" for split, count in report.counts.items())
-        counts = f"{report.converted} scenarios converted, {len(report.skipped)} lost"
+        counts = f"{report.converted} scenarios converted, {count_lost(report.skipped)} lost"
         print(f"{report.destination}: {counts}; in all {by_split}.")
         for what, count in report.tallies.items():
             print(f"  {count} {what}")

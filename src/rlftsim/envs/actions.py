@@ -145,6 +145,8 @@ def checked(action: Any, controls: Controls, name_of: Callable[[int], str], coun
         array = np.asarray(action, np.float64)
     except (TypeError, ValueError):
         raise ConfigError(f"action of {name_of(0)} must be numbers in shape {shape[1:]}.") from None
+    if array.shape != shape and array.shape[1:] == shape[1:]:
+        raise ConfigError(f"actions have shape {array.shape}, they must have {shape}: one for each of {count}.")
     if array.shape != shape:
         raise ConfigError(f"action of {name_of(0)} has shape {array.shape[1:]}, it must have {shape[1:]}.")
     if controls.num_choices:

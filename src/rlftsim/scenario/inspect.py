@@ -211,7 +211,10 @@ def check_scenario(scenario: Scenario) -> Iterator[Finding]:
         detail = f"no {' and no '.join(missing)}" if len(features.points) else "no map features"
         yield Finding(Problem.MISSING_MAP, where, detail)
     if not (scenario.evaluated_indices != scenario.ego_index).any():
-        detail = "no track to predict is valid at the current step, only the ego is evaluated"
+        rest = (
+            "only the ego is evaluated" if len(scenario.evaluated_indices) else "nor is the ego: nothing is evaluated"
+        )
+        detail = f"no track to predict is valid at the current step, {rest}"
         yield Finding(Problem.NO_EVALUATED_AGENTS, where, detail)
 
 

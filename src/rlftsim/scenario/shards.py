@@ -183,8 +183,8 @@ class ShardReader:
             table = pa.ipc.open_file(pa.memory_map(str(path))).read_all()
             self._table = table.rename_columns([current_name(name) for name in table.schema.names])
         except (OSError, pa.ArrowException) as error:
-            cause = "is damaged" if self.path.exists() else "is missing"
-            raise DataError(f"shard {self.path} {cause}: {_WAY_OUT}") from error
+            way_out = f"is damaged: {_WAY_OUT}" if self.path.exists() else f"is missing: {_RUN_AGAIN}"
+            raise DataError(f"shard {self.path} {way_out}") from error
         known = self._table.schema.names
         expected = [name for name in _SCHEMA.names if name in known or name not in _ADDED_LATER]
         if known != expected:
@@ -227,7 +227,8 @@ class ShardReader:
             raise DataError(f"shard {self.path}: row {row} is damaged ({cause}): {_WAY_OUT}") from error
 
 
-_WAY_OUT = "delete the file and run the conversion or generation that made it again"
+_RUN_AGAIN = "run the conversion or generation that made it again"
+_WAY_OUT = f"delete the file and {_RUN_AGAIN}"
 
 
 def refuse_unsound(scenario: Scenario) -> None:

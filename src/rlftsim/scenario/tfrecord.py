@@ -9,7 +9,7 @@ next record follows from it alone.
 import logging
 import os
 import struct
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, Literal
@@ -26,6 +26,7 @@ RECORD_OVERHEAD_BYTES = _HEADER.size + _FOOTER.size
 """Bytes of a record in the file beside its own."""
 _MASK_DELTA = 0xA282EAD8
 _GZIP_MAGIC = b"\x1f\x8b"
+_REST_IS_LOST = "the rest of the file is lost"
 
 
 @dataclass(frozen=True)
@@ -36,9 +37,16 @@ class SkippedRecord:
     record: int
     """Number of the record in its file, from 0. Where the rest of the file is lost: the first one lost."""
     cause: str
+    rest_is_lost: bool = False
+    """True = nothing behind it in the file could be read either, and nothing says how many records that are."""
 
     def __str__(self) -> str:
         return f"{self.file}: record {self.record}: {self.cause}"
+
+
+def count_lost(skipped: Sequence[SkippedRecord]) -> str:
+    """Number of lost records in words, "at least" in front where the rest of a file is lost."""
+    return f"at least {len(skipped)}" if any(record.rest_is_lost for record in skipped) else str(len(skipped))
 
 
 def log_skipped(skipped: SkippedRecord) -> None:
@@ -102,7 +110,7 @@ def read_records(
         while file.tell() < size or size == 0:
             data, cause = _read_one(file, size, record)
             if cause is not None:
-                skipped = SkippedRecord(str(path), record, cause)
+                skipped = SkippedRecord(str(path), record, cause, rest_is_lost=data is None)
                 if on_error == "stop":
                     raise DataError(str(skipped))
                 report(skipped)
@@ -123,16 +131,19 @@ def _read_one(file: BinaryIO, size: int, record: int) -> tuple[bytes | None, str
         return None, "not a TFRecord file but a gzip-compressed one: unpack it with gunzip first"
     if len(header) < _HEADER.size:
         too_short = "not a TFRecord file: too short"
-        return None, too_short if record == 0 else "truncated: the file ends inside the record's header"
+        return (
+            None,
+            too_short if record == 0 else f"truncated: the file ends inside the record's header; {_REST_IS_LOST}",
+        )
     # the length is trusted only with its own checksum: a wrong one would be read as gigabytes
     length, crc = _HEADER.unpack(header)
     if crc != masked_crc32c(header[:8]):
         if record == 0:
             return None, "not a TFRecord file, or damaged at its start: the checksum of the first length does not match"
-        return None, "damaged: the checksum of its length does not match; the rest of the file is lost"
+        return None, f"damaged: the checksum of its length does not match; {_REST_IS_LOST}"
     needed = _HEADER.size + length + _FOOTER.size
     if needed > bytes_left:
-        return None, f"truncated: the record needs {needed} bytes, the file has {bytes_left} left"
+        return None, f"truncated: the record needs {needed} bytes, the file has {bytes_left} left; {_REST_IS_LOST}"
     data = file.read(length)
     (crc,) = _FOOTER.unpack(file.read(_FOOTER.size))
     if crc != masked_crc32c(data):

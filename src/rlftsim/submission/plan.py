@@ -15,6 +15,7 @@ from rlftsim.atomic_io import write_text
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.results import NUMBERS_VERSION, EvaluateConfig
 from rlftsim.scenario.dataset import ScenarioDataset
+from rlftsim.scenario.tfrecord import count_lost
 from rlftsim.submission.messages import NUM_SCENES, TRAJECTORY_BYTES
 
 FORMAT = "rlftsim-submission-1"
@@ -142,12 +143,11 @@ def refuse_incomplete(data: ScenarioDataset) -> None:
     if missing and data.url is None:
         raise DataError(f"{data.folder / missing[0]} is missing, and {len(missing) - 1} more: convert again.")
     entries = [entry for entry in data.manifest.shards if entry.split == data.split]
-    lost = sum(len(entry.skipped) for entry in entries)
+    lost = [record for entry in entries for record in entry.skipped]
     if lost:
-        first = next(entry for entry in entries if entry.skipped).skipped[0]
         raise DataError(
-            f"{data.folder}: {lost} records of split {data.split} were lost in the conversion, the first in "
-            f"{first.file}: get the file again and convert it; a submission without them is refused."
+            f"{data.folder}: {count_lost(lost)} records of split {data.split} were lost in the conversion, the first "
+            f"in {lost[0].file}: get the file again and convert it; a submission without them is refused."
         )
     numbers: dict[tuple[str, int], set[int]] = {}
     for match in (_NUMBERED.fullmatch(entry.source or "") for entry in entries):
