@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -53,6 +54,7 @@ def test_a_term_that_is_no_number_in_a_scenario_is_left_out_there(measured):
     found = rewards_of("mloo + rloo", (replace(realism, leave_one_out_meta_metric=broken), *rest))
     alone = [rewards_of(name, measured).total for name in ("mloo", "rloo")]
     torch.testing.assert_close(found.total, torch.stack([alone[0][0] + alone[1][0], alone[1][1]]))
+    assert found.is_missing.tolist() == [[False, True], [False, False]]
 
 
 @pytest.mark.parametrize("name", ["collision_offroad", "collision_offroad_ade", "goal", "minade_rloo", "mloo", "rloo"])
@@ -128,6 +130,49 @@ def test_a_reward_of_the_wrong_shape_is_refused(measured, outside):
     register_reward(outside[0])(lambda realism, rollouts, batch: realism.meta_metric)
     with pytest.raises(ConfigError, match=r"reward test_one: .* gives shape \[2\], expected \[2, 4\]"):
         rewards_of(outside[0], measured)
+
+
+@pytest.mark.parametrize(("value", "found"), [(None, "a NoneType"), (np.zeros((2, 4)), "a ndarray"), (0.5, "a float")])
+def test_a_reward_that_gives_no_tensor_is_refused_by_name(value, found, measured, outside):
+    register_reward(outside[0])(lambda realism, rollouts, batch: value)
+    with pytest.raises(ConfigError, match=rf"reward test_one: .* gives {found}, expected a tensor .* \[2, 4\]"):
+        rewards_of(outside[0], measured)
+    register_reward(outside[1])(lambda realism, rollouts, batch: realism.single_meta_metric)
+    register_agent_rewards(outside[1])(lambda agents, rollouts, batch: value)
+    with pytest.raises(ConfigError, match=rf"reward test_two: .* gives {found}, expected a tensor"):
+        rewards_of(outside[1], measured, agents=measured[3])
+
+
+def test_a_split_that_is_no_number_counts_as_missing(measured, outside):
+    register_reward(outside[0])(lambda realism, rollouts, batch: realism.single_meta_metric)
+    register_agent_rewards(outside[0])(lambda agents, rollouts, batch: agents.displacement_error * torch.inf)
+    found = rewards_of(outside[0], measured, agents=measured[3])
+    assert found.is_missing.all()
+    assert found.by_agent.isfinite().all()
+
+
+@pytest.mark.parametrize(
+    ("function", "cause"),
+    [
+        (lambda x: x, "too many positional arguments"),
+        (lambda scores, rollouts, batch, scale: scale, "missing a required argument: 'scale'"),
+        (lambda scores, rollouts, batch, *, scale: scale, "missing a required .*'scale'"),
+        (3, "3 is not a callable object"),
+    ],
+)
+def test_a_function_that_takes_other_arguments_than_a_reward_is_refused(function, cause, outside):
+    message = rf"reward test_one: .* cannot be called with realism, rollouts and batch \({cause}\): take these three"
+    with pytest.raises(ConfigError, match=message):
+        register_reward(outside[0])(function)
+    REWARDS.add(outside[0], function)  # as an entry point does
+    with pytest.raises(ConfigError, match=message):
+        FinetuneConfig(reward=f"mloo + 0.1*{outside[0]}")
+
+
+def test_a_split_that_takes_other_arguments_is_refused(outside):
+    register_reward(outside[0])(lambda realism, rollouts, batch: realism.single_meta_metric)
+    with pytest.raises(ConfigError, match="reward test_one: .* cannot be called with"):
+        register_agent_rewards(outside[0])(lambda agents: agents)
 
 
 @pytest.mark.parametrize("credit", ["rollout", "agent"])

@@ -150,7 +150,8 @@ def test_every_term_of_the_reward_is_logged_for_itself(learner, batch, fabric):
     alone = {n: update_policy(copy.deepcopy(learner), batch, replace(config, reward=n), fabric) for n in ("mloo",)}
     assert {name for name in values if name.startswith("reward_")} == {
         "reward_mean", "reward_std", "reward_zero_rate",
-        "reward_mloo_mean", "reward_mloo_std", "reward_minade_rloo_mean", "reward_minade_rloo_std",
+        "reward_mloo_mean", "reward_mloo_std", "reward_mloo_missing_rate",
+        "reward_minade_rloo_mean", "reward_minade_rloo_std", "reward_minade_rloo_missing_rate",
     }  # fmt: skip
     assert alone["mloo"]["reward_mloo_std"] == alone["mloo"]["reward_std"]
     assert values["reward_minade_rloo_std"] > values["reward_mloo_std"] > 0  # metres against fractions of the metric
@@ -483,6 +484,26 @@ def test_a_run_says_that_its_first_update_has_no_reward(vocabulary, drawn_scenar
     config = replace(tiny.FINETUNE, reward=reward, epochs=1e-3)
     finetune(tiny.tiny_policy(vocabulary), drawn_scenarios, tmp_path, config)
     assert "update 1, no reward reached a trained weight" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("processes", [1, 2])
+def test_a_reward_that_is_no_number_is_said_once_and_counted(
+    processes, vocabulary, drawn_scenarios, tmp_path, capsys, reward_of
+):
+    def broken(realism, rollouts, batch):
+        values = realism.single_meta_metric.clone()
+        values[[one.scenario_id == drawn_scenarios[0].scenario_id for one in batch.scenarios], 0] = torch.nan
+        return values
+
+    config = replace(
+        tiny.FINETUNE, reward=f"mloo + {reward_of(broken)}", batch_size=2, epochs=2.0,
+        device=replace(tiny.CPU, processes=processes),
+    )  # fmt: skip
+    finetune(tiny.tiny_policy(vocabulary), drawn_scenarios[:2], tmp_path, config)
+    lines = [line for line in capsys.readouterr().err.splitlines() if "not finite" in line]
+    assert lines == ["update 1, reward test_0: not finite in 1 of 2 scenarios, counted as 0"]
+    logged = read_metrics(tmp_path)
+    assert [(one["reward_mloo_missing_rate"], one["reward_test_0_missing_rate"]) for one in logged] == [(0, 0.5)] * 2
 
 
 def test_no_scenario_is_refused(vocabulary, tmp_path):

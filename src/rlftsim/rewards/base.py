@@ -16,13 +16,14 @@ give the reward:
         return leave_one_out(-agents.collision)
 """
 
+import inspect
 import warnings
 from collections.abc import Callable
 from typing import Any, TypeVar
 from weakref import WeakSet
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from rlftsim.errors import ConfigError
@@ -49,21 +50,31 @@ def register_reward(name: str) -> Callable[[Function], Function]:
     """Decorator that registers a reward under a name; an earlier one of your own is replaced with a warning.
 
     Raises:
-        ConfigError: the name is that of a shipped reward, or none that a sum of rewards can be written with.
+        ConfigError: the name is that of a shipped reward, or none that a sum of rewards can be written with; or the
+            function does not take what a reward is called with.
     """
-    return _register(name)
+    _require_name(name)
+
+    def register(function: Function) -> Function:
+        require_signature(name, function)
+        REWARDS.add(name, function, stacklevel=3)
+        return function
+
+    return register
 
 
 def register_sum(name: str) -> Callable[[Function], Function]:
     """Decorator that registers a sum of rewards under a name: a function of options that returns its text.
 
     Raises:
-        ConfigError: as `register_reward`.
+        ConfigError: the name is that of a shipped reward, or none that a sum of rewards can be written with.
     """
+    _require_name(name)
 
     def register(function: Function) -> Function:
         _SUMS.add(function)
-        return _register(name)(function)
+        REWARDS.add(name, function, stacklevel=3)
+        return function
 
     return register
 
@@ -72,13 +83,15 @@ def register_agent_rewards(name: str) -> Callable[[Function], Function]:
     """Decorator that registers the split of a known reward over agents. It takes the same options.
 
     Raises:
-        ConfigError: there is no reward of this name yet, or it ships with rlftsim.
+        ConfigError: there is no reward of this name yet, or it ships with rlftsim; or the function does not take what
+            a split is called with.
     """
     reward = reward_by_name(name)
 
     def register(function: Function) -> Function:
         if is_ours(reward) and not is_ours(function):
             raise ConfigError(f"reward {name!r} ships with rlftsim: choose another name.")
+        require_signature(name, function)
         # None for a reward that was registered again: its split is missing, not replaced.
         known = agent_rewards_by_name(name)
         if known not in (None, function) and not is_ours(reward):
@@ -89,12 +102,31 @@ def register_agent_rewards(name: str) -> Callable[[Function], Function]:
     return register
 
 
-def _register(name: str) -> Callable[[Function], Function]:
+def _require_name(name: object) -> None:
     if not isinstance(name, str):
         raise ConfigError('a reward needs a name: write @register_reward("name") above the function.')
     if not name.isidentifier():
         raise ConfigError(f"reward {name!r}: a name is letters, digits and underscores, such as on_the_road.")
-    return REWARDS.register(name)
+
+
+def require_signature(name: str, function: Callable[..., Any]) -> None:
+    """Require that a reward or its split can be called with three arguments by position and nothing else.
+
+    Args:
+        name: of the reward, for the message.
+        function: of any package.
+
+    Raises:
+        ConfigError: it takes fewer, or needs more.
+    """
+    try:
+        inspect.signature(function).bind(None, None, None)
+    except (TypeError, ValueError) as error:
+        raise ConfigError(
+            f"reward {name}: {getattr(function, '__name__', function)} cannot be called with realism, rollouts and "
+            f"batch ({error}): take these three by position, and options by keyword only with defaults, such as "
+            "*, scale=1.0."
+        ) from None
 
 
 def reward_by_name(name: str) -> Reward:
@@ -146,8 +178,8 @@ def require_two(values: Float[Tensor, "B N *A"]) -> int:
     return values.shape[1]
 
 
-def finite_or_zero(values: Float[Tensor, "B N *A"]) -> Float[Tensor, "B N *A"]:
-    """Rewards with the scenarios that have none (nothing valid to compare with) at zero."""
+def finite_or_zero(values: Float[Tensor, "B N *A"]) -> tuple[Float[Tensor, "B N *A"], Bool[Tensor, "B"]]:
+    """Rewards with the scenarios that have none (nothing valid to compare with) at zero, and True for those."""
     # A whole scenario at once: a leave-one-out reward of which one number is missing has no baseline.
-    is_finite = values.isfinite().flatten(1).all(1)  # [B]
-    return torch.where(is_finite.view(-1, *[1] * (values.dim() - 1)), values, 0.0)
+    is_finite = values.isfinite().flatten(1).all(1)
+    return torch.where(is_finite.view(-1, *[1] * (values.dim() - 1)), values, 0.0), ~is_finite

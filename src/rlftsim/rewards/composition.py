@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from rlftsim.errors import ConfigError
@@ -39,6 +39,8 @@ class Rewards:
     terms: tuple[Term, ...]
     by_term: Float[Tensor, "K B N"]
     """Before the weights."""
+    is_missing: Bool[Tensor, "K B"]
+    """True where a term is not finite in a scenario."""
     total: Float[Tensor, "B N"]
     """Their weighted sum."""
     by_agent: Float[Tensor, "B N A"]
@@ -64,31 +66,36 @@ def compute_rewards(
         credit_mixing: weight of what the other agents earned.
 
     Raises:
-        ConfigError: a reward or its split has the wrong shape.
+        ConfigError: a reward or its split gives no tensor, or one of the wrong shape.
     """
-    by_term, by_agent = [], torch.zeros_like(rollouts.heading[..., 0])  # [B, N, A]
+    by_term, missing, by_agent = [], [], torch.zeros_like(rollouts.heading[..., 0])  # [B, N, A]
     for term in terms:
-        reward = _call(reward_by_name(term.name), term, realism, rollouts, batch, shape=by_agent.shape[:2])
+        reward, is_missing = _call(reward_by_name(term.name), term, realism, rollouts, batch, shape=by_agent.shape[:2])
         credit = reward[..., None]  # [B, N, 1]: for all agents alike
         split = agent_rewards_by_name(term.name)
         # Without a split W is R for all agents, whatever the mixing.
         if agents is not None and split is not None:
-            own = _call(split, term, agents, rollouts, batch, shape=by_agent.shape)
+            own, is_split_missing = _call(split, term, agents, rollouts, batch, shape=by_agent.shape)
+            is_missing = is_missing | is_split_missing
             credit = own + credit_mixing * (credit - own)
         by_term.append(reward)
+        missing.append(is_missing)
         by_agent = by_agent + term.weight * credit
     stacked = torch.stack(by_term)  # [terms, B, N]
     weights = torch.tensor([term.weight for term in terms], device=stacked.device)
-    return Rewards(terms, stacked, (weights[:, None, None] * stacked).sum(0), by_agent)
+    return Rewards(terms, stacked, torch.stack(missing), (weights[:, None, None] * stacked).sum(0), by_agent)
 
 
-def _call(function: Callable[..., Tensor], term: Term, *arguments: object, shape: torch.Size) -> Tensor:
-    """Values of a reward or of its split, with their shape checked: it may come from another package."""
+def _call(
+    function: Callable[..., object], term: Term, *arguments: object, shape: torch.Size
+) -> tuple[Tensor, Bool[Tensor, "B"]]:
+    """Values of a reward or of its split, checked as it may come from another package, and the scenarios without."""
     # Arguments by position: a reward of another package may name them as it likes.
     values = function(*arguments, **dict(term.options))
-    if values.shape != shape:
+    if not isinstance(values, Tensor) or values.shape != shape:
+        found = f"shape {list(values.shape)}" if isinstance(values, Tensor) else f"a {type(values).__name__}"
         raise ConfigError(
-            f"reward {term}: {getattr(function, '__name__', function)} gives shape {list(values.shape)}, "
-            f"expected {list(shape)}: one number per rollout [B, N], a split one per agent, too [B, N, A]."
+            f"reward {term}: {getattr(function, '__name__', function)} gives {found}, expected a tensor of torch with "
+            f"shape {list(shape)}: one number per rollout [B, N], a split one per agent, too [B, N, A]."
         )
     return finite_or_zero(values.float())

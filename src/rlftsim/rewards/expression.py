@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from rlftsim.errors import ConfigError
-from rlftsim.rewards.base import Reward, Sum, reward_by_name, sum_by_name
+from rlftsim.rewards.base import Reward, Sum, require_signature, reward_by_name, sum_by_name
 
 Option = float | int | bool | str
 
@@ -32,8 +32,8 @@ def parse_reward(text: str) -> tuple[Term, ...]:
     """The terms of a sum of rewards.
 
     Raises:
-        ConfigError: not a sum of rewards; a reward that is not registered or comes twice; an option that it does not
-            have; nothing but weights of 0.
+        ConfigError: not a sum of rewards; a reward that is not registered, cannot be called or comes twice; an option
+            that it does not have; nothing but weights of 0.
     """
     # Read as a Python expression, of which only sums, factors, names and options are understood; nothing is evaluated.
     try:
@@ -93,7 +93,9 @@ def _named(name: str, factor: float, given: dict[str, Option]) -> Iterator[Term]
     """Yield the term of a reward, or the terms of a sum that has a name."""
     known_sum = sum_by_name(name)
     if known_sum is None:
-        yield Term(factor, name, _options(name, reward_by_name(name), given))
+        reward = reward_by_name(name)
+        require_signature(name, reward)  # those of entry points are registered without a look at them
+        yield Term(factor, name, _options(name, reward, given))
     else:
         text = known_sum(**dict(_options(name, known_sum, given)))
         yield from _terms(ast.parse(text, mode="eval").body, factor)

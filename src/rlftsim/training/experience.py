@@ -12,7 +12,7 @@ from torch import Tensor
 from rlftsim.goals.attainment import is_passed, is_reached, rate
 from rlftsim.realism import AgentScores, RealismResult, compute_batch_features, metric_by_name, score_batch_features
 from rlftsim.realism.from_rollouts import states_of_rollouts
-from rlftsim.rewards import CreditTo, Rewards, compute_rewards, parse_reward
+from rlftsim.rewards import CreditTo, Rewards, Term, compute_rewards, parse_reward
 from rlftsim.rollout.noise import derive_seed
 from rlftsim.rollout.simulate import simulate
 from rlftsim.rollout.types import Rollouts
@@ -224,8 +224,9 @@ def describe_scenarios(experience: Experience) -> dict[str, Float[Tensor, "B"]]:
         # All zero: no finite reward, or rollouts that are exactly alike.
         "reward_zero_rate": (rewards.total == 0).all(-1).double(),
     }
-    for term, values in zip(rewards.terms, rewards.by_term):
+    for term, values, is_missing in zip(rewards.terms, rewards.by_term, rewards.is_missing):
         metrics |= {f"reward_{term.name}_mean": values.mean(-1), f"reward_{term.name}_std": values.std(-1)}
+        metrics[missing_rate_of(term)] = is_missing.double()
     metrics |= describe_goals(experience)
     metrics |= {
         "rmm": realism.meta_metric,
@@ -241,6 +242,11 @@ def describe_scenarios(experience: Experience) -> dict[str, Float[Tensor, "B"]]:
         "speed_gap_mps": compute_speed_gap(experience.batch, experience.rollouts),
     }
     return metrics
+
+
+def missing_rate_of(term: Term) -> str:
+    """Name of the metric for the fraction of scenarios in which a term of the reward is not finite."""
+    return f"reward_{term.name}_missing_rate"
 
 
 def describe_goals(experience: Experience) -> dict[str, Float[Tensor, "B"]]:

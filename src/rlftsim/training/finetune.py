@@ -25,6 +25,7 @@ from rlftsim.training.experience import (
     count_decisions,
     describe,
     hold_speed,
+    missing_rate_of,
     sample_rollouts,
 )
 from rlftsim.training.freezing import (
@@ -179,6 +180,7 @@ def finetune(
             remedy="lower learning_rate or raise kl.initial_beta",
         )  # fmt: skip
         learner = prepare(model, config, fabric.device, augmented)
+        unwarned = list(parse_reward(config.reward))
 
         def make_update() -> UpdateReport:
             batch = run.local_batch(learner.update).to(fabric.device)
@@ -186,6 +188,10 @@ def finetune(
             levels, alarms = learner.alarms.watch(values, config.alarms)
             if learner.update == 1 and (values["reward_zero_rate"] == 1 or values["gradient_norm"] == 0):
                 alarms.append(f"no reward reached a trained weight (RMM {values['rmm']:.3f})")
+            for term in [term for term in unwarned if values[missing_rate_of(term)]]:
+                unwarned.remove(term)
+                count = round(values[missing_rate_of(term)] * config.batch_size)
+                alarms.append(f"reward {term}: not finite in {count} of {config.batch_size} scenarios, counted as 0")
             cause = f"KL {values['kl']:.3g} nats per decision is above max_kl={config.max_kl:g}"
             if not math.isfinite(values["gradient_norm"]):
                 cause = "its gradient is not finite"
