@@ -171,7 +171,7 @@ def test_a_function_that_takes_other_arguments_than_a_reward_is_refused(function
 
 def test_a_split_that_takes_other_arguments_is_refused(outside):
     register_reward(outside[0])(lambda realism, rollouts, batch: realism.single_meta_metric)
-    with pytest.raises(ConfigError, match="reward test_one: .* cannot be called with"):
+    with pytest.raises(ConfigError, match=r"reward test_one: .* cannot be called with"):
         register_agent_rewards(outside[0])(lambda agents: agents)
 
 
