@@ -135,11 +135,11 @@ def test_a_reward_of_the_wrong_shape_is_refused(measured, outside):
 @pytest.mark.parametrize(("value", "found"), [(None, "a NoneType"), (np.zeros((2, 4)), "a ndarray"), (0.5, "a float")])
 def test_a_reward_that_gives_no_tensor_is_refused_by_name(value, found, measured, outside):
     register_reward(outside[0])(lambda realism, rollouts, batch: value)
-    with pytest.raises(ConfigError, match=rf"reward test_one: .* gives {found}, expected a tensor .* \[2, 4\]"):
+    with pytest.raises(ConfigError, match=rf"reward test_one: .* gives {found}, expected \[2, 4\]: a tensor"):
         rewards_of(outside[0], measured)
     register_reward(outside[1])(lambda realism, rollouts, batch: realism.single_meta_metric)
     register_agent_rewards(outside[1])(lambda agents, rollouts, batch: value)
-    with pytest.raises(ConfigError, match=rf"reward test_two: .* gives {found}, expected a tensor"):
+    with pytest.raises(ConfigError, match=rf"reward test_two: .* gives {found}, expected .*: a tensor"):
         rewards_of(outside[1], measured, agents=measured[3])
 
 
@@ -157,7 +157,6 @@ def test_a_split_that_is_no_number_counts_as_missing(measured, outside):
         (lambda x: x, "too many positional arguments"),
         (lambda scores, rollouts, batch, scale: scale, "missing a required argument: 'scale'"),
         (lambda scores, rollouts, batch, *, scale: scale, "missing a required .*'scale'"),
-        (3, "3 is not a callable object"),
     ],
 )
 def test_a_function_that_takes_other_arguments_than_a_reward_is_refused(function, cause, outside):

@@ -95,7 +95,7 @@ def _call(
     if not isinstance(values, Tensor) or values.shape != shape:
         found = f"shape {list(values.shape)}" if isinstance(values, Tensor) else f"a {type(values).__name__}"
         raise ConfigError(
-            f"reward {term}: {getattr(function, '__name__', function)} gives {found}, expected a tensor of torch with "
-            f"shape {list(shape)}: one number per rollout [B, N], a split one per agent, too [B, N, A]."
+            f"reward {term}: {getattr(function, '__name__', function)} gives {found}, expected {list(shape)}: a tensor "
+            "with one number per rollout [B, N], a split one per agent, too [B, N, A]."
         )
     return finite_or_zero(values.float())
