@@ -506,6 +506,21 @@ def test_a_reward_that_is_no_number_is_said_once_and_counted(
     assert [(one["reward_mloo_missing_rate"], one["reward_test_0_missing_rate"]) for one in logged] == [(0, 0.5)] * 2
 
 
+def test_more_epochs_continue_a_run_that_has_ended(vocabulary, drawn_scenarios, tmp_path):
+    def train(epochs, out):
+        torch.manual_seed(0)
+        config = replace(tiny.FINETUNE, epochs=epochs)
+        return finetune(tiny.tiny_policy(vocabulary), drawn_scenarios[:2], tmp_path / out, config)
+
+    train(1.0, "grown")
+    short = read_metrics(tmp_path / "grown")
+    grown, whole = train(2.0, "grown"), train(2.0, "whole")
+    assert [line["rmm"] for line in read_metrics(tmp_path / "grown")[: len(short)]] == [line["rmm"] for line in short]
+    assert (grown / "model.safetensors").read_bytes() == (whole / "model.safetensors").read_bytes()
+    with pytest.raises(CheckpointError, match=r"other settings or inputs \(epochs\)"):
+        train(1.0, "grown")
+
+
 def test_no_scenario_is_refused(vocabulary, tmp_path):
     with pytest.raises(ConfigError, match="no scenario to train on"):
         finetune(tiny.tiny_policy(vocabulary), [], tmp_path, tiny.FINETUNE)

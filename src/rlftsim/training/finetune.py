@@ -147,7 +147,7 @@ class FinetuneConfig:
 def finetune(
     policy: Policy, scenarios: TrainingScenarios, out: str | os.PathLike[str], config: FinetuneConfig, *, card: str = ""
 ) -> Path:
-    """Fine-tune a policy in place with rewards; resumes where a run in `out` was stopped.
+    """Fine-tune a policy in place with rewards; resumes where a run in `out` was stopped, or ended with fewer epochs.
 
     Args:
         policy: an nn.Module that implements `rollout.policy.Policy` and has `save_pretrained`.
@@ -178,6 +178,7 @@ def finetune(
             inputs={"augmented_goals": augmented.fingerprint} if augmented else {}, num_rollouts=config.num_rollouts,
             skip_rule=f"KL above max_kl={config.max_kl} or not finite",
             remedy="lower learning_rate or raise kl.initial_beta",
+            may_grow=("epochs",),  # the learning rate is constant: a longer run passes through the same weights
         )  # fmt: skip
         learner = prepare(model, config, fabric.device, augmented)
         unwarned = list(parse_reward(config.reward))

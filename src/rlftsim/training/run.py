@@ -6,7 +6,7 @@ does the rest, and leaves files through `training.run_folder` and `training.chec
 
 import math
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -255,6 +255,7 @@ class TrainingRun:
         num_rollouts: of each scenario of an update; processes that are more than scenarios divide them.
         skip_rule: condition under which updates are skipped, for the message of a run that diverged.
         remedy: settings to change after a divergence, for the same message.
+        may_grow: settings that a larger number continues, see `RunFolder`.
 
     Raises:
         CheckpointError: the folder belongs to a run with other settings or inputs.
@@ -272,12 +273,13 @@ class TrainingRun:
         num_rollouts: int = 1,
         skip_rule: str = "their gradients are not finite",
         remedy: str = "lower learning_rate",
+        may_grow: Collection[str] = (),
     ):
         self.scenarios = _with_shared_cache(scenarios, num_sharing_memory(fabric))
         self.total = config.num_updates(len(scenarios))
         # The identity of the run: another policy, data set or order of scenarios is refused.
         described = {**describe_inputs(policy, scenarios), **(inputs or {})}
-        self.folder = RunFolder(Path(out), config, described, writes=fabric.is_global_zero)
+        self.folder = RunFolder(Path(out), config, described, writes=fabric.is_global_zero, may_grow=may_grow)
         self._config = config
         self._fabric = fabric
         self._num_rollouts = num_rollouts

@@ -16,7 +16,7 @@ import platform
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -157,6 +157,7 @@ class RunFolder:
         inputs: hashes of what the run starts from, see `describe_inputs`.
         writes: False in all processes but that of rank 0.
         defaults: of settings that a stored run may lack, nested as the settings; None = those of the dataclass.
+        may_grow: settings that a larger number continues, such as epochs where no update depends on the run's end.
 
     Raises:
         CheckpointError: the folder belongs to a run with other settings or inputs.
@@ -170,8 +171,10 @@ class RunFolder:
         *,
         writes: bool = True,
         defaults: Mapping[str, Any] | None = None,
+        may_grow: Collection[str] = (),
     ):
         self.path = path
+        self._may_grow = may_grow
         self.checkpoints = path / "checkpoints"
         self.model = path / "model"
         self._writes = writes
@@ -197,6 +200,7 @@ class RunFolder:
         # A setting that was added after the run began has its default, with which runs are as before. Any other that
         # only one side has counts as different: None stands for it.
         old = {name: defaults.get(name) for name in new} | old
+        old |= {name: new[name] for name in self._may_grow if new[name] > old[name]}
         differing = sorted(k for k in old.keys() | new.keys() if not may_change(k) and old.get(k) != new.get(k))
         if differing:
             most = 8  # settings named in one line
