@@ -56,7 +56,7 @@ usage: rlftsim VERB ...      rlftsim VERB --help explains a verb
   pretrain     train a model on logged tracks
   finetune     fine-tune a model in closed loop with a realism reward, also with goals
   augment      sample further goals for goal-conditioned fine-tuning
-  model        import a checkpoint of the public CAT-K code, or export one
+  model        average models; import a checkpoint of the public CAT-K code, or export one
   goals        propose goals for agents and write a goals file, or check one
   simulate     roll out scenarios with a model
   drive        let a planner drive among simulated traffic, and score both

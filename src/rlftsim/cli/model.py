@@ -1,4 +1,4 @@
-"""The verb that imports and exports checkpoints of the public CAT-K code: model."""
+"""The verb that averages models, and imports and exports checkpoints of the public CAT-K code: model."""
 
 import sys
 from dataclasses import dataclass
@@ -10,6 +10,7 @@ from tyro.conf import Positional
 
 from rlftsim import __version__
 from rlftsim.errors import ConfigError
+from rlftsim.policies.averaging import average_policies
 from rlftsim.policies.registry import load_policy
 from rlftsim.policies.smart.catk_checkpoint import CatkImport, import_catk, write_catk
 from rlftsim.policies.smart.catk_vocabulary import write_catk_vocabulary
@@ -37,8 +38,7 @@ class Import:
 
     def run(self) -> int:
         """Read strictly, write the folder, print a summary."""
-        if (self.out / "config.json").exists():
-            raise ConfigError(f"{self.out} holds a model already: name another folder.")
+        _refuse_to_replace(self.out)
         imported = import_catk(self.checkpoint, self.vocabulary)
         imported.policy.save_pretrained(self.out, card=_card(self.checkpoint, imported))
         weights = sum(p.numel() for p in imported.policy.parameters())
@@ -82,14 +82,52 @@ class Export:
 
 
 @dataclass(frozen=True)
-class Model:
-    """Import a checkpoint of the public CAT-K code, or export a model to it."""
+class Average:
+    """Write the mean of models that were fine-tuned from one base, as with other seeds.
 
-    action: Annotated[Import, tyro.conf.subcommand("import")] | Annotated[Export, tyro.conf.subcommand("export")]
+    It keeps what they share and has less of the noise of their gradients.
+    """
+
+    models: Positional[list[str]]
+    """Models with the same settings and vocabulary: runs, model folders or registered names."""
+    out: Path
+    """Folder for the model."""
+    base: str | None = None
+    """Model that they were fine-tuned from, for --scale."""
+    scale: float = 1.0
+    """Above 1 goes further from the base than they did, along what they share."""
+
+    def run(self) -> int:
+        """Load all, write the folder."""
+        _refuse_to_replace(self.out)
+        base = None if self.base is None else load_policy(self.base)
+        average = average_policies([load_policy(name) for name in self.models], base=base, scale=self.scale)
+        card = f"# Mean of {len(self.models)} models\n\n* {', '.join(self.models)}\n"
+        command = f"* command: rlftsim {' '.join(sys.argv[1:])}\n* rlftsim {__version__}\n"
+        average.save_pretrained(self.out, card=card + command)
+        print(f"model: {self.out}")
+        return 0
+
+
+@dataclass(frozen=True)
+class Model:
+    """Average models, import a checkpoint of the public CAT-K code, or export a model to it."""
+
+    action: (
+        Annotated[Average, tyro.conf.subcommand("average")]
+        | Annotated[Import, tyro.conf.subcommand("import")]
+        | Annotated[Export, tyro.conf.subcommand("export")]
+    )
 
     def run(self) -> int:
         """Run the action."""
         return self.action.run()
+
+
+def _refuse_to_replace(folder: Path) -> None:
+    """Refuse a folder that holds a model."""
+    if (folder / "config.json").exists():
+        raise ConfigError(f"{folder} holds a model already: name another folder.")
 
 
 def _card(checkpoint: Path, imported: CatkImport) -> str:

@@ -1,0 +1,71 @@
+"""Averages of policies that were trained from one base.
+
+    runs = [load_policy(f"runs/mloo-{seed}") for seed in range(3)]
+    average_policies(runs).save_pretrained("runs/average")
+
+Fine-tuning runs with different seeds share what their reward teaches and differ by the noise of their gradients, which
+the mean of their weights has less of: about what a batch as many times larger would give.
+"""
+
+import copy
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import nn
+
+from rlftsim.errors import ConfigError
+from rlftsim.rollout.fingerprint import fingerprint_policy
+
+
+def average_policies(policies: Sequence[Any], *, base: Any = None, scale: float = 1.0) -> Any:
+    """A new policy with the mean weights of others: base + scale (mean - base).
+
+    Args:
+        policies: of one architecture, with the same settings and vocabulary; they are left as they are.
+        base: policy that they were fine-tuned from; only needed with a scale.
+        scale: above 1 goes further from the base than the policies did, along what they share.
+
+    Raises:
+        ConfigError: none, or policies that differ in more than their weights; a scale without a base.
+
+    Source: model soups, arXiv 2203.05482; with a scale task arithmetic, arXiv 2212.04089.
+    """
+    if not policies:
+        raise ConfigError("an average needs at least one policy.")
+    if scale != 1.0 and base is None:
+        raise ConfigError(f"scale={scale:g} needs the base that the policies were fine-tuned from.")
+    first = policies[0]
+    for place, other in enumerate(policies, 1):
+        _require_same_kind(first, other, f"policy {place} of {len(policies)}")
+    if base is not None:
+        _require_same_kind(first, base, "the base")
+    states = [policy.state_dict() for policy in policies]
+    average = copy.deepcopy(first)
+    weights = average.state_dict()
+    start = first.state_dict() if base is None else base.state_dict()
+    with torch.no_grad():
+        for name, weight in weights.items():
+            if weight.is_floating_point():
+                # in float64, so that the mean of equal weights is that weight
+                mean = torch.stack([state[name].double() for state in states]).mean(0)
+                origin = start[name].double()
+                weight.copy_(mean if scale == 1.0 else origin + scale * (mean - origin))
+    return average
+
+
+def _require_same_kind(first: Any, other: Any, name: str) -> None:
+    """Refuse a policy that differs from the first one in more than its weights, under its name in the message."""
+    if not isinstance(other, nn.Module):
+        raise ConfigError(f"{name} is a {type(other).__name__} and has no weights to average.")
+    shapes, found = ({k: v.shape for k, v in policy.state_dict().items()} for policy in (first, other))
+    if shapes == found:
+        # with the same weights only settings, vocabulary and class are left to differ
+        twin = copy.deepcopy(other)
+        twin.load_state_dict(first.state_dict())
+        if fingerprint_policy(twin) == fingerprint_policy(first):
+            return
+    raise ConfigError(
+        f"{name}, a {type(other).__name__}, differs from the first in more than its weights: averages are of policies "
+        "with one architecture, the same settings and the same vocabulary."
+    )
