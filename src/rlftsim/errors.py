@@ -46,7 +46,7 @@ def in_short(value: object) -> str:
     return repr(value) if isinstance(value, str | int | float | None) else type(value).__name__
 
 
-def place_of(error: Exception) -> str:
+def place_of(error: BaseException) -> str:
     """File, line and function where an error that was raised began; torch's code and Python's import are left out."""
     # A wrong shape is noticed inside torch, but made by the code that called it.
     foreign = (f"{os.sep}site-packages{os.sep}torch{os.sep}", "<frozen ")

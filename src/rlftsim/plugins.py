@@ -148,10 +148,10 @@ class ExtensionPoint(Generic[Value]):
         """Add an entry point to the table unless it is there; one line about its failure, None = it works."""
         if entry.name in self._registered:
             return None
-        # Any error, not only ImportError: the package runs code of its own.
+        # Any error, not only ImportError: the package runs code of its own, and may even end the program.
         try:
             value = entry.load()
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             package = f" of package {entry.dist.name} {entry.dist.version}" if entry.dist else ""
             return (
                 f"{self.kind} {entry.name!r}{package} ({entry.value}) cannot be imported "

@@ -48,6 +48,9 @@ def test_a_scale_goes_further_from_the_base(base):
     assert difference(average_policies(policies, base=base, scale=0.0), base) == 0.0
     with pytest.raises(ConfigError, match="scale=2 needs the base"):
         average_policies(policies, scale=2.0)
+    for scale, message in ((float("nan"), "finite number, got nan"), (1e41, "is not finite in the average")):
+        with pytest.raises(ConfigError, match=message):
+            average_policies(policies, base=base, scale=scale)
 
 
 def test_policies_that_differ_in_more_than_their_weights_are_refused(base):
@@ -71,4 +74,4 @@ def test_the_command_writes_a_model_folder_with_its_origin(base, tmp_path, capsy
     assert "/a, " in (tmp_path / "mean" / "README.md").read_text()
     capsys.readouterr()
     assert main(words) == 2
-    assert "holds a model already" in capsys.readouterr().err
+    assert "is not empty" in capsys.readouterr().err

@@ -512,13 +512,40 @@ def test_more_epochs_continue_a_run_that_has_ended(vocabulary, drawn_scenarios, 
         config = replace(tiny.FINETUNE, epochs=epochs)
         return finetune(tiny.tiny_policy(vocabulary), drawn_scenarios[:2], tmp_path / out, config)
 
-    train(1.0, "grown")
-    short = read_metrics(tmp_path / "grown")
+    model = train(1.0, "grown")
+    short, weights = read_metrics(tmp_path / "grown"), (model / "model.safetensors").read_bytes()
     grown, whole = train(2.0, "grown"), train(2.0, "whole")
     assert [line["rmm"] for line in read_metrics(tmp_path / "grown")[: len(short)]] == [line["rmm"] for line in short]
-    assert (grown / "model.safetensors").read_bytes() == (whole / "model.safetensors").read_bytes()
+    assert (grown / "model.safetensors").read_bytes() == (whole / "model.safetensors").read_bytes() != weights
     with pytest.raises(CheckpointError, match=r"other settings or inputs \(epochs\)"):
         train(1.0, "grown")
+
+
+def test_a_run_that_is_made_longer_and_stopped_stays_the_shorter_one(
+    vocabulary, drawn_scenarios, tmp_path, monkeypatch
+):
+    def train(epochs):
+        torch.manual_seed(0)
+        config = replace(tiny.FINETUNE, epochs=epochs, checkpoint_every=1)
+        return finetune(tiny.tiny_policy(vocabulary), drawn_scenarios[:2], tmp_path, config)
+
+    weights = (train(1.0) / "model.safetensors").read_bytes()
+    done, update = len(read_metrics(tmp_path)), update_policy
+
+    def stop(learner, *rest):
+        if learner.update > done:
+            raise KeyboardInterrupt
+        return update(learner, *rest)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("rlftsim.training.finetune.update_policy", stop)
+        with pytest.raises(KeyboardInterrupt):
+            train(4.0)
+    # the model, the settings and the command of the shorter run still belong together
+    assert json.loads((tmp_path / "config.json").read_text())["epochs"] == 1.0
+    assert (train(1.0) / "model.safetensors").read_bytes() == weights
+    assert (train(4.0) / "model.safetensors").read_bytes() != weights
+    assert json.loads((tmp_path / "config.json").read_text())["epochs"] == 4.0
 
 
 def test_no_scenario_is_refused(vocabulary, tmp_path):

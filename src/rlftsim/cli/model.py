@@ -125,9 +125,9 @@ class Model:
 
 
 def _refuse_to_replace(folder: Path) -> None:
-    """Refuse a folder that holds a model."""
-    if (folder / "config.json").exists():
-        raise ConfigError(f"{folder} holds a model already: name another folder.")
+    """Refuse a folder that holds anything: a model, or files that one would replace."""
+    if folder.is_dir() and any(folder.iterdir()):
+        raise ConfigError(f"{folder} is not empty: name another folder for the model.")
 
 
 def _card(checkpoint: Path, imported: CatkImport) -> str:

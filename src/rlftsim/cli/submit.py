@@ -173,10 +173,12 @@ class Check:
         if scores is not None:
             evaluation = scores.evaluation(check.archive, data, check.sha256)
             if not len(evaluation):
-                reason = evaluation.skipped[0].reason if evaluation.skipped else "the archive has none without an error"
+                reason = (
+                    evaluation.skipped[0].reason if evaluation.skipped else "none that was read is without an error"
+                )
                 raise DataError(
                     f"--score: none of {len(data)} scenarios of split {self.split} of {self.data} could be scored "
-                    f"({reason}): give the data set and split that the archive is for."
+                    f"({reason}): see the findings above, or give a larger --sample."
                 )
             print_wide(format_scores(evaluation))
         return int(check.findings.has_errors)

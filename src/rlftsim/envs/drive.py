@@ -155,7 +155,10 @@ def _read_finished(config: DriveConfig, settings: DriveSettings, ids: Sequence[s
     differing = [name for name in wanted if stored[name] != wanted[name]]
     if differing:
         log.info(f"{path} is of another {', '.join(differing)}: it will be replaced.")
-    if differing or found.table["scenario_id"].to_pylist() != list(ids):
+    elif found.table["scenario_id"].to_pylist() != list(ids):
+        differing = ["scenarios"]
+        log.info(f"{path} is of other scenarios: it will be replaced.")
+    if differing:
         return None
     # code beside the planner's file, or its weights, may have changed
     log.info(f"{path} is finished and is read: remove it to drive anew.")

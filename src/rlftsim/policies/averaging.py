@@ -8,6 +8,7 @@ the mean of their weights has less of: about what a batch as many times larger w
 """
 
 import copy
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -27,12 +28,15 @@ def average_policies(policies: Sequence[Any], *, base: Any = None, scale: float 
         scale: above 1 goes further from the base than the policies did, along what they share.
 
     Raises:
-        ConfigError: none, or policies that differ in more than their weights; a scale without a base.
+        ConfigError: none, or policies that differ in more than their weights; a scale without a base, or with which a
+            weight is not finite.
 
     Source: model soups, arXiv 2203.05482; with a scale task arithmetic, arXiv 2212.04089.
     """
     if not policies:
         raise ConfigError("an average needs at least one policy.")
+    if not math.isfinite(scale):
+        raise ConfigError(f"scale is a finite number, got {scale}.")
     if scale != 1.0 and base is None:
         raise ConfigError(f"scale={scale:g} needs the base that the policies were fine-tuned from.")
     first = policies[0]
@@ -51,6 +55,8 @@ def average_policies(policies: Sequence[Any], *, base: Any = None, scale: float 
                 mean = torch.stack([state[name].double() for state in states]).mean(0)
                 origin = start[name].double()
                 weight.copy_(mean if scale == 1.0 else origin + scale * (mean - origin))
+                if not weight.isfinite().all():
+                    raise ConfigError(f"{name} is not finite in the average with scale={scale:g}.")
     return average
 
 

@@ -17,6 +17,7 @@ give the reward:
 """
 
 import inspect
+import keyword
 import warnings
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -105,7 +106,7 @@ def register_agent_rewards(name: str) -> Callable[[Function], Function]:
 def _require_name(name: object) -> None:
     if not isinstance(name, str):
         raise ConfigError('a reward needs a name: write @register_reward("name") above the function.')
-    if not name.isidentifier():
+    if not name.isidentifier() or keyword.iskeyword(name):
         raise ConfigError(f"reward {name!r}: a name is letters, digits and underscores, such as on_the_road.")
 
 

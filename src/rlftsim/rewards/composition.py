@@ -78,9 +78,10 @@ def compute_rewards(
             own, is_split_missing = _call(split, term, agents, rollouts, batch, shape=by_agent.shape)
             is_missing = is_missing | is_split_missing
             credit = own + credit_mixing * (credit - own)
-        by_term.append(reward)
+        # a term that is missing in a scenario, for itself or in its split, says nothing there
+        by_term.append(reward.masked_fill(is_missing[:, None], 0.0))
         missing.append(is_missing)
-        by_agent = by_agent + term.weight * credit
+        by_agent = by_agent + term.weight * credit.masked_fill(is_missing[:, None, None], 0.0)
     stacked = torch.stack(by_term)  # [terms, B, N]
     weights = torch.tensor([term.weight for term in terms], device=stacked.device)
     return Rewards(terms, stacked, torch.stack(missing), (weights[:, None, None] * stacked).sum(0), by_agent)

@@ -331,7 +331,12 @@ class TrainingRun:
             learner.load_numbers(progress.numbers)
         # Metrics of updates behind the checkpoint would appear twice.
         self.folder.continue_from(learner.update)
+        # A longer run was begun here and stopped: the model that is there is the one of this length.
+        if learner.update > self.total and (self.folder.model / "config.json").exists():
+            return self.folder.model
         if self._fabric.is_global_zero and learner.update < self.total:
+            for name, value in self.folder.grows_from.items():
+                log.info(f"{self.folder.model} stays the model of {value:g} {name} until the run ends.")
             begun = f"goes on behind update {learner.update}" if learner.update else "begins"
             log.info(f"{title} {begun}: {self.total} updates of {_number_of_weights(learner)}.")
         try:
@@ -342,6 +347,7 @@ class TrainingRun:
             what_next = f"continues behind update {update_of(newest)}" if newest else "starts anew"
             raise KeyboardInterrupt(what_next) from None
         self.folder.close()
+        self.folder.finish()
         if self._fabric.is_global_zero:
             learner.result.eval().save_pretrained(self.folder.model, card=card)
         return self.folder.model

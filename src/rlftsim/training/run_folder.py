@@ -174,7 +174,6 @@ class RunFolder:
         may_grow: Collection[str] = (),
     ):
         self.path = path
-        self._may_grow = may_grow
         self.checkpoints = path / "checkpoints"
         self.model = path / "model"
         self._writes = writes
@@ -182,16 +181,29 @@ class RunFolder:
         self._board: SummaryWriter | None = None
         # Settings and inputs stand in one file: both make a run what it is.
         plain = {**to_plain(config), **(inputs or {})}
-        self._refuse_other(plain, flatten(default_settings(config) if defaults is None else defaults))
+        stored = self._refuse_other(
+            plain, flatten(default_settings(config) if defaults is None else defaults), may_grow
+        )
+        self._finished = plain
+        # Until a run that is made longer has ended, its settings stay those of the model that is there.
+        self.grows_from = {name: stored[name] for name in may_grow if name in stored and stored[name] != plain[name]}
         if writes:
-            write_text(path / "config.json", json.dumps(plain, indent=1) + "\n")
+            self._write_settings({**plain, **self.grows_from})
             write_text(path / "environment.json", json.dumps(describe_environment(), indent=1) + "\n")
 
-    def _refuse_other(self, config: Any, defaults: Mapping[str, Any]) -> None:
-        """Compare with the stored settings of the run that was begun here, which may lack later ones."""
+    def finish(self) -> None:
+        """Store the settings of a run that was made longer."""
+        if self._writes and self.grows_from:
+            self._write_settings(self._finished)
+
+    def _write_settings(self, settings: Mapping[str, Any]) -> None:
+        write_text(self.path / "config.json", json.dumps(settings, indent=1) + "\n")
+
+    def _refuse_other(self, config: Any, defaults: Mapping[str, Any], may_grow: Collection[str]) -> dict[str, Any]:
+        """The stored settings of the run that was begun here, compared with those given; they may lack later ones."""
         old, new = flatten(stored_settings(self.path)), flatten(config)
         if not old:
-            return
+            return old
         # Two versions of one kind of run share most names, two kinds do not: a list of them all would explain nothing.
         if len(old.keys() ^ new.keys()) > len(old.keys() & new.keys()):
             raise CheckpointError(
@@ -200,8 +212,9 @@ class RunFolder:
         # A setting that was added after the run began has its default, with which runs are as before. Any other that
         # only one side has counts as different: None stands for it.
         old = {name: defaults.get(name) for name in new} | old
-        old |= {name: new[name] for name in self._may_grow if new[name] > old[name]}
-        differing = sorted(k for k in old.keys() | new.keys() if not may_change(k) and old.get(k) != new.get(k))
+        grown = {name for name in may_grow if isinstance(old[name], int | float) and new[name] > old[name]}
+        names = {name for name in old.keys() | new.keys() if not may_change(name)} - grown
+        differing = sorted(name for name in names if old.get(name) != new.get(name))
         if differing:
             most = 8  # settings named in one line
             more = f" and {len(differing) - most} more" if len(differing) > most else ""
@@ -209,6 +222,7 @@ class RunFolder:
                 f"{self.path} belongs to a run with other settings or inputs ({', '.join(differing[:most])}{more}): "
                 "name another --out, or remove the folder to start anew."
             )
+        return old
 
     def diverged(self, cause: str, remedy: str) -> CheckpointError:
         """The error of a run that makes no sense any more; names its last good checkpoint.
