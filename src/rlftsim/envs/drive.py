@@ -153,12 +153,10 @@ def _read_finished(config: DriveConfig, settings: DriveSettings, ids: Sequence[s
         refuse_fewer(path, len(found.table), len(ids), choice, "name another --out, or drive all scenarios.")
     stored, wanted = asdict(found.settings), asdict(settings)
     differing = [name for name in wanted if stored[name] != wanted[name]]
+    if found.table["scenario_id"].to_pylist() != list(ids):
+        differing.append("choice of scenarios")
     if differing:
         log.info(f"{path} is of another {', '.join(differing)}: it will be replaced.")
-    elif found.table["scenario_id"].to_pylist() != list(ids):
-        differing = ["scenarios"]
-        log.info(f"{path} is of other scenarios: it will be replaced.")
-    if differing:
         return None
     # code beside the planner's file, or its weights, may have changed
     log.info(f"{path} is finished and is read: remove it to drive anew.")

@@ -329,11 +329,11 @@ class TrainingRun:
             progress = read_checkpoint(newest, learner.modules, learner.optimizer)
             learner.update = progress.update
             learner.load_numbers(progress.numbers)
-        # Metrics of updates behind the checkpoint would appear twice.
-        self.folder.continue_from(learner.update)
         # A longer run was begun here and stopped: the model that is there is the one of this length.
         if learner.update > self.total and (self.folder.model / "config.json").exists():
             return self.folder.model
+        # Metrics of updates behind the checkpoint would appear twice.
+        self.folder.continue_from(learner.update)
         if self._fabric.is_global_zero and learner.update < self.total:
             for name, value in self.folder.grows_from.items():
                 log.info(f"{self.folder.model} stays the model of {value:g} {name} until the run ends.")
