@@ -195,6 +195,40 @@ def test_the_template_is_built_installed_listed_and_used(template, capsys):
     assert load_planner("coast").act({}) == [0.0, 0.0]
 
 
+def test_what_its_users_refuse_is_listed_as_failing(tmp_path, capsys):
+    """Things that can be imported and are not what their group is for; the reason is the one that their users read."""
+    source = "five = 5\ndef of_two(a, b): pass\ndef broken(): return 1 / 0\n"
+    source += "class Rough:\n    def __init__(self, path): pass\n"
+    things = {
+        "rlftsim.rewards": ("of_two", r"reward bad: of_two cannot be called with realism, rollouts and batch"),
+        "rlftsim.policies": ("Rough", r"policy 'bad' cannot be read from a folder: give its class"),
+        "rlftsim.sources": ("five", r"data source 'bad' has no license_note, find, read, describe"),
+        "rlftsim.recipes": (
+            "broken",
+            r"recipe 'bad' fails \(ZeroDivisionError: division by zero, __init__.py:3 in broken",
+        ),
+        "rlftsim.planners": ("five", r"planner 'bad' is of type int: give it reset\(info\) and act\(observation\)"),
+        "rlftsim.experiments": (
+            "five",
+            r"experiment 'bad' is of type int: make it a rlftsim.experiments.results.Experiment",
+        ),
+        "rlftsim.exporters": (
+            "five",
+            r"exporter 'bad' is of type int: make it a function of scenario, rollouts and folder",
+        ),
+    }
+    assert things.keys() == POINTS.keys()
+    entries = {group: {"bad": f"test_rough:{thing}"} for group, (thing, _) in things.items()}
+    with third_party.installed(tmp_path / "site", "test_rough", source, entries):
+        assert main(["plugins"]) == 1
+        text = capsys.readouterr().out
+        assert "works" not in text
+        for _, reason in things.values():
+            assert re.search(reason, text)
+        assert main(["experiment", "bad", "--data", "synthetic", "--out", str(tmp_path / "out")]) == 2
+        assert re.search(things["rlftsim.experiments"][1], capsys.readouterr().err)
+
+
 def test_without_plug_ins_the_groups_are_named(capsys):
     assert main(["plugins"]) == 0
     text = capsys.readouterr().out

@@ -50,12 +50,22 @@ class ExtensionPoint(Generic[Value]):
             point is the thing itself, or a module that registers things when it is imported.
         shipped: things of this package, name to "module:attribute"; imported on first use. Modules of this package may
             also register theirs.
+        use: looks a name up as those who use it do, and raises ConfigError where the thing is none of this kind; None =
+            anything is.
     """
 
-    def __init__(self, kind: str, group: str, shipped: Mapping[str, str] | None = None):
+    def __init__(
+        self,
+        kind: str,
+        group: str,
+        shipped: Mapping[str, str] | None = None,
+        *,
+        use: Callable[[str], object] | None = None,
+    ):
         self.kind = kind
         self.group = group
         self._shipped = dict(shipped or {})
+        self._use = use
         self._registered: dict[str, Value] = {}
 
     def register(self, name: str) -> Callable[[Registered], Registered]:
@@ -164,6 +174,19 @@ class ExtensionPoint(Generic[Value]):
                 return str(error)
         return None
 
+    def refusal_of(self, name: str) -> str | None:
+        """One line about a registered thing that is refused where it is used; None = it works."""
+        # An entry point that is a module has a name of its own, under which there may be nothing.
+        if self._use is None or name not in self._registered:
+            return None
+        try:
+            self._use(name)
+        except ConfigError as error:
+            return str(error)
+        except (Exception, SystemExit) as error:
+            return f"{self.kind} {name!r} fails ({type(error).__name__}: {error}, {place_of(error)}): repair it."
+        return None
+
 
 @dataclass(frozen=True)
 class PlugIn:
@@ -183,14 +206,15 @@ class PlugIn:
 
 
 def installed_plug_ins() -> list[PlugIn]:
-    """Entry points of installed packages in all groups; their packages are imported."""
+    """Entry points of installed packages in all groups; their packages are imported, and each is tried out."""
     found = []
     for group, place in POINTS.items():
         for entry in sorted(entry_points(group=group), key=lambda one: one.name):
             module, _, attribute = place.partition(":")
             # The group itself may need an extra that is not installed.
             try:
-                problem = getattr(importlib.import_module(module), attribute).problem_of(entry)
+                point = getattr(importlib.import_module(module), attribute)
+                problem = point.problem_of(entry) or point.refusal_of(entry.name)
             except ConfigError as error:
                 problem = str(error)
             package, version = (entry.dist.name, entry.dist.version) if entry.dist else ("", "")

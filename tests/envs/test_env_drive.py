@@ -139,7 +139,7 @@ def test_planners_of_others_are_found(tmp_path, monkeypatch):
     PLANNERS.remove("mine")
     (far,) = drive(DriveConfig("my_planners:Far", traffic=("replay",), limit=1))
     assert far.values("route_completion")[0] > 0
-    wrong = {"my_planners:number": "is a int", "my_planners:nothing": "cannot be imported", "idn": "mean 'idm'"}
+    wrong = {"my_planners:number": "is of type int", "my_planners:nothing": "cannot be imported", "idn": "mean 'idm'"}
     wrong |= {":Still": "names no module", "nowhere.at_all:Still": "cannot be imported"}
     (tmp_path / "broken.py").write_text("def (")
     wrong |= {"my_planners:Needy": "without arguments .*wish", "broken:Still": "cannot be imported"}

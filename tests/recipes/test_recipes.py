@@ -109,7 +109,7 @@ def test_recipes_have_names():
 
 def test_a_function_that_returns_no_recipe_is_refused(monkeypatch):
     monkeypatch.setitem(RECIPES._registered, "no-recipe", dict)
-    with pytest.raises(ConfigError, match="recipe 'no-recipe' is a dict: make it extend"):
+    with pytest.raises(ConfigError, match="recipe 'no-recipe' is of type dict: make it extend"):
         recipe_by_name("no-recipe")
 
 

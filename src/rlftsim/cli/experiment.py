@@ -12,7 +12,7 @@ from rlftsim.cli.recipe_verb import Processes, RecipeVerb, value_of
 from rlftsim.errors import ConfigError
 from rlftsim.evaluation.evaluate import EvaluateConfig
 from rlftsim.experiments.model_specs import VARIED
-from rlftsim.experiments.registry import EXPERIMENTS, PAPER
+from rlftsim.experiments.registry import PAPER, experiment_by_name
 from rlftsim.experiments.results import run_experiment
 from rlftsim.experiments.suite import ExperimentSuite
 from rlftsim.policies.registry import Device, find_device
@@ -21,7 +21,7 @@ from rlftsim.recipes.registry import SECTIONS
 from rlftsim.scenario.open import SYNTHETIC, dataset_folder
 from rlftsim.workers import usable_cores
 
-QUESTIONS = "; ".join(f"{name}: {EXPERIMENTS.get(name).question}" for name in PAPER)
+QUESTIONS = "; ".join(f"{name}: {experiment_by_name(name).question}" for name in PAPER)
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ class RunExperiment(RecipeVerb):
 
     def run(self) -> int:
         """Run the missing stages and print the results."""
-        experiment = EXPERIMENTS.get(self.name)
+        experiment = experiment_by_name(self.name)
         # Several processes only help on a CPU: on a GPU they would share it.
         jobs = self.jobs
         if jobs is None:

@@ -11,7 +11,7 @@ from rlftsim.cli.goal_outcomes import read_rollouts, report_outcomes
 from rlftsim.cli.goals import given_goals, warn_of_doubts
 from rlftsim.cli.rollout_folder import claim_folder, left_to_simulate
 from rlftsim.errors import ConfigError
-from rlftsim.evaluation.exporters import EXPORTERS
+from rlftsim.evaluation.exporters import exporter_by_name
 from rlftsim.goals.placement import goals_of_batch
 from rlftsim.policies.registry import Device, load_policy, with_guidance
 from rlftsim.progress import log, progress_bar
@@ -72,7 +72,7 @@ class Simulate:
     def run(self) -> int:
         """Simulate the scenarios that have no file yet, and report goals."""
         # 1. model, data and goals; anything that does not fit is refused before the folder is touched
-        exporters = [EXPORTERS.get(name) for name in self.export]
+        exporters = [exporter_by_name(name) for name in self.export]
         policy = with_guidance(load_policy(self.model, self.device), self.guidance_scale)
         sampling = Sampling(self.temperature, self.top_k)
         scenarios = open_dataset(self.data, self.split)

@@ -7,6 +7,7 @@ csv = "my_package:write_csv"
 from collections.abc import Callable
 from pathlib import Path
 
+from rlftsim.errors import ConfigError
 from rlftsim.evaluation.explain import motion_of
 from rlftsim.plugins import ExtensionPoint
 from rlftsim.realism import SimulatedStates
@@ -22,10 +23,25 @@ EXPORTERS: ExtensionPoint[Exporter] = ExtensionPoint(
     "exporter",
     "rlftsim.exporters",
     {"page": "rlftsim.evaluation.exporters:write_player", "film": "rlftsim.evaluation.exporters:write_film"},
+    use=lambda name: exporter_by_name(name),
 )
 """Name -> function."""
 MAX_ROLLOUTS = 8
 """Rollouts that play on a page; each adds about 50 kB."""
+
+
+def exporter_by_name(name: str) -> Exporter:
+    """The exporter of a name, this package's or another's.
+
+    Raises:
+        ConfigError: unknown, with the nearest known name, or not a function.
+    """
+    found = EXPORTERS.get(name)
+    if not callable(found):
+        raise ConfigError(
+            f"exporter {name!r} is of type {type(found).__name__}: make it a function of scenario, rollouts and folder."
+        )
+    return found
 
 
 def write_player(scenario: Scenario, states: SimulatedStates, folder: Path) -> Path:

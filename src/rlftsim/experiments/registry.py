@@ -6,6 +6,7 @@ my-table = "my_package.my_table:EXPERIMENT"
 
 from typing import Any
 
+from rlftsim.errors import ConfigError
 from rlftsim.experiments.results import Experiment
 from rlftsim.plugins import ExtensionPoint
 
@@ -19,4 +20,19 @@ EXPERIMENTS = ExtensionPoint[Experiment[Any]](
     "experiment",
     "rlftsim.experiments",
     {name: f"rlftsim.experiments.paper.{name.replace('-', '_')}:EXPERIMENT" for name in PAPER},
+    use=lambda name: experiment_by_name(name),
 )
+
+
+def experiment_by_name(name: str) -> Experiment[Any]:
+    """The experiment of a name, this package's or another's.
+
+    Raises:
+        ConfigError: unknown, with the nearest known name, or not an experiment.
+    """
+    found = EXPERIMENTS.get(name)
+    if not isinstance(found, Experiment):
+        raise ConfigError(
+            f"experiment {name!r} is of type {type(found).__name__}: make it a rlftsim.experiments.results.Experiment."
+        )
+    return found

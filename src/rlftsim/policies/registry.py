@@ -34,6 +34,7 @@ POLICIES: ExtensionPoint[Callable[..., Any]] = ExtensionPoint(
         "demo-goals": "rlftsim.policies.shipped:demo_goals",
         "trafficbots-base": "rlftsim.policies.shipped:trafficbots_base",
     },
+    use=lambda name: load_policy(name) if _needs_no_arguments(POLICIES.get(name)) else _loadable(name),
 )
 """Architecture name -> policy class. A class that can be called without arguments is a policy by its name alone."""
 
@@ -80,13 +81,7 @@ def _load(name: str | os.PathLike, device: Device, *more_names: str) -> Policy:
     elif Path(name).expanduser().exists():
         # a folder; a file is refused by name
         stored = read_model(name)
-        kind = POLICIES.get(stored.architecture)
-        if not isinstance(kind, LoadablePolicy):
-            raise ConfigError(
-                f"{stored.folder}: policy {stored.architecture!r} cannot be read from a folder: "
-                "give its class an attribute architecture and a classmethod from_pretrained(folder)."
-            )
-        policy = kind.from_pretrained(stored.folder)
+        policy = _loadable(stored.architecture).from_pretrained(stored.folder)
     elif registered is not None:
         raise ConfigError(f"policy {name!r} needs its weights: name a model folder or a run's folder instead.")
     elif name == "oracle" and not more_names:
@@ -108,6 +103,17 @@ def _load(name: str | os.PathLike, device: Device, *more_names: str) -> Policy:
     if isinstance(policy, nn.Module):
         policy.eval().requires_grad_(False).to(place)
     return policy
+
+
+def _loadable(architecture: str) -> LoadablePolicy:
+    """Class that reads the model folders of an architecture."""
+    kind = POLICIES.get(architecture)
+    if not isinstance(kind, LoadablePolicy):
+        raise ConfigError(
+            f"policy {architecture!r} cannot be read from a folder: "
+            "give its class an attribute architecture and a classmethod from_pretrained(folder)."
+        )
+    return kind
 
 
 def _needs_no_arguments(make: Any) -> bool:

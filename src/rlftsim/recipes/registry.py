@@ -128,6 +128,7 @@ RECIPES: ExtensionPoint[Callable[[], Recipe]] = ExtensionPoint(
         "trafficbots": "rlftsim.recipes.trafficbots:trafficbots_v15_rlftsim",
         "trafficbots-demo": "rlftsim.recipes.trafficbots:trafficbots_demo_rlftsim",
     },
+    use=lambda name: recipe_by_name(name),
 )
 
 
@@ -141,6 +142,6 @@ def recipe_by_name(name: str) -> Recipe:
     recipe = RECIPES.get(name)()
     if not isinstance(recipe, Recipe):
         raise ConfigError(
-            f"recipe {name!r} is a {type(recipe).__name__}: make it extend rlftsim.recipes.registry.Recipe."
+            f"recipe {name!r} is of type {type(recipe).__name__}: make it extend rlftsim.recipes.registry.Recipe."
         )
     return recipe

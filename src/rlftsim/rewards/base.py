@@ -37,7 +37,9 @@ AgentRewards = Callable[..., Float[Tensor, "B N A"]]
 Sum = Callable[..., str]
 """Called with options; returns the sum of rewards that a name stands for."""
 
-REWARDS: ExtensionPoint[Callable[..., Any]] = ExtensionPoint("reward", "rlftsim.rewards")
+REWARDS: ExtensionPoint[Callable[..., Any]] = ExtensionPoint(
+    "reward", "rlftsim.rewards", use=lambda name: sum_by_name(name) or reward_by_name(name)
+)
 """Rewards and named sums of them, by name."""
 _SUMS: "WeakSet[Sum]" = WeakSet()
 """Those of them that are sums."""
@@ -134,11 +136,13 @@ def reward_by_name(name: str) -> Reward:
     """The reward of a name; those of installed packages are found, too.
 
     Raises:
-        ConfigError: unknown, with the nearest known name; or it is a sum; or a package's rewards cannot be imported.
+        ConfigError: unknown, with the nearest known name; or it is a sum, or not to be called as a reward is; or a
+            package's rewards cannot be imported.
     """
     reward = REWARDS.get(name)
     if reward in _SUMS:
         raise ConfigError(f"reward {name!r} stands for a sum of rewards: it has no number of its own.")
+    require_signature(name, reward)  # those of entry points are registered without a look at them
     return reward
 
 

@@ -116,7 +116,9 @@ _SHIPPED = {
     "av2": "rlftsim.scenario.av2:Av2Source",
     "tables": "rlftsim.scenario.tables:TablesSource",
 }
-SOURCES: ExtensionPoint[Any] = ExtensionPoint("data source", "rlftsim.sources", _SHIPPED)
+SOURCES: ExtensionPoint[Any] = ExtensionPoint(
+    "data source", "rlftsim.sources", _SHIPPED, use=lambda name: _source(name)
+)
 
 
 def find_source(reader: str, path: str | os.PathLike[str], options: Mapping[str, object] | None = None) -> DataSource:

@@ -24,6 +24,7 @@ PLANNERS: ExtensionPoint[Callable[..., Any]] = ExtensionPoint(
         "idm": "rlftsim.envs.planners.idm:IdmPlanner",
         "pdm": "rlftsim.envs.planners.pdm:PdmPlanner",
     },
+    use=lambda name: load_planner(name),
 )
 """Name -> class of a planner, or a function from observation to action."""
 
@@ -97,7 +98,9 @@ def load_planner(name: str) -> Planner:
         return planner
     if callable(planner):
         return CallablePlanner(planner)
-    raise ConfigError(f"planner {name!r} is a {type(planner).__name__}: give it reset(info) and act(observation).")
+    raise ConfigError(
+        f"planner {name!r} is of type {type(planner).__name__}: give it reset(info) and act(observation)."
+    )
 
 
 def hash_code(planner: Planner) -> str:
