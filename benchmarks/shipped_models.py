@@ -116,9 +116,9 @@ def train(options: Options, name: str) -> Path:
         seeds = [options.work / "runs" / f"{name}-{seed}" for seed in range(3)]
         for seed, folder in enumerate(seeds):
             run("finetune", "smart-demo-long", *tuned, "--out", folder, "--finetune.seed", seed)
-        if not (out / "model" / "config.json").exists():
-            start = options.work / "runs" / "demo-base"
-            run("model", "average", *seeds, "--base", start, "--scale", 2, "--out", out / "model")
+        shutil.rmtree(out, ignore_errors=True)  # made anew in seconds, so nothing half written or older stays
+        start = options.work / "runs" / "demo-base"
+        run("model", "average", *seeds, "--base", start, "--scale", 2, "--out", out / "model")
     elif name == "demo-goals":  # one scenario a batch, so one process
         words = ("--data", "synthetic", "--processes", 1, "--method", "gcsl", "--goal", "indication", "--out", out)
         run("finetune", "smart-demo", *tuned, *words)

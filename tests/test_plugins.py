@@ -103,6 +103,12 @@ def test_a_package_that_cannot_be_imported_does_not_break_others(colors, install
         assert colors.names() == ["ours", "tau", "violet"]
 
 
+def test_a_package_that_ends_the_program_ends_nothing(colors, install):
+    install("test_rude", "import sys\nsys.exit(3)\n", {"black": "test_rude:black"})
+    with pytest.raises(ConfigError, match=r"'black' of package test_rude 1.0 .* cannot be imported \(SystemExit: 3"):
+        colors.get("black")
+
+
 def test_an_attribute_that_is_missing_is_named(colors, install):
     install("test_empty", "", {"pink": "test_empty:pink"})
     with pytest.raises(ConfigError, match=r"color 'pink' of package test_empty 1.0 .* cannot be imported .*pink"):

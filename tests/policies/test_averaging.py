@@ -57,6 +57,10 @@ def test_policies_that_differ_in_more_than_their_weights_are_refused(base):
     other = SmartPolicy(replace(base.config, agent_radius_m=17.0), base.vocabulary)
     with pytest.raises(ConfigError, match="policy 2 of 2, a SmartPolicy, differs from the first in more than"):
         average_policies([base, other])
+    others = SmartPolicy(base.config, tiny.small_vocabulary(tiny.pack_scenarios(3)))
+    others.load_state_dict(base.state_dict())
+    with pytest.raises(ConfigError, match="policy 2 of 2, a SmartPolicy, differs"):
+        average_policies([base, others])
     with pytest.raises(ConfigError, match="the base, a SmartPolicy, differs"):
         average_policies([base], base=base.with_goal_conditioning("indication"))
     with pytest.raises(ConfigError, match="policy 1 of 1 is a ConstantVelocity and has no weights"):
@@ -67,11 +71,17 @@ def test_policies_that_differ_in_more_than_their_weights_are_refused(base):
 
 def test_the_command_writes_a_model_folder_with_its_origin(base, tmp_path, capsys):
     for name, policy in {"base": base, "a": moved(base, 0.1), "b": moved(base, 0.3)}.items():
-        policy.save_pretrained(tmp_path / name)
+        policy.save_pretrained(tmp_path / name, card=f"# Model\n\n* terms of the data: those of {name}\n")
     words = ["model", "average", str(tmp_path / "a"), str(tmp_path / "b"), "--out", str(tmp_path / "mean")]
     assert main([*words, "--base", str(tmp_path / "base"), "--scale", "1.5"]) == 0
     assert difference(load_policy(tmp_path / "mean"), base) == 0.3
-    assert "/a, " in (tmp_path / "mean" / "README.md").read_text()
+    card = (tmp_path / "mean" / "README.md").read_text()
+    assert "/a, " in card
+    assert f"scale 1.5 from {tmp_path / 'base'}" in card
+    assert "terms of the data: those of a\n" in card
+    assert "terms of the data: those of b\n" in card
     capsys.readouterr()
     assert main(words) == 2
     assert "is not empty" in capsys.readouterr().err
+    assert main([*words, "--base", str(tmp_path / "base")]) == 2
+    assert "--base" in capsys.readouterr().err

@@ -11,12 +11,13 @@ from rlftsim.errors import CheckpointError, ConfigError
 from rlftsim.policies import registry
 from rlftsim.policies.registry import load_policy, load_policy_or_oracle
 from rlftsim.recipes import smart, trafficbots
+from rlftsim.recipes.card import model_card
 from rlftsim.recipes.registry import RECIPES, Recipe, recipe_by_name
 from rlftsim.recipes.settings import sections_of
 from rlftsim.recipes.smart import SmartRecipe, smart_demo_rlftsim, smart_tiny_rlftsim
 from rlftsim.recipes.trafficbots import TrafficBotsRecipe
 from rlftsim.rollout.baselines import ConstantVelocity
-from rlftsim.scenario.open import open_dataset
+from rlftsim.scenario.open import dataset_folder, open_dataset
 from rlftsim.tokens.clustering import build_vocabulary
 
 SHIPPED = [
@@ -183,3 +184,11 @@ def test_a_gpu_that_is_not_there_is_refused_and_auto_does_without(monkeypatch):
     assert registry.find_device("auto").type == "cpu"
     with pytest.raises(ConfigError, match="device=cuda, but torch sees no CUDA device"):
         registry.find_device("cuda")
+
+
+def test_the_card_of_a_model_passes_on_the_terms_of_its_start(tmp_path):
+    (tmp_path / "base").mkdir()
+    (tmp_path / "base" / "README.md").write_text("# Base\n\n* terms of the data: non-commercial\n")
+    card = model_card("fine-tuned", dataset_folder("synthetic"), 2, tmp_path / "base")
+    assert "* terms of the data: CC0-1.0" in card
+    assert f"## Made from {tmp_path / 'base'}\n\n### Base\n\n* terms of the data: non-commercial\n" in card

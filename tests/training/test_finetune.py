@@ -524,28 +524,62 @@ def test_more_epochs_continue_a_run_that_has_ended(vocabulary, drawn_scenarios, 
 def test_a_run_that_is_made_longer_and_stopped_stays_the_shorter_one(
     vocabulary, drawn_scenarios, tmp_path, monkeypatch
 ):
-    def train(epochs):
+    def train(epochs, out="run", stop_behind=None):
+        def stop(learner, *rest):
+            if learner.update == stop_behind:
+                raise KeyboardInterrupt
+            return update_policy(learner, *rest)
+
         torch.manual_seed(0)
         config = replace(tiny.FINETUNE, epochs=epochs, checkpoint_every=1)
-        return finetune(tiny.tiny_policy(vocabulary), drawn_scenarios[:2], tmp_path, config)
+        with monkeypatch.context() as patch:
+            patch.setattr("rlftsim.training.finetune.update_policy", stop)
+            return finetune(tiny.tiny_policy(vocabulary), drawn_scenarios[:2], tmp_path / out, config)
 
-    weights = (train(1.0) / "model.safetensors").read_bytes()
-    done, update = len(read_metrics(tmp_path)), update_policy
+    def weights(model):
+        return (model / "model.safetensors").read_bytes()
+
+    def stored(name):
+        return json.loads((tmp_path / "run" / name).read_text())
+
+    short, environment = train(1.0), stored("environment.json")
+    first, done = weights(short), len(read_metrics(tmp_path / "run"))
+    with pytest.raises(KeyboardInterrupt):
+        train(4.0, stop_behind=2 * done + 1)
+    # the model and its settings still belong together; a run of another length cannot tell them apart from its own
+    assert (stored("config.json")["epochs"], stored("environment.json")) == (1.0, environment)
+    assert weights(short) == first
+    for epochs in (1.0, 2.0):
+        with pytest.raises(CheckpointError, match=rf"behind update {2 * done + 1}.*raise epochs.*is .*run/model"):
+            train(epochs)
+    assert weights(train(4.0)) == weights(train(4.0, out="whole")) != first
+    assert stored("config.json")["epochs"] == 4.0
+
+
+def test_a_run_that_was_stopped_may_be_made_longer_before_it_has_ended(
+    vocabulary, drawn_scenarios, tmp_path, monkeypatch
+):
+    def train(epochs, out="run"):
+        torch.manual_seed(0)
+        config = replace(tiny.FINETUNE, epochs=epochs, checkpoint_every=1)
+        return finetune(tiny.tiny_policy(vocabulary), drawn_scenarios[:2], tmp_path / out, config)
 
     def stop(learner, *rest):
-        if learner.update > done:
+        if learner.update == 1:
             raise KeyboardInterrupt
-        return update(learner, *rest)
+        return update_policy(learner, *rest)
 
     with monkeypatch.context() as patch:
         patch.setattr("rlftsim.training.finetune.update_policy", stop)
-        with pytest.raises(KeyboardInterrupt):
-            train(4.0)
-    # the model, the settings and the command of the shorter run still belong together
-    assert json.loads((tmp_path / "config.json").read_text())["epochs"] == 1.0
-    assert (train(1.0) / "model.safetensors").read_bytes() == weights
-    assert (train(4.0) / "model.safetensors").read_bytes() != weights
-    assert json.loads((tmp_path / "config.json").read_text())["epochs"] == 4.0
+        for epochs in (1.0, 4.0):
+            with pytest.raises(KeyboardInterrupt):
+                train(epochs)
+    # there is no model of one epoch, so the run is one of four from here on
+    assert json.loads((tmp_path / "run" / "config.json").read_text())["epochs"] == 4.0
+    with pytest.raises(CheckpointError, match=r"other settings or inputs \(epochs\)"):
+        train(1.0)
+    long, whole = train(4.0), train(4.0, out="whole")
+    assert (long / "model.safetensors").read_bytes() == (whole / "model.safetensors").read_bytes()
 
 
 def test_no_scenario_is_refused(vocabulary, tmp_path):

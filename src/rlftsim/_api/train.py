@@ -11,7 +11,7 @@ from torch import nn
 
 from rlftsim._api.sources import policy_of, require_name
 from rlftsim.errors import ConfigError
-from rlftsim.recipes.card import model_card
+from rlftsim.recipes.card import model_card, with_cards_of
 from rlftsim.recipes.registry import RECIPES, Recipe, recipe_by_name
 from rlftsim.rollout.policy import Policy, device_of
 from rlftsim.scenario.any_form import AnyScenarios, Name, scenarios_of
@@ -79,11 +79,12 @@ def pretrain(
         config = config or policy.pretrain
         vocabulary = None if policy.tokens is None else build_vocabulary(training, policy.tokens)[0]
         start: Any = policy.new_policy(vocabulary)
+        card = _card("pre-trained", training)
     else:
         start = policy_of(policy)
+        card = _card("pre-trained further", training, policy)
     settings = config or PretrainConfig()
     validation = None if held_out is None else scenarios_of(held_out)
-    card = _card("pre-trained", training)
     return _train_copy(
         start,
         out,
@@ -104,7 +105,8 @@ def finetune(
     Args:
         policy: a policy, or a name for `load_policy`.
         scenarios: training scenarios with their logged futures; a name of a data set stands for its split training.
-        out: folder of the run; an interrupted run goes on there, a finished one is not repeated. None keeps no files.
+        out: folder of the run; an interrupted run goes on there, a finished one is not repeated, and with a reward and
+            more epochs it is trained further. None keeps no files.
         config: settings, such as `FinetuneConfig(reward="mloo", epochs=0.5)` or `recipe("smart-demo").finetune`; those
             of a recipe's `catk` or `gcsl` choose that method. None stands for the paper's settings.
 
@@ -119,9 +121,7 @@ def finetune(
     """
     _require_config(config, "finetune", FinetuneConfig, CatkConfig, GcslConfig)
     training, settings = scenarios_of(scenarios, "training"), config or FinetuneConfig()
-    base = policy if isinstance(policy, str | os.PathLike) else type(policy).__name__
-
-    card = _card(f"fine-tuned ({describe_method(settings)}) from {base}", training)
+    card = _card(f"fine-tuned ({describe_method(settings)})", training, policy)
     return _train_copy(
         policy_of(policy), out, lambda learner, folder: finetune_policy(learner, training, folder, settings, card=card)
     )
@@ -166,8 +166,12 @@ def _train_copy(policy: Policy, out: Name | None, train: Callable[[Any, Path], o
     return learner.eval().requires_grad_(False).to(device_of(policy))
 
 
-def _card(what: str, scenarios: Scenarios) -> str:
-    """README of the model folder; the terms of the data are known for data sets only."""
+def _card(what: str, scenarios: Scenarios, start: Policy | Name | None = None) -> str:
+    """README of the model folder; terms are known of data sets and of starts that have a name."""
+    name = str(start) if isinstance(start, str | os.PathLike) else None
+    if start is not None:
+        what = f"{what} from {name or type(start).__name__}"
     if isinstance(scenarios, ScenarioDataset):
-        return model_card(what, scenarios.folder, len(scenarios))
-    return f"# Traffic model, {what}\n\n* trained on {len(scenarios)} scenarios handed over in Python\n"
+        return model_card(what, scenarios.folder, len(scenarios), name)
+    card = f"# Traffic model, {what}\n\n* trained on {len(scenarios)} scenarios handed over in Python\n"
+    return with_cards_of(card, [] if name is None else [name])

@@ -15,6 +15,7 @@ from rlftsim.policies.registry import load_policy
 from rlftsim.policies.smart.catk_checkpoint import CatkImport, import_catk, write_catk
 from rlftsim.policies.smart.catk_vocabulary import write_catk_vocabulary
 from rlftsim.policies.smart.policy import SmartPolicy
+from rlftsim.recipes.card import with_cards_of
 
 Format = Literal["catk"]
 
@@ -93,18 +94,21 @@ class Average:
     out: Path
     """Folder for the model."""
     base: str | None = None
-    """Model that they were fine-tuned from, for --scale."""
+    """Model that they were fine-tuned from; for --scale alone."""
     scale: float = 1.0
     """Above 1 goes further from the base than they did, along what they share."""
 
     def run(self) -> int:
         """Load all, write the folder."""
+        if self.base is not None and self.scale == 1.0:
+            raise ConfigError(f"--base {self.base} has no effect: the mean needs none, add --scale 2 to go further.")
         _refuse_to_replace(self.out)
         base = None if self.base is None else load_policy(self.base)
         average = average_policies([load_policy(name) for name in self.models], base=base, scale=self.scale)
-        card = f"# Mean of {len(self.models)} models\n\n* {', '.join(self.models)}\n"
-        command = f"* command: rlftsim {' '.join(sys.argv[1:])}\n* rlftsim {__version__}\n"
-        average.save_pretrained(self.out, card=card + command)
+        scaled = "" if self.base is None else f"* scale {self.scale:g} from {self.base}\n"
+        card = f"# Mean of {len(self.models)} models\n\n* {', '.join(self.models)}\n{scaled}"
+        card += f"* command: rlftsim {' '.join(sys.argv[1:])}\n* rlftsim {__version__}\n"
+        average.save_pretrained(self.out, card=with_cards_of(card, self.models))
         print(f"model: {self.out}")
         return 0
 

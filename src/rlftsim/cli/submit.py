@@ -120,7 +120,8 @@ class Build:
         work = {"model": self.model, "data set": str(data.folder), **plan.identity}
         report = Report(
             archive.name, check.size, check.sha256, entry.method, parameters, len(check.shards), check.num_scenarios,
-            check.num_trajectories, check.raw_bytes, findings, counts, closed_loop, model_card(self.model),
+            check.num_trajectories, check.raw_bytes, findings, counts, closed_loop,
+ model_card(self.model),
             work, time.monotonic() - start,
             estimate_realism(evaluation, fingerprint, config),
         )  # fmt: skip
@@ -178,7 +179,7 @@ class Check:
                 )
                 raise DataError(
                     f"--score: none of {len(data)} scenarios of split {self.split} of {self.data} could be scored "
-                    f"({reason}): see the findings above, or give a larger --sample."
+                    f"({reason}): see the findings above{', or give a larger --sample' if self.sample < 1 else ''}."
                 )
             print_wide(format_scores(evaluation))
         return int(check.findings.has_errors)

@@ -117,7 +117,9 @@ class Pretrain(RecipeVerb):
         with _learning_curve(self.out):
             start = load_policy(self.init_from) if self.init_from else None
             policy = recipe.new_policy(vocabulary) if start is None else recipe.train_further(start)
-            model = pretrain_policy(policy, scenarios, recipe.pretrain, self.out, held_out=held_out)
+            model = pretrain_policy(
+                policy, scenarios, recipe.pretrain, self.out, start=self.init_from, held_out=held_out
+            )
         print(f"model: {model}")
         return 0
 

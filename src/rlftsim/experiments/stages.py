@@ -67,6 +67,7 @@ def pretrain_policy(
     config: PretrainConfig,
     out: Path,
     *,
+    start: str | None = None,
     held_out: ScenarioDataset | None = None,
 ) -> Path:
     """Folder of the model that pre-training makes of a policy.
@@ -76,12 +77,14 @@ def pretrain_policy(
         training: training scenarios.
         config: settings.
         out: folder of the run. A run that was stopped there is resumed, a finished one is not repeated.
+        start: name of the model whose weights the policy has, for the card; None = they are fresh.
         held_out: scenarios for validation, see `config.validation`.
 
     Raises:
         CheckpointError: `out` holds a run with other settings.
     """
-    card = model_card("pre-trained", training.folder, len(training))
+    what = "pre-trained" if start is None else f"pre-trained further from {start}"
+    card = model_card(what, training.folder, len(training), start)
     if isinstance(policy, nn.Module):
         policy.requires_grad_(True)  # weights of a loaded policy are frozen
     return pretrain(policy, training, out, config, held_out=held_out, card=card)
@@ -103,7 +106,8 @@ def finetune_model(
         training: training scenarios.
         config: settings: `FinetuneConfig` for a reward, `CatkConfig` for CAT-K, `GcslConfig` for imitation of the
             model's own rollouts, relabelled with their endpoints as goals.
-        out: folder of the run. A run that was stopped there is resumed, a finished one is not repeated.
+        out: folder of the run. A run that was stopped there is resumed, a finished one is not repeated; with a reward
+            and more epochs it is trained further.
         conditioning: goal conditioning to add to the base model first; None = as the base model is.
         held_out: scenarios for validation; CAT-K only, see `config.validation`.
 
@@ -119,7 +123,7 @@ def finetune_model(
         policy = policy.with_goal_conditioning(conditioning.encoding, logit_bias=conditioning.logit_bias)
 
     what = f"fine-tuned ({describe_method(config)}{conditioning or ''}) from {base}"
-    card = model_card(what, training.folder, len(training))
+    card = model_card(what, training.folder, len(training), base)
     return finetune_policy(policy, training, out, config, held_out=held_out, card=card)
 
 

@@ -44,19 +44,17 @@ def average_policies(policies: Sequence[Any], *, base: Any = None, scale: float 
         _require_same_kind(first, other, f"policy {place} of {len(policies)}")
     if base is not None:
         _require_same_kind(first, base, "the base")
-    states = [policy.state_dict() for policy in policies]
     average = copy.deepcopy(first)
-    weights = average.state_dict()
-    start = first.state_dict() if base is None else base.state_dict()
+    originals = [dict(policy.named_parameters()) for policy in policies]
+    start = dict((first if base is None else base).named_parameters())
     with torch.no_grad():
-        for name, weight in weights.items():
-            if weight.is_floating_point():
-                # in float64, so that the mean of equal weights is that weight
-                mean = torch.stack([state[name].double() for state in states]).mean(0)
-                origin = start[name].double()
-                weight.copy_(mean if scale == 1.0 else origin + scale * (mean - origin))
-                if not weight.isfinite().all():
-                    raise ConfigError(f"{name} is not finite in the average with scale={scale:g}.")
+        for name, weight in average.named_parameters():
+            # in float64, so that the mean of equal weights is that weight
+            mean = torch.stack([weights[name].double() for weights in originals]).mean(0)
+            origin = start[name].double()
+            weight.copy_(mean if scale == 1.0 else origin + scale * (mean - origin))
+            if not weight.isfinite().all():
+                raise ConfigError(f"{name} is not finite in the average with scale={scale:g}.")
     return average
 
 
@@ -66,9 +64,9 @@ def _require_same_kind(first: Any, other: Any, name: str) -> None:
         raise ConfigError(f"{name} is a {type(other).__name__} and has no weights to average.")
     shapes, found = ({k: v.shape for k, v in policy.state_dict().items()} for policy in (first, other))
     if shapes == found:
-        # with the same weights only settings, vocabulary and class are left to differ
+        # with the same weights only settings, vocabulary, buffers and class are left to differ
         twin = copy.deepcopy(other)
-        twin.load_state_dict(first.state_dict())
+        twin.load_state_dict(dict(first.named_parameters()), strict=False)
         if fingerprint_policy(twin) == fingerprint_policy(first):
             return
     raise ConfigError(

@@ -13,6 +13,7 @@ A policy class needs this much to be saved and loaded:
 import difflib
 import json
 import os
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
@@ -200,6 +201,22 @@ def find_model(name: str | os.PathLike) -> Path:
             + (f", did you mean {near!r}?" if near else ".")
         )
     return folder
+
+
+def read_card(name: str | os.PathLike, *, deeper: int = 2) -> str | None:
+    """Card of a model; None where there is no such folder, or no card in it.
+
+    Args:
+        name: of a shipped model, a model folder or a run's folder.
+        deeper: levels that its headings go down, to stand in another text.
+    """
+    shipped = SHIPPED_MODELS / name
+    try:
+        folder = shipped if (shipped / CARD).is_file() else find_model(name)
+        text = (folder / CARD).read_text(encoding="utf-8")
+    except (ConfigError, OSError):
+        return None
+    return re.sub(r"^#+", lambda found: "#" * min(len(found[0]) + deeper, 6), text.strip(), flags=re.MULTILINE)
 
 
 def list_models(folder: Path) -> list[str]:

@@ -1,28 +1,43 @@
 """README of a model folder: the origin of a model and the terms under which it may be used."""
 
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 
+from rlftsim.policies.checkpoint import read_card
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.sources import guessed_note
 from rlftsim.training.run_folder import describe_environment
 
 
-def model_card(what: str, data: Path, num_scenarios: int) -> str:
+def model_card(what: str, data: Path, num_scenarios: int, start: str | Path | None = None) -> str:
     """Markdown card of a model trained on a data set.
 
     Args:
         what: how the model was trained, e.g. "pre-trained".
         data: folder of the data set; its license note is passed on.
         num_scenarios: number of training scenarios.
+        start: model that training started from; its card is passed on, too.
     """
     environment, dataset = describe_environment(), ScenarioDataset(data)
     note = guessed_note(dataset.sources, dataset.guessed)
     guessed = f"* {note}\n" if note else ""
-    return f"""# Traffic model, {what}
+    card = f"""# Traffic model, {what}
 
 * trained on {num_scenarios} scenarios of {data.name}
 * terms of the data: {dataset.manifest.license_note}
 {guessed}* command: rlftsim {" ".join(sys.argv[1:])}
 * rlftsim {environment["packages"]["rlftsim"]}, commit {environment["commit"] or "unknown"}
 """
+    return card if start is None else with_cards_of(card, [start])
+
+
+def with_cards_of(card: str, models: Iterable[str | Path]) -> str:
+    """A card followed by those of the models that a model was made from: the terms of their data hold for it, too.
+
+    Args:
+        card: of the new model.
+        models: shipped models, model folders or runs.
+    """
+    found = {str(model): read_card(model) for model in models}
+    return "\n".join([card, *(f"## Made from {name}\n\n{text}\n" for name, text in found.items() if text)])

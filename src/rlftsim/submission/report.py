@@ -4,16 +4,15 @@ It names the method and not the account, so that it may be shared.
 """
 
 import json
-import re
 from dataclasses import asdict, dataclass, replace
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
 from rlftsim.atomic_io import remove_temporaries, write_text
-from rlftsim.errors import ConfigError, DataError
+from rlftsim.errors import DataError
 from rlftsim.evaluation.results import EvaluateConfig, Evaluation
-from rlftsim.policies.checkpoint import CARD, SHIPPED_MODELS, find_model
+from rlftsim.policies.checkpoint import read_card
 from rlftsim.submission.check import ArchiveCheck
 from rlftsim.submission.findings import CHECKS, Finding
 
@@ -144,14 +143,8 @@ class Report:
 
 
 def model_card(name: str) -> str:
-    """Card of a model in the box or in a folder, its headings two levels down; a sentence where there is none."""
-    in_the_box = SHIPPED_MODELS / name
-    try:
-        folder = in_the_box if (in_the_box / CARD).is_file() else find_model(name)
-        text = (folder / CARD).read_text(encoding="utf-8")
-    except (ConfigError, OSError):
-        return f"{name} is no model folder, so it has no card."
-    return re.sub(r"^#", "###", text.strip(), flags=re.MULTILINE)
+    """Card of a model, its headings two levels down; a sentence where there is none."""
+    return read_card(name) or f"{name} is no model folder, so it has no card."
 
 
 def report_path(archive: Path, ending: str) -> Path:

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from torch import nn
 from torch.optim import Optimizer
 
-from rlftsim.errors import ConfigError, DataError, NotYetError
+from rlftsim.errors import CheckpointError, ConfigError, DataError, NotYetError
 from rlftsim.lease import Lease
 from rlftsim.progress import log, progress_bar
 from rlftsim.scenario.batch import ScenarioBatch
@@ -321,17 +321,21 @@ class TrainingRun:
             The model folder, `out/model`.
 
         Raises:
-            CheckpointError: the run diverged (its last good checkpoint is named), or a checkpoint is damaged.
+            CheckpointError: the run diverged (its last good checkpoint is named), a checkpoint is damaged, or a longer
+                run was begun in the folder.
             KeyboardInterrupt: Ctrl-C; says from where the run goes on.
         """
         newest = newest_checkpoint(self.folder.checkpoints)
+        if newest and update_of(newest) > self.total:
+            kept = f" The model of the shorter one is {self.folder.model}." if self.folder.has_model else ""
+            raise CheckpointError(
+                f"{self.folder.path}: a longer run was stopped here behind update {update_of(newest)}, this one has "
+                f"{self.total} updates: raise epochs again to go on with it, or name another --out.{kept}"
+            )
         if newest:
             progress = read_checkpoint(newest, learner.modules, learner.optimizer)
             learner.update = progress.update
             learner.load_numbers(progress.numbers)
-        # A longer run was begun here and stopped: the model that is there is the one of this length.
-        if learner.update > self.total and (self.folder.model / "config.json").exists():
-            return self.folder.model
         # Metrics of updates behind the checkpoint would appear twice.
         self.folder.continue_from(learner.update)
         if self._fabric.is_global_zero and learner.update < self.total:
@@ -347,9 +351,9 @@ class TrainingRun:
             what_next = f"continues behind update {update_of(newest)}" if newest else "starts anew"
             raise KeyboardInterrupt(what_next) from None
         self.folder.close()
-        self.folder.finish()
         if self._fabric.is_global_zero:
             learner.result.eval().save_pretrained(self.folder.model, card=card)
+        self.folder.finish()
         return self.folder.model
 
     def _make_updates(self, learner: Learner, make_update: Callable[[], UpdateReport], title: str) -> None:

@@ -157,7 +157,8 @@ class RunFolder:
         inputs: hashes of what the run starts from, see `describe_inputs`.
         writes: False in all processes but that of rank 0.
         defaults: of settings that a stored run may lack, nested as the settings; None = those of the dataclass.
-        may_grow: settings that a larger number continues, such as epochs where no update depends on the run's end.
+        may_grow: settings of the top level that may be raised when the folder is opened again, such as epochs where
+            no update depends on the run's end.
 
     Raises:
         CheckpointError: the folder belongs to a run with other settings or inputs.
@@ -180,27 +181,33 @@ class RunFolder:
         self._metrics = path / "metrics.jsonl"
         self._board: SummaryWriter | None = None
         # Settings and inputs stand in one file: both make a run what it is.
-        plain = {**to_plain(config), **(inputs or {})}
-        stored = self._refuse_other(
-            plain, flatten(default_settings(config) if defaults is None else defaults), may_grow
-        )
-        self._finished = plain
-        # Until a run that is made longer has ended, its settings stay those of the model that is there.
-        self.grows_from = {name: stored[name] for name in may_grow if name in stored and stored[name] != plain[name]}
-        if writes:
-            self._write_settings({**plain, **self.grows_from})
-            write_text(path / "environment.json", json.dumps(describe_environment(), indent=1) + "\n")
+        self._settings = {**to_plain(config), **(inputs or {})}
+        defaults = default_settings(config) if defaults is None else defaults
+        stored = self._checked_stored_settings(self._settings, flatten(defaults), may_grow)
+        changed = {name: stored[name] for name in may_grow if name in stored and stored[name] != self._settings[name]}
+        self.grows_from = changed if self.has_model else {}
+        """Settings of the shorter run whose model is here, by name; empty unless it is made longer."""
+        if writes and not self.grows_from:
+            self._write_settings()
+
+    @property
+    def has_model(self) -> bool:
+        """True once a run has ended here."""
+        return (self.model / "config.json").exists()
 
     def finish(self) -> None:
-        """Store the settings of a run that was made longer."""
+        """Store the settings of a run that was made longer; until then they are those of the model that was here."""
         if self._writes and self.grows_from:
-            self._write_settings(self._finished)
+            self._write_settings()
 
-    def _write_settings(self, settings: Mapping[str, Any]) -> None:
-        write_text(self.path / "config.json", json.dumps(settings, indent=1) + "\n")
+    def _write_settings(self) -> None:
+        write_text(self.path / "config.json", json.dumps(self._settings, indent=1) + "\n")
+        write_text(self.path / "environment.json", json.dumps(describe_environment(), indent=1) + "\n")
 
-    def _refuse_other(self, config: Any, defaults: Mapping[str, Any], may_grow: Collection[str]) -> dict[str, Any]:
-        """The stored settings of the run that was begun here, compared with those given; they may lack later ones."""
+    def _checked_stored_settings(
+        self, config: Any, defaults: Mapping[str, Any], may_grow: Collection[str]
+    ) -> dict[str, Any]:
+        """The stored settings of the run that was begun here, once they fit those given; they may lack later ones."""
         old, new = flatten(stored_settings(self.path)), flatten(config)
         if not old:
             return old
