@@ -14,10 +14,11 @@ from rlftsim.envs.drive import DriveConfig, drive, run_planner
 from rlftsim.envs.episode import OUTSIDE_M
 from rlftsim.envs.idm import IdmConfig, idm_acceleration
 from rlftsim.envs.planner_scores import off_road
-from rlftsim.envs.planners.registry import PLANNERS, action_of, load_planner
+from rlftsim.envs.planners.registry import PLANNERS, action_of, hash_code, load_planner
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.drive_results import DriveResult, compare_drives, format_drive_comparison
 from rlftsim.scenario.open import open_dataset
+from rlftsim.scenario.shards import hash_file
 from rlftsim.scenario.womd import find_tfrecords, read_scenarios
 from scenes import NO_LIGHTS, Mover, bend, build_scenario, junction_map, light, straight_road, without_future
 
@@ -122,6 +123,10 @@ class Far:
         pass
     def act(self, observation):
         return np.outer(np.arange(1, 21), [0.5, 0, 0])
+class Calls:
+    def __call__(self, observation):
+        return np.zeros(2, np.float32)
+instance = Calls()
 class Needy:
     def __init__(self, wish):
         pass
@@ -134,6 +139,10 @@ def test_planners_of_others_are_found(tmp_path, monkeypatch):
     assert action_of(load_planner("my_planners:Still")) == "pose"
     assert driven("my_planners:Still", straight_road()).planner.route_completion == pytest.approx(0.0, abs=1e-6)
     assert action_of(load_planner("my_planners:straight")) == "bicycle"
+    code = hash_file(tmp_path / "my_planners.py")
+    assert {hash_code(load_planner(f"my_planners:{name}")) for name in ("Still", "straight", "instance", "Calls")} == {
+        code
+    }
     PLANNERS.add("mine", sys.modules["my_planners"].Still)
     assert action_of(load_planner("mine")) == "pose"
     PLANNERS.remove("mine")

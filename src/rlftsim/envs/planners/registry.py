@@ -102,9 +102,9 @@ def load_planner(name: str) -> Planner:
 
 def hash_code(planner: Planner) -> str:
     """SHA-256 of the file that defines a planner; of one without a file, as in a notebook, another value each time."""
-    code = planner.function if isinstance(planner, CallablePlanner) else type(planner)
+    made = planner.function if isinstance(planner, CallablePlanner) else planner
     try:
-        return hash_file(inspect.getfile(code))
+        return hash_file(inspect.getfile(made if inspect.isroutine(made) else type(made)))
     except (TypeError, OSError):
         # it may be other code than the last time
         return secrets.token_hex(32)
