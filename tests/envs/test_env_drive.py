@@ -250,6 +250,43 @@ def test_an_interrupted_drive_goes_on_and_a_changed_planner_starts_anew(tmp_path
     assert driven_by(config) == list(ids)
 
 
+QUITTING_PLANNER = """
+import sys
+from pathlib import Path
+import numpy as np
+class Quits:
+    def reset(self, info):
+        self.first = info["scenario"] == Path(__file__).with_name("first").read_text()
+    def act(self, observation):
+        return np.zeros(2, np.float32) if self.first else exit()
+class Unmade:
+    def __init__(self):
+        sys.exit("no license")
+"""
+
+
+def test_a_planner_that_quits_fails_like_any_other_and_keeps_what_it_has_driven(tmp_path, monkeypatch, capsys):
+    (tmp_path / "quits.py").write_text(QUITTING_PLANNER)
+    (tmp_path / "script.py").write_text("import sys\nsys.exit(3)\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    ids = open_dataset("synthetic", "validation").scenario_ids[:2]
+    (tmp_path / "first").write_text(ids[0])
+    out = tmp_path / "out"
+    words = ["--data", "synthetic", "--out", str(out), "--limit", "2", "--traffic", "replay"]
+    messages = {
+        "quits:Quits": f"planner Quits calls exit(None) in scenario {ids[1]}: let it raise an error",
+        "quits:Unmade": "planner 'quits:Unmade' calls exit('no license') when it is made: let it raise an error",
+        "script:Any": "planner 'script:Any' cannot be imported (SystemExit: 3)",
+    }
+    for planner, message in messages.items():
+        capsys.readouterr()
+        assert main(["drive", planner, *words]) == 2
+        assert capsys.readouterr().err.splitlines()[-1].startswith(f"rlftsim: {message}")
+    assert [path.stem for path in (out / "quits.Quits-replay.parts").glob("*.json")] == [ids[0]]
+    (tmp_path / "first").write_text(ids[1])
+    assert main(["drive", "quits:Quits", *words]) == 0
+
+
 def test_a_full_disk_is_noticed_before_anything_is_driven(tmp_path, monkeypatch):
     monkeypatch.setattr("rlftsim.envs.drive.run_planner", None)
     config = DriveConfig("constant_velocity", traffic=("replay",), limit=1)

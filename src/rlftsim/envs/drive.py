@@ -21,7 +21,7 @@ from rlftsim.envs.planners.registry import Planner, action_of, hash_code, horizo
 from rlftsim.envs.result import Result, animation_of
 from rlftsim.envs.source import Source
 from rlftsim.envs.traffic_scores import blamed_others_rate, realism_of_others
-from rlftsim.errors import ConfigError, whole_number
+from rlftsim.errors import ConfigError, DataError, whole_number
 from rlftsim.evaluation.drive_results import DriveResult, DriveSettings
 from rlftsim.evaluation.resumable import JsonParts, map_scenarios, read_if_readable, refuse_fewer
 from rlftsim.evaluation.scenario_source import hash_manifest
@@ -125,11 +125,21 @@ def run_planner(env: EgoEnv, planner: Planner, scenario: Scenario, *, seed: int,
         scenario: one of the environment's.
         seed: of the traffic.
         rollout: number of the dice.
+
+    Raises:
+        DataError: the planner calls exit(). Any other error of the planner passes as it is.
     """
     observation, info = env.reset(seed=seed, options={"scenario": scenario.scenario_id, "rollout": rollout})
-    planner.reset(info)
-    while not env.state.ended[0]:
-        observation, *_ = env.step(planner.act(observation))
+    try:
+        planner.reset(info)
+        while not env.state.ended[0]:
+            observation, *_ = env.step(planner.act(observation))
+    except SystemExit as stop:
+        # It would end the command, with exit() even as if all were done.
+        raise DataError(
+            f"planner {type(planner).__name__} calls exit({stop.code!r}) in scenario {scenario.scenario_id}: let it "
+            "raise an error, or choose other scenarios."
+        ) from stop
     return env.result()
 
 

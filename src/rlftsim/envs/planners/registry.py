@@ -83,7 +83,7 @@ def load_planner(name: str) -> Planner:
             raise ConfigError(f"planner {name!r} names no module: write package.module:Class.")
         try:
             found = getattr(importlib.import_module(module), attribute)
-        except Exception as error:  # a file of others may fail in any way
+        except (Exception, SystemExit) as error:  # a file of others may fail in any way
             raise ConfigError(
                 f"planner {name!r} cannot be imported ({type(error).__name__}: {error}): name package.module:Class."
             ) from error
@@ -93,6 +93,10 @@ def load_planner(name: str) -> Planner:
         planner = found() if isinstance(found, type) else found
     except TypeError as error:
         raise ConfigError(f"planner {name!r} cannot be made without arguments ({error}).") from None
+    except SystemExit as stop:
+        raise ConfigError(
+            f"planner {name!r} calls exit({stop.code!r}) when it is made: let it raise an error."
+        ) from stop
     if isinstance(planner, Planner):
         return planner
     if callable(planner):
