@@ -272,6 +272,14 @@ def without_future(scenario_id: str = "test-split") -> Scenario:
     return replace(whole, timestamps_s=whole.timestamps_s[: CURRENT_STEP + 1], tracks=replace(tracks, **cut))
 
 
+def without_agents(steps: slice, scenario_id: str = "padded") -> Scenario:
+    """The straight road with all agents not valid at some steps."""
+    whole = straight_road(scenario_id)
+    valid = whole.tracks.valid.copy()
+    valid[:, steps] = False
+    return replace(whole, tracks=replace(whole.tracks, valid=valid))
+
+
 def without_road_edges(scenario_id: str = "no-edges") -> Scenario:
     """The straight road as in a log without road edges."""
     whole = straight_road(scenario_id)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from safetensors import SafetensorError
 from safetensors.torch import load_file
 
 from rlftsim.atomic_io import append_text, errors_name, remove_temporaries, save_tensors, write_text, write_whole
@@ -61,6 +62,17 @@ def test_only_a_full_disk_needs_room(tmp_path):
         write_text(tmp_path / "folder", "text")
     with pytest.raises(DataError, match=r"\(Permission denied\): choose another place"), errors_name(tmp_path):
         raise PermissionError(errno.EACCES, "Permission denied")
+
+
+@pytest.mark.parametrize("cause", [errno.EACCES, errno.EROFS])
+def test_a_place_where_tensors_may_not_be_written_needs_no_room(cause, tmp_path, monkeypatch):
+    def refused(*_, **__):
+        text = f'{os.strerror(cause)} (os error {cause}) at path "{tmp_path}/.tmpKuy0Um"'
+        raise SafetensorError(f"Error while serializing: I/O error: {text}")
+
+    monkeypatch.setattr("rlftsim.atomic_io.save_file", refused)
+    with pytest.raises(DataError, match=rf"safetensors \({os.strerror(cause)}\): choose another place, then run"):
+        save_tensors(tmp_path / "a.safetensors", {"x": torch.zeros(3)})
 
 
 def test_tensors_come_back_and_all_users_may_read_them(tmp_path):

@@ -19,6 +19,8 @@ NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """Errors of the operating system where a file does not fit."""
 _TEMPORARY = re.compile(r"\..+\.\d+\.tmp")
 """Names that `temporary_beside` gives."""
+_ERROR_NUMBER = re.compile(r"\(os error (\d+)\)")
+"""Where safetensors writes the number of an error of the operating system."""
 
 
 @contextmanager
@@ -42,7 +44,7 @@ def cannot_write(path: Path, error: OSError) -> DataError:
         error: of the operating system, such as that of a full disk.
     """
     remedy = "choose another place, then run the same command again."
-    # safetensors tells no error number: a full disk is the likeliest cause there
+    # some libraries tell no error number: a full disk is the likeliest cause there
     if error.errno in (None, *NO_ROOM):
         remedy = f"make room or {remedy}"
     elif isinstance(error, FileExistsError | NotADirectoryError):
@@ -142,7 +144,8 @@ def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: dict[str, 
         try:
             save_file(contiguous, temporary, metadata=metadata)
         except SafetensorError as error:  # safetensors reports a full disk by an error of its own
-            raise OSError(str(error)) from None
+            number = _ERROR_NUMBER.search(str(error))
+            raise (OSError(int(number[1]), os.strerror(int(number[1]))) if number else OSError(str(error))) from None
         # safetensors writes files that only their owner may read, whatever the umask.
         mask = os.umask(0)
         os.umask(mask)

@@ -1,9 +1,11 @@
 """Planners that ship, planners of others, `rlftsim drive` and `rlftsim compare` on its files."""
 
+import json
 import sys
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
@@ -14,10 +16,11 @@ from rlftsim.envs.drive import DriveConfig, drive, run_planner
 from rlftsim.envs.episode import OUTSIDE_M
 from rlftsim.envs.idm import IdmConfig, idm_acceleration
 from rlftsim.envs.planner_scores import off_road
-from rlftsim.envs.planners.registry import PLANNERS, action_of, load_planner
+from rlftsim.envs.planners.registry import PLANNERS, action_of, hash_code, load_planner
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.drive_results import DriveResult, compare_drives, format_drive_comparison
 from rlftsim.scenario.open import open_dataset
+from rlftsim.scenario.shards import hash_file
 from rlftsim.scenario.womd import find_tfrecords, read_scenarios
 from scenes import NO_LIGHTS, Mover, bend, build_scenario, junction_map, light, straight_road, without_future
 
@@ -122,6 +125,10 @@ class Far:
         pass
     def act(self, observation):
         return np.outer(np.arange(1, 21), [0.5, 0, 0])
+class Calls:
+    def __call__(self, observation):
+        return np.zeros(2, np.float32)
+instance = Calls()
 class Needy:
     def __init__(self, wish):
         pass
@@ -134,6 +141,10 @@ def test_planners_of_others_are_found(tmp_path, monkeypatch):
     assert action_of(load_planner("my_planners:Still")) == "pose"
     assert driven("my_planners:Still", straight_road()).planner.route_completion == pytest.approx(0.0, abs=1e-6)
     assert action_of(load_planner("my_planners:straight")) == "bicycle"
+    code = hash_file(tmp_path / "my_planners.py")
+    assert {hash_code(load_planner(f"my_planners:{name}")) for name in ("Still", "straight", "instance", "Calls")} == {
+        code
+    }
     PLANNERS.add("mine", sys.modules["my_planners"].Still)
     assert action_of(load_planner("mine")) == "pose"
     PLANNERS.remove("mine")
@@ -241,6 +252,43 @@ def test_an_interrupted_drive_goes_on_and_a_changed_planner_starts_anew(tmp_path
     assert driven_by(config) == list(ids)
 
 
+QUITTING_PLANNER = """
+import sys
+from pathlib import Path
+import numpy as np
+class Quits:
+    def reset(self, info):
+        self.first = info["scenario"] == Path(__file__).with_name("first").read_text()
+    def act(self, observation):
+        return np.zeros(2, np.float32) if self.first else exit()
+class Unmade:
+    def __init__(self):
+        sys.exit("no license")
+"""
+
+
+def test_a_planner_that_quits_fails_like_any_other_and_keeps_what_it_has_driven(tmp_path, monkeypatch, capsys):
+    (tmp_path / "quits.py").write_text(QUITTING_PLANNER)
+    (tmp_path / "script.py").write_text("import sys\nsys.exit(3)\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    ids = open_dataset("synthetic", "validation").scenario_ids[:2]
+    (tmp_path / "first").write_text(ids[0])
+    out = tmp_path / "out"
+    words = ["--data", "synthetic", "--out", str(out), "--limit", "2", "--traffic", "replay"]
+    messages = {
+        "quits:Quits": f"planner Quits calls exit(None) in scenario {ids[1]}: let it raise an error",
+        "quits:Unmade": "planner 'quits:Unmade' calls exit('no license') when it is made: let it raise an error",
+        "script:Any": "planner 'script:Any' cannot be imported (SystemExit: 3)",
+    }
+    for planner, message in messages.items():
+        capsys.readouterr()
+        assert main(["drive", planner, *words]) == 2
+        assert capsys.readouterr().err.splitlines()[-1].startswith(f"rlftsim: {message}")
+    assert [path.stem for path in (out / "quits.Quits-replay.parts").glob("*.json")] == [ids[0]]
+    (tmp_path / "first").write_text(ids[1])
+    assert main(["drive", "quits:Quits", *words]) == 0
+
+
 def test_a_full_disk_is_noticed_before_anything_is_driven(tmp_path, monkeypatch):
     monkeypatch.setattr("rlftsim.envs.drive.run_planner", None)
     config = DriveConfig("constant_velocity", traffic=("replay",), limit=1)
@@ -282,3 +330,92 @@ def test_results_survive_their_file_and_pair_by_scenario(tmp_path):
     assert ["models differ" in title for title in titles] == [False, True]
     with pytest.raises(DataError, match="not a result"):
         DriveResult.read(tmp_path / "none.parquet")
+
+
+@pytest.fixture(scope="module")
+def result_path(tmp_path_factory):
+    """A result of one scenario."""
+    out = tmp_path_factory.mktemp("drive")
+    drive(DriveConfig("constant_velocity", traffic=("replay",), limit=1), out)
+    return out / "constant_velocity-replay.parquet"
+
+
+def about_of(table):
+    return json.loads(table.schema.metadata[b"rlftsim"])
+
+
+def with_settings(table, **changes):
+    about = about_of(table)
+    return with_metadata(table, {**about, "settings": {**about["settings"], **changes}})
+
+
+def with_metadata(table, about):
+    return table.replace_schema_metadata({"rlftsim": about if isinstance(about, str) else json.dumps(about)})
+
+
+EDITS = {
+    "no JSON": (lambda table: with_metadata(table, "{"), "Expecting property name"),
+    "JSON of another kind": (lambda table: with_metadata(table, [1]), "list"),
+    "no settings": (lambda table: with_metadata(table, {"format": "rlftsim-drive-1"}), "it lacks settings"),
+    "no reasons": (
+        lambda table: with_metadata(table, {n: v for n, v in about_of(table).items() if n != "missing"}),
+        "it lacks missing",
+    ),
+    "a reason of another kind": (
+        lambda table: with_metadata(table, {**about_of(table), "missing": {"x": 3}}),
+        "a value in it is of another type",
+    ),
+    "a seed in letters": (lambda table: with_settings(table, seed="one"), "seed must be a whole number, got 'one'"),
+    "no column of ids": (lambda table: table.drop_columns(["scenario_id"]), "it lacks column scenario_id"),
+    "no column of a score": (lambda table: table.drop_columns(["comfort"]), "it lacks column comfort"),
+    "a score in letters": (
+        lambda table: table.set_column(2, "nuplan_style", pa.array(["high"])),
+        "column nuplan_style has empty cells or those of another type",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", EDITS)
+def test_an_edited_result_is_named_in_one_line(name, result_path, tmp_path, capsys):
+    edit, cause = EDITS[name]
+    edited = tmp_path / "edited.parquet"
+    pq.write_table(edit(pq.read_table(result_path)), edited)
+    for pair in ((result_path, edited), (edited, result_path)):
+        assert main(["compare", *map(str, pair)]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith(f"rlftsim: {edited}: not a result of `rlftsim drive` (")
+        assert cause in line
+        assert line.endswith("): drive again.")
+    assert main(["compare", str(edited), str(edited)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert str(edited) in line
+
+
+def test_a_cut_result_is_named_in_one_line(result_path, tmp_path, capsys):
+    cut = tmp_path / "cut.parquet"
+    cut.write_bytes(result_path.read_bytes()[:500])
+    assert main(["compare", str(result_path), str(cut)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"rlftsim: {cut}: not a result of `rlftsim drive` (")
+
+
+def test_edited_rows_of_an_unfinished_drive_are_driven_anew(tmp_path):
+    config = DriveConfig("constant_velocity", traffic=("replay",), limit=2)
+    (whole,) = drive(config, tmp_path / "whole")
+    first, second = whole.table["scenario_id"].to_pylist()
+    for number, edit in enumerate((
+        lambda row: row.pop("comfort"),
+        lambda row: row.update(comfort="high"),
+        lambda row: row.update(comfort=None),
+        lambda row: row.update(scenario_id=second),
+        lambda row: row.clear(),
+    )):  # fmt: skip
+        out = tmp_path / str(number)
+        parts = out / "constant_velocity-replay.parts"
+        parts.mkdir(parents=True)
+        row = whole.table.to_pylist()[0]
+        edit(row)
+        settings = asdict(whole.settings)
+        (parts / f"{first}.json").write_text(json.dumps({"settings": settings, "row": row, "missing": {}}))
+        (again,) = drive(config, out)
+        np.testing.assert_equal(again.table.to_pydict(), whole.table.to_pydict())

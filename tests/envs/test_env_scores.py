@@ -195,3 +195,7 @@ def test_realism_of_the_others_is_the_metric_without_the_ego():
     braking = drive(movers, np.full(80, 1.0), num_predicted=2)
     assert realism_of_others([braking.record]) < realism_of_others([result.record]) + 1e-6
     assert math.isnan(realism_of_others([drive(movers, steps=40, num_predicted=2).record]))
+    others_end = replace(result.record.scene.scenario.tracks, valid=result.record.scene.scenario.tracks.valid.copy())
+    others_end.valid[1:, 11:] = False
+    scene = replace(result.record.scene, scenario=replace(result.record.scene.scenario, tracks=others_end))
+    assert math.isnan(realism_of_others([replace(result.record, scene=scene)]))

@@ -20,6 +20,7 @@ from rlftsim.realism.from_rollouts import logged_states
 from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
+from rlftsim.scenario.types import HISTORY_STEPS
 from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
 from rlftsim.workers import Inline, Share, Unfinished
 
@@ -95,6 +96,15 @@ def test_what_cannot_be_scored_is_listed_with_the_reason(data, tmp_path):
     assert [s.scenario_id for s in result.skipped] == ["no-edges"]
     assert "no road edge" in result.skipped[0].reason
     assert len(result) == 6
+
+
+def test_a_future_of_padding_is_no_future(tmp_path):
+    padded = scenes.without_agents(slice(HISTORY_STEPS, None))
+    write_dataset([scenes.straight_road(), padded], tmp_path / "data", split="validation")
+    result = evaluate(ConstantVelocity(), tmp_path / "data", tmp_path, CONFIG, name="cv")
+    assert result.scenario_ids == ["straight"]
+    assert [s.scenario_id for s in result.skipped] == ["padded"]
+    assert "no valid logged state of an evaluated agent after the current step" in result.skipped[0].reason
 
 
 def test_a_deterministic_policy_is_simulated_once_and_scored_as_if_every_time(data, tmp_path, monkeypatch):

@@ -9,8 +9,10 @@ import torch
 from realism_drawing import draw_map, draw_red_light, draw_rollouts, draw_traffic, select_rollouts
 
 import scenes
+from rlftsim.errors import DataError
 from rlftsim.realism import SimulatedStates, compute_credit, compute_features, scenario_log, score
 from rlftsim.realism.from_rollouts import logged_states
+from rlftsim.scenario.types import HISTORY_STEPS
 
 
 def peak_mib():
@@ -90,6 +92,14 @@ def test_a_scene_of_one_step_of_history_scores():
     scenario.tracks.valid[:, :10] = False
     states = draw_rollouts(scenario, 2, seed=1)
     assert score(scenario, states).likelihoods.isfinite().all()
+
+
+def test_a_future_of_padding_is_refused_and_has_no_score_in_training():
+    padded = scenes.without_agents(slice(HISTORY_STEPS, None))
+    states = logged_states(scenes.straight_road(), num_rollouts=2)
+    with pytest.raises(DataError, match="Scenario padded has no valid logged state of an evaluated agent"):
+        score(padded, states)
+    assert score(padded, states, missing_map="neutral").meta_metric.isnan()
 
 
 def test_agents_without_extent_score():

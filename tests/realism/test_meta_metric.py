@@ -256,7 +256,8 @@ def test_an_evaluated_agent_seen_at_the_current_step_only_gives_what_the_rules_s
     scenario = draw_traffic(1, num_agents=3, num_evaluated=1)
     scenario.tracks.valid[0] = False
     scenario.tracks.valid[0, 10] = True
-    result = score(scenario, draw_rollouts(scenario, 2, seed=1))
+    # as in training: an evaluation refuses a log without anything to compare with
+    result = score(scenario, draw_rollouts(scenario, 2, seed=1), missing_map="neutral")
     # No step of the log is scored: likelihoods of histograms are 0/0; outcomes are all "no" on both sides.
     assert result.likelihoods[:7].isnan().all()
     assert result.likelihoods[7:].tolist() == pytest.approx([2.001 / 2.002] * 3)

@@ -1,5 +1,6 @@
 """The report on a vocabulary: whole or not at all, and its numbers are those that were measured."""
 
+import errno
 import json
 
 import pytest
@@ -52,7 +53,16 @@ def test_what_goes_wrong_half_way_leaves_the_old_report(classes, tmp_path, monke
         raise OSError("no space left on device")
 
     monkeypatch.setattr(vocabulary_report, "coverage_picture", full)
-    with pytest.raises(DataError, match="no space left"):
+    with pytest.raises(DataError, match=r"no space left.*make room"):
         write_vocabulary_report(folder, classes, vocabulary="new", data="two cars")
     assert (folder / "report.md").read_text().startswith("# A vocabulary\n\nold")
     assert [p.name for p in tmp_path.iterdir()] == ["v.report"]
+
+
+def test_a_read_only_place_for_a_report_needs_no_room(classes, tmp_path, monkeypatch):
+    def refused(*_, **__):
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr(vocabulary_report, "coverage_picture", refused)
+    with pytest.raises(DataError, match=r"v\.report \(Read-only file system\): choose another place"):
+        write_vocabulary_report(tmp_path / "v.report", classes, vocabulary="v", data="two cars")

@@ -137,7 +137,8 @@ class Compare:
 
     def run(self) -> int:
         """Print both tables."""
-        if is_drive_result(self.first) and is_drive_result(self.second):
+        # or: of two, the one that is damaged is to be named
+        if is_drive_result(self.first) or is_drive_result(self.second):
             drives = DriveResult.read(self.first), DriveResult.read(self.second)
             print_wide(format_drives(*drives), format_drive_comparison(*drives, alpha=self.alpha))
             return 0

@@ -6,7 +6,7 @@ Interrupted in any way, the same call goes on where it was, see `evaluation.resu
 import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, cast
@@ -17,11 +17,12 @@ import rlftsim
 from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.drivers import TRAFFIC, Traffic
 from rlftsim.envs.ego_env import EgoEnv
+from rlftsim.envs.planner_scores import PlannerScores
 from rlftsim.envs.planners.registry import Planner, action_of, hash_code, horizon_of, load_planner
 from rlftsim.envs.result import Result, animation_of
 from rlftsim.envs.source import Source
-from rlftsim.envs.traffic_scores import blamed_others_rate, realism_of_others
-from rlftsim.errors import ConfigError, whole_number
+from rlftsim.envs.traffic_scores import TrafficScores, blamed_others_rate, realism_of_others
+from rlftsim.errors import ConfigError, DataError, whole_number
 from rlftsim.evaluation.drive_results import DriveResult, DriveSettings
 from rlftsim.evaluation.resumable import JsonParts, map_scenarios, read_if_readable, refuse_fewer
 from rlftsim.evaluation.scenario_source import hash_manifest
@@ -125,11 +126,21 @@ def run_planner(env: EgoEnv, planner: Planner, scenario: Scenario, *, seed: int,
         scenario: one of the environment's.
         seed: of the traffic.
         rollout: number of the dice.
+
+    Raises:
+        DataError: the planner calls exit(). Any other error of the planner passes as it is.
     """
     observation, info = env.reset(seed=seed, options={"scenario": scenario.scenario_id, "rollout": rollout})
-    planner.reset(info)
-    while not env.state.ended[0]:
-        observation, *_ = env.step(planner.act(observation))
+    try:
+        planner.reset(info)
+        while not env.state.ended[0]:
+            observation, *_ = env.step(planner.act(observation))
+    except SystemExit as stop:
+        # It would end the command, with exit() even as if all were done.
+        raise DataError(
+            f"planner {type(planner).__name__} calls exit({stop.code!r}) in scenario {scenario.scenario_id}: let it "
+            "raise an error, or choose other scenarios."
+        ) from stop
     return env.result()
 
 
@@ -188,8 +199,17 @@ def _drive_traffic(config: DriveConfig, settings: DriveSettings, ids: Sequence[s
 
 
 def _row_and_missing(scenario_id: str, values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
-    """Row of a scenario, and the scores that it cannot give."""
-    return values["row"], values["missing"]
+    """Row of a scenario, and the scores that it cannot give, as their file has them.
+
+    Raises:
+        KeyError, TypeError, ValueError: the file was cut or edited.
+    """
+    row, missing = values["row"], values["missing"]
+    if row["scenario_id"] != scenario_id or not all(isinstance(why, str) for why in missing.values()):
+        raise ValueError("of another scenario, or without a reason")
+    names = [one.name for scores in (PlannerScores, TrafficScores) for one in fields(scores)]
+    numbers = {name: float(row[name]) for name in (*names, "blamed_others_rate", "others_realism")}
+    return {"scenario_id": scenario_id, "traffic": values["settings"]["traffic"], **numbers}, missing
 
 
 def _drive_scenario(config: DriveConfig, traffic: str, ids: Sequence[str], position: int) -> dict[str, object]:

@@ -157,7 +157,7 @@ def realism_of_others(records: Sequence[Record], config: MetricConfig = METRIC_2
     scene = records[0].scene
     scenario = _WithoutEgo(**{one.name: getattr(scene.scenario, one.name) for one in fields(Scenario)})
     is_whole = all(record.steps == FUTURE_STEPS for record in records)
-    if not (scenario.has_future and is_whole and len(scenario.evaluated_indices)) or road_edges(scene.scenario) is None:
+    if not (scenario.has_evaluated_future and is_whole) or road_edges(scene.scenario) is None:
         return float("nan")
     motion = torch.from_numpy(np.stack([record.motion[:, 1:] for record in records]))  # [N, A, 80, 5]
     world = (motion[..., :2] + torch.from_numpy(scene.scenario.origin)).float()

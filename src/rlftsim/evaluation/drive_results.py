@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 from rich.table import Table
 
 from rlftsim.atomic_io import write_whole
-from rlftsim.errors import DataError
+from rlftsim.errors import DataError, require_types
 from rlftsim.evaluation.columns import ARROWS, direction_of, format_number
 from rlftsim.evaluation.compare import PairedDifference, compare_paired
 from rlftsim.statistics import mean_interval
@@ -88,15 +88,42 @@ class DriveResult:
         """Read the file that `write` wrote.
 
         Raises:
-            DataError: not such a file.
+            DataError: not such a file, or one that was cut or edited.
         """
         try:
-            table = pq.read_table(path)
-            about = json.loads((table.schema.metadata or {})[b"rlftsim"])
+            # not `read_table`, which takes a folder for one table
+            with pq.ParquetFile(path) as file:
+                table = file.read()
+            table.validate(full=True)
+            about = json.loads((table.schema.metadata or {}).get(b"rlftsim", b"{}"))
             settings = DriveSettings(**about["settings"])
-        except (OSError, KeyError, TypeError, ValueError, pa.ArrowException) as error:
-            raise DataError(f"{path}: not a result of `rlftsim drive` ({error}): drive again.") from None
-        return cls(settings, table.replace_schema_metadata(None), about["missing"])
+            require_types(settings)
+            missing = {name: dict(reasons.items()) for name, reasons in about["missing"].items()}
+            _require_columns(table)
+        except (OSError, KeyError, TypeError, ValueError, AttributeError, pa.ArrowException) as error:
+            cause = str(error).partition("\n")[0].rstrip(".")
+            if isinstance(error, KeyError):
+                cause = f"it lacks {error.args[0]}"
+            elif isinstance(error, AttributeError):
+                cause = "a value in it is of another type"
+            raise DataError(f"{path}: not a result of `rlftsim drive` ({cause}): drive again.") from None
+        return cls(settings, table.replace_schema_metadata(None), missing)
+
+
+def _require_columns(table: pa.Table) -> None:
+    """Require what tables and comparisons read: a text for each scenario, and numbers.
+
+    Raises:
+        KeyError: a column is missing.
+        TypeError: one has other values.
+    """
+    texts = ("scenario_id", "traffic")
+    for name in (*texts, *SHOWN):
+        if name not in table.schema.names:
+            raise KeyError(f"column {name}")
+    for name, column in zip(table.schema.names, table.columns):
+        if column.type != (pa.string() if name in texts else pa.float64()) or column.null_count:
+            raise TypeError(f"column {name} has empty cells or those of another type")
 
 
 def is_drive_result(path: str | PathLike[str]) -> bool:
@@ -104,7 +131,7 @@ def is_drive_result(path: str | PathLike[str]) -> bool:
     try:
         metadata = pq.read_schema(path).metadata or {}
         return json.loads(metadata.get(b"rlftsim", b"{}")).get("format") == FORMAT
-    except (OSError, ValueError, pa.ArrowException):
+    except (OSError, ValueError, AttributeError, pa.ArrowException):
         return False
 
 

@@ -271,14 +271,16 @@ class Evaluation:
             raise DataError(f"{path} is a folder: {hint}.")
         try:
             table = pq.read_table(path)
+            names = table.schema.names  # decoded here
         except FileNotFoundError:
             raise DataError(f"{path}: no such evaluation: make one with `rlftsim evaluate`.") from None
-        except (OSError, pa.ArrowException) as error:
-            raise DataError(f"{path}: damaged evaluation ({error}): evaluate again.") from None
+        except (OSError, ValueError, pa.ArrowException) as error:
+            cause = str(error).partition("\n")[0]
+            raise DataError(f"{path}: damaged evaluation ({cause}): evaluate again.") from None
         # our part of the file's metadata; pandas and others may add theirs
-        about = json.loads((table.schema.metadata or {}).get(b"rlftsim", b"{}"))
+        about = _about((table.schema.metadata or {}).get(b"rlftsim", b"{}"))
         for name in ADDED_COLUMNS:
-            if name not in table.schema.names:
+            if name not in names:
                 missing = pa.array(np.full(len(table), np.nan))
                 table = table.add_column(SCHEMA.get_field_index(name), SCHEMA.field(name), missing)
         if about.get("format") != FORMAT or table.schema.names != SCHEMA.names:
@@ -287,8 +289,20 @@ class Evaluation:
             provenance = Provenance.from_plain(about["provenance"])
         except (TypeError, KeyError, ConfigError) as error:
             raise DataError(f"{path}: made by a later version ({error}): update rlftsim or evaluate again.") from None
-        skipped = tuple(Skipped(**one) for one in about["skipped"])
-        return cls(about["name"], provenance, table.replace_schema_metadata(None), skipped)
+        try:
+            name, skipped = about["name"], tuple(Skipped(**one) for one in about["skipped"])
+        except (TypeError, KeyError) as error:
+            raise DataError(f"{path}: damaged evaluation ({error}): evaluate again.") from None
+        return cls(name, provenance, table.replace_schema_metadata(None), skipped)
+
+
+def _about(metadata: bytes) -> dict[str, Any]:
+    """Our part of a file's metadata; empty where it is damaged."""
+    try:
+        about = json.loads(metadata)
+    except ValueError:
+        return {}
+    return about if isinstance(about, dict) else {}
 
 
 def join_evaluations(name: str, provenance: Provenance, parts: list[Evaluation]) -> Evaluation:

@@ -185,7 +185,8 @@ def scenario_log(
         scenario: with its future.
         device: where the tensors go.
         missing_map: without road edges raise ("error"), as the official evaluator does, or count log and rollouts as on
-            the road ("neutral").
+            the road ("neutral"). Under "neutral" a log in which no future state of an evaluated agent is valid raises
+            no error, either: its scores are NaN.
         compute: memory bound.
 
     Raises:
@@ -214,6 +215,12 @@ def _logs_of(scenario: Scenario) -> WeakValueDictionary[Hashable, ScenarioLog]:
 
 def _build_log(scenario: Scenario, device: torch.device, missing_map: MissingMap, max_pairs: int) -> ScenarioLog:
     agents = build_logged_agents(scenario, device)
+    # Training goes on, where the reward counts as missing: its scores are NaN.
+    if missing_map == "error" and not scenario.has_evaluated_future:
+        raise DataError(
+            f"Scenario {scenario.scenario_id} has no valid logged state of an evaluated agent after the current step: "
+            "without its future it cannot be scored. Use training or validation data, or leave the scenario out."
+        )
     road_edges = build_road_edges(scenario.map_features, device)
     if road_edges is None and missing_map == "error":
         raise DataError(

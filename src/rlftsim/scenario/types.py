@@ -305,6 +305,12 @@ class Scenario:
         """True where the log has the 80 future steps."""
         return self.num_steps >= TOTAL_STEPS
 
+    @property
+    def has_evaluated_future(self) -> bool:
+        """True where an evaluated agent has a valid state after the current step, so that there is a log to compare
+        with."""
+        return self.has_future and bool(self.tracks.valid[self.evaluated_indices, HISTORY_STEPS:TOTAL_STEPS].any())
+
     @cached_property
     def simulated_indices(self) -> Int64[np.ndarray, "A"]:
         """Simulated tracks: those valid at the current step, in track order."""

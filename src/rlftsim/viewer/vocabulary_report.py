@@ -15,6 +15,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, LogNorm
 from matplotlib.figure import Figure
 
+from rlftsim.atomic_io import cannot_write
 from rlftsim.errors import DataError
 from rlftsim.tokens.coverage import MAX_SPEED_BIN_MPS, ClassCoverage, Spread
 from rlftsim.viewer.figure import COLORS, INK, save_figure
@@ -55,7 +56,7 @@ def write_vocabulary_report(folder: Path, classes: tuple[ClassCoverage, ...], *,
         shutil.rmtree(folder, ignore_errors=True)
         partial.replace(folder)
     except OSError as error:
-        raise DataError(f"cannot write {folder} ({error}): make room or name another place with --report.") from None
+        raise cannot_write(folder, error) from None
     finally:
         shutil.rmtree(partial, ignore_errors=True)
 

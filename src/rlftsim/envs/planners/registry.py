@@ -84,7 +84,7 @@ def load_planner(name: str) -> Planner:
             raise ConfigError(f"planner {name!r} names no module: write package.module:Class.")
         try:
             found = getattr(importlib.import_module(module), attribute)
-        except Exception as error:  # a file of others may fail in any way
+        except (Exception, SystemExit) as error:  # a file of others may fail in any way
             raise ConfigError(
                 f"planner {name!r} cannot be imported ({type(error).__name__}: {error}): name package.module:Class."
             ) from error
@@ -94,6 +94,10 @@ def load_planner(name: str) -> Planner:
         planner = found() if isinstance(found, type) else found
     except TypeError as error:
         raise ConfigError(f"planner {name!r} cannot be made without arguments ({error}).") from None
+    except SystemExit as stop:
+        raise ConfigError(
+            f"planner {name!r} calls exit({stop.code!r}) when it is made: let it raise an error."
+        ) from stop
     if isinstance(planner, Planner):
         return planner
     if callable(planner):
@@ -105,9 +109,9 @@ def load_planner(name: str) -> Planner:
 
 def hash_code(planner: Planner) -> str:
     """SHA-256 of the file that defines a planner; of one without a file, as in a notebook, another value each time."""
-    code = planner.function if isinstance(planner, CallablePlanner) else type(planner)
+    made = planner.function if isinstance(planner, CallablePlanner) else planner
     try:
-        return hash_file(inspect.getfile(code))
+        return hash_file(inspect.getfile(made if inspect.isroutine(made) else type(made)))
     except (TypeError, OSError):
         # it may be other code than the last time
         return secrets.token_hex(32)

@@ -78,7 +78,7 @@ class PoseAttention(nn.Module):
             # All pairs by one matrix product are cheaper than copies of each neighbor's key.
             dense = _merge_rows(query, targets.keys) @ targets.keys.transpose(-1, -2)  # [*h, H, R, M]
             chosen = dense.gather(-1, _merged_index(neighbors.index, dense))  # [*h, H, R, K]
-            content = chosen.transpose(-2, -3).reshape(*rows, heads, -1)  # [*g, S, H, K]
+            content = chosen.transpose(-2, -3).reshape(*rows, heads, chosen.shape[-1])  # [*g, S, H, K]
             pose = pose_query @ neighbors.embedding.transpose(-1, -2)
             logits.append((content + pose).masked_fill(~neighbors.valid[..., None, :], -torch.inf))
         joined = torch.cat(logits, -1)  # [*g, S, H, all K]
@@ -89,7 +89,7 @@ class PoseAttention(nn.Module):
         for part, (targets, neighbors) in zip(parts, kinds):
             pose_value = part @ neighbors.embedding.to(part.dtype)  # [*g, S, H, E]
             out = out + torch.einsum("...he,hde->...hd", pose_value, value_relation)
-            merged = part.reshape(*targets.keys.shape[:-3], -1, heads, part.shape[-1]).transpose(-2, -3)
+            merged = part.flatten(targets.keys.dim() - 3, -3).transpose(-2, -3)  # [*h, H, R, K]
             dense = merged.new_zeros(*merged.shape[:-1], targets.keys.shape[-2])
             dense = dense.scatter(-1, _merged_index(neighbors.index, dense), merged)  # [*h, H, R, M]
             out = out + (dense @ targets.values.to(dense.dtype)).transpose(-2, -3).reshape(out.shape)

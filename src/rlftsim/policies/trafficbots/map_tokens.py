@@ -242,6 +242,8 @@ def _positions_that_matter(scenario: Scenario) -> Float64[np.ndarray, "n 3"]:
     matters[scenario.ego_index] = True
     matters[scenario.tracks_to_predict] = True
     known = tracks.valid[:, :HISTORY_STEPS] & matters[:, None]
+    if not known.any():
+        return np.zeros((1, 3))  # the frame's origin, where the ego would be
     return to_ego_frame(tracks.position[:, :HISTORY_STEPS][known].astype(np.float64), ego_pose(scenario))
 
 
