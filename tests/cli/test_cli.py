@@ -378,7 +378,10 @@ def test_an_evaluation_of_fewer_scenarios_never_replaces_a_larger_one(tmp_path, 
     assert run(capsys, *arguments, "--limit", "2")[0] == 0
     before = (tmp_path / "oracle.parquet").read_bytes()
     status, _, err = run(capsys, *arguments, "--limit", "1")
-    assert (status, "oracle.parquet holds 2 scenarios and limit=1 would replace them by fewer" in err) == (2, True)
+    assert (status, "oracle.parquet holds 2 scenarios, and limit=1 would replace them without 1 of these" in err) == (
+        2,
+        True,
+    )
     assert "--name" in err
     assert (tmp_path / "oracle.parquet").read_bytes() == before
     assert run(capsys, *arguments, "--limit", "1", "--name", "brief")[0] == 0

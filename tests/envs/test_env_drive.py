@@ -19,6 +19,7 @@ from rlftsim.envs.planner_scores import off_road
 from rlftsim.envs.planners.registry import PLANNERS, action_of, hash_code, load_planner
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.drive_results import DriveResult, compare_drives, format_drive_comparison
+from rlftsim.scenario.dataset import write_dataset
 from rlftsim.scenario.open import open_dataset
 from rlftsim.scenario.shards import hash_file
 from rlftsim.scenario.womd import find_tfrecords, read_scenarios
@@ -193,10 +194,17 @@ def test_a_smaller_drive_never_replaces_a_larger_result(tmp_path):
     config = DriveConfig("constant_velocity", traffic=("replay", "constant_velocity"), limit=2)
     (larger,) = drive(replace(config, traffic=("replay",), limit=3), tmp_path)
     before = (tmp_path / "constant_velocity-replay.parquet").read_bytes()
-    chosen = replace(config, limit=None, scenarios=(larger.table["scenario_id"][0].as_py(),))
-    for fewer, choice in ((config, "limit=2"), (replace(config, seed=1), "limit=2"), (chosen, "this choice")):
-        with pytest.raises(ConfigError, match=f"replay.parquet holds 3 scenarios and {choice} would replace them by"):
-            drive(fewer, tmp_path)
+    ids = open_dataset("synthetic", "validation").scenario_ids
+    chosen, others = (replace(config, limit=None, scenarios=tuple(some)) for some in (ids[:1], ids[2:5]))
+    cases = (
+        (config, "limit=2", 1), (replace(config, seed=1), "limit=2", 1), (chosen, "this choice", 2),
+        (others, "this choice", 2),  # as many, but not the same
+    )  # fmt: skip
+    assert larger.table["scenario_id"].to_pylist() == ids[:3]
+    for other, choice, count in cases:
+        message = f"replay.parquet holds 3 scenarios, and {choice} would replace them without {count} of these"
+        with pytest.raises(ConfigError, match=message):
+            drive(other, tmp_path)
     assert (tmp_path / "constant_velocity-replay.parquet").read_bytes() == before
     assert [path.name for path in tmp_path.iterdir()] == ["constant_velocity-replay.parquet"]  # nothing was driven
 
@@ -243,13 +251,44 @@ def test_an_interrupted_drive_goes_on_and_a_changed_planner_starts_anew(tmp_path
     assert {path.name for path in (tmp_path / "out").iterdir()} == {
         "fails.Fails-replay.parquet", "fails.Fails-constant_velocity.parquet"
     }  # fmt: skip
-    # 3. another planner under the same name, and a damaged file
+    # 3. another planner under the same name, once it is the one that drives, and a damaged file
     (tmp_path / "fails.py").write_text(FAILING_PLANNER + "# changed\n")
+    assert driven_by(config) == []
+    del sys.modules["fails"]
     assert driven_by(config) == [*ids, *ids]
     assert "is of another planner_code: it will be replaced" in caplog.text
     damaged = tmp_path / "out" / "fails.Fails-replay.parquet"
     damaged.write_bytes(damaged.read_bytes()[:100])
     assert driven_by(config) == list(ids)
+
+
+def test_a_quick_look_keeps_what_a_longer_drive_has_done(tmp_path, monkeypatch):
+    (tmp_path / "fails.py").write_text(FAILING_PLANNER)
+    monkeypatch.syspath_prepend(tmp_path)
+    sys.modules.pop("fails", None)
+    config = DriveConfig("fails:Fails", traffic=("replay",), limit=4)
+    (tmp_path / "fail").touch()
+    with pytest.raises(RuntimeError, match="no more"):
+        drive(config, tmp_path / "out")
+    (tmp_path / "fail").unlink()
+    (tmp_path / "driven").unlink()
+    drive(replace(config, limit=1), tmp_path / "out")
+    drive(config, tmp_path / "out")
+    # three were done before: the quick look took the first of them, the rest is driven by the last call
+    ids = open_dataset("synthetic", "validation").scenario_ids
+    assert (tmp_path / "driven").read_text().split() == [ids[0], ids[3]]
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["fails.Fails-replay.parquet"]
+
+
+def test_a_data_set_may_move_between_drives(tmp_path, monkeypatch, caplog):
+    write_dataset([straight_road("one"), straight_road("two")], tmp_path / "data", split="validation")
+    config = DriveConfig("constant_velocity", data=str(tmp_path / "data"), traffic=("replay",))
+    first = drive(config, tmp_path / "out")
+    (tmp_path / "data").rename(tmp_path / "moved")
+    caplog.clear()
+    moved = drive(replace(config, data=str(tmp_path / "moved")), tmp_path / "out")
+    assert "is finished and is read" in caplog.text
+    assert all(one.difference == 0 for one in compare_drives(first[0], moved[0]) if one.count)
 
 
 QUITTING_PLANNER = """
@@ -320,7 +359,8 @@ def test_results_survive_their_file_and_pair_by_scenario(tmp_path):
     assert all(row.count == 0 or row.difference == 0 for row in compare_drives(result, again))
     (more,) = drive(DriveConfig("constant_velocity", traffic=("replay",), limit=1, num_rollouts=2))
     other_dice, other_data = (
-        replace(result, settings=replace(result.settings, **new)) for new in ({"seed": 1}, {"dataset": "elsewhere"})
+        replace(result, settings=replace(result.settings, **new))
+        for new in ({"seed": 1}, {"manifest_sha256": "0" * 64})
     )
     for other in (more, other_dice, other_data):
         with pytest.raises(DataError, match="drive both alike"):

@@ -182,6 +182,17 @@ def test_an_interrupted_run_goes_on_with_what_is_missing(data, tmp_path, monkeyp
     assert rest == []
 
 
+def test_a_quick_look_keeps_what_a_longer_evaluation_has_done(data, tmp_path, monkeypatch):
+    with pytest.raises(Unfinished):
+        evaluate(Wobble(), data, tmp_path, CONFIG, name="run", runner=Share(1, 2, Inline()))
+    parts = sorted((tmp_path / "run.parts").glob("*.parquet"))
+    assert parts
+    evaluate(Wobble(), data, tmp_path, replace(CONFIG, limit=1), name="run")
+    assert sorted((tmp_path / "run.parts").glob("*.parquet")) == parts
+    evaluate(Wobble(), data, tmp_path, CONFIG, name="run")
+    assert not (tmp_path / "run.parts").exists()
+
+
 def test_unfinished_parts_of_other_settings_outlive_a_repeated_command(data, tmp_path):
     evaluate(Wobble(), data, tmp_path, CONFIG, name="run")
     with pytest.raises(Unfinished):
@@ -222,7 +233,7 @@ def test_a_limit_never_replaces_a_larger_result(data, tmp_path):
     whole = evaluate(Wobble(), data, tmp_path, CONFIG, name="w")
     few = replace(CONFIG, limit=2)
     for policy in (Wobble(), Wobble(strength_mps=2.0)):  # of the same work, and of another
-        with pytest.raises(ConfigError, match=r"w\.parquet holds 7 scenarios and limit=2 .*--name"):
+        with pytest.raises(ConfigError, match=r"w\.parquet holds 7 scenarios, and limit=2 .*--name"):
             evaluate(policy, data, tmp_path, few, name="w")
     assert same(Evaluation.read(tmp_path / "w.parquet"), whole)
     assert len(evaluate(Wobble(), data, tmp_path, replace(CONFIG, limit=7), name="w")) == 6

@@ -3,7 +3,6 @@
 Interrupted in any way, the same call goes on where it was, see `evaluation.resumable`.
 """
 
-import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
@@ -24,7 +23,7 @@ from rlftsim.envs.source import Source
 from rlftsim.envs.traffic_scores import TrafficScores, blamed_others_rate, realism_of_others
 from rlftsim.errors import ConfigError, DataError, whole_number
 from rlftsim.evaluation.drive_results import DriveResult, DriveSettings
-from rlftsim.evaluation.resumable import JsonParts, map_scenarios, read_if_readable, refuse_fewer
+from rlftsim.evaluation.resumable import JsonParts, finish_result, map_scenarios, read_if_readable, refuse_to_leave_out
 from rlftsim.evaluation.scenario_source import hash_manifest
 from rlftsim.lease import Lease
 from rlftsim.progress import log
@@ -90,7 +89,7 @@ def drive(config: DriveConfig, out: Path | None = None) -> list[DriveResult]:
         out: folder for the files; None keeps none.
 
     Raises:
-        ConfigError: an unknown planner, kind of traffic or scenario, or a result of more scenarios that a limit or a
+        ConfigError: an unknown planner, kind of traffic or scenario, or a result of other scenarios that a limit or a
             choice would replace.
         DataError: no such data, a scenario that the planner cannot drive, or a folder that cannot be written to.
     """
@@ -114,7 +113,7 @@ def drive(config: DriveConfig, out: Path | None = None) -> list[DriveResult]:
         name = config.planner.replace(":", ".")
         paths = [(out or Path(nowhere)) / f"{name}-{traffic}.parquet" for traffic in config.traffic]
         finished = [_read_finished(config, kind, ids, path) for kind, path in zip(kinds, paths)]
-        return [result or _drive_traffic(config, kind, ids, path) for kind, path, result in zip(kinds, paths, finished)]
+        return [_drive_traffic(config, kind, ids, *place) for kind, *place in zip(kinds, paths, finished)]
 
 
 def run_planner(env: EgoEnv, planner: Planner, scenario: Scenario, *, seed: int, rollout: int = 0) -> Result:
@@ -154,17 +153,19 @@ def _read_finished(config: DriveConfig, settings: DriveSettings, ids: Sequence[s
         path: of its file.
 
     Raises:
-        ConfigError: a result of more scenarios is there, which a limit or a choice would replace.
+        ConfigError: a result of other scenarios is there, which a limit or a choice would replace.
     """
     found = read_if_readable(path, DriveResult.read)
     if found is None:
         return None
     choice = f"limit={config.limit}" if config.limit is not None else "this choice" if config.scenarios else ""
+    found_ids = found.table["scenario_id"].to_pylist()
     if choice:
-        refuse_fewer(path, len(found.table), len(ids), choice, "name another --out, or drive all scenarios.")
-    stored, wanted = asdict(found.settings), asdict(settings)
+        left_out = len({*found_ids} - {*ids})
+        refuse_to_leave_out(path, len(found_ids), left_out, choice, "name another --out, or drive all scenarios.")
+    stored, wanted = found.settings.what_counts(), settings.what_counts()
     differing = [name for name in wanted if stored[name] != wanted[name]]
-    if found.table["scenario_id"].to_pylist() != list(ids):
+    if found_ids != list(ids):
         differing.append("choice of scenarios")
     if differing:
         log.info(f"{path} is of another {', '.join(differing)}: it will be replaced.")
@@ -174,28 +175,30 @@ def _read_finished(config: DriveConfig, settings: DriveSettings, ids: Sequence[s
     return found
 
 
-def _drive_traffic(config: DriveConfig, settings: DriveSettings, ids: Sequence[str], path: Path) -> DriveResult:
-    """Drive what is missing in one kind of traffic and write the result.
+def _drive_traffic(
+    config: DriveConfig, settings: DriveSettings, ids: Sequence[str], path: Path, found: DriveResult | None
+) -> DriveResult:
+    """Drive what is missing in one kind of traffic and write the result, unless it is finished.
 
     Args:
         config: of the call.
         settings: of the result.
         ids: its scenarios.
         path: of its file; finished scenarios lie beside it until all are there.
+        found: the finished result; None = there is none.
     """
-    identity = {scenario_id: {"settings": asdict(settings)} for scenario_id in ids}
-    files = JsonParts(path.with_suffix(".parts"), ids, identity, {}, _row_and_missing)
+    identity = {"settings": settings.what_counts()}
+    files = JsonParts(path.with_suffix(".parts"), ids, dict.fromkeys(ids, identity), {}, _row_and_missing)
     runner = on_this_machine(config.jobs, len(ids))
-    # the first file that is written: on a full disk nothing is driven
-    with Lease(files.folder / ".lock", runner, "drives in"):
-        found = map_scenarios(
+
+    def make(lease: Lease) -> DriveResult:
+        parts = map_scenarios(
             partial(_drive_scenario, config, settings.traffic, ids), len(ids), files,
-            runner=runner, title=f"{config.planner} in {settings.traffic}",
+            runner=runner, title=f"{config.planner} in {settings.traffic}", lease=lease,
         )  # fmt: skip
-        result = DriveResult.of(settings, [row for row, _ in found], {row["scenario_id"]: why for row, why in found})
-        result.write(path)
-        shutil.rmtree(files.folder, ignore_errors=True)
-    return result
+        return DriveResult.of(settings, [row for row, _ in parts], {row["scenario_id"]: why for row, why in parts})
+
+    return finish_result(found, make, path, files, ids, runner)
 
 
 def _row_and_missing(scenario_id: str, values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:

@@ -44,6 +44,13 @@ class DriveSettings:
     manifest_sha256: str = ""
     """Of the data set."""
 
+    def what_counts(self) -> dict[str, object]:
+        """The values that results of the same episodes share. The data set may move: its manifest identifies it."""
+        values = asdict(self)
+        if self.manifest_sha256:
+            del values["dataset"]
+        return values
+
 
 @dataclass(frozen=True, eq=False)
 class DriveResult:
@@ -146,10 +153,14 @@ def compare_drives(a: DriveResult, b: DriveResult, *, alpha: float = 0.05) -> tu
     Raises:
         DataError: other numbers of rollouts, seeds or data, or no scenario in common.
     """
-    for setting in ("num_rollouts", "seed", "dataset", "split"):
-        own, other = getattr(a.settings, setting), getattr(b.settings, setting)
-        if own != other:
-            raise DataError(f"{a.name} was driven with {setting} {own}, {b.name} with {other}: drive both alike.")
+    # a data set may have moved, or be another one at the same place; older results know its place alone
+    know_content = a.settings.manifest_sha256 and b.settings.manifest_sha256
+    data = ("dataset", "manifest_sha256") if know_content else ("dataset", "dataset")
+    for shown, setting in (("num_rollouts",) * 2, ("seed",) * 2, ("split",) * 2, data):
+        if getattr(a.settings, setting) != getattr(b.settings, setting):
+            own, other = getattr(a.settings, shown), getattr(b.settings, shown)
+            other = f"another {other}" if own == other else other
+            raise DataError(f"{a.name} was driven with {shown} {own}, {b.name} with {other}: drive both alike.")
     place = {name: row for row, name in enumerate(b.table["scenario_id"].to_pylist())}
     rows_a = [row for row, name in enumerate(a.table["scenario_id"].to_pylist()) if name in place]
     rows_b = [place[a.table["scenario_id"][row].as_py()] for row in rows_a]

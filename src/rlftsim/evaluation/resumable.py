@@ -5,19 +5,18 @@ planners. They differ in the work on one scenario and in their files: `Evaluatio
 """
 
 import json
-import shutil
 import tempfile
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import pyarrow as pa
 
-from rlftsim.atomic_io import remove_temporaries, write_text
+from rlftsim.atomic_io import remove_temporaries, remove_temporaries_below, write_text
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.results import SCHEMA, Evaluation, Provenance, Skipped, join_evaluations
 from rlftsim.lease import Lease
@@ -34,8 +33,9 @@ Stored = TypeVar("Stored")
 
 
 class PartFiles(ABC, Generic[Result, Part]):
-    """Files of finished groups. They are handed to other processes, so they can be pickled."""
+    """Files of finished groups in a folder. They are handed to other processes, so they can be pickled."""
 
+    folder: Path
     group_size: ClassVar[int]
     """Scenarios in a file: for each process, what an interruption loses at most."""
 
@@ -51,6 +51,10 @@ class PartFiles(ABC, Generic[Result, Part]):
     @abstractmethod
     def read(self, group: range) -> Part | None:
         """A group that an earlier call finished; None if it is missing, damaged or of other work."""
+
+    @abstractmethod
+    def remove(self, scenario_ids: Collection[str]) -> None:
+        """Remove the files of this work that hold nothing but some scenarios: those of a finished result."""
 
 
 def map_scenarios(
@@ -146,19 +150,28 @@ class JsonParts(PartFiles[Mapping[str, object], Part]):
         """Write the file of a scenario, see `PartFiles`."""
         scenario_id = self.scenario_ids[group.start]
         values = {**self.identity[scenario_id], **results[0], **self.information}
-        write_text(self.folder / f"{scenario_id}.json", json.dumps(values) + "\n")
+        write_text(self._path(scenario_id), json.dumps(values) + "\n")
 
     def read(self, group: range) -> Part | None:
         """The parsed values of a scenario, see `PartFiles`."""
         scenario_id = self.scenario_ids[group.start]
         try:
-            values = json.loads((self.folder / f"{scenario_id}.json").read_text())
+            values = json.loads(self._path(scenario_id).read_text())
             # A name that is missing agrees: 0.1 wrote fewer, and kept one setting per folder.
             if any(values.get(name, own) != own for name, own in self.identity[scenario_id].items()):
                 return None
             return self.parse(scenario_id, values)
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
             return None
+
+    def remove(self, scenario_ids: Collection[str]) -> None:
+        """Remove the files of scenarios, see `PartFiles`."""
+        for position, scenario_id in enumerate(self.scenario_ids):
+            if scenario_id in scenario_ids and self.read(range(position, position + 1)) is not None:
+                self._path(scenario_id).unlink(missing_ok=True)
+
+    def _path(self, scenario_id: str) -> Path:
+        return self.folder / f"{scenario_id}.json"
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,13 +198,13 @@ class EvaluationParts(PartFiles[Mapping[str, object] | Skipped, Evaluation]):
         return self.out / f"{self.name}.parquet"
 
     @property
-    def parts_folder(self) -> Path:
+    def folder(self) -> Path:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Finished groups of an unfinished evaluation."""
         return self.out / f"{self.name}.parts"
 
     def part_path(self, group: range) -> Path:
         """File of one finished group."""
-        return self.parts_folder / f"{group.start:06d}-{group.stop:06d}.parquet"
+        return self.folder / f"{group.start:06d}-{group.stop:06d}.parquet"
 
     def write(self, group: range, results: Sequence[Mapping[str, object] | Skipped]) -> None:
         """Write rows of `SCHEMA` and scenarios without scores, see `PartFiles`."""
@@ -219,23 +232,30 @@ class EvaluationParts(PartFiles[Mapping[str, object] | Skipped, Evaluation]):
         if limit is not None:
             num_found = len(found) + len(found.skipped)
             way_out = "name this one apart with --name, or leave the limit out."
-            refuse_fewer(self.result_path, num_found, len(scenario_ids), f"limit={limit}", way_out)
+            num_left_out = num_found - len(scenario_ids)
+            refuse_to_leave_out(self.result_path, num_found, num_left_out, f"limit={limit}", way_out)
         if not self._is_ours(found, self.result_path, "it will be replaced"):
             return None
         # as a set: a scenario may have several sets of rollouts
-        found_ids = {*found.scenario_ids, *(skipped.scenario_id for skipped in found.skipped)}
-        return found if found_ids == set(scenario_ids) else None
+        return found if _ids_of(found) == set(scenario_ids) else None
 
-    def has_only_ours(self) -> bool:
-        """True if no part of an evaluation with other settings is there."""
-        found = (read_if_readable(path, Evaluation.read) for path in self.parts_folder.glob("*.parquet"))
-        return not any(part is not None and part.provenance.differences(self.provenance) for part in found)
+    def remove(self, scenario_ids: Collection[str]) -> None:
+        """Remove the files of groups whose scenarios are all among those given, see `PartFiles`."""
+        for path in self.folder.glob("*.parquet"):
+            part = read_if_readable(path, Evaluation.read)
+            if part is None or (not part.provenance.differences(self.provenance) and _ids_of(part) <= {*scenario_ids}):
+                path.unlink(missing_ok=True)
 
     def _is_ours(self, found: Evaluation, path: Path, fate: str) -> bool:
         other = found.provenance.differences(self.provenance)
         if other:
             log.info(f"{path} is of another {', '.join(other)}: {fate}.")
         return not other
+
+
+def _ids_of(evaluation: Evaluation) -> set[str]:
+    """Ids of all scenarios of an evaluation, those without scores included."""
+    return {*evaluation.scenario_ids, *(skipped.scenario_id for skipped in evaluation.skipped)}
 
 
 def resume_evaluation(
@@ -272,39 +292,88 @@ def resume_evaluation(
     # Processes hand their rows over in files, so even a result that is not kept needs a folder.
     with tempfile.TemporaryDirectory() as nowhere:
         files = EvaluationParts(name, provenance, out or Path(nowhere))
-        finished = files.read_finished(scenario_ids)
-        if finished is None:
-            with Lease(files.parts_folder / ".lock", runner, "works in") as lease:
-                parts = map_scenarios(
-                    work, len(scenario_ids), files,
-                    runner=runner, title=title, lease=lease, show_progress=show_progress,
-                )  # fmt: skip
-                finished = join_evaluations(name, provenance, parts)
-                remove_temporaries(files.result_path)
-                finished.write(files.result_path)
-                # Only now: an interruption between the two leaves the parts, and the next call finds the result.
-                shutil.rmtree(files.parts_folder, ignore_errors=True)
-        elif files.parts_folder.exists() and files.has_only_ours():
-            with suppress(DataError), Lease(files.parts_folder / ".lock", Inline(), "works in"):
-                shutil.rmtree(files.parts_folder, ignore_errors=True)
-    return finished
+
+        def make(lease: Lease) -> Evaluation:
+            parts = map_scenarios(
+                work, len(scenario_ids), files, runner=runner, title=title, lease=lease, show_progress=show_progress
+            )
+            return join_evaluations(name, provenance, parts)
+
+        return finish_result(files.read_finished(scenario_ids), make, files.result_path, files, scenario_ids, runner)
 
 
-def refuse_fewer(path: Path, num_stored: int, num_wanted: int, choice: str, way_out: str) -> None:
-    """Refuse to replace a result by one of fewer scenarios that were chosen for a quick look.
+class Writable(Protocol):
+    """A result that is kept in one file."""
+
+    def write(self, path: Path) -> None:
+        """Write it whole or not at all."""
+        ...
+
+
+Kept = TypeVar("Kept", bound=Writable)
+
+
+def finish_result(
+    found: Kept | None,
+    make: Callable[[Lease], Kept],
+    path: Path,
+    parts: PartFiles[Any, Any],
+    scenario_ids: Sequence[str],
+    runner: Runner,
+) -> Kept:
+    """The result that an earlier call finished, or the one that is made now and written; its parts are removed.
+
+    Args:
+        found: the finished one; None = there is none.
+        make: makes it of its parts.
+        path: of its file.
+        parts: finished groups of it. Those of other work, or of other scenarios of this work, stay.
+        scenario_ids: of the result.
+        runner: does the work.
+
+    Raises:
+        DataError: another driver is at work on it.
+    """
+    if found is None:
+        with Lease(parts.folder / ".lock", runner, "works in") as lease:
+            found = make(lease)
+            remove_temporaries(path)
+            found.write(path)
+            # Only now: an interruption between the two leaves the parts, and the next call finds the result.
+            _remove_parts(parts, scenario_ids, lease)
+    elif parts.folder.exists():
+        with suppress(DataError), Lease(parts.folder / ".lock", Inline(), "works in") as lease:
+            _remove_parts(parts, scenario_ids, lease)
+    return found
+
+
+def _remove_parts(parts: PartFiles[Any, Any], scenario_ids: Sequence[str], lease: Lease) -> None:
+    """Remove the parts of a finished result, and their folder unless it holds others."""
+    parts.remove({*scenario_ids})
+    remove_temporaries_below(parts.folder)
+    lease.remove()
+    with suppress(OSError):
+        parts.folder.rmdir()
+
+
+def refuse_to_leave_out(path: Path, num_stored: int, num_left_out: int, choice: str, way_out: str) -> None:
+    """Refuse to replace a result by one without some of its scenarios, of a quick look.
 
     Args:
         path: of the stored result.
         num_stored: scenarios in it.
-        num_wanted: scenarios of the new result.
-        choice: setting that left the others out.
+        num_left_out: those of them that the new result would not have.
+        choice: setting that leaves them out.
         way_out: end of the message.
 
     Raises:
-        ConfigError: the stored result has more.
+        ConfigError: there are such scenarios.
     """
-    if num_stored > num_wanted:
-        raise ConfigError(f"{path} holds {num_stored} scenarios and {choice} would replace them by fewer: {way_out}")
+    if num_left_out > 0:
+        raise ConfigError(
+            f"{path} holds {num_stored} scenarios, and {choice} would replace them without {num_left_out} of these: "
+            f"{way_out}"
+        )
 
 
 def read_if_readable(path: Path, read: Callable[[Path], Stored]) -> Stored | None:

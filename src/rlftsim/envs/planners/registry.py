@@ -8,6 +8,7 @@ import importlib
 import inspect
 import secrets
 from collections.abc import Callable
+from functools import cache
 from typing import Any, Protocol, runtime_checkable
 
 from rlftsim.envs.actions import LEAST_HORIZON, ActionKind
@@ -110,8 +111,15 @@ def load_planner(name: str) -> Planner:
 def hash_code(planner: Planner) -> str:
     """SHA-256 of the file that defines a planner; of one without a file, as in a notebook, another value each time."""
     made = planner.function if isinstance(planner, CallablePlanner) else planner
+    return _hash_definition(made if inspect.isroutine(made) else type(made))
+
+
+@cache
+def _hash_definition(code: Any) -> str:
+    """Hash of the file that defines a class or a function, as it is when this process first sees it: one that is
+    edited afterwards is another file than the one that drives."""
     try:
-        return hash_file(inspect.getfile(made if inspect.isroutine(made) else type(made)))
+        return hash_file(inspect.getfile(code))
     except (TypeError, OSError):
         # it may be other code than the last time
         return secrets.token_hex(32)
