@@ -113,7 +113,7 @@ def drive(config: DriveConfig, out: Path | None = None) -> list[DriveResult]:
         name = config.planner.replace(":", ".")
         paths = [(out or Path(nowhere)) / f"{name}-{traffic}.parquet" for traffic in config.traffic]
         finished = [_read_finished(config, kind, ids, path) for kind, path in zip(kinds, paths)]
-        return [_drive_traffic(config, kind, ids, *place) for kind, *place in zip(kinds, paths, finished)]
+        return [_drive_traffic(config, kind, ids, path, found) for kind, path, found in zip(kinds, paths, finished)]
 
 
 def run_planner(env: EgoEnv, planner: Planner, scenario: Scenario, *, seed: int, rollout: int = 0) -> Result:
