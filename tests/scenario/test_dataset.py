@@ -2,6 +2,7 @@ import errno
 import json
 import pickle
 import tarfile
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,7 +10,9 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
+import scenes
 from rlftsim.errors import DataError
+from rlftsim.rollout.edge_scenes import move_scenario
 from rlftsim.scenario import shards
 from rlftsim.scenario.dataset import DatasetWriter, ScenarioDataset, read_manifest, write_dataset
 from rlftsim.scenario.inspect import dataset_stats, verify_dataset
@@ -204,6 +207,14 @@ def test_a_size_of_zero_is_fine_where_a_track_is_not_valid_now(tmp_path, scenari
     scenarios[1].tracks.valid[0, 10] = False
     scenarios[1].tracks.size[1, 11:] = 0
     assert write_dataset(scenarios, tmp_path / "data").num_scenarios == 5
+
+
+@pytest.mark.parametrize(("far_m", "is_refused"), [(1e5, False), (2e5, True), (1e7, True)])
+def test_positions_where_float32_is_coarse_are_refused(tmp_path, far_m, is_refused):
+    moved = move_scenario(scenes.lone_agent(), 0.0, (far_m, 0.0))
+    refused = pytest.raises(DataError, match=r"float32 resolves [\d.]+ m: subtract an origin")
+    with refused if is_refused else nullcontext():
+        write_dataset([moved], tmp_path / "data")
 
 
 def test_a_wrong_dtype_is_refused_before_it_is_written(tmp_path, scenarios):

@@ -235,8 +235,9 @@ def refuse_unsound(scenario: Scenario) -> None:
     """Check that a scenario is what `types.py` declares, so that it can be stored, simulated and scored.
 
     Raises:
-        DataError: its id is no file name, an array has another dtype, a valid state or map point is not finite, or what
-            `Scenario.refuse_broken` finds; names the scenario and the value.
+        DataError: its id is no file name, an array has another dtype, a valid state or map point is not finite, a
+            position is too far out for float32, or what `Scenario.refuse_broken` finds; names the scenario and the
+            value.
     """
     scenario.refuse_bad_id()
     try:
@@ -245,6 +246,7 @@ def refuse_unsound(scenario: Scenario) -> None:
                 raise DataError(f"{name} is {array.dtype}, it must be {_ARRAY_DTYPES[name]}")
         scenario.refuse_broken()
         scenario.refuse_not_finite()
+        scenario.refuse_coarse()
     except DataError as error:
         raise DataError(f"scenario {scenario.scenario_id}: {error}") from None
 

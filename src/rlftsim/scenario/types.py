@@ -22,6 +22,8 @@ from jaxtyping import Bool, Float, Float32, Float64, Int8, Int32, Int64
 
 from rlftsim.errors import DataError
 
+COARSEST_M = 0.01
+"""Coordinates are refused where float32 has larger gaps."""
 STEP_S = 0.1
 HISTORY_STEPS = 11
 CURRENT_STEP = 10
@@ -293,6 +295,25 @@ class Scenario:
             raise DataError(
                 f"map feature {lines.feature_id[owner]} has a NaN or infinite point (its point {place}): "
                 "correct it or leave the feature out"
+            )
+
+    def refuse_coarse(self) -> None:
+        """Check that float32 resolves every valid position to a centimeter, as it does up to 131 km from the origin.
+
+        Raises:
+            DataError: one lies farther out, as in UTM coordinates. Names track, step, place and what float32 resolves.
+        """
+        tracks = self.tracks
+        with np.errstate(invalid="ignore"):  # states that are not valid may hold infinities
+            spacing = np.spacing(np.abs(tracks.position[..., :2])).max(-1)  # [O, S] distance to the next float32
+        bad = np.argwhere(tracks.valid & (spacing > COARSEST_M))
+        if len(bad):
+            track, step = bad[0]
+            x, y = tracks.position[track, step, :2].tolist()
+            raise DataError(
+                f"track {tracks.object_id[track]} is at ({x:.0f}, {y:.0f}) m at step {step}, where float32 resolves "
+                f"{spacing[track, step]:g} m: subtract an origin near it, in whole meters, from x and y of tracks, map "
+                "and lights"
             )
 
     @property
