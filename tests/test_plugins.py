@@ -220,7 +220,7 @@ def test_what_its_users_refuse_is_listed_as_failing(tmp_path, capsys):
         ),
         "rlftsim.exporters": (
             "five",
-            r"exporter 'bad' is of type int: make it a function of scenario, rollouts and folder",
+            r"exporter 'bad' cannot be called \(.*\): make it a function of scenario, rollouts and folder",
         ),
     }
     assert things.keys() == POINTS.keys()

@@ -167,6 +167,8 @@ class ExtensionPoint(Generic[Value]):
                 f"{self.kind} {entry.name!r}{package} ({entry.value}) cannot be imported "
                 f"({type(error).__name__}: {error}, {place_of(error)}): repair or uninstall the package."
             )
+        if value is None:
+            return f"{self.kind} {entry.name!r} ({entry.value}) is None: name an object or a module."
         if not isinstance(value, ModuleType):  # a module has registered its things itself
             try:
                 self.add(entry.name, value)

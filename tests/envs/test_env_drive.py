@@ -1,5 +1,6 @@
 """Planners that ship, planners of others, `rlftsim drive` and `rlftsim compare` on its files."""
 
+import importlib
 import json
 import sys
 from dataclasses import asdict, replace
@@ -12,6 +13,7 @@ import pytest
 from full_disk import limit_files_to
 from rlftsim.cli import main
 from rlftsim.envs import EgoEnv
+from rlftsim.envs import drive as drive_module
 from rlftsim.envs.drive import DriveConfig, drive, run_planner
 from rlftsim.envs.episode import OUTSIDE_M
 from rlftsim.envs.idm import IdmConfig, idm_acceleration
@@ -143,9 +145,7 @@ def test_planners_of_others_are_found(tmp_path, monkeypatch):
     assert driven("my_planners:Still", straight_road()).planner.route_completion == pytest.approx(0.0, abs=1e-6)
     assert action_of(load_planner("my_planners:straight")) == "bicycle"
     code = hash_file(tmp_path / "my_planners.py")
-    assert {hash_code(load_planner(f"my_planners:{name}")) for name in ("Still", "straight", "instance", "Calls")} == {
-        code
-    }
+    assert {hash_code(f"my_planners:{name}") for name in ("Still", "straight", "instance", "Calls")} == {code}
     PLANNERS.add("mine", sys.modules["my_planners"].Still)
     assert action_of(load_planner("mine")) == "pose"
     PLANNERS.remove("mine")
@@ -274,10 +274,45 @@ def test_a_quick_look_keeps_what_a_longer_drive_has_done(tmp_path, monkeypatch):
     (tmp_path / "driven").unlink()
     drive(replace(config, limit=1), tmp_path / "out")
     drive(config, tmp_path / "out")
-    # three were done before: the quick look took the first of them, the rest is driven by the last call
+    # three were done before, one of which the quick look shows
     ids = open_dataset("synthetic", "validation").scenario_ids
-    assert (tmp_path / "driven").read_text().split() == [ids[0], ids[3]]
+    assert (tmp_path / "driven").read_text().split() == [ids[3]]
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["fails.Fails-replay.parquet"]
+
+
+def test_a_result_that_another_drive_finished_meanwhile_is_not_replaced_by_fewer(tmp_path, monkeypatch):
+    config = DriveConfig("constant_velocity", traffic=("constant_velocity", "replay"), limit=1)
+    original = drive_module._drive_scenario
+
+    def meanwhile(*arguments):
+        monkeypatch.setattr(drive_module, "_drive_scenario", original)
+        drive(replace(config, traffic=("replay",), limit=2), tmp_path)
+        return original(*arguments)
+
+    monkeypatch.setattr(drive_module, "_drive_scenario", meanwhile)
+    with pytest.raises(ConfigError, match=r"replay\.parquet holds 2 scenarios, and limit=1 would replace them"):
+        drive(config, tmp_path)
+    assert len(DriveResult.read(tmp_path / "constant_velocity-replay.parquet").scenario_ids) == 2
+
+
+def test_a_planner_object_is_known_by_the_module_that_makes_it_too(tmp_path, monkeypatch):
+    (tmp_path / "library.py").write_text(
+        "class Cruise:\n    def __init__(self, a): self.a = a\n    def __call__(self, o): return [self.a, 0.0]\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    seen = set()
+    for number in ("0.0", "-5.0"):
+        (tmp_path / "own.py").write_text(
+            f"import functools\nfrom library import Cruise\nfast = Cruise({number})\n"
+            f"part = functools.partial(lambda a, o: [a, 0.0], {number})\n"
+        )
+        sys.modules.pop("own", None)
+        importlib.invalidate_caches()
+        for name in ("own:fast", "own:part"):
+            assert hash_code(name) == hash_code(name)
+            seen.add(hash_code(name))
+    assert len(seen) == 4
+    del sys.modules["own"], sys.modules["library"]
 
 
 def test_a_data_set_may_move_between_drives(tmp_path, monkeypatch, caplog):

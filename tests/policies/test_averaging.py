@@ -80,6 +80,7 @@ def test_the_command_writes_a_model_folder_with_its_origin(base, tmp_path, capsy
     assert f"scale 1.5 from {tmp_path / 'base'}" in card
     assert "terms of the data: those of a\n" in card
     assert "terms of the data: those of b\n" in card
+    assert "terms of the data: those of base\n" in card
     capsys.readouterr()
     assert main(words) == 2
     assert "is not empty" in capsys.readouterr().err

@@ -108,7 +108,7 @@ class Average:
         scaled = "" if self.base is None else f"* scale {self.scale:g} from {self.base}\n"
         card = f"# Mean of {len(self.models)} models\n\n* {', '.join(self.models)}\n{scaled}"
         card += f"* command: rlftsim {' '.join(sys.argv[1:])}\n* rlftsim {__version__}\n"
-        average.save_pretrained(self.out, card=with_cards_of(card, self.models))
+        average.save_pretrained(self.out, card=with_cards_of(card, [*self.models, *filter(None, [self.base])]))
         print(f"model: {self.out}")
         return 0
 

@@ -101,7 +101,7 @@ def drive(config: DriveConfig, out: Path | None = None) -> list[DriveResult]:
     common = {
         "planner": config.planner, "dataset": config.data, "split": config.split, "num_rollouts": config.num_rollouts,
         "seed": config.seed, "rlftsim_version": rlftsim.__version__,
-        "planner_code": hash_code(load_planner(config.planner)),
+        "planner_code": hash_code(config.planner),
         "manifest_sha256": hash_manifest(dataset_folder(config.data)),
     }  # fmt: skip
     kinds = [
@@ -112,8 +112,9 @@ def drive(config: DriveConfig, out: Path | None = None) -> list[DriveResult]:
     with tempfile.TemporaryDirectory() as nowhere:
         name = config.planner.replace(":", ".")
         paths = [(out or Path(nowhere)) / f"{name}-{traffic}.parquet" for traffic in config.traffic]
-        finished = [_read_finished(config, kind, ids, path) for kind, path in zip(kinds, paths)]
-        return [_drive_traffic(config, kind, ids, path, found) for kind, path, found in zip(kinds, paths, finished)]
+        for path in paths:
+            _read_and_refuse(config, ids, path)
+        return [_drive_traffic(config, kind, ids, path) for kind, path in zip(kinds, paths)]
 
 
 def run_planner(env: EgoEnv, planner: Planner, scenario: Scenario, *, seed: int, rollout: int = 0) -> Result:
@@ -155,17 +156,12 @@ def _read_finished(config: DriveConfig, settings: DriveSettings, ids: Sequence[s
     Raises:
         ConfigError: a result of other scenarios is there, which a limit or a choice would replace.
     """
-    found = read_if_readable(path, DriveResult.read)
+    found = _read_and_refuse(config, ids, path)
     if found is None:
         return None
-    choice = f"limit={config.limit}" if config.limit is not None else "this choice" if config.scenarios else ""
-    found_ids = found.table["scenario_id"].to_pylist()
-    if choice:
-        left_out = len({*found_ids} - {*ids})
-        refuse_to_leave_out(path, len(found_ids), left_out, choice, "name another --out, or drive all scenarios.")
     stored, wanted = found.settings.what_counts(), settings.what_counts()
     differing = [name for name in wanted if stored[name] != wanted[name]]
-    if found_ids != list(ids):
+    if found.scenario_ids != list(ids):
         differing.append("choice of scenarios")
     if differing:
         log.info(f"{path} is of another {', '.join(differing)}: it will be replaced.")
@@ -175,9 +171,18 @@ def _read_finished(config: DriveConfig, settings: DriveSettings, ids: Sequence[s
     return found
 
 
-def _drive_traffic(
-    config: DriveConfig, settings: DriveSettings, ids: Sequence[str], path: Path, found: DriveResult | None
-) -> DriveResult:
+def _read_and_refuse(config: DriveConfig, ids: Sequence[str], path: Path) -> DriveResult | None:
+    """The stored result of any settings, unless a limit or a choice would leave out some of its scenarios."""
+    found = read_if_readable(path, DriveResult.read)
+    choice = f"limit={config.limit}" if config.limit is not None else "this choice" if config.scenarios else ""
+    if found is not None and choice:
+        left_out = len({*found.scenario_ids} - {*ids})
+        way_out = "name another --out, or drive all scenarios."
+        refuse_to_leave_out(path, len(found.scenario_ids), left_out, choice, way_out)
+    return found
+
+
+def _drive_traffic(config: DriveConfig, settings: DriveSettings, ids: Sequence[str], path: Path) -> DriveResult:
     """Drive what is missing in one kind of traffic and write the result, unless it is finished.
 
     Args:
@@ -185,7 +190,6 @@ def _drive_traffic(
         settings: of the result.
         ids: its scenarios.
         path: of its file; finished scenarios lie beside it until all are there.
-        found: the finished result; None = there is none.
     """
     identity = {"settings": settings.what_counts()}
     files = JsonParts(path.with_suffix(".parts"), ids, dict.fromkeys(ids, identity), {}, _row_and_missing)
@@ -198,7 +202,7 @@ def _drive_traffic(
         )  # fmt: skip
         return DriveResult.of(settings, [row for row, _ in parts], {row["scenario_id"]: why for row, why in parts})
 
-    return finish_result(found, make, path, files, ids, runner)
+    return finish_result(partial(_read_finished, config, settings, ids, path), make, path, files, ids, runner)
 
 
 def _row_and_missing(scenario_id: str, values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:

@@ -26,6 +26,10 @@ SHOWN = (
 """Columns of the table and of comparisons on the command line; the file has more."""
 
 
+TEXTS = ("scenario_id", "traffic")
+"""Columns that are no scores."""
+
+
 @dataclass(frozen=True)
 class DriveSettings:
     """Planner, traffic, data and dice of a result's episodes."""
@@ -80,6 +84,11 @@ class DriveResult:
         """Planner and traffic."""
         return f"{self.settings.planner} in {self.settings.traffic}"
 
+    @property
+    def scenario_ids(self) -> list[str]:
+        """Ids of its scenarios."""
+        return self.table["scenario_id"].to_pylist()
+
     def values(self, column: str) -> np.ndarray:
         """A column as float64 [scenarios]."""
         return self.table[column].to_numpy()
@@ -103,6 +112,8 @@ class DriveResult:
                 table = file.read()
             table.validate(full=True)
             about = json.loads((table.schema.metadata or {}).get(b"rlftsim", b"{}"))
+            if about["format"] != FORMAT:
+                raise ValueError(f"its format is {about['format']}, not {FORMAT}")
             settings = DriveSettings(**about["settings"])
             require_types(settings)
             missing = {name: dict(reasons.items()) for name, reasons in about["missing"].items()}
@@ -122,15 +133,20 @@ def _require_columns(table: pa.Table) -> None:
 
     Raises:
         KeyError: a column is missing.
-        TypeError: one has other values.
+        TypeError: one has other values, or is there twice.
+        ValueError: a scenario is there twice.
     """
-    texts = ("scenario_id", "traffic")
-    for name in (*texts, *SHOWN):
+    for name in (*TEXTS, *SHOWN):
         if name not in table.schema.names:
             raise KeyError(f"column {name}")
     for name, column in zip(table.schema.names, table.columns):
-        if column.type != (pa.string() if name in texts else pa.float64()) or column.null_count:
+        if column.type != (pa.string() if name in TEXTS else pa.float64()) or column.null_count:
             raise TypeError(f"column {name} has empty cells or those of another type")
+        if table.schema.names.count(name) > 1:
+            raise TypeError(f"column {name} is there twice")
+    ids = table["scenario_id"].to_pylist()
+    if len({*ids}) < len(ids):
+        raise ValueError("a scenario is there twice")
 
 
 def is_drive_result(path: str | PathLike[str]) -> bool:
@@ -166,7 +182,7 @@ def compare_drives(a: DriveResult, b: DriveResult, *, alpha: float = 0.05) -> tu
     rows_b = [place[a.table["scenario_id"][row].as_py()] for row in rows_a]
     if not rows_a:
         raise DataError(f"{a.name} and {b.name} have no scenario in common.")
-    columns = [name for name in a.table.schema.names[2:] if name in b.table.schema.names]
+    columns = [name for name in a.table.schema.names if name not in TEXTS and name in b.table.schema.names]
     return tuple(compare_paired(name, a.values(name)[rows_a], b.values(name)[rows_b], alpha=alpha) for name in columns)
 
 

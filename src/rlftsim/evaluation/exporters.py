@@ -4,6 +4,7 @@
 csv = "my_package:write_csv"
 """
 
+import inspect
 from collections.abc import Callable
 from pathlib import Path
 
@@ -34,13 +35,15 @@ def exporter_by_name(name: str) -> Exporter:
     """The exporter of a name, this package's or another's.
 
     Raises:
-        ConfigError: unknown, with the nearest known name, or not a function.
+        ConfigError: unknown, with the nearest known name, or not a function of three arguments.
     """
     found = EXPORTERS.get(name)
-    if not callable(found):
+    try:
+        inspect.signature(found).bind(None, None, None)
+    except (TypeError, ValueError) as error:
         raise ConfigError(
-            f"exporter {name!r} is of type {type(found).__name__}: make it a function of scenario, rollouts and folder."
-        )
+            f"exporter {name!r} cannot be called ({error}): make it a function of scenario, rollouts and folder."
+        ) from None
     return found
 
 

@@ -5,6 +5,7 @@ planners. They differ in the work on one scenario and in their files: `Evaluatio
 """
 
 import json
+import shutil
 import tempfile
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -16,7 +17,7 @@ from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import pyarrow as pa
 
-from rlftsim.atomic_io import remove_temporaries, remove_temporaries_below, write_text
+from rlftsim.atomic_io import remove_temporaries, write_text
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.results import SCHEMA, Evaluation, Provenance, Skipped, join_evaluations
 from rlftsim.lease import Lease
@@ -53,8 +54,8 @@ class PartFiles(ABC, Generic[Result, Part]):
         """A group that an earlier call finished; None if it is missing, damaged or of other work."""
 
     @abstractmethod
-    def remove(self, scenario_ids: Collection[str]) -> None:
-        """Remove the files of this work that hold nothing but some scenarios: those of a finished result."""
+    def has_others(self, scenario_ids: Collection[str]) -> bool:
+        """True if the folder holds finished groups with scenarios beside those given, such as of a longer run."""
 
 
 def map_scenarios(
@@ -164,11 +165,9 @@ class JsonParts(PartFiles[Mapping[str, object], Part]):
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
             return None
 
-    def remove(self, scenario_ids: Collection[str]) -> None:
-        """Remove the files of scenarios, see `PartFiles`."""
-        for position, scenario_id in enumerate(self.scenario_ids):
-            if scenario_id in scenario_ids and self.read(range(position, position + 1)) is not None:
-                self._path(scenario_id).unlink(missing_ok=True)
+    def has_others(self, scenario_ids: Collection[str]) -> bool:
+        """True if there are files of other scenarios, see `PartFiles`."""
+        return any(path.stem not in scenario_ids for path in self.folder.glob("*.json"))
 
     def _path(self, scenario_id: str) -> Path:
         return self.folder / f"{scenario_id}.json"
@@ -232,19 +231,20 @@ class EvaluationParts(PartFiles[Mapping[str, object] | Skipped, Evaluation]):
         if limit is not None:
             num_found = len(found) + len(found.skipped)
             way_out = "name this one apart with --name, or leave the limit out."
-            num_left_out = num_found - len(scenario_ids)
+            num_left_out = len(_ids_of(found) - {*scenario_ids})
             refuse_to_leave_out(self.result_path, num_found, num_left_out, f"limit={limit}", way_out)
         if not self._is_ours(found, self.result_path, "it will be replaced"):
             return None
         # as a set: a scenario may have several sets of rollouts
         return found if _ids_of(found) == set(scenario_ids) else None
 
-    def remove(self, scenario_ids: Collection[str]) -> None:
-        """Remove the files of groups whose scenarios are all among those given, see `PartFiles`."""
-        for path in self.folder.glob("*.parquet"):
-            part = read_if_readable(path, Evaluation.read)
-            if part is None or (not part.provenance.differences(self.provenance) and _ids_of(part) <= {*scenario_ids}):
-                path.unlink(missing_ok=True)
+    def has_others(self, scenario_ids: Collection[str]) -> bool:
+        """True if a group has other scenarios or settings, see `PartFiles`."""
+        parts = (read_if_readable(path, Evaluation.read) for path in self.folder.glob("*.parquet"))
+        return any(
+            part is not None and bool(part.provenance.differences(self.provenance) or _ids_of(part) - {*scenario_ids})
+            for part in parts
+        )
 
     def _is_ours(self, found: Evaluation, path: Path, fate: str) -> bool:
         other = found.provenance.differences(self.provenance)
@@ -299,7 +299,8 @@ def resume_evaluation(
             )
             return join_evaluations(name, provenance, parts)
 
-        return finish_result(files.read_finished(scenario_ids), make, files.result_path, files, scenario_ids, runner)
+        find = partial(files.read_finished, scenario_ids)
+        return finish_result(find, make, files.result_path, files, scenario_ids, runner)
 
 
 class Writable(Protocol):
@@ -314,7 +315,7 @@ Kept = TypeVar("Kept", bound=Writable)
 
 
 def finish_result(
-    found: Kept | None,
+    find: Callable[[], Kept | None],
     make: Callable[[Lease], Kept],
     path: Path,
     parts: PartFiles[Any, Any],
@@ -324,36 +325,43 @@ def finish_result(
     """The result that an earlier call finished, or the one that is made now and written; its parts are removed.
 
     Args:
-        found: the finished one; None = there is none.
+        find: reads the finished one; None = there is none.
         make: makes it of its parts.
         path: of its file.
-        parts: finished groups of it. Those of other work, or of other scenarios of this work, stay.
+        parts: finished groups of it. They stay where a longer run, or a share of one, is unfinished in their folder.
         scenario_ids: of the result.
         runner: does the work.
 
     Raises:
         DataError: another driver is at work on it.
     """
+    before, found = _stamp(path), find()
     if found is None:
+        shares = {*parts.folder.glob(".lock.*-of-*")}
         with Lease(parts.folder / ".lock", runner, "works in") as lease:
-            found = make(lease)
-            remove_temporaries(path)
-            found.write(path)
+            # another driver may have finished since, so what would be replaced is looked at again
+            found = find() if _stamp(path) != before else None
+            if found is None:
+                found = make(lease)
+                remove_temporaries(path)
+                found.write(path)
+            is_share = isinstance(runner, Share | Joining)
             # Only now: an interruption between the two leaves the parts, and the next call finds the result.
-            _remove_parts(parts, scenario_ids, lease)
-    elif parts.folder.exists():
-        with suppress(DataError), Lease(parts.folder / ".lock", Inline(), "works in") as lease:
-            _remove_parts(parts, scenario_ids, lease)
+            if not parts.has_others({*scenario_ids}) and (is_share or not shares):
+                shutil.rmtree(parts.folder, ignore_errors=True)
+    elif parts.folder.exists() and not parts.has_others({*scenario_ids}):
+        with suppress(DataError), Lease(parts.folder / ".lock", Inline(), "works in"):
+            shutil.rmtree(parts.folder, ignore_errors=True)
     return found
 
 
-def _remove_parts(parts: PartFiles[Any, Any], scenario_ids: Sequence[str], lease: Lease) -> None:
-    """Remove the parts of a finished result, and their folder unless it holds others."""
-    parts.remove({*scenario_ids})
-    remove_temporaries_below(parts.folder)
-    lease.remove()
-    with suppress(OSError):
-        parts.folder.rmdir()
+def _stamp(path: Path) -> tuple[int, int] | None:
+    """Time and size of a file, which tell whether it was replaced; None where there is none."""
+    try:
+        about = path.stat()
+    except OSError:
+        return None
+    return about.st_mtime_ns, about.st_size
 
 
 def refuse_to_leave_out(path: Path, num_stored: int, num_left_out: int, choice: str, way_out: str) -> None:

@@ -210,10 +210,11 @@ def read_card(name: str | os.PathLike, *, deeper: int = 2) -> str | None:
         name: of a shipped model, a model folder or a run's folder.
         deeper: levels that its headings go down, to stand in another text.
     """
-    shipped = SHIPPED_MODELS / name
+    # as in `load_policy`: "./demo-base" is a folder
+    ships = isinstance(name, str) and Path(name).name == name and (SHIPPED_MODELS / name / CARD).is_file()
     try:
-        folder = shipped if (shipped / CARD).is_file() else find_model(name)
-        text = (folder / CARD).read_text(encoding="utf-8")
+        folder = SHIPPED_MODELS / name if ships else find_model(name)
+        text = (folder / CARD).read_text(encoding="utf-8", errors="replace")
     except (ConfigError, OSError):
         return None
     return re.sub(r"^#+", lambda found: "#" * min(len(found[0]) + deeper, 6), text.strip(), flags=re.MULTILINE)

@@ -77,7 +77,10 @@ def _load(name: str | os.PathLike, device: Device, *more_names: str) -> Policy:
     # anything with a separator is a path: no entry point of another package is imported for it
     registered = POLICIES.find(name) if isinstance(name, str) and Path(name).name == name else None
     if registered is not None and _needs_no_arguments(registered):
-        policy = registered()
+        try:
+            policy = registered()
+        except SystemExit as stop:  # it would end the command, with exit() even as if all were done
+            raise ConfigError(f"policy {name!r} calls exit({stop.code!r}) when it is made: let it raise.") from stop
     elif Path(name).expanduser().exists():
         # a folder; a file is refused by name
         stored = read_model(name)

@@ -194,7 +194,9 @@ def build_logged_agents(scenario: Scenario, device: torch.device) -> LoggedAgent
         )
     tracks, simulated, evaluated = scenario.tracks, scenario.simulated_indices, scenario.evaluated_indices
     if len(evaluated) == 0:
-        raise DataError(f"Scenario {scenario.scenario_id} has no evaluated agent that is valid at the current step.")
+        raise DataError(
+            f"Scenario {scenario.scenario_id} has no evaluated agent that is valid at the current step: leave it out."
+        )
     # x, y, z and heading in one array, so that one copy goes to the device: [4, A, 91].
     states = np.concatenate([tracks.position, tracks.heading[..., None]], axis=-1)[simulated, :TOTAL_STEPS]
     fields = torch.from_numpy(np.ascontiguousarray(np.moveaxis(states, -1, 0))).to(device)

@@ -38,7 +38,7 @@ Sum = Callable[..., str]
 """Called with options; returns the sum of rewards that a name stands for."""
 
 REWARDS: ExtensionPoint[Callable[..., Any]] = ExtensionPoint(
-    "reward", "rlftsim.rewards", use=lambda name: sum_by_name(name) or reward_by_name(name)
+    "reward", "rlftsim.rewards", use=lambda name: _in_expression(name)
 )
 """Rewards and named sums of them, by name."""
 _SUMS: "WeakSet[Sum]" = WeakSet()
@@ -150,6 +150,12 @@ def sum_by_name(name: str) -> Sum | None:
     """The sum of rewards that a name stands for; None if there is no such sum."""
     found = REWARDS.find(name)
     return found if found is not None and found in _SUMS else None
+
+
+def _in_expression(name: str) -> Sum | Reward:
+    """The reward or sum of a name that a sum of rewards can be written with."""
+    _require_name(name)
+    return sum_by_name(name) or reward_by_name(name)
 
 
 def agent_rewards_by_name(name: str) -> AgentRewards | None:

@@ -351,9 +351,9 @@ class TrainingRun:
             what_next = f"continues behind update {update_of(newest)}" if newest else "starts anew"
             raise KeyboardInterrupt(what_next) from None
         self.folder.close()
+        self.folder.finish()
         if self._fabric.is_global_zero:
             learner.result.eval().save_pretrained(self.folder.model, card=card)
-        self.folder.finish()
         return self.folder.model
 
     def _make_updates(self, learner: Learner, make_update: Callable[[], UpdateReport], title: str) -> None:

@@ -196,8 +196,12 @@ class RunFolder:
         return (self.model / "config.json").exists()
 
     def finish(self) -> None:
-        """Store the settings of a run that was made longer; until then they are those of the model that was here."""
+        """Store the settings of a run that was made longer; until then they are those of the model that was here.
+
+        That model is none any more, so that a kill before the new one is complete leaves none of other settings.
+        """
         if self._writes and self.grows_from:
+            (self.model / "config.json").unlink()
             self._write_settings()
 
     def _write_settings(self) -> None:

@@ -7,6 +7,7 @@ mine = "my_package:MyPlanner"
 import importlib
 import inspect
 import secrets
+import sys
 from collections.abc import Callable
 from functools import cache
 from typing import Any, Protocol, runtime_checkable
@@ -93,6 +94,7 @@ def load_planner(name: str) -> Planner:
         found = PLANNERS.get(name)
     try:
         planner = found() if isinstance(found, type) else found
+        _ = action_of(planner), horizon_of(planner)  # properties, maybe
     except TypeError as error:
         raise ConfigError(f"planner {name!r} cannot be made without arguments ({error}).") from None
     except SystemExit as stop:
@@ -108,21 +110,32 @@ def load_planner(name: str) -> Planner:
     )
 
 
-def hash_code(planner: Planner) -> str:
-    """SHA-256 of the file that defines a planner; of one without a file, as in a notebook, another value each time."""
+def hash_code(name: str) -> str:
+    """SHA-256 of the file that defines a planner, and of the module in its name if that is another one.
+
+    Of a planner without a file, as in a notebook, it is another value each time.
+
+    Args:
+        name: as for `load_planner`.
+    """
+    planner = load_planner(name)
     made = planner.function if isinstance(planner, CallablePlanner) else planner
-    return _hash_definition(made if inspect.isroutine(made) else type(made))
+    places = [made if inspect.isroutine(made) else type(made)]
+    if ":" in name:
+        places.append(sys.modules[name.partition(":")[0]])
+    hashes = dict.fromkeys(found for found in map(_hash_source, places) if found)
+    # without a file it may be other code than the last time
+    return "-".join(hashes) or secrets.token_hex(32)
 
 
 @cache
-def _hash_definition(code: Any) -> str:
-    """Hash of the file that defines a class or a function, as it is when this process first sees it: one that is
-    edited afterwards is another file than the one that drives."""
+def _hash_source(code: Any) -> str | None:
+    """Hash of the file of a module, class or function, as it is when this process first sees it: one that is edited
+    afterwards is not the one that drives. None = there is no file."""
     try:
         return hash_file(inspect.getfile(code))
     except (TypeError, OSError):
-        # it may be other code than the last time
-        return secrets.token_hex(32)
+        return None
 
 
 def action_of(planner: Planner | Callable[..., Any]) -> ActionKind:
