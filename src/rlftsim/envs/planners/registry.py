@@ -120,7 +120,7 @@ def hash_code(name: str) -> str:
     """
     planner = load_planner(name)
     made = planner.function if isinstance(planner, CallablePlanner) else planner
-    places = [made if inspect.isroutine(made) else type(made)]
+    places: list[Any] = [made if inspect.isroutine(made) else type(made)]
     if ":" in name:
         places.append(sys.modules[name.partition(":")[0]])
     hashes = dict.fromkeys(found for found in map(_hash_source, places) if found)
