@@ -504,9 +504,14 @@ def test_settings_without_effect_are_refused(tmp_path, capsys):
     status, _, err = run(capsys, *words, "--finetune.reward", "rloo")
     assert status == 2
     assert "--finetune.reward has no effect here: the settings of pretrain are --model.* and --pretrain.*" in err
-    status, _, err = run(capsys, *words, "--init-from", "demo-base")
+    status, _, err = run(capsys, *words, "--keep-tokens", "vehicle")
     assert status == 2
-    assert f"--vocabulary {tmp_path / 'v'} has no effect: demo-base has one of its own" in err
+    assert "--keep-tokens has no effect without both --init-from and --vocabulary" in err
+    words = ["pretrain", "trafficbots-demo", *words[2:], "--init-from", "trafficbots-base"]
+    load_policy("demo-base").vocabulary.save(tmp_path / "v")
+    status, _, err = run(capsys, *words)
+    assert status == 2
+    assert "makes a model without a vocabulary: leave --vocabulary out" in err
     words = ["pretrain", "smart-demo", "--data", "synthetic", "--init-from", "demo-base", "--out", tmp_path / "run"]
     status, _, err = run(capsys, *words, "--model.num-heads", "2")
     assert status == 2

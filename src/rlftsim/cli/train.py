@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
@@ -25,6 +25,7 @@ from rlftsim.training.parallel import is_first_process
 VALIDATION = "validation"
 """Split that is validated on where none is named."""
 SECTION_OF_METHOD = {"rlft": "finetune", "catk": "catk", "road": "road", "gcsl": "gcsl"}
+ClassName = Literal["vehicle", "pedestrian", "cyclist"]
 RecipeArgument = Annotated[Positional[str], tyro.conf.arg(metavar="RECIPE")]
 
 
@@ -46,11 +47,14 @@ class Pretrain(RecipeVerb):
     out: Path
     """Folder of the run: configuration, metrics, checkpoints, model."""
     vocabulary: Path | None = None
-    """File that `rlftsim tokens` wrote; needed by models with a vocabulary, such as SMART."""
+    """File that `rlftsim tokens` wrote; needed by models with a vocabulary, such as SMART. With --init-from its tokens
+    take the places of the most similar ones of the model."""
+    keep_tokens: list[ClassName] = field(default_factory=list)
+    """Classes whose tokens stay those of --init-from, with --vocabulary."""
     init_from: str | None = None
     """Model to train further, such as one of synthetic scenarios on logs: a run, a model folder or a registered name.
-    It brings its vocabulary and the settings --model.*; flags change those that its weights do not depend on, such as
-    the number of neighbors. Left out: fresh weights."""
+    It brings its vocabulary (but see --vocabulary) and the settings --model.*; flags change those that its weights do
+    not depend on, such as the number of neighbors. Left out: fresh weights."""
     processes: Processes = None
     """Processes that train, in short for --pretrain.device.processes."""
     split: str = "training"
@@ -85,12 +89,13 @@ class Pretrain(RecipeVerb):
         """Refuse what a model that is trained further brings along.
 
         Raises:
-            ConfigError: there are two vocabularies, or a flag would change what the weights are made for.
+            ConfigError: tokens are to be kept where there are none or no others, or a flag would change what the
+                weights are made for.
         """
+        if self.keep_tokens and (self.init_from is None or self.vocabulary is None):
+            raise ConfigError("--keep-tokens has no effect without both --init-from and --vocabulary: leave it out.")
         if self.init_from is None:
             return
-        if self.vocabulary is not None:
-            raise ConfigError(f"--vocabulary {self.vocabulary} has no effect: {self.init_from} has one of its own.")
         free = self.starting_recipe.free_fields
         for flag in flags:
             name = flag.removeprefix("--model.").replace("-", "_")
@@ -116,7 +121,12 @@ class Pretrain(RecipeVerb):
         # The curve is drawn of interrupted runs, too.
         with _learning_curve(self.out):
             start = load_policy(self.init_from) if self.init_from else None
-            policy = recipe.new_policy(vocabulary) if start is None else recipe.train_further(start)
+            if start is None:
+                policy = recipe.new_policy(vocabulary)
+            elif vocabulary is None:
+                policy = recipe.train_further(start)
+            else:
+                policy = recipe.train_further(start, vocabulary, self.keep_tokens)
             model = pretrain_policy(
                 policy, scenarios, recipe.pretrain, self.out, start=self.init_from, held_out=held_out
             )

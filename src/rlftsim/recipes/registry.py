@@ -11,7 +11,7 @@ pyproject.toml of its package:
     cruise-small = "my_package.recipes:cruise_small"
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Literal
 
@@ -81,8 +81,19 @@ class Recipe:
         """Settings of the section `model` that weights do not depend on."""
         return ()
 
-    def train_further(self, policy: Policy) -> Policy:
-        """The policy that `rlftsim pretrain --init-from` trains: an existing one, with this recipe's `free_fields`."""
+    def train_further(self, policy: Policy, vocabulary: Vocabulary | None = None, keep: Collection[str] = ()) -> Policy:
+        """The policy that `rlftsim pretrain --init-from` trains: an existing one, with this recipe's `free_fields`.
+
+        Args:
+            policy: the existing one.
+            vocabulary: tokens in place of its own; None = it keeps them.
+            keep: classes whose tokens stay its own all the same, see `align_vocabulary`.
+
+        Raises:
+            ConfigError: there is a vocabulary, and nothing that would use it.
+        """
+        if vocabulary is not None:
+            raise ConfigError(f"a {type(policy).__name__} takes no other vocabulary: leave --vocabulary out.")
         return policy
 
     def with_goals(self) -> "Recipe":

@@ -1,6 +1,7 @@
 """SMART models of several sizes, each with the numbers it is trained by. A variant calls one of these and
 changes fields."""
 
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -11,6 +12,7 @@ from rlftsim.policies.smart.config import SmartConfig, smart_demo, smart_mini, s
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.recipes.registry import Recipe
 from rlftsim.rollout.policy import Policy
+from rlftsim.tokens.alignment import align_vocabulary
 from rlftsim.tokens.clustering import TokensConfig
 from rlftsim.tokens.vocabulary import Vocabulary
 from rlftsim.training.catk import CatkConfig, RoadConfig
@@ -71,14 +73,23 @@ class SmartRecipe(Recipe):
         """Numbers and distances of neighbors, and what only training uses."""
         return self.model.free_fields
 
-    def train_further(self, policy: Policy) -> SmartPolicy:
+    def train_further(
+        self, policy: Policy, vocabulary: Vocabulary | None = None, keep: Collection[str] = ()
+    ) -> SmartPolicy:
         """A policy with the sizes of this recipe and the weights of an existing one.
+
+        Args:
+            policy: the existing one.
+            vocabulary: tokens in place of its own, see `align_vocabulary`; None = it keeps them.
+            keep: classes whose tokens stay its own all the same.
 
         Raises:
             CheckpointError: the weights are of other sizes.
+            ConfigError: there are more tokens than places for them.
         """
         assert isinstance(policy, SmartPolicy)
-        further = self.new_policy(policy.vocabulary)
+        own = policy.vocabulary
+        further = self.new_policy(own if vocabulary is None else align_vocabulary(vocabulary, own, keep=keep))
         load_strictly(further, policy.state_dict(), source="the model to train further")
         return further
 

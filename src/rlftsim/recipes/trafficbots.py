@@ -1,5 +1,6 @@
 """TrafficBots models, each with the numbers it is trained by."""
 
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -65,14 +66,22 @@ class TrafficBotsRecipe(Recipe):
         """Neighborhoods, exploration noise, and what only training uses."""
         return self.model.free_fields
 
-    def train_further(self, policy: Policy) -> TrafficBotsPolicy:
+    def train_further(
+        self, policy: Policy, vocabulary: Vocabulary | None = None, keep: Collection[str] = ()
+    ) -> TrafficBotsPolicy:
         """A policy with the sizes of this recipe and the weights of an existing one.
+
+        Args:
+            policy: the existing one.
+            vocabulary: refused.
+            keep: not used.
 
         Raises:
             CheckpointError: the weights are of other sizes.
+            ConfigError: there is a vocabulary, and nothing that would use it.
         """
         assert isinstance(policy, TrafficBotsPolicy)
-        further = self.new_policy(None)
+        further = self.new_policy(vocabulary)
         load_strictly(further, policy.state_dict(), source="the model to train further")
         return further
 
