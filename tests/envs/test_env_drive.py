@@ -2,8 +2,9 @@
 
 import importlib
 import json
+import shutil
 import sys
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import numpy as np
 import pyarrow as pa
@@ -20,6 +21,7 @@ from rlftsim.envs.idm import IdmConfig, idm_acceleration
 from rlftsim.envs.planner_scores import off_road
 from rlftsim.envs.planners.registry import PLANNERS, action_of, hash_code, load_planner
 from rlftsim.errors import ConfigError, DataError
+from rlftsim.evaluation import resumable
 from rlftsim.evaluation.drive_results import DriveResult, compare_drives, format_drive_comparison
 from rlftsim.scenario.dataset import write_dataset
 from rlftsim.scenario.open import open_dataset
@@ -281,18 +283,39 @@ def test_a_quick_look_keeps_what_a_longer_drive_has_done(tmp_path, monkeypatch):
 
 
 def test_a_result_that_another_drive_finished_meanwhile_is_not_replaced_by_fewer(tmp_path, monkeypatch):
-    config = DriveConfig("constant_velocity", traffic=("constant_velocity", "replay"), limit=1)
-    original = drive_module._drive_scenario
+    config = DriveConfig("constant_velocity", traffic=("replay",), limit=1)
+    drive(replace(config, limit=2), tmp_path / "other")
 
-    def meanwhile(*arguments):
-        monkeypatch.setattr(drive_module, "_drive_scenario", original)
-        drive(replace(config, traffic=("replay",), limit=2), tmp_path)
-        return original(*arguments)
+    class Late(resumable.Lease):
+        """The other drive ends just before this one's turn."""
 
-    monkeypatch.setattr(drive_module, "_drive_scenario", meanwhile)
+        def __enter__(self):
+            shutil.copy(tmp_path / "other" / "constant_velocity-replay.parquet", tmp_path)
+            return super().__enter__()
+
+    monkeypatch.setattr(resumable, "Lease", Late)
     with pytest.raises(ConfigError, match=r"replay\.parquet holds 2 scenarios, and limit=1 would replace them"):
         drive(config, tmp_path)
     assert len(DriveResult.read(tmp_path / "constant_velocity-replay.parquet").scenario_ids) == 2
+
+
+def test_unfinished_parts_of_other_settings_outlive_a_repeated_drive(tmp_path, monkeypatch):
+    config = DriveConfig("constant_velocity", traffic=("replay",), limit=2)
+    drive(config, tmp_path)
+    original, calls = drive_module._drive_scenario, []
+
+    def second_fails(*arguments):
+        calls.append(arguments)
+        return original(*arguments) if len(calls) == 1 else 1 / 0
+
+    with monkeypatch.context() as patch:
+        patch.setattr(drive_module, "_drive_scenario", second_fails)
+        with pytest.raises(ZeroDivisionError):
+            drive(replace(config, seed=1), tmp_path)
+    parts = [*(tmp_path / "constant_velocity-replay.parts").glob("*.json")]
+    assert len(parts) == 1
+    drive(config, tmp_path)
+    assert parts[0].exists()
 
 
 def test_a_planner_object_is_known_by_the_module_that_makes_it_too(tmp_path, monkeypatch):
@@ -474,11 +497,15 @@ def test_a_cut_result_is_named_in_one_line(result_path, tmp_path, capsys):
     assert line.startswith(f"rlftsim: {cut}: not a result of `rlftsim drive` (")
 
 
-def test_edited_rows_of_an_unfinished_drive_are_driven_anew(tmp_path):
+def test_edited_rows_of_an_unfinished_drive_are_driven_anew(tmp_path, monkeypatch):
     config = DriveConfig("constant_velocity", traffic=("replay",), limit=2)
     (whole,) = drive(config, tmp_path / "whole")
     first, second = whole.table["scenario_id"].to_pylist()
+    driven = []
+    original = drive_module._drive_scenario
+    monkeypatch.setattr(drive_module, "_drive_scenario", lambda *a: driven.append(a[-1]) or original(*a))
     for number, edit in enumerate((
+        lambda row: row,  # as it was: only the other scenario is driven
         lambda row: row.pop("comfort"),
         lambda row: row.update(comfort="high"),
         lambda row: row.update(comfort=None),
@@ -490,7 +517,9 @@ def test_edited_rows_of_an_unfinished_drive_are_driven_anew(tmp_path):
         parts.mkdir(parents=True)
         row = whole.table.to_pylist()[0]
         edit(row)
-        settings = asdict(whole.settings)
+        settings = whole.settings.what_counts()
         (parts / f"{first}.json").write_text(json.dumps({"settings": settings, "row": row, "missing": {}}))
+        driven.clear()
         (again,) = drive(config, out)
+        assert driven == ([0, 1] if number else [1])
         np.testing.assert_equal(again.table.to_pydict(), whole.table.to_pydict())

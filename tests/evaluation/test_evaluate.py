@@ -187,7 +187,7 @@ def test_a_quick_look_keeps_what_a_longer_evaluation_has_done(data, tmp_path, mo
         evaluate(Wobble(), data, tmp_path, CONFIG, name="run", runner=Share(1, 2, Inline()))
     parts = sorted((tmp_path / "run.parts").glob("*.parquet"))
     assert parts
-    for limit in (1, 4):  # also where the share has done no more than the quick look
+    for limit in (1, 4, 4):  # also where the share has done no more than the quick look, and repeated
         evaluate(Wobble(), data, tmp_path, replace(CONFIG, limit=limit), name="run")
         assert set(parts) <= set((tmp_path / "run.parts").glob("*.parquet"))
     evaluate(Wobble(), data, tmp_path, CONFIG, name="run", runner=Share(2, 2, Inline()))

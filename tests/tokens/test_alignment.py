@@ -1,17 +1,21 @@
 """Tokens of one vocabulary in the places of another one's."""
 
 from dataclasses import replace
+from typing import get_args
 
 import pytest
 import torch
 
 import tiny
 from rlftsim.cli.main import main
+from rlftsim.cli.train import ClassName
 from rlftsim.errors import ConfigError
 from rlftsim.policies.registry import load_policy
+from rlftsim.policies.smart.policy import SmartPolicy
+from rlftsim.recipes.smart import smart_demo_rlftsim
 from rlftsim.tokens.alignment import align_vocabulary
 from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
-from rlftsim.tokens.vocabulary import STILL_TOKEN, Vocabulary
+from rlftsim.tokens.vocabulary import CLASS_NAMES, STILL_TOKEN, Vocabulary
 
 VEHICLE, PEDESTRIAN, CYCLIST = range(3)
 
@@ -43,7 +47,7 @@ def test_new_tokens_take_the_places_of_similar_ones_and_all_of_them_are_there(vo
         assert torch.equal(found.corners[index, STILL_TOKEN], vocabulary.corners[index, STILL_TOKEN])
         tokens = [{tuple(t.flatten().tolist()) for t in v.corners[index, v.token_mask[index]]} for v in (found, other)]
         assert tokens[0] == tokens[1]
-        # nearer to the old tokens than in any other order
+        # nearer to the old tokens than when turned by one
         both = found.token_mask[index] & vocabulary.token_mask[index]
 
         def distance(corners, index=index, both=both):
@@ -57,8 +61,21 @@ def test_new_tokens_take_the_places_of_similar_ones_and_all_of_them_are_there(vo
 
 def test_more_tokens_than_places_are_refused(vocabulary):
     small = build_vocabulary(tiny.pack_scenarios(2), TokensConfig(num_tokens=12, num_map_prototypes=8))[0]
-    with pytest.raises(ConfigError, match=r"\d+ vehicle tokens do not fit into the 12 places .*num-tokens 12"):
+    with pytest.raises(ConfigError, match=r"\d+ vehicle tokens do not fit into the 12 places .*num-tokens"):
         align_vocabulary(vocabulary, small)
+    with pytest.raises(ConfigError, match="no class 'tram': classes are vehicle, pedestrian, cyclist"):
+        align_vocabulary(small, vocabulary, keep=["tram"])
+
+
+def test_the_command_line_knows_all_classes():
+    assert get_args(ClassName) == CLASS_NAMES
+
+
+def test_a_model_with_a_head_for_each_class_keeps_its_tokens(vocabulary):
+    config = replace(tiny.MODEL, head_per_class=True)
+    recipe = replace(smart_demo_rlftsim(), model=config)
+    with pytest.raises(ConfigError, match="a head of its own"):
+        recipe.train_further(SmartPolicy(config, vocabulary), vocabulary)
 
 
 def test_a_model_is_trained_further_with_tokens_of_other_data(tmp_path, monkeypatch):

@@ -168,7 +168,7 @@ def _train_copy(policy: Policy, out: Name | None, train: Callable[[Any, Path], o
 
 def _card(what: str, scenarios: Scenarios, start: Policy | Name | None = None) -> str:
     """README of the model folder; terms are known of data sets and of starts that have a name."""
-    name = str(start) if isinstance(start, str | os.PathLike) else None
+    name = start if isinstance(start, str | os.PathLike) else None
     if start is not None:
         what = f"{what} from {name or type(start).__name__}"
     if isinstance(scenarios, ScenarioDataset):

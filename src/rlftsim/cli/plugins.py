@@ -11,7 +11,8 @@ from rlftsim.progress import print_wide
 @dataclass(frozen=True)
 class Plugins:
     """List what other installed packages add: rewards, policies, data sources, recipes, experiments, planners and
-    exporters, with package and version, and the reason where one fails.
+    exporters, with package and version, and the reason where one fails. Each is tried out: policies, planners and
+    recipes are made.
 
     Exit status 1 if one fails. The others are used all the same.
     """

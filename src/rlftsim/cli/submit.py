@@ -121,7 +121,7 @@ class Build:
         report = Report(
             archive.name, check.size, check.sha256, entry.method, parameters, len(check.shards), check.num_scenarios,
             check.num_trajectories, check.raw_bytes, findings, counts, closed_loop,
- model_card(self.model),
+            model_card(self.model),
             work, time.monotonic() - start,
             estimate_realism(evaluation, fingerprint, config),
         )  # fmt: skip

@@ -47,8 +47,8 @@ class Pretrain(RecipeVerb):
     out: Path
     """Folder of the run: configuration, metrics, checkpoints, model."""
     vocabulary: Path | None = None
-    """File that `rlftsim tokens` wrote; needed by models with a vocabulary, such as SMART. With --init-from its tokens
-    take the places of the most similar ones of the model."""
+    """File that `rlftsim tokens` wrote; needed by models with a vocabulary, such as SMART. With --init-from its motion
+    tokens take the places of the most similar ones of the model, which keeps its map pieces."""
     keep_tokens: list[ClassName] = field(default_factory=list)
     """Classes whose tokens stay those of --init-from, with --vocabulary."""
     init_from: str | None = None
@@ -123,7 +123,7 @@ class Pretrain(RecipeVerb):
             start = load_policy(self.init_from) if self.init_from else None
             if start is None:
                 policy = recipe.new_policy(vocabulary)
-            elif vocabulary is None:
+            elif vocabulary is None:  # all that recipes of other packages may know
                 policy = recipe.train_further(start)
             else:
                 policy = recipe.train_further(start, vocabulary, self.keep_tokens)

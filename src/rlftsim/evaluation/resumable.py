@@ -55,7 +55,7 @@ class PartFiles(ABC, Generic[Result, Part]):
 
     @abstractmethod
     def has_others(self, scenario_ids: Collection[str]) -> bool:
-        """True if the folder holds finished groups with scenarios beside those given, such as of a longer run."""
+        """True if the folder holds finished groups of scenarios beside those given, or of other settings."""
 
 
 def map_scenarios(
@@ -158,16 +158,21 @@ class JsonParts(PartFiles[Mapping[str, object], Part]):
         scenario_id = self.scenario_ids[group.start]
         try:
             values = json.loads(self._path(scenario_id).read_text())
-            # A name that is missing agrees: 0.1 wrote fewer, and kept one setting per folder.
-            if any(values.get(name, own) != own for name, own in self.identity[scenario_id].items()):
-                return None
-            return self.parse(scenario_id, values)
+            return self.parse(scenario_id, values) if self._is_ours(scenario_id, values) else None
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
             return None
 
     def has_others(self, scenario_ids: Collection[str]) -> bool:
-        """True if there are files of other scenarios, see `PartFiles`."""
-        return any(path.stem not in scenario_ids for path in self.folder.glob("*.json"))
+        """True if there are files of other scenarios or settings, see `PartFiles`."""
+        for path in self.folder.glob("*.json"):
+            with suppress(OSError, ValueError, AttributeError):  # a damaged file holds nothing
+                if path.stem not in scenario_ids or not self._is_ours(path.stem, json.loads(path.read_text())):
+                    return True
+        return False
+
+    def _is_ours(self, scenario_id: str, values: Mapping[str, object]) -> bool:
+        # A name that is missing agrees: 0.1 wrote fewer, and kept one setting per folder.
+        return all(values.get(name, own) == own for name, own in self.identity[scenario_id].items())
 
     def _path(self, scenario_id: str) -> Path:
         return self.folder / f"{scenario_id}.json"
@@ -221,7 +226,7 @@ class EvaluationParts(PartFiles[Mapping[str, object] | Skipped, Evaluation]):
         """The result of an earlier call for the same scenarios; None if there is none.
 
         Raises:
-            ConfigError: a result of more scenarios is there, which a limit would replace.
+            ConfigError: a result is there with scenarios that a limit would leave out.
         """
         found = read_if_readable(self.result_path, Evaluation.read)
         if found is None:
@@ -229,7 +234,7 @@ class EvaluationParts(PartFiles[Mapping[str, object] | Skipped, Evaluation]):
         # Before anything else: also a result of another policy or setting is worth more than a quick look.
         limit = self.provenance.config.limit
         if limit is not None:
-            num_found = len(found) + len(found.skipped)
+            num_found = len(_ids_of(found))
             way_out = "name this one apart with --name, or leave the limit out."
             num_left_out = len(_ids_of(found) - {*scenario_ids})
             refuse_to_leave_out(self.result_path, num_found, num_left_out, f"limit={limit}", way_out)
@@ -282,7 +287,7 @@ def resume_evaluation(
         show_progress: False = no progress bar.
 
     Raises:
-        ConfigError: the name cannot be a file's, a limit would replace a result of more scenarios, or there is no
+        ConfigError: the name cannot be a file's, a limit would leave out scenarios of a stored result, or there is no
             folder in which shares could meet.
         DataError: another driver is at work on this evaluation.
         SetAside, Unfinished: see `map_scenarios`.
@@ -328,7 +333,8 @@ def finish_result(
         find: reads the finished one; None = there is none.
         make: makes it of its parts.
         path: of its file.
-        parts: finished groups of it. They stay where a longer run, or a share of one, is unfinished in their folder.
+        parts: finished groups of it. All of them stay where the folder holds others, or lock files of shares while
+            `runner` is none: then a longer run is unfinished there.
         scenario_ids: of the result.
         runner: does the work.
 
@@ -337,7 +343,6 @@ def finish_result(
     """
     before, found = _stamp(path), find()
     if found is None:
-        shares = {*parts.folder.glob(".lock.*-of-*")}
         with Lease(parts.folder / ".lock", runner, "works in") as lease:
             # another driver may have finished since, so what would be replaced is looked at again
             found = find() if _stamp(path) != before else None
@@ -345,14 +350,23 @@ def finish_result(
                 found = make(lease)
                 remove_temporaries(path)
                 found.write(path)
-            is_share = isinstance(runner, Share | Joining)
             # Only now: an interruption between the two leaves the parts, and the next call finds the result.
-            if not parts.has_others({*scenario_ids}) and (is_share or not shares):
-                shutil.rmtree(parts.folder, ignore_errors=True)
-    elif parts.folder.exists() and not parts.has_others({*scenario_ids}):
+            _remove_parts(parts, scenario_ids, runner)
+    elif parts.folder.exists():
         with suppress(DataError), Lease(parts.folder / ".lock", Inline(), "works in"):
-            shutil.rmtree(parts.folder, ignore_errors=True)
+            _remove_parts(parts, scenario_ids, runner)
     return found
+
+
+def _remove_parts(parts: PartFiles[Any, Any], scenario_ids: Sequence[str], runner: Runner) -> None:
+    """Remove the parts of a finished result, but for those of a longer run that is not.
+
+    A share that has ended leaves its lock file until all are put together: its parts may be of a longer run, too.
+    """
+    is_share = isinstance(runner, Share | Joining)
+    has_shares = any(parts.folder.glob(".lock.*-of-*")) and not is_share
+    if not has_shares and not parts.has_others({*scenario_ids}):
+        shutil.rmtree(parts.folder, ignore_errors=True)
 
 
 def _stamp(path: Path) -> tuple[int, int] | None:

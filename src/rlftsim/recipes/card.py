@@ -1,5 +1,6 @@
 """README of a model folder: the origin of a model and the terms under which it may be used."""
 
+import os
 import sys
 from collections.abc import Iterable
 from pathlib import Path
@@ -10,7 +11,7 @@ from rlftsim.scenario.sources import guessed_note
 from rlftsim.training.run_folder import describe_environment
 
 
-def model_card(what: str, data: Path, num_scenarios: int, start: str | Path | None = None) -> str:
+def model_card(what: str, data: Path, num_scenarios: int, start: str | os.PathLike | None = None) -> str:
     """Markdown card of a model trained on a data set.
 
     Args:
@@ -32,7 +33,7 @@ def model_card(what: str, data: Path, num_scenarios: int, start: str | Path | No
     return card if start is None else with_cards_of(card, [start])
 
 
-def with_cards_of(card: str, models: Iterable[str | Path]) -> str:
+def with_cards_of(card: str, models: Iterable[str | os.PathLike]) -> str:
     """A card followed by those of the models that a model was made from: the terms of their data hold for it, too.
 
     Args:

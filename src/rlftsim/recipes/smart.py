@@ -85,9 +85,14 @@ class SmartRecipe(Recipe):
 
         Raises:
             CheckpointError: the weights are of other sizes.
-            ConfigError: there are more tokens than places for them.
+            ConfigError: there are more tokens than places for them, or each class has a head of its own.
         """
         assert isinstance(policy, SmartPolicy)
+        if vocabulary is not None and policy.config.head_per_class:
+            raise ConfigError(
+                "each class of this model has a head of its own, whose places other tokens cannot take: leave "
+                "--vocabulary out."
+            )
         own = policy.vocabulary
         further = self.new_policy(own if vocabulary is None else align_vocabulary(vocabulary, own, keep=keep))
         load_strictly(further, policy.state_dict(), source="the model to train further")

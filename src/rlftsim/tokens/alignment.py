@@ -20,7 +20,8 @@ from rlftsim.tokens.vocabulary import CLASS_NAMES, STILL_TOKEN, Vocabulary
 def align_vocabulary(vocabulary: Vocabulary, other: Vocabulary, *, keep: Collection[str] = ()) -> Vocabulary:
     """A vocabulary with its tokens in the places of another one's, so that the sum of distances is least.
 
-    Map prototypes and the number of places are the other's. The token that stands still stays in its place.
+    Map prototypes and the number of places are the other's. The token that stands still stays in its place. Only for
+    models in which all classes share one head.
 
     Args:
         vocabulary: with the new tokens.
@@ -28,10 +29,13 @@ def align_vocabulary(vocabulary: Vocabulary, other: Vocabulary, *, keep: Collect
         keep: names of classes whose tokens stay the other's, of `CLASS_NAMES`.
 
     Raises:
-        ConfigError: a class has more tokens than the other vocabulary has places.
+        ConfigError: a class has more tokens than the other vocabulary has places, or there is no class of a name.
 
     Source: the assignment is `scipy.optimize.linear_sum_assignment`.
     """
+    unknown = sorted({*keep} - {*CLASS_NAMES})
+    if unknown:
+        raise ConfigError(f"no class {unknown[0]!r}: classes are {', '.join(CLASS_NAMES)}.")
     corners, mask = other.corners.clone(), other.token_mask.clone()
     for index, name in enumerate(CLASS_NAMES):
         if name in keep:
@@ -39,8 +43,8 @@ def align_vocabulary(vocabulary: Vocabulary, other: Vocabulary, *, keep: Collect
         new = vocabulary.corners[index, vocabulary.token_mask[index]]  # [n, 6, 4, 2]
         if len(new) > other.num_tokens:
             raise ConfigError(
-                f"{len(new)} {name} tokens do not fit into the {other.num_tokens} places of the model: build the "
-                f"vocabulary with --tokens.num-tokens {other.num_tokens}."
+                f"{len(new)} {name} tokens do not fit into the {other.num_tokens} places of the model: build a "
+                "smaller vocabulary, such as with --tokens.num-tokens."
             )
         distance = _distances(new, other.corners[index])  # [n, V]
         # Places without a token come last: their weights were never trained.
@@ -50,7 +54,9 @@ def align_vocabulary(vocabulary: Vocabulary, other: Vocabulary, *, keep: Collect
         tokens, places = (torch.from_numpy(found) for found in linear_sum_assignment(distance.numpy()))
         corners[index], mask[index] = 0.0, False
         corners[index, places], mask[index, places] = new[tokens], True
-    return replace(other, corners=corners, token_mask=mask, origin=f"{vocabulary.origin}; in the places of another one")
+    kept = ", ".join((*(f"{name} tokens" for name in keep), "map pieces"))
+    origin = f"{vocabulary.origin}; in the places of, and {kept} from: {other.origin}"
+    return replace(other, corners=corners, token_mask=mask, origin=origin)
 
 
 def _distances(new: Float[Tensor, "n 6 4 2"], old: Float[Tensor, "V 6 4 2"]) -> Float[Tensor, "n V"]:

@@ -201,7 +201,7 @@ class RunFolder:
         That model is none any more, so that a kill before the new one is complete leaves none of other settings.
         """
         if self._writes and self.grows_from:
-            (self.model / "config.json").unlink()
+            (self.model / "config.json").unlink(missing_ok=True)
             self._write_settings()
 
     def _write_settings(self) -> None:

@@ -94,7 +94,6 @@ def load_planner(name: str) -> Planner:
         found = PLANNERS.get(name)
     try:
         planner = found() if isinstance(found, type) else found
-        _ = action_of(planner), horizon_of(planner)  # properties, maybe
     except TypeError as error:
         raise ConfigError(f"planner {name!r} cannot be made without arguments ({error}).") from None
     except SystemExit as stop:
