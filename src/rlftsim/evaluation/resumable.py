@@ -13,7 +13,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, Generic, Protocol, TypeVar
+from typing import Any, ClassVar, Generic, Protocol, TypeVar, runtime_checkable
 
 import pyarrow as pa
 
@@ -308,6 +308,7 @@ def resume_evaluation(
         return finish_result(find, make, files.result_path, files, scenario_ids, runner)
 
 
+@runtime_checkable
 class Writable(Protocol):
     """A result that is kept in one file."""
 
