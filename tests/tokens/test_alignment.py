@@ -1,6 +1,7 @@
 """Tokens of one vocabulary in the places of another one's."""
 
 from dataclasses import replace
+from pathlib import Path
 from typing import get_args
 
 import pytest
@@ -104,6 +105,6 @@ def test_a_model_is_trained_further_with_tokens_of_other_data(tmp_path, monkeypa
     ]
     words += ["--pretrain.epochs", "0.02", "--processes", "1", "--pretrain.validation.every", "0"]
     assert main([*words, "--keep-tokens", "vehicle", "--out", "run"]) == 0
-    trained, base, new = load_policy("run"), load_policy("demo-base"), Vocabulary.load("v.safetensors")
+    trained, base, new = load_policy("run"), load_policy("demo-base"), Vocabulary.load(Path("v.safetensors"))
     assert torch.equal(trained.vocabulary.corners[VEHICLE], base.vocabulary.corners[VEHICLE])
     assert trained.vocabulary.token_mask.sum(1)[1:].tolist() == new.token_mask.sum(1)[1:].tolist()
