@@ -120,8 +120,7 @@ class Build:
         work = {"model": self.model, "data set": str(data.folder), **plan.identity}
         report = Report(
             archive.name, check.size, check.sha256, entry.method, parameters, len(check.shards), check.num_scenarios,
-            check.num_trajectories, check.raw_bytes, findings, counts, closed_loop,
-            model_card(self.model),
+            check.num_trajectories, check.raw_bytes, findings, counts, closed_loop, model_card(self.model),
             work, time.monotonic() - start,
             estimate_realism(evaluation, fingerprint, config),
         )  # fmt: skip

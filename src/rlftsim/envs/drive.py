@@ -5,7 +5,7 @@ Interrupted in any way, the same call goes on where it was, see `evaluation.resu
 
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, cast
@@ -16,11 +16,10 @@ import rlftsim
 from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.drivers import TRAFFIC, Traffic
 from rlftsim.envs.ego_env import EgoEnv
-from rlftsim.envs.planner_scores import PlannerScores
 from rlftsim.envs.planners.registry import Planner, action_of, hash_code, horizon_of, load_planner
-from rlftsim.envs.result import Result, animation_of
+from rlftsim.envs.result import SCORE_NAMES, Result, animation_of
 from rlftsim.envs.source import Source
-from rlftsim.envs.traffic_scores import TrafficScores, blamed_others_rate, realism_of_others
+from rlftsim.envs.traffic_scores import blamed_others_rate, realism_of_others
 from rlftsim.errors import ConfigError, DataError, whole_number
 from rlftsim.evaluation.drive_results import DriveResult, DriveSettings
 from rlftsim.evaluation.resumable import JsonParts, finish_result, map_scenarios, read_if_readable, refuse_to_leave_out
@@ -214,8 +213,7 @@ def _row_and_missing(scenario_id: str, values: Mapping[str, Any]) -> tuple[dict[
     row, missing = values["row"], values["missing"]
     if row["scenario_id"] != scenario_id or not all(isinstance(why, str) for why in missing.values()):
         raise ValueError("of another scenario, or without a reason")
-    names = [one.name for scores in (PlannerScores, TrafficScores) for one in fields(scores)]
-    numbers = {name: float(row[name]) for name in (*names, "blamed_others_rate", "others_realism")}
+    numbers = {name: float(row[name]) for name in (*SCORE_NAMES, "blamed_others_rate", "others_realism")}
     return {"scenario_id": scenario_id, "traffic": values["settings"]["traffic"], **numbers}, missing
 
 
@@ -226,7 +224,7 @@ def _drive_scenario(config: DriveConfig, traffic: str, ids: Sequence[str], posit
     results = [
         run_planner(env, planner, scenario, seed=config.seed, rollout=rollout) for rollout in range(config.num_rollouts)
     ]
-    rows = [{**asdict(result.planner), **asdict(result.traffic)} for result in results]
+    rows = [result.scores for result in results]
     # a rollout that cannot give a score leaves it to the others
     means = {name: mean_interval(np.array([row[name] for row in rows])).mean for name in rows[0]}
     means["blamed_others_rate"] = blamed_others_rate([one for result in results for one in result.record.collisions])

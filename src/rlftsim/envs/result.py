@@ -1,7 +1,7 @@
 """Results of episodes: scores, what they lack, pictures and films."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
 from functools import cached_property
 from os import PathLike
 
@@ -14,6 +14,9 @@ from rlftsim.scenario.types import HISTORY_STEPS
 from rlftsim.viewer.film import to_film
 from rlftsim.viewer.page import Animation, Panel, animation_html, page_html
 from rlftsim.viewer.scene import SceneMotion, build_scene, logged_trajectories
+
+SCORE_NAMES = tuple(one.name for scores in (PlannerScores, TrafficScores) for one in fields(scores))
+"""Names of all scores of an episode."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +34,11 @@ class Result:
     def traffic(self) -> TrafficScores:
         """Scores of the traffic around it."""
         return score_traffic(self.record)
+
+    @property
+    def scores(self) -> dict[str, float]:
+        """All scores by `SCORE_NAMES`."""
+        return {**asdict(self.planner), **asdict(self.traffic)}
 
     @cached_property
     def missing(self) -> dict[str, str]:

@@ -24,8 +24,6 @@ SHOWN = (
     "at_fault_collision_rate", "hit_rate", "others_realism", "others_collision_rate", "others_offroad_rate",
 )  # fmt: skip
 """Columns of the table and of comparisons on the command line; the file has more."""
-
-
 TEXTS = ("scenario_id", "traffic")
 """Columns that are no scores."""
 
@@ -171,8 +169,9 @@ def compare_drives(a: DriveResult, b: DriveResult, *, alpha: float = 0.05) -> tu
     """
     # a data set may have moved, or be another one at the same place; older results know its place alone
     know_content = a.settings.manifest_sha256 and b.settings.manifest_sha256
-    data = ("dataset", "manifest_sha256") if know_content else ("dataset", "dataset")
-    for shown, setting in (("num_rollouts",) * 2, ("seed",) * 2, ("split",) * 2, data):
+    compared = {name: name for name in ("num_rollouts", "seed", "split")}
+    compared["dataset"] = "manifest_sha256" if know_content else "dataset"
+    for shown, setting in compared.items():
         if getattr(a.settings, setting) != getattr(b.settings, setting):
             own, other = getattr(a.settings, shown), getattr(b.settings, shown)
             other = f"another {other}" if own == other else other

@@ -38,7 +38,7 @@ Sum = Callable[..., str]
 """Called with options; returns the sum of rewards that a name stands for."""
 
 REWARDS: ExtensionPoint[Callable[..., Any]] = ExtensionPoint(
-    "reward", "rlftsim.rewards", use=lambda name: _in_expression(name)
+    "reward", "rlftsim.rewards", use=lambda name: sum_by_name(name) or checked_reward(name)
 )
 """Rewards and named sums of them, by name."""
 _SUMS: "WeakSet[Sum]" = WeakSet()
@@ -136,13 +136,25 @@ def reward_by_name(name: str) -> Reward:
     """The reward of a name; those of installed packages are found, too.
 
     Raises:
-        ConfigError: unknown, with the nearest known name; or it is a sum, or not to be called as a reward is; or a
-            package's rewards cannot be imported.
+        ConfigError: unknown, with the nearest known name; or it is a sum; or a package's rewards cannot be imported.
     """
     reward = REWARDS.get(name)
     if reward in _SUMS:
         raise ConfigError(f"reward {name!r} stands for a sum of rewards: it has no number of its own.")
-    require_signature(name, reward)  # those of entry points are registered without a look at them
+    return reward
+
+
+def checked_reward(name: str) -> Reward:
+    """As `reward_by_name`, for a sum of rewards that is to be computed: those of entry points are registered without a
+    look at them.
+
+    Raises:
+        ConfigError: as `reward_by_name`; or a sum cannot be written with the name, or the reward is not to be called as
+            rewards are.
+    """
+    _require_name(name)
+    reward = reward_by_name(name)
+    require_signature(name, reward)
     return reward
 
 
@@ -150,12 +162,6 @@ def sum_by_name(name: str) -> Sum | None:
     """The sum of rewards that a name stands for; None if there is no such sum."""
     found = REWARDS.find(name)
     return found if found is not None and found in _SUMS else None
-
-
-def _in_expression(name: str) -> Sum | Reward:
-    """The reward or sum of a name that a sum of rewards can be written with."""
-    _require_name(name)
-    return sum_by_name(name) or reward_by_name(name)
 
 
 def agent_rewards_by_name(name: str) -> AgentRewards | None:

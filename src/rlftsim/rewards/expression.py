@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from rlftsim.errors import ConfigError
-from rlftsim.rewards.base import Reward, Sum, reward_by_name, sum_by_name
+from rlftsim.rewards.base import Reward, Sum, checked_reward, sum_by_name
 
 Option = float | int | bool | str
 
@@ -93,8 +93,7 @@ def _named(name: str, factor: float, given: dict[str, Option]) -> Iterator[Term]
     """Yield the term of a reward, or the terms of a sum that has a name."""
     known_sum = sum_by_name(name)
     if known_sum is None:
-        reward = reward_by_name(name)
-        yield Term(factor, name, _options(name, reward, given))
+        yield Term(factor, name, _options(name, checked_reward(name), given))
     else:
         text = known_sum(**dict(_options(name, known_sum, given)))
         yield from _terms(ast.parse(text, mode="eval").body, factor)
