@@ -24,6 +24,7 @@ from rlftsim.scenario import womd_pb2
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import write_dataset
 from rlftsim.scenario.tfrecord import write_records
+from rlftsim.workers import Inline, Share, Unfinished
 
 CONFIG = ScoreConfig(jobs=1)
 SCENARIOS = [
@@ -99,6 +100,18 @@ def test_an_interrupted_run_goes_on_with_what_is_missing(data, rollouts, tmp_pat
     rest.clear()
     assert same(score_rollouts(rollouts, data, tmp_path, CONFIG), whole)
     assert rest == []
+
+
+def test_a_quick_look_keeps_what_a_longer_scoring_has_done(data, rollouts, tmp_path):
+    with pytest.raises(Unfinished):
+        score_rollouts(rollouts, data, tmp_path, CONFIG, runner=Share(1, 2, Inline()))
+    parts = set((tmp_path / "rollouts.parts").glob("*.parquet"))
+    assert parts
+    assert len(score_rollouts(rollouts, data, tmp_path, replace(CONFIG, limit=1))) == 1
+    assert parts <= set((tmp_path / "rollouts.parts").glob("*.parquet"))
+    assert len(score_rollouts(rollouts, data, tmp_path, CONFIG, runner=Share(2, 2, Inline()))) == len(SCENARIOS)
+    with pytest.raises(ConfigError, match=r"holds 6 scenarios, and limit=1 would replace them without 5"):
+        score_rollouts(rollouts, data, tmp_path, replace(CONFIG, limit=1))
 
 
 def test_other_rollouts_under_the_same_name_are_scored_again(data, rollouts, tmp_path, capsys):

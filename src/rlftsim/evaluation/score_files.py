@@ -100,7 +100,8 @@ def score_rollouts(
         ConfigError: a limit that would replace a stored result of more scenarios.
     """
     rollouts, scenarios = Path(rollouts), Path(scenarios)
-    entries, source = find_rollouts(rollouts)[: config.limit], open_scenarios(scenarios)
+    found, source = find_rollouts(rollouts), open_scenarios(scenarios)
+    entries = found[: config.limit]
     check_entries(entries, source, config, scenarios)
     known = next((entry for entry in entries if entry.scenario_id in source), None)
     if known is None:
@@ -110,7 +111,8 @@ def score_rollouts(
     provenance = Provenance(
         config=EvaluateConfig(num_rollouts=num_rollouts, metric=config.metric, split=None, limit=config.limit),
         policy="rollouts from files",
-        policy_fingerprint=_fingerprint(entries),
+        # of all, also under a limit: a quick look and the whole are of the same rollouts
+        policy_fingerprint=_fingerprint(found),
         dataset=str(scenarios.absolute()),
         manifest_sha256=source.fingerprint,
         sources=source.sources,
