@@ -137,6 +137,15 @@ instance = Calls()
 class Needy:
     def __init__(self, wish):
         pass
+class Deaf(Calls):
+    def reset(self, info): pass
+    def act(self): pass
+class Resets(Calls):
+    def reset(self): pass
+    def act(self, observation): pass
+class Steers(Still):
+    action = "steering"
+def blind(): pass
 """
 
 
@@ -157,6 +166,9 @@ def test_planners_of_others_are_found(tmp_path, monkeypatch):
     wrong |= {":Still": "names no module", "nowhere.at_all:Still": "cannot be imported"}
     (tmp_path / "broken.py").write_text("def (")
     wrong |= {"my_planners:Needy": "without arguments .*wish", "broken:Still": "cannot be imported"}
+    wrong |= {"my_planners:Deaf": "act of planner .* observation alone", "my_planners:Resets": "reset of .* info alone"}
+    wrong |= {"my_planners:Steers": "planner Steers has action = 'steering': known are bicycle"}
+    wrong |= {"my_planners:blind": "planner .* cannot be called with observation alone"}
     for name, message in wrong.items():
         with pytest.raises(ConfigError, match=message):
             load_planner(name)

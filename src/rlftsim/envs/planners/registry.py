@@ -10,7 +10,7 @@ import secrets
 import sys
 from collections.abc import Callable
 from functools import cache
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, get_args, runtime_checkable
 
 from rlftsim.envs.actions import LEAST_HORIZON, ActionKind
 from rlftsim.errors import ConfigError
@@ -60,7 +60,7 @@ class CallablePlanner:
 
     def __init__(self, function: Callable[[dict[str, Any]], Any]):
         self.function = function
-        self.action: ActionKind = action_of(function)
+        self.action = action_of(function)
         self.horizon = horizon_of(function)
 
     def reset(self, info: dict[str, Any]) -> None:
@@ -78,7 +78,8 @@ def load_planner(name: str) -> Planner:
         name: a registered name, or "package.module:Class" (or ":function").
 
     Raises:
-        ConfigError: unknown, not importable, or neither an object with `reset` and `act` nor a function.
+        ConfigError: unknown, not importable, neither an object with `reset` and `act` nor a function, with other
+            arguments than these, or with an unknown kind of action.
     """
     if ":" in name:
         module, _, attribute = name.partition(":")
@@ -100,13 +101,28 @@ def load_planner(name: str) -> Planner:
         raise ConfigError(
             f"planner {name!r} calls exit({stop.code!r}) when it is made: let it raise an error."
         ) from stop
-    if isinstance(planner, Planner):
-        return planner
-    if callable(planner):
-        return CallablePlanner(planner)
-    raise ConfigError(
-        f"planner {name!r} is of type {type(planner).__name__}: give it reset(info) and act(observation)."
-    )
+    if not isinstance(planner, Planner):
+        if not callable(planner):
+            kind = type(planner).__name__
+            raise ConfigError(f"planner {name!r} is of type {kind}: give it reset(info) and act(observation).")
+        _require_one_argument(f"planner {name!r}", planner, "observation")
+        planner = CallablePlanner(planner)
+    _require_one_argument(f"reset of planner {name!r}", planner.reset, "info")
+    _require_one_argument(f"act of planner {name!r}", planner.act, "observation")
+    action_of(planner)
+    return planner
+
+
+def _require_one_argument(what: str, function: Callable[..., Any], argument: str) -> None:
+    """Refuse a function that cannot be called with one value; one without a readable signature passes."""
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):
+        return
+    try:
+        signature.bind(argument)
+    except TypeError as error:
+        raise ConfigError(f"{what} cannot be called with {argument} alone ({error}): let it take that.") from None
 
 
 def hash_code(name: str) -> str:
@@ -138,8 +154,17 @@ def _hash_source(code: Any) -> str | None:
 
 
 def action_of(planner: Planner | Callable[..., Any]) -> ActionKind:
-    """Kind of action that a planner takes."""
-    return getattr(planner, "action", "bicycle")
+    """Kind of action that a planner takes.
+
+    Raises:
+        ConfigError: there is no such kind.
+    """
+    action: Any = getattr(planner, "action", "bicycle")
+    if action not in get_args(ActionKind):
+        known = ", ".join(get_args(ActionKind))
+        name = getattr(planner, "__name__", type(planner).__name__)
+        raise ConfigError(f"planner {name} has action = {action!r}: known are {known}.")
+    return action
 
 
 def horizon_of(planner: Planner | Callable[..., Any]) -> int:
