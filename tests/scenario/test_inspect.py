@@ -76,6 +76,26 @@ def test_a_scenario_that_breaks_the_contract_is_found(make_message, tmp_path, mo
     assert str(finding) == "broken scenario: a: ego_index names track index -1, but there are 3 tracks"
 
 
+def test_a_map_in_another_frame_and_positions_beyond_float32_are_found(
+    make_dataset, make_message, tmp_path, monkeypatch
+):
+    shifted = make_message("a")
+    for state in (state for track in shifted.tracks for state in track.states):
+        state.center_y += 5_000.0
+    folder = make_dataset(shifted, make_message("b"))
+    (finding,) = verify_dataset(folder)
+    assert (finding.problem, finding.where) == (Problem.MAP_ELSEWHERE, "a")
+    assert " m from the ego: give map and tracks the same origin" in finding.detail
+
+    scenario = scenario_from_bytes(make_message("utm").SerializeToString())
+    scenario.tracks.position[..., 1] += 4_649_000.0
+    scenario.map_features.points[:, 1] += 4_649_000.0
+    with monkeypatch.context() as other_writer:
+        other_writer.setattr(Scenario, "refuse_coarse", lambda _: None)
+        write_dataset([scenario], tmp_path / "older")
+    assert (Problem.FAR_FROM_ORIGIN, "utm") in found(tmp_path / "older")
+
+
 def test_missing_map_and_no_agent_to_evaluate_are_found(make_dataset, make_message):
     no_map, no_edges, alone = make_message("a"), make_message("b"), make_message("c")
     no_map.ClearField("map_features")

@@ -21,6 +21,7 @@ from rlftsim.scenario.dataset import (
 )
 from rlftsim.scenario.shards import ShardReader, hash_file
 from rlftsim.scenario.types import (
+    CURRENT_STEP,
     LANE_TYPES,
     ROAD_EDGE_TYPES,
     STEP_S,
@@ -29,6 +30,8 @@ from rlftsim.scenario.types import (
 )
 
 TELEPORT_SPEED_MPS = 60.0
+FAR_MAP_M = 200.0
+"""A map whose nearest point is farther from the ego is taken to be in another frame."""
 
 
 class Problem(StrEnum):
@@ -40,6 +43,8 @@ class Problem(StrEnum):
     CONTRADICTORY_LIGHTS = "contradictory lights"
     TELEPORT = "teleport"
     MISSING_MAP = "missing map"
+    MAP_ELSEWHERE = "map elsewhere"
+    FAR_FROM_ORIGIN = "far from the origin"
     NOT_FINITE = "not finite"
     BROKEN = "broken scenario"
     NO_EVALUATED_AGENTS = "no evaluated agents"
@@ -100,9 +105,9 @@ def verify_dataset(folder: str | os.PathLike[str]) -> list[Finding]:
     """Check every shard and every scenario of a data set.
 
     Damage: shards missing or not as the manifest has them, index and manifest that do not belong together. Doubtful
-    content: impossible ids, types, sizes or track indices, NaN or infinite states or map points, a lane with two states
-    at a step, consecutive valid positions that imply more than 60 m/s, no lanes or no road edges, no agent to evaluate
-    beside the ego.
+    content: impossible ids, types, sizes or track indices, NaN or infinite states or map points, positions too far from
+    the origin for float32, a lane with two states at a step, consecutive valid positions that imply more than 60 m/s,
+    no lanes or no road edges, a map 200 m from the ego or more, no agent to evaluate beside the ego.
 
     Args:
         folder: the data set, or "synthetic".
@@ -183,6 +188,10 @@ def check_scenario(scenario: Scenario) -> Iterator[Finding]:
         scenario.refuse_not_finite()
     except DataError as error:
         yield Finding(Problem.NOT_FINITE, where, str(error))
+    try:
+        scenario.refuse_coarse()
+    except DataError as error:
+        yield Finding(Problem.FAR_FROM_ORIGIN, where, str(error))
 
     # Different states of one lane at one step. Repeated equal observations are no contradiction.
     observed = np.unique(np.stack([lights.step, lights.lane_id, lights.state], axis=1), axis=0)
@@ -210,6 +219,12 @@ def check_scenario(scenario: Scenario) -> Iterator[Finding]:
     if missing:
         detail = f"no {' and no '.join(missing)}" if len(features.points) else "no map features"
         yield Finding(Problem.MISSING_MAP, where, detail)
+    if len(features.points):
+        ego = tracks.position[scenario.ego_index, CURRENT_STEP, :2].astype(np.float64)
+        nearest = np.linalg.norm(features.points[:, :2] - ego, axis=-1).min()  # NaN of either is no finding of its own
+        if nearest > FAR_MAP_M:
+            detail = f"its nearest point is {nearest:.0f} m from the ego: give map and tracks the same origin"
+            yield Finding(Problem.MAP_ELSEWHERE, where, detail)
     if not (scenario.evaluated_indices != scenario.ego_index).any():
         rest = (
             "only the ego is evaluated" if len(scenario.evaluated_indices) else "nor is the ego: nothing is evaluated"
