@@ -8,10 +8,13 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+import scenes
 import tiny
-from rlftsim.scenario.dataset import ScenarioDataset
+from rlftsim.errors import DataError
+from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
 from rlftsim.scenario.synthetic import pack_path
-from rlftsim.training.batches import balance_by_cost, micro_batches, scenario_costs
+from rlftsim.scenario.types import CURRENT_STEP
+from rlftsim.training.batches import balance_by_cost, micro_batches, refuse_unscored, scenario_costs
 
 COSTS = st.lists(st.floats(0.1, 100.0), min_size=1, max_size=24)
 
@@ -53,6 +56,22 @@ def test_the_index_knows_what_the_scenarios_cost():
     counted = [len(data[i].simulated_indices) * 0.2 + len(data[i].map_features.points) / 1000 for i in some]
     assert scenario_costs(data)[some] == pytest.approx(counted)
     assert scenario_costs([data[i] for i in some]) == pytest.approx(counted)
+
+
+def test_scenarios_without_a_reward_are_refused_before_a_run_begins(vocabulary, tmp_path):
+    sound = scenes.straight_road()
+    tracks = sound.tracks
+    valid = tracks.valid.copy()
+    valid[sound.evaluated_indices, CURRENT_STEP] = False
+    alone = replace(sound, scenario_id="alone", tracks=replace(tracks, valid=valid))
+    refuse_unscored([sound])
+    with pytest.raises(DataError, match=r"scenario alone has no evaluated agent: .* and 0 others of 2"):
+        refuse_unscored([sound, alone])
+    write_dataset([sound, alone], tmp_path / "data", split="training")
+    data = ScenarioDataset(tmp_path / "data", "training")
+    with pytest.raises(DataError, match=r"scenario alone has no evaluated agent"):
+        tiny.train("finetune", tiny.tiny_policy(vocabulary), data, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize("stage", ["pretrain", "catk"])

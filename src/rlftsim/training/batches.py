@@ -6,11 +6,12 @@ Losses are sums that are divided by global counts, so nothing here changes a gra
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 
+from rlftsim.errors import DataError
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.index_row import IndexRow, compute_index_row
-from rlftsim.scenario.types import Scenarios
+from rlftsim.scenario.types import TOTAL_STEPS, Scenarios
 
 MAP_POINTS_PER_AGENT = 200
 """Map points that need about as much memory as an agent; measured 170 (SMART-nano) and 410 (the demo's model) on real
@@ -24,14 +25,42 @@ def scenario_costs(scenarios: Scenarios) -> Float[np.ndarray, "n"]:
 
     The index of a data set has the counts without a scenario being read; the scenarios of a list are counted here.
     """
-    columns = (*COUNTED, "num_map_points")
-    if isinstance(scenarios, ScenarioDataset):
-        counts = np.array([scenarios.index[name].to_pylist() for name in columns])  # [columns, n]
-    else:
-        rows: list[IndexRow] = [compute_index_row(scenarios[i], "") for i in range(len(scenarios))]
-        counts = np.array([[getattr(row, name) for row in rows] for name in columns])
+    counts = counts_of(scenarios, (*COUNTED, "num_map_points"))
     # Thousands, so that budgets are numbers a person can write.
     return (counts[-1] + MAP_POINTS_PER_AGENT * counts[:-1].sum(0)) / 1000.0
+
+
+def counts_of(scenarios: Scenarios, columns: Sequence[str]) -> Int64[np.ndarray, "columns n"]:
+    """Counts of each scenario by columns of the index, from the index of a data set without a scenario being read.
+
+    Args:
+        scenarios: a data set, or others, which are counted here.
+        columns: fields of `IndexRow` that are numbers.
+    """
+    if isinstance(scenarios, ScenarioDataset):
+        return np.array([scenarios.index[name].to_pylist() for name in columns], dtype=np.int64)
+    rows: list[IndexRow] = [compute_index_row(scenarios[i], "") for i in range(len(scenarios))]
+    return np.array([[getattr(row, name) for row in rows] for name in columns], dtype=np.int64)
+
+
+def refuse_unscored(scenarios: Scenarios) -> None:
+    """Check before a run begins that the metric, and so a reward, is defined for each scenario.
+
+    Args:
+        scenarios: to be rewarded in.
+
+    Raises:
+        DataError: some have no logged future or no evaluated agent; the first is named.
+    """
+    num_steps, num_evaluated = counts_of(scenarios, ("num_steps", "num_evaluated"))
+    unscored = np.flatnonzero((num_steps < TOTAL_STEPS) | (num_evaluated == 0))
+    if len(unscored):
+        first = scenarios[int(unscored[0])]
+        cause = "no evaluated agent" if first.has_future else f"{first.num_steps} logged steps, its future is withheld"
+        raise DataError(
+            f"scenario {first.scenario_id} has {cause}: no reward is defined for it and {len(unscored) - 1} others of "
+            f"{len(scenarios)}: leave them out, or train on the training split."
+        )
 
 
 def balance_by_cost(costs: Sequence[float] | Float[np.ndarray, "n"], num_parts: int) -> list[list[int]]:

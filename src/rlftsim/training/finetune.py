@@ -161,11 +161,12 @@ def finetune(
 
     Raises:
         ConfigError: the policy has no weights or is not goal-conditioned as the settings want, or there is no scenario.
+        DataError: a scenario has no logged future or no evaluated agent.
         CheckpointError: `out` holds another run, or the run diverged (its last good checkpoint is named).
         NotYetError: another run is at work in `out`.
     """
     scenarios = as_scenarios(scenarios)
-    model = require_trainable(policy, scenarios, "rewards", imitated=config.imitation_weight > 0)
+    model = require_trainable(policy, scenarios, "rewards", imitated=config.imitation_weight > 0, rewarded=True)
     trained_parts(model, config.trained)  # refuses what the policy does not have, before the folder is claimed
     refuse_goals(policy, config.goals.probability)
     augmented = config.goals.open_augmented(scenarios)

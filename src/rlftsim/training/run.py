@@ -25,7 +25,7 @@ from rlftsim.progress import log, progress_bar
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.types import Scenario, Scenarios
-from rlftsim.training.batches import scenario_costs
+from rlftsim.training.batches import refuse_unscored, scenario_costs
 from rlftsim.training.checkpoint import Progress, newest_checkpoint, read_checkpoint, update_of, write_checkpoint
 from rlftsim.training.data import batch_with_futures, scenarios_of_update
 from rlftsim.training.interruption import ctrl_c_waits
@@ -44,7 +44,13 @@ def as_scenarios(scenarios: TrainingScenarios) -> Scenarios:
 
 
 def require_trainable(
-    policy: object, scenarios: Scenarios, method: str, *, needs: Sequence[str] = (), imitated: bool = False
+    policy: object,
+    scenarios: Scenarios,
+    method: str,
+    *,
+    needs: Sequence[str] = (),
+    imitated: bool = False,
+    rewarded: bool = False,
 ) -> Any:
     """Return the policy if a method can train it on these scenarios.
 
@@ -54,9 +60,11 @@ def require_trainable(
         method: name of the training method in messages, such as "CAT-K".
         needs: further attributes that the method uses, such as "vocabulary".
         imitated: the method uses the pre-training loss; one of the two ways to it is enough.
+        rewarded: the method scores rollouts of every scenario.
 
     Raises:
         ConfigError: the policy has no weights or lacks an attribute, or there is no scenario.
+        DataError: rewarded, and a scenario has no logged future or no evaluated agent.
     """
     name = type(policy).__name__
     if not isinstance(policy, nn.Module):
@@ -69,6 +77,8 @@ def require_trainable(
         raise ConfigError(f"{name} cannot be trained with {method}: it has no {' and no '.join(missing)}.")
     if not len(scenarios):
         raise ConfigError("no scenario to train on: is the data set empty, or the split misspelled?")
+    if rewarded:
+        refuse_unscored(scenarios)
     return policy
 
 
