@@ -344,6 +344,21 @@ def test_pre_training_from_a_recipe_makes_a_new_policy_that_is_ready(home):
     assert not any(weight.requires_grad for weight in model.parameters())
 
 
+@pytest.mark.parametrize("stage", ["pretrain", "road"])
+def test_what_training_returns_is_what_it_saves_also_where_weights_are_averaged(home, stage):
+    """The moving average, not the weights that it is the average of; also where the run is only read."""
+    training = rs.load_dataset(SMALL, "training")
+    settings = {
+        "pretrain": replace(TINY.pretrain, ema_decay=0.5),
+        "road": replace(TINY.catk, ema_decay=0.5, choice="sampled", targets="taken", num_candidates=4, epochs=1.0),
+    }
+    start = rs.pretrain(TINY, training, out="runs/start")
+    train = rs.pretrain if stage == "pretrain" else rs.finetune
+    for _ in range(2):
+        model = train(start, training, out="runs/averaged", config=settings[stage])
+        assert fingerprint_policy(model) == fingerprint_policy(rs.load_policy("runs/averaged"))
+
+
 def test_recipes_by_name():
     assert isinstance(rs.recipe("smart-demo").finetune, rs.FinetuneConfig)
     with pytest.raises(ConfigError, match="did you mean 'smart-demo'"):

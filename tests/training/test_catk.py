@@ -81,6 +81,15 @@ def test_road_imitates_the_nearest_of_its_own_samples(policy, batch):
     assert found[1] > found[4] > found[64]
 
 
+def test_samples_of_an_agent_do_not_depend_on_its_batch(policy, batch):
+    options = {"num_candidates": 8, "choice": "sampled", "num_rollouts": 2, "seed": 3}
+    together = roll_out_closest(policy, batch, **options).rollouts.decision
+    assert batch.num_scenarios > 1
+    for row, scenario in enumerate(batch.scenarios):
+        alone = roll_out_closest(policy, collate([scenario]), **options).rollouts.decision[0]
+        assert torch.equal(alone, together[row, :, : alone.shape[1]])
+
+
 def test_a_single_sample_has_the_policys_probabilities(policy, batch):
     """Without the log's guidance the first tokens of many rollouts are distributed as the policy says."""
     context = policy.encode(batch)

@@ -84,3 +84,21 @@ def test_the_loss_does_not_depend_on_how_many_scenarios_are_in_memory(drawn_scen
         pretrain(Glide(), drawn_scenarios, tmp_path / str(size), config)
         losses.append([line["loss"] for line in read_metrics(tmp_path / str(size))])
     assert losses[0] == pytest.approx(losses[1], rel=1e-4)
+
+
+def test_a_count_that_adds_up_to_less_than_one_divides_all_the_same(drawn_scenarios, tmp_path):
+    """Counts may be weights, as those of tokens that stand still; a mean does not depend on their scale."""
+
+    class Light(Glide):
+        def imitation_loss(self, scenarios, trained, update):
+            loss = super().imitation_loss(scenarios, trained, update)
+            sums = {name: 1e-6 * value for name, value in loss.sums.items()}
+            return ImitationLoss(1e-6 * loss.loss, 1e-6 * loss.count, sums)
+
+    found = []
+    for kind in (Glide, Light):
+        torch.manual_seed(0)
+        pretrain(kind(), drawn_scenarios, tmp_path / kind.__name__, replace(CONFIG, epochs=1.0, gradient_clip=1e9))
+        lines = read_metrics(tmp_path / kind.__name__)
+        found.append([line[name] for line in lines for name in ("loss", "error_m", "gradient_norm")])
+    assert found[0] == pytest.approx(found[1], rel=1e-3)

@@ -228,6 +228,17 @@ def test_with_hold_speed_an_agent_that_is_faster_or_slower_earns_nothing_by_it(l
     values = update_policy(learner, batch, replace(config, hold_speed=True), fabric)
     assert math.isfinite(values["speed_slope"])
 
+    # a scenario without a finite reward earns 0 all the same, and changes nothing for the others
+    unknown = torch.zeros_like(rewards.is_missing)
+    unknown[:, 0] = True
+    partly = replace(
+        rewards, is_missing=unknown, by_agent=rewards.by_agent.masked_fill(unknown.any(0)[:, None, None], 0)
+    )
+    [one], slope = experience.hold_speed([experience.Experience(batch, rollouts, realism, partly)], fabric)
+    assert (one.rewards.by_agent[0] == 0).all()
+    explained = (faster[1:] * rewards.by_agent[1:]).sum() / faster[1:].square().sum()
+    assert slope == pytest.approx(float(explained), rel=1e-5)
+
 
 def gradients_with(learner, batch, fabric, config, beta):
     twin = copy.deepcopy(learner)

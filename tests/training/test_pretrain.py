@@ -15,6 +15,7 @@ from rlftsim.errors import ConfigError
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.scenario.batch import collate
 from rlftsim.tokens.smoothing import neighbor_weights
+from rlftsim.training.checkpoint import newest_checkpoint
 from rlftsim.training.data import trained_agents
 from rlftsim.training.imitation import learning_rate, summed_loss
 from rlftsim.training.pretrain import PretrainConfig, pretrain
@@ -210,8 +211,10 @@ def test_the_average_of_the_weights_is_saved_and_resumes(vocabulary, drawn_scena
     policy = Followed(tiny.MODEL, vocabulary)
     start = copy.deepcopy(policy)
     pretrain(policy, drawn_scenarios, tmp_path / "whole", config)
-    weights.append(policy.network.state_dict())  # the last weights themselves
+    last = load_file(newest_checkpoint(tmp_path / "whole" / "checkpoints") / "policy.safetensors")
+    weights.append({name.removeprefix("network."): value for name, value in last.items()})
     saved = load_file(tmp_path / "whole" / "model" / "model.safetensors")
+    assert all(torch.equal(value, policy.network.state_dict()[name]) for name, value in saved.items())
     for name, value in saved.items():
         mean = weights[0][name]
         for update, later in enumerate(weights[1:], start=1):

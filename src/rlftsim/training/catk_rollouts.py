@@ -11,7 +11,7 @@ from torch import Tensor
 
 from rlftsim.errors import ConfigError
 from rlftsim.goals.types import Goals
-from rlftsim.rollout.noise import derive_seed
+from rlftsim.rollout.noise import draw_noise
 from rlftsim.rollout.policy import DecisionDistribution, Sampling, TokenPolicy
 from rlftsim.rollout.rows import pick_rows, place_rows
 from rlftsim.rollout.simulate import simulate
@@ -85,15 +85,19 @@ def roll_out_closest(
     found: list[tuple[Tensor, Tensor]] = []  # target token and its mask of each decision, [B, N, A]
     logged = _targets(batch, tokens, policy.vocabulary, catk_compat)
     take = _CHOICES[choice]
-    draws = torch.Generator().manual_seed(derive_seed(seed, "candidates") % 2**63)
+    # K numbers for each decision of an agent in place of one, as independent of the batch as those of `simulate`
+    num_draws = num_candidates if choice == "sampled" else 0
+    num_decisions = tokens.logged_valid.shape[-1] - HISTORY_TOKENS
+    draws = draw_noise(batch, range(num_rollouts), seed=seed, purpose="candidates", per_agent=num_decisions * num_draws)
+    draw = iter(draws.unflatten(-1, (num_decisions, num_draws)).unbind(-2))  # [B, N, A, K] of each decision
 
     def choose(
         distribution: DecisionDistribution, state: Any, sampling: Sampling, noise: Tensor
     ) -> Int64[Tensor, "B N A"]:
         # `simulate` decides in the order of time, so the next target is that of this decision.
         target = next(logged)((state.position, state.heading))
-        if choice == "sampled":  # K numbers for each agent instead of one
-            noise = torch.rand((*noise.shape[:-1], num_candidates), generator=draws).to(noise)
+        if choice == "sampled":
+            noise = next(draw)
         taken = take(distribution, target, num_candidates, noise)  # type: ignore[arg-type]
         best = taken if targets == "taken" else target.best_token()
         found.append((best, target.logged_valid & target.is_near_log(max_distance_lengths)))

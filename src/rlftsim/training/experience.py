@@ -165,6 +165,9 @@ def hold_speed(experiences: Sequence[Experience], fabric: Fabric) -> tuple[list[
         speed, logged_valid = simulated_speeds(experience.batch, experience.rollouts)
         mean_speed = (speed * logged_valid[:, None]).sum(-1) / logged_valid.sum(-1).clamp(min=1)[:, None]  # [B, N, A]
         deviation = torch.nan_to_num(mean_speed - mean_speed.mean(1, keepdim=True), 0.0, 0.0, 0.0)
+        # A scenario of which no reward is known earns 0, and has no part in the regression.
+        is_known = ~experience.rewards.is_missing.all(0)  # [B]
+        deviation = deviation * is_known[:, None, None]
         sums += torch.stack([(deviation * experience.rewards.by_agent).sum(), deviation.square().sum()])
         deviations.append(deviation)
     # One slope for all processes, or their gradients would not add up to that of one process.

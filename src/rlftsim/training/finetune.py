@@ -88,7 +88,8 @@ class FinetuneConfig:
     """Weight of the policy's entropy in the objective."""
     imitation_weight: float = 0.0
     """Weight of the pre-training loss on the same scenarios in the objective: it holds speeds and kinematics near the
-    log while realism rises. 0 = the paper's objective."""
+    log while realism rises. A loss with noise of its own (TrafficBots) draws it for each piece in memory, so that this
+    part of an update depends on `micro_batch_size`. 0 = the paper's objective."""
     hold_speed: bool = False
     """Take out of the rewards what an agent's mean speed explains, so that driving slowly (or fast) earns nothing by
     itself. Not with goals, which ask for a speed. False = the paper's objective."""

@@ -308,19 +308,19 @@ def _update(learner: _Imitator, update: int) -> dict[str, float]:
         sums = sums + torch.stack([value.detach().float() for value in values])
     # 2. They add up over processes, and are divided by the number of predictions of the whole batch.
     sums = all_reduce_sum(sums, fabric)
+    count = torch.where(sums[-1] > 0, sums[-1], 1.0)  # weights of tokens may add up to less than 1
     parameters = list(learner.policy.parameters())
     all_reduce_gradients(parameters, fabric)
     for parameter in parameters:
         if parameter.grad is not None:
-            parameter.grad.div_(sums[-1].clamp(min=1))
+            parameter.grad.div_(count)
     # 3. The step, skipped where the gradient is not finite.
     norm = float(torch.nn.utils.clip_grad_norm_(parameters, config.gradient_clip))
     learner.finish_update(is_good=math.isfinite(norm))
-    *totals, predictions = sums.tolist()
     return {
-        **{name: total / max(predictions, 1.0) for name, total in zip(("loss", *names), totals)},
+        **dict(zip(("loss", *names), (sums[:-1] / count).tolist())),
         "gradient_norm": norm,
-        "predictions": predictions,
+        "predictions": float(sums[-1]),
         "learning_rate": learner.optimizer.param_groups[0]["lr"],
     }
 

@@ -362,8 +362,10 @@ class TrainingRun:
             raise KeyboardInterrupt(what_next) from None
         self.folder.close()
         self.folder.finish()
+        if learner.result is not learner.policy:  # trained in place: the policy is what the folder holds
+            learner.policy.load_state_dict(learner.result.state_dict())
         if self._fabric.is_global_zero:
-            learner.result.eval().save_pretrained(self.folder.model, card=card)
+            learner.policy.eval().save_pretrained(self.folder.model, card=card)
         return self.folder.model
 
     def _make_updates(self, learner: Learner, make_update: Callable[[], UpdateReport], title: str) -> None:
