@@ -140,6 +140,19 @@ def test_the_same_scenarios_give_the_same_bytes(tmp_path, scenarios):
         assert path.read_bytes() == (tmp_path / "b" / path.relative_to(tmp_path / "a")).read_bytes()
 
 
+def test_the_fingerprint_is_that_of_the_content_of_a_split(tmp_path, scenarios):
+    moved = [*scenarios[:3], move_scenario(scenarios[3], 0.0, (0.0, 0.5))]
+    for name, some in {"first": scenarios[:4], "elsewhere": scenarios[:4], "grown": scenarios, "moved": moved}.items():
+        with DatasetWriter(tmp_path / name, scenarios_per_shard=4) as writer:
+            for scenario in some:
+                writer.add(scenario, "validation" if scenario.scenario_id == "id4" else "training")
+    found = {name: ScenarioDataset(tmp_path / name, "training") for name in ("first", "elsewhere", "grown", "moved")}
+    first, elsewhere, grown, other = (one.fingerprint for one in found.values())
+    assert first == elsewhere == grown  # of another split no file has a part in it
+    assert first != other
+    assert found["first"].manifest.index_sha256 == found["moved"].manifest.index_sha256  # an index has no poses
+
+
 def test_another_process_can_open_the_data_set_again(folder):
     again = pickle.loads(pickle.dumps(ScenarioDataset(folder, "training")))
     assert again.scenario_ids == ["id0", "id1", "id2", "id3"]

@@ -5,6 +5,8 @@ import pytest
 
 import tiny
 from rlftsim.errors import CheckpointError, DataError
+from rlftsim.rollout.edge_scenes import move_scenario
+from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
 from rlftsim.training.finetune import FinetuneConfig
 from rlftsim.training.reference import KlConfig
 from rlftsim.training.run_folder import RunFolder, board_tag, describe_inputs, read_metrics, to_plain
@@ -107,6 +109,23 @@ def test_another_vocabulary_or_radius_is_another_run(tmp_path, drawn_scenarios):
             RunFolder(tmp_path, tiny.FINETUNE, describe_inputs(other, drawn_scenarios))
     with pytest.raises(CheckpointError, match="scenarios"):
         RunFolder(tmp_path, tiny.FINETUNE, describe_inputs(first, drawn_scenarios[:-1]))
+
+
+def test_a_data_set_that_was_converted_otherwise_is_another_run(tmp_path, drawn_scenarios):
+    """The same ids, other poses. A list of scenarios and a run of before have no files, and are taken to agree."""
+    policy = tiny.tiny_policy(tiny.small_vocabulary(drawn_scenarios))
+    for name, along_m in {"first": 0.0, "again": 0.0, "otherwise": 0.5}.items():
+        write_dataset([move_scenario(one, 0.0, (along_m, 0.0)) for one in drawn_scenarios], tmp_path / name)
+    data = {name: ScenarioDataset(tmp_path / name) for name in ("first", "again", "otherwise")}
+    run = tmp_path / "run"
+    RunFolder(run, tiny.FINETUNE, describe_inputs(policy, data["first"]))
+    RunFolder(run, tiny.FINETUNE, describe_inputs(policy, data["again"]))
+    with pytest.raises(CheckpointError, match=r"other settings or inputs \(scenario_files\)"):
+        RunFolder(run, tiny.FINETUNE, describe_inputs(policy, data["otherwise"]))
+    RunFolder(run, tiny.FINETUNE, describe_inputs(policy, list(data["first"])))
+    with pytest.raises(CheckpointError, match="scenario_files"):
+        RunFolder(run, tiny.FINETUNE, describe_inputs(policy, data["otherwise"]))
+    RunFolder(run, tiny.FINETUNE, describe_inputs(policy, data["first"]))
 
 
 def test_precision_is_part_of_a_run_and_threads_are_not(tmp_path):

@@ -101,7 +101,7 @@ class Simulate:
         about = {
             "model": self.model,
             "policy": fingerprint_policy(policy),
-            "data": scenarios.manifest.index_sha256,
+            "data": scenarios.fingerprint,
             "seed": self.seed,
             "num_rollouts": self.num_rollouts,
             "sampling": asdict(sampling),

@@ -15,7 +15,15 @@ import torch
 from torch import nn
 
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.evaluation.results import EvaluateConfig, Evaluation, GoalsGiven, Provenance, Skipped, row_of_result
+from rlftsim.evaluation.results import (
+    NUMBERS_VERSION,
+    EvaluateConfig,
+    Evaluation,
+    GoalsGiven,
+    Provenance,
+    Skipped,
+    row_of_result,
+)
 from rlftsim.evaluation.resumable import EvaluationParts, groups_of, resume_evaluation
 from rlftsim.evaluation.scenario_source import choose_scenarios, hash_manifest, open_held_out
 from rlftsim.goals.logged import logged_goals
@@ -124,6 +132,22 @@ def frozen_copy(policy: AnyPolicy) -> AnyPolicy:
 def evaluated_ends(batch: ScenarioBatch) -> Goals:
     """Logged final positions of the evaluated agents, as their goals."""
     return logged_goals(batch, batch.evaluated_mask)
+
+
+def identity_of(policy: Policy, dataset: ScenarioDataset, config: EvaluateConfig) -> dict[str, object]:
+    """Plain values by which a stored measurement is known to be this one, for `JsonParts`.
+
+    Args:
+        policy: measured.
+        dataset: of the scenarios.
+        config: settings of the rollouts.
+    """
+    return {
+        "rlftsim": NUMBERS_VERSION,
+        "policy": fingerprint_policy(policy),
+        "data": dataset.fingerprint,
+        "settings": config.what_counts(),
+    }
 
 
 def check_jobs(config: EvaluateConfig, device: torch.device) -> None:

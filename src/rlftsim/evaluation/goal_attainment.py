@@ -14,14 +14,13 @@ from typing import Any
 import torch
 
 from rlftsim import __version__
-from rlftsim.evaluation.evaluate import check_jobs, frozen_copy, simulate_encoded
-from rlftsim.evaluation.results import NUMBERS_VERSION, EvaluateConfig
+from rlftsim.evaluation.evaluate import check_jobs, frozen_copy, identity_of, simulate_encoded
+from rlftsim.evaluation.results import EvaluateConfig
 from rlftsim.evaluation.resumable import JsonParts, map_scenarios
 from rlftsim.evaluation.scenario_source import open_held_out
 from rlftsim.goals.attainment import outcome_of
 from rlftsim.goals.goals_file import GoalEntry
 from rlftsim.goals.placement import goals_of_batch
-from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import Policy, device_of, is_goal_conditioned
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import ScenarioDataset
@@ -80,7 +79,7 @@ def attain_goals(
     for goal in goals:
         by_scenario.setdefault(goal.scenario_id, []).append(goal)
     # The goals' labels are not compared: renaming one measures nothing anew.
-    common = {"rlftsim": NUMBERS_VERSION, "policy": fingerprint_policy(policy), "settings": config.what_counts()}
+    common = identity_of(policy, dataset, config)
     points = {i: [[goal.agent_id, goal.x, goal.y] for goal in own] for i, own in by_scenario.items()}
     identity = {scenario_id: common | {"goals": own} for scenario_id, own in points.items()}
     ids, information = tuple(by_scenario), {"package_version": __version__}

@@ -18,14 +18,13 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.evaluation.evaluate import check_jobs, frozen_copy, simulate_states
+from rlftsim.evaluation.evaluate import check_jobs, frozen_copy, identity_of, simulate_states
 from rlftsim.evaluation.results import EvaluateConfig
 from rlftsim.evaluation.resumable import JsonParts, map_scenarios
 from rlftsim.evaluation.scenario_source import choose_scenarios, open_held_out
 from rlftsim.realism import Features, ScenarioLog, compute_features, metric_by_name, scenario_log, score_features
 from rlftsim.rewards.base import leave_one_out
 from rlftsim.rewards.mloo import compute_mloo
-from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import Policy, device_of
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.workers import on_this_machine
@@ -79,7 +78,7 @@ def measure_variances(
         )
     check_jobs(config, device_of(policy))
     ids = [dataset.scenario_ids[i] for i in choose_scenarios(dataset, config)]
-    identity = {"sizes": list(sizes), "policy": fingerprint_policy(policy), "settings": config.what_counts()}
+    identity = {"sizes": list(sizes), **identity_of(policy, dataset, config)}
     files = JsonParts(Path(out), ids, dict.fromkeys(ids, identity), {}, _stored_variances)
     work = partial(_measure_scenario, _Job(frozen_copy(policy), dataset, config, sizes))
     runner = on_this_machine(config.jobs, len(ids))

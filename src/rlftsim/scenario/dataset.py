@@ -11,6 +11,7 @@ Files are written under temporary names and renamed, so a file under its own nam
 """
 
 import difflib
+import hashlib
 import json
 import os
 import shutil
@@ -147,6 +148,16 @@ class ScenarioDataset:
     def guessed(self) -> tuple[str, ...]:
         """Values that are guessed in at least one scenario, see `Scenario.guessed`, in alphabetical order."""
         return tuple(sorted({word for words in set(self.index["guessed"].to_pylist()) for word in words.split()}))
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Hash of the files with its scenarios: of another place the same, of data that was converted otherwise not.
+
+        Files of other splits have no part in it: adding one changes nothing.
+        """
+        own = set(self._shard_names)
+        checksums = "".join(entry.sha256 for entry in self.manifest.shards if entry.file in own)
+        return hashlib.blake2b(checksums.encode(), digest_size=16).hexdigest()
 
     def __len__(self) -> int:
         return len(self.scenario_ids)

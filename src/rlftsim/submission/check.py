@@ -254,8 +254,8 @@ class _Pass:
         if others >= max(MIN_OTHER_AGENTS, MAX_OTHER_AGENTS * found.num_checked):
             first = found.findings.drop(1)[0]
             text = (
-                f"{others} of {found.num_checked} scenarios have other agents than {self.data.folder} (index "
-                f"{self.data.manifest.index_sha256[:8]}): simulated from another version of the data. First: {first}"
+                f"{others} of {found.num_checked} scenarios have other agents than {self.data.folder} "
+                f"({self.data.fingerprint[:8]}): simulated from another version of the data. First: {first}"
             )
             self._add(15, text, found.archive)
 

@@ -106,7 +106,7 @@ def make_plan(
     identity = {
         "format": FORMAT,
         "policy": policy_fingerprint,
-        "data": data.manifest.index_sha256,
+        "data": data.fingerprint,
         "split": data.split,
         # hashed: the plan does not show the account
         "entry": hashlib.sha256(metadata).hexdigest(),

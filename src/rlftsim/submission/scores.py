@@ -6,6 +6,7 @@ import torch
 
 from rlftsim.evaluation.results import SCHEMA, EvaluateConfig, Evaluation, Provenance, Skipped, row_of_result
 from rlftsim.evaluation.rollout_files import AXES
+from rlftsim.evaluation.scenario_source import hash_manifest
 from rlftsim.evaluation.score_files import has_road_edge
 from rlftsim.realism import SimulatedStates, metric_by_name, scenario_log, score
 from rlftsim.scenario.dataset import ScenarioDataset
@@ -50,7 +51,7 @@ class ArchiveScores:
             policy="rollouts of a submission",
             policy_fingerprint=sha256,
             dataset=str(data.folder.absolute()),
-            manifest_sha256=data.manifest.index_sha256,
+            manifest_sha256=hash_manifest(data.folder),
             sources=data.sources,
             guessed=data.guessed,
         )

@@ -26,6 +26,7 @@ from rlftsim.aliases import current_names
 from rlftsim.atomic_io import append_text, errors_name, write_text
 from rlftsim.errors import CheckpointError
 from rlftsim.rollout.fingerprint import fingerprint_policy
+from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.types import Scenarios, scenario_ids_of
 from rlftsim.training.checkpoint import newest_checkpoint
 
@@ -60,6 +61,10 @@ BOARD_GROUPS = {
 """Groups of metrics in TensorBoard: by the beginnings of their names."""
 
 
+SCENARIO_FILES = "scenario_files"
+"""Input that only data sets have, not lists of scenarios, and not runs of before: compared where both have it."""
+
+
 def board_tag(name: str) -> str:
     """A metric's name in TensorBoard: that of metrics.jsonl, behind its group if it has one."""
     groups = [group for group, beginnings in BOARD_GROUPS.items() if name.startswith(beginnings)]
@@ -71,13 +76,14 @@ def describe_inputs(policy: object, scenarios: Scenarios) -> dict[str, str]:
 
     Args:
         policy: its weights, settings and vocabulary count.
-        scenarios: their ids and order count.
+        scenarios: their ids and order count, and the files of a data set.
     """
     ids = hashlib.blake2b(digest_size=16)
-    # Ids and order only: reading every scenario would take minutes.
+    # Not the scenarios themselves: reading every one would take minutes.
     for scenario_id in scenario_ids_of(scenarios):
         ids.update(f"{scenario_id}\n".encode())
-    return {"initial_policy": fingerprint_policy(policy), "scenarios": ids.hexdigest()}
+    files = {SCENARIO_FILES: scenarios.fingerprint} if isinstance(scenarios, ScenarioDataset) else {}
+    return {"initial_policy": fingerprint_policy(policy), "scenarios": ids.hexdigest(), **files}
 
 
 def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -184,6 +190,8 @@ class RunFolder:
         self._settings = {**to_plain(config), **(inputs or {})}
         defaults = default_settings(config) if defaults is None else defaults
         stored = self._checked_stored_settings(self._settings, flatten(defaults), may_grow)
+        if stored.get(SCENARIO_FILES):  # kept where the same scenarios come as a list this time
+            self._settings.setdefault(SCENARIO_FILES, stored[SCENARIO_FILES])
         changed = {name: stored[name] for name in may_grow if name in stored and stored[name] != self._settings[name]}
         self.grows_from = changed if self.has_model else {}
         """Settings of the shorter run whose model is here, by name; empty unless it is made longer."""
@@ -222,9 +230,10 @@ class RunFolder:
             )
         # A setting that was added after the run began has its default, with which runs are as before. Any other that
         # only one side has counts as different: None stands for it.
+        one_sided = {SCENARIO_FILES} - (old.keys() & new.keys())
         old = {name: defaults.get(name) for name in new} | old
         grown = {name for name in may_grow if isinstance(old[name], int | float) and new[name] > old[name]}
-        names = {name for name in old.keys() | new.keys() if not may_change(name)} - grown
+        names = {name for name in old.keys() | new.keys() if not may_change(name)} - grown - one_sided
         differing = sorted(name for name in names if old.get(name) != new.get(name))
         if differing:
             most = 8  # settings named in one line
