@@ -20,7 +20,9 @@ import torch
 import rlftsim as rs
 from made_up import CPU, TINY
 from rlftsim.cli.main import main
-from rlftsim.errors import CheckpointError, ConfigError
+from rlftsim.envs.config import EnvConfig
+from rlftsim.envs.source import Source
+from rlftsim.errors import CheckpointError, ConfigError, DataError
 from rlftsim.evaluation.results import SCORE_COLUMNS, EvaluateConfig, Evaluation
 from rlftsim.evaluation.score_files import ScoreConfig
 from rlftsim.rollout.fingerprint import fingerprint_policy
@@ -357,6 +359,27 @@ def test_what_training_returns_is_what_it_saves_also_where_weights_are_averaged(
     for _ in range(2):
         model = train(start, training, out="runs/averaged", config=settings[stage])
         assert fingerprint_policy(model) == fingerprint_policy(rs.load_policy("runs/averaged"))
+
+
+def test_dropout_changes_no_simulation(home, data):
+    """A module in training mode, as a fresh one is, is simulated as in evaluation mode; environments refuse it."""
+    policy = TINY.new_policy(rs.load_policy("runs/base").vocabulary)
+    config = replace(policy.config, dropout=0.5)
+    policy = rs.SmartPolicy(config, policy.vocabulary).train()
+    first, again, still = (rs.simulate(one, data[0], num_rollouts=2) for one in (policy, policy, policy.eval()))
+    assert torch.equal(first.position, again.position)
+    assert torch.equal(first.position, still.position)
+    with pytest.raises(ConfigError, match=r"policy is in training mode, .* call policy\.eval\(\)"):
+        Source(EnvConfig(), list(data), policy.train())
+
+
+def test_weights_that_are_nan_are_refused_where_they_are_simulated(base, data):
+    with torch.no_grad():
+        next(base.parameters()).fill_(float("nan"))
+    with pytest.raises(DataError, match=f"probabilities that are NaN in scenario {data.scenario_ids[0]}"):
+        rs.simulate(base, data, num_rollouts=2)
+    with pytest.raises(DataError, match="probabilities that are NaN"):
+        rs.evaluate(base, data, num_rollouts=2)
 
 
 def test_recipes_by_name():

@@ -21,7 +21,9 @@ from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.evaluate import simulate_states
 from rlftsim.evaluation.rollout_files import find_rollouts, read_states
 from rlftsim.rollout.baselines import ConstantVelocity
+from rlftsim.rollout.check import check_policy
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
+from rlftsim.scenario.types import CURRENT_STEP
 from rlftsim.submission.build import build_archive, forecast_size
 from rlftsim.submission.check import check_archive
 from rlftsim.submission.closed_loop import refuse_open_loop, statement
@@ -284,8 +286,26 @@ class Drawing(ConstantVelocity):
         return replace(super().begin(context, num_rollouts, goals, noise), draws=draws)
 
 
+class Foreseeing(ConstantVelocity):
+    """Drives at the mean velocity of the logged future."""
+
+    def encode(self, scenarios):
+        if scenarios.valid.shape[-1] <= CURRENT_STEP + 1:
+            return super().encode(scenarios)
+        velocity = scenarios.velocity.clone()
+        velocity[:, :, CURRENT_STEP] = (
+            scenarios.position[:, :, -1] - scenarios.position[:, :, CURRENT_STEP]
+        ) / 8.0 + 1.0
+        return super().encode(replace(scenarios, velocity=velocity))
+
+
 def test_policies_that_are_no_closed_loop_are_refused():
     drawn = scenes.straight_road()
+    with pytest.raises(ConfigError, match="change where the logged future is taken away"):
+        refuse_open_loop(Foreseeing(), drawn)
+    refuse_open_loop(Foreseeing(), scenes.without_future())  # there is nothing to foresee
+    (found,) = check_policy(Foreseeing(), [drawn]).failures
+    assert found.rule == "rollouts do not depend on the logged future"
     with pytest.raises(ConfigError, match=r"decides every 1\.6 s: the challenge wants an inference call at least once"):
         refuse_open_loop(Slow(), drawn)
     with pytest.raises(ConfigError, match="the ego shares with other agents"):

@@ -8,12 +8,13 @@ import torch
 
 from rlftsim._api.sources import batch_of, policy_of
 from rlftsim.errors import ConfigError, DataError, whole_number
+from rlftsim.evaluation.evaluate import frozen_copy
 from rlftsim.goals.maneuvers.reach import HORIZON_S
 from rlftsim.goals.placement import FASTEST_MPS
 from rlftsim.goals.types import Goals, PointById
 from rlftsim.progress import progress_bar
 from rlftsim.rollout.fingerprint import fingerprint_policy
-from rlftsim.rollout.policy import Policy, Sampling, device_of, is_goal_conditioned
+from rlftsim.rollout.policy import Policy, Sampling, device_of, is_goal_conditioned, is_training
 from rlftsim.rollout.simulate import simulate as simulate_batch
 from rlftsim.rollout.types import RolloutProvenance, Rollouts
 from rlftsim.scenario.any_form import AnyScenarios, Name
@@ -35,7 +36,7 @@ def simulate(
     The same seed gives the same rollouts as `rlftsim simulate`, whatever other scenarios are handed over with one.
 
     Args:
-        policy: a policy, or a name for `load_policy`.
+        policy: a policy, simulated as in evaluation mode, or a name for `load_policy`.
         scenarios: one scenario, several, a batch or a data set, all of which are in memory at once; a name of a data
             set stands for its split validation. Only history, map and lights are used.
         num_rollouts: N, futures of every scenario.
@@ -56,6 +57,8 @@ def simulate(
     num_rollouts, seed = whole_number("num_rollouts", num_rollouts, 1), whole_number("seed", seed)
     sampling = sampling_of(sampling)
     policy = policy_of(policy)
+    if is_training(policy):  # with dropout a seed would not say what happens
+        policy = frozen_copy(policy)
     batch = batch_of(scenarios, device_of(policy))
     if not isinstance(goals, Goals | Mapping | None):
         raise ConfigError(

@@ -13,7 +13,7 @@ from rlftsim.envs.world import build_world
 from rlftsim.errors import ConfigError, in_short
 from rlftsim.policies.registry import load_policy
 from rlftsim.rollout.fingerprint import fingerprint_policy
-from rlftsim.rollout.policy import Policy, device_of, is_goal_conditioned
+from rlftsim.rollout.policy import Policy, device_of, is_goal_conditioned, is_training
 from rlftsim.scenario.any_form import AnyScenarios, scenarios_of
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.types import Scenario, Scenarios, scenario_ids_of
@@ -46,6 +46,10 @@ class Source:
     ):
         if policy is not None and not isinstance(policy, Policy):
             raise ConfigError(f"policy is {in_short(policy)}, not a policy: name a stored one as `model`.")
+        if is_training(policy):
+            raise ConfigError(
+                "policy is in training mode, in which dropout makes traffic of one seed differ: call policy.eval()."
+            )
         self.config = config
         self.scenarios: Scenarios = scenarios_of(scenarios if scenarios is not None else config.data, config.split)
         self.scenario_ids = list(scenario_ids_of(self.scenarios))

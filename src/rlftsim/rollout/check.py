@@ -21,7 +21,14 @@ from torch import Tensor, nn
 from rlftsim.errors import RlftsimError, place_of
 from rlftsim.geometry import rotate, wrap_angle
 from rlftsim.goals.types import Goals
-from rlftsim.rollout.edge_scenes import EXACT_TURN_RAD, GRID_M, edge_scenes, move_scenario, place_on_grid
+from rlftsim.rollout.edge_scenes import (
+    EXACT_TURN_RAD,
+    GRID_M,
+    edge_scenes,
+    move_scenario,
+    place_on_grid,
+    without_future,
+)
 from rlftsim.rollout.noise import draw_noise
 from rlftsim.rollout.policy import (
     DecisionDistribution,
@@ -600,6 +607,14 @@ def rollouts_are_independent_of_batch_composition(subject: _Subject) -> str:
     return _within(max(gaps), PADDING_TOLERANCE + subject.rounding, "largest gap")
 
 
+def rollouts_do_not_depend_on_the_logged_future(subject: _Subject) -> str:
+    """The rollouts are the same where tracks and lights end at the current step, as in a test split."""
+    if not all(scenario.has_future for scenario in subject.scenarios):
+        raise _NotApplicable("a scenario has no logged future")
+    hidden = subject.collate([without_future(scenario) for scenario in subject.scenarios])
+    return _within(_gap(subject.simulate(hidden).position, subject.rollouts.position), POSE_TOLERANCE_M, "apart (m)")
+
+
 def edge_cases_can_be_simulated_and_scored(subject: _Subject) -> str:
     """All are simulated and scored: one agent, no map, no lights, 128 agents, agents first seen now or never, NaN."""
     gaps = {}
@@ -660,5 +675,6 @@ CHECKS: tuple[Check, ...] = (
     shared_passes_change_no_number,
     scores_are_invariant_to_rotation_and_translation,
     rollouts_are_independent_of_batch_composition,
+    rollouts_do_not_depend_on_the_logged_future,
     edge_cases_can_be_simulated_and_scored,
 )

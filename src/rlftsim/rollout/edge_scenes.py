@@ -1,6 +1,6 @@
 """Variants of a scenario that policies must handle: moved, emptied, crowded, with agents that appear late."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 
@@ -43,6 +43,19 @@ def move_scenario(scenario: Scenario, turn_rad: float, shift_m: tuple[float, flo
         tracks=replace(tracks, position=moved(tracks.position), heading=heading.astype(np.float32), velocity=velocity),
         map_features=replace(features, points=moved(features.points), polygon_rest=None),
         lights=replace(lights, stop_point=moved(lights.stop_point)),
+    )
+
+
+def without_future(scenario: Scenario) -> Scenario:
+    """The same scenario as in a test split: tracks and lights end at the current step."""
+    tracks, lights, end = scenario.tracks, scenario.lights, CURRENT_STEP + 1
+    cut = {name: getattr(tracks, name)[:, :end] for name in ("position", "heading", "velocity", "size", "valid")}
+    seen = {field.name: getattr(lights, field.name)[lights.step < end] for field in fields(lights)}
+    return replace(
+        scenario,
+        timestamps_s=scenario.timestamps_s[:end],
+        tracks=replace(tracks, **cut),
+        lights=LightStates(**seen),
     )
 
 

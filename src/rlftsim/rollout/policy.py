@@ -474,6 +474,11 @@ def device_of(policy: object) -> torch.device:
     return next((w.device for w in weights), torch.device("cpu"))
 
 
+def is_training(policy: object) -> bool:
+    """True for a module of which some part is in training mode, so that dropout may change its rollouts."""
+    return isinstance(policy, nn.Module) and any(module.training for module in policy.modules())
+
+
 def is_goal_conditioned(policy: object) -> bool:
     """True if goals have an effect on a policy: its attribute of this name, False where it has none."""
     return bool(getattr(policy, "is_goal_conditioned", False))

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from rlftsim.errors import ConfigError
+from rlftsim.errors import ConfigError, DataError
 from rlftsim.goals.types import Goals
 from rlftsim.rollout.noise import draw_noise
 from rlftsim.rollout.policy import DecisionDistribution, Policy, Sampling, device_of
@@ -49,6 +49,7 @@ def simulate(
     choose: Choose = sample_decision,
     force: Force | None = None,
     observe: Observe | None = None,
+    may_be_nan: bool = False,
 ) -> Rollouts:
     """Simulate N futures of every scenario, all in one batch; on a CPU with one thread.
 
@@ -65,12 +66,14 @@ def simulate(
         force: called before every advance with the state and the step it starts at; may impose states on agents.
         observe: called after every decision with the poses so far (x, y, heading, map frame); an error that it raises
             ends the simulation.
+        may_be_nan: True = log-probabilities that are NaN are handed on, to training, which skips such an update.
 
     Returns:
         Poses, decisions and log-probabilities, under the distribution that was sampled from.
 
     Raises:
         ConfigError: no rollouts, or a decision length that does not divide the 80 steps.
+        DataError: log-probabilities that are NaN, as of weights that are; the scenario is named.
     """
     rollout_ids = range(num_rollouts) if isinstance(num_rollouts, int) else num_rollouts
     stride = policy.steps_per_decision
@@ -113,12 +116,20 @@ def simulate(
     mask = torch.stack([present if one is None else present & one for one in masks], 3)  # [B, N, A, L]
     if all_forced is not None:
         mask = mask & ~all_forced.valid.unflatten(-1, (num_decisions, -1)).all(-1)
+    log_prob = torch.where(mask, torch.stack(log_probs, dim=3), 0.0)
+    is_nan = log_prob.isnan().flatten(1).any(1)  # [B]
+    if not may_be_nan and is_nan.any():
+        first = batch.scenarios[int(is_nan.nonzero()[0])].scenario_id
+        raise DataError(
+            f"{type(policy).__name__} decides with probabilities that are NaN in scenario {first}: load its weights "
+            "again if they diverged, or leave out a scenario with extreme values."
+        )
     return Rollouts(
         position=path[..., :2],
         heading=path[..., 2],
         decision=torch.stack(decisions, dim=3),
         decision_mask=mask,
-        log_prob=torch.where(mask, torch.stack(log_probs, dim=3), 0.0),
+        log_prob=log_prob,
         draws=draws,
         goals=goals,
         forced=all_forced,

@@ -4,13 +4,17 @@ import torch
 from torch import Tensor
 
 from rlftsim.errors import ConfigError
+from rlftsim.rollout.edge_scenes import without_future
 from rlftsim.rollout.noise import draw_noise
 from rlftsim.rollout.policy import Policy, Sampling, device_of
+from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.types import FUTURE_STEPS, STEP_S, Scenario
 
 MAX_STEPS_PER_DECISION = 10
 """Inference may be called as rarely as once a second, with interpolation to 10 Hz."""
+SAME_POSE_M = 1e-3
+"""Rounding may differ where tensors are shorter."""
 
 
 def statement(policy: Policy, sampling: Sampling) -> str:
@@ -42,8 +46,8 @@ def refuse_open_loop(policy: Policy, scenario: Scenario) -> None:
         scenario: any, to try the policy on.
 
     Raises:
-        ConfigError: it decides less than once a second, or the ego's draws at the start of a rollout depend on other
-            agents' noise, or theirs on the ego's.
+        ConfigError: it decides less than once a second, reads the logged future, or the ego's draws at the start of a
+            rollout depend on other agents' noise, or theirs on the ego's.
     """
     stride = policy.steps_per_decision
     if stride > MAX_STEPS_PER_DECISION:
@@ -51,6 +55,16 @@ def refuse_open_loop(policy: Policy, scenario: Scenario) -> None:
             f"the policy decides every {stride * STEP_S:g} s: the challenge wants an inference call at least once "
             "a second."
         )
+    if scenario.has_future:  # in a test split there is none that could be read
+        with_it, without_it = (
+            simulate(policy, collate([one]).to(device_of(policy)), num_rollouts=1, seed=0).position
+            for one in (scenario, without_future(scenario))
+        )
+        if not torch.allclose(with_it, without_it, rtol=0.0, atol=SAME_POSE_M):
+            raise ConfigError(
+                "the policy's rollouts change where the logged future is taken away: the challenge wants each state "
+                "to follow from the states before it. Let `encode` read no step behind the current one."
+            )
     if not policy.initial_noise_size:
         return
     batch = collate([scenario]).to(device_of(policy))

@@ -104,7 +104,14 @@ def roll_out_closest(
         return taken
 
     rollouts = simulate(
-        policy, batch, num_rollouts=num_rollouts, seed=seed, context=context, goals=goals, choose=choose
+        policy,
+        batch,
+        num_rollouts=num_rollouts,
+        seed=seed,
+        context=context,
+        goals=goals,
+        choose=choose,
+        may_be_nan=True,
     )
     target, mask = (torch.stack(part, -1) for part in zip(*found))  # [B, N, A, L]
     return TargetedRollouts(rollouts, target, mask, class_of_type(batch.object_type))

@@ -80,7 +80,13 @@ def sample_rollouts(
     with fabric.autocast(), torch.no_grad(), one_thread():
         context = policy.encode(batch)
         rollouts = simulate(
-            policy, batch, num_rollouts=own, seed=derive_seed(seed, "rollouts", update), context=context, goals=chosen
+            policy,
+            batch,
+            num_rollouts=own,
+            seed=derive_seed(seed, "rollouts", update),
+            context=context,
+            goals=chosen,
+            may_be_nan=True,
         )
     if len(own) < num_rollouts:
         rollouts = _gather_rollouts(rollouts, num_rollouts, fabric)

@@ -89,7 +89,7 @@ def gcsl_finetune(
         model.eval()  # nothing that dropout would act on is trained
         context = model.encode(batch)
         seed = derive_seed(config.seed, "rollouts", update)
-        rollouts = simulate(model, batch, num_rollouts=config.num_rollouts, seed=seed, context=context)
+        rollouts = simulate(model, batch, num_rollouts=config.num_rollouts, seed=seed, context=context, may_be_nan=True)
         # Autocast keeps weights that it has cast, and those cast in the rollout have no gradient.
         torch.clear_autocast_cache()
         relabelled = relabel_with_endpoints(rollouts)
