@@ -171,7 +171,8 @@ def measure_update(
     from rlftsim.policies.smart.policy import SmartPolicy
     from rlftsim.scenario.batch import collate
     from rlftsim.scenario.womd import read_scenarios
-    from rlftsim.training.finetune import FinetuneConfig, prepare, update_policy
+    from rlftsim.training.finetune import prepare, update_policy
+    from rlftsim.training.finetune_config import FinetuneConfig
     from rlftsim.training.parallel import DeviceConfig, start_fabric
 
     torch.set_num_threads(1)

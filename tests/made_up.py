@@ -8,7 +8,7 @@ from rlftsim.policies.smart.config import SmartConfig
 from rlftsim.recipes.smart import SmartRecipe
 from rlftsim.tokens.clustering import TokensConfig
 from rlftsim.training.catk import CatkConfig
-from rlftsim.training.finetune import FinetuneConfig
+from rlftsim.training.finetune_config import FinetuneConfig
 from rlftsim.training.parallel import DeviceConfig
 from rlftsim.training.pretrain import PretrainConfig
 

@@ -17,7 +17,8 @@ from rlftsim.scenario.synthetic import pack_path
 from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
 from rlftsim.training.alarms import AlarmConfig
 from rlftsim.training.catk import CatkConfig, RoadConfig, catk_finetune
-from rlftsim.training.finetune import FinetuneConfig, finetune
+from rlftsim.training.finetune import finetune
+from rlftsim.training.finetune_config import FinetuneConfig
 from rlftsim.training.parallel import DeviceConfig, is_first_process
 from rlftsim.training.pretrain import PretrainConfig, pretrain
 from rlftsim.training.reference import KlConfig

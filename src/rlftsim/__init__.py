@@ -66,7 +66,7 @@ _MODULES = {
     "rlftsim.scenario.dataset": ("write_dataset",),
     "rlftsim.scenario.types": ("Scenario",),
     "rlftsim.studio.notebook": ("open_studio",),
-    "rlftsim.training.finetune": ("FinetuneConfig",),
+    "rlftsim.training.finetune_config": ("FinetuneConfig",),
     "rlftsim.viewer.notebook": ("show",),
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}

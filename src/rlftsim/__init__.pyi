@@ -24,7 +24,7 @@ from rlftsim.rollout.types import Rollouts as Rollouts
 from rlftsim.scenario.dataset import write_dataset as write_dataset
 from rlftsim.scenario.types import Scenario as Scenario
 from rlftsim.studio.notebook import open_studio as open_studio
-from rlftsim.training.finetune import FinetuneConfig as FinetuneConfig
+from rlftsim.training.finetune_config import FinetuneConfig as FinetuneConfig
 from rlftsim.viewer.notebook import show as show
 
 __version__: str

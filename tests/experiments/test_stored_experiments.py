@@ -20,7 +20,7 @@ from rlftsim.recipes.smart import SmartRecipe
 from rlftsim.tokens.clustering import TokensConfig
 from rlftsim.training.alarms import AlarmConfig
 from rlftsim.training.catk import CatkConfig
-from rlftsim.training.finetune import FinetuneConfig
+from rlftsim.training.finetune_config import FinetuneConfig
 from rlftsim.training.goal_relabeling import GcslConfig
 from rlftsim.training.parallel import DeviceConfig
 from rlftsim.training.pretrain import PretrainConfig

@@ -23,7 +23,7 @@ from rlftsim.rewards import (
 )
 from rlftsim.rewards.base import agent_rewards_by_name
 from rlftsim.rewards.mloo import compute_mloo
-from rlftsim.training.finetune import FinetuneConfig
+from rlftsim.training.finetune_config import FinetuneConfig
 
 values = st.integers(2, 8).flatmap(
     lambda n: st.lists(st.lists(st.floats(0, 1, width=32), min_size=n, max_size=n), min_size=1, max_size=3)

@@ -20,7 +20,8 @@ from rlftsim.scenario.batch import collate
 from rlftsim.training import experience
 from rlftsim.training import finetune as module
 from rlftsim.training.data import trained_agents
-from rlftsim.training.finetune import FinetuneConfig, compute_reward, finetune, prepare, update_policy
+from rlftsim.training.finetune import compute_reward, finetune, prepare, update_policy
+from rlftsim.training.finetune_config import FinetuneConfig
 from rlftsim.training.parallel import start_fabric
 from rlftsim.training.policy_gradient import masked_sum
 from rlftsim.training.reference import KlConfig

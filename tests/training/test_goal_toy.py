@@ -7,7 +7,8 @@ import tiny
 from rlftsim.goals.logged import logged_goals
 from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import collate
-from rlftsim.training.finetune import FinetuneConfig, prepare, update_policy
+from rlftsim.training.finetune import prepare, update_policy
+from rlftsim.training.finetune_config import FinetuneConfig
 from rlftsim.training.goals import GoalConfig
 from rlftsim.training.parallel import start_fabric
 from rlftsim.training.reference import KlConfig

@@ -27,7 +27,8 @@ from rlftsim.training import hindsight
 from rlftsim.training.augment import AugmentConfig, augment_goals
 from rlftsim.training.catk import catk_finetune
 from rlftsim.training.experience import Experience
-from rlftsim.training.finetune import FinetuneConfig, compute_reward, finetune, prepare, update_policy
+from rlftsim.training.finetune import compute_reward, finetune, prepare, update_policy
+from rlftsim.training.finetune_config import FinetuneConfig
 from rlftsim.training.freezing import freeze_untrained
 from rlftsim.training.goal_relabeling import GcslConfig, gcsl_finetune, relabel_with_endpoints
 from rlftsim.training.goals import GoalConfig, choose_goals

@@ -21,7 +21,8 @@ from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.tokens.vocabulary import Vocabulary
 from rlftsim.training.alarms import AlarmConfig
 from rlftsim.training.catk import CatkConfig, catk_finetune
-from rlftsim.training.finetune import FinetuneConfig, finetune
+from rlftsim.training.finetune import finetune
+from rlftsim.training.finetune_config import FinetuneConfig
 from rlftsim.training.goal_relabeling import GcslConfig, gcsl_finetune
 from rlftsim.training.goals import GoalConfig
 from rlftsim.training.pretrain import PretrainConfig, pretrain

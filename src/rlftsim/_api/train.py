@@ -19,7 +19,7 @@ from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.types import Scenarios
 from rlftsim.tokens.clustering import build_vocabulary
 from rlftsim.training.catk import CatkConfig
-from rlftsim.training.finetune import FinetuneConfig
+from rlftsim.training.finetune_config import FinetuneConfig
 from rlftsim.training.goal_relabeling import GcslConfig
 from rlftsim.training.methods import FinetuningConfig, describe_method, finetune_policy
 from rlftsim.training.pretrain import PretrainConfig

@@ -27,7 +27,6 @@ WOMD_SCENARIOS: dict[Plan, int] = {"convert": 576_000, "evaluate": 44_100, "subm
 """All records of the Waymo Open Motion Dataset, its validation split and its test split."""
 WOMD_PIECES: dict[Plan, int] = {"convert": 1_300, "evaluate": 44_100 // EvaluationParts.group_size, "submit": 150}
 """Pieces of the work, each done by one core: source files, groups of scenarios, shards."""
-_AGENT_COLUMNS = ("num_vehicles", "num_pedestrians", "num_cyclists", "num_others")
 
 
 @dataclass(frozen=True)
@@ -60,7 +59,7 @@ def measure_cost(plan: Plan, model: str, data: str, num_measured: int) -> UnitCo
                 raise DataError(f"{data}: no scenario could be converted, so there is no cost to plan with.")
             return UnitCost((time.process_time() - start) / report.converted, report.converted)
     dataset = open_dataset(data, cache_size=2)
-    agents = np.stack([dataset.index[name].to_numpy() for name in _AGENT_COLUMNS]).sum(0)  # [scenarios]
+    agents = dataset.num_agents
     bins = np.array_split(np.argsort(agents, kind="stable"), min(num_measured, len(dataset)))
     chosen = [int(members[len(members) // 2]) for members in bins]
     policy, config = frozen_copy(load_policy(model, "cpu")), EvaluateConfig()

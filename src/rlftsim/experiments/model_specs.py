@@ -8,7 +8,7 @@ from rlftsim.errors import ConfigError
 from rlftsim.recipes.registry import Recipe
 from rlftsim.rewards import CreditTo
 from rlftsim.training.catk import CatkConfig
-from rlftsim.training.finetune import FinetuneConfig
+from rlftsim.training.finetune_config import FinetuneConfig
 from rlftsim.training.goal_relabeling import GcslConfig
 from rlftsim.training.goals import GoalConfig, with_goals
 from rlftsim.training.methods import FinetuningConfig

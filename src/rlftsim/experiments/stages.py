@@ -148,5 +148,7 @@ def start_from_shorter_run(out: Path, epochs: float) -> None:
     found, copied = max(shorter, key=epochs_of), out.with_name(f".partial-{out.name}")
     shutil.rmtree(copied, ignore_errors=True)
     shutil.copytree(found / "checkpoints", copied / "checkpoints")
-    shutil.copy(found / "metrics.jsonl", copied / "metrics.jsonl")
+    # with its settings, so that one of other settings is refused rather than continued
+    for name in ("config.json", "metrics.jsonl"):
+        shutil.copy(found / name, copied / name)
     copied.rename(out)

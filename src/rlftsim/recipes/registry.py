@@ -23,7 +23,7 @@ from rlftsim.rollout.policy import Policy
 from rlftsim.tokens.clustering import TokensConfig
 from rlftsim.tokens.vocabulary import Vocabulary
 from rlftsim.training.catk import CatkConfig, RoadConfig
-from rlftsim.training.finetune import FinetuneConfig
+from rlftsim.training.finetune_config import FinetuneConfig
 from rlftsim.training.goal_relabeling import GcslConfig
 from rlftsim.training.goals import with_goals
 from rlftsim.training.pretrain import PretrainConfig

@@ -17,7 +17,7 @@ from rlftsim.errors import ConfigError
 from rlftsim.recipes.registry import SECTIONS, Recipe, section_names
 from rlftsim.training.run_folder import flatten, to_plain
 
-RUN_INPUTS = ("initial_policy", "scenarios", "augmented_goals")
+RUN_INPUTS = ("initial_policy", "scenarios", "scenario_files", "augmented_goals")
 """Entries of a run's config.json that describe what the run started from. They are hashes, not settings."""
 
 

@@ -16,7 +16,7 @@ from rlftsim.tokens.alignment import align_vocabulary
 from rlftsim.tokens.clustering import TokensConfig
 from rlftsim.tokens.vocabulary import Vocabulary
 from rlftsim.training.catk import CatkConfig, RoadConfig
-from rlftsim.training.finetune import FinetuneConfig
+from rlftsim.training.finetune_config import FinetuneConfig
 from rlftsim.training.goal_relabeling import GcslConfig
 from rlftsim.training.goals import GoalConfig
 from rlftsim.training.pretrain import PretrainConfig

@@ -13,7 +13,7 @@ from rlftsim.recipes.registry import Recipe
 from rlftsim.rollout.policy import Policy
 from rlftsim.tokens.vocabulary import Vocabulary
 from rlftsim.training.catk import CatkConfig
-from rlftsim.training.finetune import FinetuneConfig
+from rlftsim.training.finetune_config import FinetuneConfig
 from rlftsim.training.goal_relabeling import GcslConfig
 from rlftsim.training.pretrain import PretrainConfig
 from rlftsim.training.reference import KlConfig

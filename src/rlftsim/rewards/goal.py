@@ -1,5 +1,7 @@
 """The goal reward, and the paper's mixture of it with realism (RLFTSim, equation 4)."""
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -8,6 +10,7 @@ from rlftsim.errors import ConfigError
 from rlftsim.goals.attainment import NEAR_M, closest_m, final_m
 from rlftsim.realism import AgentScores, RealismResult
 from rlftsim.rewards.base import register_agent_rewards, register_reward, register_sum, require_two
+from rlftsim.rewards.expression import Term
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import CURRENT_STEP
@@ -49,6 +52,11 @@ def goal_by_agent(
         partial: as in `goal`.
     """
     return goal_advantage(rollouts, batch, kind, partial)
+
+
+def goal_terms(terms: Sequence[Term]) -> list[Term]:
+    """The terms of a reward that depend on goals."""
+    return [term for term in terms if term.name == "goal"]
 
 
 def goal_advantage(

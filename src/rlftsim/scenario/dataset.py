@@ -24,14 +24,17 @@ from threading import Lock
 from types import TracebackType
 from typing import Any, overload
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
+from jaxtyping import Int64
 
 import rlftsim
 from rlftsim.aliases import current_name, current_names
 from rlftsim.atomic_io import cannot_write, write_text, write_whole
 from rlftsim.errors import ConfigError, DataError, whole_number
+from rlftsim.scenario.index_row import AGENT_COLUMNS
 from rlftsim.scenario.shards import (
     INDEX_FIELDS,
     SCHEMA_VERSION,
@@ -148,6 +151,11 @@ class ScenarioDataset:
     def guessed(self) -> tuple[str, ...]:
         """Values that are guessed in at least one scenario, see `Scenario.guessed`, in alphabetical order."""
         return tuple(sorted({word for words in set(self.index["guessed"].to_pylist()) for word in words.split()}))
+
+    @cached_property
+    def num_agents(self) -> Int64[np.ndarray, "scenarios"]:
+        """Simulated agents of each scenario."""
+        return np.stack([self.index[name].to_numpy() for name in AGENT_COLUMNS]).sum(0, dtype=np.int64)
 
     @cached_property
     def fingerprint(self) -> str:

@@ -7,6 +7,8 @@ import numpy as np
 from rlftsim.scenario.maneuver import Maneuver, maneuver_of_turn
 from rlftsim.scenario.types import CURRENT_STEP, ObjectType, Scenario
 
+AGENT_COLUMNS = ("num_vehicles", "num_pedestrians", "num_cyclists", "num_others")
+"""Counts that add up to a scenario's simulated agents."""
 _STATIONARY_SPEED_MPS = 2.0
 _STATIONARY_DISTANCE_M = 5.0
 

@@ -216,9 +216,9 @@ class Session:
             raise Refusal(f"no split {split!r} in {self.data}, only {', '.join(self.splits)}.", status=404)
         if split not in self._rows:
             columns = [column for column in FIELDS.values() if column != "num_agents"]
-            rows = self._datasets[split].index.select(columns).to_pylist()
-            for row in rows:
-                row["num_agents"] = row["num_vehicles"] + row["num_pedestrians"] + row["num_cyclists"]
+            dataset = self._datasets[split]
+            index = dataset.index.select(columns).append_column("num_agents", [dataset.num_agents])
+            rows = index.to_pylist()
             self._rows[split] = rows  # complete: another request may read them at once
         tests = [_test_of(term) for term in query.split()]
         found = [row for row in self._rows[split] if all(test(row) for test in tests)]

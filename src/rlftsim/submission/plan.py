@@ -23,7 +23,6 @@ PLAN = "plan.json"
 GZIP_RATIO = (0.56, 0.64)
 """Compressed size of sampled rollouts, lowest and highest of five models."""
 _NUMBERED = re.compile(r"(.*)-(\d{5})-of-(\d{5})")
-_AGENT_COLUMNS = ("num_vehicles", "num_pedestrians", "num_cyclists", "num_others")
 
 
 @dataclass(frozen=True)
@@ -88,7 +87,7 @@ def make_plan(
     Raises:
         ConfigError: no shards, a step of nothing or above 1 m, or another number of rollouts than the challenge wants.
     """
-    agents = np.stack([data.index[name].to_numpy() for name in _AGENT_COLUMNS]).sum(0)  # [scenarios]
+    agents = data.num_agents
     if num_shards < 1:
         raise ConfigError(f"num_shards must be at least 1, got {num_shards}.")
     if config.num_rollouts != NUM_SCENES:

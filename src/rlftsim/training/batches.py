@@ -10,14 +10,12 @@ from jaxtyping import Float, Int64
 
 from rlftsim.errors import DataError
 from rlftsim.scenario.dataset import ScenarioDataset
-from rlftsim.scenario.index_row import IndexRow, compute_index_row
+from rlftsim.scenario.index_row import AGENT_COLUMNS, IndexRow, compute_index_row
 from rlftsim.scenario.types import TOTAL_STEPS, Scenarios
 
 MAP_POINTS_PER_AGENT = 200
 """Map points that need about as much memory as an agent; measured 170 (SMART-nano) and 410 (the demo's model) on real
 scenarios."""
-COUNTED = ("num_vehicles", "num_pedestrians", "num_cyclists", "num_others")
-"""Columns of a data set's index that add up to its simulated agents."""
 
 
 def scenario_costs(scenarios: Scenarios) -> Float[np.ndarray, "n"]:
@@ -25,7 +23,7 @@ def scenario_costs(scenarios: Scenarios) -> Float[np.ndarray, "n"]:
 
     The index of a data set has the counts without a scenario being read; the scenarios of a list are counted here.
     """
-    counts = counts_of(scenarios, (*COUNTED, "num_map_points"))
+    counts = counts_of(scenarios, (*AGENT_COLUMNS, "num_map_points"))
     # Thousands, so that budgets are numbers a person can write.
     return (counts[-1] + MAP_POINTS_PER_AGENT * counts[:-1].sum(0)) / 1000.0
 

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -12,13 +12,14 @@ from torch import Tensor
 from rlftsim.goals.attainment import is_passed, is_reached, rate
 from rlftsim.realism import AgentScores, RealismResult, compute_batch_features, metric_by_name, score_batch_features
 from rlftsim.realism.from_rollouts import states_of_rollouts
-from rlftsim.rewards import CreditTo, Rewards, Term, compute_rewards, parse_reward
+from rlftsim.rewards import Rewards, Term, compute_rewards, parse_reward
 from rlftsim.rollout.noise import derive_seed
 from rlftsim.rollout.simulate import simulate
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import CURRENT_STEP, STEP_S
 from rlftsim.threads import one_thread
+from rlftsim.training.finetune_config import FinetuneConfig
 from rlftsim.training.goals import GoalConfig, StoredGoals, choose_goals
 from rlftsim.training.parallel import Fabric, all_gather, all_reduce_sum
 
@@ -108,32 +109,7 @@ def _gather_rollouts(own: Rollouts, num_rollouts: int, fabric: Fabric) -> Rollou
     return replace(own, **joined, goals=goals)
 
 
-@runtime_checkable
-class RewardSettings(Protocol):
-    """The settings of a run that its rewards depend on."""
-
-    @property
-    def reward(self) -> str:
-        """Sum of registered rewards."""
-        ...
-
-    @property
-    def metric(self) -> str:
-        """Configuration of the meta-metric."""
-        ...
-
-    @property
-    def credit(self) -> CreditTo:
-        """Credit assignment: by rollout or by agent."""
-        ...
-
-    @property
-    def credit_mixing(self) -> float:
-        """Weight of the other agents' rewards."""
-        ...
-
-
-def compute_reward(batch: ScenarioBatch, rollouts: Rollouts, config: RewardSettings) -> tuple[RealismResult, Rewards]:
+def compute_reward(batch: ScenarioBatch, rollouts: Rollouts, config: FinetuneConfig) -> tuple[RealismResult, Rewards]:
     """Realism of rollouts and what they earn; a scenario without a map counts as on the road.
 
     The features that both are made of are measured once, however many terms the reward has.

@@ -21,7 +21,7 @@ from torch import Tensor
 from rlftsim.goals.types import Goals
 from rlftsim.realism import RealismResult
 from rlftsim.rewards import Term
-from rlftsim.rewards.goal import goal_advantage
+from rlftsim.rewards.goal import goal_advantage, goal_terms
 from rlftsim.rollout.policy import encode_like
 from rlftsim.rollout.types import Rollouts
 from rlftsim.training.augment import ends_of, most_realistic
@@ -31,11 +31,6 @@ from rlftsim.training.policy_gradient import GradientSums, LossTerms, agent_log_
 
 LARGEST_RATIO = 10.0
 """Importance ratios are clipped to it."""
-
-
-def goal_terms(terms: Sequence[Term]) -> list[Term]:
-    """The terms of a reward that depend on goals."""
-    return [term for term in terms if term.name == "goal"]
 
 
 def relabel_with_hindsight(experiences: Sequence[Experience], terms: Sequence[Term]) -> list[Experience]:
@@ -128,7 +123,7 @@ def accumulate_hindsight(
                 dist = policy.score(encode_like(policy, part.batch, part.context), rollouts)
             log_prob = dist.log_prob(rollouts.decision)  # [B, n, A, L]
             ratio = importance_ratio(agent_log_prob(log_prob, mask, "sum"), old)  # [B, n, A]
-            by_agent = agent_log_prob(log_prob, mask, terms.reduction)
+            by_agent = agent_log_prob(log_prob, mask, terms.config.log_prob_reduction)
             fabric.backward(policy_gradient_loss(earned * ratio, by_agent, terms.num_scenarios))
             # Agents that decide nothing have a ratio of exp(0) = 1, which would pull the mean to 1.
             sums += torch.stack([ratio[decides].sum(), decides.sum()])

@@ -6,7 +6,8 @@ from pathlib import Path
 from rlftsim.errors import ConfigError
 from rlftsim.rollout.policy import Policy
 from rlftsim.training.catk import CatkConfig, RoadConfig, catk_finetune
-from rlftsim.training.finetune import FinetuneConfig, finetune
+from rlftsim.training.finetune import finetune
+from rlftsim.training.finetune_config import FinetuneConfig
 from rlftsim.training.goal_relabeling import GcslConfig, gcsl_finetune
 from rlftsim.training.run import TrainingScenarios
 

@@ -9,7 +9,7 @@ Preferences", 2020.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -17,10 +17,9 @@ from torch import Tensor
 
 from rlftsim.rollout.policy import decision_statistics, encode_like, score_both
 from rlftsim.training.experience import Experience
+from rlftsim.training.finetune_config import FinetuneConfig, Reduction
 from rlftsim.training.imitation import accumulate_imitation
 from rlftsim.training.parallel import Fabric, all_reduce_sum
-
-Reduction = Literal["mean", "sum"]
 
 
 def agent_log_prob(
@@ -73,16 +72,10 @@ class LossTerms:
     num_decisions: float
     beta: float
     """Strength of the KL penalty."""
-    entropy_bonus: float
-    reduction: Reduction
-    condition_reference: bool
-    """False = the reference is scored without goals."""
-    imitation_weight: float
-    """Of the pre-training loss on the same scenarios."""
     update: int
     """Counted from 0."""
-    seed: int
-    """Of what the pre-training loss draws."""
+    config: FinetuneConfig
+    """All other coefficients."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,9 +111,9 @@ def accumulate_gradients(
 
     Args:
         policy: scores the rollouts with gradient; its gradients are zero.
-        reference: scores them without; under the same goals, unless `terms.condition_reference` is False. A reference
-            whose goal encoder was added for this run is still goal-free; an already conditioned one anchors the policy
-            to its goal-following.
+        reference: scores them without; under the same goals, unless the setting `kl.condition_reference` is False. A
+            reference whose goal encoder was added for this run is still goal-free; an already conditioned one anchors
+            the policy to its goal-following.
         experiences: of this process.
         terms: coefficients and counts.
         fabric: precision, and the processes that the statistics are summed over.
@@ -131,10 +124,10 @@ def accumulate_gradients(
     by_experience: list[list[Tensor]] = []
     num_decisions = max(terms.num_decisions, 1.0)
     imitation: dict[str, float] = {}
-    if terms.imitation_weight:
+    if terms.config.imitation_weight:
         batches = [experience.batch for experience in experiences]
         loss = accumulate_imitation(
-            policy, batches, terms.imitation_weight, fabric, update=terms.update, seed=terms.seed
+            policy, batches, terms.config.imitation_weight, fabric, update=terms.update, seed=terms.config.seed
         )
         imitation["imitation_loss"] = loss
     for experience in experiences:
@@ -143,16 +136,16 @@ def accumulate_gradients(
             ref_context = encode_like(reference, experience.batch, experience.context)
         for rollouts, reward in experience.slices(rollouts_per_pass):
             mask = rollouts.decision_mask  # [B, n, A, L]
-            ref_rollouts = rollouts if terms.condition_reference else replace(rollouts, goals=None)
+            ref_rollouts = rollouts if terms.config.kl.condition_reference else replace(rollouts, goals=None)
             with fabric.autocast():
                 # Encoded anew for every slice: each slice's graph is freed by its own backward pass.
                 context = encode_like(policy, experience.batch, experience.context)
                 dist, ref_dist = score_both(policy, context, rollouts, reference, ref_context, ref_rollouts)
             found = decision_statistics(dist, rollouts.decision, ref_dist)  # [B, n, A, L] each
             kl, entropy = masked_sum(found.kl, mask), masked_sum(found.entropy, mask)
-            by_agent = agent_log_prob(found.log_prob, mask, terms.reduction)  # [B, n, A]
+            by_agent = agent_log_prob(found.log_prob, mask, terms.config.log_prob_reduction)  # [B, n, A]
             loss = policy_gradient_loss(reward, by_agent, terms.num_scenarios)
-            loss = loss + (terms.beta * kl - terms.entropy_bonus * entropy) / num_decisions
+            loss = loss + (terms.beta * kl - terms.config.entropy_bonus * entropy) / num_decisions
             # Every slice adds its part; nothing is divided by the number of slices.
             fabric.backward(loss)
             sums += torch.stack([kl.detach(), entropy.detach()])

@@ -19,6 +19,7 @@ REFERENCE, TUNED, CEILING, FLOOR = "base", "RLFTSim (MLOO)", "oracle", "constant
 IMITATIONS = {"CAT-K": CATK, "RoaD": ROAD}
 """Methods of closed-loop imitation by the name of their row."""
 NUM_RESAMPLES = 10_000
+RESAMPLES_AT_ONCE = 100
 
 
 def run(suite: ExperimentSuite) -> dict[str, Row]:
@@ -103,11 +104,15 @@ def gap_closed(base: Evaluation, tuned: Evaluation, ceiling: Evaluation) -> GapC
     gain, gap = (after - before)[known], (best - before)[known]  # [scenarios]
     if not len(gain):
         return GapClosed(np.nan, (np.nan, np.nan))
-    # Bootstrap: scenarios are drawn again and again with replacement. [resamples, scenarios]
-    drawn = np.random.default_rng(0).integers(len(gain), size=(NUM_RESAMPLES, len(gain)))
+    # Bootstrap: scenarios are drawn again and again with replacement, a few resamples at a time for memory.
+    rng, means = np.random.default_rng(0), []
+    for _ in range(NUM_RESAMPLES // RESAMPLES_AT_ONCE):
+        drawn = rng.integers(len(gain), size=(RESAMPLES_AT_ONCE, len(gain)))  # [resamples, scenarios]
+        means.append((gain[drawn].mean(1), gap[drawn].mean(1)))
+    mean_gain, mean_gap = np.concatenate(means, axis=1)  # [NUM_RESAMPLES] each
     # Ratio of means, not mean of ratios: scenarios in which the base model is as good as the oracle have no ratio.
     with np.errstate(divide="ignore", invalid="ignore"):
-        low, high = np.quantile(gain[drawn].mean(1) / gap[drawn].mean(1), (0.025, 0.975))
+        low, high = np.quantile(mean_gain / mean_gap, (0.025, 0.975))
         return GapClosed(float(np.divide(gain.mean(), gap.mean())), (float(low), float(high)))
 
 

@@ -15,7 +15,7 @@ from rlftsim.experiments.rows import Row
 from rlftsim.experiments.suite import ExperimentSuite
 from rlftsim.policies.registry import load_policy
 from rlftsim.recipes.registry import recipe_by_name
-from rlftsim.training.finetune import FinetuneConfig
+from rlftsim.training.finetune_config import FinetuneConfig
 
 FLOOR = "constant velocity"
 BEFORE, AFTER, MEAN_ACTIONS = "base", "RLFTSim (MLOO)", ", mean actions"
