@@ -427,6 +427,36 @@ def test_rollouts_of_other_scenarios_are_refused(data):
         rs.score(list(data), replace(rollouts, provenance=None))
 
 
+def test_rollouts_of_other_agents_are_refused(data):
+    scenario = data[0]
+    rollouts = rs.simulate(CV, scenario, num_rollouts=2)
+    other = int(np.setdiff1d(scenario.simulated_indices, scenario.evaluated_indices)[0])
+    valid, position = scenario.tracks.valid.copy(), scenario.tracks.position.copy()
+    valid[other, 10] = False
+    position[..., 0] += 7
+    fewer = replace(scenario, tracks=replace(scenario.tracks, valid=valid))
+    moved = replace(scenario, tracks=replace(scenario.tracks, position=position))
+    for call in (rs.score, rs.show):
+        agent = scenario.tracks.object_id[other]
+        refuse(lambda: call(fewer, rollouts), f"not as it was simulated: only one of them simulates agent {agent}:")  # noqa: B023
+        refuse(lambda: call(moved, rollouts), "not as it was simulated: the ego is elsewhere")  # noqa: B023
+    # The logged future may be another one.
+    position = scenario.tracks.position.copy()
+    position[:, 11:, 0] += 7
+    later = replace(scenario, tracks=replace(scenario.tracks, position=position))
+    assert float(rs.score(later, rollouts).meta_metric) < float(rs.score(scenario, rollouts).meta_metric)
+
+
+def test_rollouts_in_the_world_frame_are_scored_there(data):
+    scenario = data[0]
+    world, centered = collate([scenario], frame="world"), collate([scenario])
+    rollouts = rs.simulate(CV, world, num_rollouts=2)
+    expected = float(rs.score(scenario, rs.simulate(CV, scenario, num_rollouts=2)).meta_metric)
+    for form in (scenario, world, centered):
+        assert float(rs.score(form, rollouts).meta_metric) == pytest.approx(expected, abs=1e-3)
+    assert float(rs.score(world, rs.simulate(CV, scenario, num_rollouts=2)).meta_metric) == expected
+
+
 # ---- agents by object id, provenance --------------------------------------------------------------------------------
 
 

@@ -87,7 +87,8 @@ def show(scenario: AnyScenarios, *rollouts: Rollouts, titles: Sequence[str] = ()
 
     Raises:
         ConfigError: rollouts of other scenarios, more titles than rollouts, or no scenario.
-        DataError: no data set of this name, or without this split.
+        DataError: no data set of this name, or without this split, or a scenario with other agents than the simulated
+            one.
     """
     require_rollouts("show", scenario, *rollouts)
     if len(titles) > len(rollouts):
