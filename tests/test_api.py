@@ -741,6 +741,19 @@ def test_goals_of_another_batch_are_refused(follower, data):
     refuse(lambda: rs.simulate(follower, scenario, num_rollouts=3, goals=goals), "do not fit num_rollouts=3")
 
 
+def test_goals_in_another_frame_are_refused(follower, data):
+    scenario = data[1]
+    track = scenario.evaluated_indices[0]
+    points = {int(scenario.tracks.object_id[track]): scenario.tracks.position[track, 10, :2]}
+    world = collate([scenario], frame="world")
+    goals = rs.Goals.from_points(world, points)
+    assert rs.simulate(follower, world, num_rollouts=2, goals=goals).goals.frame == "world"
+    refuse(
+        lambda: rs.simulate(follower, scenario, num_rollouts=2, goals=goals),
+        "goals in the world frame do not fit scenarios in the map frame",
+    )
+
+
 def test_a_misspelled_public_name_has_a_suggestion():
     with pytest.raises(AttributeError, match="no attribute 'simulat': did you mean 'simulate'"):
         _ = rs.simulat
