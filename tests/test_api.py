@@ -557,6 +557,7 @@ def test_scenarios_and_rollouts_play_in_a_cell(base, data, tmp_path):
     page = html.unescape(cell._repr_html_())
     assert "<iframe" in page
     assert all(title in page for title in ("logged", "base", "rollouts 2"))
+    assert rs.show(scenario, rollouts, titles="base").page == rs.show(scenario, rollouts, titles=("base",)).page
     assert len(repr(cell)) < 100
     cell.save(tmp_path / "page.html")
     assert (tmp_path / "page.html").read_text() == cell.page

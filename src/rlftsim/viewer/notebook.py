@@ -71,7 +71,7 @@ def require_rollouts(function: str, scenarios: object, *rollouts: object) -> Non
             raise ConfigError(f"write rs.{function}(scenario, rollouts), got ({kinds}).")
 
 
-def show(scenario: AnyScenarios, *rollouts: Rollouts, titles: Sequence[str] = ()) -> Cell:
+def show(scenario: AnyScenarios, *rollouts: Rollouts, titles: str | Sequence[str] = ()) -> Cell:
     """Player of the logged scenario beside its rollouts, for a notebook cell.
 
     Boxes that overlap are marked; the first rollouts of each kind can be played.
@@ -91,6 +91,7 @@ def show(scenario: AnyScenarios, *rollouts: Rollouts, titles: Sequence[str] = ()
             one.
     """
     require_rollouts("show", scenario, *rollouts)
+    titles = (titles,) if isinstance(titles, str) else titles
     if len(titles) > len(rollouts):
         raise ConfigError(f"{len(titles)} titles for {len(rollouts)} rollouts: give one each, or none.")
     numbered = [f"rollouts {i + 1}" for i in range(len(rollouts))] if len(rollouts) > 1 else ["rollouts"]
