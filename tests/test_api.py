@@ -675,6 +675,32 @@ def test_a_scenario_made_in_python_is_checked_by_every_function(data, unchecked)
         broken = replace(data[0], tracks=replace(tracks, position=position))
         for call in (*calls, rs.show, lambda one: rs.score(one, good)):
             refuse(lambda call=call, broken=broken: call(broken), f"scenario {broken.scenario_id}: .*{message}")
+    one, features, lights = data[0], data[0].map_features, data[0].lights
+    more = replace(lights, step=np.zeros(1, np.int32), lane_id=np.ones(1, np.int64), stop_point=np.zeros((1, 3), "f4"))
+    for broken, message in (
+        (replace(one, tracks=replace(tracks, position=tracks.position[..., :2])), r"tracks.position has the shape"),
+        (replace(one, tracks=replace(tracks, valid=tracks.valid[:, :-1])), r"must be \[O, S\]: O = .*, S = 91"),
+        (
+            replace(one, tracks=replace(tracks, heading=tracks.heading.tolist())),
+            "tracks.heading is list, it must be an",
+        ),
+        (replace(one, tracks_to_predict=[0]), "tracks_to_predict is list, it must be int32"),
+        (replace(one, map_features=replace(features, offsets=features.offsets[:-1])), "map.offsets has the shape"),
+        (
+            replace(one, map_features=replace(features, offsets=features.offsets[::-1].copy())),
+            "offsets does not divide",
+        ),
+        (
+            replace(one, map_features=replace(features, feature_type=features.feature_type + np.int8(50))),
+            r"map feature \d+: type \d+ is none of 0 lane_undefined, 1 lane_freeway",
+        ),
+        (
+            replace(one, lights=replace(more, state=np.full(1, 77, np.int8))),
+            "light of lane 1: state 77 is none of 0 unk",
+        ),
+    ):
+        for call in (calls[0], rs.show, lambda one: rs.score(one, good)):
+            refuse(lambda call=call, broken=broken: call(broken), f"scenario {broken.scenario_id}: .*{message}")
     batch = replace(collate([data[0]]), scenarios=(replace(data[0], ego_index=-1),))
     refuse(lambda: rs.simulate(CV, batch), "ego_index names track index -1")
 

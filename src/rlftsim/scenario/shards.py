@@ -235,15 +235,17 @@ def refuse_unsound(scenario: Scenario) -> None:
     """Check that a scenario is what `types.py` declares, so that it can be stored, simulated and scored.
 
     Raises:
-        DataError: its id is no file name, an array has another dtype, a valid state or map point is not finite, a
-            position is too far out for float32, or what `Scenario.refuse_broken` finds; names the scenario and the
-            value.
+        DataError: its id is no file name, an array has another dtype or other axes, a valid state or map point is not
+            finite, a position is too far out for float32, or what `Scenario.refuse_broken` finds; names the scenario
+            and the value.
     """
     scenario.refuse_bad_id()
     try:
+        scenario.refuse_misshapen()
         for name, array in _to_arrays(scenario).items():
-            if array is not None and array.dtype != _ARRAY_DTYPES[name]:
-                raise DataError(f"{name} is {array.dtype}, it must be {_ARRAY_DTYPES[name]}")
+            kind = getattr(array, "dtype", type(array).__name__)
+            if array is not None and kind != _ARRAY_DTYPES[name]:
+                raise DataError(f"{name} is {kind}, it must be {_ARRAY_DTYPES[name]}")
         scenario.refuse_broken()
         scenario.refuse_not_finite()
         scenario.refuse_coarse()
