@@ -612,10 +612,16 @@ def refuse(call, message):
     assert "\n" not in str(caught.value)
 
 
+def arranged(rollouts, make):
+    """Rollouts with positions in another form."""
+    return replace(rollouts, position=make(rollouts.position))
+
+
 CV = rs.ConstantVelocity()  # has no state, so tests may share it
 WHOLE = "num_rollouts must be a whole number of at least 1, got"
 GOALS = "goals must be one of none, logged, got"
 CONFIG = "config must be a FinetuneConfig, CatkConfig or GcslConfig, got"
+AXES = r"tensors \[B, N, A, T, 2\] and \[B, N, A, T\], got (ndarray )?\(2, .*\): hand over"
 ORDER = r"write rs\.\w+\(scenario, rollouts\), got"
 
 
@@ -649,6 +655,15 @@ ORDER = r"write rs\.\w+\(scenario, rollouts\), got"
         (lambda d: rs.show(rs.simulate(CV, d[0], num_rollouts=1), d[0]), ORDER),
         (lambda d: rs.score(rs.simulate(CV, d[0], num_rollouts=1), d[0]), ORDER),
         (lambda d: rs.score(d[0], None), ORDER),
+        (
+            lambda d: rs.simulate(CV, d, num_rollouts=2).select(0),
+            r"a slice of the rollouts, got 0: write slice\(0, 1\)",
+        ),
+        *(
+            (lambda d, c=c, make=make: c(d, arranged(rs.simulate(CV, d, num_rollouts=2), make)), AXES)
+            for c in (rs.score, rs.show)
+            for make in (torch.Tensor.numpy, lambda values: values[..., :1], lambda values: values[:, 0])
+        ),
         (lambda d: rs.compare(None, 3), "NoneType: not an evaluation"),
         (lambda d: rs.compare("a.parquet", "b.parquet"), "a.parquet: no such evaluation"),
         (lambda d: rs.register_reward(len), "write @register_reward"),

@@ -120,7 +120,14 @@ class Rollouts:
         return self.position.shape[1]
 
     def select(self, selected: slice) -> "Rollouts":
-        """Some of the rollouts of every scenario."""
+        """Some of the rollouts of every scenario.
+
+        Raises:
+            ConfigError: a number, which would drop the axis of rollouts.
+        """
+        if isinstance(selected, int | np.integer):
+            one = f"slice({selected}, {selected + 1})" if selected != -1 else "slice(-1, None)"
+            raise ConfigError(f"select takes a slice of the rollouts, got {selected}: write {one} for a single one.")
         return replace(
             self,
             position=self.position[:, selected],
