@@ -759,6 +759,16 @@ def test_numbers_of_numpy_are_numbers(data, home, unchecked):
     assert EvaluateConfig(goals="recorded").goals == "logged"
 
 
+def test_scenarios_of_a_data_set_cannot_be_edited_in_place(data):
+    scenario = data[0]
+    features = scenario.map_features
+    for part in (scenario, scenario.tracks, features, features.topology, scenario.lights):
+        arrays = [value for value in vars(part).values() if isinstance(value, np.ndarray)]
+        assert not any(array.flags.writeable for array in arrays)
+    with pytest.raises(ValueError, match="read-only"):
+        scenario.tracks.position[:, 11:] += 5
+
+
 def test_a_data_set_is_read_like_a_list(data):
     scenario = data[0]
     assert scenario in data

@@ -204,7 +204,7 @@ class ShardReader:
         return with_later_columns(pa.table(columns, schema=pa.schema([schema.field(name) for name in columns])), schema)
 
     def read(self, row: int) -> Scenario:
-        """Decode a row.
+        """Decode a row. Its arrays are read-only, because what is computed from them is kept.
 
         Raises:
             DataError: the row is damaged.
@@ -221,10 +221,16 @@ class ShardReader:
             }
             names = [name for name in ("scenario_id", "ego_index", "source", "guessed") if name in known]
             plain = {name: self._table[name][row].as_py() for name in names}
-            return _from_arrays({**_INDEX_DEFAULTS, **plain}, arrays)
+            scenario = _from_arrays({**_INDEX_DEFAULTS, **plain}, arrays)
         except (ValueError, OSError, pa.ArrowException) as error:
             cause = "it cannot be read" if isinstance(error, OSError | pa.ArrowException) else error
             raise DataError(f"shard {self.path}: row {row} is damaged ({cause}): {_WAY_OUT}") from error
+        features = scenario.map_features
+        for part in (scenario, scenario.tracks, features, features.topology, scenario.lights):
+            for value in vars(part).values():
+                if isinstance(value, np.ndarray):
+                    value.flags.writeable = False
+        return scenario
 
 
 _RUN_AGAIN = "run the conversion or generation that made it again"

@@ -199,7 +199,11 @@ class LightStates:
 
 @dataclass(frozen=True, eq=False)
 class Scenario:
-    """One logged scenario. Compared and hashed by identity, so that values derived from it can be cached."""
+    """One logged scenario. Compared and hashed by identity, so that values derived from it can be cached.
+
+    Its arrays must not change for the same reason, and those of a data set are read-only: a changed scenario is made
+    with `dataclasses.replace` and copies.
+    """
 
     scenario_id: str
     timestamps_s: Float[np.ndarray, "S"]
