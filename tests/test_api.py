@@ -450,6 +450,36 @@ def test_rollouts_of_other_scenarios_are_refused(data):
         rs.score(list(data), replace(rollouts, provenance=None))
 
 
+def test_rollouts_of_other_agents_are_refused(data):
+    scenario = data[0]
+    rollouts = rs.simulate(CV, scenario, num_rollouts=2)
+    other = int(np.setdiff1d(scenario.simulated_indices, scenario.evaluated_indices)[0])
+    valid, position = scenario.tracks.valid.copy(), scenario.tracks.position.copy()
+    valid[other, 10] = False
+    position[..., 0] += 7
+    fewer = replace(scenario, tracks=replace(scenario.tracks, valid=valid))
+    moved = replace(scenario, tracks=replace(scenario.tracks, position=position))
+    for call in (rs.score, rs.show):
+        agent = scenario.tracks.object_id[other]
+        refuse(lambda: call(fewer, rollouts), f"not as it was simulated: only one of them simulates agent {agent}:")  # noqa: B023
+        refuse(lambda: call(moved, rollouts), "not as it was simulated: the ego is elsewhere")  # noqa: B023
+    # The logged future may be another one.
+    position = scenario.tracks.position.copy()
+    position[:, 11:, 0] += 7
+    later = replace(scenario, tracks=replace(scenario.tracks, position=position))
+    assert float(rs.score(later, rollouts).meta_metric) < float(rs.score(scenario, rollouts).meta_metric)
+
+
+def test_rollouts_in_the_world_frame_are_scored_there(data):
+    scenario = data[0]
+    world, centered = collate([scenario], frame="world"), collate([scenario])
+    rollouts = rs.simulate(CV, world, num_rollouts=2)
+    expected = float(rs.score(scenario, rs.simulate(CV, scenario, num_rollouts=2)).meta_metric)
+    for form in (scenario, world, centered):
+        assert float(rs.score(form, rollouts).meta_metric) == pytest.approx(expected, abs=1e-3)
+    assert float(rs.score(world, rs.simulate(CV, scenario, num_rollouts=2)).meta_metric) == expected
+
+
 # ---- agents by object id, provenance --------------------------------------------------------------------------------
 
 
@@ -550,6 +580,7 @@ def test_scenarios_and_rollouts_play_in_a_cell(base, data, tmp_path):
     page = html.unescape(cell._repr_html_())
     assert "<iframe" in page
     assert all(title in page for title in ("logged", "base", "rollouts 2"))
+    assert rs.show(scenario, rollouts, titles="base").page == rs.show(scenario, rollouts, titles=("base",)).page
     assert len(repr(cell)) < 100
     cell.save(tmp_path / "page.html")
     assert (tmp_path / "page.html").read_text() == cell.page
@@ -604,10 +635,16 @@ def refuse(call, message):
     assert "\n" not in str(caught.value)
 
 
+def arranged(rollouts, make):
+    """Rollouts with positions in another form."""
+    return replace(rollouts, position=make(rollouts.position))
+
+
 CV = rs.ConstantVelocity()  # has no state, so tests may share it
 WHOLE = "num_rollouts must be a whole number of at least 1, got"
 GOALS = "goals must be one of none, logged, got"
 CONFIG = "config must be a FinetuneConfig, CatkConfig or GcslConfig, got"
+AXES = r"tensors \[B, N, A, T, 2\] and \[B, N, A, T\], got (ndarray )?\(2, .*\): hand over"
 ORDER = r"write rs\.\w+\(scenario, rollouts\), got"
 
 
@@ -641,6 +678,15 @@ ORDER = r"write rs\.\w+\(scenario, rollouts\), got"
         (lambda d: rs.show(rs.simulate(CV, d[0], num_rollouts=1), d[0]), ORDER),
         (lambda d: rs.score(rs.simulate(CV, d[0], num_rollouts=1), d[0]), ORDER),
         (lambda d: rs.score(d[0], None), ORDER),
+        (
+            lambda d: rs.simulate(CV, d, num_rollouts=2).select(0),
+            r"a slice of the rollouts, got 0: write slice\(0, 1\)",
+        ),
+        *(
+            (lambda d, c=c, make=make: c(d, arranged(rs.simulate(CV, d, num_rollouts=2), make)), AXES)
+            for c in (rs.score, rs.show)
+            for make in (torch.Tensor.numpy, lambda values: values[..., :1], lambda values: values[:, 0])
+        ),
         (lambda d: rs.compare(None, 3), "NoneType: not an evaluation"),
         (lambda d: rs.compare("a.parquet", "b.parquet"), "a.parquet: no such evaluation"),
         (lambda d: rs.register_reward(len), "write @register_reward"),
@@ -666,6 +712,32 @@ def test_a_scenario_made_in_python_is_checked_by_every_function(data, unchecked)
     for position, message in ((lost, "NaN or infinite position at step 10"), (wide, "is float64, it must be float32")):
         broken = replace(data[0], tracks=replace(tracks, position=position))
         for call in (*calls, rs.show, lambda one: rs.score(one, good)):
+            refuse(lambda call=call, broken=broken: call(broken), f"scenario {broken.scenario_id}: .*{message}")
+    one, features, lights = data[0], data[0].map_features, data[0].lights
+    more = replace(lights, step=np.zeros(1, np.int32), lane_id=np.ones(1, np.int64), stop_point=np.zeros((1, 3), "f4"))
+    for broken, message in (
+        (replace(one, tracks=replace(tracks, position=tracks.position[..., :2])), r"tracks.position has the shape"),
+        (replace(one, tracks=replace(tracks, valid=tracks.valid[:, :-1])), r"must be \[O, S\]: O = .*, S = 91"),
+        (
+            replace(one, tracks=replace(tracks, heading=tracks.heading.tolist())),
+            "tracks.heading is list, it must be an",
+        ),
+        (replace(one, tracks_to_predict=[0]), "tracks_to_predict is list, it must be int32"),
+        (replace(one, map_features=replace(features, offsets=features.offsets[:-1])), "map.offsets has the shape"),
+        (
+            replace(one, map_features=replace(features, offsets=features.offsets[::-1].copy())),
+            "offsets does not divide",
+        ),
+        (
+            replace(one, map_features=replace(features, feature_type=features.feature_type + np.int8(50))),
+            r"map feature \d+: type \d+ is none of 0 lane_undefined, 1 lane_freeway",
+        ),
+        (
+            replace(one, lights=replace(more, state=np.full(1, 77, np.int8))),
+            "light of lane 1: state 77 is none of 0 unk",
+        ),
+    ):
+        for call in (calls[0], rs.show, lambda one: rs.score(one, good)):
             refuse(lambda call=call, broken=broken: call(broken), f"scenario {broken.scenario_id}: .*{message}")
     batch = replace(collate([data[0]]), scenarios=(replace(data[0], ego_index=-1),))
     refuse(lambda: rs.simulate(CV, batch), "ego_index names track index -1")
@@ -710,6 +782,16 @@ def test_numbers_of_numpy_are_numbers(data, home, unchecked):
     assert EvaluateConfig(goals="recorded").goals == "logged"
 
 
+def test_scenarios_of_a_data_set_cannot_be_edited_in_place(data):
+    scenario = data[0]
+    features = scenario.map_features
+    for part in (scenario, scenario.tracks, features, features.topology, scenario.lights):
+        arrays = [value for value in vars(part).values() if isinstance(value, np.ndarray)]
+        assert not any(array.flags.writeable for array in arrays)
+    with pytest.raises(ValueError, match="read-only"):
+        scenario.tracks.position[:, 11:] += 5
+
+
 def test_a_data_set_is_read_like_a_list(data):
     scenario = data[0]
     assert scenario in data
@@ -732,6 +814,19 @@ def test_goals_of_another_batch_are_refused(follower, data):
         lambda: rs.simulate(follower, data, num_rollouts=2, goals=goals), "goals of 1 scenarios .* do not belong to 2"
     )
     refuse(lambda: rs.simulate(follower, scenario, num_rollouts=3, goals=goals), "do not fit num_rollouts=3")
+
+
+def test_goals_in_another_frame_are_refused(follower, data):
+    scenario = data[1]
+    track = scenario.evaluated_indices[0]
+    points = {int(scenario.tracks.object_id[track]): scenario.tracks.position[track, 10, :2]}
+    world = collate([scenario], frame="world")
+    goals = rs.Goals.from_points(world, points)
+    assert rs.simulate(follower, world, num_rollouts=2, goals=goals).goals.frame == "world"
+    refuse(
+        lambda: rs.simulate(follower, scenario, num_rollouts=2, goals=goals),
+        "goals in the world frame do not fit scenarios in the map frame",
+    )
 
 
 def test_a_misspelled_public_name_has_a_suggestion():

@@ -182,6 +182,11 @@ def test_snapshots_of_something_else_are_refused(data):
         ).restore(saved)
     with pytest.raises(DataError, match="not a snapshot"):
         env.restore(b"12345678")
+    for place in range(0, len(saved), 97):
+        damaged = saved[:place] + bytes([saved[place] ^ 1]) + saved[place + 1 :]
+        with pytest.raises(DataError, match="not a snapshot of an episode, or a damaged one"):
+            env.restore(damaged)
+    env.restore(saved)
 
 
 def test_replayed_agents_stand_in_a_gap_of_their_log_and_leave_with_its_end():

@@ -3,9 +3,11 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 
 import rlftsim as rs
+from rlftsim.errors import ConfigError
 from rlftsim.policies import shipped
 from rlftsim.policies.registry import POLICIES
 
@@ -53,6 +55,13 @@ def test_the_shipped_goal_model_follows_goals_and_is_the_base_model_without_them
     end = torch.as_tensor(np.array(place[scenario.scenario_id][179]) - scenario.origin, dtype=torch.float32)
     away = [(one[0, :, track, -1] - end).norm(dim=-1).median() for one in (free, led)]
     assert away[1] < 0.5 * away[0]
+
+
+@pytest.mark.parametrize("name", ["demo-base", "demo-goals", "trafficbots-base"])
+def test_from_pretrained_says_how_a_shipped_model_is_loaded(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match=rf"^'{name}' is no folder but .*: rs.load_policy\('{name}'\) loads it\.$"):
+        rs.SmartPolicy.from_pretrained(name)
 
 
 def test_shipped_models_are_small_and_say_what_they_are():

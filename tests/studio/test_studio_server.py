@@ -3,12 +3,16 @@
 import json
 import re
 import shlex
+from pathlib import Path
 
+import httpx
+import jaxtyping
 import numpy as np
 import pytest
 
 import rlftsim as rs
 from rlftsim.cli.main import main
+from rlftsim.errors import ConfigError
 from rlftsim.evaluation.rollout_files import find_rollouts, read_states
 from rlftsim.goals.goals_file import GoalEntry, read_goals
 from rlftsim.goals.placement import goal_warnings
@@ -351,6 +355,25 @@ def test_rollouts_of_files_are_shown_and_scored_like_simulated_ones(tmp_path, ac
     other = files.get("/api/imported/still/validation/1870d99f95300e18")
     assert (other.status_code, other.json()["error"]) == (404, "still has no rollouts of scenario 1870d99f95300e18.")
     assert client.get(place).status_code == 404  # this studio was started without them
+
+
+@pytest.mark.parametrize("models", ["constant_velocity", Path("constant_velocity"), ["constant_velocity"]])
+def test_one_model_need_not_be_a_list(models, tmp_path):
+    cell = rs.open_studio(models=models, out=tmp_path)
+    headers = {"Authorization": f"Bearer {cell.studio.access.token}"}
+    about = httpx.get(f"http://127.0.0.1:{cell.studio.port}/api/session", headers=headers).json()
+    cell.stop()
+    assert [model["name"] for model in about["models"]] == ["constant_velocity"]
+
+
+@pytest.mark.parametrize("models", [rs.ConstantVelocity(), [rs.ConstantVelocity()], None])
+def test_a_policy_in_place_of_its_name_is_refused_in_one_line(models):
+    jaxtyping.config.update("jaxtyping_disable", True)  # as users call it, without the type checks of the test run
+    try:
+        with pytest.raises(ConfigError, match=r"^models must be names or folders, got .*\.$"):
+            rs.open_studio(models=models)
+    finally:
+        jaxtyping.config.update("jaxtyping_disable", False)
 
 
 def test_a_split_without_its_future_says_why_there_is_no_score(tmp_path, scenario):

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 
+import rlftsim as rs
 from rlftsim.errors import DataError
 from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.rollout.simulate import simulate
@@ -77,6 +78,14 @@ def test_rollout_is_the_history_followed_by_the_simulation(scenario):
     np.testing.assert_allclose(simulated.position[1, 1, :, 0], np.arange(-10, 81), atol=1e-4)
     assert simulated.valid[:, 2].all()
     np.testing.assert_allclose(simulated.position[0, 2, 90], [0, 5])
+
+
+def test_rollouts_in_the_world_frame_are_shown_where_the_log_is(scenario):
+    shown = [
+        rollout_trajectories(scenario, rs.simulate(ConstantVelocity(), batch, num_rollouts=1), row=0).position
+        for batch in (collate([scenario]), collate([scenario], frame="world"))
+    ]
+    np.testing.assert_allclose(shown[1], shown[0], atol=1e-3)
 
 
 def test_rollouts_of_another_scenario_are_refused(scenario):

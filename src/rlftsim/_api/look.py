@@ -10,6 +10,7 @@ from rlftsim.rollout.check import check_policy as check_contract
 from rlftsim.rollout.policy import Policy
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.any_form import AnyScenarios, Name, scenarios_of
+from rlftsim.scenario.batch import collate
 from rlftsim.scenario.types import Scenario
 from rlftsim.viewer.notebook import require_rollouts
 
@@ -28,15 +29,24 @@ def score(scenarios: AnyScenarios, rollouts: Rollouts, metric: str | int = "2025
 
     Raises:
         ConfigError: rollouts of other scenarios, or no such metric.
-        DataError: a scenario that cannot be scored, e.g. one without its future, or a pose that is not finite.
+        DataError: a scenario that cannot be scored, e.g. one without its future, a pose that is not finite, or a
+            scenario with other agents than the simulated one.
     """
     require_rollouts("score", scenarios, rollouts)
     batch = batch_of(scenarios, rollouts.position.device)
-    # 1. Refuse rollouts of other scenarios: by id where they know them, else by the numbers of scenarios and agents.
-    ids = tuple(scenario.scenario_id for scenario in batch.scenarios)
-    if rollouts.provenance is not None and rollouts.provenance.scenario_ids != ids:
-        theirs = ", ".join(rollouts.provenance.scenario_ids[:3])
-        raise ConfigError(f"rollouts of {theirs} do not belong to {', '.join(ids[:3])}: hand over the same scenarios.")
+    # 1. Refuse rollouts of other scenarios: by the ids of scenarios and agents where they know them, else by numbers.
+    about = rollouts.provenance
+    if about is not None:
+        ids = tuple(scenario.scenario_id for scenario in batch.scenarios)
+        if about.scenario_ids != ids:
+            theirs = ", ".join(about.scenario_ids[:3])
+            raise ConfigError(
+                f"rollouts of {theirs} do not belong to {', '.join(ids[:3])}: hand over the same scenarios."
+            )
+        for row, scenario in enumerate(batch.scenarios):
+            about.refuse_other_agents(row, scenario)
+        if batch.frame != about.frame:
+            batch = collate(batch.scenarios, frame=about.frame).to(batch.device)
     num_scenarios, _, num_agents = rollouts.position.shape[:3]
     if num_scenarios != batch.num_scenarios or num_agents < batch.agent_mask.shape[1]:
         raise ConfigError(

@@ -50,8 +50,8 @@ def simulate(
         (`provenance`), and `trajectory(object_id)` gives an agent's poses in the world frame.
 
     Raises:
-        ConfigError: no scenario, fewer than one rollout, goals for a policy that is not goal-conditioned or for
-            scenarios that were not handed over.
+        ConfigError: no scenario, fewer than one rollout, goals for a policy that is not goal-conditioned, for
+            scenarios that were not handed over or in another frame.
         DataError: a goal of an agent that is not simulated, out of its reach, or not two finite numbers.
     """
     num_rollouts, seed = whole_number("num_rollouts", num_rollouts, 1), whole_number("seed", seed)
@@ -65,6 +65,11 @@ def simulate(
             f"goals must be {{object_id: (x, y)}}, {{scenario_id: {{object_id: (x, y)}}}} or Goals, got {goals!r}."
         )
     placed = goals.to(batch.device) if isinstance(goals, Goals) else Goals.from_points(batch, goals or {})
+    if placed.frame != batch.frame:
+        raise ConfigError(
+            f"goals in the {placed.frame} frame do not fit scenarios in the {batch.frame} frame: make them with "
+            "rs.Goals.from_points(batch, points) and simulate the same batch, or give {object_id: (x, y)}."
+        )
     num_scenarios, rollouts_with_goals, num_agents = placed.goal_mask.shape
     if (num_scenarios, num_agents) != tuple(batch.agent_mask.shape):
         raise ConfigError(
@@ -89,7 +94,10 @@ def simulate(
     parts = []
     with progress_bar("simulate", batch.num_scenarios, show=batch.num_scenarios > 1) as advance:
         for row, one in enumerate(batch.split(1)):
-            own = Goals(placed.position[row : row + 1], placed.goal_mask[row : row + 1]) if has_goals[row] else None
+            own = None
+            if has_goals[row]:
+                here = slice(row, row + 1)
+                own = replace(placed, position=placed.position[here], goal_mask=placed.goal_mask[here])
             parts.append(
                 simulate_batch(policy, one, num_rollouts=num_rollouts, seed=seed, goals=own, sampling=sampling)
             )

@@ -163,7 +163,7 @@ class EgoEnv(gymnasium.Env):
 
         Raises:
             ConfigError: of another model, or of other settings.
-            DataError: no snapshot.
+            DataError: no snapshot, or a damaged one.
         """
         self._go_on(*read_snapshot(saved, self.source))
         return self._look(), about(self.episode, self.state, 0, self.source)

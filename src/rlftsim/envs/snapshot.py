@@ -1,15 +1,16 @@
-"""Snapshots of episodes as bytes: numbers and JSON in the safetensors format, nothing that could run code.
+"""Snapshots of episodes as bytes: numbers and JSON in the safetensors format and a checksum, nothing that could run
+code.
 
 An episode follows from its scenarios, its dice and the planner's motion, so these are all that is stored. Reading runs
 the episode again, which gives equal bits: the same network calls on the same numbers.
 """
 
+import hashlib
 import json
 from dataclasses import asdict
 from typing import Any
 
 import numpy as np
-from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from rlftsim.envs.episode import Episode, EpisodeState, repeat, start
@@ -19,6 +20,7 @@ from rlftsim.errors import ConfigError, DataError
 from rlftsim.scenario.types import CURRENT_STEP
 
 FORMAT = "rlftsim-snapshot-1"
+CHECKSUM_BYTES = 32
 IGNORED = ("data", "split", "model", "device", "render_mode", "observation", "frame")
 """Settings that may differ between writing and reading."""
 
@@ -42,7 +44,8 @@ def write_snapshot(episode: Episode, state: EpisodeState, fingerprint: str) -> b
     }
     motion = np.stack([step[scene, agent] for step in state.world.track[CURRENT_STEP:]])  # [T + 1, M, 5]
     text = np.frombuffer(json.dumps(about).encode(), np.uint8)
-    return save({"motion": motion, "about": text})
+    body = save({"motion": motion, "about": text})
+    return body + hashlib.sha256(body).digest()
 
 
 def read_snapshot(saved: bytes, source: Source) -> tuple[Episode, EpisodeState]:
@@ -53,16 +56,14 @@ def read_snapshot(saved: bytes, source: Source) -> tuple[Episode, EpisodeState]:
         source: of the environment that goes on with it.
 
     Raises:
-        DataError: no snapshot.
+        DataError: no snapshot, or a damaged one.
         ConfigError: of another model, or of other settings.
     """
-    try:
-        arrays = load(saved)
-        about = json.loads(arrays["about"].tobytes())
-        is_ours = about["format"] == FORMAT
-    except (SafetensorError, KeyError, ValueError, TypeError) as error:
-        raise DataError(f"not a snapshot of an episode ({error}): take one with snapshot().") from None
-    if not is_ours:
+    if not isinstance(saved, bytes) or hashlib.sha256(saved[:-CHECKSUM_BYTES]).digest() != saved[-CHECKSUM_BYTES:]:
+        raise DataError("not a snapshot of an episode, or a damaged one: take one with snapshot().")
+    arrays = load(saved[:-CHECKSUM_BYTES])
+    about = json.loads(arrays["about"].tobytes())
+    if about["format"] != FORMAT:
         raise DataError("a snapshot of another version: take a new one with snapshot().")
     if about["model"] != source.fingerprint:
         raise ConfigError("the snapshot is of another traffic model: make the environment with the same one.")

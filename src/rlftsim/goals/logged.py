@@ -45,7 +45,7 @@ def logged_goals(batch: ScenarioBatch, chosen: Bool[Tensor, "B A"] | None = None
         chosen: True = the agent gets a goal; None = every agent that has a logged future.
     """
     ends = logged_endpoints(batch)
-    return Goals.of_scenarios(ends.position, ends.mask if chosen is None else ends.mask & chosen)
+    return Goals.of_scenarios(ends.position, ends.mask if chosen is None else ends.mask & chosen, batch.frame)
 
 
 def _at(values: Float[Tensor, "B A S k"], step: Int64[Tensor, "B A"]) -> Float[Tensor, "B A k"]:

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.scenario.batch import ScenarioBatch, origin_of
+from rlftsim.scenario.batch import Frame, ScenarioBatch, origin_of
 from rlftsim.scenario.types import Scenario
 
 Points = tuple[Int64[np.ndarray, "n"], Float[np.ndarray, "n 2"]]
@@ -26,23 +26,27 @@ LISTED = 12
 
 @dataclass(frozen=True, eq=False)
 class Goals:
-    """A point for some of the agents of each rollout. Frame: map (centered on each scenario).
+    """A point for some of the agents of each rollout. Frame: that of the batch, map (centered) by default.
 
     `goal_mask` is True where an agent has a goal. Elsewhere `position` is undefined and must not be read.
     """
 
     position: Float[Tensor, "B N A 2"]
     goal_mask: Bool[Tensor, "B N A"]
+    frame: Frame = "map"
 
     @classmethod
-    def of_scenarios(cls, position: Float[Tensor, "B A 2"], goal_mask: Bool[Tensor, "B A"]) -> "Goals":
+    def of_scenarios(
+        cls, position: Float[Tensor, "B A 2"], goal_mask: Bool[Tensor, "B A"], frame: Frame = "map"
+    ) -> "Goals":
         """Goals of a single rollout (N = 1); `repeat` expands them to N.
 
         Args:
-            position: goal of each agent, map frame, m.
+            position: goal of each agent, m.
             goal_mask: True = the agent has a goal.
+            frame: of the positions.
         """
-        return cls(position[:, None], goal_mask[:, None])
+        return cls(position[:, None], goal_mask[:, None], frame)
 
     @classmethod
     def from_points(cls, batch: ScenarioBatch, points: Mapping[str, PointById] | PointById) -> "Goals":
@@ -93,7 +97,7 @@ class Goals:
 
     def rollouts(self, selected: slice) -> "Goals":
         """The goals of some of the rollouts."""
-        return Goals(self.position[:, selected], self.goal_mask[:, selected])
+        return replace(self, position=self.position[:, selected], goal_mask=self.goal_mask[:, selected])
 
     def repeat(self, num_rollouts: int) -> "Goals":
         """The goals of a single rollout expanded to N, without copies; goals of N rollouts as they are.
@@ -106,7 +110,11 @@ class Goals:
                 f"goals of {self.num_rollouts} rollouts do not fit {num_rollouts} rollouts: give goals of one rollout "
                 "or of as many."
             )
-        return Goals(self.position.expand(-1, num_rollouts, -1, -1), self.goal_mask.expand(-1, num_rollouts, -1))
+        return replace(
+            self,
+            position=self.position.expand(-1, num_rollouts, -1, -1),
+            goal_mask=self.goal_mask.expand(-1, num_rollouts, -1),
+        )
 
     def only(self, chosen: Bool[Tensor, "B #N A"]) -> "Goals":
         """The same goals, masked to the chosen agents."""
@@ -117,16 +125,17 @@ class Goals:
 
         Args:
             condition: True = keep this goal (or none, if there is none here).
-            other: goals of the same shape.
+            other: goals of the same shape, in the same frame.
         """
-        return Goals(
-            torch.where(condition[..., None], self.position, other.position),
-            torch.where(condition, self.goal_mask, other.goal_mask),
+        return replace(
+            self,
+            position=torch.where(condition[..., None], self.position, other.position),
+            goal_mask=torch.where(condition, self.goal_mask, other.goal_mask),
         )
 
     def to(self, device: torch.device | str) -> "Goals":
         """The same goals on another device."""
-        return Goals(self.position.to(device), self.goal_mask.to(device))
+        return replace(self, position=self.position.to(device), goal_mask=self.goal_mask.to(device))
 
     def __repr__(self) -> str:
         num_scenarios, num_rollouts, num_agents = self.goal_mask.shape
@@ -157,7 +166,7 @@ def goals_at(points: Mapping[str, Points], batch: ScenarioBatch) -> Goals:
             # The origin is subtracted in float64: world coordinates may be kilometers, where float32 has steps of 0.5
             # mm.
             position[row, agents] = places[given] - origin_of(scenario, batch.frame)
-    return Goals.of_scenarios(torch.from_numpy(position), torch.from_numpy(mask)).to(batch.device)
+    return Goals.of_scenarios(torch.from_numpy(position), torch.from_numpy(mask), batch.frame).to(batch.device)
 
 
 def shown_id(object_id: object) -> str:

@@ -195,6 +195,8 @@ def find_model(name: str | os.PathLike) -> Path:
     if (folder / "model" / CONFIG).exists():
         folder = folder / "model"
     if not folder.is_dir():
+        if _ships(name):
+            raise ConfigError(f"{str(name)!r} is no folder but a model in the box: rs.load_policy({name!r}) loads it.")
         near = similar_model(folder)
         raise ConfigError(
             f"{str(name)!r} is no model folder: there is none of that name"
@@ -210,14 +212,17 @@ def read_card(name: str | os.PathLike, *, deeper: int = 2) -> str | None:
         name: of a shipped model, a model folder or a run's folder.
         deeper: levels that its headings go down, to stand in another text.
     """
-    # as in `load_policy`: "./demo-base" is a folder
-    ships = isinstance(name, str) and Path(name).name == name and (SHIPPED_MODELS / name / CARD).is_file()
     try:
-        folder = SHIPPED_MODELS / name if ships else find_model(name)
+        folder = SHIPPED_MODELS / name if _ships(name) else find_model(name)
         text = (folder / CARD).read_text(encoding="utf-8", errors="replace")
     except (ConfigError, OSError):
         return None
     return re.sub(r"^#+", lambda found: "#" * min(len(found[0]) + deeper, 6), text.strip(), flags=re.MULTILINE)
+
+
+def _ships(name: str | os.PathLike) -> bool:
+    """True for the name of a model in the box; as in `load_policy`, "./demo-base" is a folder."""
+    return isinstance(name, str) and Path(name).name == name and (SHIPPED_MODELS / name / CARD).is_file()
 
 
 def list_models(folder: Path) -> list[str]:

@@ -14,7 +14,7 @@ def states_of_rollouts(batch: ScenarioBatch, rollouts: Rollouts) -> tuple[Simula
 
     Args:
         batch: the scenarios that were simulated.
-        rollouts: N rollouts of each, map frame.
+        rollouts: N rollouts of each, in the frame of the batch.
     """
     world = batch.to_world(rollouts.position)  # [B, N, A, T, 2]
     states = []

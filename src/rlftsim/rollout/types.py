@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 import rlftsim
-from rlftsim.errors import ConfigError
+from rlftsim.errors import ConfigError, DataError
 from rlftsim.goals.types import Goals, shown_id
 from rlftsim.scenario.batch import Frame, origin_of
 from rlftsim.scenario.types import Scenario
@@ -67,6 +67,32 @@ class RolloutProvenance:
         """Ids of the scenarios, in the order of the rollouts' axis B."""
         return tuple(scenario.scenario_id for scenario in self.scenarios)
 
+    def refuse_other_agents(self, row: int, scenario: Scenario) -> None:
+        """Check that a scenario simulates the agents of the one that was simulated, around the same origin.
+
+        Its logged future and its map may differ.
+
+        Args:
+            row: index of the simulated scenario on axis B.
+            scenario: to be looked at or scored with the rollouts.
+
+        Raises:
+            DataError: it has other agents or another order of them, or an origin elsewhere.
+        """
+        known = self.scenarios[row]
+        ids, known_ids = (one.tracks.object_id[one.simulated_indices] for one in (scenario, known))
+        if not np.array_equal(ids, known_ids):
+            differ = np.setxor1d(ids, known_ids).tolist()
+            cause = f"only one of them simulates agent {differ[0]}" if differ else "their agents are in another order"
+        elif self.frame == "map" and not np.array_equal(scenario.origin, known.origin, equal_nan=True):
+            cause = "the ego is elsewhere at the current step"
+        else:
+            return
+        raise DataError(
+            f"scenario {scenario.scenario_id} is not as it was simulated: {cause}: hand over the simulated one, or "
+            "simulate this one."
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class Rollouts:
@@ -94,7 +120,14 @@ class Rollouts:
         return self.position.shape[1]
 
     def select(self, selected: slice) -> "Rollouts":
-        """Some of the rollouts of every scenario."""
+        """Some of the rollouts of every scenario.
+
+        Raises:
+            ConfigError: a number, which would drop the axis of rollouts.
+        """
+        if isinstance(selected, int | np.integer):
+            one = f"slice({selected}, {selected + 1})" if selected != -1 else "slice(-1, None)"
+            raise ConfigError(f"select takes a slice of the rollouts, got {selected}: write {one} for a single one.")
         return replace(
             self,
             position=self.position[:, selected],

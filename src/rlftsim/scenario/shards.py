@@ -204,7 +204,7 @@ class ShardReader:
         return with_later_columns(pa.table(columns, schema=pa.schema([schema.field(name) for name in columns])), schema)
 
     def read(self, row: int) -> Scenario:
-        """Decode a row.
+        """Decode a row. Its arrays are read-only, because what is computed from them is kept.
 
         Raises:
             DataError: the row is damaged.
@@ -221,10 +221,16 @@ class ShardReader:
             }
             names = [name for name in ("scenario_id", "ego_index", "source", "guessed") if name in known]
             plain = {name: self._table[name][row].as_py() for name in names}
-            return _from_arrays({**_INDEX_DEFAULTS, **plain}, arrays)
+            scenario = _from_arrays({**_INDEX_DEFAULTS, **plain}, arrays)
         except (ValueError, OSError, pa.ArrowException) as error:
             cause = "it cannot be read" if isinstance(error, OSError | pa.ArrowException) else error
             raise DataError(f"shard {self.path}: row {row} is damaged ({cause}): {_WAY_OUT}") from error
+        features = scenario.map_features
+        for part in (scenario, scenario.tracks, features, features.topology, scenario.lights):
+            for value in vars(part).values():
+                if isinstance(value, np.ndarray):
+                    value.flags.writeable = False
+        return scenario
 
 
 _RUN_AGAIN = "run the conversion or generation that made it again"
@@ -235,15 +241,17 @@ def refuse_unsound(scenario: Scenario) -> None:
     """Check that a scenario is what `types.py` declares, so that it can be stored, simulated and scored.
 
     Raises:
-        DataError: its id is no file name, an array has another dtype, a valid state or map point is not finite, a
-            position is too far out for float32, or what `Scenario.refuse_broken` finds; names the scenario and the
-            value.
+        DataError: its id is no file name, an array has another dtype or other axes, a valid state or map point is not
+            finite, a position is too far out for float32, or what `Scenario.refuse_broken` finds; names the scenario
+            and the value.
     """
     scenario.refuse_bad_id()
     try:
+        scenario.refuse_misshapen()
         for name, array in _to_arrays(scenario).items():
-            if array is not None and array.dtype != _ARRAY_DTYPES[name]:
-                raise DataError(f"{name} is {array.dtype}, it must be {_ARRAY_DTYPES[name]}")
+            kind = getattr(array, "dtype", type(array).__name__)
+            if array is not None and kind != _ARRAY_DTYPES[name]:
+                raise DataError(f"{name} is {kind}, it must be {_ARRAY_DTYPES[name]}")
         scenario.refuse_broken()
         scenario.refuse_not_finite()
         scenario.refuse_coarse()

@@ -12,15 +12,15 @@ needs torch.
 import importlib
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from enum import IntEnum
 from functools import cached_property
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, get_args, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int8, Int32, Int64
 
-from rlftsim.errors import DataError
+from rlftsim.errors import DataError, in_short
 
 COARSEST_M = 0.01
 """Coordinates are refused where float32 has larger gaps."""
@@ -199,7 +199,11 @@ class LightStates:
 
 @dataclass(frozen=True, eq=False)
 class Scenario:
-    """One logged scenario. Compared and hashed by identity, so that values derived from it can be cached."""
+    """One logged scenario. Compared and hashed by identity, so that values derived from it can be cached.
+
+    Its arrays must not change for the same reason, and those of a data set are read-only: a changed scenario is made
+    with `dataclasses.replace` and copies.
+    """
 
     scenario_id: str
     timestamps_s: Float[np.ndarray, "S"]
@@ -231,14 +235,25 @@ class Scenario:
                 "slashes and control characters"
             )
 
+    def refuse_misshapen(self) -> None:
+        """Check that tracks, map and lights hold arrays with the axes that their classes declare.
+
+        Raises:
+            DataError: something else, or an axis of another length than in the arrays before it.
+        """
+        features = self.map_features
+        parts = {"tracks": self.tracks, "map": features, "topology": features.topology, "lights": self.lights}
+        for place, part in parts.items():
+            _refuse_misshapen(part, place)
+
     def refuse_broken(self) -> None:
-        """Check what every reader relies on: number of steps, track indices, object ids and types, sizes.
+        """Check what every reader relies on: number of steps, track indices, object ids, types and states, sizes, map.
 
         Sizes are those at the current step: simulation and metric read no others, and logs hold zeros where a state is
         not valid.
 
         Raises:
-            DataError: names the track or the index, and its value.
+            DataError: names the track, map feature, light or index, and its value.
         """
         tracks = self.tracks
         if self.num_steps < HISTORY_STEPS:
@@ -250,11 +265,15 @@ class Scenario:
         ids, count = np.unique(tracks.object_id, return_counts=True)
         if (count > 1).any():
             raise DataError(f"object id {ids[count.argmax()]} belongs to {count.max()} tracks: give each its own")
-        wrong = np.flatnonzero(~np.isin(tracks.object_type, list(ObjectType)))
-        if len(wrong):
-            kinds = ", ".join(f"{kind.value} {kind.name.lower()}" for kind in ObjectType)
+        lines, lights = self.map_features, self.lights
+        _refuse_unknown("track", tracks.object_id, "type", tracks.object_type, ObjectType)
+        _refuse_unknown("map feature", lines.feature_id, "type", lines.feature_type, MapFeatureType)
+        _refuse_unknown("light of lane", lights.lane_id, "state", lights.state, LightState)
+        cuts = lines.offsets
+        if len(cuts) != len(lines) + 1 or cuts[0] != 0 or cuts[-1] != len(lines.points) or (np.diff(cuts) < 0).any():
             raise DataError(
-                f"track {tracks.object_id[wrong[0]]}: type {tracks.object_type[wrong[0]]} is none of {kinds}"
+                f"map.offsets does not divide {len(lines.points)} points among {len(lines)} features: it must rise "
+                f"from 0 to {len(lines.points)} in {len(lines) + 1} numbers, as MapFeatures.of makes it"
             )
         size = tracks.size[:, CURRENT_STEP]
         flat = np.argwhere((size <= 0) & tracks.valid[:, CURRENT_STEP, None])
@@ -365,6 +384,36 @@ class Scenario:
     def _repr_html_(self) -> str:
         # The viewer is on a higher floor, so it is looked up by name and only where a notebook shows the value.
         return importlib.import_module("rlftsim.viewer.notebook").scenario_html(self)
+
+
+def _refuse_misshapen(part: Any, place: str) -> None:
+    sizes: dict[str, int] = {}
+    for one in fields(part):
+        value, is_optional = getattr(part, one.name), type(None) in get_args(one.type)
+        declared: Any = get_args(one.type)[0] if is_optional else one.type
+        if not hasattr(declared, "dim_str") or (value is None and is_optional):
+            continue
+        axes = declared.dim_str.split()
+        shown = f"[{', '.join(axes)}]"
+        if not isinstance(value, np.ndarray):
+            raise DataError(f"{place}.{one.name} is {in_short(value)}, it must be an array {shown}")
+        wanted = []
+        for axis, length in zip(axes, value.shape):
+            name, _, more = axis.partition("+")  # such as "F+1"
+            extra = int(more or 0)
+            wanted.append(int(axis) if axis.isdigit() else sizes.setdefault(name, length - extra) + extra)
+        if value.shape != tuple(wanted) or len(axes) != value.ndim:
+            known = ", ".join(f"{name} = {size}" for name, size in sizes.items())
+            raise DataError(f"{place}.{one.name} has the shape {value.shape}, it must be {shown}: {known}")
+
+
+def _refuse_unknown(
+    thing: str, ids: Int64[np.ndarray, "n"], field_name: str, codes: Int8[np.ndarray, "n"], kinds: type[IntEnum]
+) -> None:
+    wrong = np.flatnonzero(~np.isin(codes, list(kinds)))
+    if len(wrong):
+        known = ", ".join(f"{kind.value} {kind.name.lower()}" for kind in kinds)
+        raise DataError(f"{thing} {ids[wrong[0]]}: {field_name} {codes[wrong[0]]} is none of {known}")
 
 
 @runtime_checkable

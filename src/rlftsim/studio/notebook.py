@@ -8,6 +8,8 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rlftsim.errors import ConfigError, in_short
+from rlftsim.scenario.any_form import Name
 from rlftsim.studio import require_extra
 
 if TYPE_CHECKING:
@@ -56,19 +58,19 @@ class StudioCell:
 
 def open_studio(
     data: str | os.PathLike[str] = "synthetic",
-    models: Sequence[str | os.PathLike[str]] = ("demo-goals",),
+    models: Name | Sequence[Name] = ("demo-goals",),
     *,
-    rollouts: Sequence[str | os.PathLike[str]] = (),
+    rollouts: Name | Sequence[Name] = (),
     split: str | None = None,
     out: str | os.PathLike[str] = "studio",
-    trusted_hosts: Sequence[str] = (),
+    trusted_hosts: str | Sequence[str] = (),
 ) -> StudioCell:
     """Start the goal studio for a notebook cell.
 
     Args:
         data: folder of a data set, or "synthetic".
-        models: runs, model folders or registered names.
-        rollouts: files or folders of rollouts, for panels of their own.
+        models: runs, model folders or registered names, one or several.
+        rollouts: files or folders of rollouts, for panels of their own, one or several.
         split: shown first; None = validation, where there is one.
         out: folder of everything that the page saves.
         trusted_hosts: Host headers of a proxy, such as "hub.example"; its origin may show the page, too.
@@ -77,16 +79,31 @@ def open_studio(
         A value that a notebook displays; `stop()` ends the server.
 
     Raises:
-        RlftsimError: no such data set, split or model, or the extra is not installed.
+        RlftsimError: no such data set, split or model, a policy in place of a name, or the extra is not installed.
     """
     require_extra()
     # Not at the top: `import rlftsim` works without the extra.
     from rlftsim.studio.serving import Studio
     from rlftsim.studio.session import Session
 
-    names, files = tuple(os.fspath(one) for one in models), tuple(os.fspath(one) for one in rollouts)
+    names, files = _several("models", models), _several("rollouts", rollouts)
+    hosts = _several("trusted_hosts", trusted_hosts)
     session = Session(os.fspath(data), names, split, Path(out), rollouts=files)
-    origins = (*NOTEBOOK_ORIGINS, *(f"https://{host}" for host in trusted_hosts))
-    studio = Studio(session, trusted_hosts=tuple(trusted_hosts), frame_ancestors=origins)
+    origins = (*NOTEBOOK_ORIGINS, *(f"https://{host}" for host in hosts))
+    studio = Studio(session, trusted_hosts=hosts, frame_ancestors=origins)
     studio.start()
     return StudioCell(studio)
+
+
+def _several(argument: str, names: object) -> tuple[str, ...]:
+    """Names as text; a single one counts as a list of one.
+
+    Raises:
+        ConfigError: something else, such as a policy.
+    """
+    listed = [names] if isinstance(names, str | os.PathLike) else names
+    if not isinstance(listed, Sequence) or not all(isinstance(one, str | os.PathLike) for one in listed):
+        raise ConfigError(
+            f"{argument} must be names or folders, got {in_short(names)}: write what is in memory to a folder first."
+        )
+    return tuple(os.fspath(one) for one in listed)

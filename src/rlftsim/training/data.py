@@ -91,7 +91,7 @@ def trained_agents(
     """
     interest = torch.zeros_like(batch.agent_mask)  # [B, A]
     for row, scenario, ids in zip(interest, batch.scenarios, batch.object_id):
-        row |= torch.isin(ids, torch.from_numpy(scenario.objects_of_interest).to(ids.device))
+        row |= torch.isin(ids, torch.tensor(scenario.objects_of_interest, device=ids.device))
     first = (batch.evaluated_mask | interest) & batch.agent_mask
     # [B, A] each from here on.
     has_future = batch.valid[:, :, CURRENT_STEP + 1 :].sum(-1) >= MIN_FUTURE_STEPS

@@ -7,9 +7,12 @@ import os
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
+from typing import Any
+
+from torch import Tensor
 
 from rlftsim.atomic_io import write_text
-from rlftsim.errors import ConfigError
+from rlftsim.errors import ConfigError, DataError
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.any_form import AnyScenarios, scenarios_of
 from rlftsim.scenario.types import Scenario
@@ -64,14 +67,28 @@ def require_rollouts(function: str, scenarios: object, *rollouts: object) -> Non
 
     Raises:
         ConfigError: there is something else.
+        DataError: rollouts whose positions and headings are no tensors of the axes that they have.
     """
     for one in rollouts:
         if not isinstance(one, Rollouts) or isinstance(scenarios, Rollouts):
             kinds = ", ".join(type(value).__name__ for value in (scenarios, *rollouts))
             raise ConfigError(f"write rs.{function}(scenario, rollouts), got ({kinds}).")
+        poses = (one.position, one.heading)
+        is_sound = all(isinstance(values, Tensor) for values in poses) and one.heading.dim() == 4
+        if not is_sound or one.position.shape != (*one.heading.shape, 2):
+            found = " and ".join(_in_short(values) for values in poses)
+            raise DataError(
+                f"position and heading of rollouts must be tensors [B, N, A, T, 2] and [B, N, A, T], got {found}: hand "
+                "over those of rs.simulate, or put such tensors in their place."
+            )
 
 
-def show(scenario: AnyScenarios, *rollouts: Rollouts, titles: Sequence[str] = ()) -> Cell:
+def _in_short(values: Any) -> str:
+    shape = tuple(getattr(values, "shape", ()))
+    return str(shape) if isinstance(values, Tensor) else f"{type(values).__name__} {shape}"
+
+
+def show(scenario: AnyScenarios, *rollouts: Rollouts, titles: str | Sequence[str] = ()) -> Cell:
     """Player of the logged scenario beside its rollouts, for a notebook cell.
 
     Boxes that overlap are marked; the first rollouts of each kind can be played.
@@ -87,9 +104,11 @@ def show(scenario: AnyScenarios, *rollouts: Rollouts, titles: Sequence[str] = ()
 
     Raises:
         ConfigError: rollouts of other scenarios, more titles than rollouts, or no scenario.
-        DataError: no data set of this name, or without this split.
+        DataError: no data set of this name, or without this split, or a scenario with other agents than the simulated
+            one.
     """
     require_rollouts("show", scenario, *rollouts)
+    titles = (titles,) if isinstance(titles, str) else titles
     if len(titles) > len(rollouts):
         raise ConfigError(f"{len(titles)} titles for {len(rollouts)} rollouts: give one each, or none.")
     numbered = [f"rollouts {i + 1}" for i in range(len(rollouts))] if len(rollouts) > 1 else ["rollouts"]

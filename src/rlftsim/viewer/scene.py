@@ -257,8 +257,11 @@ def rollout_trajectories(
         max_rollouts: number of rollouts that are kept, the first ones; None = all.
 
     Raises:
-        DataError: the rollouts have fewer agents than the scenario, so they belong to another one.
+        DataError: the rollouts have other agents than the scenario, or fewer, so they belong to another one.
     """
+    about = rollouts.provenance
+    if about is not None:
+        about.refuse_other_agents(row, scenario)
     num_agents = len(scenario.simulated_indices)
     if rollouts.position.shape[2] < num_agents:
         raise DataError(
@@ -270,6 +273,8 @@ def rollout_trajectories(
         values[row, :max_rollouts, :num_agents].detach().to("cpu", torch.float32).numpy()
         for values in (rollouts.position, rollouts.heading)
     )
+    if about is not None and about.frame != "map":
+        future_position = (future_position - scenario.origin).astype(np.float32)
     log = logged_trajectories(scenario)
 
     def join(past: np.ndarray, future: np.ndarray) -> np.ndarray:  # along the axis of steps
