@@ -1,8 +1,10 @@
 import io
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from rich.console import Console
@@ -125,6 +127,22 @@ def test_files_of_another_version_are_refused(tmp_path):
         Evaluation.read(tmp_path / "b.parquet")
     with pytest.raises(DataError, match="no such evaluation"):
         Evaluation.read(tmp_path / "c.parquet")
+
+
+def test_other_tables_and_columns_of_text_are_refused_in_one_line(tmp_path):
+    pq.write_table(pa.table({"scenario_id": ["a"], "split": ["training"]}), tmp_path / "index.parquet")
+    with pytest.raises(DataError, match=r"index\.parquet: not an evaluation of this version: name a file that"):
+        Evaluation.read(tmp_path / "index.parquet")
+    whole = evaluation("a", [0.1])
+    column = whole.table.schema.get_field_index("kinematic")
+    text = whole.table.set_column(column, "kinematic", pa.array(["0.5"]))
+    for table, message in (
+        (text, "damaged evaluation (column kinematic holds string, not double): evaluate again."),
+        (whole.table.drop_columns("kinematic"), "not an evaluation of this version"),
+    ):
+        replace(whole, table=table).write(tmp_path / "edited.parquet")
+        with pytest.raises(DataError, match=re.escape(message)):
+            Evaluation.read(tmp_path / "edited.parquet")
 
 
 def test_provenance_lists_what_differs():

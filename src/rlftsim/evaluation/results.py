@@ -279,12 +279,17 @@ class Evaluation:
             raise DataError(f"{path}: damaged evaluation ({cause}): evaluate again.") from None
         # our part of the file's metadata; pandas and others may add theirs
         about = _about((table.schema.metadata or {}).get(b"rlftsim", b"{}"))
-        for name in ADDED_COLUMNS:
-            if name not in names:
-                missing = pa.array(np.full(len(table), np.nan))
-                table = table.add_column(SCHEMA.get_field_index(name), SCHEMA.field(name), missing)
-        if about.get("format") != FORMAT or table.schema.names != SCHEMA.names:
-            raise DataError(f"{path}: not an evaluation of this version: evaluate again.")
+        added = [name for name in ADDED_COLUMNS if name not in names]
+        if about.get("format") != FORMAT or sorted([*names, *added]) != sorted(SCHEMA.names):
+            way_out = "name a file that `rlftsim evaluate` wrote, or evaluate again."
+            raise DataError(f"{path}: not an evaluation of this version: {way_out}")
+        for name in added:
+            table = table.append_column(SCHEMA.field(name), pa.array(np.full(len(table), np.nan)))
+        table = table.select(SCHEMA.names)
+        for field, found in zip(SCHEMA, table.schema):
+            if found.type != field.type:
+                cause = f"column {field.name} holds {found.type}, not {field.type}"
+                raise DataError(f"{path}: damaged evaluation ({cause}): evaluate again.")
         try:
             provenance = Provenance.from_plain(about["provenance"])
         except (TypeError, KeyError, ConfigError) as error:
