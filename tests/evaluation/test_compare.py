@@ -111,6 +111,17 @@ def test_a_table_shows_means_errors_and_which_way_is_better():
     assert "nan" not in text
 
 
+def test_scenarios_without_a_meta_metric_are_counted_beside_the_mean():
+    partly, whole = evaluation("a", [0.4, math.nan, 0.6]), evaluation("b", [0.5, 0.5, 0.5])
+    assert repr(partly).startswith("a, 3 scenarios (2 with RMM) x 32 rollouts, metric 2025: RMM 0.5000 ± 0.1000")
+    assert "<caption>a, 3 scenarios (2 with RMM) x" in partly._repr_html_()
+    assert repr(whole).startswith("b, 3 scenarios x 32 rollouts")
+    text = render(format_table(partly, whole))
+    assert "3 (2 with RMM)" in text
+    assert text.count("with RMM") == 1
+    assert compare(partly, whole).pairing == "3 scenarios in both (2 with RMM)"
+
+
 def test_a_comparison_is_shown_with_its_verdict():
     text = render(format_comparison(compare(evaluation("base", [0.4, 0.6]), evaluation("tuned", [0.5, 0.71]))))
     assert "tuned against base: 2 scenarios in both" in text

@@ -208,9 +208,16 @@ class Evaluation:
 
     @property
     def _title(self) -> str:
-        skipped = f" ({len(self.skipped)} skipped)" if self.skipped else ""
+        notes = [f"{len(self.skipped)} skipped"] if self.skipped else []
+        notes += [f"{self.num_with_rmm} with RMM"] if self.num_with_rmm < len(self) else []
+        of_these = f" ({', '.join(notes)})" if notes else ""
         config = self.config
-        return f"{self.name}, {len(self)} scenarios{skipped} x {config.num_rollouts} rollouts, metric {config.metric}"
+        return f"{self.name}, {len(self)} scenarios{of_these} x {config.num_rollouts} rollouts, metric {config.metric}"
+
+    @property
+    def num_with_rmm(self) -> int:
+        """Scenarios whose meta-metric is defined, over which its mean is taken: all terms of it need a value."""
+        return self.mean_and_error("meta_metric").count
 
     @property
     def config(self) -> EvaluateConfig:
