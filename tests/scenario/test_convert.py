@@ -305,7 +305,7 @@ def test_an_interrupted_conversion_goes_on_and_gives_the_same_bytes(many, tmp_pa
     assert report.shards_written + report.shards_reused == 12
     run(many, tmp_path / "uninterrupted")
     assert contents(destination) == contents(tmp_path / "uninterrupted")
-    assert verify_dataset(destination) == []
+    assert not any(finding.problem.is_damage for finding in verify_dataset(destination))
 
 
 def wait_for_orphans(destination):
