@@ -288,8 +288,10 @@ class Evaluation:
         about = _about((table.schema.metadata or {}).get(b"rlftsim", b"{}"))
         added = [name for name in ADDED_COLUMNS if name not in names]
         if about.get("format") != FORMAT or sorted([*names, *added]) != sorted(SCHEMA.names):
-            way_out = "name a file that `rlftsim evaluate` wrote, or evaluate again."
-            raise DataError(f"{path}: not an evaluation of this version: {way_out}")
+            raise DataError(
+                f"{path}: not an evaluation of this version: name a file that `rlftsim evaluate` wrote, or evaluate "
+                "again."
+            )
         for name in added:
             table = table.append_column(SCHEMA.field(name), pa.array(np.full(len(table), np.nan)))
         table = table.select(SCHEMA.names)
