@@ -6,6 +6,7 @@ import signal
 import socket
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -166,6 +167,41 @@ def test_a_share_ends_well_while_others_are_at_work_and_joining_does_not():
 def test_a_script_with_the_main_guard_may_start_processes(tmp_path):
     done = run_script(tmp_path, SCRIPT.format(jobs=2, call='if __name__ == "__main__":\n    main()'))
     assert (done.stdout, done.returncode) == ("[2, 4, 6]\n", 0), done.stderr
+
+
+INTERRUPTED = """
+import os, signal, time
+from multiprocessing import active_children
+import rlftsim.workers
+
+if __name__ == "__main__":
+    start = rlftsim.workers._Worker.__init__
+
+    def start_then_interrupt(worker):
+        start(worker)
+        if len(active_children()) == 2:
+            time.sleep({seconds})
+            os.killpg(0, signal.SIGINT)  # as a terminal does, to the processes that are starting, too
+
+    rlftsim.workers._Worker.__init__ = start_then_interrupt
+    try:
+        rlftsim.workers.Processes(2).run(print, ["an item", "another"], advance=lambda count: None)
+    except KeyboardInterrupt:
+        print("stopped", active_children())
+"""
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.05, 0.3])
+def test_ctrl_c_while_processes_start_ends_them_silently(tmp_path, seconds):
+    (tmp_path / "script.py").write_text(INTERRUPTED.format(seconds=seconds))
+    done = subprocess.run(
+        [sys.executable, "script.py"],
+        env={**os.environ, "PYTHONPATH": str(Path(rlftsim.__file__).parents[1])},
+        capture_output=True, text=True, timeout=120, cwd=tmp_path, start_new_session=True,
+        # a shell's background job ignores Ctrl-C, and so would everything it starts
+        preexec_fn=partial(signal.signal, signal.SIGINT, signal.default_int_handler),
+    )  # fmt: skip
+    assert (done.stdout, done.stderr) == ("stopped []\n", "")
 
 
 def test_a_script_without_the_main_guard_gets_a_hint_and_starts_nothing(tmp_path):

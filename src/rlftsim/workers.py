@@ -23,10 +23,11 @@ import threading
 import time
 import traceback
 from collections import Counter, deque
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -313,11 +314,13 @@ class Processes:
         waiting = attempts.waiting
         crew: dict[Any, _Worker] = {}
         failed_starts = 0
+        resource_tracker.ensure_running()  # before Ctrl-C is blocked: starting it unblocks Ctrl-C
         try:
             while (num_left := len(items) - len(results) - len(attempts.set_aside)) > 0:
-                while len(crew) < min(self.jobs, num_left):
-                    worker = _Worker()
-                    crew[worker.line] = worker
+                with ctrl_c_blocked():
+                    while len(crew) < min(self.jobs, num_left):
+                        worker = _Worker()
+                        crew[worker.line] = worker
                 for worker in crew.values():
                     if worker.is_idle and waiting:
                         worker.give(pickle.dumps(items[waiting[0]]), waiting.popleft())
@@ -350,6 +353,8 @@ class Processes:
             # A closed line is the sign to stop.
             for worker in crew.values():
                 worker.line.close()
+                if worker.is_starting:
+                    worker.process.kill()  # it would import everything first, and has written nothing
             for worker in crew.values():
                 worker.process.join()
         if attempts.set_aside:
@@ -396,6 +401,11 @@ class _Worker:
         """Reported since the item was begun."""
         self.since = 0.0
         """Moment at which the item was begun, `time.monotonic`."""
+
+    @property
+    def is_starting(self) -> bool:
+        """True until the process has read the task."""
+        return not (self.is_idle or self.was_ready)
 
     def give(self, message: bytes, item: int | None) -> None:
         """Send the task, or an item of a number."""
@@ -467,8 +477,6 @@ def _refuse_unguarded_main() -> None:
 
 def _work(line: Connection) -> None:
     """Main function of a worker process: the task first, then an item after each other until the line is closed."""
-    # Ctrl-C reaches the whole process group; only the parent reacts, and stops the workers by closing the lines.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=exit_with_parent, daemon=True).start()
     keep_freed_memory()
     os.environ["OMP_NUM_THREADS"] = "1"  # read when torch is imported, which unpickling the task may do
@@ -492,6 +500,19 @@ def _work(line: Connection) -> None:
             except Exception as error:
                 say("error", portable_error(error))
             say("idle")
+
+
+@contextmanager
+def ctrl_c_blocked() -> Iterator[None]:
+    """Context in which Ctrl-C waits. Processes that are started in it never see it.
+
+    Ctrl-C reaches all processes of a terminal, but only the one that started the others is to react, and ends them.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def exit_with_parent() -> None:

@@ -1,8 +1,10 @@
 import io
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from rich.console import Console
@@ -109,6 +111,17 @@ def test_a_table_shows_means_errors_and_which_way_is_better():
     assert "nan" not in text
 
 
+def test_scenarios_without_a_meta_metric_are_counted_beside_the_mean():
+    partly, whole = evaluation("a", [0.4, math.nan, 0.6]), evaluation("b", [0.5, 0.5, 0.5])
+    assert repr(partly).startswith("a, 3 scenarios (2 with RMM) x 32 rollouts, metric 2025: RMM 0.5000 ± 0.1000")
+    assert "<caption>a, 3 scenarios (2 with RMM) x" in partly._repr_html_()
+    assert repr(whole).startswith("b, 3 scenarios x 32 rollouts")
+    text = render(format_table(partly, whole))
+    assert "3 (2 with RMM)" in text
+    assert text.count("with RMM") == 1
+    assert compare(partly, whole).pairing == "3 scenarios in both (2 with RMM)"
+
+
 def test_a_comparison_is_shown_with_its_verdict():
     text = render(format_comparison(compare(evaluation("base", [0.4, 0.6]), evaluation("tuned", [0.5, 0.71]))))
     assert "tuned against base: 2 scenarios in both" in text
@@ -125,6 +138,22 @@ def test_files_of_another_version_are_refused(tmp_path):
         Evaluation.read(tmp_path / "b.parquet")
     with pytest.raises(DataError, match="no such evaluation"):
         Evaluation.read(tmp_path / "c.parquet")
+
+
+def test_other_tables_and_columns_of_text_are_refused_in_one_line(tmp_path):
+    pq.write_table(pa.table({"scenario_id": ["a"], "split": ["training"]}), tmp_path / "index.parquet")
+    with pytest.raises(DataError, match=r"index\.parquet: not an evaluation of this version: name a file that"):
+        Evaluation.read(tmp_path / "index.parquet")
+    whole = evaluation("a", [0.1])
+    column = whole.table.schema.get_field_index("kinematic")
+    text = whole.table.set_column(column, "kinematic", pa.array(["0.5"]))
+    for table, message in (
+        (text, "damaged evaluation (column kinematic holds string, not double): evaluate again."),
+        (whole.table.drop_columns("kinematic"), "not an evaluation of this version"),
+    ):
+        replace(whole, table=table).write(tmp_path / "edited.parquet")
+        with pytest.raises(DataError, match=re.escape(message)):
+            Evaluation.read(tmp_path / "edited.parquet")
 
 
 def test_provenance_lists_what_differs():

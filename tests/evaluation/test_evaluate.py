@@ -3,6 +3,7 @@ import multiprocessing
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import torch
@@ -222,6 +223,13 @@ def test_a_damaged_part_is_made_again(data, tmp_path, capsys):
     (tmp_path / "w.parts" / "000000-000004.parquet").write_bytes(b"PAR1 nonsense")
     assert same(evaluate(Wobble(), data, tmp_path, CONFIG, name="w"), expected)
     assert "damaged" in capsys.readouterr().err
+
+
+def test_a_result_with_doubled_rows_is_made_again(data, tmp_path):
+    expected = evaluate("oracle", data, tmp_path, CONFIG, name="o")
+    replace(expected, table=pa.concat_tables([expected.table, expected.table])).write(tmp_path / "o.parquet")
+    assert same(evaluate("oracle", data, tmp_path, CONFIG, name="o"), expected)
+    assert same(Evaluation.read(tmp_path / "o.parquet"), expected)
 
 
 def test_a_higher_limit_adds_scenarios(data, tmp_path):

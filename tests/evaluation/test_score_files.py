@@ -208,11 +208,17 @@ def test_sets_of_different_size_are_not_averaged(data, tmp_path):
         score_rollouts(tmp_path, data, None, CONFIG)
 
 
-def test_two_sets_for_one_scenario_are_both_scored_with_a_message(data, tmp_path, capsys):
+def test_two_sets_for_one_scenario_are_both_scored_with_a_message(data, tmp_path, capsys, monkeypatch):
+    (tmp_path / "sets").mkdir()
     for seed in (1, 2):
-        write_npz(tmp_path / f"{seed}.npz", draw_arrays(SCENARIOS[0], seed=seed))
-    assert len(score_rollouts(tmp_path, data, None, CONFIG, show_progress=False)) == 2
+        write_npz(tmp_path / "sets" / f"{seed}.npz", draw_arrays(SCENARIOS[0], seed=seed))
+    result = score_rollouts(tmp_path / "sets", data, tmp_path / "out", CONFIG, show_progress=False)
+    assert len(result) == 2
     assert "straight first, have several sets" in capsys.readouterr().err
+    with pytest.raises(ConfigError, match="holds 2 scenarios, and limit=1 would replace them without 1"):
+        score_rollouts(tmp_path / "sets", data, tmp_path / "out", replace(CONFIG, limit=1))
+    monkeypatch.setattr(module, "_score_entry", lambda *_: pytest.fail("scored again"))
+    assert same(score_rollouts(tmp_path / "sets", data, tmp_path / "out", CONFIG, show_progress=False), result)
 
 
 def test_agents_that_are_not_the_scenarios_are_named_with_the_file(data, tmp_path):

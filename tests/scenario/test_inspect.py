@@ -1,11 +1,20 @@
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
+import pyarrow as pa
 import pytest
 
 from rlftsim.errors import DataError
-from rlftsim.scenario.dataset import DatasetWriter, write_dataset
+from rlftsim.scenario import dataset
+from rlftsim.scenario.dataset import (
+    DatasetWriter,
+    build_index,
+    read_manifest,
+    write_dataset,
+    write_index_and_manifest,
+)
 from rlftsim.scenario.inspect import Problem, check_scenario, dataset_stats, verify_dataset
 from rlftsim.scenario.types import Scenario
 from rlftsim.scenario.womd import scenario_from_bytes
@@ -115,6 +124,27 @@ def test_missing_map_and_no_agent_to_evaluate_are_found(make_dataset, make_messa
     empty = replace(whole, tracks=replace(whole.tracks, valid=np.zeros_like(whole.tracks.valid)))
     (finding,) = check_scenario(empty)
     assert finding.detail == only_ego.replace("only the ego is evaluated", "nor is the ego: nothing is evaluated")
+
+
+def test_a_scenario_that_is_in_the_index_twice_is_found(make_dataset, make_message, monkeypatch):
+    folder = make_dataset(make_message("a"), make_message("b"))
+    entry = read_manifest(folder).shards[0]
+    shutil.copy(folder / entry.file, folder / "shards" / "copy.arrow")
+    with monkeypatch.context() as earlier_version:
+        parts = [build_index(folder, [one])[0] for one in (entry, replace(entry, file="shards/copy.arrow"))]
+        earlier_version.setattr(dataset, "build_index", lambda *_: (pa.concat_tables(parts), []))
+        write_index_and_manifest(folder, [entry, replace(entry, file="shards/copy.arrow")])
+    (finding,) = verify_dataset(folder)
+    assert finding.problem == Problem.INDEX_MISMATCH
+    places = "shards/00000.arrow and shards/copy.arrow"
+    assert finding.detail.startswith(f"scenario a is in it from {places} (and 1 more): convert one of the sources ")
+    # the same shards with an index of today
+    write_index_and_manifest(folder, read_manifest(folder).shards)
+    assert verify_dataset(folder) == []
+    # another wording of the duplicates is no damage
+    manifest = folder / "manifest.json"
+    manifest.write_text(manifest.read_text().replace("the first is kept", "left out"))
+    assert verify_dataset(folder) == []
 
 
 def test_a_flipped_byte_and_a_missing_shard_are_found(make_dataset, make_message):

@@ -1,6 +1,10 @@
 """The command line of submissions, and the report."""
 
+import errno
+import itertools
 import json
+import os
+import tarfile
 
 import entries
 import pytest
@@ -58,7 +62,7 @@ def test_a_build_is_declared_checked_and_reported(place, capsys):
     assert json.loads((place / "out" / "submission.report.json").read_text())["sha256"] == report["sha256"]
 
 
-def test_an_archive_is_checked_described_cut_and_joined(place, capsys):
+def test_an_archive_is_checked_described_cut_and_joined(place, capsys, monkeypatch):
     main([*BUILD, "--i-comply"])
     archive = place / "out" / "submission.tar.gz"
     assert main([*CHECK, "--json", "found.json", "--sample", "0.5"]) == 0
@@ -72,6 +76,19 @@ def test_an_archive_is_checked_described_cut_and_joined(place, capsys):
     parts = sorted((place / "out").glob("*.tar.gz.0*"))
     assert b"".join(part.read_bytes() for part in parts) == archive.read_bytes()
     assert max(part.stat().st_size for part in parts) == 10_000
+    before = {part: part.read_bytes() for part in (place / "out").iterdir()}
+    sync, count = os.fsync, itertools.count()
+
+    def full_at_the_third(descriptor):
+        if next(count) == 2:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        sync(descriptor)
+
+    with monkeypatch.context() as disk:
+        disk.setattr(os, "fsync", full_at_the_third)
+        assert main(["submit", "info", str(archive), "--split-gb", "0.000005"]) == 2
+    assert "submission.tar.gz.002 (No space left on device): make room" in capsys.readouterr().err
+    assert {part: part.read_bytes() for part in (place / "out").iterdir()} == before
     archive.write_bytes(archive.read_bytes()[:-50])  # copied in part
     assert main(CHECK) == 1
     printed = capsys.readouterr().out
@@ -81,6 +98,17 @@ def test_an_archive_is_checked_described_cut_and_joined(place, capsys):
     assert "cannot be uploaded: remove it and repeat the command" in capsys.readouterr().out
     archive.unlink()
     assert main([*BUILD, "--i-comply"]) == 0
+
+
+def test_an_archive_without_a_shard_is_found_and_a_folder_named(tmp_path, capsys):
+    with tarfile.open(tmp_path / "empty.tar.gz", "w:gz"):
+        pass
+    assert main(["submit", "info", str(tmp_path / "empty.tar.gz")]) == 1
+    printed = capsys.readouterr().out
+    assert "error, check 6: empty.tar.gz: there is no shard in it" in printed
+    assert "1 findings" in printed
+    assert main(["submit", "info", str(tmp_path)]) == 2
+    assert f"{tmp_path} is a folder: name the .tar.gz in it." in capsys.readouterr().err
 
 
 def test_the_rollouts_of_an_archive_score_as_its_unpacked_files(tmp_path, monkeypatch, capsys):

@@ -99,7 +99,9 @@ class Comparison:
         """Numbers of scenarios that are compared and left out, in words."""
         alone = [(self.num_only_a, self.name_a), (self.num_only_b, self.name_b)]
         left_out = "".join(f", {count} only in {name} left out" for count, name in alone if count)
-        return f"{self.num_paired} scenario{'s' if self.num_paired != 1 else ''} in both{left_out}"
+        num_with_rmm = self["meta_metric"].count
+        with_rmm = f" ({num_with_rmm} with RMM)" if num_with_rmm < self.num_paired else ""
+        return f"{self.num_paired} scenario{'s' if self.num_paired != 1 else ''} in both{with_rmm}{left_out}"
 
 
 def compare(a: Evaluation, b: Evaluation, *, alpha: float = 0.05) -> Comparison:
@@ -228,7 +230,8 @@ def format_table(*evaluations: Evaluation, columns: Sequence[Column] | None = No
     for evaluation in evaluations:
         means = [evaluation.mean_and_error(column.source) for column in columns]
         cells = [_plus_minus(found.mean, found.standard_error) for found in means]
-        table.add_row(evaluation.name, str(len(evaluation)), *cells)
+        with_rmm = f" ({evaluation.num_with_rmm} with RMM)" if evaluation.num_with_rmm < len(evaluation) else ""
+        table.add_row(evaluation.name, f"{len(evaluation)}{with_rmm}", *cells)
     return table
 
 

@@ -208,9 +208,16 @@ class Evaluation:
 
     @property
     def _title(self) -> str:
-        skipped = f" ({len(self.skipped)} skipped)" if self.skipped else ""
+        notes = [f"{len(self.skipped)} skipped"] if self.skipped else []
+        notes += [f"{self.num_with_rmm} with RMM"] if self.num_with_rmm < len(self) else []
+        of_these = f" ({', '.join(notes)})" if notes else ""
         config = self.config
-        return f"{self.name}, {len(self)} scenarios{skipped} x {config.num_rollouts} rollouts, metric {config.metric}"
+        return f"{self.name}, {len(self)} scenarios{of_these} x {config.num_rollouts} rollouts, metric {config.metric}"
+
+    @property
+    def num_with_rmm(self) -> int:
+        """Scenarios whose meta-metric is defined, over which its mean is taken: all terms of it need a value."""
+        return self.mean_and_error("meta_metric").count
 
     @property
     def config(self) -> EvaluateConfig:
@@ -279,12 +286,19 @@ class Evaluation:
             raise DataError(f"{path}: damaged evaluation ({cause}): evaluate again.") from None
         # our part of the file's metadata; pandas and others may add theirs
         about = _about((table.schema.metadata or {}).get(b"rlftsim", b"{}"))
-        for name in ADDED_COLUMNS:
-            if name not in names:
-                missing = pa.array(np.full(len(table), np.nan))
-                table = table.add_column(SCHEMA.get_field_index(name), SCHEMA.field(name), missing)
-        if about.get("format") != FORMAT or table.schema.names != SCHEMA.names:
-            raise DataError(f"{path}: not an evaluation of this version: evaluate again.")
+        added = [name for name in ADDED_COLUMNS if name not in names]
+        if about.get("format") != FORMAT or sorted([*names, *added]) != sorted(SCHEMA.names):
+            raise DataError(
+                f"{path}: not an evaluation of this version: name a file that `rlftsim evaluate` wrote, or evaluate "
+                "again."
+            )
+        for name in added:
+            table = table.append_column(SCHEMA.field(name), pa.array(np.full(len(table), np.nan)))
+        table = table.select(SCHEMA.names)
+        for field, found in zip(SCHEMA, table.schema):
+            if found.type != field.type:
+                cause = f"column {field.name} holds {found.type}, not {field.type}"
+                raise DataError(f"{path}: damaged evaluation ({cause}): evaluate again.")
         try:
             provenance = Provenance.from_plain(about["provenance"])
         except (TypeError, KeyError, ConfigError) as error:

@@ -8,6 +8,7 @@ import json
 import shutil
 import tempfile
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -234,20 +235,21 @@ class EvaluationParts(PartFiles[Mapping[str, object] | Skipped, Evaluation]):
         # Before anything else: also a result of another policy or setting is worth more than a quick look.
         limit = self.provenance.config.limit
         if limit is not None:
-            num_found = len(_ids_of(found))
+            num_found = _ids_of(found).total()
             way_out = "name this one apart with --name, or leave the limit out."
-            num_left_out = len(_ids_of(found) - {*scenario_ids})
+            num_left_out = (_ids_of(found) - Counter(scenario_ids)).total()
             refuse_to_leave_out(self.result_path, num_found, num_left_out, f"limit={limit}", way_out)
         if not self._is_ours(found, self.result_path, "it will be replaced"):
             return None
-        # as a set: a scenario may have several sets of rollouts
-        return found if _ids_of(found) == set(scenario_ids) else None
+        # counted: a scenario may have several sets of rollouts in files, and one by a policy
+        return found if _ids_of(found) == Counter(scenario_ids) else None
 
     def has_others(self, scenario_ids: Collection[str]) -> bool:
         """True if a group has other scenarios or settings, see `PartFiles`."""
         parts = (read_if_readable(path, Evaluation.read) for path in self.folder.glob("*.parquet"))
         return any(
-            part is not None and bool(part.provenance.differences(self.provenance) or _ids_of(part) - {*scenario_ids})
+            part is not None
+            and bool(part.provenance.differences(self.provenance) or _ids_of(part).keys() - {*scenario_ids})
             for part in parts
         )
 
@@ -258,9 +260,9 @@ class EvaluationParts(PartFiles[Mapping[str, object] | Skipped, Evaluation]):
         return not other
 
 
-def _ids_of(evaluation: Evaluation) -> set[str]:
-    """Ids of all scenarios of an evaluation, those without scores included."""
-    return {*evaluation.scenario_ids, *(skipped.scenario_id for skipped in evaluation.skipped)}
+def _ids_of(evaluation: Evaluation) -> Counter[str]:
+    """Ids of all scenarios of an evaluation, those without scores included, and the number of rows of each."""
+    return Counter([*evaluation.scenario_ids, *(skipped.scenario_id for skipped in evaluation.skipped)])
 
 
 def resume_evaluation(

@@ -11,7 +11,7 @@ import os
 import shutil
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -27,6 +27,7 @@ from rlftsim.scenario.dataset import (
     SHARDS,
     Manifest,
     ShardEntry,
+    names_of_shards,
     parse_manifest,
     read_manifest,
     shard_entry_from_json,
@@ -53,7 +54,7 @@ class ConvertReport:
     skipped: tuple[SkippedRecord, ...]
     """Files and records of these sources that could not be used."""
     duplicates: tuple[SkippedRecord, ...]
-    """Records left out because an earlier one has the same scenario id."""
+    """Records left out because an earlier one has the same scenario id, those of other sources included."""
     shards_written: int
     shards_reused: int
     counts: Mapping[str, int]
@@ -194,9 +195,10 @@ def convert(
         entries = [made[task.shard] for task in tasks if task.shard in made and _is_of(made[task.shard], task)]
         require_finished(runner, len(tasks) - len(entries), len(tasks), "convert")
         remove_temporaries_below(folder)  # of processes that were killed
+        earlier = _earlier_manifest(folder)
         manifest = _finish(folder, entries, data_source, license_note, lease)
         lease.remove()
-    return _report(folder, entries, outcomes, manifest)
+    return _report(folder, entries, outcomes, manifest, earlier.duplicates if earlier else ())
 
 
 def _is_of(entry: ShardEntry, task: _Task) -> bool:
@@ -396,18 +398,29 @@ def _finish(
     return manifest
 
 
-def _report(folder: Path, entries: list[ShardEntry], outcomes: list[_Outcome], manifest: Manifest) -> ConvertReport:
+def _report(
+    folder: Path,
+    entries: list[ShardEntry],
+    outcomes: list[_Outcome],
+    manifest: Manifest,
+    earlier_duplicates: Sequence[SkippedRecord],
+) -> ConvertReport:
     """Report on the units of this call; a data set may hold more, and of a share's call other shares made the rest."""
-    sources = {entry.source for entry in entries}
-    duplicates = tuple(record for record in manifest.duplicates if record.file in sources)
+    all_names = names_of_shards(manifest.shards)
+    names = {all_names[entry.file] for entry in entries}
+    own = [record for record in manifest.duplicates if record.file in names]
+    # a shard of this call that comes first in the index makes duplicates of scenarios that were there before
+    replaced = [
+        record for record in manifest.duplicates if record.file not in names and record not in earlier_duplicates
+    ]
     tallies: Counter[str] = Counter()
     for entry in entries:
         tallies.update(entry.tallies)
     return ConvertReport(
         destination=folder,
-        converted=sum(entry.num_rows for entry in entries) - len(duplicates),
+        converted=sum(entry.num_rows for entry in entries) - len(own),
         skipped=tuple(record for entry in entries for record in entry.skipped),
-        duplicates=duplicates,
+        duplicates=(*own, *replaced),
         shards_written=sum(not outcome.reused for outcome in outcomes),
         shards_reused=sum(outcome.reused for outcome in outcomes),
         counts=manifest.counts,

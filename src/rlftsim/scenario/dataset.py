@@ -516,20 +516,36 @@ def build_index(folder: Path, entries: Iterable[ShardEntry]) -> tuple[pa.Table, 
         folder: the data set.
         entries: its shards in the order of the index.
     """
+    entries = list(entries)
+    names = names_of_shards(entries)
     tables, duplicates, first_place = [], [], {}
     for entry in entries:
         rows = ShardReader(folder / entry.file).index_rows()
         keep = []
-        ids, records = (rows[column].to_pylist() for column in ("scenario_id", "source_record"))
-        for row, (scenario_id, record) in enumerate(zip(ids, records)):
+        ids, records, splits = (rows[column].to_pylist() for column in ("scenario_id", "source_record", "split"))
+        for row, (scenario_id, record, split) in enumerate(zip(ids, records, splits)):
             # the first of equal ids is indexed; the others stay in their shards, reported as duplicates
-            place = f"{entry.source or entry.file} record {row if record is None else record}"
-            keep.append(first_place.setdefault(scenario_id, place) == place)
-            if not keep[-1]:
-                cause = f"scenario {scenario_id} is already in {first_place[scenario_id]}; the first is kept"
-                duplicates.append(SkippedRecord(entry.source or entry.file, row if record is None else record, cause))
+            keep.append(scenario_id not in first_place)
+            record = row if record is None else record
+            if keep[-1]:
+                first_place[scenario_id] = (f"{names[entry.file]} record {record}", split)
+                continue
+            place, first_split = first_place[scenario_id]
+            cause = f"scenario {scenario_id} is already in {place}; the first is kept"
+            if split != first_split:
+                cause += f", in split {first_split}: to have it in split {split}, convert to another folder"
+            duplicates.append(SkippedRecord(names[entry.file], record, cause))
         table = rows.drop_columns("source_record")
         table = table.append_column("shard", pa.array([entry.file] * len(table), pa.string()))
         table = table.append_column("row", pa.array(range(len(table)), pa.int32()))
         tables.append(table.filter(pa.array(keep, pa.bool_())))
     return pa.concat_tables([INDEX_SCHEMA.empty_table(), *tables]).combine_chunks(), duplicates
+
+
+def names_of_shards(entries: Iterable[ShardEntry]) -> dict[str, str]:
+    """Name in messages by shard file: that of its source, or the file where the source has several shards or none."""
+    entries = list(entries)
+    num_shards = Counter(entry.source for entry in entries)
+    return {
+        entry.file: entry.source if entry.source and num_shards[entry.source] == 1 else entry.file for entry in entries
+    }

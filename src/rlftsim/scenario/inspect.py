@@ -104,10 +104,11 @@ class DatasetStats:
 def verify_dataset(folder: str | os.PathLike[str]) -> list[Finding]:
     """Check every shard and every scenario of a data set.
 
-    Damage: shards missing or not as the manifest has them, index and manifest that do not belong together. Doubtful
-    content: impossible ids, types, sizes or track indices, NaN or infinite states or map points, positions too far from
-    the origin for float32, a lane with two states at a step, consecutive valid positions that imply more than 60 m/s,
-    no lanes or no road edges, a map 200 m from the ego or more, no agent to evaluate beside the ego.
+    Damage: shards missing or not as the manifest has them, index and manifest that do not belong together, a scenario
+    that is in the index twice. Doubtful content: impossible ids, types, sizes or track indices, NaN or infinite states
+    or map points, positions too far from the origin for float32, a lane with two states at a step, consecutive valid
+    positions that imply more than 60 m/s, no lanes or no road edges, a map 200 m from the ego or more, no agent to
+    evaluate beside the ego.
 
     Args:
         folder: the data set, or "synthetic".
@@ -257,10 +258,22 @@ def _check_index(folder: Path, manifest: Manifest) -> Iterator[Finding]:
     if not path.exists() or hash_file(path) != manifest.index_sha256:
         yield Finding(Problem.INDEX_MISMATCH, INDEX, "it is not the one the manifest was written for: convert again")
         return
+    index = load_index(folder)
+    shards: dict[str, list[str]] = {}
+    for scenario_id, shard in zip(index["scenario_id"].to_pylist(), index["shard"].to_pylist()):
+        shards.setdefault(scenario_id, []).append(shard)
+    repeated = [scenario_id for scenario_id, places in shards.items() if len(places) > 1]
+    if repeated:
+        # earlier versions could write such an index
+        places = " and ".join(shards[repeated[0]])
+        detail = f"scenario {repeated[0]} is in it from {places}{_and_more(len(repeated))}"
+        yield Finding(Problem.INDEX_MISMATCH, INDEX, f"{detail}: convert one of the sources again, the first is kept")
+        return
     expected, duplicates = build_index(folder, manifest.shards)
-    if not load_index(folder).equals(expected):
+    if not index.equals(expected):
         yield Finding(Problem.INDEX_MISMATCH, INDEX, "its rows are not those of the shards: convert again")
-    if expected.num_rows != manifest.num_scenarios or tuple(duplicates) != manifest.duplicates:
+    # of duplicates the number alone: versions describe them differently
+    if expected.num_rows != manifest.num_scenarios or len(duplicates) != len(manifest.duplicates):
         yield Finding(Problem.INDEX_MISMATCH, INDEX, "the manifest's counts are not those of the shards: convert again")
 
 

@@ -82,11 +82,13 @@ def check_archive(
 
     Raises:
         ConfigError: a sample of nothing.
-        DataError: no such file, or a damaged data set.
+        DataError: no such file, a folder, or a damaged data set.
     """
     if not 0 < sample <= 1:
         raise ConfigError(f"sample={sample:g} must be above 0 and at most 1.")
     archive = Path(archive)
+    if archive.is_dir():
+        raise DataError(f"{archive} is a folder: name the .tar.gz in it.")
     if not archive.is_file():
         raise DataError(f"{archive}: there is no such archive.")
     found = ArchiveCheck(archive.name, archive.stat().st_size)
@@ -232,6 +234,10 @@ class _Pass:
             found.findings.add(Finding(16, "warning", text, found.archive))
         if not is_whole:
             return  # whatever is missing lies behind the damage
+        if not found.shards:
+            self._add(
+                6, "there is no shard in it: pack files named as submission.binproto-00000-of-00150", found.archive
+            )
         if self.numbers:
             total = self.numbers[0][1]
             if Counter(number for number, _ in self.numbers) != Counter(range(total)) or any(

@@ -1,17 +1,20 @@
 """Large archives cut into parts, for moving them about. The upload page takes the joined file."""
 
 import math
+import os
 from glob import escape
 from pathlib import Path
 
-from rlftsim.atomic_io import errors_name
+from rlftsim.atomic_io import errors_name, remove_temporaries, temporary_beside
 from rlftsim.errors import ConfigError
 
 _CHUNK = 1 << 22
 
 
 def split_file(path: Path, part_gb: float) -> list[Path]:
-    """Copy a file into parts named `<name>.000`, `<name>.001` and so on; `cat` joins them. Older parts are removed.
+    """Copy a file into parts named `<name>.000`, `<name>.001` and so on; `cat` joins them.
+
+    Parts of an earlier cut are removed when all new ones are written.
 
     Args:
         path: of the file, which is kept.
@@ -19,20 +22,28 @@ def split_file(path: Path, part_gb: float) -> list[Path]:
 
     Raises:
         ConfigError: more than 1000 parts.
-        DataError: a part cannot be written.
+        DataError: a part cannot be written; those of an earlier cut are left as they are.
     """
     part_bytes = int(part_gb * 1e9) if 0 < part_gb < math.inf else 0
     count = -(-path.stat().st_size // part_bytes) if part_bytes else 0
     if not 0 < count <= 1000:
         raise ConfigError(f"{path} cannot be cut into parts of {part_gb:g} GB: choose 1 to 1000 parts.")
     parts = [path.with_name(f"{path.name}.{number:03d}") for number in range(count)]
-    for old in path.parent.glob(f"{escape(path.name)}.[0-9][0-9][0-9]"):
-        old.unlink()  # `cat` would join those of an earlier, finer cut, too
-    with path.open("rb") as source:
+    try:
+        with path.open("rb") as source:
+            for part in parts:
+                with errors_name(part), temporary_beside(part).open("wb") as out:
+                    left = part_bytes
+                    while left and (chunk := source.read(min(left, _CHUNK))):
+                        out.write(chunk)
+                        left -= len(chunk)
+                    out.flush()
+                    os.fsync(out.fileno())
+        for old in path.parent.glob(f"{escape(path.name)}.[0-9][0-9][0-9]"):
+            old.unlink()  # `cat` would join those of an earlier, finer cut, too
         for part in parts:
-            with errors_name(part), part.open("wb") as out:
-                left = part_bytes
-                while left and (chunk := source.read(min(left, _CHUNK))):
-                    out.write(chunk)
-                    left -= len(chunk)
+            temporary_beside(part).replace(part)
+    finally:
+        for part in parts:
+            remove_temporaries(part)
     return parts

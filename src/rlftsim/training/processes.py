@@ -6,7 +6,6 @@ notebook may train with the rewards and policies that its cells define, and scen
 
 import multiprocessing
 import os
-import signal
 import sys
 import threading
 import warnings
@@ -22,7 +21,7 @@ from torch import Tensor
 
 from rlftsim.errors import ConfigError, DataError, RlftsimError
 from rlftsim.training.parallel import DeviceConfig, Fabric, can_fork, start_fabric
-from rlftsim.workers import exit_with_parent, portable_error
+from rlftsim.workers import ctrl_c_blocked, exit_with_parent, portable_error
 
 Result = TypeVar("Result")
 
@@ -57,10 +56,8 @@ def in_processes(work: Callable[[Fabric], Result], config: DeviceConfig) -> Resu
     context = multiprocessing.get_context("fork")
     links: list[Connection] = []
     helpers: list[BaseProcess] = []
-    # Helpers inherit the blocked signal: Ctrl-C reaches all processes, but only this one reacts.
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
     try:
-        try:
+        with ctrl_c_blocked():
             for rank in range(1, processes):
                 link, theirs = Pipe()
                 links.append(link)
@@ -72,8 +69,6 @@ def in_processes(work: Callable[[Fabric], Result], config: DeviceConfig) -> Resu
                     helpers[-1].start()
                 # Only the helper holds it from here on: its end is the end of the pipe.
                 theirs.close()
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
         return work(LinkedProcess(fabric, 0, processes, links))
     finally:
         for helper in helpers:
