@@ -25,6 +25,8 @@ Differences from a classical policy API, each for a reason:
 * Randomness is handed in as uniform noise, a few values for every (scenario, rollout, agent, decision), drawn from
   the seed and the scenario's id (`rollout.noise`). So the same seed gives the same rollouts however a batch is
   composed, sliced or moved between devices, and nothing random has to be stored to resume a run.
+* A batch holds the logged future, which training learns from. `encode` may not read it: rollouts are those of a test
+  split, in which tracks and lights end at the current step.
 
 A policy that is an nn.Module is used in these modes. `policies.registry.load_policy` returns it in evaluation mode with
 `requires_grad` False everywhere. Imitation of the log (pre-training, CAT-K) trains it in `.train()`, so dropout is
