@@ -95,6 +95,9 @@ def test_a_map_in_another_frame_and_positions_beyond_float32_are_found(
     (finding,) = verify_dataset(folder)
     assert (finding.problem, finding.where) == (Problem.MAP_ELSEWHERE, "a")
     assert " m from the ego: give map and tracks the same origin" in finding.detail
+    unknown = scenario_from_bytes(shifted.SerializeToString())  # the ego may be anywhere: nothing is known to be far
+    unknown.tracks.valid[unknown.ego_index, 10] = False
+    assert Problem.MAP_ELSEWHERE not in [finding.problem for finding in check_scenario(unknown)]
 
     scenario = scenario_from_bytes(make_message("utm").SerializeToString())
     scenario.tracks.position[..., 1] += 4_649_000.0

@@ -99,8 +99,7 @@ class Comparison:
         """Numbers of scenarios that are compared and left out, in words."""
         alone = [(self.num_only_a, self.name_a), (self.num_only_b, self.name_b)]
         left_out = "".join(f", {count} only in {name} left out" for count, name in alone if count)
-        num_with_rmm = self["meta_metric"].count
-        with_rmm = f" ({num_with_rmm} with RMM)" if num_with_rmm < self.num_paired else ""
+        with_rmm = _with_rmm(self["meta_metric"].count, self.num_paired)
         return f"{self.num_paired} scenario{'s' if self.num_paired != 1 else ''} in both{with_rmm}{left_out}"
 
 
@@ -207,6 +206,11 @@ def columns_of(*evaluations: Evaluation) -> tuple[Column, ...]:
     return TERMINAL_GOAL_COLUMNS if have_goals else TERMINAL_COLUMNS
 
 
+def _with_rmm(count: int, num_scenarios: int) -> str:
+    """Note on the scenarios that the mean meta-metric is over, where it is undefined for some."""
+    return f" ({count} with RMM)" if count < num_scenarios else ""
+
+
 def format_table(*evaluations: Evaluation, columns: Sequence[Column] | None = None) -> Table:
     """One row per evaluation: mean ± standard error over its scenarios. Arrows point in the better direction.
 
@@ -230,8 +234,8 @@ def format_table(*evaluations: Evaluation, columns: Sequence[Column] | None = No
     for evaluation in evaluations:
         means = [evaluation.mean_and_error(column.source) for column in columns]
         cells = [_plus_minus(found.mean, found.standard_error) for found in means]
-        with_rmm = f" ({evaluation.num_with_rmm} with RMM)" if evaluation.num_with_rmm < len(evaluation) else ""
-        table.add_row(evaluation.name, f"{len(evaluation)}{with_rmm}", *cells)
+        num_scenarios = len(evaluation)
+        table.add_row(evaluation.name, f"{num_scenarios}{_with_rmm(evaluation.num_with_rmm, num_scenarios)}", *cells)
     return table
 
 

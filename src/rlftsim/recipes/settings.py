@@ -15,10 +15,7 @@ from typing import Any, get_type_hints
 from rlftsim.aliases import current_names
 from rlftsim.errors import ConfigError
 from rlftsim.recipes.registry import SECTIONS, Recipe, section_names
-from rlftsim.training.run_folder import flatten, to_plain
-
-RUN_INPUTS = ("initial_policy", "scenarios", "scenario_files", "augmented_goals")
-"""Entries of a run's config.json that describe what the run started from. They are hashes, not settings."""
+from rlftsim.training.run_folder import RUN_INPUTS, flatten, to_plain
 
 
 def recipe_as_json(recipe: Recipe) -> str:

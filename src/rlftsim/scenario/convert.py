@@ -410,9 +410,8 @@ def _report(
     names = {all_names[entry.file] for entry in entries}
     own = [record for record in manifest.duplicates if record.file in names]
     # a shard of this call that comes first in the index makes duplicates of scenarios that were there before
-    replaced = [
-        record for record in manifest.duplicates if record.file not in names and record not in earlier_duplicates
-    ]
+    known = set(earlier_duplicates)
+    replaced = [record for record in manifest.duplicates if record.file not in names and record not in known]
     tallies: Counter[str] = Counter()
     for entry in entries:
         tallies.update(entry.tallies)

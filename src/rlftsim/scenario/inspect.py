@@ -220,9 +220,9 @@ def check_scenario(scenario: Scenario) -> Iterator[Finding]:
     if missing:
         detail = f"no {' and no '.join(missing)}" if len(features.points) else "no map features"
         yield Finding(Problem.MISSING_MAP, where, detail)
-    if len(features.points):
-        ego = tracks.position[scenario.ego_index, CURRENT_STEP, :2].astype(np.float64)
-        nearest = np.linalg.norm(features.points[:, :2] - ego, axis=-1).min()  # NaN of either is no finding of its own
+    if len(features.points) and tracks.valid[scenario.ego_index, CURRENT_STEP]:
+        # NaN of either is no finding of its own
+        nearest = np.linalg.norm(features.points[:, :2] - scenario.origin, axis=-1).min()
         if nearest > FAR_MAP_M:
             detail = f"its nearest point is {nearest:.0f} m from the ego: give map and tracks the same origin"
             yield Finding(Problem.MAP_ELSEWHERE, where, detail)

@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 from rlftsim.errors import ConfigError
+from rlftsim.rollout.check import POSE_TOLERANCE_M
 from rlftsim.rollout.edge_scenes import without_future
 from rlftsim.rollout.noise import draw_noise
 from rlftsim.rollout.policy import Policy, Sampling, device_of
@@ -13,8 +14,6 @@ from rlftsim.scenario.types import FUTURE_STEPS, STEP_S, Scenario
 
 MAX_STEPS_PER_DECISION = 10
 """Inference may be called as rarely as once a second, with interpolation to 10 Hz."""
-SAME_POSE_M = 1e-3
-"""Rounding may differ where tensors are shorter."""
 
 
 def statement(policy: Policy, sampling: Sampling) -> str:
@@ -60,7 +59,7 @@ def refuse_open_loop(policy: Policy, scenario: Scenario) -> None:
             simulate(policy, collate([one]).to(device_of(policy)), num_rollouts=1, seed=0).position
             for one in (scenario, without_future(scenario))
         )
-        if not torch.allclose(with_it, without_it, rtol=0.0, atol=SAME_POSE_M):
+        if not torch.allclose(with_it, without_it, rtol=0.0, atol=POSE_TOLERANCE_M):
             raise ConfigError(
                 "the policy's rollouts change where the logged future is taken away: the challenge wants each state "
                 "to follow from the states before it. Let `encode` read no step behind the current one."

@@ -63,6 +63,8 @@ BOARD_GROUPS = {
 
 SCENARIO_FILES = "scenario_files"
 """Input that only data sets have, not lists of scenarios, and not runs of before: compared where both have it."""
+RUN_INPUTS = ("initial_policy", "scenarios", SCENARIO_FILES, "augmented_goals")
+"""Entries of a run's config.json that describe what the run started from. They are hashes, not settings."""
 
 
 def board_tag(name: str) -> str:

@@ -76,14 +76,14 @@ def require_rollouts(function: str, scenarios: object, *rollouts: object) -> Non
         poses = (one.position, one.heading)
         is_sound = all(isinstance(values, Tensor) for values in poses) and one.heading.dim() == 4
         if not is_sound or one.position.shape != (*one.heading.shape, 2):
-            found = " and ".join(_in_short(values) for values in poses)
+            found = " and ".join(_shape_of(values) for values in poses)
             raise DataError(
                 f"position and heading of rollouts must be tensors [B, N, A, T, 2] and [B, N, A, T], got {found}: hand "
                 "over those of rs.simulate, or put such tensors in their place."
             )
 
 
-def _in_short(values: Any) -> str:
+def _shape_of(values: Any) -> str:
     shape = tuple(getattr(values, "shape", ()))
     return str(shape) if isinstance(values, Tensor) else f"{type(values).__name__} {shape}"
 

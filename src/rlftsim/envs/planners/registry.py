@@ -109,7 +109,7 @@ def load_planner(name: str) -> Planner:
         planner = CallablePlanner(planner)
     _require_one_argument(f"reset of planner {name!r}", planner.reset, "info")
     _require_one_argument(f"act of planner {name!r}", planner.act, "observation")
-    action_of(planner)
+    action_of(planner)  # refuses an unknown kind now, not in the first episode
     return planner
 
 
