@@ -779,7 +779,6 @@ def test_numbers_of_numpy_are_numbers(data, home, unchecked):
     compared = rs.compare("runs/e/a.parquet", one)
     assert compared["RMM"] is compared["meta_metric"]
     assert type(rs.FinetuneConfig(seed=two, learning_rate=np.float32(0.5)).learning_rate) is float
-    assert EvaluateConfig(goals="recorded").goals == "logged"
 
 
 def test_scenarios_of_a_data_set_cannot_be_edited_in_place(data):

@@ -11,7 +11,7 @@ PACKAGE = Path(rlftsim.__file__).parent
 
 FLOORS = (
     ("errors",),
-    ("aliases", "atomic_io", "geometry", "plugins", "progress", "statistics", "threads"),
+    ("atomic_io", "geometry", "plugins", "progress", "statistics", "threads"),
     ("workers", "storage"),
     ("lease", "cluster"),
     ("scenario",),

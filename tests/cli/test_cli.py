@@ -167,10 +167,6 @@ WRONG = {
         "convert a b --window frist",
         "--window frist: expected one of 'av2', 'both', 'first', 'last'.",
     ),
-    "an old flag with a value that is none": (
-        "finetune smart-demo --model m --data d --out o --goal-aim maybe",
-        "no flag --goal-aim: did you mean --goal-logit-bias?",
-    ),
     "a choice that does not exist": ("convert a b --on-error wait", "--on-error wait: expected one of 'skip', 'stop'"),
     "a value that is missing": ("evaluate oracle --out", "--out needs a value"),
     "a value of the wrong kind": (
@@ -207,7 +203,6 @@ WRONG = {
         "simulate constant_velocity --data synthetic --out {tmp}/whose",
         "rollouts.json: damaged .* name another --out",
     ),
-    "no value": ("tokens --data synthetic --out {tmp}/v --set tokens.num_tokens", "is not field=value"),
     "an unknown metric": (
         "evaluate oracle --data synthetic --out {tmp}/o --metric 1999",
         "Unknown metric '1999': known are 2025",

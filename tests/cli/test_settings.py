@@ -1,4 +1,4 @@
-"""Settings on the command line: flags for every field, files of settings, `--set` and names of earlier versions."""
+"""Settings on the command line: flags for every field, files of settings."""
 
 import json
 import re
@@ -8,7 +8,6 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from rlftsim.aliases import current_words
 from rlftsim.cli.main import main, parse
 from rlftsim.errors import ConfigError
 from rlftsim.policies.smart.config import smart_demo
@@ -219,9 +218,11 @@ def test_flags_override_a_file_which_overrides_the_recipe(tmp_path):
     assert settings.num_rollouts == recipe.num_rollouts
 
 
-def test_a_runs_config_of_an_earlier_version_is_read_by_its_method(tmp_path):
+def test_a_runs_config_is_read_by_its_method(tmp_path):
     path = tmp_path / "config.json"
-    path.write_text(json.dumps({"num_candidates": 7, "goal_share": 0.5, "initial_policy": "ab", "scenarios": "cd"}))
+    path.write_text(
+        json.dumps({"num_candidates": 7, "goal_probability": 0.5, "initial_policy": "ab", "scenarios": "cd"})
+    )
     settings = parse([*FINETUNE, "--method", "catk", "--config", str(path)]).settings
     assert (settings.catk.num_candidates, settings.catk.goal_probability) == (7, 0.5)
     with pytest.raises(
@@ -286,51 +287,9 @@ def test_a_run_repeated_from_its_own_config_gives_the_same_bits(tmp_path):
     assert any(not torch.equal(first[key], before[key]) for key in first)
 
 
-# ---- words of earlier versions -------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("setting", "name", "value"),
-    [
-        ("finetune.learning-rate=1e-5", "finetune.learning_rate", 1e-5),
-        ("finetune.betas=(0.8, 0.95)", "finetune.betas", (0.8, 0.95)),
-        ("finetune.betas=0.8,0.95", "finetune.betas", (0.8, 0.95)),
-        ("finetune.goals.augmented=none", "finetune.goals.augmented", None),
-        ("finetune.shared-credit=0.5", "finetune.credit_mixing", 0.5),
-        ("finetune.kl.reference_share=0.5", "finetune.kl.reference_ema", 0.5),
-        ("finetune.reward=mloo + 0.1*collision_offroad", "finetune.reward", "mloo + 0.1*collision_offroad"),
-    ],
-)
-def test_set_of_the_first_version_still_works_with_a_hint(setting, name, value, capsys):
-    assert value_at(parse([*FINETUNE, "--set", setting]).settings, name) == value
-    assert f"--set {setting} is written --{name.replace('_', '-')}" in capsys.readouterr().err
-
-
-def test_set_takes_switches_and_many_settings_in_any_place():
-    once = parse([*TOKENS[:1], "--set", "tokens.mirror=false", "tokens.seed=5", *TOKENS[1:]]).settings.tokens
-    many = parse([*TOKENS, "--set", "tokens.mirror=False", "--set", "tokens.seed=5"]).settings.tokens
-    assert once == many
-    assert (once.mirror, once.seed) == (False, 5)
-
-
-@pytest.mark.parametrize(
-    ("old", "new"),
-    [
-        ("--goal concat --goal-aim yes", "--goal concat --goal-logit-bias"),
-        ("--goal-aim=no --goal concat", "--no-goal-logit-bias --goal concat"),
-        ("--goal-guidance 2 --goals recorded", "--guidance-scale 2 --goals logged"),
-        ("--goal-guidance=2 --goals=recorded", "--guidance-scale 2 --goals logged"),
-        ("--goals mine.json --choose recorded", "--goals mine.json --choose logged"),
-        ("--out=recorded", "--out=recorded"),
-    ],
-)
-def test_flags_of_the_first_version_have_the_names_of_today(old, new):
-    assert current_words(old.split()) == new.split()
-
-
 @pytest.mark.parametrize(
     ("words", "bias"),
-    [([], None), (["--goal-logit-bias"], True), (["--no-goal-logit-bias"], False), (["--goal-aim", "no"], False)],
+    [([], None), (["--goal-logit-bias"], True), (["--no-goal-logit-bias"], False)],
 )
 def test_the_goal_logit_bias_is_on_off_or_left_to_the_model(words, bias):
     verb = parse([*FINETUNE, "--goal", "concat", *words])

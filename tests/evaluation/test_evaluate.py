@@ -1,6 +1,6 @@
 import json
 import multiprocessing
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pyarrow as pa
@@ -12,7 +12,7 @@ import scenes
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation import evaluate as module
 from rlftsim.evaluation.evaluate import EvaluateConfig, Evaluation, evaluate
-from rlftsim.evaluation.results import NUMBERS_VERSION, SCORE_COLUMNS, Provenance
+from rlftsim.evaluation.results import NUMBERS_VERSION, SCORE_COLUMNS
 from rlftsim.evaluation.resumable import EvaluationParts, resume_evaluation
 from rlftsim.policies.smart.config import SmartConfig
 from rlftsim.policies.smart.policy import SmartPolicy
@@ -255,10 +255,6 @@ def test_a_release_that_changes_no_number_leaves_results_valid(data, tmp_path, m
     later = replace(old.provenance, package_version="9.9.9")
     assert later.differences(old.provenance) == []
     assert replace(later, rlftsim_version="9.9.9").differences(old.provenance) == ["rlftsim_version"]
-    # 0.1 wrote no package_version
-    values = asdict(old.provenance)
-    del values["package_version"]
-    assert Provenance.from_plain(values).package_version == NUMBERS_VERSION
 
 
 def test_an_evaluation_needs_no_folder_and_takes_an_opened_data_set(data, tmp_path):

@@ -325,7 +325,7 @@ def test_the_experiments_run_with_tiny_models(suite):
     evaluated = suite.evaluate({"soft": (variant,)}, goals="logged")["soft"].mean
     assert len(evaluated) == 3
     assert suite.evaluation_name(variant, "logged") == (
-        "gcft-indication-soft-from-gcsl-indication-from-mloo-seed0-seed0-seed0-0.5-epochs-recorded-goals"
+        "gcft-indication-soft-from-gcsl-indication-from-mloo-seed0-seed0-seed0-0.5-epochs-logged-goals"
     )
     assert (suite.out / "evaluations" / f"{suite.evaluation_name(variant, 'logged')}.parquet").exists()
     goals = [GoalEntry("straight", 100, 1080.0, -200.0)]

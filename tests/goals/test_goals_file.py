@@ -2,9 +2,7 @@
 
 import json
 import re
-import tarfile
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -107,18 +105,6 @@ def test_a_file_that_is_not_there_says_how_to_make_one(tmp_path):
     (tmp_path / "goals.json").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(DataError, match="not a text file"):
         read_goals(tmp_path / "goals.json")
-
-
-@pytest.mark.parametrize("name", ["proposed", "by_hand"])
-def test_goals_files_of_0_1_are_read(name, tmp_path):
-    stored = Path(__file__).parent.parent / "data" / "stored_0_1"
-    with tarfile.open(stored / "stored.tar.xz") as archive:
-        archive.extract(f"goals/{name}.json", tmp_path)
-    file = read_goals(tmp_path / "goals" / f"{name}.json")
-    expected = json.loads((stored / "expected.json").read_text())["goals_files"][name]
-    for section in ("goals", "alternatives"):
-        entries = [[e.scenario_id, e.agent_id, e.x, e.y, e.label] for e in getattr(file, section)]
-        assert entries == expected[section]
 
 
 def test_a_goal_of_the_command_line():

@@ -77,30 +77,3 @@ def test_fields_of_foreign_settings_never_share_a_key():
 
     values = [(0.1, 0.5), (0.1, 0.6), (0.2, 0.5)]
     assert len({fingerprint_policy(Sized(Both(*both))) for both in values}) == 3
-
-
-def test_a_rename_that_is_declared_keeps_the_fingerprint():
-    @dataclass(frozen=True)
-    class Old:
-        fingerprint_name: ClassVar[str] = "cruise_package.Settings"
-        share: float = 0.5
-
-    @dataclass(frozen=True)
-    class New:
-        fingerprint_name: ClassVar[str] = "cruise_package.Settings"
-        first_names: ClassVar[dict[str, str]] = {"probability": "share"}
-        probability: float = 0.5
-
-    assert fingerprint_policy(Sized(New())) == fingerprint_policy(Sized(Old()))
-
-
-def test_a_field_that_is_added_counts_only_where_it_changes_something():
-    @dataclass(frozen=True)
-    class New:
-        fingerprint_name: ClassVar[str] = "cruise_package.Width"
-        added_fields: ClassVar[dict[str, object]] = {"shape": "box"}
-        width: int = 3
-        shape: str = "box"
-
-    assert fingerprint_policy(Sized(New())) == fingerprint_policy(Sized(Width()))
-    assert fingerprint_policy(Sized(New(shape="disk"))) != fingerprint_policy(Sized(Width()))

@@ -1,25 +1,18 @@
 import errno
 import json
 import pickle
-import tarfile
 from contextlib import nullcontext
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
 import pytest
 
 import scenes
 from rlftsim.errors import DataError
 from rlftsim.rollout.edge_scenes import move_scenario
-from rlftsim.scenario import shards
 from rlftsim.scenario.dataset import DatasetWriter, ScenarioDataset, read_manifest, write_dataset
-from rlftsim.scenario.inspect import dataset_stats, verify_dataset
 from rlftsim.scenario.types import LaneTopology
 from rlftsim.scenario.womd import read_scenarios, scenario_from_bytes
-
-STORED = Path(__file__).parents[1] / "data" / "stored_0_1" / "stored.tar.xz"
 
 
 @pytest.fixture
@@ -53,18 +46,12 @@ def test_odd_values_and_missing_tables_come_back(tmp_path, scenarios, difference
     assert differences(one, ScenarioDataset(tmp_path / "data")[0]) == []
 
 
-def test_shards_from_before_the_rest_of_polygons_are_read(tmp_path, scenarios, differences, monkeypatch):
+def test_the_rest_of_polygons_is_kept(tmp_path, scenarios, differences):
     one = next(iter(scenarios))
     rest = np.ones_like(one.map_features.points)
     one = replace(one, map_features=replace(one.map_features, polygon_rest=rest))
-    write_dataset([one], tmp_path / "now")
-    assert differences(one, ScenarioDataset(tmp_path / "now")[0]) == []
-    columns = [name for name in shards._SCHEMA.names if name not in shards._ADDED_LATER]
-    earlier = pa.schema([shards._SCHEMA.field(name) for name in columns], metadata=shards._SCHEMA.metadata)
-    with monkeypatch.context() as patch:
-        patch.setattr(shards, "_SCHEMA", earlier)
-        write_dataset([replace(one, map_features=replace(one.map_features, polygon_rest=None))], tmp_path / "before")
-    assert ScenarioDataset(tmp_path / "before")[0].map_features.polygon_rest is None
+    write_dataset([one], tmp_path / "data")
+    assert differences(one, ScenarioDataset(tmp_path / "data")[0]) == []
 
 
 def test_scenarios_are_found_by_position_and_id(folder):
@@ -84,19 +71,6 @@ def test_a_folder_may_be_a_text_and_the_embedded_data_set_has_a_name(folder):
     assert ScenarioDataset(str(folder)).scenario_ids == ScenarioDataset(folder).scenario_ids
     assert len(ScenarioDataset("synthetic")) == 200
     assert read_manifest("synthetic").counts == {"training": 160, "validation": 40}
-
-
-def test_a_data_set_of_release_0_1_opens_under_the_names_of_today(tmp_path):
-    """Its index has a column `ego_manoeuvre`, its manifest a `licence_note`."""
-    with tarfile.open(STORED) as stored:
-        stored.extractall(tmp_path, [m for m in stored if m.name.startswith("data/")])
-    assert "licence_note" in (tmp_path / "data" / "manifest.json").read_text()
-    dataset = ScenarioDataset(tmp_path / "data")
-    assert len(dataset) == len({scenario.scenario_id for scenario in dataset}) == 9
-    assert dataset.manifest.license_note.startswith("CC0-1.0")
-    assert "straight" in dataset.index["ego_maneuver"].to_pylist()
-    assert sum(dataset_stats(tmp_path / "data").by_ego_maneuver.values()) == 9
-    assert verify_dataset(tmp_path / "data") == []
 
 
 def test_a_split_shows_only_its_scenarios(folder):

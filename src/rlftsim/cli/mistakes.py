@@ -5,8 +5,6 @@ import re
 from collections.abc import Sequence
 from itertools import pairwise
 
-from rlftsim.aliases import current_name
-
 RULE = re.compile(r"^(╭|╰|─{4}|-{4})")
 FLAG = re.compile(r"--[A-Za-z][\w.-]*")
 ACTIONS = re.compile(r"\A\s*usage: .* \{([\w,-]+)\}$", re.MULTILINE)
@@ -33,9 +31,7 @@ def explain(words: Sequence[str], complaint: str, help_text: str) -> str:
     known = list(dict.fromkeys(FLAG.findall(help_text)))
     for flag in flags_of(words):
         if flag not in known:
-            # A flag of earlier versions whose value was not understood leads to the flag of today.
-            renamed = "--" + current_name(flag.removeprefix("--").replace("-", "_")).replace("_", "-")
-            near = renamed if renamed in known else nearest(flag, known)
+            near = nearest(flag, known)
             return f"no flag {flag}: " + (f"did you mean {near}?" if near else "`--help` lists them all.")
     # `--switch yes`: tyro complains about the value alone
     left_over = re.search(r"Unrecognized options: (\S+)", complaint)

@@ -11,7 +11,6 @@ from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
-from rlftsim.aliases import current_name, current_words
 from rlftsim.cli.mistakes import FLAG, explain, flags_of
 from rlftsim.cli.stand_ins import stand_ins
 from rlftsim.errors import ConfigError
@@ -26,7 +25,6 @@ EITHER_OR = {"--goal-logit-bias": "True", "--no-goal-logit-bias": "False"}
 """Switches that may also be left out, which is a third value. tyro has no such kind: it is handed the value."""
 ADDRESS = re.compile(r"\w{2,}:/")
 """Beginning of an address such as s3://bucket, of which a path keeps one slash."""
-NUMBERS = re.compile(r"[\d.eE+\-\s]+(,[\d.eE+\-\s]+)+,?")
 
 
 def parse(words: Sequence[str], verbs: Mapping[str, tuple[str, str]]) -> Any:
@@ -41,11 +39,9 @@ def parse(words: Sequence[str], verbs: Mapping[str, tuple[str, str]]) -> Any:
         SystemExit: they ask for help, which has been printed.
     """
     name, *rest = words
-    # 1. words of earlier versions become words of today
-    rest = _flags_of_set(current_words(rest))
-    # 2. switches that may be left out get the value that tyro expects
+    # switches that may be left out get the value that tyro expects
     rest = [part for word in rest for part in (["--goal-logit-bias", EITHER_OR[word]] if word in EITHER_OR else [word])]
-    # 3. help leaves here by SystemExit
+    # help leaves here by SystemExit
     if any(word in HELP for word in rest):
         try:
             with stand_ins():
@@ -125,42 +121,6 @@ def _wide() -> Iterator[None]:
         del os.environ["COLUMNS"]
         if before is not None:
             os.environ["COLUMNS"] = before
-
-
-def _flags_of_set(words: Sequence[str]) -> list[str]:
-    """The same words with flags in place of `--set field=value ...`, the way of 0.1 to give settings.
-
-    Raises:
-        ConfigError: a value without "=".
-    """
-    flags: list[str] = []
-    is_setting = False
-    for word in words:
-        # `--set` takes all words up to the next flag.
-        is_setting = word == "--set" or (is_setting and not word.startswith("-"))
-        if not is_setting:
-            flags.append(word)
-        elif word != "--set":
-            flags += _flag_of_setting(word)
-    return flags
-
-
-def _flag_of_setting(setting: str) -> list[str]:
-    name, equals, value = setting.partition("=")
-    if not equals:
-        raise ConfigError(f"--set {setting} is not field=value. Settings are flags now: --{name} VALUE.")
-    flag = f"--{current_name(name.replace('-', '_')).replace('_', '-')}"
-    group, dot, last = flag.removeprefix("--").rpartition(".")
-    value = value.strip()
-    # Kinds of values that are written otherwise now: switches, tuples, none.
-    if value.lower() in ("true", "false"):
-        flags = [f"--{group}{dot}{'' if value.lower() == 'true' else 'no-'}{last}"]
-    elif NUMBERS.fullmatch(value.strip("()[] ")):
-        flags = [flag, *(part.strip() for part in value.strip("()[] ").split(",") if part.strip())]
-    else:
-        flags = [flag, "None" if value.lower() == "none" else value]
-    log.warning(f"--set {setting} is written {' '.join(flags)} from 0.2 on.")
-    return flags
 
 
 def _refuse_values(verb: Any, words: Sequence[str]) -> None:

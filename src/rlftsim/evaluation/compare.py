@@ -259,6 +259,6 @@ def format_comparison(comparison: Comparison, *, columns: Sequence[Column] = TER
 
 
 def _plus_minus(mean: float, error: float, sign: str = "") -> str:
-    if math.isnan(mean):  # no scenario has a value, as in a file of an earlier version
+    if math.isnan(mean):  # no scenario has a value
         return "–"
     return f"{mean:{sign}.4f}" + ("" if math.isnan(error) else f" ± {error:.4f}")

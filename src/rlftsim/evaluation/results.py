@@ -16,7 +16,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 import rlftsim
-from rlftsim.aliases import RENAMED_VALUES, current_names
 from rlftsim.atomic_io import write_whole
 from rlftsim.errors import ConfigError, DataError, require_types
 from rlftsim.evaluation.columns import SCORES
@@ -98,8 +97,6 @@ class EvaluateConfig:
     """Goals of the evaluated agents: none, or their logged final positions, for a goal-conditioned model."""
 
     def __post_init__(self) -> None:
-        if isinstance(self.goals, str):  # the word of an earlier version
-            object.__setattr__(self, "goals", RENAMED_VALUES.get(("goals", self.goals), self.goals))
         require_types(self)
         for name in ("num_rollouts", "rollouts_per_pass", "jobs", "limit"):
             value = getattr(self, name)
@@ -152,10 +149,7 @@ class Provenance:
 
     @classmethod
     def from_plain(cls, values: dict[str, Any]) -> "Provenance":
-        """The provenance that `dataclasses.asdict` made plain, by this version or an earlier one."""
-        values = current_names(values)
-        # 0.1 had one version for both
-        values.setdefault("package_version", values["rlftsim_version"])
+        """The provenance that `dataclasses.asdict` made plain."""
         # JSON has no tuples
         plain = {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
         return cls(**{**plain, "config": EvaluateConfig(**values["config"])})

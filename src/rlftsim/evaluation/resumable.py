@@ -172,8 +172,7 @@ class JsonParts(PartFiles[Mapping[str, object], Part]):
         return False
 
     def _is_ours(self, scenario_id: str, values: Mapping[str, object]) -> bool:
-        # A name that is missing agrees: 0.1 wrote fewer, and kept one setting per folder.
-        return all(values.get(name, own) == own for name, own in self.identity[scenario_id].items())
+        return all(values.get(name) == own for name, own in self.identity[scenario_id].items())
 
     def _path(self, scenario_id: str) -> Path:
         return self.folder / f"{scenario_id}.json"

@@ -18,8 +18,6 @@ from rlftsim.scenario.types import Scenario
 MAX_PAIRS = 1 << 17
 LOGGED = " (logged)"
 """Ending of the label of the logged maneuver."""
-_LOGGED_ENDINGS = (LOGGED, " (recorded)")
-"""The second is that of goals files of 0.1."""
 
 
 @cached_on_scenario
@@ -79,7 +77,4 @@ def label_of(proposal: Proposal) -> str:
 
 def split_label(label: str) -> tuple[str, bool]:
     """The maneuver of a label, and True for the logged one."""
-    for ending in _LOGGED_ENDINGS:
-        if label.endswith(ending):
-            return label.removesuffix(ending), True
-    return label, False
+    return label.removesuffix(LOGGED), label.endswith(LOGGED)

@@ -77,7 +77,7 @@ class FineTuned:
     @property
     def name(self) -> str:
         """Name of its files, without the epochs."""
-        # Names of files: those of release 0.1 must be found, so default values add nothing to a name.
+        # default values add nothing to a name, which becomes a file's
         credit = "" if self.credit == "rollout" else f"-{self.credit}"
         base = "" if self.base == Base() else f"-from-{self.base.name}"
         goals = "" if self.goals is None else f"-{self.goals.name}"

@@ -38,10 +38,10 @@ from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import ConditionablePolicy, Policy, TokenPolicy
 from rlftsim.scenario.dataset import MANIFEST, ScenarioDataset
 from rlftsim.scenario.shards import hash_file
-from rlftsim.training.run_folder import RunFolder, default_settings, flatten, may_change, to_plain
+from rlftsim.training.run_folder import RunFolder, flatten, may_change, to_plain
 
-GOALS_SUFFIX: Mapping[GoalsGiven, str] = {"none": "", "logged": "-recorded-goals"}
-"""End of the names of evaluations; release 0.1 named them so, and its evaluations are found."""
+GOALS_SUFFIX: Mapping[GoalsGiven, str] = {"none": "", "logged": "-logged-goals"}
+"""End of the names of evaluations."""
 
 
 @dataclass(frozen=True)
@@ -90,8 +90,7 @@ class ExperimentSuite:
 
         It is written when the first stage begins, so that what is refused before has not claimed the folder.
         """
-        defaults = {"recipe": default_settings(self.recipe)}
-        RunFolder(self.out, self._what_counts(), defaults=defaults, writes=writes)
+        RunFolder(self.out, self._what_counts(), writes=writes)
 
     @cached_property
     def training(self) -> ScenarioDataset:

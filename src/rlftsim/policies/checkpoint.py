@@ -23,16 +23,12 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
-from rlftsim.aliases import current_names
 from rlftsim.atomic_io import save_tensors, write_text
 from rlftsim.errors import CheckpointError, ConfigError
 
 CONFIG, WEIGHTS, CARD = "config.json", "model.safetensors", "README.md"
 SHIPPED_MODELS = Path(__file__).parent / "shipped"
 """A folder for each model in the box, by its registered name."""
-_FIRST_FORMAT = {"rlftsim-smart-1": "smart"}
-"""Architecture of folders of release 0.1, which name a format instead."""
-
 SHOWN_PROBLEMS = 6
 """Weights that a message names; a model of other sizes has a hundred that do not fit."""
 
@@ -47,7 +43,7 @@ class StoredModel:
     architecture: str
     """Name of the policy class in `policies.registry.POLICIES`."""
     config: dict[str, Any]
-    """Settings that were saved, under the names of today."""
+    """Settings that were saved."""
 
     def read_weights(self) -> dict[str, Tensor]:
         """Weights by name, on the CPU.
@@ -73,8 +69,6 @@ class StoredModel:
         kind: Any = make
         try:
             if is_dataclass(kind):
-                # Folders from before a field was there say how the model was by not having it.
-                settings = {**getattr(kind, "added_fields", {}), **getattr(kind, "later_stored", {}), **settings}
                 _require_same_names(settings, kind)
             return make(**settings)
         except (ConfigError, TypeError) as error:
@@ -166,10 +160,7 @@ def read_model(folder: str | os.PathLike, *, architecture: str | None = None) ->
         raise CheckpointError(f"{path}: damaged model folder ({CONFIG}: {error}): write it again.") from None
     if not isinstance(values, dict):
         raise CheckpointError(f"{path}: damaged model folder ({CONFIG} is no object): write it again.")
-    # Only folders of 0.1 have old names, and only theirs is a format: other architectures may use any of these words.
-    first = _FIRST_FORMAT.get(str(values.get("format")))
-    config = dict(values) if first is None else current_names({k: v for k, v in values.items() if k != "format"})
-    stored = config.pop("architecture", first)
+    stored = values.pop("architecture", None)
     if not isinstance(stored, str):
         # a run's folder has a config.json of its own beside its checkpoints
         is_run = (path / "environment.json").exists() or (path / "checkpoints").is_dir()
@@ -180,7 +171,7 @@ def read_model(folder: str | os.PathLike, *, architecture: str | None = None) ->
         )
     if architecture not in (None, stored):
         raise CheckpointError(f"{path}: not a {architecture} model, its architecture is {stored!r}.")
-    return StoredModel(path, stored, config)
+    return StoredModel(path, stored, values)
 
 
 def find_model(name: str | os.PathLike) -> Path:

@@ -12,7 +12,6 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any, get_type_hints
 
-from rlftsim.aliases import current_names
 from rlftsim.errors import ConfigError
 from rlftsim.recipes.registry import SECTIONS, Recipe, section_names
 from rlftsim.training.run_folder import RUN_INPUTS, flatten, to_plain
@@ -83,7 +82,7 @@ def flags_of_file(path: Path, recipe: Recipe, sections: Sequence[str], run_secti
     Raises:
         ConfigError: the file cannot be read, or a setting is unknown (the nearest known name is in the message).
     """
-    # 1. sections by name, under the names of today
+    # 1. sections by name
     values = _read_mapping(path)
     run_fields = [field.name for field in fields(getattr(recipe, run_section))]
     is_run, is_recipe = set(values) & {*run_fields, *RUN_INPUTS}, set(values) & {*SECTIONS, *section_names(recipe)}
@@ -140,4 +139,4 @@ def _read_mapping(path: Path) -> dict[str, Any]:
         raise ConfigError(f"--config {path}: not JSON ({error}).") from None
     if not isinstance(values, Mapping):
         raise ConfigError(f"--config {path}: holds {json.dumps(values)[:40]}, not settings by name.")
-    return current_names(values)
+    return dict(values)

@@ -12,11 +12,9 @@ from torch import Tensor, nn
 def fingerprint_policy(policy: object) -> str:
     """Hash of a policy's architecture, weights and public settings (numbers, texts, tensors, dataclasses of these).
 
-    Moving or renaming code must leave the fingerprints of stored models valid. So a class is hashed under the name
-    that it declares itself, `fingerprint_name` or else `architecture`, and only without either under its module and
-    name. A dataclass whose fields were renamed declares in `first_names` the names they had at first, and one that got
-    further fields declares them in `added_fields`: they count only with another value than the one given there. Classes
-    of nested settings count too. What a base class declares does not stand for a subclass, which is other code.
+    Moving code must leave the fingerprints of stored models valid. So a class is hashed under the name that it declares
+    itself, `fingerprint_name` or else `architecture`, and only without either under its module and name. Classes of
+    nested settings count too. What a base class declares does not stand for a subclass, which is other code.
 
     Returns:
         32 hexadecimal digits; for a policy without weights and settings they stand for its architecture alone.
@@ -57,9 +55,7 @@ def _feed_object(digest: "hashlib.blake2b", value: object) -> None:
     name = names[0] if names else f"{kind.__module__}.{kind.__qualname__}"
     digest.update(f"object {name}".encode())
     if is_dataclass(value) and not isinstance(value, type):
-        first_names, added = getattr(kind, "first_names", {}), getattr(kind, "added_fields", {})
-        own = {field.name: getattr(value, field.name) for field in fields(value)}
-        _feed(digest, {first_names.get(k, k): v for k, v in own.items() if k not in added or v != added[k]})
+        _feed(digest, {field.name: getattr(value, field.name) for field in fields(value)})
         return
     own = (
         {name: item for name, item in vars(value).items() if not name.startswith("_")} if _keeps_settings(value) else {}

@@ -260,16 +260,8 @@ class LoadablePolicy(Protocol):
 
     Stored evaluations and runs know a policy by its fingerprint (`rollout.fingerprint`), a hash of its weights, its
     public settings and the name of its class. That name is `architecture` of the class itself, so the class may be
-    moved or renamed. Three more class attributes, all optional, keep stored fingerprints valid through other changes:
-
-    * `fingerprint_name: ClassVar[str]`, to be declared by every class of nested settings, such as a dataclass in
-      `self.config`; without it that class is known by its module and name, and cannot be moved. A policy needs it
-      only where its `architecture` is to change.
-    * `first_names: ClassVar[dict[str, str]]`, in a dataclass: present name -> first name of each renamed field.
-    * `added_fields: ClassVar[dict[str, Any]]`, in a dataclass: name of each field that was added after models had been
-      stored -> the value with which the model is as before.
-
-    `later_stored` is like `added_fields`, but such a field counts in fingerprints with every value.
+    moved or renamed. A class of nested settings, such as a dataclass in `self.config`, declares its name as
+    `fingerprint_name: ClassVar[str]`; without it that class is known by its module and name, and cannot be moved.
     """
 
     architecture: ClassVar[str]

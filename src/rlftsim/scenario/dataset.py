@@ -31,7 +31,6 @@ import pyarrow.parquet as pq
 from jaxtyping import Int64
 
 import rlftsim
-from rlftsim.aliases import current_name, current_names
 from rlftsim.atomic_io import cannot_write, write_text, write_whole
 from rlftsim.errors import ConfigError, DataError, whole_number
 from rlftsim.scenario.index_row import AGENT_COLUMNS
@@ -41,7 +40,6 @@ from rlftsim.scenario.shards import (
     ShardReader,
     ShardWriter,
     hash_file,
-    with_later_columns,
 )
 from rlftsim.scenario.synthetic.pack import pack_path
 from rlftsim.scenario.tfrecord import SkippedRecord
@@ -442,8 +440,6 @@ def parse_manifest(folder: Path) -> Manifest:
     """Manifest of a data set as `read_manifest` gives it, even where a conversion is unfinished."""
     try:
         values = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
-        # earlier versions wrote other names, e.g. of the license
-        values = current_names(values) if isinstance(values, dict) else values
     except FileNotFoundError:
         raise DataError(f"{folder} is no data set: {_missing_manifest_hint(folder)}") from None
     except NotADirectoryError:
@@ -494,19 +490,16 @@ def write_json(path: Path, values: Mapping[str, object]) -> None:
 
 
 def load_index(folder: Path) -> pa.Table:
-    """Index file of a data set with the column names of today.
+    """Index file of a data set.
 
     Raises:
         DataError: the file is missing or damaged.
     """
     try:
-        index = pq.read_table(folder / INDEX)
+        return pq.read_table(folder / INDEX)
     except (OSError, pa.ArrowException) as error:
         cause = getattr(error, "strerror", None) or "it is not a whole Parquet file"
         raise DataError(f"{folder / INDEX} cannot be read ({cause}): convert again") from error
-    index = index.rename_columns([current_name(name) for name in index.schema.names])
-    # columns that do not belong there stay, so that a wrong file is noticed
-    return with_later_columns(index, INDEX_SCHEMA) if set(index.schema.names) <= set(INDEX_SCHEMA.names) else index
 
 
 def build_index(folder: Path, entries: Iterable[ShardEntry]) -> tuple[pa.Table, list[SkippedRecord]]:

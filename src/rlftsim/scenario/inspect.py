@@ -264,7 +264,6 @@ def _check_index(folder: Path, manifest: Manifest) -> Iterator[Finding]:
         shards.setdefault(scenario_id, []).append(shard)
     repeated = [scenario_id for scenario_id, places in shards.items() if len(places) > 1]
     if repeated:
-        # earlier versions could write such an index
         places = " and ".join(shards[repeated[0]])
         detail = f"scenario {repeated[0]} is in it from {places}{_and_more(len(repeated))}"
         yield Finding(Problem.INDEX_MISMATCH, INDEX, f"{detail}: convert one of the sources again, the first is kept")

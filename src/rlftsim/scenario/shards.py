@@ -8,7 +8,7 @@ import hashlib
 import os
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import MISSING, asdict, fields
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,6 @@ import google_crc32c
 import numpy as np
 import pyarrow as pa
 
-from rlftsim.aliases import current_name
 from rlftsim.atomic_io import cannot_write, temporary_beside
 from rlftsim.errors import DataError
 from rlftsim.scenario.codec import decode_array, encode_array
@@ -70,9 +69,6 @@ _ARRAY_DTYPES: Mapping[str, str] = {
 }
 _INDEX_TYPES = {str: pa.string(), int: pa.int32()}
 INDEX_FIELDS = tuple(pa.field(field.name, _INDEX_TYPES[field.type]) for field in fields(IndexRow))
-_INDEX_DEFAULTS = {field.name: field.default for field in fields(IndexRow) if field.default is not MISSING}
-_ADDED_LATER = {"map.polygon_rest.x", "map.polygon_rest.y", "map.polygon_rest.z", *_INDEX_DEFAULTS}
-"""Columns that shards of earlier versions lack: None there, or the default of `IndexRow`."""
 _SCHEMA = pa.schema(
     [
         *INDEX_FIELDS,
@@ -180,14 +176,11 @@ class ShardReader:
         self.path = Path(path)
         try:
             # memory-mapped: "reading all" touches no page of the columns yet
-            table = pa.ipc.open_file(pa.memory_map(str(path))).read_all()
-            self._table = table.rename_columns([current_name(name) for name in table.schema.names])
+            self._table = pa.ipc.open_file(pa.memory_map(str(path))).read_all()
         except (OSError, pa.ArrowException) as error:
             way_out = f"is damaged: {_WAY_OUT}" if self.path.exists() else f"is missing: {_RUN_AGAIN}"
             raise DataError(f"shard {self.path} {way_out}") from error
-        known = self._table.schema.names
-        expected = [name for name in _SCHEMA.names if name in known or name not in _ADDED_LATER]
-        if known != expected:
+        if self._table.schema.names != _SCHEMA.names:
             raise DataError(f"shard {self.path} was written with another schema version: convert again")
 
     def __len__(self) -> int:
@@ -196,12 +189,10 @@ class ShardReader:
     def index_rows(self) -> pa.Table:
         """Columns of `IndexRow` and `source_record`, one row per scenario; a copy in memory."""
         schema = pa.schema([*INDEX_FIELDS, pa.field("source_record", pa.int32())])
-        known = self._table.schema.names
         try:
-            columns = {name: self._table[name].to_pylist() for name in schema.names if name in known}
+            return pa.table({name: self._table[name].to_pylist() for name in schema.names}, schema=schema)
         except (OSError, UnicodeDecodeError, pa.ArrowException) as error:
             raise DataError(f"shard {self.path} is damaged: {_WAY_OUT}") from error
-        return with_later_columns(pa.table(columns, schema=pa.schema([schema.field(name) for name in columns])), schema)
 
     def read(self, row: int) -> Scenario:
         """Decode a row. Its arrays are read-only, because what is computed from them is kept.
@@ -209,9 +200,8 @@ class ShardReader:
         Raises:
             DataError: the row is damaged.
         """
-        known = self._table.schema.names
         try:
-            encoded = {name: self._table[name][row].as_buffer() if name in known else None for name in _ARRAY_DTYPES}
+            encoded = {name: self._table[name][row].as_buffer() for name in _ARRAY_DTYPES}
             # the checksum first: nothing of a damaged row is decoded
             if _checksum(encoded) != self._table["checksum"][row].as_py():
                 raise ValueError("its checksum does not match")
@@ -219,9 +209,9 @@ class ShardReader:
             arrays: dict[str, Any] = {
                 name: None if data is None else decode_array(data) for name, data in encoded.items()
             }
-            names = [name for name in ("scenario_id", "ego_index", "source", "guessed") if name in known]
+            names = ("scenario_id", "ego_index", "source", "guessed")
             plain = {name: self._table[name][row].as_py() for name in names}
-            scenario = _from_arrays({**_INDEX_DEFAULTS, **plain}, arrays)
+            scenario = _from_arrays(plain, arrays)
         except (ValueError, OSError, pa.ArrowException) as error:
             cause = "it cannot be read" if isinstance(error, OSError | pa.ArrowException) else error
             raise DataError(f"shard {self.path}: row {row} is damaged ({cause}): {_WAY_OUT}") from error
@@ -263,22 +253,6 @@ def hash_file(path: str | os.PathLike[str]) -> str:
     """SHA-256 of a file's bytes in hexadecimal."""
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def with_later_columns(table: pa.Table, schema: pa.Schema) -> pa.Table:
-    """Rows of an index with the columns that earlier versions did not have, filled with their defaults.
-
-    Args:
-        table: columns of `IndexRow`, and others.
-        schema: columns in the order of today; the result has those that have a default or are in the table.
-    """
-    columns = {}
-    for column in schema:
-        if column.name in table.schema.names:
-            columns[column] = table[column.name]
-        elif column.name in _INDEX_DEFAULTS:
-            columns[column] = pa.array([_INDEX_DEFAULTS[column.name]] * len(table), column.type)
-    return pa.table(list(columns.values()), schema=pa.schema(list(columns)))
 
 
 def _checksum(encoded: Mapping[str, bytes | pa.Buffer | None]) -> int:

@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rlftsim import __version__
-from rlftsim.aliases import current_names
 from rlftsim.atomic_io import append_text, errors_name, write_text
 from rlftsim.errors import CheckpointError
 from rlftsim.rollout.fingerprint import fingerprint_policy
@@ -102,7 +101,7 @@ def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def stored_settings(path: Path) -> dict[str, Any]:
-    """Settings and inputs of the run in a folder, by the names of today; empty where no run has begun.
+    """Settings and inputs of the run in a folder, empty where no run has begun.
 
     Raises:
         CheckpointError: the file that holds them is damaged.
@@ -111,8 +110,8 @@ def stored_settings(path: Path) -> dict[str, Any]:
     if not file.exists():
         return {}
     try:
-        return current_names(json.loads(file.read_text()))
-    except (ValueError, AttributeError) as error:
+        return dict(json.loads(file.read_text()))
+    except (ValueError, TypeError) as error:
         raise CheckpointError(f"{file}: damaged ({error}): remove the folder {path} to start anew.") from None
 
 
@@ -125,19 +124,6 @@ def to_plain(config: Any) -> Any:
     if isinstance(config, list | tuple):
         return [to_plain(v) for v in config]
     return config if isinstance(config, str | int | float | bool | None) else str(config)
-
-
-def default_settings(config: Any) -> dict[str, Any]:
-    """The defaults of a configuration dataclass's fields and of those nested in it, plain; fields without one are left
-    out."""
-    defaults: dict[str, Any] = {}
-    for field in dataclasses.fields(config) if dataclasses.is_dataclass(config) else ():
-        value = getattr(config, field.name)
-        if dataclasses.is_dataclass(value):
-            defaults[field.name] = default_settings(value)
-        elif field.default is not dataclasses.MISSING:
-            defaults[field.name] = to_plain(field.default)
-    return defaults
 
 
 def describe_environment() -> dict[str, Any]:
@@ -164,7 +150,6 @@ class RunFolder:
         config: a dataclass of settings.
         inputs: hashes of what the run starts from, see `describe_inputs`.
         writes: False in all processes but that of rank 0.
-        defaults: of settings that a stored run may lack, nested as the settings; None = those of the dataclass.
         may_grow: settings of the top level that may be raised when the folder is opened again, such as epochs where
             no update depends on the run's end.
 
@@ -179,7 +164,6 @@ class RunFolder:
         inputs: Mapping[str, str] | None = None,
         *,
         writes: bool = True,
-        defaults: Mapping[str, Any] | None = None,
         may_grow: Collection[str] = (),
     ):
         self.path = path
@@ -190,8 +174,7 @@ class RunFolder:
         self._board: SummaryWriter | None = None
         # Settings and inputs stand in one file: both make a run what it is.
         self._settings = {**to_plain(config), **(inputs or {})}
-        defaults = default_settings(config) if defaults is None else defaults
-        stored = self._checked_stored_settings(self._settings, flatten(defaults), may_grow)
+        stored = self._checked_stored_settings(self._settings, may_grow)
         if stored.get(SCENARIO_FILES):  # kept where the same scenarios come as a list this time
             self._settings.setdefault(SCENARIO_FILES, stored[SCENARIO_FILES])
         changed = {name: stored[name] for name in may_grow if name in stored and stored[name] != self._settings[name]}
@@ -218,10 +201,8 @@ class RunFolder:
         write_text(self.path / "config.json", json.dumps(self._settings, indent=1) + "\n")
         write_text(self.path / "environment.json", json.dumps(describe_environment(), indent=1) + "\n")
 
-    def _checked_stored_settings(
-        self, config: Any, defaults: Mapping[str, Any], may_grow: Collection[str]
-    ) -> dict[str, Any]:
-        """The stored settings of the run that was begun here, once they fit those given; they may lack later ones."""
+    def _checked_stored_settings(self, config: Any, may_grow: Collection[str]) -> dict[str, Any]:
+        """The stored settings of the run that was begun here, once they fit those given."""
         old, new = flatten(stored_settings(self.path)), flatten(config)
         if not old:
             return old
@@ -230,11 +211,8 @@ class RunFolder:
             raise CheckpointError(
                 f"{self.path} belongs to a run of another kind: name another --out, or remove the folder to start anew."
             )
-        # A setting that was added after the run began has its default, with which runs are as before. Any other that
-        # only one side has counts as different: None stands for it.
         one_sided = {SCENARIO_FILES} - (old.keys() & new.keys())
-        old = {name: defaults.get(name) for name in new} | old
-        grown = {name for name in may_grow if isinstance(old[name], int | float) and new[name] > old[name]}
+        grown = {name for name in may_grow if isinstance(old.get(name), int | float) and new[name] > old[name]}
         names = {name for name in old.keys() | new.keys() if not may_change(name)} - grown - one_sided
         differing = sorted(name for name in names if old.get(name) != new.get(name))
         if differing:

@@ -1,7 +1,7 @@
 """Sizes and radii of a SMART model."""
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Literal, get_args
+from typing import ClassVar, Literal, get_args
 
 from rlftsim.errors import ConfigError, given, require_finite, require_positive, require_types
 
@@ -16,12 +16,6 @@ class SmartConfig:
     """SMART's architecture. The defaults are SMART-tiny (7 M parameters)."""
 
     fingerprint_name: ClassVar[str] = "rlftsim.policies.smart.config.SmartConfig"
-    first_names: ClassVar[dict[str, str]] = {"goal_logit_bias": "goal_aim", "catk_compat": "public_code_quirks"}
-    """Fields that were renamed after models had been stored, and their names in fingerprints."""
-    added_fields: ClassVar[dict[str, Any]] = {"frequency_init": "normal", "continuation_scores": False}
-    """Fields that were added after models had been stored, and the values with which a model is as before."""
-    later_stored: ClassVar[dict[str, Any]] = {"goal_logit_bias": False}
-    """The same of fields that count in fingerprints with every value."""
     free_fields: ClassVar[tuple[str, ...]] = (
         "map_radius_m", "agent_map_radius_m", "agent_radius_m", "max_map_neighbors", "max_agent_map_neighbors",
         "max_agent_neighbors", "dropout", "history_drop",

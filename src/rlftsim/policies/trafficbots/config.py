@@ -1,7 +1,7 @@
 """Sizes, neighborhoods and training schedule of a TrafficBots model."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from rlftsim.errors import ConfigError, given, require_finite, require_not_negative, require_positive, require_types
 
@@ -17,8 +17,6 @@ class TrafficBotsConfig:
     without its unused ones)."""
 
     fingerprint_name: ClassVar[str] = "rlftsim.policies.trafficbots.config.TrafficBotsConfig"
-    added_fields: ClassVar[dict[str, Any]] = {"noise_pedestrian_yaw_rate_radps": None}
-    """Fields that were added after models had been stored, and the values with which a model is as before."""
     free_fields: ClassVar[tuple[str, ...]] = (
         "max_map_tokens", "map_neighbors", "light_neighbors", "agent_map_neighbors", "agent_light_neighbors",
         "agent_neighbors", "radius_m", "light_radius_m", "dropout", "input_drop", "prior_probability", "free_nats",

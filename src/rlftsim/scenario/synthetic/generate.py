@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 
-from rlftsim.aliases import current_names
 from rlftsim.atomic_io import remove_temporaries_below, write_text
 from rlftsim.errors import ConfigError, DataError, RlftsimError
 from rlftsim.lease import Lease
@@ -173,7 +172,7 @@ def generate(
         return manifest
     marker = folder / INCOMPLETE
     if marker.exists():
-        if current_names(json.loads(marker.read_text(encoding="utf-8") or "{}")) != provenance:
+        if json.loads(marker.read_text(encoding="utf-8") or "{}") != provenance:
             raise DataError(f"{folder} was begun with another seed, other arguments or versions: choose another folder")
     else:
         # not what other shares of the same run make in this moment
