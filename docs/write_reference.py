@@ -22,7 +22,8 @@ import rlftsim
 from rlftsim import errors
 from rlftsim.cli.main import OVERVIEW, VERBS, main
 from rlftsim.cli.mistakes import ACTIONS
-from rlftsim.plugins import POINTS, is_ours
+from rlftsim.cli.plugins import POINTS
+from rlftsim.plugins import is_ours
 from rlftsim.recipes.registry import RECIPES
 from rlftsim.recipes.settings import field_documentation, sections_of, summary_of
 from rlftsim.training.run_folder import to_plain

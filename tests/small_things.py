@@ -22,7 +22,8 @@ from rlftsim.policies.registry import POLICIES
 from rlftsim.policies.smart.catk_checkpoint import export_catk
 from rlftsim.policies.smart.catk_vocabulary import write_catk_vocabulary
 from rlftsim.policies.trafficbots.config import TrafficBotsConfig
-from rlftsim.recipes.registry import RECIPES, Recipe, recipe_by_name
+from rlftsim.recipes.base import Recipe
+from rlftsim.recipes.registry import RECIPES, recipe_by_name
 from rlftsim.rollout.files import write_rollouts
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.tfrecord import write_records

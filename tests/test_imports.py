@@ -1,6 +1,7 @@
 """The arrows of the package: an import points to a lower floor, never sideways between rooms, never up."""
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
@@ -32,6 +33,8 @@ FLOORS = (
 A room is a sub-package or a top-level module.
 """
 
+MODULE = re.compile(r"rlftsim(\.\w+)+(:[\w.]+)?")
+"""A string that names a module, or something in one."""
 FLOOR_OF = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
 NOT_THOUGH_BELOW = {("training", "policies"), ("training", "viewer"), ("rewards", "policies"), ("rewards", "viewer")}
 """Training changes the weights of any policy: a recipe hands one in."""
@@ -45,7 +48,7 @@ def room_of(path: Path, package: Path) -> str:
 
 
 def imported_rooms(source: str, package_of_file: tuple[str, ...] = ("rlftsim",)) -> set[str]:
-    """Rooms of rlftsim that a source text imports: at the top, in functions, under TYPE_CHECKING, relatively."""
+    """Rooms of rlftsim that a source text imports (at the top, in functions, relatively) or names in a string."""
     names = []
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
@@ -54,6 +57,11 @@ def imported_rooms(source: str, package_of_file: tuple[str, ...] = ("rlftsim",))
             above = list(package_of_file[: len(package_of_file) - node.level + 1]) if node.level else []
             base = above + (node.module.split(".") if node.module else [])
             names += [[*base, alias.name] for alias in node.names] if len(base) == 1 else [base]
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and MODULE.fullmatch(node.value):
+            module, colon, _ = node.value.partition(":")
+            # the bare name of a sub-package is an entry-point group
+            if colon or PACKAGE.parent.joinpath(*module.split(".")).with_suffix(".py").is_file():
+                names.append(module.split("."))
     return {name[1] for name in names if name[0] == "rlftsim" and len(name) > 1 and name[1] in FLOOR_OF}
 
 
@@ -89,6 +97,9 @@ def test_imports_point_down(path):
         ("if TYPE_CHECKING:\n    import rlftsim.realism as r", {"realism"}),
         ("from ..policies import layers", {"policies"}),
         ("from .. import policies", {"policies"}),
+        ("import_module('rlftsim.viewer.notebook')", {"viewer"}),
+        ("PLACES = {'a': 'rlftsim.rewards:REWARDS'}", {"rewards"}),
+        ("group = 'rlftsim.rewards'", set()),
         ("import torch\nfrom pathlib import Path", set()),
     ],
 )

@@ -13,9 +13,10 @@ import pytest
 
 import third_party
 from rlftsim.cli.main import main
+from rlftsim.cli.plugins import POINTS
 from rlftsim.envs.planners.registry import load_planner
 from rlftsim.errors import ConfigError
-from rlftsim.plugins import POINTS, ExtensionPoint
+from rlftsim.plugins import ExtensionPoint
 from rlftsim.rewards.base import reward_by_name
 
 ROOT = Path(__file__).parents[1]

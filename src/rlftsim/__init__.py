@@ -15,6 +15,7 @@ checkers read them in `__init__.pyi`.
 # pyright: reportUnsupportedDunderAll=false
 
 import importlib
+import sys
 from typing import Any
 
 __version__ = "0.2.0.dev0"
@@ -80,6 +81,8 @@ def __getattr__(name: str) -> Any:
         hint = f": did you mean {near[0]!r}?" if near else ""
         raise AttributeError(f"module 'rlftsim' has no attribute {name!r}{hint}")
     value = getattr(importlib.import_module(_MODULE_OF[name]), name)
+    if "IPython" in sys.modules:  # a notebook plays scenarios and rollouts that end a cell
+        importlib.import_module("rlftsim.viewer.notebook")
     globals()[name] = value  # from now on found without this function
     return value
 

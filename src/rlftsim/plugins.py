@@ -19,23 +19,11 @@ import difflib
 import importlib
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from types import ModuleType
 from typing import Generic, TypeVar
 
 from rlftsim.errors import ConfigError, place_of
-
-POINTS = {
-    "rlftsim.policies": "rlftsim.policies.registry:POLICIES",
-    "rlftsim.recipes": "rlftsim.recipes.registry:RECIPES",
-    "rlftsim.rewards": "rlftsim.rewards:REWARDS",
-    "rlftsim.sources": "rlftsim.scenario.sources:SOURCES",
-    "rlftsim.planners": "rlftsim.envs.planners.registry:PLANNERS",
-    "rlftsim.experiments": "rlftsim.experiments.registry:EXPERIMENTS",
-    "rlftsim.exporters": "rlftsim.evaluation.exporters:EXPORTERS",
-}
-"""Entry-point group -> place of its `ExtensionPoint`."""
 
 Value = TypeVar("Value")
 Registered = TypeVar("Registered")
@@ -188,40 +176,6 @@ class ExtensionPoint(Generic[Value]):
         except (Exception, SystemExit) as error:
             return f"{self.kind} {name!r} fails ({type(error).__name__}: {error}, {place_of(error)}): repair it."
         return None
-
-
-@dataclass(frozen=True)
-class PlugIn:
-    """An entry point of an installed package."""
-
-    group: str
-    """Entry-point group, such as "rlftsim.rewards"."""
-    name: str
-    value: str
-    """Object or module that it names, "package.module:attribute"."""
-    package: str
-    """Name of the distribution that announces it."""
-    version: str
-    """Version of this distribution."""
-    problem: str | None
-    """Reason why it cannot be used; None = it works."""
-
-
-def installed_plug_ins() -> list[PlugIn]:
-    """Entry points of installed packages in all groups; their packages are imported, and each is tried out."""
-    found = []
-    for group, place in POINTS.items():
-        for entry in sorted(entry_points(group=group), key=lambda one: one.name):
-            module, _, attribute = place.partition(":")
-            # The group itself may need an extra that is not installed.
-            try:
-                point = getattr(importlib.import_module(module), attribute)
-                problem = point.problem_of(entry) or point.refusal_of(entry.name)
-            except ConfigError as error:
-                problem = str(error)
-            package, version = (entry.dist.name, entry.dist.version) if entry.dist else ("", "")
-            found.append(PlugIn(group, entry.name, entry.value, package, version, problem))
-    return found
 
 
 def is_ours(value: object) -> bool:

@@ -31,7 +31,7 @@ from rlftsim.experiments.results import ExperimentResult, finite_or_none, run_ex
 from rlftsim.experiments.rows import mean_of_seeds
 from rlftsim.experiments.stage_progress import StageProgress
 from rlftsim.experiments.suite import ExperimentSuite
-from rlftsim.recipes.registry import Recipe
+from rlftsim.recipes.base import Recipe
 from rlftsim.rewards.base import leave_one_out
 from rlftsim.rewards.mloo import compute_mloo
 from rlftsim.scenario.dataset import write_dataset

@@ -20,7 +20,7 @@ from rlftsim.experiments.model_specs import BASE, CATK, ORACLE, Base, FineTuned,
 from rlftsim.experiments.paper import qualitative, variance_scaling
 from rlftsim.experiments.results import Experiment, ExperimentResult, run_experiment
 from rlftsim.experiments.suite import ExperimentSuite
-from rlftsim.recipes.registry import Recipe
+from rlftsim.recipes.base import Recipe
 from rlftsim.scenario.dataset import write_dataset
 from rlftsim.training import methods
 

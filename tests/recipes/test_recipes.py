@@ -11,8 +11,9 @@ from rlftsim.errors import CheckpointError, ConfigError
 from rlftsim.policies import registry
 from rlftsim.policies.registry import load_policy, load_policy_or_oracle
 from rlftsim.recipes import smart, trafficbots
+from rlftsim.recipes.base import Recipe
 from rlftsim.recipes.card import model_card
-from rlftsim.recipes.registry import RECIPES, Recipe, recipe_by_name
+from rlftsim.recipes.registry import RECIPES, recipe_by_name
 from rlftsim.recipes.settings import sections_of
 from rlftsim.recipes.smart import SmartRecipe, smart_demo_rlftsim, smart_tiny_rlftsim
 from rlftsim.recipes.trafficbots import TrafficBotsRecipe

@@ -11,8 +11,9 @@ from torch import nn
 
 from rlftsim._api.sources import policy_of, require_name
 from rlftsim.errors import ConfigError
+from rlftsim.recipes.base import Recipe
 from rlftsim.recipes.card import model_card, with_cards_of
-from rlftsim.recipes.registry import RECIPES, Recipe, recipe_by_name
+from rlftsim.recipes.registry import RECIPES, recipe_by_name
 from rlftsim.rollout.policy import Policy, device_of
 from rlftsim.scenario.any_form import AnyScenarios, Name, scenarios_of
 from rlftsim.scenario.dataset import ScenarioDataset

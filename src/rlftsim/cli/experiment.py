@@ -17,7 +17,7 @@ from rlftsim.experiments.results import run_experiment
 from rlftsim.experiments.suite import ExperimentSuite
 from rlftsim.policies.registry import Device, find_device
 from rlftsim.progress import log, print_wide
-from rlftsim.recipes.registry import SECTIONS
+from rlftsim.recipes.base import SECTIONS
 from rlftsim.scenario.open import SYNTHETIC, dataset_folder
 from rlftsim.workers import usable_cores
 

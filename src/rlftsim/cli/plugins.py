@@ -1,11 +1,58 @@
 """The verb that lists plug-ins: plugins."""
 
+import importlib
 from dataclasses import dataclass
+from importlib.metadata import entry_points
 
 from rich.table import Table
 
-from rlftsim.plugins import POINTS, installed_plug_ins
+from rlftsim.errors import ConfigError
 from rlftsim.progress import print_wide
+
+POINTS = {
+    "rlftsim.policies": "rlftsim.policies.registry:POLICIES",
+    "rlftsim.recipes": "rlftsim.recipes.registry:RECIPES",
+    "rlftsim.rewards": "rlftsim.rewards:REWARDS",
+    "rlftsim.sources": "rlftsim.scenario.sources:SOURCES",
+    "rlftsim.planners": "rlftsim.envs.planners.registry:PLANNERS",
+    "rlftsim.experiments": "rlftsim.experiments.registry:EXPERIMENTS",
+    "rlftsim.exporters": "rlftsim.evaluation.exporters:EXPORTERS",
+}
+"""Entry-point group -> module and name of its `ExtensionPoint`."""
+
+
+@dataclass(frozen=True)
+class PlugIn:
+    """An entry point of an installed package."""
+
+    group: str
+    """Entry-point group, such as "rlftsim.rewards"."""
+    name: str
+    value: str
+    """Object or module that it names, "package.module:attribute"."""
+    package: str
+    """Name of the distribution that announces it."""
+    version: str
+    """Version of this distribution."""
+    problem: str | None
+    """Reason why it cannot be used; None = it works."""
+
+
+def list_plug_ins() -> list[PlugIn]:
+    """Entry points of installed packages in all groups; their packages are imported, and each is tried out."""
+    plug_ins = []
+    for group, location in POINTS.items():
+        for entry in sorted(entry_points(group=group), key=lambda entry: entry.name):
+            module, _, attribute = location.partition(":")
+            # The group itself may need an extra that is not installed.
+            try:
+                point = getattr(importlib.import_module(module), attribute)
+                problem = point.problem_of(entry) or point.refusal_of(entry.name)
+            except ConfigError as error:
+                problem = str(error)
+            package, version = (entry.dist.name, entry.dist.version) if entry.dist else ("", "")
+            plug_ins.append(PlugIn(group, entry.name, entry.value, package, version, problem))
+    return plug_ins
 
 
 @dataclass(frozen=True)
@@ -19,17 +66,18 @@ class Plugins:
 
     def run(self) -> int:
         """Print the list."""
-        found = installed_plug_ins()
-        if not found:
+        plug_ins = list_plug_ins()
+        if not plug_ins:
             print(f"no installed package has an entry point in {', '.join(POINTS)}.")
             return 0
         table = Table()
         for heading in ("group", "name", "package", "version", "object", "state"):
             table.add_column(heading, overflow="fold")
-        for one in found:
-            table.add_row(one.group, one.name, one.package, one.version, one.value, "fails" if one.problem else "works")
+        for plug_in in plug_ins:
+            state = "fails" if plug_in.problem else "works"
+            table.add_row(plug_in.group, plug_in.name, plug_in.package, plug_in.version, plug_in.value, state)
         print_wide(table)
-        for one in found:
-            if one.problem:
-                print(one.problem)
-        return int(any(one.problem for one in found))
+        problems = [plug_in.problem for plug_in in plug_ins if plug_in.problem]
+        for problem in problems:
+            print(problem)
+        return int(bool(problems))

@@ -10,7 +10,8 @@ import tyro
 
 from rlftsim.cli.mistakes import flags_of
 from rlftsim.errors import ConfigError
-from rlftsim.recipes.registry import RECIPES, SECTIONS, Recipe, recipe_by_name
+from rlftsim.recipes.base import SECTIONS, Recipe
+from rlftsim.recipes.registry import RECIPES, recipe_by_name
 from rlftsim.recipes.settings import flags_of_file, sections_of
 
 DEFAULT_RECIPE = "smart-tiny"

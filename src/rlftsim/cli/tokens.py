@@ -13,7 +13,8 @@ from rlftsim.cli.recipe_verb import DEFAULT_RECIPE, RecipeVerb, value_of
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.policies.smart.catk_vocabulary import read_catk_vocabulary
 from rlftsim.progress import log, print_wide
-from rlftsim.recipes.registry import Recipe, recipe_by_name
+from rlftsim.recipes.base import Recipe
+from rlftsim.recipes.registry import recipe_by_name
 from rlftsim.scenario.open import open_dataset
 from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
 from rlftsim.tokens.coverage import measure_coverage

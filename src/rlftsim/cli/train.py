@@ -15,7 +15,7 @@ from rlftsim.evaluation.learning_curve import write_learning_curve
 from rlftsim.experiments.stages import GoalConditioning, finetune_model, pretrain_policy
 from rlftsim.policies.registry import load_policy
 from rlftsim.progress import log
-from rlftsim.recipes.registry import Recipe
+from rlftsim.recipes.base import Recipe
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.open import open_dataset, splits_of
 from rlftsim.tokens.vocabulary import Vocabulary

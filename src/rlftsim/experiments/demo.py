@@ -16,7 +16,7 @@ from rlftsim.experiments.demo_report import BASE, CEILING, FLOOR, TUNED, ReportS
 from rlftsim.experiments.stages import find_vocabulary, finetune_model, open_training, pretrain_policy
 from rlftsim.policies.registry import load_policy
 from rlftsim.progress import print_wide
-from rlftsim.recipes.registry import Recipe
+from rlftsim.recipes.base import Recipe
 from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.viewer.picture import to_png
 

@@ -12,7 +12,7 @@ from rlftsim.evaluation.evaluate import EvaluateConfig
 from rlftsim.evaluation.learning_curve import finetuning_charts, imitation_charts
 from rlftsim.evaluation.report import ChartGroup, PairedComparison, Report, ResultRow
 from rlftsim.evaluation.results import Evaluation
-from rlftsim.recipes.registry import Recipe
+from rlftsim.recipes.base import Recipe
 from rlftsim.rollout.policy import Policy
 from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import collate

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from rlftsim.errors import ConfigError
-from rlftsim.recipes.registry import Recipe
+from rlftsim.recipes.base import Recipe
 from rlftsim.rewards import CreditTo
 from rlftsim.training.catk import CatkConfig
 from rlftsim.training.finetune_config import FinetuneConfig

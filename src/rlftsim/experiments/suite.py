@@ -33,7 +33,7 @@ from rlftsim.experiments.stages import (
 )
 from rlftsim.policies.registry import Device, load_policy, load_policy_or_oracle, with_guidance
 from rlftsim.progress import log
-from rlftsim.recipes.registry import Recipe
+from rlftsim.recipes.base import Recipe
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import ConditionablePolicy, Policy, TokenPolicy
 from rlftsim.scenario.dataset import MANIFEST, ScenarioDataset

@@ -1,130 +1,10 @@
-"""Recipes by name, and the contract of a recipe.
+"""Recipes by name, this package's and those of other packages."""
 
-A recipe holds every number of a model's way from fresh weights to the fine-tuned policy, a section for each
-stage. The command line shows each field of each section in `--help`, with its docstring, and takes it as a
-flag: `--finetune.learning-rate 1e-5`.
-
-A recipe for another policy is a frozen dataclass that extends `Recipe` and a function that returns one. In the
-pyproject.toml of its package:
-
-    [project.entry-points."rlftsim.recipes"]
-    cruise-small = "my_package.recipes:cruise_small"
-"""
-
-from collections.abc import Callable, Collection
-from dataclasses import dataclass, field, fields, is_dataclass, replace
-from typing import Literal
-
-from torch import nn
+from collections.abc import Callable
 
 from rlftsim.errors import ConfigError
 from rlftsim.plugins import ExtensionPoint
-from rlftsim.rollout.policy import Policy
-from rlftsim.tokens.clustering import TokensConfig
-from rlftsim.tokens.vocabulary import Vocabulary
-from rlftsim.training.catk import CatkConfig, RoadConfig
-from rlftsim.training.finetune_config import FinetuneConfig
-from rlftsim.training.goal_relabeling import GcslConfig
-from rlftsim.training.goals import with_goals
-from rlftsim.training.pretrain import PretrainConfig
-
-SECTIONS = ("tokens", "model", "pretrain", "finetune", "catk", "road", "gcsl")
-"""Sections that the verbs of the command line know, in the order of their use; see `section_names`."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Recipe:
-    """Sections that every policy has. A subclass adds `model`, the sizes of its policies, and whatever else it needs:
-    each field that is a dataclass is a section."""
-
-    tokens: TokensConfig | None = None
-    """Vocabulary; None for policies without one."""
-    pretrain: PretrainConfig = field(default_factory=PretrainConfig)
-    finetune: FinetuneConfig = field(default_factory=FinetuneConfig)
-    catk: CatkConfig | None = field(default_factory=CatkConfig)
-    """None for policies without tokens, which CAT-K cannot train."""
-    road: RoadConfig | None = None
-    """None where there is no RoaD."""
-    gcsl: GcslConfig | None = field(default_factory=GcslConfig)
-    """None likewise."""
-
-    @property
-    def model_name(self) -> str:
-        """Name of the recipe's models in tables."""
-        return "model"
-
-    @property
-    def counterpart(self) -> str | None:
-        """Name of the recipe of another architecture to compare with, of about the same size; None = there is none."""
-        return None
-
-    def new_policy(self, vocabulary: Vocabulary | None) -> nn.Module:
-        """A policy with fresh weights, drawn with the seed of pre-training (`torch.manual_seed(self.pretrain.seed)`).
-
-        Args:
-            vocabulary: tokens built with the settings `tokens`; None where these are None.
-        """
-        raise ConfigError(
-            f"{type(self).__name__} describes no new policy: take a recipe that does, or fine-tune an existing model."
-        )
-
-    def like(self, policy: Policy) -> "Recipe":
-        """The same recipe for policies of the architecture and sizes of an existing one.
-
-        Raises:
-            ConfigError: this recipe makes no such policies.
-        """
-        raise ConfigError(f"{type(self).__name__} describes no policy like a {type(policy).__name__}.")
-
-    @property
-    def free_fields(self) -> tuple[str, ...]:
-        """Settings of the section `model` that weights do not depend on."""
-        return ()
-
-    def train_further(self, policy: Policy, vocabulary: Vocabulary | None = None, keep: Collection[str] = ()) -> Policy:
-        """The policy that `rlftsim pretrain --init-from` trains: an existing one, with this recipe's `free_fields`.
-
-        Args:
-            policy: the existing one.
-            vocabulary: tokens in place of its own; None = it keeps them.
-            keep: classes whose tokens stay its own all the same, see `align_vocabulary`.
-
-        Raises:
-            ConfigError: there is a vocabulary, and nothing that would use it.
-        """
-        if vocabulary is not None:
-            raise ConfigError(f"a {type(policy).__name__} takes no other vocabulary: leave --vocabulary out.")
-        return policy
-
-    def with_goals(self) -> "Recipe":
-        """The same recipe for goal-conditioned fine-tuning: every agent's goal is its logged endpoint, the
-        reward is `gcft`.
-
-        CAT-K and RoaD, if the recipe has them, then train the goal-conditioned weights alone.
-        """
-        # Goals that the recipe has chosen already stay: `with_goals` fills in what is off.
-        finetune = replace(self.finetune, goals=with_goals(self.finetune.goals), reward="gcft", hold_speed=False)
-        catk, road = (
-            method and replace(method, goal_probability=1.0, trained="goals") for method in (self.catk, self.road)
-        )
-        return replace(self, finetune=finetune, catk=catk, road=road)
-
-    def with_processes(self, processes: int | Literal["auto"]) -> "Recipe":
-        """The same recipe, trained by so many processes on this machine, see `DeviceConfig.processes`."""
-        methods = {name: getattr(self, name) for name in ("pretrain", "finetune", "catk", "road", "gcsl")}
-        changed = {
-            name: replace(method, device=replace(method.device, processes=processes))
-            for name, method in methods.items()
-            if method is not None
-        }
-        return replace(self, **changed)
-
-
-def section_names(recipe: Recipe) -> tuple[str, ...]:
-    """Names of the sections of a recipe: the known ones in the order of their use, then its own."""
-    present = [one.name for one in fields(recipe) if is_dataclass(getattr(recipe, one.name))]
-    return tuple(sorted(present, key=lambda name: SECTIONS.index(name) if name in SECTIONS else len(SECTIONS)))
-
+from rlftsim.recipes.base import Recipe
 
 RECIPES: ExtensionPoint[Callable[[], Recipe]] = ExtensionPoint(
     "recipe",
@@ -153,6 +33,6 @@ def recipe_by_name(name: str) -> Recipe:
     recipe = RECIPES.get(name)()
     if not isinstance(recipe, Recipe):
         raise ConfigError(
-            f"recipe {name!r} is of type {type(recipe).__name__}: make it extend rlftsim.recipes.registry.Recipe."
+            f"recipe {name!r} is of type {type(recipe).__name__}: make it extend rlftsim.recipes.base.Recipe."
         )
     return recipe

@@ -10,7 +10,7 @@ from rlftsim.errors import ConfigError
 from rlftsim.policies.checkpoint import load_strictly
 from rlftsim.policies.smart.config import SmartConfig, smart_demo, smart_mini, smart_nano, smart_tiny
 from rlftsim.policies.smart.policy import SmartPolicy
-from rlftsim.recipes.registry import Recipe
+from rlftsim.recipes.base import Recipe
 from rlftsim.rollout.policy import Policy
 from rlftsim.tokens.alignment import align_vocabulary
 from rlftsim.tokens.clustering import TokensConfig

@@ -9,7 +9,7 @@ from rlftsim.errors import ConfigError
 from rlftsim.policies.checkpoint import load_strictly
 from rlftsim.policies.trafficbots.config import TrafficBotsConfig, trafficbots_demo, trafficbots_v15
 from rlftsim.policies.trafficbots.policy import TrafficBotsPolicy
-from rlftsim.recipes.registry import Recipe
+from rlftsim.recipes.base import Recipe
 from rlftsim.rollout.policy import Policy
 from rlftsim.tokens.vocabulary import Vocabulary
 from rlftsim.training.catk import CatkConfig

@@ -4,7 +4,6 @@ Frame: map (centered, meters). N rollouts, L decisions, T simulated steps of 0.1
 axes `*event` (none for SMART's token ids, one of size 2 for two-dimensional actions).
 """
 
-import importlib
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,7 +15,7 @@ import rlftsim
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.goals.types import Goals, shown_id
 from rlftsim.scenario.batch import Frame, origin_of
-from rlftsim.scenario.types import Scenario
+from rlftsim.scenario.types import Scenario, render_html
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,5 +204,4 @@ class Rollouts:
         return f"Rollouts({counts}{seed})"
 
     def _repr_html_(self) -> str | None:
-        # The viewer is on a higher floor, so it is looked up by name and only where a notebook shows the value.
-        return importlib.import_module("rlftsim.viewer.notebook").rollouts_html(self)
+        return render_html(self)

@@ -9,9 +9,8 @@ Shapes: O objects, S steps at 10 Hz (91; 11 in a test split), F map features, P 
 needs torch.
 """
 
-import importlib
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, fields
 from enum import IntEnum
 from functools import cached_property
@@ -381,9 +380,27 @@ class Scenario:
             f"{len(self.map_features)} map features)"
         )
 
-    def _repr_html_(self) -> str:
-        # The viewer is on a higher floor, so it is looked up by name and only where a notebook shows the value.
-        return importlib.import_module("rlftsim.viewer.notebook").scenario_html(self)
+    def _repr_html_(self) -> str | None:
+        return render_html(self)
+
+
+_HTML_RENDERERS: dict[type, Callable[[Any], str | None]] = {}
+
+
+def register_html(shown: type, render: Callable[[Any], str | None]) -> None:
+    """Choose how a notebook shows values of a class. The viewer registers itself when it is imported.
+
+    Args:
+        shown: Class whose `_repr_html_` calls `render_html`.
+        render: Function from a value to a text in HTML; None = the notebook prints the value.
+    """
+    _HTML_RENDERERS[shown] = render
+
+
+def render_html(value: Any) -> str | None:
+    """Text in HTML that a notebook shows for a value; None where nothing was registered for its class."""
+    render = _HTML_RENDERERS.get(type(value))
+    return None if render is None else render(value)
 
 
 def _refuse_misshapen(part: Any, place: str) -> None:

@@ -1,6 +1,6 @@
 """Scenarios and rollouts in a notebook: the player of `viewer.page` in a frame below the cell.
 
-`show` is the public function; `scenario_html` and `rollouts_html` serve the `_repr_html_` of `Scenario` and `Rollouts`.
+`show` is the public function. Importing this module makes a notebook show `Scenario` and `Rollouts` so.
 """
 
 import os
@@ -15,7 +15,7 @@ from rlftsim.atomic_io import write_text
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.any_form import AnyScenarios, scenarios_of
-from rlftsim.scenario.types import Scenario
+from rlftsim.scenario.types import Scenario, register_html
 from rlftsim.viewer.page import Animation, Panel, animation_html, page_html
 from rlftsim.viewer.scene import build_scene, logged_trajectories, rollout_trajectories
 
@@ -135,13 +135,10 @@ def show(scenario: AnyScenarios, *rollouts: Rollouts, titles: str | Sequence[str
     return Cell(page, FRAME_HEIGHT * len(shown))
 
 
-def scenario_html(scenario: Scenario) -> str:
-    """Frame that plays a logged scenario."""
-    return show(scenario)._repr_html_()
-
-
-def rollouts_html(rollouts: Rollouts) -> str | None:
+def _show_rollouts(rollouts: Rollouts) -> str | None:
     """Frame that plays rollouts beside the log; None where they do not know their scenarios."""
-    if rollouts.provenance is None:
-        return None
-    return show(rollouts.provenance.scenarios, rollouts)._repr_html_()
+    return None if rollouts.provenance is None else show(rollouts.provenance.scenarios, rollouts)._repr_html_()
+
+
+register_html(Scenario, lambda scenario: show(scenario)._repr_html_())
+register_html(Rollouts, _show_rollouts)
