@@ -44,7 +44,7 @@ types: $(BIN)/.installed-test
 types-js:
 	npx --yes --package typescript@7 tsc --project tests/studio/jsconfig.json
 
-## docs/reference, written from the package
+## the reference alone, in build/pages/reference
 reference: $(BIN)/.installed-test
 	$(BIN)/python docs/write_reference.py
 

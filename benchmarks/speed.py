@@ -2,7 +2,7 @@
 
     python benchmarks/speed.py WORK --shared ../shared --old CHECKOUT --womd FOLDER \\
         --catk CHECKOUT --catk-python VENV/bin/python --official VENV/bin/python \\
-        --out benchmarks/speed_cpu_DATE.md
+        --out WORK/speed.md
 
 Prints Markdown, each row when it is done; `--rows finetune rollouts` picks some. Results are kept in WORK, so the same
 command continues where it was stopped. What is not there (an older version, the public code, real scenarios, a GPU)

@@ -5,7 +5,8 @@
     REPOSITORY=https://... python docs/build_site.py
 
 Pages of the repository link to each other as files. Here links to pages become links of the site; links to other files
-lead to the commit in REPOSITORY, and are plain text where that is not set.
+lead to the commit in REPOSITORY, and are plain text where that is not set. The reference, docs/reference in links, is
+written now.
 """
 
 import argparse
@@ -19,6 +20,7 @@ from pathlib import Path
 
 import jupytext
 import nbformat
+import write_reference
 from run_pages import RUN, blocks_of
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -30,6 +32,8 @@ ELSEWHERE = {"CHANGELOG.md": "changes.md", "CONTRIBUTING.md": "contributing.md",
 NO_PAGES = (".py", ".toml")
 DOWNLOADS = "_to_tables.py"
 """End of the names of scripts that readers take from the site."""
+REFERENCE = "docs/reference/"
+"""Where links look for the reference, which is no file of the repository; the builder finds dead ones."""
 TEMPLATE = ROOT / "docs" / "plugin_template"
 SHIM = "https://unpkg.com/iframe-worker/shim"
 """Script of another host that the builders name in every page; docs/assets has one of our own in its place."""
@@ -65,7 +69,7 @@ def relinked(text: str, source: str, base: str | None) -> str:
         mark, words, path, anchor = match[1], match[2], match[3], match[4] or ""
         target = posixpath.normpath(posixpath.join(posixpath.dirname(source), path)) if path else source
         place = place_of(target)
-        if place is not None and (ROOT / target).is_file():
+        if place is not None and (target.startswith(REFERENCE) or (ROOT / target).is_file()):
             relative = posixpath.relpath(place, posixpath.dirname(own) or ".") if path else ""
             return f"{mark}[{words}]({relative}{anchor})"
         if not (ROOT / target).exists():
@@ -131,6 +135,7 @@ def stage() -> None:
             target.write_text(text)
         else:
             shutil.copyfile(path, target)
+    write_reference.write_pages(PAGES / "reference")
 
 
 def build(builder: str) -> Path:

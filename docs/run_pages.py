@@ -33,8 +33,8 @@ from rlftsim.cli.plugins import POINTS
 ROOT = Path(__file__).resolve().parents[1]
 TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("[1-9]*.md"))
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), *(ROOT / "docs" / "plugin_template").glob("*.md")])
-PAGES += [ROOT / "docs" / "tutorials" / "index.md", *TUTORIALS]
-"""Pages that people write; docs/reference, docs/qualitative and benchmarks hold what programs print."""
+PAGES += [ROOT / "docs" / "tutorials" / "index.md", *TUTORIALS, *sorted((ROOT / "benchmarks").glob("*.md"))]
+"""Pages that people write; docs/qualitative holds what a program prints."""
 FENCE = re.compile(
     r"^(?:<!-- not run: (?P<reason>[^\n]+) -->\n)?"
     r'^```(?P<language>\w*)(?: title="(?P<title>[^"]+)")?\n(?P<text>.*?)^```$',

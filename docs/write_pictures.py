@@ -1,13 +1,14 @@
-"""Write the pictures of the site that show traffic: the film at the top, the demo page, the gallery.
+"""Write the pictures of the site: the film at the top, the demo page, the gallery, the chart of the results.
 
     python docs/write_pictures.py                     # everything
-    python docs/write_pictures.py gallery/planner     # one piece: traffic, demo or gallery/NAME
+    python docs/write_pictures.py gallery/planner     # one piece: traffic, demo, results or gallery/NAME
 
 Synthetic scenarios and the models that ship, seed 0: the same files every time on the same machine. The gallery needs
 the extra `env`, playwright and a chromium.
 """
 
 import io
+import re
 import shutil
 import subprocess
 import sys
@@ -16,6 +17,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from PIL import Image
 
 import rlftsim as rs
@@ -293,11 +296,38 @@ def write_demo(path: Path) -> None:
     write_page(path, "Six scenarios, simulated in advance", animations, caption=caption)
 
 
+def read_gains() -> list[tuple[str, float, float, float]]:
+    """Label, difference in RMM and its interval of each row of the table in docs/results.md."""
+    table = (DOCS / "results.md").read_text().replace("−", "-")
+    number = r"([+-][\d.]+)"
+    rows = re.findall(rf"^\| (.+?) \| (.+?) × \d+ \| .+? \| {number} \[{number}, {number}\]", table, re.MULTILINE)
+    return [
+        (f"{method.replace('`', '')}: {data}", float(gain), float(low), float(high))
+        for method, data, gain, low, high in rows
+    ]
+
+
+def draw_gains(path: Path) -> None:
+    """Chart of the gains in docs/results.md with their intervals."""
+    gains = read_gains()[::-1]
+    figure = Figure(figsize=(9, 3.4), layout="constrained")
+    axes = figure.add_subplot()
+    for row, (_, gain, low, high) in enumerate(gains):
+        axes.errorbar(gain, row, xerr=[[gain - low], [high - gain]], fmt="o", color="#1f6feb", capsize=4)
+    axes.axvline(0, color="0.5", linewidth=1)
+    axes.set_yticks(range(len(gains)), [label for label, *_ in gains])
+    axes.set_xlabel("gain in RMM over the base, 95 % interval")
+    axes.grid(axis="x", color="0.9")
+    axes.spines[["top", "right", "left"]].set_visible(False)
+    FigureCanvasAgg(figure).print_figure(path, dpi=110, format="webp", pil_kwargs={"lossless": True, "method": 6})
+
+
 def main() -> None:
     """Write the named pictures, or all, and the page of the gallery."""
     writers = {
         "traffic": lambda: write_film(DOCS / "traffic.webp"),
         "demo": lambda: write_demo(DOCS / "demo/live.html"),
+        "results": lambda: draw_gains(DOCS / "results.webp"),
     }
     for piece in PIECES:
         writers[f"gallery/{piece.name}"] = lambda piece=piece: piece.write(GALLERY / f"{piece.name}.webp")

@@ -1,8 +1,8 @@
-"""Write docs/reference: command line, settings, errors, extension points and Python names, read from the package.
+"""Write the site's reference: command line, settings, errors, extension points and Python names, read from the package.
 
-    python docs/write_reference.py
+    python docs/write_reference.py    # to build/pages/reference
 
-A test fails where the pages differ from what this script writes (`tests/test_reference_pages.py`).
+`docs/build_site.py` does the same, so the pages are not in git.
 """
 
 import ast
@@ -29,7 +29,7 @@ from rlftsim.recipes.settings import field_documentation, sections_of, summary_o
 from rlftsim.training.run_folder import to_plain
 
 ROOT = Path(__file__).resolve().parents[1]
-REFERENCE = Path(__file__).resolve().parent / "reference"
+REFERENCE = ROOT / "build" / "pages" / "reference"
 PACKAGE = ROOT / "src" / "rlftsim"
 CONFIGS = {
     "Evaluate and score": ("rlftsim.evaluation.results:EvaluateConfig", "rlftsim.evaluation.score_files:ScoreConfig"),
@@ -42,7 +42,7 @@ MODULES = ("rlftsim.rollout.policy", "rlftsim.realism", "rlftsim.rewards", "rlft
 
 
 def pages() -> dict[str, str]:
-    """Text of every page by its path below docs/reference."""
+    """Text of every page by its path below the reference's folder."""
     found = {"cli/index.md": cli_index(), "fields.md": fields_page(), "errors.md": errors_page()}
     found |= {f"cli/{verb}.md": cli_page(verb) for verb in VERBS}
     return found | {"plugins.md": plugins_page(), "python.md": python_page()}
@@ -269,9 +269,14 @@ def python_page() -> str:
     return "\n".join(lines)
 
 
-if __name__ == "__main__":
-    shutil.rmtree(REFERENCE, ignore_errors=True)
+def write_pages(folder: Path = REFERENCE) -> None:
+    """Write every page to a folder, which is emptied first."""
+    shutil.rmtree(folder, ignore_errors=True)
     for name, text in pages().items():
-        path = REFERENCE / name
+        path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
+
+
+if __name__ == "__main__":
+    write_pages()

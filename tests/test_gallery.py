@@ -1,4 +1,4 @@
-"""The gallery of the site: its page is the one that its script writes, and all of its pictures are there and small."""
+"""Pictures of the site: the gallery is what its script writes, all are small, and the chart shows the table."""
 
 import importlib.util
 from pathlib import Path
@@ -30,3 +30,13 @@ def test_there_are_twelve_pieces_of_400_kilobytes_at_most_and_films_have_a_page_
     assert sum(sizes.values()) <= 3_000_000
     for piece in pictures.PIECES:
         assert getattr(Image.open(DOCS / "gallery" / f"{piece.name}.webp"), "is_animated", False) == piece.is_film
+
+
+def test_the_chart_of_the_results_has_a_mark_for_every_row_of_the_table(pictures, tmp_path):
+    gains = pictures.read_gains()
+    table = (DOCS / "results.md").read_text().partition("<!-- measured:begin -->")[2].partition("<!-- measured:end")[0]
+    assert 1 < len(gains) == table.count("\n|") - 2 <= 8
+    assert all(low < gain < high for _, gain, low, high in gains)
+    pictures.draw_gains(tmp_path / "chart.webp")
+    with Image.open(tmp_path / "chart.webp") as drawn, Image.open(DOCS / "results.webp") as shown:
+        assert drawn.size == shown.size

@@ -29,7 +29,7 @@ FIRST = {
 }
 """Words for the search, and the end of the anchor that it has to find first."""
 KINDS = (
-    "index", "start", "live", "gallery", "comparison", "training", "results", "results/smart_cpu_2026-11-21",
+    "index", "start", "live", "gallery", "comparison", "training", "results", "results/speed",
     "tutorials/1_futures", "reference/cli/finetune", "reference/python",
 )  # fmt: skip
 """A page of each kind."""
