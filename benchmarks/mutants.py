@@ -9,11 +9,13 @@ of libraries, and messages of more than a line. Formats and their samples are in
 """
 
 import argparse
+import json
 import os
 import sys
 import tempfile
-from collections import defaultdict
+from collections import Counter, defaultdict
 from pathlib import Path
+from typing import Any
 
 os.environ["OMP_NUM_THREADS"] = "1"
 TESTS = Path(__file__).resolve().parents[1] / "tests"
@@ -44,6 +46,15 @@ def faults(rows: list[Row]) -> list[str]:
     ]
 
 
+def outcomes(rows: list[Row]) -> dict[str, dict[str, Any]]:
+    """Counts of verdicts and lines on the faults, by format."""
+    by_format = {row.format: [one for one in rows if one.format == row.format] for row in rows}
+    return {
+        name: {"counts": sum((row.counts for row in some), Counter({"read": 0, "refused": 0})), "faults": faults(some)}
+        for name, some in by_format.items()
+    }
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--mutants", type=int, default=500)
@@ -52,7 +63,12 @@ def main() -> int:
     parser.add_argument("--family", nargs="+", choices=FAMILIES, default=FAMILIES)
     parser.add_argument("--only", nargs=3, metavar=("FAMILY", "SEED", "FILE"))
     parser.add_argument("--out", type=Path)
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--list", action="store_true")
     options = parser.parse_args()
+    if options.list:
+        print(json.dumps({name: form.readers for name, form in FORMATS.items()}))
+        return 0
     pa.set_cpu_count(1)
     rows: list[Row] = []
     with tempfile.TemporaryDirectory(prefix="mutants-") as folder:
@@ -74,6 +90,8 @@ def main() -> int:
     print("\n".join(lines))
     if options.out and lines:
         options.out.write_text("\n".join(lines) + "\n")
+    if options.json:
+        options.json.write_text(json.dumps(outcomes(rows)))
     return int(any(row.faults for row in rows))
 
 

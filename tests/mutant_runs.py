@@ -1,6 +1,7 @@
 """Runs of mutants, each in a forked child, and what came of them."""
 
 import contextlib
+import gc
 import json
 import os
 import re
@@ -84,6 +85,8 @@ class Sample:
             warm = self._copy("warm")
             self.format.read(warm)
         shutil.rmtree(warm)
+        gc.collect()
+        gc.freeze()  # a child's collections would copy every page of this process
         self.files = {
             str(path.relative_to(self.good)): kind
             for pattern, kind in self.format.files.items()
@@ -207,6 +210,7 @@ def _read_in_child(form: Format, prepare: Callable[[], object], place: Path, tel
         os.chdir(place)
         os.write(tell, b"r")
         verdict, text = _read(form, place)
+        text = text.replace(str(place), "SAMPLE")
         sys.stdout.flush()
         sys.stderr.flush()
         lines = printed.read_text(errors="replace").split("\n")
@@ -214,7 +218,7 @@ def _read_in_child(form: Format, prepare: Callable[[], object], place: Path, tel
             bad = next((line for line in lines if not _is_showable(line)), None)
             native = next((line for line in lines if re.search(r"\bWarning\b|\[W\d+", line)), None)
             if bad is not None:
-                verdict, text = "message", f"printed {len(bad)} characters: {bad[:200]!r}"
+                verdict, text = "message", f"printed {len(bad)} characters: {bad.replace(str(place), 'SAMPLE')[:200]!r}"
             elif native is not None:
                 verdict, text = "warning", native[:300]
         result.write_text(json.dumps([verdict, text[-3000:]]))
@@ -237,9 +241,9 @@ def _read(form: Format, place: Path) -> tuple[str, str]:
         except RlftsimError as error:
             text = str(error)
             verdict = "refused" if _is_showable(text) else "message"
-            text = text if verdict == "refused" else f"{len(text)} characters: {text[:200]!r}"
+            if verdict == "message":
+                text = f"{len(text)} characters: {text.replace(str(place), 'SAMPLE')[:200]!r}"
         except BaseException as error:
-            text = traceback.format_exc()
             where = [f"{one.filename}:{one.lineno} {one.name}" for one in traceback.extract_tb(error.__traceback__)]
             ours = [one for one in where if "/rlftsim/" in one]
             last = f"{type(error).__name__}: {str(error)[:200]!r}"

@@ -1,7 +1,7 @@
 """Mutants: damaged copies of a good file, by its bytes or by its meaning. The same seed gives the same mutant.
 
-A mutant of the bytes is what a broken disk, a cut copy or an editor leaves. A mutant of the meaning is well-formed, with
-sound checksums, and says something else: another type, another number of axes, NaN, a missing or a foreign name.
+A mutant of the bytes is what a broken disk, a cut copy or an editor leaves. A mutant of the meaning is well-formed,
+with sound checksums, and says something else: another type, another number of axes, NaN, a missing or a foreign name.
 """
 
 import gzip
@@ -90,9 +90,11 @@ class Raw(str):
 
 VALUES: tuple[Any, ...] = (
     None, True, False, 0, 1, -1, 7, 2**31, 2**63, 2**64, -(2**70), 10**400, 0.5, -0.0, 1e-320, 1e308, Raw("NaN"),
-    Raw("Infinity"), Raw("-Infinity"), Raw("1" * 5000), Raw("1e999"), "", "x", "7", "nan", LONG, CONTROL, "../../x", "/",
-    "e\u0301\u202e", Raw('"\\ud800"'), [], [[]], {}, {"a": 1}, [None], [1, 2, 3], [0] * 50_000, ["a"] * 3, Raw("[" * 50 + "]" * 50),
-    Raw("[" * 2000 + "]" * 2000), Raw('{"a":' * 900 + "1" + "}" * 900), Raw("[" * 100_000 + "]" * 100_000), {LONG: 1}, {CONTROL: 1},
+    Raw("Infinity"), Raw("-Infinity"), Raw("1" * 5000), Raw("1e999"), "", "x", "7", "nan", LONG, CONTROL, "../x", "/",
+    "e\u0301\u202e", Raw('"\\ud800"'), [], [[]], {}, {"a": 1}, [None], [1, 2, 3], [0] * 50_000, ["a"] * 3,
+    Raw("[" * 50 + "]" * 50), Raw("[" * 2000 + "]" * 2000), Raw('{"a":' * 900 + "1" + "}" * 900),
+    Raw("[" * 100_000 + "]" * 100_000),
+    {LONG: 1}, {CONTROL: 1},
 )  # fmt: skip
 
 
@@ -175,8 +177,9 @@ def _json_text(tree: Any) -> str:
 
 
 TOML_VALUES = (
-    "1", "true", '""', '"x"', "[]", "{}", "1979-05-27", "nan", "inf", f'"{LONG}"', '"a\\nb\\u001bc"', "[[]]", '{a = "b"}', "9" * 5000,
-    "[" * 60 + "]" * 60, "[" * 3000 + "]" * 3000, "{a=" * 900 + "1" + "}" * 900, '["a", 1]', '[""]', '"\\ud800"', "'", "0x",
+    "1", "true", '""', '"x"', "[]", "{}", "1979-05-27", "nan", "inf", f'"{LONG}"', '"a\\nb\\u001bc"', "[[]]",
+    '{a = "b"}', "9" * 5000, "[" * 60 + "]" * 60, "[" * 3000 + "]" * 3000, "{a=" * 900 + "1" + "}" * 900,
+    '["a", 1]', '[""]', '"\\ud800"', "'", "0x",
 )  # fmt: skip
 
 
@@ -275,7 +278,11 @@ def mutate_npz(data: bytes, dice: random.Random) -> bytes:
             shape = dice.choice(
                 ("(1000000000, 1000)", "(-1,)", "(2, 3)", "(99999999999999999999,)", "()", "(0, 1000000000000)", "'a'")
             )
-            members[name] = _npy_header(dice.choice((repr(array.dtype.str), "'<f8'", "'<U1000000000'", "'|O'", "[('a', '<f4')]", "'x'")), shape, members[name][128:])  # fmt: skip
+            members[name] = _npy_header(
+                dice.choice((repr(array.dtype.str), "'<f8'", "'<U1000000000'", "'|O'", "[('a', '<f4')]", "'x'")),
+                shape,
+                members[name][128:],
+            )
         case 5:
             members[name] = dice.choice((b"", b"x", pickle.dumps([1]), members[name][:-7], bytes(1_000_000)))
         case 6:
@@ -373,7 +380,19 @@ def mutate_checkpoint(data: bytes, dice: random.Random) -> bytes:
         case 1:
             weights[dice.choice((f"{name}_", "x", 7, None, (1, 2), LONG, CONTROL))] = weights.pop(name)
         case 2:
-            weights[name] = dice.choice((None, 1, "x", [1.0], {"a": 1}, torch.zeros(0), torch.tensor(1j), torch.zeros(3).to_sparse(), torch.zeros(1).expand(1 << 40)))  # fmt: skip
+            weights[name] = dice.choice(
+                (
+                    None,
+                    1,
+                    "x",
+                    [1.0],
+                    {"a": 1},
+                    torch.zeros(0),
+                    torch.tensor(1j),
+                    torch.zeros(3).to_sparse(),
+                    torch.zeros(1).expand(1 << 40),
+                )
+            )
         case 3 | 4:
             changed = mutate_array(array, dice)
             if changed.dtype.kind not in "US":
@@ -384,7 +403,21 @@ def mutate_checkpoint(data: bytes, dice: random.Random) -> bytes:
                 (None, 0, -1, 1 << 40, 10**9, 1e18, float("nan"), "x", [], {}, True, 0.5, LONG)
             )
         case 7:
-            content = dice.choice(({"state_dict": dice.choice((None, [], 1, {}))}, {}, [], weights, torch.zeros(3), {**content, "hyper_parameters": dice.choice((None, 1, {"model_config": 1}, {"model_config": {"decoder": []}}))}))  # fmt: skip
+            content = dice.choice(
+                (
+                    {"state_dict": dice.choice((None, [], 1, {}))},
+                    {},
+                    [],
+                    weights,
+                    torch.zeros(3),
+                    {
+                        **content,
+                        "hyper_parameters": dice.choice(
+                            (None, 1, {"model_config": 1}, {"model_config": {"decoder": []}})
+                        ),
+                    },
+                )
+            )
         case _:
             content = dice.choice(({**content, "more": _Unsafe()}, {**content, 7: 1, None: 2}))
     file = io.BytesIO()
@@ -445,10 +478,27 @@ def mutate_table(table: pa.Table, dice: random.Random) -> pa.Table:
                 metadata[key] = dice.choice((b"", b"x", b"\xff\xfe", LONG.encode()))
             return table.replace_schema_metadata(dice.choice((metadata, metadata, metadata, None)))
         case 7 | 8:
-            casts = ("string", "large_string", "binary", "float64", "float32", "float16", "int64", "int8", "uint64", "bool", "null", "list", "dictionary", "decimal", "timestamp", "struct")  # fmt: skip
+            casts = (
+                "string",
+                "large_string",
+                "binary",
+                "float64",
+                "float32",
+                "float16",
+                "int64",
+                "int8",
+                "uint64",
+                "bool",
+                "null",
+                "list",
+                "dictionary",
+                "decimal",
+                "timestamp",
+                "struct",
+            )
             column = _cast(column, dice.choice(casts))
         case 9 if len(values):
-            values = values[:row] + [None] + values[row + 1 :] if dice.random() < 0.7 else [None] * len(values)
+            values = [*values[:row], None, *values[row + 1 :]] if dice.random() < 0.7 else [None] * len(values)
             column = pa.array(values, field.type)
         case _ if len(values):
             try:
@@ -468,7 +518,11 @@ def _other_value(value: Any, kind: pa.DataType, dice: random.Random) -> Any:
     if pa.types.is_boolean(kind):
         return not value
     if pa.types.is_integer(kind):
-        least, most = (0, 2**kind.bit_width - 1) if pa.types.is_unsigned_integer(kind) else (-(2 ** (kind.bit_width - 1)), 2 ** (kind.bit_width - 1) - 1)  # fmt: skip
+        least, most = (
+            (0, 2**kind.bit_width - 1)
+            if pa.types.is_unsigned_integer(kind)
+            else (-(2 ** (kind.bit_width - 1)), 2 ** (kind.bit_width - 1) - 1)
+        )
         return dice.choice((least, most, 0, 1, -1, 999, (value or 0) + 1))
     if pa.types.is_string(kind) or pa.types.is_large_string(kind):
         return dice.choice(("", "x", LONG, CONTROL, "../../x", "/etc/passwd", "\u202e", f"{value}_"))
@@ -545,7 +599,10 @@ def mutate_shard(data: bytes, dice: random.Random) -> bytes:
 
 # ---- messages -------------------------------------------------------------------------------------
 
-_NUMBERS = {"f": (float("nan"), float("inf"), -float("inf"), 1e308, -1e30, 0.0, 3e38, 1e6), "i": (0, 1, -1, 2**31 - 1, -(2**31), 2**62, -(2**63), 99)}  # fmt: skip
+_NUMBERS = {
+    "f": (float("nan"), float("inf"), -float("inf"), 1e308, -1e30, 0.0, 3e38, 1e6),
+    "i": (0, 1, -1, 2**31 - 1, -(2**31), 2**62, -(2**63), 99),
+}
 
 
 def mutate_message(message: Any, dice: random.Random) -> None:
@@ -663,7 +720,16 @@ def mutate_archive(data: bytes, dice: random.Random) -> bytes:
         case 4:
             return gzip.compress(mutate_bytes(raw, dice.random()), 1)
         case 5:
-            return dice.choice((data + data, data + b"x", data + bytes(1000), raw, gzip.compress(raw[:-1024], 1), gzip.compress(raw + bytes(50_000_000), 1)))  # fmt: skip
+            return dice.choice(
+                (
+                    data + data,
+                    data + b"x",
+                    data + bytes(1000),
+                    raw,
+                    gzip.compress(raw[:-1024], 1),
+                    gzip.compress(raw + bytes(50_000_000), 1),
+                )
+            )
         case _:
             members[number] = (member, mutate_submission(body, dice))
     file = io.BytesIO()
@@ -780,17 +846,24 @@ HOSTILE: Mapping[str, Mapping[str, Change]] = {
         "1 GB of zeros": _npz_of(a=_npy_header("'<f8'", "(125000000,)", bytes(50_000_000))),
         "a pickle": _pickled,
     },
-    "safetensors": {"a header of 8 EB": lambda data: struct.pack("<Q", 1 << 63), "4 TB promised": _framed(_HEADER), "nested deeply": _framed(_DEEP)},
+    "safetensors": {
+        "a header of 8 EB": lambda data: struct.pack("<Q", 1 << 63),
+        "4 TB promised": _framed(_HEADER),
+        "nested deeply": _framed(_DEEP),
+    },
     "checkpoint": {"a pickle that calls": _executing_checkpoint, "a plain pickle": _pickled},
     "snapshot": {"nested deeply": _with_checksum(_framed(_DEEP)), "nothing inside": _with_checksum(_framed(b"{}"))},
-    "parquet": {"a footer of 4 GB": lambda data: data[:-8] + b"\xff\xff\xff\xffPAR1", "frame alone": lambda data: b"PAR1PAR1"},
+    "parquet": {
+        "a footer of 4 GB": lambda data: data[:-8] + b"\xff\xff\xff\xffPAR1",
+        "frame alone": lambda data: b"PAR1PAR1",
+    },
     "shard": {"a negative offset": _with_bad_offset, "frame alone": lambda data: b"ARROW1\x00\x00ARROW1"},
     "tfrecord": {"a record of 1 PB": _long_record},
     "submission": {"a field of 2 GB": lambda data: b"\x0a\xff\xff\xff\xff\x07" + data},
     "rollouts": {"a field of 2 GB": lambda data: b"\x0a\xff\xff\xff\xff\x07" + data},
     "archive": {"1 GB of zeros": lambda data: gzip.compress(bytes(250_000_000), 1) * 4},
     "text": {"no text": lambda data: b"\xff\xfe\x00\x80"},
-}  # fmt: skip
+}
 """Inputs that someone would write to harm a reader, by kind; `EVERYWHERE` has those of every kind."""
 EVERYWHERE: Mapping[str, Change] = {"nothing": lambda data: b"", "zeros": lambda data: bytes(4096)}
 assert HOSTILE.keys() == _BY_MEANING.keys()

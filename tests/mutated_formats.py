@@ -11,10 +11,11 @@ from functools import lru_cache
 from pathlib import Path
 from unittest import mock
 
+import entries
 import numpy as np
 import torch
+from rollout_drawing import draw_arrays, to_scenario_rollouts, write_npz, write_submission
 
-import entries
 import made_up
 import rlftsim as rs
 import scenes
@@ -42,7 +43,6 @@ from rlftsim.studio.serving import token_of
 from rlftsim.submission.entry import describe_entry, read_entry
 from rlftsim.tokens.vocabulary import Vocabulary
 from rlftsim.training.run_folder import read_metrics
-from rollout_drawing import draw_arrays, to_scenario_rollouts, write_npz, write_submission
 from small_things import TINY_BOTS
 from table_files import MAP, write_tables
 from womd_messages import build_message
@@ -167,8 +167,8 @@ def _drawn(task: object) -> Iterator[rs.Scenario]:
 def without_sumo() -> Iterator[None]:
     """Inside, synthetic scenarios are drawn by hand."""
     with (
-        mock.patch.object(generate.sumo, "is_available", lambda: True),
-        mock.patch.object(generate.sumo, "sumo_version", lambda: "1.0"),
+        mock.patch.object(generate.sumo, "is_available", return_value=True),
+        mock.patch.object(generate.sumo, "sumo_version", return_value="1.0"),
         mock.patch.object(generate, "generate_scenarios", _drawn),
     ):
         yield
@@ -185,9 +185,10 @@ def make_begun_synthesis(folder: Path) -> None:
 
 
 def make_begun_copy(folder: Path) -> None:
-    write_set(folder)
+    write_set(folder.parent)  # the copy's address must not change with the folder
     (folder / "new").mkdir()
-    note = f"A copy of file://{folder / 'set'} runs here or was interrupted: run the same command again, it goes on."
+    url = f"file://{folder.parent / 'set'}"
+    note = f"A copy of {url} runs here or was interrupted: run the same command again, it goes on."
     (folder / "new" / "INCOMPLETE").write_text(note + "\nhost process 1 since 2026-01-01T00:00:00+00:00\n")
 
 
@@ -363,13 +364,13 @@ def read_drives(folder: Path) -> None:
 def make_begun_drive(folder: Path) -> None:
     write_set(folder)
     # a result that cannot be put together leaves what is finished
-    with mock.patch.object(DriveResult, "of", side_effect=InterruptedError), contextlib.suppress(InterruptedError):
+    with mock.patch.object(DriveResult, "of", side_effect=NotRead), contextlib.suppress(NotRead):
         drive(folder)
 
 
 def measure(folder: Path) -> None:
     data = folder / "set"
-    measure_variances(rs.ConstantVelocity(), data, folder / "variances", EVALUATE, show_progress=False)
+    measure_variances(entries.Wanderer(), data, folder / "variances", EVALUATE, show_progress=False)
     attain_goals(rs.ConstantVelocity(), data, folder / "goals", EVALUATE, _entries(), show_progress=False)
 
 
@@ -468,61 +469,102 @@ FORMATS: Mapping[str, Format] = {
     "WOMD": Format({"womd/*": "tfrecord"}, make_womd, convert(Path("womd")), ("scenario.tfrecord", "scenario.womd")),
     "Argoverse 2": Format(
         {"val/*/*.parquet": "parquet", "val/*/*.json": "json"},
-        make_av2, convert(Path("val"), "--from", "av2"), ("scenario.av2", "scenario.av2_map"),
+        make_av2,
+        convert(Path("val"), "--from", "av2"),
+        ("scenario.av2", "scenario.av2_map"),
     ),
     "sizes of Argoverse 2": Format(
         {"sizes.json": "json"}, make_av2, convert(Path("val"), "--sizes", Path("sizes.json")), ("scenario.av2",)
     ),
-    "tables": Format({"tables/*": "parquet"}, make_tables, convert(Path("tables"), "--from", "tables"), ("scenario.tables",)),
-    "data set": Format({"set/manifest.json": "json", "set/index.parquet": "parquet"}, *(write_set, read_set), ("scenario.dataset",)),
+    "tables": Format(
+        {"tables/*": "parquet"}, make_tables, convert(Path("tables"), "--from", "tables"), ("scenario.tables",)
+    ),
+    "data set": Format(
+        {"set/manifest.json": "json", "set/index.parquet": "parquet"}, *(write_set, read_set), ("scenario.dataset",)
+    ),
     "shard": Format({"set/shards/*.arrow": "shard"}, write_set, read_shard, ("scenario.shards",)),
-    "begun conversion": Format({"new/shards/**/*.json": "json"}, make_begun_conversion, convert(Path("womd")), ("scenario.convert",)),
-    "begun synthesis": Format({"new/INCOMPLETE": "json"}, make_begun_synthesis, read_begun_synthesis, ("scenario.synthetic.generate",)),
+    "begun conversion": Format(
+        {"new/shards/**/*.json": "json"}, make_begun_conversion, convert(Path("womd")), ("scenario.convert",)
+    ),
+    "begun synthesis": Format(
+        {"new/INCOMPLETE": "json"}, make_begun_synthesis, read_begun_synthesis, ("scenario.synthetic.generate",)
+    ),
     "begun copy": Format(
         {"new/INCOMPLETE": "text"},
-        make_begun_copy, lambda folder: pull_dataset(f"file://{folder / 'set'}", folder / "new"), ("scenario.transfer",),
+        make_begun_copy,
+        lambda folder: pull_dataset(f"file://{folder.parent / 'set'}", folder / "new"),
+        ("scenario.transfer",),
     ),
     "vocabulary": Format(
         {"v.safetensors": "safetensors"},
         lambda folder: _vocabulary().save(folder / "v.safetensors"),
-        lambda folder: rs.simulate(tiny.tiny_policy(Vocabulary.load(folder / "v.safetensors")), _scenarios()[0], num_rollouts=1),
+        lambda folder: rs.simulate(
+            tiny.tiny_policy(Vocabulary.load(folder / "v.safetensors")), _scenarios()[0], num_rollouts=1
+        ),
         ("tokens.vocabulary",),
     ),
     "SMART": Format(
         {"model/config.json": "json", "model/*.safetensors": "safetensors", "model/README.md": "text"},
-        make_smart, read_policy, ("policies.checkpoint", "tokens.vocabulary"),
+        make_smart,
+        read_policy,
+        ("policies.checkpoint", "tokens.vocabulary"),
     ),
     "TrafficBots": Format(
-        {"model/config.json": "json", "model/*.safetensors": "safetensors"}, make_trafficbots, read_policy, ("policies.checkpoint",)
+        {"model/config.json": "json", "model/*.safetensors": "safetensors"},
+        make_trafficbots,
+        read_policy,
+        ("policies.checkpoint",),
     ),
     "CAT-K checkpoint": Format(
-        {"epoch.ckpt": "checkpoint"}, make_catk, import_catk("epoch.ckpt"), ("policies.smart.lightning_file", "policies.smart.catk_checkpoint")
+        {"epoch.ckpt": "checkpoint"},
+        make_catk,
+        import_catk("epoch.ckpt"),
+        ("policies.smart.lightning_file", "policies.smart.catk_checkpoint"),
     ),
     "CAT-K weights": Format(
         {"weights.safetensors": "safetensors", "tables.npz": "npz"},
-        make_catk, import_catk("weights.safetensors"), ("policies.smart.catk_checkpoint", "policies.smart.catk_vocabulary"),
+        make_catk,
+        import_catk("weights.safetensors"),
+        ("policies.smart.catk_checkpoint", "policies.smart.catk_vocabulary"),
     ),
-    "run": Format({"run/config.json": "json", "run/metrics.jsonl": "jsonl"}, make_run, read_run, ("training.run_folder",)),
+    "run": Format(
+        {"run/config.json": "json", "run/metrics.jsonl": "jsonl"}, make_run, read_run, ("training.run_folder",)
+    ),
     "checkpoint of a run": Format(
-        {"run/checkpoints/*4/*.safetensors": "safetensors", "run/checkpoints/*4/*.json": "json"}, make_run, read_run, ("training.checkpoint",)
+        {"run/checkpoints/*4/*.safetensors": "safetensors", "run/checkpoints/*4/*.json": "json"},
+        make_run,
+        read_run,
+        ("training.checkpoint",),
     ),
     "settings": Format({"*.json": "json"}, make_config, read_config, ("recipes.settings",)),
     "goals": Format(
         {"goals.json": "json"},
-        make_goals, lambda folder: run("goals", "check", folder / "goals.json", "--data", folder / "set"), ("goals.goals_file",),
+        make_goals,
+        lambda folder: run("goals", "check", folder / "goals.json", "--data", folder / "set"),
+        ("goals.goals_file",),
     ),
     "augmented goals": Format({"goals/*": "parquet"}, make_stored_goals, read_stored_goals, ("goals.stored",)),
     "evaluation": Format({"b.parquet": "parquet"}, make_evaluations, read_evaluations, ("evaluation.results",)),
-    "finished evaluation": Format({"out/*.parquet": "parquet"}, make_finished_evaluation, evaluate, ("evaluation.results",)),
+    "finished evaluation": Format(
+        {"out/*.parquet": "parquet"}, make_finished_evaluation, evaluate, ("evaluation.results",)
+    ),
     "begun evaluation": Format({"out/*.parts/*": "parquet"}, make_begun_evaluation, evaluate, ("evaluation.results",)),
-    "drive": Format({"b.parquet": "parquet", "out/*.parquet": "parquet"}, make_drives, read_drives, ("evaluation.drive_results",)),
+    "drive": Format(
+        {"b.parquet": "parquet", "out/*.parquet": "parquet"}, make_drives, read_drives, ("evaluation.drive_results",)
+    ),
     "begun drive": Format({"out/*.parts/*.json": "json"}, make_begun_drive, drive, ("evaluation.resumable",)),
     "measurements": Format({"*/s?.json": "json"}, make_measured, measure, ("evaluation.resumable",)),
     "rollouts": Format({"rollouts/*": "npz"}, make_rollouts, score("rollouts"), ("evaluation.rollout_files",)),
-    "messages of rollouts": Format({"all.binproto": "submission"}, make_messages, score("all.binproto"), ("evaluation.rollout_files",)),
+    "messages of rollouts": Format(
+        {"all.binproto": "submission"}, make_messages, score("all.binproto"), ("evaluation.rollout_files",)
+    ),
     "message of rollouts": Format({"one/*": "rollouts"}, make_messages, score("one"), ("evaluation.rollout_files",)),
-    "scored records": Format({"womd/*": "tfrecord"}, make_scored_records, score("new", "womd"), ("evaluation.scenario_source",)),
-    "simulated folder": Format({"out/rollouts.json": "json", "out/*.npz": "npz"}, make_simulated, simulate, ("cli.rollout_folder",)),
+    "scored records": Format(
+        {"womd/*": "tfrecord"}, make_scored_records, score("new", "womd"), ("evaluation.scenario_source",)
+    ),
+    "simulated folder": Format(
+        {"out/rollouts.json": "json", "out/*.npz": "npz"}, make_simulated, simulate, ("cli.rollout_folder",)
+    ),
     "snapshot": Format({"snapshot": "snapshot"}, make_snapshot, read_snapshot, ("envs.snapshot",)),
     "entry": Format(
         {"entry.toml": "toml"},
@@ -532,12 +574,24 @@ FORMATS: Mapping[str, Format] = {
     ),
     "archive": Format(
         {"submission.tar.gz": "archive"},
-        make_archive, check_archive, ("submission.archive", "submission.check", "submission.messages"),
+        make_archive,
+        check_archive,
+        ("submission.archive", "submission.check", "submission.messages"),
     ),
-    "report of an archive": Format({"submission.report.json": "json"}, make_archive, check_archive, ("submission.report",)),
+    "report of an archive": Format(
+        {"submission.report.json": "json"}, make_archive, check_archive, ("submission.report",)
+    ),
     "begun build": Format(
-        {"out/plan.json": "json", "out/**/*.json": "json"}, make_begun_build, build(), ("submission.plan", "submission.build")
+        {"out/plan.json": "json", "out/**/*.json": "json"},
+        make_begun_build,
+        build(),
+        ("submission.plan", "submission.build"),
     ),
-    "token": Format({"token": "text"}, lambda folder: token_of(folder / "token"), lambda folder: token_of(folder / "token"), ("studio.serving",)),
-}  # fmt: skip
+    "token": Format(
+        {"token": "text"},
+        lambda folder: token_of(folder / "token"),
+        lambda folder: token_of(folder / "token"),
+        ("studio.serving",),
+    ),
+}
 """All formats by name."""
