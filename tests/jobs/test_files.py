@@ -32,8 +32,11 @@ def test_json_that_no_reader_could_use_is_refused_in_one_line_with_the_way_out(t
     with pytest.raises(CheckpointError) as error:
         parse_json(text, "write it again", source="model/config.json", error=CheckpointError)
     message = str(error.value)
-    assert message.startswith("model/config.json: ") and cause in message and message.endswith(": write it again.")
-    assert "\n" not in message and len(message) < 200
+    assert message.startswith("model/config.json: ")
+    assert cause in message
+    assert message.endswith(": write it again.")
+    assert "\n" not in message
+    assert len(message) < 200
 
 
 def test_json_is_read_with_a_mark_in_front_to_the_greatest_depth(tmp_path):
@@ -49,7 +52,7 @@ def test_metrics_may_hold_nan():
 def test_a_missing_file_is_the_callers_to_explain_and_a_folder_is_refused(tmp_path):
     with pytest.raises(FileNotFoundError):
         read_json(tmp_path / "no.json", "write it")
-    with pytest.raises(DataError, match="cannot be read .*: write it.$"):
+    with pytest.raises(DataError, match=r"cannot be read .*: write it\.$"):
         read_json(tmp_path, "write it")
 
 
@@ -84,7 +87,8 @@ def test_toml_that_is_damaged_is_refused_in_one_line(tmp_path, text, cause):
     (tmp_path / "e.toml").write_bytes(text)
     with pytest.raises(DataError) as error:
         read_toml(tmp_path / "e.toml", "write one")
-    assert cause in str(error.value) and "\n" not in str(error.value)
+    assert cause in str(error.value)
+    assert "\n" not in str(error.value)
 
 
 def test_no_other_module_parses_json_or_toml():

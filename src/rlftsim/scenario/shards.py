@@ -74,7 +74,6 @@ INDEX_FIELDS = tuple(pa.field(field.name, _INDEX_TYPES[field.type]) for field in
 _INDEX_DEFAULTS = {field.name: field.default for field in fields(IndexRow) if field.default is not MISSING}
 _ADDED_LATER = {"map.polygon_rest.x", "map.polygon_rest.y", "map.polygon_rest.z", *_INDEX_DEFAULTS}
 """Columns that shards of earlier versions lack: None there, or the default of `IndexRow`."""
-_MAY_BE_EMPTY = {"source_record", "map.polygon_rest.x", "map.polygon_rest.y", "map.polygon_rest.z"}
 _SCHEMA = pa.schema(
     [
         *INDEX_FIELDS,
@@ -192,7 +191,7 @@ class ShardReader:
         if known != pa.schema(expected):
             raise DataError(f"shard {self.path} was written with another schema version: convert again")
         for name in known.names:
-            if name not in _MAY_BE_EMPTY and self._table[name].null_count:
+            if name not in ("source_record", *_ARRAY_DTYPES) and self._table[name].null_count:
                 raise DataError(f"shard {self.path} is damaged (column {name} has empty cells): {_WAY_OUT}")
 
     def __len__(self) -> int:
@@ -229,8 +228,8 @@ class ShardReader:
             num_tracks = len(scenario.tracks.object_id)
             if not 0 <= scenario.ego_index < num_tracks:
                 raise ValueError(f"its ego is track {scenario.ego_index} of {num_tracks}")
-        except (ValueError, IndexError, DataError) as error:
-            cause = "there is no such row" if isinstance(error, IndexError) else error
+        except (ValueError, TypeError, AttributeError, IndexError, DataError) as error:
+            cause = error if isinstance(error, ValueError | DataError) else "it lacks an array, or there is no such row"
             raise DataError(f"shard {self.path}: row {row} is damaged ({cause}): {_WAY_OUT}") from error
         features = scenario.map_features
         for part in (scenario, scenario.tracks, features, features.topology, scenario.lights):
