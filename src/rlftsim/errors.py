@@ -4,6 +4,7 @@ import math
 import operator
 import os
 import traceback
+from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from types import UnionType
 from typing import Any, ClassVar, Literal, Union, get_args, get_origin, get_type_hints
@@ -137,6 +138,22 @@ def require_finite(config: object, names: tuple[str, ...]) -> None:
     for name in names:
         if not math.isfinite(getattr(config, name)):
             raise ConfigError(f"{name} must be a finite number, got {getattr(config, name)}.")
+
+
+def check_limits(config: object, limits: Mapping[str, float]) -> None:
+    """Check that fields of a configuration are not above their limits, which keep a slip from filling the memory.
+
+    Args:
+        config: a dataclass; fields that are None have no limit.
+        limits: Highest value of a field, by its name.
+
+    Raises:
+        ConfigError: A value is above its limit; the message names both.
+    """
+    for name, limit in limits.items():
+        value = getattr(config, name)
+        if value is not None and not value <= limit:
+            raise ConfigError(f"{name} must be at most {limit}, got {str(value)[:40]}.")
 
 
 def given(config: object, names: tuple[str, ...]) -> tuple[str, ...]:

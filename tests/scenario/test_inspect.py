@@ -80,9 +80,11 @@ def test_a_scenario_that_breaks_the_contract_is_found(make_message, tmp_path, mo
     scenario = scenario_from_bytes(make_message("a").SerializeToString())
     with monkeypatch.context() as other_writer:
         other_writer.setattr(Scenario, "refuse_broken", lambda _: None)
-        write_dataset([replace(scenario, ego_index=-1)], tmp_path / "data")
+        write_dataset(
+            [replace(scenario, tracks=replace(scenario.tracks, object_id=np.array([7, 7, 8])))], tmp_path / "data"
+        )
     (finding,) = verify_dataset(tmp_path / "data")
-    assert str(finding) == "broken scenario: a: ego_index names track index -1, but there are 3 tracks"
+    assert str(finding) == "broken scenario: a: object id 7 belongs to 2 tracks: give each its own"
 
 
 def test_a_map_in_another_frame_and_positions_beyond_float32_are_found(

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from rlftsim.atomic_io import write_text
-from rlftsim.errors import ConfigError, DataError
+from rlftsim.errors import ConfigError
+from rlftsim.jobs.files import read_json
 from rlftsim.progress import log
 
 ABOUT = "rollouts.json"
@@ -27,13 +28,10 @@ def claim_folder(folder: Path, about: Mapping[str, Any]) -> None:
     """
     path = folder / ABOUT
     rollouts = sorted(folder.glob("*.npz"))
-    unknown = "model and settings of its rollouts are unknown: name another --out."
+    way_out = "name another --out"
     if rollouts and not path.exists():
-        raise ConfigError(f"{folder} holds {rollouts[0].name} but no {ABOUT}, so {unknown}")
-    try:
-        old = dict(json.loads(path.read_text())) if path.exists() else dict(about)
-    except (ValueError, TypeError) as error:
-        raise DataError(f"{path}: damaged ({error}), so {unknown}") from None
+        raise ConfigError(f"{folder} holds {rollouts[0].name} but no {ABOUT}, so their model is unknown: {way_out}.")
+    old = read_json(path, way_out) if path.exists() else dict(about)
     names = [name for name in {**about, **old} if name != "model"]
     differing = [name for name in names if old.get(name) != about.get(name)]
     if differing and rollouts:

@@ -17,6 +17,7 @@ from rlftsim.envs.episode import Episode, EpisodeState, repeat, start
 from rlftsim.envs.source import Source
 from rlftsim.envs.world import Dice
 from rlftsim.errors import ConfigError, DataError
+from rlftsim.jobs.files import parse_json
 from rlftsim.scenario.types import CURRENT_STEP
 
 FORMAT = "rlftsim-snapshot-1"
@@ -81,4 +82,4 @@ def read_snapshot(saved: bytes, source: Source) -> tuple[Episode, EpisodeState]:
 def _settings(episode: Episode) -> dict[str, Any]:
     """Settings that an episode depends on, as JSON has them."""
     known = {name: value for name, value in asdict(episode.config).items() if name not in IGNORED}
-    return json.loads(json.dumps(known))
+    return parse_json(json.dumps(known), "give plain values", source="settings of the environment")

@@ -21,6 +21,7 @@ import pyarrow as pa
 from rlftsim.atomic_io import remove_temporaries, write_text
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.results import SCHEMA, Evaluation, Provenance, Skipped, join_evaluations
+from rlftsim.jobs.files import read_json
 from rlftsim.lease import Lease
 from rlftsim.progress import log, progress_bar
 from rlftsim.threads import one_thread
@@ -158,22 +159,26 @@ class JsonParts(PartFiles[Mapping[str, object], Part]):
         """The parsed values of a scenario, see `PartFiles`."""
         scenario_id = self.scenario_ids[group.start]
         try:
-            values = json.loads(self._path(scenario_id).read_text())
+            values = self._read(scenario_id)
             return self.parse(scenario_id, values) if self._is_ours(scenario_id, values) else None
-        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        except (DataError, OSError, ValueError, KeyError, TypeError, AttributeError):
             return None
 
     def has_others(self, scenario_ids: Collection[str]) -> bool:
         """True if there are files of other scenarios or settings, see `PartFiles`."""
         for path in self.folder.glob("*.json"):
-            with suppress(OSError, ValueError, AttributeError):  # a damaged file holds nothing
-                if path.stem not in scenario_ids or not self._is_ours(path.stem, json.loads(path.read_text())):
+            with suppress(DataError, FileNotFoundError):  # a damaged file holds nothing
+                is_ours = path.stem in scenario_ids and self._is_ours(path.stem, self._read(path.stem))
+                if not is_ours:
                     return True
         return False
 
     def _is_ours(self, scenario_id: str, values: Mapping[str, object]) -> bool:
         # A name that is missing agrees: 0.1 wrote fewer, and kept one setting per folder.
         return all(values.get(name, own) == own for name, own in self.identity[scenario_id].items())
+
+    def _read(self, scenario_id: str) -> dict[str, Any]:
+        return read_json(self._path(scenario_id), "measure it again", allow_nan=True)
 
     def _path(self, scenario_id: str) -> Path:
         return self.folder / f"{scenario_id}.json"

@@ -19,6 +19,7 @@ from pathlib import Path
 
 from rlftsim.atomic_io import remove_temporaries_below
 from rlftsim.errors import ConfigError, DataError
+from rlftsim.jobs.files import parse_json, read_json
 from rlftsim.lease import Lease
 from rlftsim.progress import progress_bar
 from rlftsim.scenario.dataset import (
@@ -211,8 +212,8 @@ def _known_shards(folder: Path) -> dict[str, _Known]:
     earlier = _earlier_manifest(folder)
     shards = {entry.file: _Known(entry, earlier.provenance) for entry in earlier.shards} if earlier else {}
     for path in sorted((folder / SHARDS).rglob(_RECEIPTS)):
-        with suppress(ValueError, KeyError, TypeError, AttributeError):  # a damaged one counts for nothing
-            receipt = json.loads(path.read_text(encoding="utf-8"))
+        with suppress(DataError, ConfigError, KeyError, TypeError):  # a damaged one counts for nothing
+            receipt = read_json(path, "convert again")
             settings = receipt.pop("settings")
             if receipt.pop("schema_version") == SCHEMA_VERSION:
                 entry = shard_entry_from_json(receipt)
@@ -253,7 +254,7 @@ def _difference(found: object, wanted: object, name: str = "") -> str:
 
 def _plain(settings: Mapping[str, object]) -> dict[str, object]:
     """Settings as JSON gives them back."""
-    return json.loads(json.dumps(settings))
+    return parse_json(json.dumps(settings), "give plain values", source="settings of the source")
 
 
 def _earlier_manifest(folder: Path) -> Manifest | None:

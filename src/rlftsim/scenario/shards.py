@@ -19,6 +19,7 @@ import pyarrow as pa
 from rlftsim.aliases import current_name
 from rlftsim.atomic_io import cannot_write, temporary_beside
 from rlftsim.errors import DataError
+from rlftsim.jobs.tables import map_arrow
 from rlftsim.scenario.codec import decode_array, encode_array
 from rlftsim.scenario.index_row import IndexRow, compute_index_row
 from rlftsim.scenario.types import LaneTopology, LightStates, MapFeatures, Scenario, Tracks
@@ -179,16 +180,19 @@ class ShardReader:
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
         try:
-            # memory-mapped: "reading all" touches no page of the columns yet
-            table = pa.ipc.open_file(pa.memory_map(str(path))).read_all()
-            self._table = table.rename_columns([current_name(name) for name in table.schema.names])
-        except (OSError, pa.ArrowException) as error:
-            way_out = f"is damaged: {_WAY_OUT}" if self.path.exists() else f"is missing: {_RUN_AGAIN}"
-            raise DataError(f"shard {self.path} {way_out}") from error
-        known = self._table.schema.names
-        expected = [name for name in _SCHEMA.names if name in known or name not in _ADDED_LATER]
-        if known != expected:
+            table = map_arrow(self.path, _WAY_OUT)
+        except FileNotFoundError:
+            raise DataError(f"shard {self.path} is missing: {_RUN_AGAIN}") from None
+        except DataError as error:
+            raise DataError(f"shard {error}") from None
+        self._table = table.rename_columns([current_name(name) for name in table.schema.names])
+        known = self._table.schema
+        expected = [field for field in _SCHEMA if field.name in known.names or field.name not in _ADDED_LATER]
+        if known != pa.schema(expected):
             raise DataError(f"shard {self.path} was written with another schema version: convert again")
+        for name in known.names:
+            if name not in ("source_record", *_ARRAY_DTYPES) and self._table[name].null_count:
+                raise DataError(f"shard {self.path} is damaged (column {name} has empty cells): {_WAY_OUT}")
 
     def __len__(self) -> int:
         return self._table.num_rows
@@ -197,10 +201,7 @@ class ShardReader:
         """Columns of `IndexRow` and `source_record`, one row per scenario; a copy in memory."""
         schema = pa.schema([*INDEX_FIELDS, pa.field("source_record", pa.int32())])
         known = self._table.schema.names
-        try:
-            columns = {name: self._table[name].to_pylist() for name in schema.names if name in known}
-        except (OSError, UnicodeDecodeError, pa.ArrowException) as error:
-            raise DataError(f"shard {self.path} is damaged: {_WAY_OUT}") from error
+        columns = {name: self._table[name].to_pylist() for name in schema.names if name in known}
         return with_later_columns(pa.table(columns, schema=pa.schema([schema.field(name) for name in columns])), schema)
 
     def read(self, row: int) -> Scenario:
@@ -222,8 +223,13 @@ class ShardReader:
             names = [name for name in ("scenario_id", "ego_index", "source", "guessed") if name in known]
             plain = {name: self._table[name][row].as_py() for name in names}
             scenario = _from_arrays({**_INDEX_DEFAULTS, **plain}, arrays)
-        except (ValueError, OSError, pa.ArrowException) as error:
-            cause = "it cannot be read" if isinstance(error, OSError | pa.ArrowException) else error
+            # the checksum is of the arrays alone
+            scenario.refuse_bad_id()
+            num_tracks = len(scenario.tracks.object_id)
+            if not 0 <= scenario.ego_index < num_tracks:
+                raise ValueError(f"its ego is track {scenario.ego_index} of {num_tracks}")
+        except (ValueError, TypeError, AttributeError, IndexError, DataError) as error:
+            cause = error if isinstance(error, ValueError | DataError) else "it lacks an array, or there is no such row"
             raise DataError(f"shard {self.path}: row {row} is damaged ({cause}): {_WAY_OUT}") from error
         features = scenario.map_features
         for part in (scenario, scenario.tracks, features, features.topology, scenario.lights):
@@ -278,7 +284,7 @@ def with_later_columns(table: pa.Table, schema: pa.Schema) -> pa.Table:
             columns[column] = table[column.name]
         elif column.name in _INDEX_DEFAULTS:
             columns[column] = pa.array([_INDEX_DEFAULTS[column.name]] * len(table), column.type)
-    return pa.table(list(columns.values()), schema=pa.schema(list(columns)))
+    return pa.table(list(columns.values()), names=[column.name for column in columns])
 
 
 def _checksum(encoded: Mapping[str, bytes | pa.Buffer | None]) -> int:

@@ -18,12 +18,12 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 from jaxtyping import Bool, Float, Int64
 from scipy.spatial import KDTree
 
 from rlftsim.errors import DataError
 from rlftsim.geometry import wrapped
+from rlftsim.jobs.tables import read_parquet
 from rlftsim.scenario.polylines import Heights, densify
 from rlftsim.scenario.sources import BytesRead, Item, Unit, units_of_files
 from rlftsim.scenario.tfrecord import SkippedRecord
@@ -510,11 +510,9 @@ def _read_table(path: Path) -> _Rows:
         DataError: it is missing or damaged, or a column is missing, of another type or has empty cells.
     """
     try:
-        table = pq.ParquetFile(path).read()
+        table = read_parquet(path, "write it again")
     except FileNotFoundError:
         raise DataError(f"{path.name}: there is no such table beside {TRACKS}") from None
-    except (OSError, pa.ArrowException) as error:
-        raise DataError(f"{path.name} cannot be read: {str(error).splitlines()[0]}") from None
     needed, optional = _SCHEMAS[path.name]
     for name in needed:
         if name not in table.schema.names:
@@ -523,8 +521,6 @@ def _read_table(path: Path) -> _Rows:
         raise DataError(f"{path.name} has no column scenario_id or map_id")
     columns = {}
     for name, kind in (needed | optional).items():
-        if table.schema.names.count(name) > 1:
-            raise DataError(f"{path.name} has two columns {name}")
         if name in table.schema.names:
             columns[name] = _read_column(path.name, name, table[name], kind)
     return _Rows(path.name, np.arange(table.num_rows), columns)

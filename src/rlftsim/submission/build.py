@@ -20,6 +20,7 @@ from rlftsim.atomic_io import errors_name, remove_temporaries, temporary_beside,
 from rlftsim.errors import DataError
 from rlftsim.evaluation.evaluate import check_jobs, simulate_states
 from rlftsim.evaluation.results import EvaluateConfig
+from rlftsim.jobs.files import read_json
 from rlftsim.lease import Lease, remove_locks
 from rlftsim.progress import log, progress_bar
 from rlftsim.rollout.policy import Policy, device_of
@@ -60,9 +61,11 @@ class Job:
     def receipt(self, number: int) -> Piece | None:
         """A finished shard; None if there is none. Its file may be in the archive already."""
         try:
-            return Piece(**json.loads(self.receipt_path(number).read_text(encoding="utf-8")))
-        except (OSError, ValueError, TypeError):
+            piece = Piece(**read_json(self.receipt_path(number), "build again"))
+            require_types(piece)
+        except (DataError, ConfigError, FileNotFoundError, TypeError):
             return None
+        return piece
 
 
 def build_archive(

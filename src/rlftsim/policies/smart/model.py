@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 
 from rlftsim.errors import CheckpointError, ConfigError
-from rlftsim.policies.checkpoint import load_strictly, read_model, save_model
+from rlftsim.policies.checkpoint import check_fit, load_strictly, read_model, save_model
 from rlftsim.policies.distributions import CategoricalDistribution, LazyTokenDistribution, TokenDistribution
 from rlftsim.policies.sharing import are_frozen_alike
 from rlftsim.policies.smart.config import GoalEncoding, SmartConfig
@@ -168,7 +168,9 @@ class SmartModel(nn.Module):
         path = model.folder / VOCABULARY
         if not path.exists():
             raise CheckpointError(f"{model.folder}: not a SMART model folder, {VOCABULARY} is missing.")
-        policy = cls(config, Vocabulary.load(path))
+        vocabulary = Vocabulary.load(path)
+        check_fit(lambda: cls(config, vocabulary).network, weights, source=str(model.folder))
+        policy = cls(config, vocabulary)
         load_strictly(policy.network, weights, source=str(model.folder))
         return policy
 

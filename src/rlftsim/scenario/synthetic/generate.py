@@ -13,6 +13,7 @@ import numpy as np
 from rlftsim.aliases import current_names
 from rlftsim.atomic_io import remove_temporaries_below, write_text
 from rlftsim.errors import ConfigError, DataError, RlftsimError
+from rlftsim.jobs.files import read_json
 from rlftsim.lease import Lease
 from rlftsim.progress import progress_bar
 from rlftsim.scenario.dataset import (
@@ -173,7 +174,8 @@ def generate(
         return manifest
     marker = folder / INCOMPLETE
     if marker.exists():
-        if current_names(json.loads(marker.read_text(encoding="utf-8") or "{}")) != provenance:
+        begun = read_json(marker, "choose another folder, or delete this one")
+        if current_names(begun) != provenance:
             raise DataError(f"{folder} was begun with another seed, other arguments or versions: choose another folder")
     else:
         # not what other shares of the same run make in this moment
