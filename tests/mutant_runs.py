@@ -294,7 +294,13 @@ def run_format(name: str, folder: Path, seed: int, count: int, families: tuple[s
         count: Mutants of each family; hostile inputs come besides.
         families: Families that are tried.
     """
-    sample = Sample(name, folder)
+    try:
+        sample = Sample(name, folder)
+    except Exception as error:
+        where = traceback.extract_tb(error.__traceback__)[-1]
+        text = f"{type(error).__name__}: {str(error)[:200]!r} in {where.filename}:{where.lineno}"
+        fault = (Mutant(name, "none", "the good sample", "", ""), Outcome("traceback", text, 0))
+        return [Row(name, family, Counter(traceback=1), [fault]) for family in families[:1]]
     rows = {family: Row(name, family, Counter(), []) for family in families}
     for mutant in sample.mutants(seed, count):
         if mutant.family not in rows:
