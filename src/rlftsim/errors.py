@@ -140,7 +140,7 @@ def require_finite(config: object, names: tuple[str, ...]) -> None:
             raise ConfigError(f"{name} must be a finite number, got {getattr(config, name)}.")
 
 
-def check_limits(config: object, limits: Mapping[str, float]) -> None:
+def check_limits(config: object, limits: Mapping[Any, int]) -> None:
     """Check that fields of a configuration are not above their limits, which keep a slip from filling the memory.
 
     Args:

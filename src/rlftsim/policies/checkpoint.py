@@ -21,6 +21,7 @@ from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
+from torch.overrides import TorchFunctionMode
 
 from rlftsim.aliases import current_names
 from rlftsim.atomic_io import save_tensors, write_text
@@ -304,6 +305,26 @@ def check_shapes(weights: Mapping[str, Tensor], own: Mapping[str, Tensor], *, so
         raise CheckpointError(f"{source}: {len(problems)} weights do not fit this model: {shown}.")
 
 
+class _NoDraws(TorchFunctionMode):
+    """Draws no normal numbers, and keeps sequences in memory: torch needs imports of seconds for either without."""
+
+    def __torch_function__(self, func: Any, types: Any, args: tuple = (), kwargs: dict | None = None) -> Any:
+        kwargs = kwargs or {}
+        if func.__name__ == "normal_":
+            return next(iter((*args, *kwargs.values())))
+        return func(*args, **kwargs, **({"device": "cpu"} if func.__name__ in ("linspace", "logspace") else {}))
+
+
+def outline(make: Callable[[], nn.Module]) -> dict[str, Tensor]:
+    """State dict of a network that is built without memory: names, shapes and kinds of numbers.
+
+    Args:
+        make: Builds the network on torch's default device.
+    """
+    with torch.device("meta"), _NoDraws():
+        return make().state_dict()
+
+
 def check_fit(make: Callable[[], nn.Module], weights: Mapping[str, Tensor], *, source: str) -> None:
     """Check that weights fit a network before it is built: its settings may be damaged, and ask for any memory.
 
@@ -315,6 +336,5 @@ def check_fit(make: Callable[[], nn.Module], weights: Mapping[str, Tensor], *, s
     Raises:
         CheckpointError: The weights have other names, shapes or kinds of numbers.
     """
-    with torch.device("meta"):
-        own = make().state_dict()
+    own = outline(make)
     check_shapes(strip_wrappers(weights, own), own, source=source)

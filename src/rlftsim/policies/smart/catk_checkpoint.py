@@ -15,7 +15,7 @@ from torch import Tensor
 from rlftsim.atomic_io import save_tensors
 from rlftsim.errors import CheckpointError, ConfigError
 from rlftsim.jobs.arrays import read_tensors
-from rlftsim.policies.checkpoint import strip_wrappers
+from rlftsim.policies.checkpoint import outline, strip_wrappers
 from rlftsim.policies.smart.catk_keys import PREFIX, aliases, catk_name
 from rlftsim.policies.smart.catk_vocabulary import (
     PUBLISHED_AGENT_FILE,
@@ -78,9 +78,7 @@ def import_catk(checkpoint: Path, vocabulary: Sequence[Path]) -> CatkImport:
     head = weights.get(_HEAD_BIAS, torch.zeros(PUBLISHED_NUM_TOKENS))
     if head.dim() != 1 or not 1 <= len(head) <= MAX_TOKENS:
         raise CheckpointError(f"{checkpoint}: {_HEAD_BIAS} has shape {tuple(head.shape)}, not one number a token.")
-    with torch.device("meta"):  # names and shapes alone: the weights need not fit
-        network = SmartNetwork(config, len(head))
-    own = _translate(weights, network, str(checkpoint))
+    own = _translate(weights, outline(lambda: SmartNetwork(config, len(head))), str(checkpoint))
     tables = read_catk_vocabulary(vocabulary)
     if tables.num_tokens != len(head) or not tables.token_mask.all():
         raise CheckpointError(
@@ -198,15 +196,14 @@ def _vocabulary_note(settings: dict[str, Any], published: bool, path: Path) -> s
     return f"vocabulary: {what}; the checkpoint names {named}"
 
 
-def _translate(weights: dict[str, Tensor], network: SmartNetwork, source: str) -> dict[str, Tensor]:
-    """Weights under our names.
+def _translate(weights: dict[str, Tensor], own: dict[str, Tensor], source: str) -> dict[str, Tensor]:
+    """Weights under our names, those of a network's state dict.
 
     Raises:
         CheckpointError: lists everything that is missing, unknown, of the wrong shape or kind, or unequal to its
             second name.
     """
     # shapes of all names that must be there, second names of shared norms included
-    own = network.state_dict()
     names = {catk_name(key): key for key in own}
     seconds = aliases(names)
     shapes = {name: own[key].shape for name, key in names.items()}

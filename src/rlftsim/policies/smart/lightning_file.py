@@ -73,7 +73,7 @@ def mapping_in(settings: dict[str, Any], name: str) -> dict[str, Any]:
     return group if isinstance(group, dict) else {}
 
 
-def _is_weight(name: object, value: object) -> bool:
+def _is_weight(name: object, value: Any) -> bool:
     """True for a dense tensor on the CPU whose values are all stored: views may announce more than memory holds."""
     if not isinstance(name, str) or type(value) not in (Tensor, nn.Parameter) or value.layout != torch.strided:
         return False

@@ -133,7 +133,7 @@ class TrafficBotsModel(nn.Module):
         """
         stored = read_model(folder, architecture=cls.architecture)
         config, weights = stored.build(TrafficBotsConfig), stored.read_weights()
-        check_fit(lambda: cls(config).network, weights, source=str(stored.folder))
+        check_fit(lambda: TrafficBotsNetwork(config), weights, source=str(stored.folder))
         policy = cls(config)
         load_strictly(policy.network, weights, source=str(stored.folder))
         return policy
