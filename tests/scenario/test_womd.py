@@ -77,7 +77,7 @@ def test_every_kind_of_map_feature_gets_its_type_and_points():
         (womd_pb2.MapFeature(id=7, driveway=womd_pb2.Driveway()), MapFeatureType.DRIVEWAY, "driveway.polygon"),
     ]
     message = womd_pb2.Scenario(scenario_id="a", sdc_track_index=0)
-    message.timestamps_seconds.extend([0.0] * 11)
+    message.timestamps_seconds.extend(0.1 * step for step in range(11))
     message.tracks.add(id=1).states.extend([womd_pb2.ObjectState(length=4, width=2, height=2, valid=True)] * 11)
     for number, (feature, _, path) in enumerate(features):
         kind, points = path.split(".")

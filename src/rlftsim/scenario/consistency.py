@@ -7,7 +7,7 @@ detections are noisy; a scenario does where more than half of its moving tracks 
 import math
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int64
+from jaxtyping import Bool, Int64
 
 from rlftsim.scenario.types import STEP_S, ObjectType, Tracks
 
