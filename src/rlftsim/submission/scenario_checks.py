@@ -12,7 +12,7 @@ from rlftsim.scenario.types import Scenario
 from rlftsim.submission.findings import Finding
 from rlftsim.submission.messages import NUM_SCENES, DecodedRollouts
 
-_CHECK_OF_SUBJECT = {"not finite": 10, "distance": 10, "heading": 11, "height": 12, "equal": 14}
+_CHECK_OF_SUBJECT = {"not finite": 10, "distance": 10, "heading": 11, "turn": 11, "height": 12, "equal": 14}
 """The first step, 13, is judged over all scenarios."""
 
 
