@@ -144,6 +144,12 @@ BAD = {
     "kind": ({"tracks": [{**row, "x": "a"} for row in TWO]}, "column x is string, it must have numbers"),
     "no map": ({"map_rows": drop(MAP, "scenario_id")}, "map.parquet has no column scenario_id or map_id"),
     "lane": ({"lanes": [{"scenario_id": "one", "lane_id": 2}]}, "lanes.parquet: row 0: lane 2 is no lane"),
+    "across": ({"tracks": [{**r, "vx": 0.0, "vy": 9.0} for r in TWO]}, "tracks.parquet: velocities contradict"),
+    "time base": ({"scenarios": [{**ROW, "step_s": 0.2}]}, "moves at 5.0 m/s, its velocity is 10.0 m/s and"),
+    "headings": ({"tracks": [{**r, "heading": 1.4} for r in TWO]}, "tracks.parquet: headings contradict the motion"),
+    "predict twice": ({"scenarios": [{**ROW, "predict": [8, 8]}]}, "row 0: predict lists object 8 twice"),
+    "lane twice": ({"lanes": [LANE, LANE]}, "lanes.parquet: row 1: a second row with lane_id 1"),
+    "light twice": ({"lights": [LIGHT, {**LIGHT, "state": "go"}]}, "row 1: a second row with lane_id 1, step 0"),
     "light": ({"lights": [{"scenario_id": "one", "step": 0, "lane_id": 1, "state": 77}]}, "row 0: state 77"),
 }  # fmt: skip
 
