@@ -11,6 +11,7 @@ PACKAGE = Path(rlftsim.__file__).parent
 
 FLOORS = (
     ("errors",),
+    ("jobs",),
     ("aliases", "atomic_io", "geometry", "plugins", "progress", "statistics", "threads"),
     ("workers", "storage"),
     ("lease", "cluster"),

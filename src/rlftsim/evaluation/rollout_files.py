@@ -31,7 +31,8 @@ _KEYS = ("scenario_id", "object_ids", *AXES)
 _SUBMISSION_NAME = re.compile(r"\.(binproto|pb)(-\d+-of-\d+)?$")
 _PICKLE_NAME = re.compile(r"\.(pkl|pickle|pt|pth|ckpt|joblib)$")
 _ZIP_MAGIC, _GZIP_MAGIC, _PICKLE_MAGIC = b"PK\x03\x04", b"\x1f\x8b", tuple(b"\x80" + bytes([n]) for n in range(2, 6))
-_NPZ_DAMAGE = (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, MemoryError, OverflowError, RuntimeError)
+NPZ_DAMAGE = (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, MemoryError, OverflowError, RuntimeError)
+"""Errors of numpy and zipfile about a damaged archive."""
 
 Kind = Literal["npz", "submission"]
 
@@ -145,7 +146,7 @@ def _read_npz(path: Path, keys: Sequence[str]) -> dict[str, np.ndarray]:
             if missing:
                 raise DataError(f"{path}: no {', '.join(missing)} in it, only {', '.join(archive.files) or 'nothing'}.")
             return {key: archive[key] for key in keys}
-    except _NPZ_DAMAGE as error:
+    except NPZ_DAMAGE as error:
         # numpy takes what it does not know for a pickle; its own words would suggest to allow that
         is_archive = zipfile.is_zipfile(path)
         looks_pickled = is_archive and isinstance(error, ValueError) and "pickle" in str(error)

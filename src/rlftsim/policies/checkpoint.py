@@ -26,6 +26,7 @@ from torch import Tensor, nn
 from rlftsim.aliases import current_names
 from rlftsim.atomic_io import save_tensors, write_text
 from rlftsim.errors import CheckpointError, ConfigError
+from rlftsim.jobs.folder import check_folder
 
 CONFIG, WEIGHTS, CARD = "config.json", "model.safetensors", "README.md"
 SHIPPED_MODELS = Path(__file__).parent / "shipped"
@@ -129,6 +130,7 @@ def save_model(
         DataError: the folder cannot be written.
     """
     folder, architecture = Path(folder), getattr(policy, "architecture", None)
+    check_folder(folder, "model")
     if not isinstance(architecture, str):
         kind = type(policy).__name__
         raise ConfigError(

@@ -34,6 +34,7 @@ import rlftsim
 from rlftsim.aliases import current_name, current_names
 from rlftsim.atomic_io import cannot_write, write_text, write_whole
 from rlftsim.errors import ConfigError, DataError, whole_number
+from rlftsim.jobs.folder import check_folder
 from rlftsim.scenario.index_row import AGENT_COLUMNS
 from rlftsim.scenario.shards import (
     INDEX_FIELDS,
@@ -255,6 +256,7 @@ class DatasetWriter:
         provenance: Mapping[str, object] | None = None,
     ) -> None:
         self.folder = require_folder(folder)
+        check_folder(self.folder, "data set")
         if self.folder.exists() and (not self.folder.is_dir() or any(self.folder.iterdir())):
             raise DataError(f"{self.folder} is not an empty folder: choose another one or delete it")
         # beside the folder, so that renaming it never crosses file systems
