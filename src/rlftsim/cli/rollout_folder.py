@@ -27,7 +27,7 @@ def claim_folder(folder: Path, about: Mapping[str, Any]) -> None:
         ConfigError: the folder holds rollouts of another model or other settings.
         DataError: its description is damaged.
     """
-    check_folder(folder, "rollouts")
+    check_folder(folder, "set of rollouts")
     path = folder / ABOUT
     rollouts = sorted(folder.glob("*.npz"))
     unknown = "model and settings of its rollouts are unknown: name another --out."

@@ -5,13 +5,13 @@ from typing import Literal
 
 from rlftsim.errors import ConfigError, DataError, in_short
 
-FolderType = Literal["data set", "submission", "rollouts", "model", "run", "results"]
+FolderType = Literal["data set", "submission", "set of rollouts", "model", "run", "results"]
 """Type of a result folder. "results" are files that lie beside others, such as evaluations, pages and reports."""
 
 MARKERS: dict[FolderType, tuple[tuple[str, ...], ...]] = {
     "data set": (("manifest.json", "index.parquet"), ("manifest.json", "shards"), ("INCOMPLETE",)),
     "submission": (("plan.json", "shards"), ("plan.json", "submission.tar.gz"), ("plan.json", ".lock")),
-    "rollouts": (("rollouts.json",),),
+    "set of rollouts": (("rollouts.json",),),
     "model": (("config.json", "model.safetensors"),),
     "run": (("config.json", "environment.json"), ("config.json", "checkpoints")),
 }
@@ -22,7 +22,7 @@ INNER_FOLDERS: dict[FolderType, tuple[str, ...]] = {
     "run": ("checkpoints", "tensorboard"),
 }
 """Folders inside a result folder that are its own alone."""
-MAY_LIE_BESIDE: dict[FolderType, tuple[FolderType, ...]] = {"results": ("rollouts", "run")}
+MAY_LIE_BESIDE: dict[FolderType, tuple[FolderType, ...]] = {"results": ("set of rollouts", "run")}
 """Types of result that may be written into a folder of another type, which has no use for their names."""
 
 
@@ -50,8 +50,7 @@ def check_folder(folder: Path, folder_type: FolderType) -> None:
         raise DataError(f"{folder} lies inside {holder}: choose another folder.")
     found = recognize_folder(folder)
     if found not in (None, folder_type, *MAY_LIE_BESIDE.get(folder_type, ())):
-        wanted = "other results" if folder_type == "results" else f"a {folder_type}"
-        raise DataError(f"{folder} is the folder of a {found}: choose another folder for {wanted}.")
+        raise DataError(f"{folder} is the folder of a {found}: choose another folder.")
 
 
 def check_file(path: Path) -> None:

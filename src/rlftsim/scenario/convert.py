@@ -142,7 +142,7 @@ def convert(
     if jobs is not None and jobs < 1:
         raise ConfigError(f"jobs must be at least 1, got {jobs}: leave it out for one per core.")
     if split is not None:
-        check_name(split, "the split's name (left out, it is read off the folder or file)")
+        check_name(split, "a split's name")
     # 1. Refuse a destination that holds anything but a data set or an unfinished conversion.
     folder = require_folder(destination)
     check_folder(folder, "data set")
