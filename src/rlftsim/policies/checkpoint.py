@@ -28,6 +28,7 @@ from rlftsim.atomic_io import save_tensors, write_text
 from rlftsim.errors import CheckpointError, ConfigError
 from rlftsim.jobs.arrays import read_tensors
 from rlftsim.jobs.files import read_json
+from rlftsim.jobs.folder import check_folder
 
 CONFIG, WEIGHTS, CARD = "config.json", "model.safetensors", "README.md"
 SHIPPED_MODELS = Path(__file__).parent / "shipped"
@@ -133,6 +134,7 @@ def save_model(
         DataError: the folder cannot be written.
     """
     folder, architecture = Path(folder), getattr(policy, "architecture", None)
+    check_folder(folder, "model")
     if not isinstance(architecture, str):
         kind = type(policy).__name__
         raise ConfigError(

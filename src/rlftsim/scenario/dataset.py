@@ -35,6 +35,7 @@ from rlftsim.aliases import current_name, current_names
 from rlftsim.atomic_io import cannot_write, write_text, write_whole
 from rlftsim.errors import ConfigError, DataError, require_types, whole_number
 from rlftsim.jobs.files import read_json
+from rlftsim.jobs.folder import check_folder
 from rlftsim.jobs.tables import check_columns, read_parquet
 from rlftsim.scenario.index_row import AGENT_COLUMNS
 from rlftsim.scenario.shards import (
@@ -268,6 +269,7 @@ class DatasetWriter:
         provenance: Mapping[str, object] | None = None,
     ) -> None:
         self.folder = require_folder(folder)
+        check_folder(self.folder, "data set")
         if self.folder.exists() and (not self.folder.is_dir() or any(self.folder.iterdir())):
             raise DataError(f"{self.folder} is not an empty folder: choose another one or delete it")
         # beside the folder, so that renaming it never crosses file systems

@@ -6,7 +6,6 @@ renamed when it is whole, so a folder of that name is never half-written.
 
 import json
 import math
-import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,7 +13,7 @@ from pathlib import Path
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from rlftsim.atomic_io import errors_name, save_tensors, write_text
+from rlftsim.atomic_io import errors_name, remove_folder, save_tensors, write_text
 from rlftsim.errors import CheckpointError
 from rlftsim.jobs.arrays import read_tensors
 from rlftsim.jobs.files import read_json
@@ -48,9 +47,10 @@ def write_checkpoint(folder: Path, progress: Progress, modules: dict[str, nn.Mod
     """
     target = folder / f"{PREFIX}{progress.update:08d}"
     partial = folder / f".partial-{target.name}"
+    files = (*(f"{name}.safetensors" for name in (*modules, "optimizer")), "progress.json")
     with errors_name(target):
-        shutil.rmtree(partial, ignore_errors=True)  # left by a run that was killed
-        partial.mkdir(parents=True)
+        remove_folder(partial, files)  # left by a run that was killed
+        partial.mkdir(parents=True, exist_ok=True)
         for name, module in modules.items():
             save_tensors(partial / f"{name}.safetensors", module.state_dict())
         # "0.exp_avg" = the first moment of the first parameter, in the order of the optimizer's groups.
@@ -58,17 +58,22 @@ def write_checkpoint(folder: Path, progress: Progress, modules: dict[str, nn.Mod
         tensors = {f"{i}.{name}": value.detach().cpu() for i, state in states.items() for name, value in state.items()}
         save_tensors(partial / "optimizer.safetensors", tensors)
         write_text(partial / "progress.json", json.dumps({"update": progress.update, "numbers": progress.numbers}))
-        shutil.rmtree(target, ignore_errors=True)
+        remove_folder(target, files)
         partial.rename(target)
-    # Names are padded with zeros, so their order is that of the updates. Only now is an older one expendable.
-    for old in sorted(folder.glob(f"{PREFIX}*"))[:-KEPT]:
-        shutil.rmtree(old)
+        # Names are padded with zeros, so their order is that of the updates. Only now is an older one expendable.
+        for old in _checkpoints(folder)[:-KEPT]:
+            remove_folder(old, files)
     return target
 
 
 def newest_checkpoint(folder: Path) -> Path | None:
     """The latest whole checkpoint of a run; None if it has none yet."""
-    return max(folder.glob(f"{PREFIX}*"), default=None)
+    return max(_checkpoints(folder), default=None)
+
+
+def _checkpoints(folder: Path) -> list[Path]:
+    """Whole checkpoints of a run, the latest last; anything else of a similar name is a user's."""
+    return sorted(path for path in folder.glob(f"{PREFIX}*") if path.name.removeprefix(PREFIX).isdecimal())
 
 
 def update_of(path: Path) -> int:

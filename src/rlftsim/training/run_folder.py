@@ -27,6 +27,7 @@ from rlftsim.aliases import current_names
 from rlftsim.atomic_io import append_text, errors_name, write_text
 from rlftsim.errors import CheckpointError, DataError
 from rlftsim.jobs.files import parse_json, read_json
+from rlftsim.jobs.folder import check_folder
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.types import Scenarios, scenario_ids_of
@@ -183,6 +184,7 @@ class RunFolder:
         defaults: Mapping[str, Any] | None = None,
         may_grow: Collection[str] = (),
     ):
+        check_folder(path, "run")
         self.path = path
         self.checkpoints = path / "checkpoints"
         self.model = path / "model"

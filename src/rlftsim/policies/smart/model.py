@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 
 from rlftsim.errors import CheckpointError, ConfigError
+from rlftsim.jobs.folder import check_folder
 from rlftsim.policies.checkpoint import check_fit, load_strictly, read_model, save_model
 from rlftsim.policies.distributions import CategoricalDistribution, LazyTokenDistribution, TokenDistribution
 from rlftsim.policies.sharing import are_frozen_alike
@@ -149,6 +150,7 @@ class SmartModel(nn.Module):
             folder: created where it is missing.
             card: text of README.md.
         """
+        check_folder(Path(folder), "model")
         Path(folder).mkdir(parents=True, exist_ok=True)
         self.vocabulary.to("cpu").save(Path(folder) / VOCABULARY)
         card = card or "A SMART traffic model. Origin unknown.\n"

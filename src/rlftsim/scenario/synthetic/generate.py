@@ -14,6 +14,7 @@ from rlftsim.aliases import current_names
 from rlftsim.atomic_io import remove_temporaries_below, write_text
 from rlftsim.errors import ConfigError, DataError, RlftsimError
 from rlftsim.jobs.files import read_json
+from rlftsim.jobs.folder import check_folder
 from rlftsim.lease import Lease
 from rlftsim.progress import progress_bar
 from rlftsim.scenario.dataset import (
@@ -152,6 +153,7 @@ def generate(
     """
     request = SyntheticRequest(num_scenarios, seed, scenarios_per_network, splits)
     folder = Path(destination)
+    check_folder(folder, "data set")
     tasks = plan_networks(request)
     runner = runner or on_this_machine(jobs, len(tasks))
     require_begun(runner, folder)
