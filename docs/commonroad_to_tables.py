@@ -1,4 +1,4 @@
-"""CommonRoad scenarios (XML 2018b, plain or gzip) to the tables that `rlftsim convert --from tables` reads.
+"""CommonRoad scenarios (XML 2018b or 2020a, plain or gzip) to the tables that `rlftsim convert --from tables` reads.
 
     python docs/commonroad_to_tables.py XML_FOLDER TABLES_FOLDER      needs numpy, pyarrow, shapely
     rlftsim convert TABLES_FOLDER data/commonroad
@@ -8,7 +8,7 @@ Only dynamic obstacles with a trajectory are taken. What the files do not have:
 * an ego: the vehicle nearest to the start of the planning problem that is there for all of the first 9.1 s is taken
 * heights: of vehicles and ground, both are left to the converter
 * road edges: the outline of all lanelets, without its pieces where a lanelet begins or ends at the border of the map
-* painted lines, crosswalks, traffic lights: left out
+* painted lines, crosswalks, traffic lights, speed limits on signs (2020a): left out
 """
 
 import gzip
@@ -26,8 +26,9 @@ LICENSE = (
     "NGSIM trajectories: U.S. Department of Transportation, open data. Maps: OpenStreetMap contributors, ODbL. "
     "The terms of the CommonRoad scenario files apply."
 )
-KINDS = {"car": "vehicle", "truck": "vehicle", "bus": "vehicle", "motorcycle": "cyclist", "bicycle": "cyclist",
-         "pedestrian": "pedestrian"}  # fmt: skip
+VERSIONS = ("2018b", "2020a")
+KINDS = {"car": "vehicle", "truck": "vehicle", "bus": "vehicle", "taxi": "vehicle", "priorityVehicle": "vehicle",
+         "motorcycle": "cyclist", "bicycle": "cyclist", "pedestrian": "pedestrian"}  # fmt: skip
 STEPS = 91
 SLIT_M = 0.6
 """Gaps between lanelets up to this width are closed, islands narrower than it disappear."""
@@ -56,24 +57,31 @@ def at_fractions(points, count):
 
 def read_tracks(root, name):
     """Rows of tracks.parquet."""
-    for obstacle in root.iter("obstacle"):
-        if obstacle.findtext("role") != "dynamic" or obstacle.find("trajectory") is None:
+    # 2018b names the role inside, 2020a by the element
+    moving = [obstacle for obstacle in root.iter("obstacle") if obstacle.findtext("role") == "dynamic"]
+    for obstacle in [*moving, *root.iter("dynamicObstacle")]:
+        if obstacle.find("trajectory") is None:
             continue
         shape = obstacle.find("shape/rectangle")
+        length, width = (float(shape.findtext(side)) for side in ("length", "width")) if shape is not None else (
+            [2 * float(obstacle.findtext("shape/circle/radius"))] * 2
+        )  # fmt: skip
         for state in [obstacle.find("initialState"), *obstacle.iter("state")]:
             heading, speed = number(state, "orientation"), number(state, "velocity")
             yield {
-                "scenario_id": name, "object_id": int(obstacle.get("id")), "type": KINDS[obstacle.findtext("type")],
+                "scenario_id": name, "object_id": int(obstacle.get("id")),
+                "type": KINDS.get(obstacle.findtext("type"), "other"),
                 "step": round(number(state, "time")), "x": float(state.findtext("position/point/x")),
                 "y": float(state.findtext("position/point/y")), "heading": heading,
                 "vx": speed * math.cos(heading), "vy": speed * math.sin(heading),
-                "length": float(shape.findtext("length")), "width": float(shape.findtext("width")),
+                "length": length, "width": width,
             }  # fmt: skip
 
 
 def read_map(root, name):
     """Rows of map.parquet and lanes.parquet."""
-    kind = "lane_freeway" if "highway" in root.get("tags", "").split() else "lane_surface_street"
+    tags = [*root.get("tags", "").split(), *(tag.tag for tag in root.findall("scenarioTags/*"))]
+    kind = "lane_freeway" if "highway" in tags else "lane_surface_street"
     points, lanes, areas, ends = [], [], [], []
     lanelets = list(root.findall("lanelet"))
     for lanelet in lanelets:
@@ -126,6 +134,10 @@ def main(source, destination):
     tables = {"tracks": [], "map": [], "lanes": [], "scenarios": []}
     for path in sorted([*Path(source).glob("*.xml"), *Path(source).glob("*.xml.gz")]):
         root = ElementTree.fromstring(gzip.decompress(path.read_bytes()) if path.suffix == ".gz" else path.read_bytes())
+        if root.get("commonRoadVersion") not in VERSIONS:
+            sys.exit(
+                f"{path}: CommonRoad version {root.get('commonRoadVersion')}, only {' and '.join(VERSIONS)} are read."
+            )
         name = root.get("benchmarkID")
         tracks = list(read_tracks(root, name))
         points, lanes = read_map(root, name)

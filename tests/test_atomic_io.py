@@ -4,6 +4,9 @@ import errno
 import os
 import resource
 import stat
+import subprocess
+import sys
+import threading
 from pathlib import Path
 
 import pytest
@@ -11,7 +14,15 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file
 
-from rlftsim.atomic_io import append_text, errors_name, remove_temporaries, save_tensors, write_text, write_whole
+from rlftsim.atomic_io import (
+    append_text,
+    errors_name,
+    remove_folder,
+    remove_temporaries,
+    save_tensors,
+    write_text,
+    write_whole,
+)
 from rlftsim.errors import DataError
 
 
@@ -125,3 +136,67 @@ def test_lines_are_added_to_what_is_there(tmp_path):
 def test_errors_that_are_not_of_the_system_pass_as_they_are(tmp_path):
     with pytest.raises(KeyError), errors_name(tmp_path):
         raise KeyError("x")
+
+
+def test_a_symbolic_link_stays_and_its_target_is_replaced_whole(tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    target, link = tmp_path / "elsewhere" / "goals.json", tmp_path / "goals.json"
+    target.write_text("old")
+    link.symlink_to(target)
+    write_text(link, "new")
+    assert (link.is_symlink(), target.read_text()) == (True, "new")
+    assert names(tmp_path / "elsewhere") == ["goals.json"]
+    (tmp_path / "to_nothing").symlink_to("elsewhere/later.json")
+    write_text(tmp_path / "to_nothing", "new")
+    assert (tmp_path / "elsewhere" / "later.json").read_text() == "new"
+
+
+def test_a_pipe_is_written_through_and_stays(tmp_path):
+    pipe, received = tmp_path / "pipe", []
+    os.mkfifo(pipe)
+    reader = threading.Thread(target=lambda: received.append(pipe.read_text()))
+    reader.start()
+    write_text(pipe, "bytes")
+    reader.join(timeout=10)
+    assert received == ["bytes"]
+    assert stat.S_ISFIFO(pipe.stat().st_mode)
+    assert names(tmp_path) == ["pipe"]
+
+
+def test_a_device_is_written_through_and_stays(tmp_path):
+    device = tmp_path / "null"
+    try:
+        os.mknod(device, 0o666 | stat.S_IFCHR, os.makedev(1, 3))
+    except PermissionError:
+        pytest.skip("needs root")
+    write_text(device, "nothing")
+    assert stat.S_ISCHR(device.stat().st_mode)
+
+
+def test_a_folder_is_removed_only_with_what_its_writer_names(tmp_path):
+    folder = tmp_path / "update-00000001"
+    folder.mkdir()
+    for name in ("policy.safetensors", ".policy.safetensors.host.7.tmp", "notes.txt"):
+        (folder / name).touch()
+    remove_folder(folder, ["policy.safetensors", "missing.json"])
+    assert names(folder) == ["notes.txt"]
+    (folder / "notes.txt").unlink()
+    remove_folder(folder, [])
+    remove_folder(folder, [])
+    assert names(tmp_path) == []
+
+
+def test_tensors_have_the_same_bytes_in_each_process(tmp_path):
+    code = """
+import sys
+from pathlib import Path
+import torch
+from rlftsim.atomic_io import save_tensors
+tensors = {f"t{i}": torch.arange(i, dtype=torch.float32 if i % 2 else torch.int64) for i in range(6)}
+save_tensors(Path(sys.argv[1]), tensors, {f"näme {i}": '"\\n' * i for i in range(12)})
+"""
+    paths = [tmp_path / f"{n}.safetensors" for n in range(3)]
+    for path in paths:
+        subprocess.run([sys.executable, "-c", code, str(path)], check=True)
+    assert len({path.read_bytes() for path in paths}) == 1
+    assert load_file(paths[0])["t4"].tolist() == [0, 1, 2, 3]

@@ -1,11 +1,14 @@
 """Files that are written whole or not at all: under another name beside their own, then renamed."""
 
 import errno
+import json
 import os
 import re
+import shutil
 import socket
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, nullcontext, suppress
 from glob import escape
 from pathlib import Path
 
@@ -59,6 +62,8 @@ def cannot_write(path: Path, error: OSError) -> DataError:
 def write_whole(path: Path, write: Callable[[Path], object]) -> None:
     """Let `write` fill a temporary file beside `path`, then give it that name. A missing folder is created.
 
+    A symbolic link stays, and what it leads to is replaced. Devices and pipes stay, too: they get the finished bytes.
+
     Args:
         path: of the file.
         write: called with the path of the temporary file.
@@ -67,18 +72,26 @@ def write_whole(path: Path, write: Callable[[Path], object]) -> None:
         DataError: the file cannot be written, such as on a full disk. Then, and after any other error, nothing is left
             behind and a file that was there before is untouched.
     """
-    temporary = temporary_beside(path)
-    try:
-        with errors_name(path):
-            path.parent.mkdir(parents=True, exist_ok=True)
+    target = Path(os.path.realpath(path)) if path.is_symlink() else path
+    # Asked of the path: /dev/stdout leads to a pipe, which has no path of its own.
+    is_stream = path.exists() and not (path.is_file() or path.is_dir())
+    folder = tempfile.TemporaryDirectory() if is_stream else nullcontext(target.parent)
+    with errors_name(path), folder as place:
+        temporary = temporary_beside(Path(place) / target.name)
+        try:
+            temporary.parent.mkdir(parents=True, exist_ok=True)
             write(temporary)
             # On disk before it gets the name: after a power cut the name must not stand for an empty file.
             with temporary.open("rb") as file:
                 os.fsync(file.fileno())
-            temporary.replace(path)
-    finally:
-        if temporary.is_file():
-            temporary.unlink()
+                if is_stream:
+                    with path.open("wb") as stream:
+                        shutil.copyfileobj(file, stream)
+            if not is_stream:
+                temporary.replace(target)
+        finally:
+            if temporary.is_file():
+                temporary.unlink()
 
 
 def temporary_beside(path: Path) -> Path:
@@ -98,6 +111,20 @@ def remove_temporaries_below(folder: Path) -> None:
     for path in folder.rglob(".*.tmp"):
         if _TEMPORARY.fullmatch(path.name):
             path.unlink(missing_ok=True)
+
+
+def remove_folder(folder: Path, names: Iterable[str]) -> None:
+    """Remove files of the given names and what killed processes left of them, then the folder if nothing else is in it.
+
+    Args:
+        folder: May be missing. Files of other names, and folders in it, stay.
+        names: Files that the caller has written there.
+    """
+    for name in names:
+        (folder / name).unlink(missing_ok=True)
+        remove_temporaries(folder / name)
+    with suppress(OSError):  # it holds something else, or is gone
+        folder.rmdir()
 
 
 def write_text(path: Path, text: str) -> None:
@@ -128,7 +155,7 @@ def append_text(path: Path, text: str) -> None:
 
 
 def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: dict[str, str] | None = None) -> None:
-    """Write named tensors as safetensors, readable by all users that may read the folder.
+    """Write named tensors as safetensors, the same bytes in each process, readable by all that may read the folder.
 
     Args:
         path: of the file.
@@ -143,6 +170,7 @@ def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: dict[str, 
         contiguous = {name: t.detach().cpu().contiguous() for name, t in tensors.items()}
         try:
             save_file(contiguous, temporary, metadata=metadata)
+            _sort_metadata(temporary)
         except SafetensorError as error:  # safetensors reports a full disk by an error of its own
             number = _ERROR_NUMBER.search(str(error))
             raise (OSError(int(number[1]), os.strerror(int(number[1]))) if number else OSError(str(error))) from None
@@ -152,3 +180,16 @@ def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: dict[str, 
         temporary.chmod(0o666 & ~mask)
 
     write_whole(path, write)
+
+
+def _sort_metadata(path: Path) -> None:
+    """Sort the metadata in the header of a safetensors file, whose order differs from process to process."""
+    with path.open("r+b") as file:
+        size = int.from_bytes(file.read(8), "little")
+        header = json.loads(file.read(size))
+        if "__metadata__" in header:
+            header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+            text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode().ljust(size)
+            assert len(text) == size, "both write JSON without spaces"
+            file.seek(8)
+            file.write(text)

@@ -4,6 +4,7 @@ import math
 import operator
 import os
 import traceback
+from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from types import UnionType
 from typing import Any, ClassVar, Literal, Union, get_args, get_origin, get_type_hints
@@ -41,9 +42,31 @@ class CheckpointError(RlftsimError):
     """A checkpoint or run folder that is damaged or does not fit; the message names the key or file and what to do."""
 
 
+MAX_VALUE, MAX_MESSAGE = 100, 2000
+"""Characters of a value in a message, and of a message."""
+
+
 def in_short(value: object) -> str:
-    """A value as a message shows it: numbers and text as they are, anything else by its type."""
-    return repr(value) if isinstance(value, str | int | float | None) else type(value).__name__
+    """A value as a message shows it: numbers and text, of which the middle is left out where it is long, anything else
+    by its type."""
+    if not isinstance(value, str | int | float | None):
+        return type(value).__name__
+    if isinstance(value, int) and value.bit_length() > 4 * MAX_VALUE:  # Python writes no number of 5000 digits
+        return f"a number of {value.bit_length()} bits"
+    return shorten(repr(value), MAX_VALUE)
+
+
+def shorten(text: str, most: int = MAX_MESSAGE) -> str:
+    """A text on one line, without control characters, and without its middle where it is long.
+
+    Args:
+        text: Any text, such as a message that carries what a user wrote.
+        most: Characters that are left of it; those left out are counted in their place.
+    """
+    if len(text) > most:
+        gap = f" ... {len(text) - most} characters ... "
+        text = text[: most // 2] + gap + text[len(text) - most // 2 :]
+    return "".join(sign if sign.isprintable() else " " for sign in text)
 
 
 def place_of(error: BaseException) -> str:
@@ -137,6 +160,22 @@ def require_finite(config: object, names: tuple[str, ...]) -> None:
     for name in names:
         if not math.isfinite(getattr(config, name)):
             raise ConfigError(f"{name} must be a finite number, got {getattr(config, name)}.")
+
+
+def check_limits(config: object, limits: Mapping[Any, int]) -> None:
+    """Check that fields of a configuration are not above their limits, which keep a slip from filling the memory.
+
+    Args:
+        config: a dataclass; fields that are None have no limit.
+        limits: Highest value of a field, by its name.
+
+    Raises:
+        ConfigError: A value is above its limit; the message names both.
+    """
+    for name, limit in limits.items():
+        value = getattr(config, name)
+        if value is not None and not value <= limit:
+            raise ConfigError(f"{name} must be at most {limit}, got {str(value)[:40]}.")
 
 
 def given(config: object, names: tuple[str, ...]) -> tuple[str, ...]:

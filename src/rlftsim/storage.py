@@ -5,6 +5,7 @@ Credentials are found by the libraries in their own ways; nothing here reads, ke
 
 import hashlib
 import os
+import re
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -33,6 +34,8 @@ READ_ONLY = ("hf", "http", "https")
 """Protocols that only read: what is written to a repository at Hugging Face is a commit of its own."""
 SECONDS_OF_A_TEMPORARY = 24 * 3600.0
 """What a killed process left in the cache is removed after so long."""
+_SHA256 = re.compile("[0-9a-f]{64}")
+"""Names of shards in the cache; a file of another name is somebody else's."""
 _EXTRAS = {"s3": "s3", "s3a": "s3", "gs": "gcs", "gcs": "gcs", "hf": "hf"}
 
 
@@ -259,7 +262,7 @@ def _evict(newest: Path) -> None:
             with suppress(FileNotFoundError):  # another process has just finished it
                 if time.time() - path.stat().st_mtime > SECONDS_OF_A_TEMPORARY:
                     path.unlink()
-        shards = [path for path in newest.parent.iterdir() if not path.suffix]
+        shards = [path for path in newest.parent.iterdir() if _SHA256.fullmatch(path.name)]
         shards.sort(key=lambda path: path.stat().st_mtime, reverse=True)
         total = 0
         for path in shards:

@@ -23,8 +23,8 @@ import threading
 import time
 import traceback
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from multiprocessing import resource_tracker
@@ -35,6 +35,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 
 from rlftsim.atomic_io import append_text
 from rlftsim.errors import ConfigError, DataError, NotYetError, RlftsimError
+from rlftsim.jobs.interruption import ctrl_c_blocked
 from rlftsim.progress import log
 from rlftsim.threads import keep_freed_memory
 
@@ -314,7 +315,8 @@ class Processes:
         waiting = attempts.waiting
         crew: dict[Any, _Worker] = {}
         failed_starts = 0
-        resource_tracker.ensure_running()  # before Ctrl-C is blocked: starting it unblocks Ctrl-C
+        with ctrl_c_blocked():
+            resource_tracker.ensure_running()  # apart from the others: starting it unblocks Ctrl-C
         try:
             while (num_left := len(items) - len(results) - len(attempts.set_aside)) > 0:
                 with ctrl_c_blocked():
@@ -500,19 +502,6 @@ def _work(line: Connection) -> None:
             except Exception as error:
                 say("error", portable_error(error))
             say("idle")
-
-
-@contextmanager
-def ctrl_c_blocked() -> Iterator[None]:
-    """Context in which Ctrl-C waits. Processes that are started in it never see it.
-
-    Ctrl-C reaches all processes of a terminal, but only the one that started the others is to react, and ends them.
-    """
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def exit_with_parent() -> None:

@@ -663,7 +663,7 @@ def test_an_evaluation_with_goals_says_so_and_replaces_none_without(tmp_path, ca
     status, _, err = run(capsys, *arguments)
     assert (
         status,
-        "goal-seeker.parquet was measured with goals=logged, not none: give this one another --name" in err,
+        "goal-seeker.parquet is the result of another goals: choose another --name" in err,
     ) == (2, True)
     status, out, _ = run(capsys, *arguments, "--name", "free")
     assert (status, "missed" in out) == (0, False)

@@ -196,21 +196,35 @@ def test_a_quick_look_keeps_what_a_longer_evaluation_has_done(data, tmp_path, mo
 
 
 def test_unfinished_parts_of_other_settings_outlive_a_repeated_command(data, tmp_path):
-    evaluate(Wobble(), data, tmp_path, CONFIG, name="run")
     with pytest.raises(Unfinished):
-        evaluate(Wobble(), data, tmp_path, replace(CONFIG, seed=1), name="run", runner=Share(1, 2, Inline()))
-    parts = sorted((tmp_path / "run.parts").glob("*.parquet"))
-    assert parts
-    evaluate(Wobble(), data, tmp_path, CONFIG, name="run")
-    assert sorted((tmp_path / "run.parts").glob("*.parquet")) == parts
+        evaluate(Wobble(), data, tmp_path, replace(CONFIG, seed=1), name="run", runner=Share(2, 2, Inline()))
+    (part,) = (tmp_path / "run.parts").glob("*.parquet")
+    for _ in range(2):
+        evaluate(Wobble(), data, tmp_path, replace(CONFIG, limit=4), name="run")
+        assert part.exists()
 
 
-def test_parts_and_results_of_another_policy_are_replaced_with_a_message(data, tmp_path, capsys):
+@pytest.mark.parametrize(
+    ("policy", "config", "what"),
+    [(Wobble(strength_mps=2.0), CONFIG, "policy_fingerprint"), (Wobble(), replace(CONFIG, seed=1), "seed")],
+)
+def test_a_result_of_another_policy_or_other_settings_is_not_replaced(data, tmp_path, policy, config, what):
+    old = evaluate(Wobble(), data, tmp_path, CONFIG, name="w")
+    with pytest.raises(ConfigError, match=rf"w\.parquet is the result of another {what}: choose another --name"):
+        evaluate(policy, data, tmp_path, config, name="w")
+    assert same(Evaluation.read(tmp_path / "w.parquet"), old)
+
+
+def test_only_the_files_of_an_evaluation_are_removed_with_its_parts(data, tmp_path):
+    (tmp_path / "w.parts").mkdir()
+    (tmp_path / "w.parts" / "notes.txt").write_text("of a user")
+    evaluate(Wobble(), data, tmp_path, CONFIG, name="w")
+    assert [path.name for path in (tmp_path / "w.parts").iterdir()] == ["notes.txt"]
+
+
+def test_parts_of_another_policy_are_replaced_with_a_message(data, tmp_path, capsys):
     expected = evaluate(Wobble(strength_mps=2.0), data, tmp_path, CONFIG, name="expected")
     old = evaluate(Wobble(), data, tmp_path, CONFIG, name="w")
-    replace_all = evaluate(Wobble(strength_mps=2.0), data, tmp_path, CONFIG, name="w")
-    assert "another policy_fingerprint" in capsys.readouterr().err
-    assert same(replace_all, expected)
     parts = EvaluationParts("parts", old.provenance, tmp_path)
     parts.write(range(0, 4), [dict(row) for row in old.table.slice(0, 4).to_pylist()])
     assert same(evaluate(Wobble(strength_mps=2.0), data, tmp_path, CONFIG, name="parts"), expected)

@@ -3,6 +3,7 @@ import gzip
 import io
 import pickle
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,6 +16,10 @@ import scenes
 from rlftsim.errors import DataError
 from rlftsim.evaluation.rollout_files import find_rollouts, read_states
 from rlftsim.evaluation.wire_format import iterate_fields
+from rlftsim.rollout.baselines import ConstantVelocity
+from rlftsim.rollout.files import write_rollouts
+from rlftsim.rollout.simulate import simulate
+from rlftsim.scenario.batch import collate
 
 FUZZ = settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
@@ -248,3 +253,13 @@ def test_a_file_is_named_once_and_ids_that_occur_twice_are_named(arrays, tmp_pat
     ids[1] = ids[0]
     with pytest.raises(DataError, match=rf"object_ids must differ: {ids[0]} listed twice"):
         read_all(write_npz(path, {**arrays, "object_ids": ids}))
+
+
+def test_object_ids_of_more_than_32_bits_come_back(tmp_path):
+    scenario = scenes.lone_agent()
+    ids = scenario.tracks.object_id + 2**40
+    scenario = replace(scenario, tracks=replace(scenario.tracks, object_id=ids))
+    batch = collate([scenario])
+    write_rollouts(tmp_path, batch, simulate(ConstantVelocity(), batch, num_rollouts=2, seed=0))
+    (entry,) = find_rollouts(tmp_path)
+    assert read_states(entry).object_id.tolist() == ids[scenario.simulated_indices].tolist()

@@ -114,15 +114,15 @@ def test_a_quick_look_keeps_what_a_longer_scoring_has_done(data, rollouts, tmp_p
         score_rollouts(rollouts, data, tmp_path, replace(CONFIG, limit=1))
 
 
-def test_other_rollouts_under_the_same_name_are_scored_again(data, rollouts, tmp_path, capsys):
+def test_scores_of_other_rollouts_are_not_replaced(data, rollouts, tmp_path):
     folder = tmp_path / "rollouts"
     folder.mkdir()
     write_npz(folder / "a.npz", draw_arrays(SCENARIOS[0], seed=1))
     first = score_rollouts(folder, data, tmp_path / "out", CONFIG)
     write_npz(folder / "a.npz", draw_arrays(SCENARIOS[0], seed=2))
-    second = score_rollouts(folder, data, tmp_path / "out", CONFIG)
-    assert "another policy_fingerprint" in capsys.readouterr().err
-    assert not same(first, second)
+    with pytest.raises(ConfigError, match="is the result of another policy_fingerprint: choose another"):
+        score_rollouts(folder, data, tmp_path / "out", CONFIG)
+    assert same(Evaluation.read(tmp_path / "out" / "rollouts.parquet"), first)
 
 
 def test_json_has_the_official_names_and_where_the_data_come_from(data, rollouts):

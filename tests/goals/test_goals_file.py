@@ -48,10 +48,10 @@ def test_what_is_written_is_read(tmp_path):
         ({"scenario": 5}, r"goals\[1\]: scenario must be text in quotes, is a number"),
         ({"label": 5}, r"goals\[1\]: label must be text"),
         ({"lable": "x"}, r"goals\[1\]: no field 'lable' here: did you mean 'label'"),
-        ({"label": "\ud800"}, r"goals\[1\]: label has half a character, U\+D800, that cannot be shown"),
+        ({"label": "\ud800"}, r"half a character, U\+D800, in a text: goals are a list"),
         ({"label": "a\x1b[31m"}, r"goals\[1\]: label has a control character, U\+001B"),
-        ({"x": 10**400}, r"goals\[1\]: x is inf: a goal needs a finite point"),
-        ({"agent": 10**400}, r"goals\[1\]: agent must be a whole number"),
+        ({"x": 10**400}, "a whole number of 401 digits"),
+        ({"agent": 2**63}, r"goals\[1\]: agent 9223372036854775808 is no object id, which have 64 bits"),
         ({"agent": 100}, r"goals\[1\]: agent 100 of scenario straight has a goal already \(.*goals\[0\]\)"),
     ],
 )
@@ -73,17 +73,17 @@ def test_a_wrong_entry_is_named(change, message, tmp_path):
         (f'{{"format": "{FORMAT}", "goals": [{{"x": 1}}]}}', r"goals\[0\]: scenario, agent, y missing"),
         (
             f'{{"format": "{FORMAT}", "goals": [{{"scenario": "s", "agent": 1, "x": {"1" * 5000}, "y": 1}}]}}',
-            r"goals\[0\]: x is inf",
+            "a whole number of 5000 digits",
         ),
         (
             f'{{"format": "{FORMAT}", "goals": [{{"scenario": "s", "agent": 1, "x": 1, "x": 2, "y": 1}}]}}',
-            r"goals\[0\]: x is written more than once",
+            "'x' is written more than once",
         ),
         (
             f'{{"format": "{FORMAT}", "goals": [], "goals": []}}',
-            r"json: goals is written more than once: keep one of them",
+            "json: 'goals' is written more than once: goals are a list",
         ),
-        (f'{{"format": "{FORMAT}", "goals": {"[" * 200_000}', "brackets nested too deeply"),
+        (f'{{"format": "{FORMAT}", "goals": {"[" * 200_000}', "brackets nested more than 64 deep"),
         (f'{{"format": "{FORMAT}", "goal": []}}', "no field 'goal' here: did you mean 'goals'"),
     ],
 )  # fmt: skip
@@ -103,7 +103,7 @@ def test_a_file_that_is_not_there_says_how_to_make_one(tmp_path):
     with pytest.raises(DataError, match="no such goals file: make one with `rlftsim goals propose`"):
         read_goals(tmp_path / "goals.json")
     (tmp_path / "goals.json").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(DataError, match="not a text file"):
+    with pytest.raises(DataError, match="not text in UTF-8"):
         read_goals(tmp_path / "goals.json")
 
 

@@ -376,7 +376,7 @@ BAD = {
     "mark": (lambda p: edit_map(p, lambda a, lane: lane.update(left_lane_mark_type="PINK")), "lane mark 'PINK'"),
     "lane": (lambda p: edit_map(p, lambda a, lane: lane.update(lane_type="RAIL")), "unknown lane type 'RAIL'"),
     "part": (lambda p: edit_map(p, lambda a, lane: a.pop("drivable_areas")), "has no drivable_areas"),
-    "text": (lambda p: next(p.glob("*.json")).write_text("{"), "it is no JSON text"),
+    "text": (lambda p: next(p.glob("*.json")).write_text("{"), "not JSON, line 1"),
     "time": (lambda p: edit_each(p, end_timestamp=3e17 + 1.2e10), "110 steps last 12"),
 }  # fmt: skip
 

@@ -62,7 +62,8 @@ def test_any_number_of_jobs_gives_the_same_bytes(source, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("setting", "cause"), [({"jobs": 0}, "jobs must be at least 1, got 0"), ({"split": " "}, "no name")]
+    ("setting", "cause"),
+    [({"jobs": 0}, "jobs must be at least 1, got 0"), ({"split": " "}, "a split's name becomes")],
 )
 def test_impossible_settings_are_refused(source, tmp_path, setting, cause):
     with pytest.raises(ConfigError, match=cause):

@@ -242,8 +242,8 @@ def test_a_missing_shard_is_named(folder):
 @pytest.mark.parametrize(
     ("file", "content", "cause"),
     [
-        ("manifest.json", b"{", "cannot be read"),
-        ("manifest.json", b"[]", "not the manifest"),
+        ("manifest.json", b"{", "not JSON, line 1"),
+        ("manifest.json", b"[]", "holds a list instead of an object"),
         ("manifest.json", b'{"format": "rlftsim scenarios", "schema_version": 99}', "schema version 99"),
         ("manifest.json", b'{"format": "rlftsim scenarios", "schema_version": 1}', "is damaged"),
         ("index.parquet", b"nonsense", "cannot be read"),

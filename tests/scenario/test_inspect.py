@@ -8,6 +8,7 @@ import pytest
 
 from rlftsim.errors import DataError
 from rlftsim.scenario import dataset
+from rlftsim.scenario.convert import convert
 from rlftsim.scenario.dataset import (
     DatasetWriter,
     build_index,
@@ -16,6 +17,7 @@ from rlftsim.scenario.dataset import (
     write_index_and_manifest,
 )
 from rlftsim.scenario.inspect import Problem, check_scenario, dataset_stats, verify_dataset
+from rlftsim.scenario.sources import CONTRADICTORY
 from rlftsim.scenario.types import Scenario
 from rlftsim.scenario.womd import scenario_from_bytes
 
@@ -80,9 +82,44 @@ def test_a_scenario_that_breaks_the_contract_is_found(make_message, tmp_path, mo
     scenario = scenario_from_bytes(make_message("a").SerializeToString())
     with monkeypatch.context() as other_writer:
         other_writer.setattr(Scenario, "refuse_broken", lambda _: None)
-        write_dataset([replace(scenario, ego_index=-1)], tmp_path / "data")
+        write_dataset(
+            [replace(scenario, tracks=replace(scenario.tracks, object_id=np.array([7, 7, 8])))], tmp_path / "data"
+        )
     (finding,) = verify_dataset(tmp_path / "data")
-    assert str(finding) == "broken scenario: a: ego_index names track index -1, but there are 3 tracks"
+    assert str(finding) == "broken scenario: a: object id 7 belongs to 2 tracks: give each its own"
+
+
+@pytest.mark.parametrize(
+    ("change", "cause"),
+    [
+        ({"timestamps_s": np.arange(91.0)}, "step 1 is 1.000 s after step 0 instead of 0.1 s: steps must be"),
+        (
+            {"tracks_to_predict": np.array([1, 1], np.int32), "difficulty": np.zeros(2, np.int8)},
+            "tracks_to_predict names track index 1 2 times",
+        ),
+    ],
+)
+def test_a_time_base_and_ids_that_an_earlier_version_took_are_found(make_message, tmp_path, monkeypatch, change, cause):
+    scenario = replace(scenario_from_bytes(make_message("a").SerializeToString()), **change)
+    with pytest.raises(DataError, match=cause):
+        write_dataset([scenario], tmp_path / "refused")
+    with monkeypatch.context() as earlier_version:
+        earlier_version.setattr(Scenario, "refuse_broken", lambda _: None)
+        write_dataset([scenario], tmp_path / "data")
+    (finding,) = verify_dataset(tmp_path / "data")
+    assert str(finding).startswith(f"broken scenario: a: {cause}")
+
+
+def test_velocities_across_the_motion_are_counted_by_convert_and_found(make_message, make_tfrecord, tmp_path):
+    across = make_message("a")
+    for state in (state for track in across.tracks for state in track.states):
+        state.velocity_x, state.velocity_y = 0.0, state.velocity_x
+    make_tfrecord(tmp_path / "x.tfrecord", across, make_message("b"))
+    report = convert(tmp_path / "x.tfrecord", tmp_path / "data", jobs=1, show_progress=False)
+    assert report.converted == 2
+    assert report.tallies == {CONTRADICTORY: 1}
+    (finding,) = verify_dataset(tmp_path / "data")
+    assert str(finding).startswith("contradictory motion: a: velocities contradict the change of positions in 2 of 2")
 
 
 def test_a_map_in_another_frame_and_positions_beyond_float32_are_found(

@@ -144,6 +144,12 @@ BAD = {
     "kind": ({"tracks": [{**row, "x": "a"} for row in TWO]}, "column x is string, it must have numbers"),
     "no map": ({"map_rows": drop(MAP, "scenario_id")}, "map.parquet has no column scenario_id or map_id"),
     "lane": ({"lanes": [{"scenario_id": "one", "lane_id": 2}]}, "lanes.parquet: row 0: lane 2 is no lane"),
+    "across": ({"tracks": [{**r, "vx": 0.0, "vy": 9.0} for r in TWO]}, "tracks.parquet: velocities contradict"),
+    "time base": ({"scenarios": [{**ROW, "step_s": 0.2}]}, "moves at 5.0 m/s, its velocity is 10.0 m/s and"),
+    "headings": ({"tracks": [{**r, "heading": 1.4} for r in TWO]}, "tracks.parquet: headings contradict the motion"),
+    "predict twice": ({"scenarios": [{**ROW, "predict": [8, 8]}]}, "row 0: predict lists object 8 twice"),
+    "lane twice": ({"lanes": [LANE, LANE]}, "lanes.parquet: row 1: a second row with lane_id 1"),
+    "light twice": ({"lights": [LIGHT, {**LIGHT, "state": "go"}]}, "row 1: a second row with lane_id 1, step 0"),
     "light": ({"lights": [{"scenario_id": "one", "step": 0, "lane_id": 1, "state": 77}]}, "row 0: state 77"),
 }  # fmt: skip
 
@@ -207,7 +213,7 @@ def test_several_folders_are_several_shards_with_their_licenses(tmp_path):
     assert data.guessed == ("ego", "predict", "size", "z")
 
 
-COMMONROAD = """<commonRoad benchmarkID="X" timeStepSize="0.1" tags="urban">
+COMMONROAD = """<commonRoad benchmarkID="X" commonRoadVersion="2018b" timeStepSize="0.1" tags="urban">
 <lanelet id="5"><leftBound>{left}</leftBound><rightBound>{right}</rightBound></lanelet>
 <obstacle id="1"><role>dynamic</role><type>car</type>
 <shape><rectangle><length>4</length><width>2</width></rectangle></shape>{states}</obstacle>
@@ -218,10 +224,11 @@ COMMONROAD = """<commonRoad benchmarkID="X" timeStepSize="0.1" tags="urban">
 def run_script(source, destination):
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     command = [sys.executable, ROOT / "docs" / "commonroad_to_tables.py", source, destination]
-    subprocess.run(command, check=True, env=environment)
+    return subprocess.run(command, env=environment, capture_output=True, text=True)
 
 
-def test_the_commonroad_script_writes_the_tables(tmp_path):
+@pytest.mark.parametrize("version", ["2018b", "2020a"])
+def test_the_commonroad_script_writes_the_tables(tmp_path, version):
     def points(*places):
         return "".join(f"<point><x>{x}</x><y>{y}</y></point>" for x, y in places)
 
@@ -235,9 +242,11 @@ def test_the_commonroad_script_writes_the_tables(tmp_path):
         state("initialState", 0) + "<trajectory>" + "".join(state("state", k) for k in range(1, 95)) + "</trajectory>"
     )
     text = COMMONROAD.format(left=points((0, 2), (150, 2)), right=points((0, -2), (150, -2)), states=states)
+    if version == "2020a":
+        text = text.replace("2018b", "2020a").replace("<role>dynamic</role>", "").replace("obstacle", "dynamicObstacle")
     (tmp_path / "xml").mkdir()
     (tmp_path / "xml" / "x.xml.gz").write_bytes(gzip.compress(text.encode()))
-    run_script(tmp_path / "xml", tmp_path / "tables")
+    assert run_script(tmp_path / "xml", tmp_path / "tables").returncode == 0
     (scenario,) = read(tmp_path / "tables")
     assert scenario.guessed == {"ego", "edges", "predict", "size", "z"}
     features = scenario.map_features
@@ -245,6 +254,14 @@ def test_the_commonroad_script_writes_the_tables(tmp_path):
     edges = [features.polyline(k) for k in features.indices_of((MapFeatureType.EDGE_BOUNDARY,))]
     assert sorted(float(edge[0, 1]) for edge in edges) == [-2.0, 2.0]
     assert {float(edge[0, 1]): edge[-1, 0] > edge[0, 0] for edge in edges} == {-2.0: True, 2.0: False}
+
+
+def test_the_commonroad_script_names_a_version_that_it_does_not_read(tmp_path):
+    (tmp_path / "x.xml").write_text('<commonRoad benchmarkID="X" commonRoadVersion="2017a"/>')
+    done = run_script(tmp_path, tmp_path / "tables")
+    assert done.returncode == 1
+    (line,) = done.stderr.splitlines()
+    assert line.endswith("x.xml: CommonRoad version 2017a, only 2018b and 2020a are read.")
 
 
 @pytest.mark.official

@@ -77,7 +77,7 @@ def test_every_kind_of_map_feature_gets_its_type_and_points():
         (womd_pb2.MapFeature(id=7, driveway=womd_pb2.Driveway()), MapFeatureType.DRIVEWAY, "driveway.polygon"),
     ]
     message = womd_pb2.Scenario(scenario_id="a", sdc_track_index=0)
-    message.timestamps_seconds.extend([0.0] * 11)
+    message.timestamps_seconds.extend(0.1 * step for step in range(11))
     message.tracks.add(id=1).states.extend([womd_pb2.ObjectState(length=4, width=2, height=2, valid=True)] * 11)
     for number, (feature, _, path) in enumerate(features):
         kind, points = path.split(".")
@@ -204,6 +204,22 @@ def spoil_timestamps(m):
     del m.timestamps_seconds[50:]
 
 
+def spoil_time_base(m):
+    m.timestamps_seconds[:] = [float(step) for step in range(91)]
+
+
+def spoil_one_time(m):
+    m.timestamps_seconds[40:] = [t + 0.1 for t in m.timestamps_seconds[40:]]  # a frame is missing
+
+
+def spoil_map_ids(m):
+    m.map_features[1].id = m.map_features[0].id
+
+
+def repeat_prediction(m):
+    m.tracks_to_predict.add(track_index=0, difficulty=1)
+
+
 def spoil_prediction(m):
     m.tracks_to_predict[0].track_index = 7
 
@@ -237,6 +253,10 @@ BAD = [
     (spoil_ego_invalid, r"the ego \(track 102\) is not valid at the current step"),
     (spoil_steps, "track 101 has 50 states, track 100 has 91"),
     (spoil_timestamps, "50 timestamps for 91 steps"),
+    (spoil_time_base, r"step 1 is 1\.000 s after step 0 instead of 0\.1 s: steps must be 0\.1 s apart"),
+    (spoil_one_time, r"step 40 is 4\.100 s after step 0 instead of 4\.0 s"),
+    (spoil_map_ids, "map feature id 7 belongs to 2 features"),
+    (repeat_prediction, "tracks_to_predict names track index 0 2 times"),
     (spoil_prediction, "track index 7, but there are 3 tracks"),
     (spoil_current, "current_time_index is 50 instead of 10"),
     (spoil_ids, "object id 100 belongs to 2 tracks"),
@@ -258,6 +278,13 @@ def test_a_bad_scenario_is_named_and_the_others_survive(tmp_path, make_message, 
     scenarios = list(read_scenarios(path, "skip", report=skipped.append))
     assert [scenario.scenario_id for scenario in scenarios] == ["a", "c"]
     assert [(s.file, s.record) for s in skipped] == [(str(path), 1)]
+
+
+def test_clocks_that_drift_and_jitter_like_those_of_real_logs_are_taken(make_message):
+    message = make_message("a")
+    times = 3.0 + 0.1002 * np.arange(91) + 0.01 * (-1.0) ** np.arange(91)
+    message.timestamps_seconds[:] = times.tolist()
+    assert parse(message).timestamps_s.tolist() == times.tolist()
 
 
 @pytest.mark.parametrize("record", [b"", b"\xff\xff\xff", b"not a message at all", b"\x0a\x10" + bytes(16)])

@@ -147,7 +147,7 @@ def raise_an_agent(shards):
 
 def shift_the_frame(shards):
     for trajectory in all_agents(shards):
-        trajectory.center_x[:] = [x + 4 for x in trajectory.center_x]
+        trajectory.center_x[:] = [x + 6 for x in trajectory.center_x]
 
 
 def repeat_a_scene(shards):
@@ -175,14 +175,14 @@ DAMAGES = [
     (8, repeat_a_scenario, "error", r"in the archive twice$", SECOND, "a0", None),
     (8, list_an_agent_twice, "error", r"listed twice in scene 7$", FIRST, "a0", 101),
     (9, take_a_scenario_of_another_split, "error", r"of split training, not testing$", FIRST, "another", None),
-    (10, write_a_nan, "error", r"x is nan in scene 7 at step 40$", FIRST, "a0", 102),
+    (10, write_a_nan, "error", r"x is nan at step 40 in scene 7$", FIRST, "a0", 102),
     (10, jump_far, "error", r"a step of \d+\.\d m in 0\.1 s in scene 7$", FIRST, "a0", 102),
-    (11, write_degrees, "warning", r"heading changes by 170\.00 rad", FIRST, "a0", 102),
+    (11, write_degrees, "warning", r"heading of 1\d\d rad \(degrees\?\) in scene 7$", FIRST, "a0", 102),
     (11, add_a_turn_midway, "warning", r"heading changes by 6\.28 rad", FIRST, "a0", 102),
     (12, forget_heights, "warning", r"z is 0 everywhere, in the log it is not", FIRST, "a0", None),
     (12, raise_an_agent, "warning", r"z is 21 m from that of the current step in scene 7$", FIRST, "a0", 102),
     (13, shift_the_frame, "warning", r"100 % of agents jump away from the log", "a.tar.gz", None, None),
-    (14, repeat_a_scene, "warning", r"all 32 scenes are equal", FIRST, "a0", None),
+    (14, repeat_a_scene, "warning", r"all 32 rollouts are equal", FIRST, "a0", None),
     (15, take_ids_of_another_version, "error", r"12 of 12 scenarios have other agents than", "a.tar.gz", None, None),
 ]
 

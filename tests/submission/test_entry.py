@@ -44,7 +44,7 @@ def test_a_file_becomes_all_required_fields(read):
         ("link =", "lnk = 3\nlink =", "lnk unknown"),
         ("link =", "uses_lidar = 1\nlink =", "uses_lidar must be true or false"),
         ("link =", "uses_public_models = true\nlink =", "name the models"),
-        ("link =", "link = =", "not a TOML file"),
+        ("link =", "link = =", "not TOML: "),
     ],
 )
 def test_mistakes_are_named_with_the_file(read, old, new, message):

@@ -53,6 +53,11 @@ def test_values_come_back_bit_for_bit_in_any_layout():
     assert decoded.object_ids[2] == (-1, 70000, 3)
 
 
+def test_an_id_of_more_than_32_bits_is_refused():
+    with pytest.raises(DataError, match="scenario a: object id 1099511627777 does not fit the 32 bits"):
+        encode_rollouts("a", states([3, 2**40 + 1], 1))
+
+
 def test_equal_rollouts_are_written_as_often_as_they_count():
     one = states([1, 2], 1)
     repeated = SimulatedStates(one.object_id, one.x, one.y, one.z, one.heading, repeat=32)

@@ -16,6 +16,7 @@ from safetensors.torch import load_file
 
 import rlftsim
 import tiny
+from rlftsim.jobs.interruption import Interruption, signals_like_ctrl_c
 from rlftsim.training import finetune as finetune_module
 from rlftsim.training import imitation as imitation_module
 from rlftsim.training.batches import scenario_costs
@@ -44,7 +45,7 @@ def train(stage, vocabulary, scenarios, out, **changes):
     return tiny.train(stage, tiny.tiny_policy(vocabulary), scenarios, out, **changes)
 
 
-def stop_at(monkeypatch, stage, update, *, presses=None):
+def stop_at(monkeypatch, stage, update, *, presses=None, number=signal.SIGINT):
     """Let a run be interrupted in the middle of its n-th update: by an exception, or by Ctrl-C so many times."""
     module = MODULES[stage]
     name = WORK[module]
@@ -56,7 +57,7 @@ def stop_at(monkeypatch, stage, update, *, presses=None):
         if len(calls) == update and presses is None:
             raise KeyboardInterrupt
         for _ in range((presses or 0) if len(calls) == update else 0):
-            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(number)
         return result
 
     monkeypatch.setattr(module, name, interrupted)
@@ -85,6 +86,14 @@ def test_a_run_interrupted_inside_an_update_ends_as_if_it_never_was(
     timeless = {k for k in lines[0] if k != "time" and not k.startswith("seconds")}
     for mine, other in zip(lines, read_metrics(tmp_path / "whole")):
         assert {k: mine[k] for k in timeless} == {k: other[k] for k in timeless}
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGUSR1])
+def test_a_signal_of_slurm_keeps_the_update_that_has_begun(number, vocabulary, drawn_scenarios, tmp_path, monkeypatch):
+    stop_at(monkeypatch, "pretrain", 1, presses=1, number=number)
+    with signals_like_ctrl_c(), pytest.raises(Interruption, match="continues behind update 1"):
+        train("pretrain", vocabulary, drawn_scenarios, tmp_path, epochs=1.25, batch_size=1)
+    assert len(read_metrics(tmp_path)) == 1
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from rlftsim._api.sources import batch_of, policy_of
 from rlftsim.errors import ConfigError
+from rlftsim.evaluation.rollout_checks import warn_of_doubts
 from rlftsim.realism import RealismResult, metric_by_name, score_batch
 from rlftsim.realism import score as score_scenario
 from rlftsim.realism.from_rollouts import states_of_rollouts
@@ -17,6 +18,8 @@ from rlftsim.viewer.notebook import require_rollouts
 
 def score(scenarios: AnyScenarios, rollouts: Rollouts, metric: str | int = "2025") -> RealismResult:
     """Score rollouts with the realism meta-metric of the Waymo Open Sim Agents Challenge.
+
+    Rollouts that cannot be, such as those of another frame, are scored with a warning that names scenario and agent.
 
     Args:
         scenarios: the scenarios of the rollouts with their logged futures, in the same order; a name of a data set
@@ -57,6 +60,7 @@ def score(scenarios: AnyScenarios, rollouts: Rollouts, metric: str | int = "2025
     states, config = states_of_rollouts(batch, rollouts), metric_by_name(str(metric))
     for scenario, simulated in zip(batch.scenarios, states):
         simulated.check_finite(scenario.scenario_id)
+        warn_of_doubts(scenario, simulated)
     if isinstance(scenarios, Scenario):
         return score_scenario(scenarios, states[0], config)
     return score_batch(batch.scenarios, states, config)

@@ -15,6 +15,7 @@ from rlftsim.experiments.goal_proposals import entry_of, label_of, propose
 from rlftsim.goals.goals_file import GoalEntry, GoalsFile, parse_goal, read_goals, refuse_twice, write_goals
 from rlftsim.goals.maneuvers.proposals import Proposal, no_proposal_reason
 from rlftsim.goals.placement import distance_m, goal_warnings
+from rlftsim.jobs.folder import check_file
 from rlftsim.progress import log, print_wide
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.open import dataset_folder, refuse_unknown
@@ -54,6 +55,8 @@ class Propose:
     def run(self) -> int:
         """Propose goals; print, draw and write them."""
         # 1. mistakes that need no scenario to be seen
+        for file in filter(None, (self.out, self.picture)):
+            check_file(file)
         if self.picture is not None:
             refuse_no_picture(self.picture)
         # 2. a table for each scenario, and its goals and pictures for later

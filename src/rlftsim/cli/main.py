@@ -5,13 +5,16 @@ Only the module of the verb is imported, and help texts do not import torch.
 
 import difflib
 import errno
+import io
 import os
+import signal
 import sys
 from collections.abc import Sequence
 from typing import Any
 
 from rlftsim import __version__
-from rlftsim.errors import ConfigError, RlftsimError
+from rlftsim.errors import ConfigError, RlftsimError, in_short, shorten
+from rlftsim.jobs.interruption import signals_like_ctrl_c
 from rlftsim.threads import keep_freed_memory
 
 VERBS = {
@@ -76,14 +79,24 @@ STARTS_ANEW = ("doctor", "plugins", "data", "recipe", "tokens", "model", "goals"
 JOIN = "join"
 HAVE_SHARES = ("convert", "evaluate", "score", "submit build", "synthesize")
 """Commands with --share, whose shares `join` puts together."""
-INTERRUPTED = 130
+SIGNALLED = 128
+"""Added to the number of the signal that ended the command: 130 = Ctrl-C, 143 = SIGTERM, 138 = SIGUSR1."""
 USER_MISTAKE = 2
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command line; returns the exit status."""
     keep_freed_memory()
-    words = list(sys.argv[1:] if arguments is None else arguments)
+    for stream in (sys.stdout, sys.stderr):
+        # A sign that the terminal does not have is no reason to end in a traceback after hours of work.
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
+    with signals_like_ctrl_c():
+        return _run(list(sys.argv[1:] if arguments is None else arguments))
+
+
+def _run(words: list[str]) -> int:
+    """Run a command line; returns the exit status."""
     if not words or words[0] in ("-h", "--help", "help"):
         print(OVERVIEW, end="")
         return 0 if words else USER_MISTAKE
@@ -94,18 +107,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if verb not in VERBS and verb != JOIN:
         near = difflib.get_close_matches(verb, [*VERBS, JOIN], 1)
         hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(VERBS)}."
-        print(f"rlftsim: no verb {verb!r}: {hint}", file=sys.stderr)
+        _print_error(f"no verb {in_short(verb)}: {hint}")
         return USER_MISTAKE
     try:
         return parse(words).run()
     except RlftsimError as error:
-        print(f"rlftsim: {error}", file=sys.stderr)
+        _print_error(str(error))
         return error.exit_status
     except KeyboardInterrupt as stop:
         # Training says where it goes on.
         what_next = str(stop) or ("starts anew" if verb in STARTS_ANEW else "continues where this one stopped")
-        print(f"\nrlftsim: stopped. The same command {what_next}.", file=sys.stderr)
-        return INTERRUPTED
+        print(file=sys.stderr)
+        _print_error(f"stopped. The same command {what_next}.")
+        return SIGNALLED + getattr(stop, "number", signal.SIGINT)
     except BrokenPipeError:
         # `rlftsim ... | head` has read enough
         return 0
@@ -114,8 +128,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if line is None:
             # A bug of this package: its traceback is what a report needs.
             raise
-        print(f"rlftsim: {line}", file=sys.stderr)
+        _print_error(line)
         return 1
+
+
+def _print_error(message: str) -> None:
+    """Print one line: without control characters that a user's text may bring, and of a length that can be read."""
+    print(f"rlftsim: {shorten(message)}", file=sys.stderr)
 
 
 def parse(words: Sequence[str]) -> Any:

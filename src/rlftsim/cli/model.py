@@ -10,6 +10,7 @@ from tyro.conf import Positional
 
 from rlftsim import __version__
 from rlftsim.errors import ConfigError
+from rlftsim.jobs.folder import check_file
 from rlftsim.policies.averaging import average_policies
 from rlftsim.policies.registry import load_policy
 from rlftsim.policies.smart.catk_checkpoint import CatkImport, import_catk, write_catk
@@ -74,6 +75,7 @@ class Export:
                 "alone."
             )
         tables = self.out.with_suffix(".vocabulary.npz")
+        check_file(self.out)
         write_catk(policy, self.out)
         write_catk_vocabulary(policy.vocabulary, tables)
         print(f"{self.out}: weights\n{tables}: token tables")

@@ -50,7 +50,6 @@ class Evaluate:
     def run(self) -> int:
         """Evaluate and print the table."""
         name = self.name or evaluation_name(self.model)
-        self._refuse_to_replace(self.out / f"{name}.parquet")
         if self.guidance_scale != 1.0 and self.config.goals == "none":
             raise ConfigError(
                 f"--guidance-scale {self.guidance_scale:g} has no effect without goals: add --goals logged."
@@ -65,21 +64,6 @@ class Evaluate:
             print(f"  skipped {skipped.scenario_id}: {skipped.reason}")
         print(f"{self.out / name}.parquet")
         return 0
-
-    def _refuse_to_replace(self, path: Path) -> None:
-        """Protect an evaluation that was made with other goals; `evaluate` protects one of more scenarios.
-
-        Raises:
-            ConfigError: there is such an evaluation of the same name.
-        """
-        try:
-            old = Evaluation.read(path)
-        except DataError:
-            # There is none, or one that cannot be read and is replaced.
-            return
-        way_out = "give this one another --name, or remove the file."
-        if old.config.goals != self.config.goals:
-            raise ConfigError(f"{path} was measured with goals={old.config.goals}, not {self.config.goals}: {way_out}")
 
 
 @dataclass(frozen=True)

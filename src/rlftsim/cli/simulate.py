@@ -28,8 +28,8 @@ class Simulate:
     """Simulate futures of scenarios: the model moves every agent, the ego included, for 8 seconds.
 
     Writes one npz file per scenario: scenario_id, object_ids [A], x y z heading [N, A, 80], world frame.
-    Existing files are kept, so an interrupted simulation continues when the same command is repeated; one that is cut
-    off is simulated again.
+    Existing files are kept, so an interrupted simulation continues when the same command is repeated; one that is
+    damaged or cut off is simulated again.
     """
 
     model: Annotated[Positional[str], tyro.conf.arg(metavar="MODEL")]
@@ -110,7 +110,7 @@ class Simulate:
             about["goals"] = [[e.scenario_id, e.agent_id, e.x, e.y] for e in given.goals]
         claim_folder(self.out, about)
         # 3. simulate what is missing
-        left = left_to_simulate(self.out, ids)
+        left = left_to_simulate(self.out, ids, self.num_rollouts)
         with progress_bar("simulate", len(ids), len(ids) - len(left)) as advance:
             for scenario_id in left:
                 batch = collate([scenarios.by_id(scenario_id)]).to(device_of(policy))

@@ -13,6 +13,7 @@ from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.evaluate import EvaluateConfig, evaluation_name, frozen_copy
 from rlftsim.evaluation.scenario_source import choose_scenarios
 from rlftsim.evaluation.score_files import format_scores
+from rlftsim.jobs.folder import check_file
 from rlftsim.policies.registry import Device, load_policy
 from rlftsim.progress import print_wide
 from rlftsim.rollout.fingerprint import fingerprint_policy
@@ -108,8 +109,9 @@ class Build:
         metadata = describe_entry(entry, parameters)
         fingerprint = fingerprint_policy(policy)
         plan = make_plan(data, fingerprint, metadata, config, num_shards=self.num_shards, round_m=self.round)
+        job = Job(policy, data, plan, metadata, config, self.round, self.out)
         archive = build_archive(
-            Job(policy, data, plan, metadata, config, self.round, self.out),
+            job,
             runner=self.work.runner(self.jobs, self.work.on_error),
             delete_parts=self.delete_parts,
         )
@@ -129,7 +131,7 @@ class Build:
         if check.findings.has_errors:
             print(f"{archive} cannot be uploaded: remove it and repeat the command, which builds it anew.")
         else:
-            delete_parts(self.out)
+            delete_parts(job)
         print(f"{archive}: {check.size} bytes, SHA-256 {check.sha256}\n{text}")
         return int(check.findings.has_errors)
 
@@ -157,6 +159,8 @@ class Check:
         Raises:
             DataError: `score`, and the scenarios have no logged future, or the archive no scenario that can be scored.
         """
+        if self.json is not None:
+            check_file(self.json)
         data = open_dataset(self.data, self.split, cache_size=CACHED_SCENARIOS)
         if self.score:
             try:

@@ -11,6 +11,7 @@ from rich.table import Table
 
 from rlftsim.cli.recipe_verb import DEFAULT_RECIPE, RecipeVerb, value_of
 from rlftsim.errors import ConfigError, DataError
+from rlftsim.jobs.folder import check_file
 from rlftsim.policies.smart.catk_vocabulary import read_catk_vocabulary
 from rlftsim.progress import log, print_wide
 from rlftsim.recipes.base import Recipe
@@ -81,6 +82,7 @@ class Tokens(RecipeVerb):
                 f"--out {self.out}: vocabularies are safetensors files: name it {self.out.with_suffix('.safetensors')}."
             )
         if self.out is not None and self.out.exists():
+            check_file(self.out)
             _refuse_foreign(self.out)
         # 1. the vocabulary, built or read
         scenarios = open_dataset(self.data, self.split, cache_size=CACHED_SCENARIOS)

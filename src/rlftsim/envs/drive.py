@@ -22,7 +22,14 @@ from rlftsim.envs.source import Source
 from rlftsim.envs.traffic_scores import blamed_others_rate, realism_of_others
 from rlftsim.errors import ConfigError, DataError, whole_number
 from rlftsim.evaluation.drive_results import DriveResult, DriveSettings
-from rlftsim.evaluation.resumable import JsonParts, finish_result, map_scenarios, read_if_readable, refuse_to_leave_out
+from rlftsim.evaluation.resumable import (
+    JsonParts,
+    check_same_work,
+    finish_result,
+    map_scenarios,
+    read_if_readable,
+    refuse_to_leave_out,
+)
 from rlftsim.evaluation.scenario_source import hash_manifest
 from rlftsim.lease import Lease
 from rlftsim.progress import log
@@ -111,8 +118,8 @@ def drive(config: DriveConfig, out: Path | None = None) -> list[DriveResult]:
     with tempfile.TemporaryDirectory() as nowhere:
         name = config.planner.replace(":", ".")
         paths = [(out or Path(nowhere)) / f"{name}-{traffic}.parquet" for traffic in config.traffic]
-        for path in paths:
-            _read_and_refuse(config, ids, path)
+        for settings, path in zip(kinds, paths):
+            _read_and_refuse(config, settings, ids, path)
         return [_drive_traffic(config, kind, ids, path) for kind, path in zip(kinds, paths)]
 
 
@@ -155,11 +162,10 @@ def _read_finished(config: DriveConfig, settings: DriveSettings, ids: Sequence[s
     Raises:
         ConfigError: a result of other scenarios is there, which a limit or a choice would replace.
     """
-    found = _read_and_refuse(config, ids, path)
+    found = _read_and_refuse(config, settings, ids, path)
     if found is None:
         return None
-    stored, wanted = found.settings.what_counts(), settings.what_counts()
-    differing = [name for name in wanted if stored[name] != wanted[name]]
+    differing = _differences(found.settings, settings)
     if found.scenario_ids != list(ids):
         differing.append("choice of scenarios")
     if differing:
@@ -170,9 +176,21 @@ def _read_finished(config: DriveConfig, settings: DriveSettings, ids: Sequence[s
     return found
 
 
-def _read_and_refuse(config: DriveConfig, ids: Sequence[str], path: Path) -> DriveResult | None:
-    """The stored result of any settings, unless a limit or a choice would leave out some of its scenarios."""
+def _differences(stored: DriveSettings, wanted: DriveSettings) -> list[str]:
+    """Names of the values that count and differ."""
+    before, now = stored.what_counts(), wanted.what_counts()
+    return [name for name in now if before.get(name) != now[name]]
+
+
+def _read_and_refuse(
+    config: DriveConfig, settings: DriveSettings, ids: Sequence[str], path: Path
+) -> DriveResult | None:
+    """The stored result, unless it is of other work, or a limit or a choice would leave out some of its scenarios."""
     found = read_if_readable(path, DriveResult.read)
+    if found is not None:
+        # a planner whose code has changed is driven anew, and so is one of an older version of this package
+        differing = {*_differences(found.settings, settings)} - {"planner_code", "rlftsim_version"}
+        check_same_work(path, sorted(differing), "choose another --out")
     choice = f"limit={config.limit}" if config.limit is not None else "this choice" if config.scenarios else ""
     if found is not None and choice:
         left_out = len({*found.scenario_ids} - {*ids})

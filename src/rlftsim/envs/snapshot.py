@@ -11,12 +11,14 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
+from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from rlftsim.envs.episode import Episode, EpisodeState, repeat, start
 from rlftsim.envs.source import Source
 from rlftsim.envs.world import Dice
 from rlftsim.errors import ConfigError, DataError
+from rlftsim.jobs.files import parse_json
 from rlftsim.scenario.types import CURRENT_STEP
 
 FORMAT = "rlftsim-snapshot-1"
@@ -61,8 +63,7 @@ def read_snapshot(saved: bytes, source: Source) -> tuple[Episode, EpisodeState]:
     """
     if not isinstance(saved, bytes) or hashlib.sha256(saved[:-CHECKSUM_BYTES]).digest() != saved[-CHECKSUM_BYTES:]:
         raise DataError("not a snapshot of an episode, or a damaged one: take one with snapshot().")
-    arrays = load(saved[:-CHECKSUM_BYTES])
-    about = json.loads(arrays["about"].tobytes())
+    about, motion = _parse(saved[:-CHECKSUM_BYTES])
     if about["format"] != FORMAT:
         raise DataError("a snapshot of another version: take a new one with snapshot().")
     if about["model"] != source.fingerprint:
@@ -72,13 +73,33 @@ def read_snapshot(saved: bytes, source: Source) -> tuple[Episode, EpisodeState]:
     different = [name for name, value in _settings(episode).items() if about["settings"].get(name) != value]
     if different:
         raise ConfigError(f"the snapshot was taken with another {different[0]}: make the environment alike.")
-    if arrays["motion"].shape[1:] != (episode.num_agents, 5):
+    if motion.shape[1:] != (episode.num_agents, 5):
         raise ConfigError("the snapshot was taken with other planner-driven agents: make the environment alike.")
     dice = [tuple(Dice(**one) for one in row) for row in about["dice"]]
-    return episode, repeat(episode, start(episode, dice[0]), arrays["motion"][1:], dice)
+    return episode, repeat(episode, start(episode, dice[0]), motion[1:], dice)
+
+
+def _parse(body: bytes) -> tuple[dict[str, Any], np.ndarray]:
+    """Description and motion [T + 1, M, 5] of a snapshot.
+
+    Raises:
+        DataError: Something is missing, of another type or not finite.
+    """
+    try:
+        arrays = load(body)
+        about = parse_json(arrays["about"].tobytes(), "take one with snapshot()", source="description of a snapshot")
+        motion = arrays["motion"]
+        kinds = {"format": str, "model": str, "scenarios": list, "dice": list, "settings": dict}
+        wrong = [name for name, kind in kinds.items() if not isinstance(about.get(name), kind)]
+        is_motion = motion.ndim == 3 and motion.dtype.kind == "f" and np.isfinite(motion).all()
+        if wrong or not is_motion or not about["dice"]:
+            raise ValueError(f"its {wrong[0] if wrong else 'dice' if is_motion else 'motion'} cannot be used")
+    except (SafetensorError, KeyError, AttributeError, ValueError, TypeError) as error:
+        raise DataError(f"a damaged snapshot ({error}): take a new one with snapshot().") from None
+    return about, motion
 
 
 def _settings(episode: Episode) -> dict[str, Any]:
     """Settings that an episode depends on, as JSON has them."""
     known = {name: value for name, value in asdict(episode.config).items() if name not in IGNORED}
-    return json.loads(json.dumps(known))
+    return parse_json(json.dumps(known), "give plain values", source="settings of the environment")

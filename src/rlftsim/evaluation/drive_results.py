@@ -16,6 +16,8 @@ from rlftsim.atomic_io import write_whole
 from rlftsim.errors import DataError, require_types
 from rlftsim.evaluation.columns import ARROWS, direction_of, format_number
 from rlftsim.evaluation.compare import PairedDifference, compare_paired
+from rlftsim.jobs.files import parse_json
+from rlftsim.jobs.tables import read_parquet, read_parquet_metadata
 from rlftsim.statistics import mean_interval
 
 FORMAT = "rlftsim-drive-1"
@@ -105,18 +107,21 @@ class DriveResult:
             DataError: not such a file, or one that was cut or edited.
         """
         try:
-            # not `read_table`, which takes a folder for one table
-            with pq.ParquetFile(path) as file:
-                table = file.read()
-            table.validate(full=True)
-            about = json.loads((table.schema.metadata or {}).get(b"rlftsim", b"{}"))
+            table = read_parquet(path, "drive again")
+        except FileNotFoundError:
+            raise DataError(f"{path}: no such result of `rlftsim drive`: drive again.") from None
+        metadata = (table.schema.metadata or {}).get(b"rlftsim", b"{}")
+        about = parse_json(metadata, "drive again", source=f"{path}: not a result of `rlftsim drive`")
+        try:
             if about["format"] != FORMAT:
-                raise ValueError(f"its format is {about['format']}, not {FORMAT}")
+                raise ValueError(f"its format is {str(about['format'])[:40]}, not {FORMAT}")
             settings = DriveSettings(**about["settings"])
             require_types(settings)
-            missing = {name: dict(reasons.items()) for name, reasons in about["missing"].items()}
+            missing = {name: {**reasons} for name, reasons in about["missing"].items()}
+            if not all(isinstance(why, str) for reasons in missing.values() for why in reasons.values()):
+                raise TypeError("a reason is no text")
             _require_columns(table)
-        except (OSError, KeyError, TypeError, ValueError, AttributeError, pa.ArrowException) as error:
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
             cause = str(error).partition("\n")[0].rstrip(".")
             if isinstance(error, KeyError):
                 cause = f"it lacks {error.args[0]}"
@@ -131,8 +136,8 @@ def _require_columns(table: pa.Table) -> None:
 
     Raises:
         KeyError: a column is missing.
-        TypeError: one has other values, or is there twice.
-        ValueError: a scenario is there twice.
+        TypeError: one has other values.
+        ValueError: a scenario is there twice, or a number is infinite.
     """
     for name in (*TEXTS, *SHOWN):
         if name not in table.schema.names:
@@ -140,8 +145,8 @@ def _require_columns(table: pa.Table) -> None:
     for name, column in zip(table.schema.names, table.columns):
         if column.type != (pa.string() if name in TEXTS else pa.float64()) or column.null_count:
             raise TypeError(f"column {name} has empty cells or those of another type")
-        if table.schema.names.count(name) > 1:
-            raise TypeError(f"column {name} is there twice")
+        if name not in TEXTS and np.isinf(column.to_numpy()).any():
+            raise ValueError(f"column {name} has an infinite number")
     ids = table["scenario_id"].to_pylist()
     if len({*ids}) < len(ids):
         raise ValueError("a scenario is there twice")
@@ -149,10 +154,10 @@ def _require_columns(table: pa.Table) -> None:
 
 def is_drive_result(path: str | PathLike[str]) -> bool:
     """True for a Parquet file of `rlftsim drive`; False for anything else, also for no file."""
+    metadata = read_parquet_metadata(path).get(b"rlftsim", b"{}")
     try:
-        metadata = pq.read_schema(path).metadata or {}
-        return json.loads(metadata.get(b"rlftsim", b"{}")).get("format") == FORMAT
-    except (OSError, ValueError, AttributeError, pa.ArrowException):
+        return parse_json(metadata, "drive again", source=str(path)).get("format") == FORMAT
+    except DataError:
         return False
 
 

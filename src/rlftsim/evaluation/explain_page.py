@@ -14,6 +14,7 @@ from rlftsim.evaluation.explain import WHOLE_FUTURE, Explanation, FeatureHistogr
 from rlftsim.evaluation.rollout_files import RolloutEntry, find_rollouts, read_states
 from rlftsim.evaluation.scenario_source import ScenarioSource, open_scenarios
 from rlftsim.evaluation.score_files import ScoreConfig, check_entries, has_road_edge
+from rlftsim.jobs.folder import check_folder
 from rlftsim.progress import progress_bar
 from rlftsim.realism import metric_by_name
 from rlftsim.realism.config import BERNOULLI_FEATURES, FEATURE_NAMES, HISTOGRAM_FEATURES
@@ -81,6 +82,7 @@ def explain_rollouts(
     Raises:
         DataError: as `score_rollouts`.
     """
+    check_folder(Path(out), "results")
     entries, source = find_rollouts(rollouts)[: config.limit], open_scenarios(scenarios)
     check_entries(entries, source, config, Path(scenarios))
     # Pages are named before any is written, so that the names do not depend on the order of the processes.

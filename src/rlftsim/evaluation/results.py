@@ -4,6 +4,7 @@ Columns: likelihoods and meta-metrics, higher is better; `*_error` in meters and
 """
 
 import json
+import math
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from html import escape
@@ -18,8 +19,10 @@ import pyarrow.parquet as pq
 import rlftsim
 from rlftsim.atomic_io import write_whole
 from rlftsim.errors import ConfigError, DataError, require_types
-from rlftsim.evaluation.columns import SCORES
+from rlftsim.evaluation.columns import SCORES, direction_of
 from rlftsim.evaluation.drift import Drift, measure_drift
+from rlftsim.jobs.files import describe_kind, parse_json
+from rlftsim.jobs.tables import check_columns, read_parquet
 from rlftsim.realism import FEATURE_NAMES, RealismResult, SimulatedStates, metric_by_name
 from rlftsim.realism.miss import compute_miss_rates
 from rlftsim.realism.official_names import LIGHT
@@ -64,6 +67,9 @@ SCHEMA = pa.schema(
         *(pa.field(name, pa.float64()) for name in SCORE_COLUMNS),
     ]
 )
+
+ROUNDING = 1e-6
+"""Sums of weighted likelihoods may be this far out of [0, 1]."""
 
 ADDED_COLUMNS = ("unlogged_offroad_rate", *Drift._fields)
 """Columns that earlier evaluations lack; NaN when such a file is read."""
@@ -271,46 +277,60 @@ class Evaluation:
             hint = f"name one of {', '.join(files)}" if files else "name a Parquet file of `rlftsim evaluate`"
             raise DataError(f"{path} is a folder: {hint}.")
         try:
-            table = pq.read_table(path)
-            names = table.schema.names  # decoded here
+            table = read_parquet(path, "evaluate again")
         except FileNotFoundError:
             raise DataError(f"{path}: no such evaluation: make one with `rlftsim evaluate`.") from None
-        except (OSError, ValueError, pa.ArrowException) as error:
-            cause = str(error).partition("\n")[0]
-            raise DataError(f"{path}: damaged evaluation ({cause}): evaluate again.") from None
         # our part of the file's metadata; pandas and others may add theirs
-        about = _about((table.schema.metadata or {}).get(b"rlftsim", b"{}"))
-        added = [name for name in ADDED_COLUMNS if name not in names]
-        if about.get("format") != FORMAT or sorted([*names, *added]) != sorted(SCHEMA.names):
+        metadata = (table.schema.metadata or {}).get(b"rlftsim", b"{}")
+        about = parse_json(metadata, "evaluate again", source=str(path))
+        if about.get("format") != FORMAT:
             raise DataError(
                 f"{path}: not an evaluation of this version: name a file that `rlftsim evaluate` wrote, or evaluate "
                 "again."
             )
-        for name in added:
-            table = table.append_column(SCHEMA.field(name), pa.array(np.full(len(table), np.nan)))
-        table = table.select(SCHEMA.names)
-        for field, found in zip(SCHEMA, table.schema):
-            if found.type != field.type:
-                cause = f"column {field.name} holds {found.type}, not {field.type}"
-                raise DataError(f"{path}: damaged evaluation ({cause}): evaluate again.")
+        for name in ADDED_COLUMNS:
+            if name not in table.schema.names:
+                table = table.append_column(SCHEMA.field(name), pa.array(np.full(len(table), np.nan)))
+        try:
+            check_columns(table, SCHEMA)
+            table = table.select(SCHEMA.names)
+            _check_scores(table)
+            name, skipped = about["name"], tuple(Skipped(**one) for one in about["skipped"])
+            if not all(isinstance(text, str) for one in skipped for text in vars(one).values()):
+                raise DataError("a skipped scenario or its reason is no text")
+            for given, kind in ((name, str), (about["provenance"], dict)):
+                if not isinstance(given, kind):
+                    raise DataError(f"its {'name' if kind is str else 'provenance'} is {describe_kind(given)}")
+        except (TypeError, KeyError, ConfigError, DataError) as error:
+            raise DataError(f"{path}: damaged evaluation ({error}): evaluate again.") from None
         try:
             provenance = Provenance.from_plain(about["provenance"])
-        except (TypeError, KeyError, ConfigError) as error:
+            require_types(provenance)
+        except (TypeError, KeyError, AttributeError, ConfigError) as error:
+            error = "a value of another type" if isinstance(error, AttributeError) else error
             raise DataError(f"{path}: made by a later version ({error}): update rlftsim or evaluate again.") from None
-        try:
-            name, skipped = about["name"], tuple(Skipped(**one) for one in about["skipped"])
-        except (TypeError, KeyError) as error:
-            raise DataError(f"{path}: damaged evaluation ({error}): evaluate again.") from None
         return cls(name, provenance, table.replace_schema_metadata(None), skipped)
 
 
-def _about(metadata: bytes) -> dict[str, Any]:
-    """Our part of a file's metadata; empty where it is damaged."""
-    try:
-        about = json.loads(metadata)
-    except ValueError:
-        return {}
-    return about if isinstance(about, dict) else {}
+def _check_scores(table: pa.Table) -> None:
+    """Check that scores can be what their columns say; NaN = not defined in a scenario.
+
+    Raises:
+        DataError: A number that is out of range or infinite; the message names column and scenario.
+    """
+    for name in table.schema.names[1:]:
+        direction = direction_of(name)
+        # likelihoods and rates are in [0, 1] but for rounding, errors and counts in [0, inf), drift is any number
+        lowest = -math.inf if direction == "log" and not name.startswith("num_") else 0.0
+        is_fraction = name.endswith("_rate") or (direction == "higher" and not name.startswith("num_"))
+        highest = 1.0 + ROUNDING if is_fraction else math.inf
+        values = table[name].to_numpy()
+        wrong = np.isinf(values) | (values < lowest - ROUNDING) | (values > highest)
+        if wrong.any():
+            row = int(np.flatnonzero(wrong)[0])
+            scenario_id = table["scenario_id"][row].as_py()
+            wanted = "in [0, 1]" if is_fraction else "finite" if lowest < 0 else "finite and not below 0"
+            raise DataError(f"{name} of scenario {scenario_id} is {values[row]:g}, it is {wanted}")
 
 
 def join_evaluations(name: str, provenance: Provenance, parts: list[Evaluation]) -> Evaluation:

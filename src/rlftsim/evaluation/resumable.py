@@ -5,7 +5,7 @@ planners. They differ in the work on one scenario and in their files: `Evaluatio
 """
 
 import json
-import shutil
+import re
 import tempfile
 from abc import ABC, abstractmethod
 from collections import Counter
@@ -18,10 +18,12 @@ from typing import Any, ClassVar, Generic, Protocol, TypeVar, runtime_checkable
 
 import pyarrow as pa
 
-from rlftsim.atomic_io import remove_temporaries, write_text
+from rlftsim.atomic_io import remove_folder, remove_temporaries, write_text
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.results import SCHEMA, Evaluation, Provenance, Skipped, join_evaluations
-from rlftsim.lease import Lease
+from rlftsim.jobs.files import read_json
+from rlftsim.jobs.folder import check_folder, check_name
+from rlftsim.lease import Lease, remove_locks
 from rlftsim.progress import log, progress_bar
 from rlftsim.threads import one_thread
 from rlftsim.workers import Inline, Joining, Runner, Share, require_finished
@@ -32,6 +34,8 @@ Part = TypeVar("Part")
 """Results of a group of scenarios, as they are read back."""
 Stored = TypeVar("Stored")
 """A finished result."""
+_GROUP_NAME = re.compile(r"\d{6,}-\d{6,}")
+"""Stem of a file of `EvaluationParts`."""
 
 
 class PartFiles(ABC, Generic[Result, Part]):
@@ -53,6 +57,10 @@ class PartFiles(ABC, Generic[Result, Part]):
     @abstractmethod
     def read(self, group: range) -> Part | None:
         """A group that an earlier call finished; None if it is missing, damaged or of other work."""
+
+    @abstractmethod
+    def file_names(self, scenario_ids: Collection[str]) -> list[str]:
+        """Names of the files in the folder that groups of the scenarios may have written, damaged ones included."""
 
     @abstractmethod
     def has_others(self, scenario_ids: Collection[str]) -> bool:
@@ -158,21 +166,29 @@ class JsonParts(PartFiles[Mapping[str, object], Part]):
         """The parsed values of a scenario, see `PartFiles`."""
         scenario_id = self.scenario_ids[group.start]
         try:
-            values = json.loads(self._path(scenario_id).read_text())
+            values = self._read(scenario_id)
             return self.parse(scenario_id, values) if self._is_ours(scenario_id, values) else None
-        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        except (DataError, OSError, ValueError, KeyError, TypeError, AttributeError):
             return None
+
+    def file_names(self, scenario_ids: Collection[str]) -> list[str]:
+        """A name per scenario, see `PartFiles`."""
+        return [f"{scenario_id}.json" for scenario_id in scenario_ids]
 
     def has_others(self, scenario_ids: Collection[str]) -> bool:
         """True if there are files of other scenarios or settings, see `PartFiles`."""
         for path in self.folder.glob("*.json"):
-            with suppress(OSError, ValueError, AttributeError):  # a damaged file holds nothing
-                if path.stem not in scenario_ids or not self._is_ours(path.stem, json.loads(path.read_text())):
+            with suppress(DataError, FileNotFoundError):  # a damaged file holds nothing
+                is_ours = path.stem in scenario_ids and self._is_ours(path.stem, self._read(path.stem))
+                if not is_ours:
                     return True
         return False
 
     def _is_ours(self, scenario_id: str, values: Mapping[str, object]) -> bool:
         return all(values.get(name) == own for name, own in self.identity[scenario_id].items())
+
+    def _read(self, scenario_id: str) -> dict[str, Any]:
+        return read_json(self._path(scenario_id), "measure it again", allow_nan=True)
 
     def _path(self, scenario_id: str) -> Path:
         return self.folder / f"{scenario_id}.json"
@@ -189,8 +205,7 @@ class EvaluationParts(PartFiles[Mapping[str, object] | Skipped, Evaluation]):
     group_size: ClassVar[int] = 4
 
     def __post_init__(self) -> None:
-        if not self.name or Path(self.name).name != self.name:
-            raise ConfigError(f"an evaluation's name becomes a file name, {self.name!r} cannot: pass another name.")
+        check_name(self.name, "an evaluation's name")
         if self.out.suffix == ".parquet":
             raise ConfigError(f"{self.out} is to be a folder, in which {self.name}.parquet is written: name a folder.")
         if self.result_path.is_dir():
@@ -220,13 +235,16 @@ class EvaluationParts(PartFiles[Mapping[str, object] | Skipped, Evaluation]):
     def read(self, group: range) -> Evaluation | None:
         """The rows of a group, see `PartFiles`."""
         found = read_if_readable(self.part_path(group), Evaluation.read)
-        return found if found is not None and self._is_ours(found, self.part_path(group), "discarded") else None
+        other = found.provenance.differences(self.provenance) if found is not None else []
+        if other:
+            log.info(f"{self.part_path(group)} is of another {', '.join(other)}: discarded.")
+        return None if other else found
 
     def read_finished(self, scenario_ids: Sequence[str]) -> Evaluation | None:
         """The result of an earlier call for the same scenarios; None if there is none.
 
         Raises:
-            ConfigError: a result is there with scenarios that a limit would leave out.
+            ConfigError: a result is there of other work, or with scenarios that a limit would leave out.
         """
         found = read_if_readable(self.result_path, Evaluation.read)
         if found is None:
@@ -238,10 +256,17 @@ class EvaluationParts(PartFiles[Mapping[str, object] | Skipped, Evaluation]):
             way_out = "name this one apart with --name, or leave the limit out."
             num_left_out = (_ids_of(found) - Counter(scenario_ids)).total()
             refuse_to_leave_out(self.result_path, num_found, num_left_out, f"limit={limit}", way_out)
-        if not self._is_ours(found, self.result_path, "it will be replaced"):
+        other = found.provenance.differences(self.provenance)
+        if other == ["rlftsim_version"]:
+            log.info(f"{self.result_path} is of another version's numbers: it will be replaced.")
             return None
+        check_same_work(self.result_path, other, "choose another --name or --out")
         # counted: a scenario may have several sets of rollouts in files, and one by a policy
         return found if _ids_of(found) == Counter(scenario_ids) else None
+
+    def file_names(self, scenario_ids: Collection[str]) -> list[str]:
+        """Names of groups of any size, see `PartFiles`."""
+        return [path.name for path in self.folder.glob("*.parquet") if _GROUP_NAME.fullmatch(path.stem)]
 
     def has_others(self, scenario_ids: Collection[str]) -> bool:
         """True if a group has other scenarios or settings, see `PartFiles`."""
@@ -251,12 +276,6 @@ class EvaluationParts(PartFiles[Mapping[str, object] | Skipped, Evaluation]):
             and bool(part.provenance.differences(self.provenance) or _ids_of(part).keys() - {*scenario_ids})
             for part in parts
         )
-
-    def _is_ours(self, found: Evaluation, path: Path, fate: str) -> bool:
-        other = found.provenance.differences(self.provenance)
-        if other:
-            log.info(f"{path} is of another {', '.join(other)}: {fate}.")
-        return not other
 
 
 def _ids_of(evaluation: Evaluation) -> Counter[str]:
@@ -288,8 +307,8 @@ def resume_evaluation(
         show_progress: False = no progress bar.
 
     Raises:
-        ConfigError: the name cannot be a file's, a limit would leave out scenarios of a stored result, or there is no
-            folder in which shares could meet.
+        ConfigError: the name cannot be a file's, the stored result is of other work, a limit would leave out scenarios
+            of it, or there is no folder in which shares could meet.
         DataError: another driver is at work on this evaluation.
         SetAside, Unfinished: see `map_scenarios`.
     """
@@ -343,6 +362,7 @@ def finish_result(
     Raises:
         DataError: another driver is at work on it.
     """
+    check_folder(path.parent, "results")
     before, found = _stamp(path), find()
     if found is None:
         with Lease(parts.folder / ".lock", runner, "works in") as lease:
@@ -368,7 +388,8 @@ def _remove_parts(parts: PartFiles[Any, Any], scenario_ids: Sequence[str], runne
     is_share = isinstance(runner, Share | Joining)
     has_shares = any(parts.folder.glob(".lock.*-of-*")) and not is_share
     if not has_shares and not parts.has_others({*scenario_ids}):
-        shutil.rmtree(parts.folder, ignore_errors=True)
+        remove_locks(parts.folder / ".lock")
+        remove_folder(parts.folder, parts.file_names({*scenario_ids}))
 
 
 def _stamp(path: Path) -> tuple[int, int] | None:
@@ -378,6 +399,21 @@ def _stamp(path: Path) -> tuple[int, int] | None:
     except OSError:
         return None
     return about.st_mtime_ns, about.st_size
+
+
+def check_same_work(path: Path, differing: Sequence[str], way_out: str) -> None:
+    """Check that a stored result is not of other work, which the new one would replace.
+
+    Args:
+        path: File of the stored result.
+        differing: Names of the values that count and differ, such as the policy's fingerprint.
+        way_out: Flags that keep the two apart, for the message.
+
+    Raises:
+        ConfigError: There is such a value.
+    """
+    if differing:
+        raise ConfigError(f"{path} is the result of another {', '.join(differing)}: {way_out}, or remove the file.")
 
 
 def refuse_to_leave_out(path: Path, num_stored: int, num_left_out: int, choice: str, way_out: str) -> None:

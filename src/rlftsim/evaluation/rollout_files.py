@@ -5,8 +5,6 @@ loaded, because loading one runs any code in it: docs/rollout_formats.md explain
 """
 
 import re
-import zipfile
-import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from os import PathLike
@@ -20,6 +18,7 @@ from google.protobuf.message import DecodeError
 from rlftsim.errors import DataError
 from rlftsim.evaluation import submission_pb2
 from rlftsim.evaluation.wire_format import BYTES, WireField, iterate_fields
+from rlftsim.jobs.arrays import read_npz
 from rlftsim.realism import SimulatedStates
 from rlftsim.scenario.types import FUTURE_STEPS
 
@@ -27,11 +26,12 @@ FORMATS_NOTE = "see docs/rollout_formats.md"
 AXES = ("x", "y", "z", "heading")
 MAX_COORDINATE_M = 1e6
 """Beyond, float32 positions are coarser than 6 cm: such coordinates are of another frame, or damaged."""
+MAX_ID_LENGTH = 200
+"""Characters of a scenario's id, which names files."""
 _KEYS = ("scenario_id", "object_ids", *AXES)
 _SUBMISSION_NAME = re.compile(r"\.(binproto|pb)(-\d+-of-\d+)?$")
 _PICKLE_NAME = re.compile(r"\.(pkl|pickle|pt|pth|ckpt|joblib)$")
 _ZIP_MAGIC, _GZIP_MAGIC, _PICKLE_MAGIC = b"PK\x03\x04", b"\x1f\x8b", tuple(b"\x80" + bytes([n]) for n in range(2, 6))
-_NPZ_DAMAGE = (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, MemoryError, OverflowError, RuntimeError)
 
 Kind = Literal["npz", "submission"]
 
@@ -127,7 +127,12 @@ def _entries_of(path: Path) -> list[RolloutEntry]:
         if value.size != 1 or value.dtype.kind not in "US":
             raise DataError(f"{path}: scenario_id must be one text, got {value.dtype} {list(value.shape)}.")
         text = value.reshape(-1)[0]
-        scenario_id = text.decode("utf-8", "replace") if isinstance(text, bytes) else str(text)
+        try:
+            scenario_id = text.decode("utf-8", "replace") if isinstance(text, bytes) else str(text)
+        except ValueError:  # a number that is no character
+            scenario_id = ""
+        if not scenario_id.isprintable() or not 0 < len(scenario_id) <= MAX_ID_LENGTH:
+            raise DataError(f"{path}: scenario_id is no text of 1 to {MAX_ID_LENGTH} printable characters.")
         return [RolloutEntry(scenario_id, path, "npz")]
     try:
         return list(_entries_of_submission(path))
@@ -138,21 +143,13 @@ def _entries_of(path: Path) -> list[RolloutEntry]:
 def _read_npz(path: Path, keys: Sequence[str]) -> dict[str, np.ndarray]:
     """Some arrays of an npz, none of which may need a pickle."""
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            if not isinstance(archive, np.lib.npyio.NpzFile):
-                raise DataError(f"{path}: a single array, not an npz with keys {', '.join(_KEYS)}.")
-            missing = [key for key in keys if key not in archive.files]
-            if missing:
-                raise DataError(f"{path}: no {', '.join(missing)} in it, only {', '.join(archive.files) or 'nothing'}.")
-            return {key: archive[key] for key in keys}
-    except _NPZ_DAMAGE as error:
-        # numpy takes what it does not know for a pickle; its own words would suggest to allow that
-        is_archive = zipfile.is_zipfile(path)
-        looks_pickled = is_archive and isinstance(error, ValueError) and "pickle" in str(error)
-        cause = "it is not an npz archive, or cut off"
-        if is_archive:
-            cause = "it holds an array of Python objects" if looks_pickled else "an array in it is damaged"
-        raise DataError(f"{path} is no rollouts file: {cause}. Write it again as npz, {FORMATS_NOTE}.") from None
+        arrays = read_npz(path, keys, f"no rollouts file, write it again as npz, {FORMATS_NOTE}")
+    except FileNotFoundError:
+        raise DataError(f"{path}: there is no such file of rollouts.") from None
+    missing = [key for key in keys if key not in arrays]
+    if missing:
+        raise DataError(f"{path}: no {', '.join(missing)} in it: rollouts have {', '.join(_KEYS)}, {FORMATS_NOTE}.")
+    return arrays
 
 
 def _states_of_npz(entry: RolloutEntry) -> SimulatedStates:

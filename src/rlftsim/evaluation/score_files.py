@@ -27,6 +27,7 @@ from rlftsim.evaluation.results import (
     row_of_result,
 )
 from rlftsim.evaluation.resumable import EvaluationParts, groups_of, resume_evaluation
+from rlftsim.evaluation.rollout_checks import warn_of_doubts
 from rlftsim.evaluation.rollout_files import RolloutEntry, find_rollouts, read_states
 from rlftsim.evaluation.scenario_source import ScenarioSource, open_scenarios
 from rlftsim.progress import log
@@ -80,6 +81,8 @@ def score_rollouts(
     show_progress: bool = True,
 ) -> Evaluation:
     """Score rollouts from files; every scenario's numbers are also written to `out/<name>.parquet`.
+
+    Rollouts that cannot be, such as those of another frame, are scored with a warning that names scenario and agent.
 
     Interrupted in any way, the same call goes on where it was. Once finished, it reads the file. Scenarios come in the
     order of the files and of their places in them.
@@ -245,6 +248,7 @@ def _score_entry(job: _Job, position: int) -> dict[str, object] | Skipped:
         result = score(scenario_log(scenario), states, metric_by_name(job.config.metric))
     except DataError as error:
         raise DataError(f"{entry}: {error}") from error
+    warn_of_doubts(scenario, states, entry.file)
     return row_of_result(result, scenario, states)
 
 

@@ -14,6 +14,7 @@ from rlftsim.evaluation.report import report_table, write_report
 from rlftsim.evaluation.results import Evaluation
 from rlftsim.experiments.demo_report import BASE, CEILING, FLOOR, TUNED, ReportSettings, animate, build_report
 from rlftsim.experiments.stages import find_vocabulary, finetune_model, open_training, pretrain_policy
+from rlftsim.jobs.folder import check_folder
 from rlftsim.policies.registry import load_policy
 from rlftsim.progress import print_wide
 from rlftsim.recipes.base import Recipe
@@ -71,6 +72,7 @@ def run_demo(config: DemoConfig, out: Path) -> DemoResult:
     Raises:
         RlftsimError: a stage failed; the message says which file and why.
     """
+    check_folder(out, "results")
     stages = _Stages(Console(stderr=True))
     recipe, training, vocabulary = config.recipe, open_training(config.data), None
     if recipe.tokens is not None:

@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from rlftsim.atomic_io import write_text
 from rlftsim.experiments.suite import ExperimentSuite
 from rlftsim.experiments.tables import TextTable
+from rlftsim.jobs.folder import check_folder
 from rlftsim.training.run_folder import describe_environment, to_plain
 from rlftsim.viewer.figure import save_figure
 from rlftsim.viewer.film import to_film
@@ -72,6 +73,7 @@ def run_experiment(name: str, experiment: Experiment[Any], suite: ExperimentSuit
     Raises:
         RlftsimError: a stage failed; the message says which and why.
     """
+    check_folder(suite.out, "results")
     if experiment.needs_goals:
         suite.require_goals()
     # 1. Train and evaluate what is missing, then make tables of stored results alone.

@@ -21,12 +21,12 @@ from typing import Any
 
 from rlftsim.atomic_io import write_text
 from rlftsim.errors import DataError
+from rlftsim.jobs.files import describe_kind, parse_json, read_json
 
 FORMAT = "rlftsim-goals-1"
 FIELDS = ("scenario", "agent", "x", "y", "label")
 SECTIONS = ("goals", "alternatives")
-LONGEST_WHOLE = 20
-"""Digits that an int64 object id may have; longer whole numbers are read as coordinates."""
+_WAY_OUT = "goals are a list of entries, see docs/goals.md"
 UNSHOWABLE = {"Cc": "a control character", "Cs": "half a character"}
 """Unicode categories that no terminal or picture can show: control characters and lone surrogates."""
 
@@ -72,16 +72,13 @@ def read_goals(path: Path) -> GoalsFile:
         DataError: the file is missing or not JSON, or an entry is wrong: names file, entry and field.
     """
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        return _check_goals(read_json(path, _WAY_OUT, expected=object, allow_nan=True), str(path))
     except FileNotFoundError:
         raise DataError(f"{path}: no such goals file: make one with `rlftsim goals propose`.") from None
-    except UnicodeDecodeError:
-        raise DataError(f"{path}: not a text file: goals are JSON, see docs/goals.md.") from None
-    return parse_goals(text, str(path))
 
 
 def parse_goals(text: str, path: str) -> GoalsFile:
-    """Check the text of a goals file.
+    """Goals of the text of a goals file.
 
     Args:
         text: its content.
@@ -90,19 +87,11 @@ def parse_goals(text: str, path: str) -> GoalsFile:
     Raises:
         DataError: not JSON, or an entry is wrong: names file, entry and field.
     """
-    try:
-        # Python refuses to parse whole numbers of more than 4300 digits: floats report them as infinite instead.
-        about = json.loads(
-            text,
-            object_pairs_hook=_Object,
-            parse_int=lambda digits: int(digits) if len(digits) <= LONGEST_WHOLE else float(digits),
-        )
-    except json.JSONDecodeError as error:
-        raise DataError(f"{path}: not JSON, line {error.lineno}, column {error.colno}: {error.msg}.") from None
-    except RecursionError:
-        raise DataError(
-            f"{path}: brackets nested too deeply: goals are a list of entries, see docs/goals.md."
-        ) from None
+    # numbers that are not finite pass, to be refused with their place
+    return _check_goals(parse_json(text, _WAY_OUT, source=path, expected=object, allow_nan=True), path)
+
+
+def _check_goals(about: object, path: str) -> GoalsFile:
     if not isinstance(about, dict) or about.get("format") != FORMAT:
         raise DataError(f'{path}: not a goals file of this version: it must be an object with "format": "{FORMAT}".')
     _refuse_unknown(about, ("format", *SECTIONS), f"{path}")
@@ -110,7 +99,7 @@ def parse_goals(text: str, path: str) -> GoalsFile:
     for section in SECTIONS:
         found, place = about.get(section, []), f"{path}: {section}"
         if not isinstance(found, list):
-            raise DataError(f"{place}: must be a list of goals, is {_kind(found)}.")
+            raise DataError(f"{place}: must be a list of goals, is {describe_kind(found)}.")
         sections.append(tuple(_entry(one, f"{place}[{number}]") for number, one in enumerate(found)))
     refuse_twice(sections[0])
     return GoalsFile(*sections)
@@ -177,15 +166,6 @@ def refuse_twice(entries: Sequence[GoalEntry]) -> None:
             )
 
 
-class _Object(dict[str, Any]):
-    """A JSON object that remembers repeated keys, of which `json` would silently keep the last value."""
-
-    def __init__(self, pairs: Sequence[tuple[str, Any]]):
-        super().__init__(pairs)
-        names = [name for name, _ in pairs]
-        self.repeated = [name for name in self if names.count(name) > 1]
-
-
 def _entry(found: object, place: str) -> GoalEntry:
     if not isinstance(found, dict):
         raise DataError(f'{place}: must be an object such as {{"scenario": ..., "agent": ..., "x": ..., "y": ...}}.')
@@ -195,7 +175,7 @@ def _entry(found: object, place: str) -> GoalEntry:
         raise DataError(f"{place}: {', '.join(missing)} missing: a goal needs scenario, agent, x and y.")
     for name in ("scenario", "label"):
         if not isinstance(found.get(name, ""), str):
-            raise DataError(f"{place}: {name} must be text in quotes, is {_kind(found[name])}.")
+            raise DataError(f"{place}: {name} must be text in quotes, is {describe_kind(found[name])}.")
         for character in found.get(name, ""):
             unshowable = UNSHOWABLE.get(unicodedata.category(character))
             if unshowable:
@@ -204,15 +184,17 @@ def _entry(found: object, place: str) -> GoalEntry:
                 )
     # bool is a subclass of int: `true` is refused first.
     if isinstance(found["agent"], bool) or not isinstance(found["agent"], int):
-        shown = found["agent"] if isinstance(found["agent"], float) else _kind(found["agent"])
+        shown = found["agent"] if isinstance(found["agent"], float) else describe_kind(found["agent"])
         raise DataError(f"{place}: agent must be a whole number, an object id of the log, is {shown}.")
+    if not -(2**63) <= found["agent"] < 2**63:
+        raise DataError(f"{place}: agent {found['agent']} is no object id, which have 64 bits.")
     x, y = (_coordinate(found[name], f"{place}: {name}") for name in ("x", "y"))
     return GoalEntry(found["scenario"], found["agent"], x, y, found.get("label", ""), place)
 
 
 def _coordinate(value: object, place: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise DataError(f"{place} must be a number of meters, is {_kind(value)}.")
+        raise DataError(f"{place} must be a number of meters, is {describe_kind(value)}.")
     if not math.isfinite(value):
         raise DataError(f"{place} is {value}: a goal needs a finite point, meters in the world frame of the log.")
     return float(value)
@@ -224,11 +206,3 @@ def _refuse_unknown(found: Mapping[str, Any], known: Sequence[str], place: str) 
             near = difflib.get_close_matches(name, known, 1)
             hint = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(known)}."
             raise DataError(f"{place}: no field {name!r} here: {hint}")
-    if isinstance(found, _Object) and found.repeated:
-        raise DataError(f"{place}: {', '.join(found.repeated)} is written more than once: keep one of them.")
-
-
-def _kind(value: object) -> str:
-    """Kind of a JSON value in words, for messages."""
-    names = {str: "text", list: "a list", _Object: "an object", bool: "true or false", type(None): "null"}
-    return names.get(type(value), "a number")

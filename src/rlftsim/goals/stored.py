@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 from rlftsim.atomic_io import write_whole
 from rlftsim.errors import DataError
 from rlftsim.goals.types import Goals, Points, goals_at
+from rlftsim.jobs.tables import check_columns, read_parquet
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.shards import hash_file
 
@@ -39,6 +40,18 @@ def write_goal_part(path: Path, goals: Mapping[str, Points]) -> None:
     write_whole(path, lambda temporary: pq.write_table(table, temporary))
 
 
+def _read_goals(file: Path) -> pa.Table:
+    way_out = f"remove {file.parent} and write its goals again by `rlftsim augment`"
+    table = read_parquet(file, way_out)
+    try:
+        check_columns(table, SCHEMA)
+        if not np.isfinite([table["x"].to_numpy(), table["y"].to_numpy()]).all():
+            raise DataError("a point is not finite")
+    except DataError as error:
+        raise DataError(f"{file}: holds rows that are not goals ({error}): {way_out}.") from None
+    return table.replace_schema_metadata(None)
+
+
 class StoredGoals:
     """The goals of a folder, by scenario id.
 
@@ -50,18 +63,8 @@ class StoredGoals:
         self._files = sorted(folder.glob("*.parquet"))
         if not self._files:
             raise DataError(f"{folder}: holds no goals: write them by `rlftsim augment`.")
-        try:
-            self._table = pa.concat_tables(
-                [pq.read_table(file, schema=SCHEMA) for file in self._files]
-            ).combine_chunks()
-        except (pa.ArrowException, OSError) as error:
-            raise DataError(f"{folder}: damaged goals ({error}): remove the folder and write them again.") from None
-        points = np.stack([self._table[name].to_numpy().astype(float) for name in ("x", "y")])
-        if any(column.null_count for column in self._table.columns) or not np.isfinite(points).all():
-            raise DataError(
-                f"{folder}: holds rows that are not goals (a value is missing or not finite): write them by "
-                "`rlftsim augment`."
-            )
+        tables = [_read_goals(file) for file in self._files]
+        self._table = pa.concat_tables([table.select(SCHEMA.names) for table in tables]).combine_chunks()
 
     @cached_property
     def _rows(self) -> dict[str, slice]:

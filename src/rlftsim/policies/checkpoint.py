@@ -14,21 +14,28 @@ import difflib
 import json
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from safetensors import SafetensorError
-from safetensors.torch import load_file
+import torch
 from torch import Tensor, nn
+from torch.overrides import TorchFunctionMode
 
 from rlftsim.atomic_io import save_tensors, write_text
 from rlftsim.errors import CheckpointError, ConfigError
+from rlftsim.jobs.arrays import read_tensors
+from rlftsim.jobs.files import read_json
+from rlftsim.jobs.folder import check_folder
 
 CONFIG, WEIGHTS, CARD = "config.json", "model.safetensors", "README.md"
 SHIPPED_MODELS = Path(__file__).parent / "shipped"
 """A folder for each model in the box, by its registered name."""
+_WRITE_AGAIN = "damaged model folder, write it again"
+_WRAPPERS = ("_orig_mod.", "module.")
+"""Prefixes that torch.compile and distributed training put before the names of all weights."""
+_FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 SHOWN_PROBLEMS = 6
 """Weights that a message names; a model of other sizes has a hundred that do not fit."""
 
@@ -52,11 +59,9 @@ class StoredModel:
             CheckpointError: the file is missing or damaged.
         """
         try:
-            return load_file(self.folder / WEIGHTS)
+            return read_tensors(self.folder / WEIGHTS, _WRITE_AGAIN, error=CheckpointError)[0]
         except FileNotFoundError:
             raise CheckpointError(f"{self.folder}: not a model folder, {WEIGHTS} is missing.") from None
-        except (SafetensorError, OSError) as error:
-            raise CheckpointError(f"{self.folder}: damaged model folder ({error}): write it again.") from None
 
     def build(self, make: Callable[..., Loaded]) -> Loaded:
         """Call a class with the stored settings as keyword arguments.
@@ -123,6 +128,7 @@ def save_model(
         DataError: the folder cannot be written.
     """
     folder, architecture = Path(folder), getattr(policy, "architecture", None)
+    check_folder(folder, "model")
     if not isinstance(architecture, str):
         kind = type(policy).__name__
         raise ConfigError(
@@ -151,15 +157,11 @@ def read_model(folder: str | os.PathLike, *, architecture: str | None = None) ->
     """
     path = find_model(folder)
     try:
-        values = json.loads((path / CONFIG).read_text(encoding="utf-8"))
+        values = read_json(path / CONFIG, _WRITE_AGAIN, allow_nan=True, error=CheckpointError)
     except FileNotFoundError:
         inside = list_models(path)
         hint = f": did you mean {' or '.join(str(path / name) for name in inside)}?" if inside else "."
         raise CheckpointError(f"{path}: not a model folder, {CONFIG} is missing{hint}") from None
-    except (ValueError, OSError) as error:
-        raise CheckpointError(f"{path}: damaged model folder ({CONFIG}: {error}): write it again.") from None
-    if not isinstance(values, dict):
-        raise CheckpointError(f"{path}: damaged model folder ({CONFIG} is no object): write it again.")
     stored = values.pop("architecture", None)
     if not isinstance(stored, str):
         # a run's folder has a config.json of its own beside its checkpoints
@@ -242,6 +244,43 @@ def load_strictly(module: nn.Module, weights: Mapping[str, Tensor], *, source: s
         CheckpointError: anything differs, or a weight is not finite.
     """
     own = module.state_dict()
+    weights = strip_wrappers(weights, own)
+    check_shapes(weights, own, source=source)
+    # Buffers may hold infinities, such as a mask.
+    parameters = {name for name, _ in module.named_parameters()}
+    broken = [
+        name for name in own if not (weights[name].isfinite() if name in parameters else ~weights[name].isnan()).all()
+    ]
+    if broken:
+        shown = ", ".join(broken[:SHOWN_PROBLEMS]) + (" …" if len(broken) > SHOWN_PROBLEMS else "")
+        raise CheckpointError(f"{source}: weights are not finite ({shown}): take an earlier checkpoint or train again.")
+    module.load_state_dict(weights)
+
+
+def strip_wrappers(weights: Mapping[str, Tensor], names: Collection[str]) -> Mapping[str, Tensor]:
+    """Weights without the prefix that torch.compile or distributed training put before the names of all of them.
+
+    Args:
+        weights: Tensors by name, as a file has them.
+        names: Names that are wanted; a prefix that begins one of them is a part of the name.
+    """
+    for prefix in (p for _ in _WRAPPERS for p in _WRAPPERS):
+        if all(name.startswith(prefix) for name in weights) and not any(name.startswith(prefix) for name in names):
+            weights = {name.removeprefix(prefix): value for name, value in weights.items()}
+    return weights
+
+
+def check_shapes(weights: Mapping[str, Tensor], own: Mapping[str, Tensor], *, source: str) -> None:
+    """Check that weights have the names, shapes and kinds of numbers of a model, which may be on no device.
+
+    Args:
+        weights: Tensors by name, as a file has them.
+        own: State dict of the model.
+        source: Place the weights come from, for the message.
+
+    Raises:
+        CheckpointError: Anything differs; the message names the first few.
+    """
     problems = [f"missing {k}" for k in sorted(own.keys() - weights.keys())]
     problems += [f"unknown {k}" for k in sorted(weights.keys() - own.keys())]
     problems += [
@@ -249,12 +288,46 @@ def load_strictly(module: nn.Module, weights: Mapping[str, Tensor], *, source: s
         for k in sorted(own.keys() & weights.keys())
         if own[k].shape != weights[k].shape
     ]
+    problems += [
+        f"{k} holds {weights[k].dtype} instead of {own[k].dtype}"
+        for k in sorted(own.keys() & weights.keys())
+        if weights[k].dtype != own[k].dtype and not (weights[k].dtype in _FLOATS and own[k].dtype in _FLOATS)
+    ]
     if problems:
         shown = "; ".join(problems[:SHOWN_PROBLEMS]) + (" …" if len(problems) > SHOWN_PROBLEMS else "")
         raise CheckpointError(f"{source}: {len(problems)} weights do not fit this model: {shown}.")
-    # Buffers may hold infinities, such as a mask.
-    broken = [name for name, _ in module.named_parameters() if name in own and not weights[name].isfinite().all()]
-    if broken:
-        shown = ", ".join(broken[:SHOWN_PROBLEMS]) + (" …" if len(broken) > SHOWN_PROBLEMS else "")
-        raise CheckpointError(f"{source}: weights are not finite ({shown}): take an earlier checkpoint or train again.")
-    module.load_state_dict(weights)
+
+
+class _NoDraws(TorchFunctionMode):
+    """Draws no normal numbers, and keeps sequences in memory: torch needs imports of seconds for either without."""
+
+    def __torch_function__(self, func: Any, types: Any, args: tuple = (), kwargs: dict | None = None) -> Any:
+        kwargs = kwargs or {}
+        if func.__name__ == "normal_":
+            return next(iter((*args, *kwargs.values())))
+        return func(*args, **kwargs, **({"device": "cpu"} if func.__name__ in ("linspace", "logspace") else {}))
+
+
+def outline(make: Callable[[], nn.Module]) -> dict[str, Tensor]:
+    """State dict of a network that is built without memory: names, shapes and kinds of numbers.
+
+    Args:
+        make: Builds the network on torch's default device.
+    """
+    with torch.device("meta"), _NoDraws():
+        return make().state_dict()
+
+
+def check_fit(make: Callable[[], nn.Module], weights: Mapping[str, Tensor], *, source: str) -> None:
+    """Check that weights fit a network before it is built: its settings may be damaged, and ask for any memory.
+
+    Args:
+        make: Builds the network on torch's default device, which is one without memory here.
+        weights: Stored weights by name.
+        source: Place the weights come from, for the message.
+
+    Raises:
+        CheckpointError: The weights have other names, shapes or kinds of numbers.
+    """
+    own = outline(make)
+    check_shapes(strip_wrappers(weights, own), own, source=source)

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 from rlftsim.errors import ConfigError
+from rlftsim.jobs.files import read_json
 from rlftsim.recipes.base import SECTIONS, Recipe, section_names
 from rlftsim.training.run_folder import RUN_INPUTS, flatten, to_plain
 
@@ -130,13 +131,8 @@ def flag_words(name: str, value: Any, *, is_switch: bool) -> list[str]:
 
 
 def _read_mapping(path: Path) -> dict[str, Any]:
+    way_out = "`rlftsim recipe NAME --json` prints one"
     if not path.is_file():
         problem = "a folder, not a file" if path.is_dir() else "no such file"
-        raise ConfigError(f"--config {path}: {problem}; `rlftsim recipe NAME --json` prints one.")
-    try:
-        values = json.loads(path.read_text())
-    except ValueError as error:  # includes text that is not UTF-8
-        raise ConfigError(f"--config {path}: not JSON ({error}).") from None
-    if not isinstance(values, Mapping):
-        raise ConfigError(f"--config {path}: holds {json.dumps(values)[:40]}, not settings by name.")
-    return dict(values)
+        raise ConfigError(f"--config {path}: {problem}; {way_out}.")
+    return read_json(path, way_out, allow_nan=True, error=ConfigError)

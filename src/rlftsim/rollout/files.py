@@ -1,6 +1,6 @@
 """Rollouts as files: one npz a scenario, in the layout that `rlftsim score` and other tools read.
 
-Keys: scenario_id, object_ids [A], x y z heading [N, A, 80] float32, world frame.
+Keys: scenario_id, object_ids [A] int64, x y z heading [N, A, 80] float32, world frame.
 """
 
 from functools import partial
@@ -36,7 +36,7 @@ def write_rollouts(folder: Path, batch: ScenarioBatch, rollouts: Rollouts) -> li
         save = partial(
             _write_npz,
             scenario_id=np.array(scenario.scenario_id),
-            object_ids=scenario.tracks.object_id[chosen].astype(np.int32),
+            object_ids=scenario.tracks.object_id[chosen],
             x=world[b, :, : len(chosen), :, 0],
             y=world[b, :, : len(chosen), :, 1],
             z=np.broadcast_to(z[b, : len(chosen), None], own.shape),

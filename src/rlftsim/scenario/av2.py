@@ -8,7 +8,6 @@ lights, stop signs and speed limits: the scenarios have none.
 """
 
 import glob
-import json
 import os
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
@@ -17,9 +16,10 @@ from typing import Literal, get_args
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from rlftsim.errors import ConfigError, DataError
+from rlftsim.jobs.files import read_json
+from rlftsim.jobs.tables import read_parquet
 from rlftsim.scenario.av2_map import Ground, read_map
 from rlftsim.scenario.sources import BytesRead, Item, Tally, Unit
 from rlftsim.scenario.tfrecord import SkippedRecord
@@ -260,15 +260,14 @@ def _cut_window(
 def _read_columns(file: Path) -> dict[str, np.ndarray]:
     """Columns of a Parquet file, all of the published schema and of its types."""
     try:
-        table = pq.ParquetFile(file).read()
-    except (OSError, pa.ArrowException) as error:
-        raise DataError(f"{file.name} cannot be read: {str(error).splitlines()[0]}") from None
+        table = read_parquet(file, "get the file again")
+    except FileNotFoundError:
+        raise DataError(f"{file.name} is missing: get the file again") from None
     names = [name for name in table.schema.names if not name.startswith("__index_level_")]
     unknown = [name for name in names if name not in _COLUMNS]
     missing = [name for name in _NEEDED if name not in names]
-    if unknown or missing or len(set(names)) < len(names):
-        cause = f"no column {missing[0]}" if missing else "a column twice"
-        cause = f"the unknown column {unknown[0]}" if unknown else cause
+    if unknown or missing:
+        cause = f"the unknown column {unknown[0]}" if unknown else f"no column {missing[0]}"
         raise DataError(f"{file.name} has {cause}: its schema is not the published one")
     if not table.num_rows:
         raise DataError(f"{file.name} has no rows")
@@ -387,13 +386,11 @@ def _map_of(file: Path) -> Path:
 
 def _read_sizes(path: Path) -> dict[str, tuple[float, float, float]]:
     """Sizes by kind from a JSON file."""
-    try:
-        given = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise ConfigError(f"{path}: no JSON file of sizes ({error}).") from None
     example = '{"vehicle": [4.6, 2.0, 1.6]}'
-    if not isinstance(given, dict):
-        raise ConfigError(f"{path}: sizes are written like {example}.")
+    try:
+        given = read_json(path, f"sizes are written like {example}", error=ConfigError)
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file: sizes are written like {example}.") from None
     for kind, size in given.items():
         if kind not in SIZES_M:
             raise ConfigError(f"{path}: no kind {kind!r}: known are {', '.join(SIZES_M)}.")

@@ -4,7 +4,6 @@ The local map is cut out of the city's along a 30 m grid. Where the cut crosses 
 area is no curb: such pieces are left out of the road edges, see `find_cuts`.
 """
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from rlftsim.errors import ConfigError, DataError
+from rlftsim.jobs.files import read_json
 from rlftsim.scenario.polylines import Heights, arc_length, densify, resample_to
 from rlftsim.scenario.types import LaneTopology, MapFeatures, MapFeatureType
 
@@ -126,13 +126,12 @@ def read_map(path: Path) -> tuple[MapFeatures, Ground]:
         ConfigError: shapely is not installed.
     """
     try:
-        archive = json.loads(path.read_bytes())
-    except (OSError, ValueError, RecursionError) as error:
-        cause = error.strerror if isinstance(error, OSError) else "it is no JSON text"
-        raise DataError(f"{path.name} cannot be read: {cause}") from None
+        archive = read_json(path, "get the file again")
+    except FileNotFoundError:
+        raise DataError(f"{path.name} is missing: get the file again") from None
     groups = {}
     for name in ("lane_segments", "pedestrian_crossings", "drivable_areas"):
-        groups[name] = archive.get(name) if isinstance(archive, dict) else None
+        groups[name] = archive.get(name)
         if not isinstance(groups[name], dict):
             raise DataError(f"{path.name} has no {name}: it is not a map of Argoverse 2 motion forecasting")
     lanes = [_read_lane(f"{path.name}: lane segment {key}", value) for key, value in groups["lane_segments"].items()]

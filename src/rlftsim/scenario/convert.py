@@ -8,7 +8,6 @@ interrupted.
 import hashlib
 import json
 import os
-import shutil
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -19,6 +18,8 @@ from pathlib import Path
 
 from rlftsim.atomic_io import remove_temporaries_below
 from rlftsim.errors import ConfigError, DataError
+from rlftsim.jobs.files import parse_json, read_json
+from rlftsim.jobs.folder import check_folder, check_name
 from rlftsim.lease import Lease
 from rlftsim.progress import progress_bar
 from rlftsim.scenario.dataset import (
@@ -141,13 +142,12 @@ def convert(
     """
     if jobs is not None and jobs < 1:
         raise ConfigError(f"jobs must be at least 1, got {jobs}: leave it out for one per core.")
-    if split is not None and not split.strip():
-        raise ConfigError("the split has no name: leave it out to read it off the folder or file.")
+    if split is not None:
+        check_name(split, "a split's name")
     # 1. Refuse a destination that holds anything but a data set or an unfinished conversion.
     folder = require_folder(destination)
+    check_folder(folder, "data set")
     if folder.exists() and not (folder / INCOMPLETE).exists():
-        if not folder.is_dir():
-            raise DataError(f"{folder} is a file, not a folder: choose another destination")
         if (folder / MANIFEST).exists():
             read_manifest(folder)  # raises where it cannot be added to
         elif any(not path.name.startswith(INCOMPLETE) for path in folder.iterdir()):  # shares may begin just now
@@ -211,8 +211,8 @@ def _known_shards(folder: Path) -> dict[str, _Known]:
     earlier = _earlier_manifest(folder)
     shards = {entry.file: _Known(entry, earlier.provenance) for entry in earlier.shards} if earlier else {}
     for path in sorted((folder / SHARDS).rglob(_RECEIPTS)):
-        with suppress(ValueError, KeyError, TypeError, AttributeError):  # a damaged one counts for nothing
-            receipt = json.loads(path.read_text(encoding="utf-8"))
+        with suppress(DataError, ConfigError, KeyError, TypeError):  # a damaged one counts for nothing
+            receipt = read_json(path, "convert again")
             settings = receipt.pop("settings")
             if receipt.pop("schema_version") == SCHEMA_VERSION:
                 entry = shard_entry_from_json(receipt)
@@ -253,7 +253,7 @@ def _difference(found: object, wanted: object, name: str = "") -> str:
 
 def _plain(settings: Mapping[str, object]) -> dict[str, object]:
     """Settings as JSON gives them back."""
-    return json.loads(json.dumps(settings))
+    return parse_json(json.dumps(settings), "give plain values", source="settings of the source")
 
 
 def _earlier_manifest(folder: Path) -> Manifest | None:
@@ -373,10 +373,13 @@ def _finish(
     entries = earlier_shards | {entry.file: entry for entry in new}
     if not any(entry.num_rows for entry in entries.values()):
         # leave nothing behind, as if the command had not been given
-        shutil.rmtree(folder / SHARDS, ignore_errors=True)
+        for file in entries:
+            (folder / file).unlink(missing_ok=True)
+            (folder / f"{file}.json").unlink(missing_ok=True)
         lease.remove()
-        if not any(folder.iterdir()):
-            folder.rmdir()
+        for path in (*sorted((folder / SHARDS).rglob("*"), reverse=True), folder / SHARDS, folder):
+            with suppress(OSError):  # a file, or a folder with one that is not ours
+                path.rmdir()
         causes = [record for entry in new for record in entry.skipped]
         first = f"; first of {len(causes)} causes: {causes[0]}" if causes else ""
         raise DataError(f"not one scenario could be converted{first}")

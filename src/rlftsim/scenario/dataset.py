@@ -19,7 +19,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cached_property, lru_cache, partial
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from threading import Lock
 from types import TracebackType
 from typing import Any, overload
@@ -32,7 +32,10 @@ from jaxtyping import Int64
 
 import rlftsim
 from rlftsim.atomic_io import cannot_write, write_text, write_whole
-from rlftsim.errors import ConfigError, DataError, whole_number
+from rlftsim.errors import ConfigError, DataError, require_types, whole_number
+from rlftsim.jobs.files import read_json
+from rlftsim.jobs.folder import check_folder
+from rlftsim.jobs.tables import check_columns, read_parquet
 from rlftsim.scenario.index_row import AGENT_COLUMNS
 from rlftsim.scenario.shards import (
     INDEX_FIELDS,
@@ -119,7 +122,7 @@ class ScenarioDataset:
         self.cache_size = cache_size
         self.manifest = read_manifest(self.folder)
         index = load_index(self.folder)
-        if index.schema.names != INDEX_SCHEMA.names or len(index) != self.manifest.num_scenarios:
+        if len(index) != self.manifest.num_scenarios:
             raise DataError(f"{self.folder / INDEX} does not belong to {MANIFEST}: convert again")
         if split is not None and split not in self.manifest.counts:
             known = ", ".join(self.manifest.counts) or "none"
@@ -136,9 +139,7 @@ class ScenarioDataset:
         self._lock = Lock()
         # shards are opened on first use and stay open, least recently used ones go
         self._reader = lru_cache(_MAX_OPEN_SHARDS)(lambda name: ShardReader(self._shard_path(name)))
-        self._decoded = lru_cache(cache_size)(
-            lambda position: self._reader(self._shard_names[position]).read(self._rows[position])
-        )
+        self._decoded = lru_cache(cache_size)(self._read)
 
     @cached_property
     def sources(self) -> tuple[str, ...]:
@@ -210,11 +211,24 @@ class ScenarioDataset:
         split = "" if self.split is None else f", split {self.split!r}"
         return f"ScenarioDataset({str(self.folder)!r}{split}, {len(self)} scenarios)"
 
+    def _read(self, position: int) -> Scenario:
+        """Scenario at a position, decoded."""
+        name, row = self._shard_names[position], self._rows[position]
+        scenario = self._reader(name).read(row)
+        if scenario.scenario_id != self.scenario_ids[position]:
+            raise DataError(
+                f"{self.folder / INDEX} does not belong to the shards: row {row} of {name} is scenario "
+                f"{scenario.scenario_id}, not {self.scenario_ids[position]}: convert again"
+            )
+        return scenario
+
     def _shard_path(self, name: str) -> Path:
         """Local path of a shard; of a remote data set, that in the cache of this machine."""
+        sha256 = {entry.file: entry.sha256 for entry in self.manifest.shards}.get(name)
+        if sha256 is None:
+            raise DataError(f"{self.folder / INDEX} names a shard {name!r} that {MANIFEST} lacks: convert again")
         if self.url is None:
             return self.folder / name
-        sha256 = next(entry.sha256 for entry in self.manifest.shards if entry.file == name)
         return fetch_shard(f"{self.url}/{name}", sha256)
 
     def by_id(self, scenario_id: str) -> Scenario:
@@ -253,6 +267,7 @@ class DatasetWriter:
         provenance: Mapping[str, object] | None = None,
     ) -> None:
         self.folder = require_folder(folder)
+        check_folder(self.folder, "data set")
         if self.folder.exists() and (not self.folder.is_dir() or any(self.folder.iterdir())):
             raise DataError(f"{self.folder} is not an empty folder: choose another one or delete it")
         # beside the folder, so that renaming it never crosses file systems
@@ -438,25 +453,27 @@ def read_manifest(folder: str | os.PathLike[str]) -> Manifest:
 
 def parse_manifest(folder: Path) -> Manifest:
     """Manifest of a data set as `read_manifest` gives it, even where a conversion is unfinished."""
+    if folder.is_file():
+        raise DataError(f"{folder} is a file: convert it with `rlftsim convert`, then name the new folder")
     try:
-        values = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
+        values = read_json(folder / MANIFEST, "convert again")
     except FileNotFoundError:
         raise DataError(f"{folder} is no data set: {_missing_manifest_hint(folder)}") from None
-    except NotADirectoryError:
-        raise DataError(f"{folder} is a file: convert it with `rlftsim convert`, then name the new folder") from None
-    except (OSError, ValueError) as error:
-        cause = error.strerror if isinstance(error, OSError) else "it is not JSON text"
-        raise DataError(f"{folder / MANIFEST} cannot be read ({cause}): convert again") from error
-    if not isinstance(values, dict) or values.get("format") != FORMAT:
+    if values.get("format") != FORMAT:
         raise DataError(f"{folder / MANIFEST} is not the manifest of a data set of scenarios")
     if values.get("schema_version") != SCHEMA_VERSION:
         found = values.get("schema_version")
         raise DataError(f"{folder} has schema version {found}, this rlftsim reads {SCHEMA_VERSION}: convert again")
     try:
         shards = tuple(shard_entry_from_json(shard) for shard in values.pop("shards"))
-        duplicates = tuple(SkippedRecord(**duplicate) for duplicate in values.pop("duplicates"))
-        return Manifest(shards=shards, duplicates=duplicates, **values)
-    except (KeyError, TypeError) as error:
+        duplicates = tuple(_skipped_from_json(duplicate) for duplicate in values.pop("duplicates"))
+        manifest = Manifest(shards=shards, duplicates=duplicates, **values)
+        require_types(manifest)
+        _check_numbers("counts", manifest.counts)
+        if not isinstance(manifest.provenance, Mapping):
+            raise TypeError("provenance is no object")
+        return manifest
+    except (KeyError, TypeError, ConfigError) as error:
         raise DataError(f"{folder / MANIFEST} is damaged ({error}): convert again") from error
 
 
@@ -474,9 +491,30 @@ def _missing_manifest_hint(folder: Path) -> str:
 
 
 def shard_entry_from_json(values: Mapping[str, Any]) -> ShardEntry:
-    """Inverse of `asdict` for a shard's entry."""
-    skipped = tuple(SkippedRecord(**record) for record in values["skipped"])
-    return ShardEntry(**{**values, "skipped": skipped})
+    """Inverse of `asdict` for a shard's entry.
+
+    Raises:
+        KeyError, TypeError, ConfigError: It lacks a value, or has an unknown one or one of another type.
+    """
+    skipped = tuple(_skipped_from_json(record) for record in values["skipped"])
+    entry = ShardEntry(**{**values, "skipped": skipped})
+    require_types(entry)
+    _check_numbers("tallies", entry.tallies)
+    path = PurePosixPath(entry.file)
+    if path.is_absolute() or ".." in path.parts or not entry.file.isprintable():
+        raise TypeError(f"the path {entry.file[:80]!r} leads out of the folder")
+    return entry
+
+
+def _skipped_from_json(values: Mapping[str, Any]) -> SkippedRecord:
+    record = SkippedRecord(**values)
+    require_types(record)
+    return record
+
+
+def _check_numbers(name: str, numbers: object) -> None:
+    if not isinstance(numbers, Mapping) or not all(type(number) is int for number in numbers.values()):
+        raise TypeError(f"{name} are no whole numbers by name")
 
 
 def write_json(path: Path, values: Mapping[str, object]) -> None:
@@ -496,10 +534,14 @@ def load_index(folder: Path) -> pa.Table:
         DataError: the file is missing or damaged.
     """
     try:
-        return pq.read_table(folder / INDEX)
-    except (OSError, pa.ArrowException) as error:
-        cause = getattr(error, "strerror", None) or "it is not a whole Parquet file"
-        raise DataError(f"{folder / INDEX} cannot be read ({cause}): convert again") from error
+        index = read_parquet(folder / INDEX, "convert again")
+    except FileNotFoundError:
+        raise DataError(f"{folder / INDEX} is missing: convert again") from None
+    try:
+        check_columns(index, INDEX_SCHEMA)
+    except DataError as error:
+        raise DataError(f"{folder / INDEX} does not belong to {MANIFEST} ({error}): convert again") from None
+    return index
 
 
 def build_index(folder: Path, entries: Iterable[ShardEntry]) -> tuple[pa.Table, list[SkippedRecord]]:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from rlftsim.errors import DataError
+from rlftsim.scenario.consistency import describe_contradictions
 from rlftsim.scenario.dataset import (
     INDEX,
     Manifest,
@@ -41,6 +42,7 @@ class Problem(StrEnum):
     DAMAGED_SHARD = "damaged shard"
     INDEX_MISMATCH = "index mismatch"
     CONTRADICTORY_LIGHTS = "contradictory lights"
+    CONTRADICTORY_MOTION = "contradictory motion"
     TELEPORT = "teleport"
     MISSING_MAP = "missing map"
     MAP_ELSEWHERE = "map elsewhere"
@@ -105,10 +107,11 @@ def verify_dataset(folder: str | os.PathLike[str]) -> list[Finding]:
     """Check every shard and every scenario of a data set.
 
     Damage: shards missing or not as the manifest has them, index and manifest that do not belong together, a scenario
-    that is in the index twice. Doubtful content: impossible ids, types, sizes or track indices, NaN or infinite states
-    or map points, positions too far from the origin for float32, a lane with two states at a step, consecutive valid
-    positions that imply more than 60 m/s, no lanes or no road edges, a map 200 m from the ego or more, no agent to
-    evaluate beside the ego.
+    that is in the index twice. Doubtful content: steps that are not 0.1 s apart, ids that occur twice, impossible ids,
+    types, sizes or track indices, NaN or infinite states or map points, positions too far from the origin for float32,
+    a lane with two states at a step, velocities or headings that contradict the positions of most moving tracks,
+    consecutive valid positions that imply more than 60 m/s, no lanes or no road edges, a map 200 m from the ego or
+    more, no agent to evaluate beside the ego.
 
     Args:
         folder: the data set, or "synthetic".
@@ -202,6 +205,10 @@ def check_scenario(scenario: Scenario) -> Iterator[Finding]:
         step, lane = places[bad[0]]
         detail = f"lane {lane} has {count[bad[0]]} different states at step {step}{_and_more(len(bad))}"
         yield Finding(Problem.CONTRADICTORY_LIGHTS, where, detail)
+
+    contradictions = describe_contradictions(tracks)
+    if contradictions:
+        yield Finding(Problem.CONTRADICTORY_MOTION, where, contradictions)
 
     # Jumps between two valid states that no road user makes.
     with np.errstate(invalid="ignore"):  # states that are not valid may hold infinities

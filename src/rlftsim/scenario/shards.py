@@ -18,6 +18,7 @@ import pyarrow as pa
 
 from rlftsim.atomic_io import cannot_write, temporary_beside
 from rlftsim.errors import DataError
+from rlftsim.jobs.tables import map_arrow
 from rlftsim.scenario.codec import decode_array, encode_array
 from rlftsim.scenario.index_row import IndexRow, compute_index_row
 from rlftsim.scenario.types import LaneTopology, LightStates, MapFeatures, Scenario, Tracks
@@ -175,13 +176,16 @@ class ShardReader:
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
         try:
-            # memory-mapped: "reading all" touches no page of the columns yet
-            self._table = pa.ipc.open_file(pa.memory_map(str(path))).read_all()
-        except (OSError, pa.ArrowException) as error:
-            way_out = f"is damaged: {_WAY_OUT}" if self.path.exists() else f"is missing: {_RUN_AGAIN}"
-            raise DataError(f"shard {self.path} {way_out}") from error
-        if self._table.schema.names != _SCHEMA.names:
+            self._table = map_arrow(self.path, _WAY_OUT)
+        except FileNotFoundError:
+            raise DataError(f"shard {self.path} is missing: {_RUN_AGAIN}") from None
+        except DataError as error:
+            raise DataError(f"shard {error}") from None
+        if self._table.schema != _SCHEMA:
             raise DataError(f"shard {self.path} was written with another schema version: convert again")
+        for name in _SCHEMA.names:
+            if name not in ("source_record", *_ARRAY_DTYPES) and self._table[name].null_count:
+                raise DataError(f"shard {self.path} is damaged (column {name} has empty cells): {_WAY_OUT}")
 
     def __len__(self) -> int:
         return self._table.num_rows
@@ -189,10 +193,7 @@ class ShardReader:
     def index_rows(self) -> pa.Table:
         """Columns of `IndexRow` and `source_record`, one row per scenario; a copy in memory."""
         schema = pa.schema([*INDEX_FIELDS, pa.field("source_record", pa.int32())])
-        try:
-            return pa.table({name: self._table[name].to_pylist() for name in schema.names}, schema=schema)
-        except (OSError, UnicodeDecodeError, pa.ArrowException) as error:
-            raise DataError(f"shard {self.path} is damaged: {_WAY_OUT}") from error
+        return pa.table({name: self._table[name].to_pylist() for name in schema.names}, schema=schema)
 
     def read(self, row: int) -> Scenario:
         """Decode a row. Its arrays are read-only, because what is computed from them is kept.
@@ -212,8 +213,13 @@ class ShardReader:
             names = ("scenario_id", "ego_index", "source", "guessed")
             plain = {name: self._table[name][row].as_py() for name in names}
             scenario = _from_arrays(plain, arrays)
-        except (ValueError, OSError, pa.ArrowException) as error:
-            cause = "it cannot be read" if isinstance(error, OSError | pa.ArrowException) else error
+            # the checksum is of the arrays alone
+            scenario.refuse_bad_id()
+            num_tracks = len(scenario.tracks.object_id)
+            if not 0 <= scenario.ego_index < num_tracks:
+                raise ValueError(f"its ego is track {scenario.ego_index} of {num_tracks}")
+        except (ValueError, TypeError, AttributeError, IndexError, DataError) as error:
+            cause = error if isinstance(error, ValueError | DataError) else "it lacks an array, or there is no such row"
             raise DataError(f"shard {self.path}: row {row} is damaged ({cause}): {_WAY_OUT}") from error
         features = scenario.map_features
         for part in (scenario, scenario.tracks, features, features.topology, scenario.lights):

@@ -31,6 +31,7 @@ from typing import Any, Protocol, runtime_checkable
 
 from rlftsim.errors import BadRecordError, ConfigError, DataError
 from rlftsim.plugins import ExtensionPoint
+from rlftsim.scenario.consistency import describe_contradictions
 from rlftsim.scenario.shards import refuse_unsound
 from rlftsim.scenario.tfrecord import OnError, SkippedRecord
 from rlftsim.scenario.types import Scenario
@@ -38,6 +39,7 @@ from rlftsim.scenario.types import Scenario
 AUTO = "auto"
 DEFAULT_SOURCE = "womd"
 """Reads what no source recognizes, and says what is wrong with it."""
+CONTRADICTORY = "scenarios whose velocities or headings contradict their positions: `rlftsim data verify` names them"
 _SPLIT = re.compile(r"training|validation|testing")
 
 
@@ -205,6 +207,8 @@ def read_unit(
                 except DataError as error:
                     item = SkippedRecord(unit.name, record, str(error))
             if isinstance(item, Scenario):
+                if describe_contradictions(item.tracks):
+                    tally(Tally(CONTRADICTORY, 1))
                 yield record, item
             elif on_error == "stop":
                 raise DataError(str(item))

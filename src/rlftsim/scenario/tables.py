@@ -18,12 +18,13 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 from jaxtyping import Bool, Float, Int64
 from scipy.spatial import KDTree
 
 from rlftsim.errors import DataError
 from rlftsim.geometry import wrapped
+from rlftsim.jobs.tables import read_parquet
+from rlftsim.scenario.consistency import describe_contradictions
 from rlftsim.scenario.polylines import Heights, densify
 from rlftsim.scenario.sources import BytesRead, Item, Unit, units_of_files
 from rlftsim.scenario.tfrecord import SkippedRecord
@@ -202,6 +203,12 @@ def _read_scenario(row: _Rows, parts: Mapping[str, _Rows]) -> Scenario:
     if ego < 0 or not tracks.valid[ego, CURRENT_STEP]:
         raise row.error(0, f"no ego: object {ego_id} is not there 1 s after step {first_step}, the current step")
     _refuse_edges_that_run_backwards(parts[MAP], map_features)
+    contradictions = describe_contradictions(tracks)
+    if contradictions:
+        raise DataError(
+            f"{TRACKS}: {contradictions}: vx and vy are m/s along x and y of the same frame, headings radians "
+            f"counter-clockwise from +x, and step_s in {SCENARIOS} the seconds between two steps"
+        )
     if "predict" in row and row["predict"][0] is not None:
         predicted = _indices_of(row, "predict", tracks)
     else:
@@ -349,7 +356,10 @@ def _indices_of(row: _Rows, name: str, tracks: Tracks) -> list[int]:
     for object_id in row[name][0]:
         if object_id not in index:
             raise row.error(0, f"{name} lists object {object_id}, which has no state in the scenario")
-    return [index[object_id] for object_id in row[name][0]]
+    ids = list(row[name][0])
+    if len(set(ids)) < len(ids):
+        raise row.error(0, f"{name} lists object {max(ids, key=ids.count)} twice")
+    return [index[object_id] for object_id in ids]
 
 
 def _read_map(rows: _Rows, lanes: _Rows | None) -> MapFeatures:
@@ -380,6 +390,7 @@ def _read_topology(rows: _Rows | None, features: Sequence[tuple[int, int, np.nda
     last = {feature_id: len(points) - 1 for feature_id, _, points in features}
     links: dict[str, list[tuple[int, ...]]] = {"entry": [], "exit": [], "neighbors": []}
     speed_limit, interpolating = np.zeros(len(features), np.float32), np.zeros(len(features), bool)
+    _check_repeated(rows, "lane_id")
     for row, lane in enumerate(rows["lane_id"].tolist()):
         if lane not in place:
             raise rows.error(row, f"lane {lane} is no lane of {MAP}")
@@ -441,6 +452,7 @@ def _read_lights(
     found = []
     if rows is not None:
         _refuse_impossible_numbers(rows)
+        _check_repeated(rows, "lane_id", "step")
         state = _numbers_of(rows, "state", LightState)
         seconds = (rows["step"] - first_step) * step_s
         place = {int(features.feature_id[k]): k for k in features.indices_of(LANE_TYPES)}
@@ -472,6 +484,16 @@ def _refuse_impossible_numbers(rows: _Rows) -> None:
         bad = np.flatnonzero(~(np.abs(rows[name]) < _MAX_COORDINATE_M))  # NaN is not less, either
         if len(bad):
             raise rows.error(bad[0], f"{name} is {rows[name][bad[0]]:g}")
+
+
+def _check_repeated(rows: _Rows, *names: str) -> None:
+    """Raise a `DataError` at the first row that has the same values in some columns as a row before it."""
+    keys = np.column_stack([rows[name] for name in names])
+    _, first, owner = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    again = np.flatnonzero(first[owner.reshape(-1)] != np.arange(len(rows)))
+    if len(again):
+        cells = ", ".join(f"{name} {rows[name][again[0]]}" for name in names)
+        raise rows.error(again[0], f"a second row with {cells}: every row needs its own")
 
 
 def _numbers_of(rows: _Rows, name: str, kinds: type[IntEnum]) -> Int64[np.ndarray, "n"]:
@@ -510,11 +532,9 @@ def _read_table(path: Path) -> _Rows:
         DataError: it is missing or damaged, or a column is missing, of another type or has empty cells.
     """
     try:
-        table = pq.ParquetFile(path).read()
+        table = read_parquet(path, "write it again")
     except FileNotFoundError:
         raise DataError(f"{path.name}: there is no such table beside {TRACKS}") from None
-    except (OSError, pa.ArrowException) as error:
-        raise DataError(f"{path.name} cannot be read: {str(error).splitlines()[0]}") from None
     needed, optional = _SCHEMAS[path.name]
     for name in needed:
         if name not in table.schema.names:
@@ -523,8 +543,6 @@ def _read_table(path: Path) -> _Rows:
         raise DataError(f"{path.name} has no column scenario_id or map_id")
     columns = {}
     for name, kind in (needed | optional).items():
-        if table.schema.names.count(name) > 1:
-            raise DataError(f"{path.name} has two columns {name}")
         if name in table.schema.names:
             columns[name] = _read_column(path.name, name, table[name], kind)
     return _Rows(path.name, np.arange(table.num_rows), columns)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from rlftsim.atomic_io import remove_temporaries_below
 from rlftsim.errors import DataError
+from rlftsim.jobs.folder import check_folder
 from rlftsim.lease import Lease, remote_lease
 from rlftsim.progress import progress_bar
 from rlftsim.scenario.dataset import INCOMPLETE, INDEX, MANIFEST, Manifest, parse_manifest, read_manifest
@@ -66,6 +67,7 @@ def pull_dataset(url: str, folder: str | os.PathLike[str], *, show_progress: boo
             manifest's.
     """
     folder, url = Path(folder), folder_address(url)
+    check_folder(folder, "data set")
     mark = folder / INCOMPLETE
     note = f"A copy of {url} runs here or was interrupted: run the same command again, it goes on."
     is_begun = mark.exists() and mark.read_text(encoding="utf-8").startswith(note)

@@ -17,13 +17,16 @@ from functools import cached_property
 from typing import Any, Protocol, get_args, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Float64, Int8, Int32, Int64
+from jaxtyping import Bool, Float, Float32, Float64, Int, Int8, Int32, Int64
 
 from rlftsim.errors import DataError, in_short
 
 COARSEST_M = 0.01
 """Coordinates are refused where float32 has larger gaps."""
 STEP_S = 0.1
+TIME_TOLERANCE_S = STEP_S / 2
+"""A timestamp may be so far from its multiple of 0.1 s: in 9 s the clocks of real logs drift by up to 0.022 s, and
+their steps differ by up to 0.011 s."""
 HISTORY_STEPS = 11
 CURRENT_STEP = 10
 FUTURE_STEPS = 80
@@ -246,7 +249,7 @@ class Scenario:
             _refuse_misshapen(part, place)
 
     def refuse_broken(self) -> None:
-        """Check what every reader relies on: number of steps, track indices, object ids, types and states, sizes, map.
+        """Check what every reader relies on: steps of 0.1 s, track indices, ids that differ, types, states, sizes, map.
 
         Sizes are those at the current step: simulation and metric read no others, and logs hold zeros where a state is
         not valid.
@@ -261,10 +264,11 @@ class Scenario:
             for index in indices:
                 if not 0 <= index < len(tracks.object_id):
                     raise DataError(f"{name} names track index {index}, but there are {len(tracks.object_id)} tracks")
-        ids, count = np.unique(tracks.object_id, return_counts=True)
-        if (count > 1).any():
-            raise DataError(f"object id {ids[count.argmax()]} belongs to {count.max()} tracks: give each its own")
+        _check_time_base(self.timestamps_s, self.num_steps)
         lines, lights = self.map_features, self.lights
+        _check_unique("object id {} belongs to {} tracks: give each its own", tracks.object_id)
+        _check_unique("map feature id {} belongs to {} features: give each its own", lines.feature_id)
+        _check_unique("tracks_to_predict names track index {} {} times: name it once", self.tracks_to_predict)
         _refuse_unknown("track", tracks.object_id, "type", tracks.object_type, ObjectType)
         _refuse_unknown("map feature", lines.feature_id, "type", lines.feature_type, MapFeatureType)
         _refuse_unknown("light of lane", lights.lane_id, "state", lights.state, LightState)
@@ -422,6 +426,26 @@ def _refuse_misshapen(part: Any, place: str) -> None:
         if value.shape != tuple(wanted) or len(axes) != value.ndim:
             known = ", ".join(f"{name} = {size}" for name, size in sizes.items())
             raise DataError(f"{place}.{one.name} has the shape {value.shape}, it must be {shown}: {known}")
+
+
+def _check_time_base(timestamps_s: Float[np.ndarray, "t"], num_steps: int) -> None:
+    """Refuse timestamps that are not 0.1 s apart: speeds, tokens and scores would be wrong by a factor."""
+    if len(timestamps_s) != num_steps:
+        raise DataError(f"{len(timestamps_s)} timestamps for {num_steps} steps")
+    offset_s = timestamps_s - timestamps_s[0]
+    wrong = np.flatnonzero(~(np.abs(offset_s - STEP_S * np.arange(num_steps)) <= TIME_TOLERANCE_S))  # NaN, too
+    if len(wrong):
+        step = wrong[0]
+        raise DataError(
+            f"step {step} is {offset_s[step]:.3f} s after step 0 instead of {STEP_S * step:.1f} s: steps must be "
+            f"{STEP_S:g} s apart, so resample the log to 10 Hz or correct its timestamps"
+        )
+
+
+def _check_unique(complaint: str, ids: Int[np.ndarray, "n"]) -> None:
+    values, count = np.unique(ids, return_counts=True)
+    if (count > 1).any():
+        raise DataError(complaint.format(values[count.argmax()], count.max()))
 
 
 def _refuse_unknown(

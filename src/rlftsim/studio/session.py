@@ -18,6 +18,7 @@ from rlftsim.goals.goals_file import GoalEntry
 from rlftsim.goals.maneuvers.proposals import no_proposal_reason
 from rlftsim.goals.placement import goal_warnings
 from rlftsim.goals.types import simulated_track
+from rlftsim.jobs.folder import check_folder
 from rlftsim.policies.registry import Device, load_policy, with_guidance
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import Policy, is_goal_conditioned
@@ -127,8 +128,7 @@ class Session:
         self.splits = splits_of(data)
         self.split = split or ("validation" if "validation" in self.splits else self.splits[0])
         self._datasets = {name: open_dataset(data, name) for name in dict.fromkeys((self.split, *self.splits))}
-        if out.exists() and not out.is_dir():
-            raise ConfigError(f"--out {out} is a file: name a folder for what the page saves.")
+        check_folder(out, "results")
         self.out = out
         self._imported = import_rollouts(rollouts)
         self.models = {model.name: model for model in _load(models, device)}

@@ -16,10 +16,19 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 
-from rlftsim.atomic_io import errors_name, remove_temporaries, temporary_beside, write_text
-from rlftsim.errors import DataError
+from rlftsim.atomic_io import (
+    errors_name,
+    remove_folder,
+    remove_temporaries,
+    remove_temporaries_below,
+    temporary_beside,
+    write_text,
+)
+from rlftsim.errors import ConfigError, DataError, require_types
 from rlftsim.evaluation.evaluate import check_jobs, simulate_states
 from rlftsim.evaluation.results import EvaluateConfig
+from rlftsim.jobs.files import read_json
+from rlftsim.jobs.folder import check_folder
 from rlftsim.lease import Lease, remove_locks
 from rlftsim.progress import log, progress_bar
 from rlftsim.rollout.policy import Policy, device_of
@@ -60,9 +69,11 @@ class Job:
     def receipt(self, number: int) -> Piece | None:
         """A finished shard; None if there is none. Its file may be in the archive already."""
         try:
-            return Piece(**json.loads(self.receipt_path(number).read_text(encoding="utf-8")))
-        except (OSError, ValueError, TypeError):
+            piece = Piece(**read_json(self.receipt_path(number), "build again"))
+            require_types(piece)
+        except (DataError, ConfigError, FileNotFoundError, TypeError):
             return None
+        return piece if piece.file == self.piece_path(number).name else None
 
 
 def build_archive(
@@ -82,6 +93,7 @@ def build_archive(
         SetAside: shards that killed their process again and again; all others are done.
         Unfinished: `runner` is a share, which is done, while others are not.
     """
+    check_folder(job.folder, "submission")
     check_jobs(job.config, device_of(job.policy))
     archive = job.folder / ARCHIVE
     numbers = range(len(job.plan.shards))
@@ -97,7 +109,7 @@ def build_archive(
         shards = job.folder / _SHARDS
         shards.mkdir(exist_ok=True)
         if lease.is_alone:
-            _remove_strays(shards)
+            remove_temporaries_below(shards)
         receipts = [job.receipt(n) for n in numbers]
         num_joined = count_joined(archive, shards, receipts)
         own = runner.own(numbers)
@@ -107,7 +119,7 @@ def build_archive(
         with progress_bar("submit", total, total - left, show=show_progress) as advance, one_thread():
             runner.run(partial(_build_shard, job), missing, advance=advance, name_of=job.plan.shard_name)
         lease.finish("submit")
-        _remove_strays(shards)
+        remove_temporaries_below(shards)
         remove_temporaries(job.folder / PLAN)
         pieces = [piece for piece in map(job.receipt, numbers) if piece is not None]
         require_finished(runner, len(numbers) - len(pieces), len(numbers), "submit")
@@ -116,15 +128,10 @@ def build_archive(
     return archive
 
 
-def _remove_strays(shards: Path) -> None:
-    """Remove what killed processes left; no other process may write there."""
-    for stray in shards.glob(".*"):
-        stray.unlink()
-
-
-def delete_parts(folder: Path) -> None:
-    """Remove the compressed shards of a finished archive."""
-    shutil.rmtree(folder / _SHARDS, ignore_errors=True)
+def delete_parts(job: Job) -> None:
+    """Remove the compressed shards of a finished archive and their receipts."""
+    paths = [path for n in range(len(job.plan.shards)) for path in (job.piece_path(n), job.receipt_path(n))]
+    remove_folder(job.folder / _SHARDS, [path.name for path in paths])
 
 
 def _forecast(job: Job, num_missing: int) -> None:

@@ -1,16 +1,15 @@
 """Description of an entry: account, method and authors from a TOML file, and the message that each shard repeats."""
 
 import re
-import tomllib
 from dataclasses import MISSING, dataclass, fields
 from os import PathLike
-from pathlib import Path
 from typing import Any
 
 from torch import nn
 
 from rlftsim.errors import ConfigError
 from rlftsim.evaluation.submission_pb2 import SimAgentsChallengeSubmission
+from rlftsim.jobs.files import read_toml
 from rlftsim.submission.messages import as_text
 
 MAX_METHOD_LENGTH = 40
@@ -79,12 +78,11 @@ def read_entry(path: str | PathLike[str], *, account: str | None = None, method:
     Raises:
         ConfigError: no such file, unknown, missing or placeholder values; the message names the file.
     """
+    way_out = "write one as docs/submission.md shows"
     try:
-        values = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}: write one as docs/submission.md shows.") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: not a TOML file ({error}).") from None
+        values = read_toml(path, way_out, error=ConfigError)
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file: {way_out}.") from None
     values |= {name: value for name, value in (("account", account), ("method", method)) if value is not None}
     known = {field.name for field in fields(Entry)}
     missing = [f.name for f in fields(Entry) if f.name not in values and f.default is MISSING]

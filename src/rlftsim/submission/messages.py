@@ -68,7 +68,16 @@ def encode_rollouts(scenario_id: str, states: SimulatedStates) -> bytes:
     Args:
         scenario_id: of the scenario.
         states: of its N rollouts; those that stand for several are written several times.
+
+    Raises:
+        DataError: An object id that does not fit the message's 32 bits.
     """
+    wide = states.object_id[states.object_id != states.object_id.astype(np.int32)]
+    if len(wide):
+        raise DataError(
+            f"scenario {scenario_id}: object id {wide[0]} does not fit the 32 bits that a submission has for it: give "
+            "the objects smaller ids and convert again"
+        )
     arrays = [getattr(states, axis).cpu().numpy() for axis in AXES]  # each [N, A, T]
     as_bytes = [np.ascontiguousarray(a, np.dtype("<f4")).view(np.uint8) for a in arrays]  # each [N, A, 4 T]
     array_size = encode_varint(_ARRAY_BYTES)

@@ -7,13 +7,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from rlftsim.atomic_io import write_text
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.results import NUMBERS_VERSION, EvaluateConfig
+from rlftsim.jobs.files import read_json
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.tfrecord import count_lost
 from rlftsim.submission.messages import NUM_SCENES, TRAJECTORY_BYTES
@@ -52,11 +52,8 @@ class Plan:
         """
         path = folder / PLAN
         values = {**self.identity, "shards": [[shard.start, shard.stop] for shard in self.shards]}
-        try:
-            old: dict[str, Any] = json.loads(path.read_text(encoding="utf-8")) if path.exists() else dict(values)
-            differing = [name for name in {**values, **old} if old.get(name) != values.get(name)]
-        except (ValueError, AttributeError) as error:
-            raise DataError(f"{path}: damaged ({error}): name another --out, or remove the folder.") from None
+        old = read_json(path, "name another --out, or remove the folder") if path.exists() else values
+        differing = [name for name in {**values, **old} if old.get(name) != values.get(name)]
         if differing:
             raise ConfigError(
                 f"{folder} holds a submission of another {', '.join(differing)}: name another --out, or remove it."

@@ -12,6 +12,7 @@ from typing import Any
 from rlftsim.atomic_io import remove_temporaries, write_text
 from rlftsim.errors import DataError
 from rlftsim.evaluation.results import EvaluateConfig, Evaluation
+from rlftsim.jobs.files import read_json
 from rlftsim.policies.checkpoint import read_card
 from rlftsim.submission.check import ArchiveCheck
 from rlftsim.submission.findings import CHECKS, Finding
@@ -160,8 +161,8 @@ def report_path(archive: Path, ending: str) -> Path:
 def reported_sha256(archive: Path) -> str | None:
     """Checksum in the report beside an archive; None without a report."""
     try:
-        return str(json.loads(report_path(archive, "json").read_text(encoding="utf-8"))["sha256"])
-    except (OSError, ValueError, KeyError, TypeError):
+        return str(read_json(report_path(archive, "json"), "build again")["sha256"])
+    except (DataError, FileNotFoundError, KeyError):
         return None
 
 

@@ -5,6 +5,7 @@ start). Frame of a token: the agent at its start. A token's boxes have the size 
 """
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from pathlib import Path
@@ -12,12 +13,13 @@ from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Bool, Float, Int64
-from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from rlftsim.atomic_io import save_tensors
 from rlftsim.errors import DataError
 from rlftsim.geometry import pose_of_corners
+from rlftsim.jobs.arrays import read_tensors
+from rlftsim.jobs.files import parse_json
 from rlftsim.scenario.types import ObjectType
 
 STEPS_PER_TOKEN = 5
@@ -29,6 +31,12 @@ CLASS_BOXES_M = ((4.8, 2.0), (1.0, 1.0), (2.0, 1.0))
 
 PADDING_CLASS = len(CLASS_NAMES)
 """Class of rows that are no agent, where there are such rows."""
+
+MAX_TOKENS = 1 << 16
+"""Most motion tokens of a class, and most map pieces; published vocabularies have 2048."""
+MAX_COORDINATE_M = 1000.0
+"""Farthest point of a token, which lasts half a second, or of a map piece."""
+_DTYPES = {"corners": torch.float32, "token_mask": torch.bool, "map_prototypes": torch.float32}
 
 _CLASS_OF_TYPE = (0, 0, 1, 2, 0)
 FORMAT = "rlftsim-vocabulary-1"
@@ -119,14 +127,53 @@ class Vocabulary:
         Raises:
             DataError: the file is missing, damaged or not a vocabulary.
         """
+        build = "build it again with `rlftsim tokens`"
         try:
-            with safe_open(path, framework="pt") as file:
-                metadata = file.metadata() or {}
-                if metadata.get("format") != FORMAT:
-                    raise DataError(f"{path}: not a vocabulary of this version: build one with `rlftsim tokens`.")
-                names = ("corners", "token_mask", "map_prototypes")
-                return cls(*(file.get_tensor(n) for n in names), origin=json.loads(metadata["origin"]))
+            tensors, metadata = read_tensors(path, build)
         except FileNotFoundError:
             raise DataError(f"{path}: no such vocabulary: build one with `rlftsim tokens`.") from None
-        except (SafetensorError, OSError) as error:
-            raise DataError(f"{path}: damaged vocabulary ({error}): build it again with `rlftsim tokens`.") from None
+        if metadata.get("format") != FORMAT:
+            raise DataError(f"{path}: not a vocabulary of this version: build one with `rlftsim tokens`.")
+        origin = parse_json(metadata.get("origin", ""), build, source=f"{path}: origin", expected=str)
+        try:
+            check_tables(tensors)
+        except DataError as error:
+            raise DataError(f"{path}: damaged vocabulary ({error}): {build}.") from None
+        return cls(**tensors, origin=origin)
+
+
+def check_tables(tables: Mapping[str, Tensor]) -> None:
+    """Check that tensors are the tables of a vocabulary, as `Vocabulary` declares them.
+
+    Args:
+        tables: Tensors by the names of the fields.
+
+    Raises:
+        DataError: A table is missing, unknown, of another dtype or shape, too large or not finite; or a class lacks
+            the token that stands still. The message begins with the table.
+    """
+    if tables.keys() != _DTYPES.keys():
+        differing = sorted(tables.keys() ^ _DTYPES.keys())
+        raise DataError(f"{', '.join(_DTYPES)} are wanted; missing or unknown: {', '.join(differing)[:80]}")
+    corners, mask, prototypes = (tables[name] for name in _DTYPES)
+    num_tokens, num_pieces = (
+        table.shape[axis] if table.dim() > axis else 0 for table, axis in ((corners, 1), (prototypes, 0))
+    )
+    shapes = {
+        "corners": (len(CLASS_NAMES), num_tokens, STEPS_PER_TOKEN + 1, 4, 2),
+        "token_mask": (len(CLASS_NAMES), num_tokens),
+        "map_prototypes": (num_pieces, 11, 2),
+    }
+    for name, dtype in _DTYPES.items():
+        if tables[name].dtype != dtype or tables[name].shape != shapes[name]:
+            found = f"{tables[name].dtype} {list(tables[name].shape)}"
+            raise DataError(f"{name} is {found}, not {dtype} {list(shapes[name])}")
+    if not (1 <= num_tokens <= MAX_TOKENS and 1 <= num_pieces <= MAX_TOKENS):
+        raise DataError(f"{num_tokens} motion tokens and {num_pieces} map pieces, there are 1 to {MAX_TOKENS} of each")
+    for name, table in (("corners", corners), ("map_prototypes", prototypes)):
+        if not (table.abs() <= MAX_COORDINATE_M).all():  # false for NaN, too
+            raise DataError(f"{name} holds numbers that are no meters within {MAX_COORDINATE_M:g} m")
+    if not mask[:, STILL_TOKEN].all() or (mask[:, 1:] & ~mask[:, :-1]).any():
+        raise DataError(
+            "token_mask must be true for the first tokens of each class, at least for the one that stands still"
+        )

@@ -5,17 +5,18 @@ renamed when it is whole, so a folder of that name is never half-written.
 """
 
 import json
-import shutil
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from safetensors import SafetensorError
-from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from rlftsim.atomic_io import errors_name, save_tensors, write_text
+from rlftsim.atomic_io import errors_name, remove_folder, save_tensors, write_text
 from rlftsim.errors import CheckpointError
+from rlftsim.jobs.arrays import read_tensors
+from rlftsim.jobs.files import read_json
 
 PREFIX = "update-"
 KEPT = 2
@@ -46,9 +47,10 @@ def write_checkpoint(folder: Path, progress: Progress, modules: dict[str, nn.Mod
     """
     target = folder / f"{PREFIX}{progress.update:08d}"
     partial = folder / f".partial-{target.name}"
+    files = (*(f"{name}.safetensors" for name in (*modules, "optimizer")), "progress.json")
     with errors_name(target):
-        shutil.rmtree(partial, ignore_errors=True)  # left by a run that was killed
-        partial.mkdir(parents=True)
+        remove_folder(partial, files)  # left by a run that was killed
+        partial.mkdir(parents=True, exist_ok=True)
         for name, module in modules.items():
             save_tensors(partial / f"{name}.safetensors", module.state_dict())
         # "0.exp_avg" = the first moment of the first parameter, in the order of the optimizer's groups.
@@ -56,17 +58,22 @@ def write_checkpoint(folder: Path, progress: Progress, modules: dict[str, nn.Mod
         tensors = {f"{i}.{name}": value.detach().cpu() for i, state in states.items() for name, value in state.items()}
         save_tensors(partial / "optimizer.safetensors", tensors)
         write_text(partial / "progress.json", json.dumps({"update": progress.update, "numbers": progress.numbers}))
-        shutil.rmtree(target, ignore_errors=True)
+        remove_folder(target, files)
         partial.rename(target)
-    # Names are padded with zeros, so their order is that of the updates. Only now is an older one expendable.
-    for old in sorted(folder.glob(f"{PREFIX}*"))[:-KEPT]:
-        shutil.rmtree(old)
+        # Names are padded with zeros, so their order is that of the updates. Only now is an older one expendable.
+        for old in _checkpoints(folder)[:-KEPT]:
+            remove_folder(old, files)
     return target
 
 
 def newest_checkpoint(folder: Path) -> Path | None:
     """The latest whole checkpoint of a run; None if it has none yet."""
-    return max(folder.glob(f"{PREFIX}*"), default=None)
+    return max(_checkpoints(folder), default=None)
+
+
+def _checkpoints(folder: Path) -> list[Path]:
+    """Whole checkpoints of a run, the latest last; anything else of a similar name is a user's."""
+    return sorted(path for path in folder.glob(f"{PREFIX}*") if path.name.removeprefix(PREFIX).isdecimal())
 
 
 def update_of(path: Path) -> int:
@@ -88,19 +95,85 @@ def read_checkpoint(path: Path, modules: dict[str, nn.Module], optimizer: Optimi
     Raises:
         CheckpointError: damaged, or of another model.
     """
+    way_out = "delete this folder to go on from an older one"
     try:
+        values = read_json(path / "progress.json", way_out, error=CheckpointError)
+        # everything is checked before anything is loaded
+        weights = {name: _read(path / f"{name}.safetensors", way_out) for name in modules}
+        moments = _read(path / "optimizer.safetensors", way_out)
+        progress = Progress(values.get("update"), values.get("numbers"))  # type: ignore[arg-type]
+        _check_progress(progress, update_of(path))
         for name, module in modules.items():
-            module.load_state_dict(load_file(path / f"{name}.safetensors"))
-        state: dict[int, dict[str, Tensor]] = {}
-        for key, value in load_file(path / "optimizer.safetensors").items():
-            index, name = key.split(".", 1)
-            state.setdefault(int(index), {})[name] = value
-        # The groups are the new optimizer's own: learning rate and scales follow the settings, not the file.
-        groups = optimizer.state_dict()["param_groups"]
-        optimizer.load_state_dict({"state": state, "param_groups": groups})
-        values = json.loads((path / "progress.json").read_text())
-        return Progress(values["update"], values["numbers"])
-    except (OSError, SafetensorError, RuntimeError, KeyError, TypeError, ValueError) as error:
-        raise CheckpointError(
-            f"{path}: cannot go on from it ({error}): delete this folder to go on from an older one."
-        ) from None
+            _check_weights(name, weights[name], module)
+        state = _state_of_moments(moments, optimizer)
+    except FileNotFoundError as error:
+        raise CheckpointError(f"{path}: {Path(error.filename or '').name or 'a file'} is missing: {way_out}.") from None
+    except ValueError as error:
+        raise CheckpointError(f"{path}: cannot go on from it ({error}): {way_out}.") from None
+    for name, module in modules.items():
+        module.load_state_dict(weights[name])
+    # The groups are the new optimizer's own: learning rate and scales follow the settings, not the file.
+    optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
+    return progress
+
+
+def _read(path: Path, way_out: str) -> dict[str, Tensor]:
+    try:
+        return read_tensors(path, way_out, error=CheckpointError)[0]
+    except FileNotFoundError:
+        raise CheckpointError(f"{path} is missing: {way_out}.") from None
+
+
+def _check_progress(progress: Progress, update: int) -> None:
+    """Check the position of a run against the name of its folder.
+
+    Raises:
+        ValueError: It is of another update, or a number is missing or not finite.
+    """
+    if type(progress.update) is not int or progress.update != update:
+        raise ValueError(f"its update is {progress.update!r}, not {update}")
+    numbers = progress.numbers
+    if not isinstance(numbers, dict) or not all(type(v) in (int, float) and math.isfinite(v) for v in numbers.values()):
+        raise ValueError("its numbers are not finite numbers by name")
+
+
+def _check_weights(name: str, weights: Mapping[str, Tensor], module: nn.Module) -> None:
+    """Check that weights are those of a module, number for number.
+
+    Raises:
+        ValueError: Another name, shape or dtype, or a weight that is not finite.
+    """
+    own = module.state_dict()
+    if own.keys() != weights.keys():
+        raise ValueError(f"{name} lacks or adds {min(own.keys() ^ weights.keys())}")
+    for key, value in weights.items():
+        if (value.shape, value.dtype) != (own[key].shape, own[key].dtype):
+            wanted = f"{own[key].dtype} {tuple(own[key].shape)}"
+            raise ValueError(f"{key} of {name} is {value.dtype} {tuple(value.shape)}, not {wanted}")
+    for key in own.keys() & dict(module.named_parameters()).keys():
+        if not weights[key].isfinite().all():
+            raise ValueError(f"{key} of {name} is not finite")
+
+
+def _state_of_moments(moments: Mapping[str, Tensor], optimizer: Optimizer) -> dict[int, dict[str, Tensor]]:
+    """State of an optimizer by number of the parameter.
+
+    Raises:
+        ValueError: A moment of no parameter, of another shape, or not finite.
+    """
+    parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+    state: dict[int, dict[str, Tensor]] = {}
+    for key, value in moments.items():
+        number, _, name = key.partition(".")
+        index = int(number) if number.isdecimal() and name else -1
+        if not 0 <= index < len(parameters):
+            raise ValueError(f"{key[:40]!r} is no moment of its {len(parameters)} weights")
+        if value.dim() and value.shape != parameters[index].shape:
+            raise ValueError(f"{key} has shape {tuple(value.shape)}, not {tuple(parameters[index].shape)}")
+        if not value.is_floating_point() or not value.isfinite().all():
+            raise ValueError(f"{key} is not finite, or no number")
+        state.setdefault(index, {})[name] = value
+    names = {frozenset(one) for one in state.values()}
+    if len(names) > 1:
+        raise ValueError("some weights lack moments that others have")
+    return state

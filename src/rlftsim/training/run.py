@@ -20,6 +20,8 @@ from torch import nn
 from torch.optim import Optimizer
 
 from rlftsim.errors import CheckpointError, ConfigError, DataError, NotYetError
+from rlftsim.jobs.folder import check_folder
+from rlftsim.jobs.interruption import ctrl_c_waits
 from rlftsim.lease import Lease
 from rlftsim.progress import log, progress_bar
 from rlftsim.scenario.batch import ScenarioBatch
@@ -28,7 +30,6 @@ from rlftsim.scenario.types import Scenario, Scenarios
 from rlftsim.training.batches import refuse_unscored, scenario_costs
 from rlftsim.training.checkpoint import Progress, newest_checkpoint, read_checkpoint, update_of, write_checkpoint
 from rlftsim.training.data import batch_with_futures, scenarios_of_update
-from rlftsim.training.interruption import ctrl_c_waits
 from rlftsim.training.parallel import DeviceConfig, Fabric, all_reduce_sum, local_indices, num_sharing_memory
 from rlftsim.training.processes import in_processes
 from rlftsim.training.run_folder import RunFolder, describe_inputs, flatten, stored_settings
@@ -210,6 +211,7 @@ def train_in_processes(
         NotYetError: another run is at work in the folder.
         DataError: a process died, or the folder cannot be written to.
     """
+    check_folder(Path(out), "run")
     device: DeviceConfig = config.device
     begun_with = flatten(stored_settings(Path(out))).get("device.processes")
     processes = device.num_processes(num_scenarios, config.batch_size, config.micro_batch_size, begun_with)
@@ -333,7 +335,7 @@ class TrainingRun:
         Raises:
             CheckpointError: the run diverged (its last good checkpoint is named), a checkpoint is damaged, or a longer
                 run was begun in the folder.
-            KeyboardInterrupt: Ctrl-C; says from where the run goes on.
+            KeyboardInterrupt: Ctrl-C, or a signal like it; says from where the run goes on.
         """
         newest = newest_checkpoint(self.folder.checkpoints)
         if newest and update_of(newest) > self.total:
@@ -355,11 +357,12 @@ class TrainingRun:
             log.info(f"{title} {begun}: {self.total} updates of {_number_of_weights(learner)}.")
         try:
             self._make_updates(learner, make_update, title)
-        except KeyboardInterrupt:
+        except KeyboardInterrupt as stop:
             newest = newest_checkpoint(self.folder.checkpoints)
             # The command line says what the same command does next.
             what_next = f"continues behind update {update_of(newest)}" if newest else "starts anew"
-            raise KeyboardInterrupt(what_next) from None
+            stop.args = (what_next,)
+            raise
         self.folder.close()
         self.folder.finish()
         if learner.result is not learner.policy:  # trained in place: the policy is what the folder holds

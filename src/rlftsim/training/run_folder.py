@@ -17,13 +17,16 @@ import subprocess
 import sys
 import time
 from collections.abc import Collection, Mapping
+from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rlftsim import __version__
 from rlftsim.atomic_io import append_text, errors_name, write_text
-from rlftsim.errors import CheckpointError
+from rlftsim.errors import CheckpointError, DataError
+from rlftsim.jobs.files import parse_json, read_json
+from rlftsim.jobs.folder import check_folder
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.types import Scenarios, scenario_ids_of
@@ -107,12 +110,10 @@ def stored_settings(path: Path) -> dict[str, Any]:
         CheckpointError: the file that holds them is damaged.
     """
     file = path / "config.json"
-    if not file.exists():
-        return {}
     try:
-        return dict(json.loads(file.read_text()))
-    except (ValueError, TypeError) as error:
-        raise CheckpointError(f"{file}: damaged ({error}): remove the folder {path} to start anew.") from None
+        return read_json(file, f"remove the folder {path} to start anew", allow_nan=True, error=CheckpointError)
+    except FileNotFoundError:
+        return {}
 
 
 def to_plain(config: Any) -> Any:
@@ -166,6 +167,7 @@ class RunFolder:
         writes: bool = True,
         may_grow: Collection[str] = (),
     ):
+        check_folder(path, "run")
         self.path = path
         self.checkpoints = path / "checkpoints"
         self.model = path / "model"
@@ -241,9 +243,8 @@ class RunFolder:
         from torch.utils.tensorboard import SummaryWriter  # not at the top: `--help` has no use for it
 
         if self._metrics.exists():
-            lines = self._metrics.read_text().splitlines()
-            # A line cut short by a kill counts as infinitely late and goes, too.
-            kept = [line for line in lines if _update_of(line) <= update]
+            # a line cut short by a kill goes, too
+            kept = [line for line, values in _read_lines(self._metrics) if values["update"] <= update]
             write_text(self._metrics, "".join(f"{line}\n" for line in kept))
         board = self.path / "tensorboard"
         with errors_name(board):
@@ -275,13 +276,16 @@ class RunFolder:
 def read_metrics(path: Path) -> list[dict[str, Any]]:
     """The metrics of a run's folder, a dictionary per update; empty where there are none."""
     metrics = path / "metrics.jsonl"
-    lines = metrics.read_text().splitlines() if metrics.exists() else []
-    return [json.loads(line) for line in lines if math.isfinite(_update_of(line))]
+    return [values for _, values in _read_lines(metrics)] if metrics.exists() else []
 
 
-def _update_of(line: str) -> float:
-    """Update of a line of metrics; infinite for one that is no JSON, such as a line that a kill cut short."""
-    try:
-        return float(json.loads(line)["update"])
-    except (ValueError, KeyError, TypeError):
-        return float("inf")
+def _read_lines(metrics: Path) -> list[tuple[str, dict[str, Any]]]:
+    """Text and values of each line of metrics; without those that are no JSON, such as one that a kill cut short."""
+    lines = []
+    for line in metrics.read_text(encoding="utf-8", errors="replace").splitlines():
+        with suppress(DataError):
+            values = parse_json(line, "train again", source=str(metrics), allow_nan=True)
+            is_sound = all(type(value) in (int, float) for value in values.values())
+            if is_sound and math.isfinite(values.get("update", math.inf)):
+                lines.append((line, values))
+    return lines

@@ -6,7 +6,6 @@ motions.
 
 import json
 import os
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, LogNorm
 from matplotlib.figure import Figure
 
-from rlftsim.atomic_io import cannot_write
+from rlftsim.atomic_io import cannot_write, remove_folder, write_text
 from rlftsim.errors import DataError
 from rlftsim.tokens.coverage import MAX_SPEED_BIN_MPS, ClassCoverage, Spread
 from rlftsim.viewer.figure import COLORS, INK, save_figure
@@ -50,15 +49,15 @@ def write_vocabulary_report(folder: Path, classes: tuple[ClassCoverage, ...], *,
     partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
     try:
         partial.mkdir(parents=True)
-        (partial / PAGE).write_text(report_page(classes, vocabulary=vocabulary, data=data))
-        (partial / NUMBERS).write_text(json.dumps(report_numbers(classes, vocabulary=vocabulary, data=data), indent=1))
+        write_text(partial / PAGE, report_page(classes, vocabulary=vocabulary, data=data))
+        write_text(partial / NUMBERS, json.dumps(report_numbers(classes, vocabulary=vocabulary, data=data), indent=1))
         coverage_picture(partial / PICTURE, classes, title=f"{vocabulary}, compared with {data}")
-        shutil.rmtree(folder, ignore_errors=True)
+        remove_folder(folder, (PAGE, NUMBERS, PICTURE))
         partial.replace(folder)
     except OSError as error:
         raise cannot_write(folder, error) from None
     finally:
-        shutil.rmtree(partial, ignore_errors=True)
+        remove_folder(partial, (PAGE, NUMBERS, PICTURE))
 
 
 def report_numbers(classes: tuple[ClassCoverage, ...], *, vocabulary: str, data: str) -> dict[str, object]:

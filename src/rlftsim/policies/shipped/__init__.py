@@ -4,8 +4,7 @@ Their weights are stored in float16 and computed with in float32. A README in ea
 on and how it scores.
 """
 
-from safetensors.torch import load_file
-
+from rlftsim.jobs.arrays import read_tensors
 from rlftsim.policies.checkpoint import SHIPPED_MODELS, load_strictly
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.policies.trafficbots.policy import TrafficBotsPolicy
@@ -35,5 +34,6 @@ def trafficbots_base() -> TrafficBotsPolicy:
 def _with_changes(policy: SmartPolicy, name: str) -> SmartPolicy:
     """The policy with the weights that a model in the box changed, or added."""
     file = SHIPPED_MODELS / name / "changes.safetensors"
-    load_strictly(policy.network, policy.network.state_dict() | load_file(file), source=str(file))
+    changes, _ = read_tensors(file, "install rlftsim again")
+    load_strictly(policy.network, policy.network.state_dict() | changes, source=str(file))
     return policy

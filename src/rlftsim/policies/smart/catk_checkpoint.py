@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file
 from torch import Tensor
 
 from rlftsim.atomic_io import save_tensors
 from rlftsim.errors import CheckpointError, ConfigError
+from rlftsim.jobs.arrays import read_tensors
+from rlftsim.policies.checkpoint import outline, strip_wrappers
 from rlftsim.policies.smart.catk_keys import PREFIX, aliases, catk_name
 from rlftsim.policies.smart.catk_vocabulary import (
     PUBLISHED_AGENT_FILE,
@@ -24,10 +24,10 @@ from rlftsim.policies.smart.catk_vocabulary import (
     read_catk_vocabulary,
 )
 from rlftsim.policies.smart.config import SmartConfig, smart_mini, smart_nano, smart_tiny
-from rlftsim.policies.smart.lightning_file import read_lightning
+from rlftsim.policies.smart.lightning_file import mapping_in, read_lightning
 from rlftsim.policies.smart.network import SmartNetwork
 from rlftsim.policies.smart.policy import SmartPolicy
-from rlftsim.tokens.vocabulary import STEPS_PER_TOKEN
+from rlftsim.tokens.vocabulary import MAX_TOKENS, STEPS_PER_TOKEN
 
 PRESETS = {"nano": smart_nano, "mini": smart_mini, "tiny": smart_tiny}
 
@@ -76,11 +76,13 @@ def import_catk(checkpoint: Path, vocabulary: Sequence[Path]) -> CatkImport:
     weights, settings = _read(checkpoint)
     config, source = _config_of(weights, settings, checkpoint)
     head = weights.get(_HEAD_BIAS, torch.zeros(PUBLISHED_NUM_TOKENS))
-    own = _translate(weights, SmartNetwork(config, head.numel()), str(checkpoint))
+    if head.dim() != 1 or not 1 <= len(head) <= MAX_TOKENS:
+        raise CheckpointError(f"{checkpoint}: {_HEAD_BIAS} has shape {tuple(head.shape)}, not one number a token.")
+    own = _translate(weights, outline(lambda: SmartNetwork(config, len(head))), str(checkpoint))
     tables = read_catk_vocabulary(vocabulary)
-    if tables.num_tokens != head.numel() or not tables.token_mask.all():
+    if tables.num_tokens != len(head) or not tables.token_mask.all():
         raise CheckpointError(
-            f"{checkpoint}: predicts {head.numel()} tokens a class, the vocabulary holds "
+            f"{checkpoint}: predicts {len(head)} tokens a class, the vocabulary holds "
             f"{', '.join(str(int(n)) for n in tables.token_mask.sum(1))}: hand over the one it was trained with."
         )
     note = _vocabulary_note(settings, is_published(tables), checkpoint)
@@ -128,14 +130,14 @@ def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Weights by the public code's names, and the decoder's settings and token file names where the file has them."""
     if path.suffix == ".safetensors":
         try:
-            weights, settings = load_file(path), {}
+            weights, _ = read_tensors(path, "get the file again", error=CheckpointError)
+            settings = {}
         except FileNotFoundError:
             raise CheckpointError(f"{path}: no such file.") from None
-        except (SafetensorError, OSError) as error:
-            raise CheckpointError(f"{path}: damaged safetensors file ({error}).") from None
     else:
         file = read_lightning(path)
-        weights, settings = file.weights, file.settings.get("model_config") or {}
+        weights, settings = file.weights, mapping_in(file.settings, "model_config")
+    weights = dict(strip_wrappers(weights, ()))
     if not any(key.startswith(PREFIX) for key in weights):
         weights = {PREFIX + key: value for key, value in weights.items()}
     return weights, settings
@@ -144,14 +146,14 @@ def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 def _config_of(weights: dict[str, Tensor], settings: dict[str, Any], path: Path) -> tuple[SmartConfig, str]:
     """The architecture, and a note on its source: the file's settings, else the shapes of the weights."""
     # 1. a Lightning checkpoint has the settings. Radii and probabilities may be integers there, here they are floats
-    decoder = settings.get("decoder") or {}
+    decoder = mapping_in(settings, "decoder")
     values = {ours: decoder[theirs] for theirs, ours in _FIELD_OF_SETTING.items() if theirs in decoder}
     if len(values) == len(_FIELD_OF_SETTING) and isinstance(decoder.get("time_span"), int):
         try:
             kinds = {name: type(value) for name, value in vars(SmartConfig()).items()}
             typed = {name: kinds[name](value) for name, value in values.items()}
             config = SmartConfig(**typed, history_tokens=decoder["time_span"] // STEPS_PER_TOKEN)
-        except (TypeError, ValueError, ConfigError) as error:
+        except (TypeError, ValueError, OverflowError, ConfigError) as error:
             raise CheckpointError(f"{path}: settings of the decoder make no sense: {error}") from None
         return replace(config, catk_compat=True), "sizes and radii: from the checkpoint's settings"
     # 2. a safetensors file has none: one of the published sizes, or nothing
@@ -183,7 +185,7 @@ def _vocabulary_note(settings: dict[str, Any], published: bool, path: Path) -> s
     Raises:
         CheckpointError: the checkpoint names the published table, and this is another one.
     """
-    named = (settings.get("token_processor") or {}).get("agent_token_file")
+    named = mapping_in(settings, "token_processor").get("agent_token_file")
     if named == PUBLISHED_AGENT_FILE and not published:
         raise CheckpointError(f"{path}: was trained with {named}, the vocabulary is another one: hand over that table.")
     what = f"the published {PUBLISHED_AGENT_FILE}" if published else "not a published one"
@@ -194,15 +196,14 @@ def _vocabulary_note(settings: dict[str, Any], published: bool, path: Path) -> s
     return f"vocabulary: {what}; the checkpoint names {named}"
 
 
-def _translate(weights: dict[str, Tensor], network: SmartNetwork, source: str) -> dict[str, Tensor]:
-    """Weights under our names.
+def _translate(weights: dict[str, Tensor], own: dict[str, Tensor], source: str) -> dict[str, Tensor]:
+    """Weights under our names, those of a network's state dict.
 
     Raises:
         CheckpointError: lists everything that is missing, unknown, of the wrong shape or kind, or unequal to its
             second name.
     """
     # shapes of all names that must be there, second names of shared norms included
-    own = network.state_dict()
     names = {catk_name(key): key for key in own}
     seconds = aliases(names)
     shapes = {name: own[key].shape for name, key in names.items()}

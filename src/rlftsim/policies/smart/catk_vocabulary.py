@@ -1,7 +1,6 @@
 """Token tables of the public CAT-K code, which its checkpoints need and do not hold."""
 
 import hashlib
-import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,7 +9,8 @@ import torch
 
 from rlftsim.atomic_io import write_whole
 from rlftsim.errors import CheckpointError, DataError
-from rlftsim.tokens.vocabulary import STEPS_PER_TOKEN, Vocabulary
+from rlftsim.jobs.arrays import read_npz
+from rlftsim.tokens.vocabulary import MAX_COORDINATE_M, MAX_TOKENS, STEPS_PER_TOKEN, Vocabulary
 
 MOTION_TABLES = ("veh", "ped", "cyc")
 MAP_TABLE = "traj_src"
@@ -85,14 +85,11 @@ def write_catk_vocabulary(vocabulary: Vocabulary, path: Path) -> None:
 
 
 def _read_npz(path: Path) -> dict[str, np.ndarray]:
-    # a pickle could run code, so object arrays are refused
+    way_out = "not an npz of token tables (pickles are not read, see docs/catk.md)"
     try:
-        with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in (*MOTION_TABLES, MAP_TABLE) if name in file.files}
+        return read_npz(path, (*MOTION_TABLES, MAP_TABLE), way_out, error=CheckpointError)
     except FileNotFoundError:
         raise CheckpointError(f"{path}: no such vocabulary.") from None
-    except (ValueError, OSError, EOFError, AttributeError, zipfile.BadZipFile):
-        raise CheckpointError(f"{path}: not an npz of token tables (pickles are not read, see docs/catk.md).") from None
 
 
 def _check_sizes(tables: dict[str, np.ndarray], where: str) -> None:
@@ -102,9 +99,19 @@ def _check_sizes(tables: dict[str, np.ndarray], where: str) -> None:
         for name, shape in wanted.items()
         if tables[name].shape[1:] != shape[1:] or tables[name].ndim != len(shape)
     ]
-    counts = {len(tables[name]) for name in MOTION_TABLES}
+    wrong += [
+        f"{name} holds {tables[name].dtype}, not numbers" for name in wanted if tables[name].dtype.kind not in "fiu"
+    ]
+    counts = {len(tables[name]) for name in MOTION_TABLES} if not wrong else set()
+    if not wrong and not 1 <= min(counts) <= max(counts) <= MAX_TOKENS:
+        wrong = [f"a class has {max(counts)} tokens, there are 1 to {MAX_TOKENS}"]
     if not wrong and len(counts) > 1:
         wrong = [f"veh, ped and cyc have different numbers of tokens ({', '.join(map(str, sorted(counts)))})"]
-    wrong += [f"{name} holds values that are not finite" for name in wanted if not np.isfinite(tables[name]).all()]
+    if not wrong:
+        wrong = [
+            f"{name} holds values that are not finite, or beyond {MAX_COORDINATE_M:g} m"
+            for name in wanted
+            if not (np.abs(tables[name]) <= MAX_COORDINATE_M).all()
+        ]
     if wrong:
         raise CheckpointError(f"{where}: {'; '.join(wrong)}.")

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal, get_args
 
-from rlftsim.errors import ConfigError, given, require_finite, require_positive, require_types
+from rlftsim.errors import ConfigError, check_limits, given, require_finite, require_positive, require_types
 
 GoalEncoding = Literal["concat", "indication"]
 """Encoding of an agent's goal, see `goal_conditioning`."""
@@ -92,6 +92,9 @@ class SmartConfig:
         caps = ("max_map_neighbors", "max_agent_map_neighbors", "max_agent_neighbors")
         require_positive(self, (*sizes, *radii, *given(self, caps)))
         require_finite(self, radii)
+        check_limits(self, dict.fromkeys(("num_map_layers", "num_decoder_layers", "history_tokens"), 256))
+        check_limits(self, dict.fromkeys(("dim", "num_heads", "head_dim", "num_frequencies"), 65_536))
+        check_limits(self, dict.fromkeys(radii, 100_000) | dict.fromkeys(caps, 2**31 - 1))
         if self.frequency_init not in get_args(FrequencyInit):
             known = ", ".join(get_args(FrequencyInit))
             raise ConfigError(f"frequency_init={self.frequency_init!r} is none of the known ones: {known}.")

@@ -5,7 +5,6 @@ settings (OmegaConf) are replaced by name with an inert stand-in, everything els
 """
 
 import collections
-import pickle
 import typing
 import zipfile
 from dataclasses import dataclass
@@ -13,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from rlftsim.errors import CheckpointError
 
@@ -59,10 +58,26 @@ def read_lightning(path: Path) -> LightningFile:
     """
     content = _unpickle(path)
     weights = content.get("state_dict") if isinstance(content, dict) else None
-    if not isinstance(weights, dict) or not all(isinstance(v, Tensor) for v in weights.values()):
+    if not isinstance(weights, dict) or not all(_is_weight(k, v) for k, v in weights.items()):
         raise CheckpointError(f"{path}: no weights under 'state_dict': is it a Lightning checkpoint of a model?")
-    settings = _plain(content.get("hyper_parameters", {}))
+    try:
+        settings = _plain(content.get("hyper_parameters", {}))
+    except RecursionError:
+        raise CheckpointError(f"{path}: damaged, its settings hold themselves: get the file again.") from None
     return LightningFile(dict(weights), settings if isinstance(settings, dict) else {})
+
+
+def mapping_in(settings: dict[str, Any], name: str) -> dict[str, Any]:
+    """Group of settings by its name; empty where there is none."""
+    group = settings.get(name)
+    return group if isinstance(group, dict) else {}
+
+
+def _is_weight(name: object, value: Any) -> bool:
+    """True for a dense tensor on the CPU whose values are all stored: views may announce more than memory holds."""
+    if not isinstance(name, str) or type(value) not in (Tensor, nn.Parameter) or value.layout != torch.strided:
+        return False
+    return value.device.type == "cpu" and value.numel() * value.element_size() <= value.untyped_storage().nbytes()
 
 
 def _unpickle(path: Path) -> Any:
@@ -71,6 +86,9 @@ def _unpickle(path: Path) -> Any:
     if not zipfile.is_zipfile(path):
         raise CheckpointError(f"{path}: neither safetensors nor a Lightning checkpoint (a zip file by torch.save).")
     try:
+        with zipfile.ZipFile(path) as archive:
+            if any(member.compress_type != zipfile.ZIP_STORED for member in archive.infolist()):
+                raise CheckpointError(f"{path}: packed, which torch.save never does: unpack it, or get the file again.")
         # list the classes that the pickle names before any is made
         named = torch.serialization.get_unsafe_globals_in_checkpoint(path)
         unknown = sorted(set(named) - set(_FOREIGN) - set(_HARMLESS))
@@ -80,7 +98,9 @@ def _unpickle(path: Path) -> Any:
         # then let torch's restricted unpickler make stand-ins for the known ones
         with torch.serialization.safe_globals(list(known)):  # type: ignore[arg-type]
             return torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, KeyError, AttributeError, TypeError) as error:
+    except CheckpointError:
+        raise
+    except Exception as error:  # whatever damage makes of the code that reads it
         first_line = str(error).strip().splitlines()[:1]
         raise CheckpointError(f"{path}: damaged or not a checkpoint ({' '.join(first_line)}).") from None
 

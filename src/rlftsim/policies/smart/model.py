@@ -15,7 +15,8 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 
 from rlftsim.errors import CheckpointError, ConfigError
-from rlftsim.policies.checkpoint import load_strictly, read_model, save_model
+from rlftsim.jobs.folder import check_folder
+from rlftsim.policies.checkpoint import check_fit, load_strictly, read_model, save_model
 from rlftsim.policies.distributions import CategoricalDistribution, LazyTokenDistribution, TokenDistribution
 from rlftsim.policies.sharing import are_frozen_alike
 from rlftsim.policies.smart.config import GoalEncoding, SmartConfig
@@ -149,6 +150,7 @@ class SmartModel(nn.Module):
             folder: created where it is missing.
             card: text of README.md.
         """
+        check_folder(Path(folder), "model")
         Path(folder).mkdir(parents=True, exist_ok=True)
         self.vocabulary.to("cpu").save(Path(folder) / VOCABULARY)
         card = card or "A SMART traffic model. Origin unknown.\n"
@@ -168,7 +170,9 @@ class SmartModel(nn.Module):
         path = model.folder / VOCABULARY
         if not path.exists():
             raise CheckpointError(f"{model.folder}: not a SMART model folder, {VOCABULARY} is missing.")
-        policy = cls(config, Vocabulary.load(path))
+        vocabulary = Vocabulary.load(path)
+        check_fit(lambda: cls(config, vocabulary).network, weights, source=str(model.folder))
+        policy = cls(config, vocabulary)
         load_strictly(policy.network, weights, source=str(model.folder))
         return policy
 

@@ -3,7 +3,15 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
-from rlftsim.errors import ConfigError, given, require_finite, require_not_negative, require_positive, require_types
+from rlftsim.errors import (
+    ConfigError,
+    check_limits,
+    given,
+    require_finite,
+    require_not_negative,
+    require_positive,
+    require_types,
+)
 
 WINDOW = 11
 """Steps of 0.1 s that an agent or a light is seen for, the current one included."""
@@ -85,6 +93,9 @@ class TrafficBotsConfig:
         require_positive(self, (*sizes, *neighbors, *distances, *counts))
         require_finite(self, (*distances, "free_nats"))
         require_not_negative(self, ("free_nats",))
+        check_limits(self, dict.fromkeys(("num_map_layers", "num_light_layers", "num_agent_layers"), 256))
+        check_limits(self, dict.fromkeys(("dim", "num_heads"), 65_536) | dict.fromkeys(distances, 100_000))
+        check_limits(self, dict.fromkeys((*neighbors, *counts), 2**31 - 1))
         if self.dim % 16 or self.dim % self.num_heads:
             raise ConfigError(f"dim={self.dim} must be a multiple of 16 and of num_heads={self.num_heads}.")
         for name in ("dropout", "input_drop", "noise_correlation"):

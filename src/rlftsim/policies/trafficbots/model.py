@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from rlftsim.policies.checkpoint import load_strictly, read_model, save_model
+from rlftsim.policies.checkpoint import check_fit, load_strictly, read_model, save_model
 from rlftsim.policies.sharing import are_frozen_alike
 from rlftsim.policies.trafficbots.config import TrafficBotsConfig
 from rlftsim.policies.trafficbots.destinations import VEHICLE
@@ -132,6 +132,8 @@ class TrafficBotsModel(nn.Module):
                 names them all.
         """
         stored = read_model(folder, architecture=cls.architecture)
-        policy = cls(stored.build(TrafficBotsConfig))
-        load_strictly(policy.network, stored.read_weights(), source=str(stored.folder))
+        config, weights = stored.build(TrafficBotsConfig), stored.read_weights()
+        check_fit(lambda: TrafficBotsNetwork(config), weights, source=str(stored.folder))
+        policy = cls(config)
+        load_strictly(policy.network, weights, source=str(stored.folder))
         return policy

@@ -12,6 +12,8 @@ import numpy as np
 
 from rlftsim.atomic_io import remove_temporaries_below, write_text
 from rlftsim.errors import ConfigError, DataError, RlftsimError
+from rlftsim.jobs.files import read_json
+from rlftsim.jobs.folder import check_folder
 from rlftsim.lease import Lease
 from rlftsim.progress import progress_bar
 from rlftsim.scenario.dataset import (
@@ -150,6 +152,7 @@ def generate(
     """
     request = SyntheticRequest(num_scenarios, seed, scenarios_per_network, splits)
     folder = Path(destination)
+    check_folder(folder, "data set")
     tasks = plan_networks(request)
     runner = runner or on_this_machine(jobs, len(tasks))
     require_begun(runner, folder)
@@ -172,7 +175,7 @@ def generate(
         return manifest
     marker = folder / INCOMPLETE
     if marker.exists():
-        if json.loads(marker.read_text(encoding="utf-8") or "{}") != provenance:
+        if read_json(marker, "choose another folder, or delete this one") != provenance:
             raise DataError(f"{folder} was begun with another seed, other arguments or versions: choose another folder")
     else:
         # not what other shares of the same run make in this moment

@@ -1,0 +1,1 @@
+"""Long work: whole files, result folders."""

@@ -1,0 +1,102 @@
+"""Tensors and arrays from files that anybody may have written, damaged or edited.
+
+The only module that opens safetensors and npz files. Both announce sizes before their contents, and neither runs code.
+"""
+
+import math
+import struct
+import zipfile
+import zlib
+from collections.abc import Mapping, Sequence
+from os import PathLike
+
+import numpy as np
+from safetensors import SafetensorError, safe_open
+from torch import Tensor
+
+from rlftsim.errors import DataError, RlftsimError
+
+MAX_ARRAY_BYTES = 1 << 30
+"""Most bytes that arrays read together from one npz may unfold to; zeros are packed a thousand times smaller."""
+_TENSOR_DAMAGE = (SafetensorError, OSError, ValueError, TypeError, KeyError, AttributeError, RuntimeError, MemoryError)
+_ARRAY_DAMAGE = (
+    *(OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, MemoryError, OverflowError, RuntimeError),
+    *(SyntaxError, TypeError, KeyError, struct.error),  # of headers
+)
+
+
+def read_tensors(
+    path: str | PathLike[str], remedy: str, *, error: type[RlftsimError] = DataError
+) -> tuple[dict[str, Tensor], Mapping[str, str]]:
+    """Tensors of a safetensors file by name, on the CPU, and the texts in its header.
+
+    Args:
+        path: Safetensors file; its header is checked against its size before any tensor is made.
+        remedy: Way out at the end of every message, such as "write it again".
+        error: Class of the errors raised.
+
+    Raises:
+        FileNotFoundError: No such file; the caller knows what was looked for.
+        RlftsimError: Damaged file.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:
+            return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
+    except FileNotFoundError:
+        raise
+    except _TENSOR_DAMAGE as problem:
+        cause = (str(problem) or type(problem).__name__).splitlines()[0][:200]
+        raise error(f"{path}: damaged safetensors file ({cause}): {remedy}.") from None
+
+
+def read_npz(
+    path: str | PathLike[str], names: Sequence[str], remedy: str, *, error: type[RlftsimError] = DataError
+) -> dict[str, np.ndarray]:
+    """Arrays of an npz by name; names that it lacks are missing in the result.
+
+    Args:
+        path: Npz file, packed or not.
+        names: Arrays to read; headers of all of them are looked at before the contents of any.
+        remedy: Way out at the end of every message, such as "write it again".
+        error: Class of the errors raised.
+
+    Raises:
+        FileNotFoundError: No such file; the caller knows what was looked for.
+        RlftsimError: No npz, damaged, an array of Python objects, or one that unfolds to more than `MAX_ARRAY_BYTES`.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            members = {name: archive.getinfo(f"{name}.npy") for name in names if f"{name}.npy" in archive.namelist()}
+            sizes = {name: _read_header(archive, member) for name, member in members.items()}
+            if sum(sizes.values()) > MAX_ARRAY_BYTES:
+                raise ValueError(f"its arrays unfold to {sum(sizes.values()) / 1e9:.3g} GB")
+            arrays = {}
+            for name, member in members.items():
+                with archive.open(member) as file:
+                    arrays[name] = np.lib.format.read_array(file, allow_pickle=False)  # pyright: ignore
+            return arrays
+    except FileNotFoundError:
+        raise
+    except _ARRAY_DAMAGE as problem:
+        cause = str(problem).partition("\n")[0][:200] or type(problem).__name__
+        if isinstance(problem, zipfile.BadZipFile | EOFError):
+            cause = "it is not an npz archive, or cut off"
+        raise error(f"{path}: cannot be read ({cause}): {remedy}.") from None
+
+
+def _read_header(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> int:
+    """Bytes of an array by its header, checked against those of its place in the archive.
+
+    Raises:
+        ValueError: The array holds Python objects, or the two sizes differ.
+    """
+    with archive.open(member) as file:
+        version = np.lib.format.read_magic(file)
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, _, dtype = read(file)
+        size = math.prod(shape) * dtype.itemsize
+        if dtype.hasobject:
+            raise ValueError(f"{member.filename} holds Python objects")
+        if size + file.tell() != member.file_size or min(shape, default=0) < 0:
+            raise ValueError(f"{member.filename} announces an array of another size")
+    return size

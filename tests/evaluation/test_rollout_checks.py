@@ -1,0 +1,87 @@
+"""Warnings of rollouts that cannot be."""
+
+import re
+from dataclasses import replace
+
+import pytest
+import torch
+from rollout_drawing import draw_arrays, write_npz
+
+import rlftsim as rs
+import scenes
+from rlftsim.evaluation.rollout_checks import warn_of_doubts
+from rlftsim.evaluation.score_files import ScoreConfig, score_rollouts
+from rlftsim.realism import SimulatedStates
+from rlftsim.realism.from_rollouts import logged_states
+from rlftsim.scenario.dataset import write_dataset
+
+SCENARIO = scenes.straight_road()
+
+
+@pytest.fixture
+def warnings_of(capsys):
+    def warnings(states, scenario=SCENARIO):
+        warn_of_doubts(scenario, states, "x.npz")
+        return capsys.readouterr().err.splitlines()
+
+    return warnings
+
+
+def states_of(arrays):
+    return SimulatedStates(arrays["object_ids"], *(torch.from_numpy(arrays[a]) for a in ("x", "y", "z", "heading")))
+
+
+def test_rollouts_that_go_on_from_the_log_are_taken_without_a_word(warnings_of):
+    for scenario in (SCENARIO, scenes.with_gaps(), scenes.crowd(num_agents=9), scenes.lone_agent()):
+        assert warnings_of(states_of(draw_arrays(scenario)), scenario) == []
+        assert warnings_of(logged_states(scenario, num_rollouts=4), scenario) == []
+
+
+def test_steps_that_the_log_lacks_may_hold_anything(warnings_of):
+    scenario = scenes.with_gaps()
+    states, valid = logged_states(scenario, num_rollouts=1), scenario.tracks.valid[scenario.simulated_indices, 11:]
+    assert not valid.all()
+    lost = torch.where(torch.from_numpy(valid), states.x, torch.tensor(-9e3))
+    assert warnings_of(replace(states, x=lost), scenario) == []
+
+
+def test_another_frame_is_told_by_scenario_agent_and_distance(warnings_of):
+    states = logged_states(SCENARIO, num_rollouts=1)
+    (line,) = warnings_of(replace(states, x=states.x + 6000))
+    assert line.startswith(f"x.npz: scenario straight: agent {states.object_id[0]}: ")
+    count = len(states.object_id)
+    assert f"{count} of {count} agents do not begin where the log stops" in line
+    assert "this one 6000 m from there in rollout 0." in line
+
+
+@pytest.mark.parametrize(
+    ("axis", "change", "text"),
+    [
+        ("x", lambda v: torch.cat([v[..., :40], v[..., 40:] + 9], -1), "a step of 9.[0-9] m in 0.1 s in rollout 0"),
+        ("x", lambda v: v + 7 * torch.arange(80.0), "from its current position, beyond 480 m, in rollout 0"),
+        ("z", lambda v: v + 30, "z is 30 m from that of the current step"),
+        ("heading", lambda v: torch.rad2deg(v + 3), r"heading of \d{3} rad \(degrees\?\)"),
+    ],
+)
+def test_what_no_road_user_does_is_told(warnings_of, axis, change, text):
+    states = logged_states(SCENARIO, num_rollouts=1)
+    lines = "\n".join(warnings_of(replace(states, **{axis: change(getattr(states, axis))})))
+    assert re.search(text, lines), lines
+
+
+def test_files_with_agents_and_rollouts_exchanged_are_scored_with_a_warning(tmp_path, capsys):
+    arrays = draw_arrays(SCENARIO, num_rollouts=len(SCENARIO.simulated_indices))
+    swapped = {a: v.swapaxes(0, 1).copy() if v.ndim == 3 else v for a, v in arrays.items()}
+    write_dataset(SCENARIO, tmp_path / "data")
+    for name, values in (("right", arrays), ("swapped", swapped)):
+        file = write_npz(tmp_path / f"{name}.npz", values)
+        score_rollouts(file, tmp_path / "data", None, ScoreConfig(jobs=1), show_progress=False)
+        assert ("m from there in rollout" in capsys.readouterr().err) == (name == "swapped")
+
+
+def test_rollouts_in_python_are_warned_of_too(capsys):
+    rollouts = rs.simulate("constant_velocity", SCENARIO, num_rollouts=2)
+    rs.score(SCENARIO, rollouts)
+    assert capsys.readouterr().err == ""
+    rs.score(SCENARIO, replace(rollouts, position=rollouts.position + 50))
+    assert "agents do not begin where the log stops" in capsys.readouterr().err

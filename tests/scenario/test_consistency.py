@@ -1,0 +1,69 @@
+"""Positions against velocities, headings and times."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import scenes
+from rlftsim.scenario.consistency import describe_contradictions
+from rlftsim.scenario.dataset import ScenarioDataset
+from rlftsim.scenario.types import ObjectType
+from rlftsim.scenario.womd import read_scenarios
+
+
+@pytest.fixture
+def tracks():
+    return scenes.straight_road().tracks
+
+
+def rotated(velocity):
+    return np.stack([-velocity[..., 1], velocity[..., 0]], -1)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [rotated, np.zeros_like, lambda v: v * np.float32(3.6), lambda v: -v, lambda v: v / np.float32(10)],
+    ids=["across", "zero", "km/h", "backwards", "steps of a second"],
+)
+def test_velocities_of_another_frame_unit_or_time_base_contradict_positions(tracks, change):
+    assert describe_contradictions(tracks) == ""
+    assert describe_contradictions(replace(tracks, velocity=change(tracks.velocity))).startswith("velocities ")
+
+
+def test_the_first_contradictory_track_is_named_with_its_speeds(tracks):
+    kept = replace(tracks, position=np.zeros_like(tracks.position), velocity=np.full_like(tracks.velocity, 3.0))
+    text = describe_contradictions(kept)
+    assert f"track {tracks.object_id[0]} moves at 0.0 m/s, its velocity is 4.2 m/s and 4.2 m/s off" in text
+
+
+def test_headings_in_degrees_or_from_north_contradict_the_motion(tracks):
+    for heading in (np.rad2deg(tracks.heading + np.pi / 2), np.pi / 2 - tracks.heading):
+        assert describe_contradictions(replace(tracks, heading=heading.astype(np.float32))).startswith("headings ")
+
+
+def test_vehicles_that_back_up_slowly_and_pedestrians_face_where_they_like(tracks):
+    turned = tracks.heading + np.float32(np.pi)
+    slow = replace(tracks, position=tracks.position / np.float32(10), velocity=tracks.velocity / np.float32(10))
+    assert describe_contradictions(replace(slow, heading=turned)) == ""
+    kinds = np.full_like(tracks.object_type, ObjectType.PEDESTRIAN)
+    assert describe_contradictions(replace(tracks, heading=turned, object_type=kinds)) == ""
+
+
+def test_a_minority_of_tracks_may_be_noisy_and_states_that_are_not_valid_hold_anything(tracks):
+    noisy = tracks.velocity.copy()
+    noisy[:2] *= -1  # of five that move
+    assert describe_contradictions(replace(tracks, velocity=noisy)) == ""
+    lost, valid = tracks.position.copy(), tracks.valid.copy()
+    valid[:, 30:60], lost[:, 30:60] = False, np.inf
+    assert describe_contradictions(replace(tracks, position=lost, valid=valid)) == ""
+
+
+def test_synthetic_scenarios_do_not_contradict_themselves():
+    assert not any(describe_contradictions(scenario.tracks) for scenario in ScenarioDataset("synthetic", cache_size=0))
+
+
+@pytest.mark.official
+def test_real_scenarios_do_not_contradict_themselves(shared):
+    files = sorted((shared / "data" / "womd").rglob("*.tfrecord"))
+    assert not any(describe_contradictions(scenario.tracks) for file in files for scenario in read_scenarios(file))
