@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from rlftsim.atomic_io import write_text
-from rlftsim.errors import DataError
+from rlftsim.errors import DataError, in_short
 
 FORMAT = "rlftsim-goals-1"
 FIELDS = ("scenario", "agent", "x", "y", "label")
@@ -223,7 +223,7 @@ def _refuse_unknown(found: Mapping[str, Any], known: Sequence[str], place: str) 
         if name not in known:
             near = difflib.get_close_matches(name, known, 1)
             hint = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(known)}."
-            raise DataError(f"{place}: no field {name!r} here: {hint}")
+            raise DataError(f"{place}: no field {in_short(name)} here: {hint}")
     if isinstance(found, _Object) and found.repeated:
         raise DataError(f"{place}: {', '.join(found.repeated)} is written more than once: keep one of them.")
 
