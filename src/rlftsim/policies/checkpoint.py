@@ -27,7 +27,7 @@ from rlftsim.aliases import current_names
 from rlftsim.atomic_io import save_tensors, write_text
 from rlftsim.errors import CheckpointError, ConfigError
 from rlftsim.jobs.arrays import read_tensors
-from rlftsim.jobs.files import read_json
+from rlftsim.jobs.files import printable, read_json
 
 CONFIG, WEIGHTS, CARD = "config.json", "model.safetensors", "README.md"
 SHIPPED_MODELS = Path(__file__).parent / "shipped"
@@ -289,7 +289,7 @@ def check_shapes(weights: Mapping[str, Tensor], own: Mapping[str, Tensor], *, so
         CheckpointError: Anything differs; the message names the first few.
     """
     problems = [f"missing {k}" for k in sorted(own.keys() - weights.keys())]
-    problems += [f"unknown {k}" for k in sorted(weights.keys() - own.keys())]
+    problems += [f"unknown {k[:200]}" for k in sorted(weights.keys() - own.keys())]
     problems += [
         f"{k} has shape {tuple(weights[k].shape)} instead of {tuple(own[k].shape)}"
         for k in sorted(own.keys() & weights.keys())
@@ -302,7 +302,7 @@ def check_shapes(weights: Mapping[str, Tensor], own: Mapping[str, Tensor], *, so
     ]
     if problems:
         shown = "; ".join(problems[:SHOWN_PROBLEMS]) + (" …" if len(problems) > SHOWN_PROBLEMS else "")
-        raise CheckpointError(f"{source}: {len(problems)} weights do not fit this model: {shown}.")
+        raise CheckpointError(f"{source}: {len(problems)} weights do not fit this model: {printable(shown)}.")
 
 
 class _NoDraws(TorchFunctionMode):
