@@ -17,7 +17,7 @@ from functools import partial
 from pathlib import Path
 
 from rlftsim.atomic_io import errors_name, remove_temporaries, temporary_beside, write_text
-from rlftsim.errors import DataError
+from rlftsim.errors import ConfigError, DataError, require_types
 from rlftsim.evaluation.evaluate import check_jobs, simulate_states
 from rlftsim.evaluation.results import EvaluateConfig
 from rlftsim.jobs.files import read_json
