@@ -289,7 +289,7 @@ def check_shapes(weights: Mapping[str, Tensor], own: Mapping[str, Tensor], *, so
         CheckpointError: Anything differs; the message names the first few.
     """
     problems = [f"missing {k}" for k in sorted(own.keys() - weights.keys())]
-    problems += [f"unknown {k[:200]}" for k in sorted(weights.keys() - own.keys())]
+    problems += [f"unknown {k[:100]}" for k in sorted(weights.keys() - own.keys())]
     problems += [
         f"{k} has shape {tuple(weights[k].shape)} instead of {tuple(own[k].shape)}"
         for k in sorted(own.keys() & weights.keys())

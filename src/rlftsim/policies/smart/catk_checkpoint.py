@@ -16,7 +16,7 @@ from rlftsim.atomic_io import save_tensors
 from rlftsim.errors import CheckpointError, ConfigError
 from rlftsim.jobs.arrays import read_tensors
 from rlftsim.jobs.files import printable
-from rlftsim.policies.checkpoint import outline, strip_wrappers
+from rlftsim.policies.checkpoint import SHOWN_PROBLEMS, outline, strip_wrappers
 from rlftsim.policies.smart.catk_keys import PREFIX, aliases, catk_name
 from rlftsim.policies.smart.catk_vocabulary import (
     PUBLISHED_AGENT_FILE,
@@ -226,5 +226,6 @@ def _translate(weights: dict[str, Tensor], own: dict[str, Tensor], source: str) 
         if second in weights and first in weights and not torch.equal(weights[second], weights[first]):
             problems.append(f"{second} differs from {first}, which must be the same")
     if problems:
-        raise CheckpointError(f"{source}: {len(problems)} weights do not fit: {printable('; '.join(problems))}.")
+        shown = "; ".join(problems[:SHOWN_PROBLEMS]) + (" …" if len(problems) > SHOWN_PROBLEMS else "")
+        raise CheckpointError(f"{source}: {len(problems)} weights do not fit: {printable(shown)}.")
     return {key: weights[name] for name, key in names.items()}
