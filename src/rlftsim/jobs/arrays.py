@@ -5,6 +5,8 @@ The only module that opens safetensors and npz files. Both announce sizes before
 
 import math
 import struct
+import tokenize
+import warnings
 import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
@@ -15,13 +17,14 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from rlftsim.errors import DataError, RlftsimError
+from rlftsim.jobs.files import first_line
 
 MAX_ARRAY_BYTES = 1 << 30
 """Most bytes that arrays read together from one npz may unfold to; zeros are packed a thousand times smaller."""
 _TENSOR_DAMAGE = (SafetensorError, OSError, ValueError, TypeError, KeyError, AttributeError, RuntimeError, MemoryError)
 _ARRAY_DAMAGE = (
     *(OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, MemoryError, OverflowError, RuntimeError),
-    *(SyntaxError, TypeError, KeyError, struct.error),  # of headers
+    *(SyntaxError, TypeError, KeyError, struct.error, tokenize.TokenError),  # of headers
 )
 
 
@@ -45,8 +48,7 @@ def read_tensors(
     except FileNotFoundError:
         raise
     except _TENSOR_DAMAGE as problem:
-        cause = (str(problem) or type(problem).__name__).splitlines()[0][:200]
-        raise error(f"{path}: damaged safetensors file ({cause}): {remedy}.") from None
+        raise error(f"{path}: damaged safetensors file ({first_line(problem)}): {remedy}.") from None
 
 
 def read_npz(
@@ -65,7 +67,8 @@ def read_npz(
         RlftsimError: No npz, damaged, an array of Python objects, or one that unfolds to more than `MAX_ARRAY_BYTES`.
     """
     try:
-        with zipfile.ZipFile(path) as archive:
+        # numpy and Python warn of odd headers
+        with warnings.catch_warnings(action="ignore"), zipfile.ZipFile(path) as archive:
             members = {name: archive.getinfo(f"{name}.npy") for name in names if f"{name}.npy" in archive.namelist()}
             sizes = {name: _read_header(archive, member) for name, member in members.items()}
             if sum(sizes.values()) > MAX_ARRAY_BYTES:
@@ -78,9 +81,8 @@ def read_npz(
     except FileNotFoundError:
         raise
     except _ARRAY_DAMAGE as problem:
-        cause = str(problem).partition("\n")[0][:200] or type(problem).__name__
-        if isinstance(problem, zipfile.BadZipFile | EOFError):
-            cause = "it is not an npz archive, or cut off"
+        is_cut = isinstance(problem, zipfile.BadZipFile | EOFError)
+        cause = "it is not an npz archive, or cut off" if is_cut else first_line(problem)
         raise error(f"{path}: cannot be read ({cause}): {remedy}.") from None
 
 

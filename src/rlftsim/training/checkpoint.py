@@ -9,6 +9,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from torch import Tensor, nn
 from torch.optim import Optimizer
@@ -101,8 +102,7 @@ def read_checkpoint(path: Path, modules: dict[str, nn.Module], optimizer: Optimi
         # everything is checked before anything is loaded
         weights = {name: _read(path / f"{name}.safetensors", way_out) for name in modules}
         moments = _read(path / "optimizer.safetensors", way_out)
-        progress = Progress(values.get("update"), values.get("numbers"))  # type: ignore[arg-type]
-        _check_progress(progress, update_of(path))
+        _check_progress(values, update_of(path))
         for name, module in modules.items():
             _check_weights(name, weights[name], module)
         state = _state_of_moments(moments, optimizer)
@@ -114,7 +114,7 @@ def read_checkpoint(path: Path, modules: dict[str, nn.Module], optimizer: Optimi
         module.load_state_dict(weights[name])
     # The groups are the new optimizer's own: learning rate and scales follow the settings, not the file.
     optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
-    return progress
+    return Progress(values["update"], values["numbers"])
 
 
 def _read(path: Path, way_out: str) -> dict[str, Tensor]:
@@ -124,15 +124,15 @@ def _read(path: Path, way_out: str) -> dict[str, Tensor]:
         raise CheckpointError(f"{path} is missing: {way_out}.") from None
 
 
-def _check_progress(progress: Progress, update: int) -> None:
+def _check_progress(values: Mapping[str, Any], update: int) -> None:
     """Check the position of a run against the name of its folder.
 
     Raises:
         ValueError: It is of another update, or a number is missing or not finite.
     """
-    if type(progress.update) is not int or progress.update != update:
-        raise ValueError(f"its update is {progress.update!r}, not {update}")
-    numbers = progress.numbers
+    if type(values.get("update")) is not int or values["update"] != update:
+        raise ValueError(f"its update is {str(values.get('update'))[:40]!r}, not {update}")
+    numbers = values.get("numbers")
     if not isinstance(numbers, dict) or not all(type(v) in (int, float) and math.isfinite(v) for v in numbers.values()):
         raise ValueError("its numbers are not finite numbers by name")
 
@@ -145,7 +145,7 @@ def _check_weights(name: str, weights: Mapping[str, Tensor], module: nn.Module) 
     """
     own = module.state_dict()
     if own.keys() != weights.keys():
-        raise ValueError(f"{name} lacks or adds {min(own.keys() ^ weights.keys())}")
+        raise ValueError(f"{name} lacks or adds {min(own.keys() ^ weights.keys())[:80]!r}")
     for key, value in weights.items():
         if (value.shape, value.dtype) != (own[key].shape, own[key].dtype):
             wanted = f"{own[key].dtype} {tuple(own[key].shape)}"
@@ -169,9 +169,9 @@ def _state_of_moments(moments: Mapping[str, Tensor], optimizer: Optimizer) -> di
         if not 0 <= index < len(parameters):
             raise ValueError(f"{key[:40]!r} is no moment of its {len(parameters)} weights")
         if value.dim() and value.shape != parameters[index].shape:
-            raise ValueError(f"{key} has shape {tuple(value.shape)}, not {tuple(parameters[index].shape)}")
+            raise ValueError(f"{key[:80]!r} has shape {tuple(value.shape)}, not {tuple(parameters[index].shape)}")
         if not value.is_floating_point() or not value.isfinite().all():
-            raise ValueError(f"{key} is not finite, or no number")
+            raise ValueError(f"{key[:80]!r} is not finite, or no number")
         state.setdefault(index, {})[name] = value
     names = {frozenset(one) for one in state.values()}
     if len(names) > 1:
