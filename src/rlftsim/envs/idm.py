@@ -9,9 +9,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from rlftsim.envs.actions import signed_speed
+from rlftsim.envs.levels import RouteHeights, is_on_level
 from rlftsim.envs.route import headings_of, points_every
 from rlftsim.envs.scene import RED, YELLOW, Scene
-from rlftsim.geometry import wrapped
+from rlftsim.geometry import heights_overlap, wrapped
 from rlftsim.scenario.polylines import arc_length
 from rlftsim.scenario.types import CURRENT_STEP, STEP_S, TOTAL_STEPS
 
@@ -118,6 +119,8 @@ class IdmLines:
     """Direction of the line."""
     facing: Float[np.ndarray, "M P"]
     """Heading of the agent there: against the line where it backs up in its log."""
+    ground: Float[np.ndarray, "M P"]
+    """Height of the ground; zeros in scenes without levels."""
     stop_m: Float[np.ndarray, "M T"]
     """Distance along the line to the stop point of each light; infinite where the light is on another way."""
     wanted_mps: Float[np.ndarray, "M"]
@@ -149,9 +152,13 @@ def idm_lines(scene: Scene, agents: np.ndarray, config: IdmConfig) -> IdmLines:
         backs_up[row] = np.cos(heading[row] - path[at - 1, 2]) < 0
     wanted = np.where(backs_up.any(1), fastest, np.maximum(fastest, config.speed_mps))
     offset = np.linalg.norm(points[:, :, None] - scene.lights.point, axis=-1)  # [M, P, T]
+    ground = np.zeros(heading.shape)
+    if scene.levels is not None:
+        ground = scene.levels.follow_lines(points, scene.z[agents] - scene.size[agents, 2] / 2)
+        offset[~is_on_level(scene.lights.z - ground[..., None])] = np.inf
     stop = np.where(offset.min(1) <= ON_LINE_M, offset.argmin(1), np.inf)
     facing = np.where(backs_up, wrapped(heading + np.pi), heading)
-    return IdmLines(agents, points, heading, facing, stop, wanted)
+    return IdmLines(agents, points, heading, facing, ground, stop, wanted)
 
 
 def _logged_path(scene: Scene, agent: int) -> Float[np.ndarray, "p 3"]:
@@ -173,6 +180,7 @@ def advance_idm(
     lines: IdmLines,
     place: Float[np.ndarray, "M 2"],
     motion: Float[np.ndarray, "A 5"],
+    z: Float[np.ndarray, "A"],
     present: Bool[np.ndarray, "A"],
     scene: Scene,
     step: int,
@@ -184,6 +192,7 @@ def advance_idm(
         lines: their ways.
         place: distance along the line, and speed.
         motion: x, y, heading, vx, vy of all agents.
+        z: Heights of their centers.
         present: False = the agent is not there.
         scene: the scenario.
         step: of the log, for the lights.
@@ -199,6 +208,13 @@ def advance_idm(
     nearest = np.argsort(away, axis=1)[:, :NEAREST]
     mask = np.take_along_axis(away, nearest, 1) < LOOKAHEAD_M + BEYOND_BOX_M
     line, heading = lines.points[rows[:, None], window], lines.heading[rows[:, None], window]
+    if scene.levels is not None:
+        height, ground = scene.size[:, 2], lines.ground[rows[:, None], window]
+        center = z[nearest] - height[lines.agents, None] / 2
+        heights = RouteHeights.measure(motion[nearest, :2], center, line, ground)
+        away = np.take_along_axis(away, nearest, 1)
+        rise = heights.differences(away, ground[:, 0], np.zeros(len(rows)))
+        mask &= heights_overlap(rise, height[lines.agents, None], height[nearest])
     gap, lead = find_leaders(line, heading, size[lines.agents], motion[nearest], size[nearest], mask)
     # 2. A red or yellow light ahead is a standing leader.
     front = way + size[lines.agents, 0] / 2
