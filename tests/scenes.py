@@ -4,7 +4,7 @@ World frame, meters: the ego is near (1000, -200) at the current step. Nothing i
 tie.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -285,3 +285,17 @@ def without_road_edges(scenario_id: str = "no-edges") -> Scenario:
     whole = straight_road(scenario_id)
     lanes = polylines([(MapFeatureType.LANE_SURFACE_STREET, [(-60.3, 0.1), (140.6, 0.3)])])
     return replace(whole, map_features=lanes)
+
+
+def raised(
+    scenario: Scenario, rise: Callable[[np.ndarray], np.ndarray], features: slice, tracks: Sequence[int]
+) -> Scenario:
+    """The scenario on the ground, with some features and tracks higher by a height (m) that depends on x."""
+    maps, log = scenario.map_features, scenario.tracks
+    points, position = maps.points.copy(), log.position.copy()
+    position[..., 2] += log.size[..., 2] / 2
+    for index in range(len(maps))[features]:
+        line = points[maps.offsets[index] : maps.offsets[index + 1]]
+        line[:, 2] += rise(line[:, 0] - EGO_POSITION_M[0])
+    position[list(tracks), :, 2] += rise(position[list(tracks), :, 0] - EGO_POSITION_M[0])
+    return replace(scenario, map_features=replace(maps, points=points), tracks=replace(log, position=position))

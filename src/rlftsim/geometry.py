@@ -93,6 +93,21 @@ def clockwise_corners(
     return np.stack([position + a * forward + b * left for a, b in signs], axis=-2)
 
 
+def heights_overlap(
+    rise: Float[np.ndarray, "*shape"],
+    height: Float[np.ndarray, "*#shape"],
+    other_height: Float[np.ndarray, "*#shape"],
+) -> Bool[np.ndarray, "*shape"]:
+    """True where the heights of two boxes overlap; boxes above each other never meet.
+
+    Args:
+        rise: Difference of the heights of both centers, m.
+        height: Height of the first box, m.
+        other_height: Height of the other one, m.
+    """
+    return np.abs(rise) <= (height + other_height) / 2
+
+
 def boxes_overlap(
     gap: Float[np.ndarray, "*shape 2"],
     heading: Float[np.ndarray, "*#shape"],

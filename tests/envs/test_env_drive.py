@@ -47,6 +47,12 @@ def test_planners_keep_their_distance_to_a_slow_car(name):
     assert driven("constant_velocity", slow).planner.at_fault_collision_rate == 1.0
 
 
+def test_constant_velocity_keeps_backing_up(tmp_path):
+    write_dataset([build_scenario("backing", (Mover(speed_mps=-2.0),))], tmp_path, split="validation")
+    (result,) = drive(DriveConfig("constant_velocity", data=str(tmp_path), traffic=("replay",)))
+    assert result.table["displacement_error"][0].as_py() < 0.01
+
+
 @pytest.mark.parametrize("name", ["idm", "pdm"])
 def test_planners_stop_at_a_red_light_and_go_at_green(name):
     stays = build_scenario("red", (Mover(speed_mps=8.0),), junction_map(), light(1, 38.0, 0.2, red_until=91))
@@ -335,7 +341,7 @@ def test_a_drive_with_other_dice_is_not_replaced(tmp_path):
     config = DriveConfig("constant_velocity", traffic=("replay",), limit=1)
     drive(config, tmp_path)
     before = (tmp_path / "constant_velocity-replay.parquet").read_bytes()
-    with pytest.raises(ConfigError, match="replay.parquet is the result of another seed: choose another --out"):
+    with pytest.raises(ConfigError, match=r"replay\.parquet is the result of another seed: choose another --out"):
         drive(replace(config, seed=1), tmp_path)
     assert (tmp_path / "constant_velocity-replay.parquet").read_bytes() == before
 

@@ -257,6 +257,36 @@ def test_a_bicycle_that_tracks_a_steady_plan_keeps_its_speed():
     assert result.planner.comfort == 1.0
 
 
+@pytest.mark.parametrize(("reverse", "expected"), [(False, [-1.6, -1.2, -0.8, -0.4, 0.0, 0.0]), (True, [-2.0] * 6)])
+def test_a_bicycle_that_backs_up_brakes_within_its_limit_or_goes_on(reverse, expected):
+    log = build_scenario("backing", (Mover(speed_mps=-2.0),))
+    env = EgoEnv(scenarios=[log], traffic="replay", reverse=reverse, stop_on=(), reward="none")
+    env.reset(seed=0)
+    speeds = [env.step(np.zeros(2, np.float32))[0]["ego"][0] for _ in range(6)]
+    np.testing.assert_allclose(speeds, expected, atol=1e-5)
+
+
+def test_hard_braking_does_not_speed_up_backwards():
+    log = build_scenario("backing", (Mover(speed_mps=-2.0),))
+    env = EgoEnv(scenarios=[log], traffic="replay", reverse=True, hard_braking=True, stop_on=(), reward="none")
+    env.reset(seed=0)
+    observation, *_ = env.step(np.array([-1.0, 0.0], np.float32))
+    assert observation["ego"][0] == pytest.approx(-2.4, abs=1e-5)
+
+
+@pytest.mark.parametrize("speed", [-3.0, -0.6])
+def test_idm_traffic_backs_up_as_in_its_log(speed):
+    log = build_scenario("backing", (Mover(x_m=60.0, y_m=30.0), Mover(x_m=10.0, heading_rad=0.5, speed_mps=speed)))
+    world = build_world([log], None, rules={"ego": "planner", "vehicles": "idm", "*": "replay"})
+    state = begin(world, [Dice(0)])
+    for _ in range(20):
+        state = step_world(world, state, world.logged[0, :1, CURRENT_STEP])
+    now, logged = state.now[0, 1], world.logged[0, 1, CURRENT_STEP + 20]
+    assert now[2] == pytest.approx(0.5, abs=1e-3)
+    np.testing.assert_allclose(now[:2], logged[:2], atol=0.2)
+    np.testing.assert_allclose(now[3:], logged[3:], atol=0.3)
+
+
 def test_lights_hold_their_last_state_where_a_log_ends():
     cut = replace(without_future(), lights=junction_with_light().lights)
     lights = cut.lights

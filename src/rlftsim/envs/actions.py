@@ -184,7 +184,8 @@ class Bicycle:
         """
         _only_vehicles(actors, "bicycle")
         kept = np.clip(action, -1.0, 1.0)
-        acceleration = kept[:, 0] * np.where(kept[:, 0] < 0, self.hardest, ACCELERATION_MPS2)
+        is_braking = (kept[:, 0] < 0) & (signed_speed(actors.motion) > 0)
+        acceleration = kept[:, 0] * np.where(is_braking, self.hardest, ACCELERATION_MPS2)
         motion = self.drive(actors.motion, acceleration, kept[:, 1] * STEERING_RAD, actors.size[:, 0])
         return Moves(motion[:, None], np.any(kept != action, axis=1))
 
@@ -197,6 +198,8 @@ class Bicycle:
     ) -> Float[np.ndarray, "*m 5"]:
         """Motion after 0.1 s at constant acceleration and steering; the turn is integrated exactly.
 
+        A bicycle that may not drive backwards but does so at first brakes with 4 m/s² until it stands.
+
         Args:
             motion: before.
             acceleration: m/s².
@@ -207,7 +210,8 @@ class Bicycle:
         speed = signed_speed(motion)
         new_speed = speed + acceleration * STEP_S
         if not self.reverse:
-            new_speed = np.maximum(new_speed, 0.0)
+            # a vehicle that backs up already brakes until it stands: nothing stops at once
+            new_speed = np.maximum(new_speed, np.minimum(speed + ACCELERATION_MPS2 * STEP_S, 0.0))
         mean_speed = (speed + new_speed) / 2
         # the center lies between the axles, so it moves at an angle to the heading
         slip = np.arctan(np.tan(steering) / 2)
@@ -308,7 +312,8 @@ class TrajectoryControls:
         target = np.where((away >= wanted).any(1), (away >= wanted).argmax(1), self.horizon - 1)
         steering = pursue(kept[np.arange(len(kept)), target, :2], actors.size[:, 0])
         needed = (kept[:, 0, 0] / STEP_S - speed) / STEP_S
-        acceleration = np.clip(needed, -self.tracker.hardest, ACCELERATION_MPS2)
+        lowest = -np.where(speed > 0, self.tracker.hardest, ACCELERATION_MPS2)
+        acceleration = np.clip(needed, lowest, ACCELERATION_MPS2)
         motion = self.tracker.drive(actors.motion, acceleration, steering, actors.size[:, 0])
         return Moves(motion[:, None], clipped)
 
@@ -369,7 +374,7 @@ def pursue(point: Float[np.ndarray, "*m 2"], length: Float[np.ndarray, "*#m"]) -
 
 def pursuit_m(speed: Float[np.ndarray, "*m"]) -> Float[np.ndarray, "*m"]:
     """Distance of the point that is steered for at a speed, m."""
-    return np.maximum(LEAST_PURSUIT_M, PURSUIT_S * speed)
+    return np.maximum(LEAST_PURSUIT_M, PURSUIT_S * np.abs(speed))
 
 
 def signed_speed(motion: Float[np.ndarray, "*m 5"]) -> Float[np.ndarray, "*m"]:

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int64
 from scipy.spatial import KDTree
 
+from rlftsim.envs.levels import is_on_level
 from rlftsim.envs.scene import PIECE_POINTS, Scene, build_env_scene
 from rlftsim.geometry import boxes_overlap, clockwise_corners
 from rlftsim.scenario.derived import cached_on_scenario
@@ -58,6 +59,7 @@ def collision_of(
     agent: int,
     ego: Float[np.ndarray, "5"],
     ego_size: Float[np.ndarray, "2"],
+    ego_ground: Float[np.ndarray, "1"],
     track: Float[np.ndarray, "5"],
     track_size: Float[np.ndarray, "2"],
 ) -> Collision:
@@ -69,6 +71,7 @@ def collision_of(
         agent: row of the track.
         ego: motion of the planner's agent.
         ego_size: its length and width.
+        ego_ground: Height of the ground under it.
         track: motion of the other one.
         track_size: its length and width.
     """
@@ -86,7 +89,7 @@ def collision_of(
     else:
         kind = CollisionType.ACTIVE_LATERAL
     at_fault = kind in (CollisionType.STOPPED_TRACK, CollisionType.ACTIVE_FRONT) or (
-        kind == CollisionType.ACTIVE_LATERAL and not bool(in_one_lane(scene, ego[None], ego_size)[0])
+        kind == CollisionType.ACTIVE_LATERAL and not bool(in_one_lane(scene, ego[None], ego_size, ego_ground)[0])
     )
     return Collision(step, agent, kind, at_fault, float(np.hypot(*(ego[3:] - track[3:]))))
 
@@ -99,10 +102,28 @@ class LaneSearch:
     lane: Int64[np.ndarray, "p"]
     """Lane of each point, as an index of the scene's `graph`."""
     heading: Float[np.ndarray, "p"]
+    z: Float[np.ndarray, "p"] | None
+    """Heights; None where they do not count."""
     joined: tuple[frozenset[int], ...]
     """Each lane with its predecessors and successors."""
     is_junction: Bool[np.ndarray, "n"]
     """True = the lane joins two others inside a junction."""
+
+    def find_near(
+        self, positions: Float[np.ndarray, "m 2"], distance_m: float, ground: Float[np.ndarray, "m"]
+    ) -> list[list[int]]:
+        """For each position the list of points of lanes near it, on its level.
+
+        Args:
+            positions: Where to search.
+            distance_m: Largest distance in the plane.
+            ground: Heights of the ground there.
+        """
+        near = list(self.tree.query_ball_point(positions, distance_m))
+        if self.z is None:
+            return near
+        rows = [np.array(points, np.int64) for points in near]
+        return [points[is_on_level(self.z[points] - height)].tolist() for points, height in zip(rows, ground)]
 
 
 @cached_on_scenario
@@ -128,12 +149,15 @@ def lane_search(scenario: Scenario) -> LaneSearch | None:
         tree=KDTree(points.reshape(-1, 2)),
         lane=np.repeat(pieces.lane, len(part)),
         heading=np.arctan2(along[..., 1], along[..., 0]).ravel(),
+        z=None if scene.levels is None else pieces.z[:, low].ravel(),
         joined=tuple(frozenset(lanes) for lanes in joined),
         is_junction=np.isin(graph.lane_id, ids),
     )
 
 
-def in_one_lane(scene: Scene, motion: Float[np.ndarray, "n c"], size: Float[np.ndarray, "2"]) -> Bool[np.ndarray, "n"]:
+def in_one_lane(
+    scene: Scene, motion: Float[np.ndarray, "n c"], size: Float[np.ndarray, "_"], ground: Float[np.ndarray, "n"]
+) -> Bool[np.ndarray, "n"]:
     """True where all corners of a box are within the half width of one lane, or of lanes that merge or follow.
 
     Without lanes a box is in none.
@@ -142,12 +166,13 @@ def in_one_lane(scene: Scene, motion: Float[np.ndarray, "n c"], size: Float[np.n
         scene: the map.
         motion: x, y, heading of a box over time.
         size: its length and width.
+        ground: Height of the ground under it.
     """
     search = lane_search(scene.scenario)
     if search is None:
         return np.zeros(len(motion), bool)
     corners = clockwise_corners(motion[:, :2], motion[:, 2], size)
-    near = search.tree.query_ball_point(corners.reshape(-1, 2), HALF_LANE_M)
+    near = search.find_near(corners.reshape(-1, 2), HALF_LANE_M, np.repeat(ground, 4))
     lanes = [frozenset(search.lane[rows].tolist()) for rows in near]
     inside = np.zeros(len(motion), bool)
     for step in range(len(motion)):

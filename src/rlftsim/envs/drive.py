@@ -16,7 +16,7 @@ import rlftsim
 from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.drivers import TRAFFIC, Traffic
 from rlftsim.envs.ego_env import EgoEnv
-from rlftsim.envs.planners.registry import Planner, action_of, hash_code, horizon_of, load_planner
+from rlftsim.envs.planners.registry import Planner, action_of, hash_code, horizon_of, load_planner, may_reverse
 from rlftsim.envs.result import SCORE_NAMES, Result, animation_of
 from rlftsim.envs.source import Source
 from rlftsim.envs.traffic_scores import blamed_others_rate, realism_of_others
@@ -80,7 +80,8 @@ class DriveConfig:
         planner = load_planner(self.planner)
         return EnvConfig(
             data=self.data, split=self.split, model=self.model, traffic=cast(Traffic, traffic),
-            action=action_of(planner), horizon=horizon_of(planner), stop_on=(), reward="none",
+            action=action_of(planner), horizon=horizon_of(planner), reverse=may_reverse(planner), stop_on=(),
+            reward="none",
         )  # fmt: skip
 
 

@@ -19,7 +19,7 @@ from rlftsim.envs.rewards import WeightedTerm, parse_terms
 from rlftsim.envs.road import MAX_PAIRS, OUTSIDE_M, nearest_edges, road_edges
 from rlftsim.envs.route import SPACING_M, route_of
 from rlftsim.envs.world import Dice, World, WorldState, begin, step_world, with_dice
-from rlftsim.geometry import boxes_overlap, clockwise_corners, wrapped
+from rlftsim.geometry import boxes_overlap, clockwise_corners, heights_overlap, wrapped
 from rlftsim.goals.types import PointById
 from rlftsim.realism.map_based import RoadEdges, compute_point_distance_to_road_edge, join_road_edges
 from rlftsim.viewer.scene import SIMPLIFY_TOLERANCE_M
@@ -41,8 +41,6 @@ class Episode:
     terms: tuple[WeightedTerm, ...]
     config: EnvConfig
     edges: RoadEdges | None
-    bottom_z: Float[np.ndarray, "M"]
-    """Height of the agents' boxes above the world's zero, m."""
     goals: ScenarioGoals | None
     """Of agents that follow the policy."""
 
@@ -110,11 +108,8 @@ def build_episode(
         )
         for scene, agent in world.actors
     )
-    bottom = [world.scenes[scene].z[agent] - world.scenes[scene].size[agent, 2] / 2 for scene, agent in world.actors]
     edges = join_road_edges([road_edges(scene.scenario) for scene in world.scenes])
-    return Episode(
-        world, build_atlas(world, routes), controls, parse_terms(config.reward), config, edges, np.array(bottom), goals
-    )
+    return Episode(world, build_atlas(world, routes), controls, parse_terms(config.reward), config, edges, goals)
 
 
 def start(episode: Episode, dice: tuple[Dice, ...]) -> EpisodeState:
@@ -127,7 +122,7 @@ def start(episode: Episode, dice: tuple[Dice, ...]) -> EpisodeState:
     world = begin(episode.world, dice)
     motion = own_motion(episode, world)
     never = np.zeros(episode.num_agents, bool)
-    off = off_road_m(episode, motion, np.arange(episode.num_agents))
+    off = off_road_m(episode, motion, _ground(episode, world), np.arange(episode.num_agents))
     return EpisodeState(
         world=world,
         touched=_contacts(episode, world, motion),
@@ -229,6 +224,7 @@ def _step(
     """State 0.1 s later, and the terms of this step."""
     before = own_motion(episode, state.world)
     world = step_world(episode.world, state.world, moved)
+    ground = _ground(episode, world)
     # 1. contacts with tracks that have not been touched
     contacts = _contacts(episode, world, moved) & ~state.touched
     found = [list(known) for known in state.collisions]
@@ -237,7 +233,7 @@ def _step(
         found[row].append(
             collision_of(
                 episode.world.scenes[scene], world.step, int(agent), moved[row], episode.world.size[scene, own],
-                world.now[scene, agent], episode.world.size[scene, agent],
+                ground[row : row + 1], world.now[scene, agent], episode.world.size[scene, agent],
             )
         )  # fmt: skip
     new = [known[len(earlier) :] for known, earlier in zip(found, state.collisions)]
@@ -248,7 +244,7 @@ def _step(
     clear = state.clear_m - np.hypot(*(moved[:, :2] - before[:, :2]).T) - turned
     unclear = np.flatnonzero((clear <= 0) & ~state.outside)
     if len(unclear):
-        clear[unclear] = _free_way_m(episode, moved, unclear)
+        clear[unclear] = _free_way_m(episode, moved, ground, unclear)
     outside = state.outside.copy()
     outside[unclear] = clear[unclear] <= 0
     progress = _progress(episode, moved)
@@ -294,14 +290,21 @@ def look(episode: Episode, state: EpisodeState) -> Observation:
     return observe(episode.world, episode.atlas, state.world, frame=config.frame, steps=config.max_steps)
 
 
+def _ground(episode: Episode, world: WorldState) -> Float[np.ndarray, "M"]:
+    """Height of the ground under the planner-driven agents: that of their boxes' undersides."""
+    scene, agent = episode.world.actors.T
+    return world.z[-1][scene, agent] - episode.world.height[scene, agent] / 2
+
+
 def off_road_m(
-    episode: Episode, motion: Float[np.ndarray, "M 5"], rows: Int64[np.ndarray, "m"]
+    episode: Episode, motion: Float[np.ndarray, "M 5"], ground: Float[np.ndarray, "M"], rows: Int64[np.ndarray, "m"]
 ) -> Float[np.ndarray, "m"]:
     """Signed distance of the corner farthest off the road, negative on it; that of the official metric.
 
     Args:
         episode: the scenes.
         motion: of the planner-driven agents.
+        ground: Height of the ground under them.
         rows: those that are measured.
     """
     scene, agent = episode.world.actors[rows].T
@@ -309,7 +312,7 @@ def off_road_m(
         return np.full(len(rows), -np.inf)
     corners = clockwise_corners(motion[rows, :2], motion[rows, 2], episode.world.size[scene, agent])
     origin = np.stack([episode.world.scenes[b].scenario.origin for b in scene])
-    z = np.repeat(episode.bottom_z[rows, None, None], 4, 1)
+    z = np.repeat(ground[rows, None, None], 4, 1)
     groups = torch.from_numpy(np.concatenate([corners + origin[:, None], z], -1)).float()
     of_scene = torch.from_numpy(scene) if len(episode.world.scenes) > 1 else None
     distance = compute_point_distance_to_road_edge(groups, episode.edges, max_pairs=MAX_PAIRS, scenario=of_scene)
@@ -320,21 +323,21 @@ def off_road_m(
 
 
 def _free_way_m(
-    episode: Episode, motion: Float[np.ndarray, "M 5"], rows: Int64[np.ndarray, "m"]
+    episode: Episode, motion: Float[np.ndarray, "M 5"], ground: Float[np.ndarray, "M"], rows: Int64[np.ndarray, "m"]
 ) -> Float[np.ndarray, "m"]:
     """Distance that agents may move by before a corner can be 0.3 m off the road; at most 0 where one is.
 
     The search for the official distance is slow. Where all corners are clearly to the left of the simplified edges of
-    the observations, these decide.
+    the observations, these decide, unless edges lie above each other.
     """
     scene, agent = episode.world.actors[rows].T
     corners = clockwise_corners(motion[rows, :2], motion[rows, 2], episode.world.size[scene, agent])  # [m, 4, 2]
     distance, side, is_beside = nearest_edges(corners, episode.atlas.edges[scene])
     free = distance.min(1) - SIMPLIFIED_M
-    unclear = np.flatnonzero((free <= 0) | ~((side > 0) & is_beside).all(1))
+    unclear = np.flatnonzero((free <= 0) | ~((side > 0) & is_beside).all(1) | episode.world.has_levels[scene])
     free += OUTSIDE_M
     if len(unclear):
-        free[unclear] = OUTSIDE_M - off_road_m(episode, motion, rows[unclear])
+        free[unclear] = OUTSIDE_M - off_road_m(episode, motion, ground, rows[unclear])
     return free
 
 
@@ -346,7 +349,13 @@ def _contacts(episode: Episode, world: WorldState, motion: Float[np.ndarray, "M 
     known[np.arange(len(scene)), agent] = False
     others = world.now[scene]  # [M, A, 5]
     gap = others[..., :2] - motion[:, None, :2]
-    return known & boxes_overlap(gap, motion[:, None, 2], others[..., 2], size[scene, agent][:, None], size[scene])
+    meets = known & boxes_overlap(gap, motion[:, None, 2], others[..., 2], size[scene, agent][:, None], size[scene])
+    if episode.world.has_levels.any():
+        z, height = world.z[-1], episode.world.height
+        rise = z[scene] - z[scene, agent][:, None]
+        on_level = heights_overlap(rise, height[scene, agent][:, None], height[scene])
+        meets &= on_level | ~episode.world.has_levels[scene][:, None]
+    return meets
 
 
 def _progress(episode: Episode, motion: Float[np.ndarray, "M 5"]) -> Float[np.ndarray, "M"]:

@@ -8,8 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
+from rlftsim.envs.actions import signed_speed
+from rlftsim.envs.levels import RouteHeights, is_on_level
 from rlftsim.envs.route import headings_of, points_every
 from rlftsim.envs.scene import RED, YELLOW, Scene
+from rlftsim.geometry import heights_overlap, wrapped
+from rlftsim.scenario.polylines import arc_length
 from rlftsim.scenario.types import CURRENT_STEP, STEP_S, TOTAL_STEPS
 
 LOOKAHEAD_M = 40
@@ -112,10 +116,15 @@ class IdmLines:
     points: Float[np.ndarray, "M P 2"]
     """One every meter; the last one repeated."""
     heading: Float[np.ndarray, "M P"]
+    """Direction of the line."""
+    facing: Float[np.ndarray, "M P"]
+    """Heading of the agent there: against the line where it backs up in its log."""
+    ground: Float[np.ndarray, "M P"]
+    """Height of the ground; zeros in scenes without levels."""
     stop_m: Float[np.ndarray, "M T"]
     """Distance along the line to the stop point of each light; infinite where the light is on another way."""
     wanted_mps: Float[np.ndarray, "M"]
-    """The fastest logged speed, at least that of `IdmConfig`."""
+    """The fastest logged speed, at least that of `IdmConfig` unless the agent backs up."""
 
 
 def idm_lines(scene: Scene, agents: np.ndarray, config: IdmConfig) -> IdmLines:
@@ -128,7 +137,8 @@ def idm_lines(scene: Scene, agents: np.ndarray, config: IdmConfig) -> IdmLines:
     """
     fastest = np.linalg.norm(scene.logged[agents, CURRENT_STEP:, 3:], axis=-1).max(1, initial=0.0)
     agents, fastest = agents[fastest >= PARKED_MPS], fastest[fastest >= PARKED_MPS]
-    lines = [_line(scene, int(agent)) for agent in agents]
+    logged_paths = [_logged_path(scene, int(agent)) for agent in agents]
+    lines = [points_every(path[:, :2], 1.0) for path in logged_paths]
     longest = max((len(line) for line in lines), default=1)
     points = np.stack([np.pad(line, ((0, longest - len(line)), (0, 0)), mode="edge") for line in lines] or [
         np.zeros((1, 2))
@@ -136,29 +146,41 @@ def idm_lines(scene: Scene, agents: np.ndarray, config: IdmConfig) -> IdmLines:
     heading = np.stack([np.pad(headings_of(line), (0, longest - len(line)), mode="edge") for line in lines] or [
         np.zeros(1)
     ])[: len(agents)]  # fmt: skip
+    backs_up = np.zeros(heading.shape, bool)
+    for row, path in enumerate(logged_paths):
+        at = np.minimum(np.searchsorted(arc_length(path), np.arange(longest), side="right"), len(path) - 1)
+        backs_up[row] = np.cos(heading[row] - path[at - 1, 2]) < 0
+    wanted = np.where(backs_up.any(1), fastest, np.maximum(fastest, config.speed_mps))
     offset = np.linalg.norm(points[:, :, None] - scene.lights.point, axis=-1)  # [M, P, T]
+    ground = np.zeros(heading.shape)
+    if scene.levels is not None:
+        ground = scene.levels.follow_lines(points, scene.z[agents] - scene.size[agents, 2] / 2)
+        offset[~is_on_level(scene.lights.z - ground[..., None])] = np.inf
     stop = np.where(offset.min(1) <= ON_LINE_M, offset.argmin(1), np.inf)
-    return IdmLines(agents, points, heading, stop, np.maximum(fastest, config.speed_mps))
+    facing = np.where(backs_up, wrapped(heading + np.pi), heading)
+    return IdmLines(agents, points, heading, facing, ground, stop, wanted)
 
 
-def _line(scene: Scene, agent: int) -> Float[np.ndarray, "p 2"]:
-    """The logged way of an agent, and straight on."""
-    way = scene.logged[agent, CURRENT_STEP:TOTAL_STEPS, :2]
-    step = np.linalg.norm(np.diff(way, axis=0), axis=1)
-    kept = way[np.append(True, step > 0.05)]
-    heading = scene.logged[agent, CURRENT_STEP, 2]
-    if len(kept) > 1 and np.linalg.norm(kept[-1] - kept[0]) > STANDS_M:
-        last = kept[-1] - kept[max(len(kept) - 5, 0)]
-        heading = np.arctan2(last[1], last[0])
+def _logged_path(scene: Scene, agent: int) -> Float[np.ndarray, "p 3"]:
+    """Poses of an agent's log where it moves, and a last one straight on."""
+    logged = scene.logged[agent, CURRENT_STEP:TOTAL_STEPS]
+    step = np.linalg.norm(np.diff(logged[:, :2], axis=0), axis=1)
+    poses = logged[np.append(True, step > 0.05), :3]
+    direction = logged[0, 2] + (np.pi if signed_speed(logged[:1])[0] < 0 else 0.0)
+    if len(poses) > 1 and np.linalg.norm(poses[-1, :2] - poses[0, :2]) > STANDS_M:
+        last = poses[-1] - poses[max(len(poses) - 5, 0)]
+        direction = np.arctan2(last[1], last[0])
     else:
-        kept = way[:1]
-    return points_every(np.vstack([kept, kept[-1] + BEYOND_M * np.array([np.cos(heading), np.sin(heading)])]), 1.0)
+        poses = poses[:1]
+    beyond = poses[-1] + BEYOND_M * np.array([np.cos(direction), np.sin(direction), 0.0])
+    return np.vstack([poses, beyond])
 
 
 def advance_idm(
     lines: IdmLines,
     place: Float[np.ndarray, "M 2"],
     motion: Float[np.ndarray, "A 5"],
+    z: Float[np.ndarray, "A"],
     present: Bool[np.ndarray, "A"],
     scene: Scene,
     step: int,
@@ -170,6 +192,7 @@ def advance_idm(
         lines: their ways.
         place: distance along the line, and speed.
         motion: x, y, heading, vx, vy of all agents.
+        z: Heights of their centers.
         present: False = the agent is not there.
         scene: the scenario.
         step: of the log, for the lights.
@@ -185,6 +208,13 @@ def advance_idm(
     nearest = np.argsort(away, axis=1)[:, :NEAREST]
     mask = np.take_along_axis(away, nearest, 1) < LOOKAHEAD_M + BEYOND_BOX_M
     line, heading = lines.points[rows[:, None], window], lines.heading[rows[:, None], window]
+    if scene.levels is not None:
+        height, ground = scene.size[:, 2], lines.ground[rows[:, None], window]
+        center = z[nearest] - height[lines.agents, None] / 2
+        heights = RouteHeights.measure(motion[nearest, :2], center, line, ground)
+        away = np.take_along_axis(away, nearest, 1)
+        rise = heights.differences(away, ground[:, 0], np.zeros(len(rows)))
+        mask &= heights_overlap(rise, height[lines.agents, None], height[nearest])
     gap, lead = find_leaders(line, heading, size[lines.agents], motion[nearest], size[nearest], mask)
     # 2. A red or yellow light ahead is a standing leader.
     front = way + size[lines.agents, 0] / 2
@@ -201,4 +231,5 @@ def advance_idm(
     position = (1 - part) * lines.points[rows, low] + part * lines.points[rows, low + 1]
     angle = lines.heading[rows, low]
     velocity = new_speed[:, None] * np.stack([np.cos(angle), np.sin(angle)], -1)
-    return np.stack([way, new_speed], -1), np.concatenate([position, angle[:, None], velocity], -1)
+    facing = lines.facing[rows, low]
+    return np.stack([way, new_speed], -1), np.concatenate([position, facing[:, None], velocity], -1)

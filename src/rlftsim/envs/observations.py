@@ -2,7 +2,8 @@
 
 M agents over B scenes; K neighbors, L pieces of lanes, E pieces of road edges, C crossings, T lights, R route points.
 Frame: the observing agent's own at the present step (x ahead, y left), or the map frame; meters, seconds, radians. Rows
-beyond what is there are zeros, and 0 in their mask.
+beyond what is there are zeros, and 0 in their mask. What lies above or below the agent's road, as at a bridge, is left
+out.
 """
 
 from dataclasses import dataclass, fields
@@ -13,10 +14,11 @@ from jaxtyping import Bool, Float, Float32, Int8, Int64
 
 from rlftsim.envs.actions import WHEELBASE_PER_LENGTH, signed_speed
 from rlftsim.envs.drivers import Driver
+from rlftsim.envs.levels import RouteHeights, is_on_level
 from rlftsim.envs.route import Route, headings_of
 from rlftsim.envs.scene import GREEN, PIECE_POINTS, RED, YELLOW
 from rlftsim.envs.world import World, WorldState, padded
-from rlftsim.geometry import wrapped
+from rlftsim.geometry import heights_overlap, wrapped
 from rlftsim.scenario.types import STEP_S, TOTAL_STEPS
 
 Frame = Literal["ego", "world"]
@@ -127,6 +129,9 @@ class Atlas:
     route_heading: Float[np.ndarray, "M r"]
     route_limit: Float[np.ndarray, "M r"]
     route_length: Int64[np.ndarray, "M"]
+    route_ground: Float[np.ndarray, "M r"]
+    heights: dict[str, RouteHeights]
+    """Of pieces of lanes ("lanes"), "edges", "crossings" and "lights"; empty where no scene has levels."""
 
 
 def build_atlas(world: World, routes: tuple[Route, ...]) -> Atlas:
@@ -150,26 +155,44 @@ def build_atlas(world: World, routes: tuple[Route, ...]) -> Atlas:
     facts = [np.stack([s.lanes.kind, s.lanes.limit_mps, s.lanes.has_stop_sign], -1) for s in scenes]
     edges, crossings = _stack([s.edges for s in scenes], _FAR_M), _stack([s.crossings for s in scenes], _FAR_M)
     on_route = [np.isin(owner[b], route.lanes) for (b, _), route in zip(world.actors, routes)]
+    lane_middle, edge_middle = points[:, :, PIECE_POINTS // 2], (edges[..., :2] + edges[..., 2:]) / 2
+    crossing_middle = crossings.reshape(*crossings.shape[:2], 4, 2).mean(2)
+    route_points = _stack([route.points for route in routes] or [np.zeros((0, 2))], _FAR_M)
+    route_ground = _stack([route.ground for route in routes] or [np.zeros(0)], 0.0)
+    heights: dict[str, RouteHeights] = {}
+    if world.has_levels.any():
+        things = {
+            "lanes": (lane_middle, [s.lanes.z[:, PIECE_POINTS // 2] for s in scenes]),
+            "edges": (edge_middle, [s.edges_z for s in scenes]),
+            "crossings": (crossing_middle, [s.crossings_z for s in scenes]),
+            "lights": (np.stack(light_point), [s.lights.z for s in scenes]),
+        }
+        of_scene = world.actors[:, 0]
+        for name, (middle, z) in things.items():
+            padded_z = padded(z, middle.shape[:2])
+            heights[name] = RouteHeights.measure(middle[of_scene], padded_z[of_scene], route_points, route_ground)
     return Atlas(
         lane_points=points,
         lane_heading=headings_of(points),
-        lane_middle=points[:, :, PIECE_POINTS // 2],
+        lane_middle=lane_middle,
         lane_facts=_stack(facts, 0.0),
         lane_light=lane_light,
         on_route=np.stack(on_route) if on_route else np.zeros((0, owner.shape[1]), bool),
         edges=edges,
-        edge_middle=(edges[..., :2] + edges[..., 2:]) / 2,
+        edge_middle=edge_middle,
         crossings=crossings,
-        crossing_middle=crossings.reshape(*crossings.shape[:2], 4, 2).mean(2),
+        crossing_middle=crossing_middle,
         light_point=np.stack(light_point),
         light_state=np.stack(states),
         light_age=np.stack(ages),
         last_logged=np.maximum.accumulate(np.where(world.valid, np.arange(TOTAL_STEPS), 0), axis=2),
         routes=routes,
-        route_points=_stack([route.points for route in routes] or [np.zeros((0, 2))], _FAR_M),
+        route_points=route_points,
         route_heading=_stack([route.heading for route in routes] or [np.zeros(0)], 0.0),
         route_limit=_stack([route.limit_mps for route in routes] or [np.zeros(0)], 0.0),
         route_length=np.array([len(route) for route in routes], np.int64),
+        route_ground=route_ground,
+        heights=heights,
     )
 
 
@@ -202,20 +225,30 @@ def observe(world: World, atlas: Atlas, state: WorldState, *, frame: Frame = "eg
     away = _distance(now, past[:, -1])
     away[~there[:, -1]] = np.inf
     away[row, agent] = np.inf
+    distances = {
+        "lanes": _distance(now, atlas.lane_middle[scene]),
+        "edges": _distance(now, atlas.edge_middle[scene]),
+        "crossings": _distance(now, atlas.crossing_middle[scene]),
+        "lights": _distance(now, atlas.light_point[scene]),
+        "neighbors": away,
+    }
+    nearest_on_route = _distance(now, atlas.route_points).argmin(1)
+    if atlas.heights:
+        _leave_out_other_levels(world, atlas, state, nearest_on_route, distances)
     chosen, near = _nearest(away, NEIGHBORS)
     steps_back = np.arange(HISTORY + 1)[:, None]
     seen = past[row[:, None, None], steps_back, chosen[:, None]]  # [M, 11, K, 5]
     seen_there = there[row[:, None, None], steps_back, chosen[:, None]] & near[:, None]
     own = past[row, :, agent]  # [M, 11, 5]
     # 2. The nearest rows of the map, lights whose state is known, and the route from the nearest place on.
-    lane, lane_near = _nearest(_distance(now, atlas.lane_middle[scene]), LANES)
-    edge, edge_near = _nearest(_distance(now, atlas.edge_middle[scene]), EDGES)
-    area, area_near = _nearest(_distance(now, atlas.crossing_middle[scene]), CROSSINGS)
+    lane, lane_near = _nearest(distances["lanes"], LANES)
+    edge, edge_near = _nearest(distances["edges"], EDGES)
+    area, area_near = _nearest(distances["crossings"], CROSSINGS)
     colors = atlas.light_state[scene, log_step]  # [M, T + 1]
-    light_away = _distance(now, atlas.light_point[scene])
+    light_away = distances["lights"]
     light_away[colors == 0] = np.inf
     light, light_near = _nearest(light_away, LIGHTS)
-    index = _distance(now, atlas.route_points).argmin(1)[:, None] + np.arange(ROUTE)
+    index = nearest_on_route[:, None] + np.arange(ROUTE)
     on_route = index < atlas.route_length[:, None]
     index = np.minimum(index, atlas.route_points.shape[1] - 1)
     pieces = atlas.lane_points[scene[:, None], lane]  # [M, L, 10, 2]
@@ -283,6 +316,38 @@ def observe(world: World, atlas: Atlas, state: WorldState, *, frame: Frame = "eg
         route_mask=_masks(on_route, ROUTE),
         goal=np.where((atlas.route_length > 0)[:, None], goal, 0.0).astype(np.float32),
     )
+
+
+def _leave_out_other_levels(
+    world: World,
+    atlas: Atlas,
+    state: WorldState,
+    nearest_on_route: Int64[np.ndarray, "M"],
+    distances: dict[str, np.ndarray],
+) -> None:
+    """Put what lies above or below the roads of the observing agents infinitely far away.
+
+    Args:
+        world: The scenes.
+        atlas: Their maps and routes.
+        state: The present one.
+        nearest_on_route: Index of the route's point nearest to each agent.
+        distances: Distances from each agent to rows of the map and to "neighbors", changed in place.
+    """
+    scene, agent = world.actors.T
+    height, z = world.height, state.z[-1]
+    half = height[scene, agent][:, None] / 2
+    ground = z[scene, agent] - half[:, 0]
+    above_route = ground - atlas.route_ground[np.arange(len(scene)), nearest_on_route]
+    # a box as high as the agent's whose height difference is 0 stands on the same ground
+    neighbors = RouteHeights.measure(state.now[scene][..., :2], z[scene] - half, atlas.route_points, atlas.route_ground)
+    for name, heights in {**atlas.heights, "neighbors": neighbors}.items():
+        difference = heights.differences(distances[name], ground, above_route)
+        if name == "neighbors":
+            on_level = heights_overlap(difference, 2 * half, height[scene])
+        else:
+            on_level = is_on_level(difference)
+        distances[name][world.has_levels[scene][:, None] & ~on_level] = np.inf
 
 
 def _rows(values: Float[np.ndarray, "M n c"], mask: Bool[np.ndarray, "M n"], length: int) -> np.ndarray:

@@ -10,14 +10,15 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from scipy.signal import savgol_filter
 
 from rlftsim.envs.contact import BEHIND_RAD, in_one_lane, lane_search
+from rlftsim.envs.levels import Levels
 from rlftsim.envs.record import Record
 from rlftsim.envs.road import MAX_PAIRS, OUTSIDE_M, road_edges
 from rlftsim.envs.route import Route
-from rlftsim.geometry import boxes_overlap, clockwise_corners, wrapped
+from rlftsim.geometry import boxes_overlap, clockwise_corners, heights_overlap, wrapped
 from rlftsim.realism.map_based import compute_point_distance_to_road_edge
 from rlftsim.realism.traffic_lights import Signals, build_signals, compute_traffic_light_violation
 from rlftsim.scenario.derived import cached_on_scenario
@@ -164,7 +165,7 @@ def _collision_score(record: Record) -> float:
 def off_road(record: Record) -> Float[np.ndarray, "T1"]:
     """Signed distance of the corner farthest off the road at each step; without road edges -inf.
 
-    The agent keeps the height of the current step, as in the metric.
+    The agent keeps the height of the current step, as in the metric, unless the scene has levels.
     """
     scene, edges = record.scene, road_edges(record.scene.scenario)
     if edges is None:
@@ -173,7 +174,7 @@ def off_road(record: Record) -> Float[np.ndarray, "T1"]:
     corners = (
         clockwise_corners(own[:, :2], own[:, 2], scene.size[record.agent]) + scene.scenario.origin
     )  # [T + 1, 4, 2]
-    z = np.full((*corners.shape[:2], 1), scene.z[record.agent] - scene.size[record.agent, 2] / 2)
+    z = np.repeat(record.ground[record.agent][:, None, None], 4, 1)
     groups = torch.from_numpy(np.concatenate([corners, z], -1)).float()
     return compute_point_distance_to_road_edge(groups, edges, max_pairs=MAX_PAIRS).amax(-1).double().numpy()
 
@@ -202,7 +203,7 @@ def _lane_headings(record: Record) -> tuple[Float[np.ndarray, "T1"], Float[np.nd
     junction = np.zeros(record.steps + 1, bool)
     if search is None:
         return angle, limit, junction
-    near = search.tree.query_ball_point(record.own[:, :2], LANE_M)
+    near = search.find_near(record.own[:, :2], LANE_M, record.ground[record.agent])
     for step, points in enumerate(near):
         if points:
             turn = np.abs(wrapped(search.heading[points] - record.own[step, 2]))
@@ -242,7 +243,7 @@ def least_time_to_collision(record: Record) -> float:
     bearing = np.abs(wrapped(np.arctan2(offset[..., 1], offset[..., 0]) - own[:, 2]))
     crossing = np.abs(np.sin(others[..., 2] - own[:, 2])) > np.sin(CROSSING_RAD)
     _, _, junction = _lane_headings(record)
-    beside = ~in_one_lane(record.scene, own, size[record.agent]) | junction
+    beside = ~in_one_lane(record.scene, own, size[record.agent], record.ground[record.agent]) | junction
     counts = record.known & (bearing < BEHIND_RAD) & ((bearing < AHEAD_RAD) | crossing | beside)
     counts[record.agent] = False
     counts &= speed > TTC_MOVING_MPS
@@ -255,10 +256,28 @@ def least_time_to_collision(record: Record) -> float:
     ego, track = own[steps], others[agents, steps]  # [P, 5] each
     gap = track[:, None, :2] - ego[:, None, :2] + time[:, None] * (track[:, None, 3:] - ego[:, None, 3:])  # [P, 31, 2]
     meets = boxes_overlap(gap, ego[:, None, 2], track[:, None, 2], size[record.agent], size[agents, None])
+    if record.scene.levels is not None:
+        meets &= _are_on_level(record, record.scene.levels, agents, steps, time)
     # tracks that overlap at the start of the episode, such as a stroller and its pusher, are in no danger of it
     overlapping = np.isin(agents, agents[(steps == 0) & meets[:, 0]])
     meets &= ~overlapping[:, None]
     return float(time[meets.argmax(1)[meets.any(1)]].min()) if meets.any() else TTC_HORIZON_S
+
+
+def _are_on_level(
+    record: Record,
+    levels: Levels,
+    agents: Int64[np.ndarray, "P"],
+    steps: Int64[np.ndarray, "P"],
+    time: Float[np.ndarray, "t"],
+) -> Bool[np.ndarray, "P t"]:
+    """True where the heights of the planner's agent and of tracks overlap, if all keep their speed and heading."""
+    z, height = [], record.scene.size[:, 2]
+    for rows in (np.full_like(agents, record.agent), agents):
+        states = record.motion[rows, steps]
+        line = states[:, None, :2] + time[:, None] * states[:, None, 3:]
+        z.append(levels.follow_lines(line, record.ground[rows, steps]) + height[rows, None] / 2)
+    return heights_overlap(z[1] - z[0], height[record.agent, None], height[agents, None])
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,6 +21,8 @@ class Record:
     """Row of the planner's agent."""
     motion: Float[np.ndarray, "A T1 5"]
     """x, y, heading, vx, vy at T + 1 steps."""
+    z: Float[np.ndarray, "A T1"]
+    """Height of the centers, that of the current step in scenes without levels."""
     there: Bool[np.ndarray, "A T1"]
     """False = a replayed agent whose log has ended."""
     known: Bool[np.ndarray, "A T1"]
@@ -38,6 +40,11 @@ class Record:
         return self.motion.shape[1] - 1
 
     @property
+    def ground(self) -> Float[np.ndarray, "A T1"]:
+        """Height of the ground under the agents."""
+        return self.z - self.scene.size[:, 2:] / 2
+
+    @property
     def own(self) -> Float[np.ndarray, "T1 5"]:
         """Motion of the planner's agent."""
         return self.motion[self.agent]
@@ -45,8 +52,9 @@ class Record:
     def first(self, steps: int) -> "Record":
         """The first steps alone."""
         return Record(
-            self.scene, self.agent, self.motion[:, : steps + 1], self.there[:, : steps + 1], self.known[:, : steps + 1],
-            tuple(one for one in self.collisions if one.step <= steps), self.route, self.logged_route,
+            self.scene, self.agent, self.motion[:, : steps + 1], self.z[:, : steps + 1], self.there[:, : steps + 1],
+            self.known[:, : steps + 1], tuple(one for one in self.collisions if one.step <= steps), self.route,
+            self.logged_route,
         )  # fmt: skip
 
 
@@ -65,6 +73,7 @@ def record_of(episode: Episode, state: EpisodeState, row: int = 0) -> Record:
         scene=scene,
         agent=agent,
         motion=np.stack([step[scene_row, :count] for step in state.world.track[CURRENT_STEP:]], 1),
+        z=np.stack([z[scene_row, :count] for z in state.world.z[CURRENT_STEP:]], 1),
         there=episode.world.there[scene_row, :count, CURRENT_STEP:last],
         known=episode.world.known[scene_row, :count, CURRENT_STEP:last],
         collisions=state.collisions[row],

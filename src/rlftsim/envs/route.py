@@ -9,13 +9,15 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int64
 
+from rlftsim.envs.levels import is_on_level
 from rlftsim.envs.scene import Scene, build_env_scene
 from rlftsim.errors import ConfigError
 from rlftsim.geometry import wrapped
-from rlftsim.goals.maneuvers.lane_paths import LanePath, lanes_for
+from rlftsim.goals.maneuvers.lane_paths import MAX_LANE_DISTANCE_M, LanePath, lanes_for
 from rlftsim.goals.maneuvers.proposals import CurrentAgent, own_paths, propose_from_lanes
 from rlftsim.goals.maneuvers.side_paths import lane_change_paths
 from rlftsim.scenario.derived import cached_on_scenario
+from rlftsim.scenario.lane_graph import LaneGraph
 from rlftsim.scenario.polylines import arc_length
 from rlftsim.scenario.types import CURRENT_STEP, Scenario
 
@@ -39,6 +41,8 @@ class Route:
 
     points: Float[np.ndarray, "R 2"]
     heading: Float[np.ndarray, "R"]
+    ground: Float[np.ndarray, "R"]
+    """Height of the ground; zeros in scenes without levels."""
     limit_mps: Float[np.ndarray, "R"]
     """Speed limit; 0 = unknown."""
     lanes: Int64[np.ndarray, "l"]
@@ -59,7 +63,7 @@ class Route:
         return SPACING_M * nearest + ((points - self.points[nearest]) * direction).sum(-1)
 
 
-NO_ROUTE = Route(np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros(0, np.int64), "none")
+NO_ROUTE = Route(np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0, np.int64), "none")
 
 
 @cached_on_scenario
@@ -78,13 +82,13 @@ def route_of(scenario: Scenario, agent: int, choice: RouteChoice) -> Route:
     if choice == "none" or not len(scene.graph):
         return NO_ROUTE
     if isinstance(choice, tuple):
-        return _of_points(scene, _along_lanes(scene, agent, choice), "lanes")
+        return _of_points(scene, agent, _along_lanes(scene, agent, choice), "lanes")
     if choice == "logged":
         return _logged_route(scene, agent)
     proposals = propose_from_lanes(scenario, int(scenario.simulated_indices[agent]))
     for proposal in proposals:
         if proposal.maneuver.value == choice:
-            return _of_points(scene, proposal.way[:, :2] - scenario.origin, "maneuver")
+            return _of_points(scene, agent, proposal.way[:, :2] - scenario.origin, "maneuver")
     known = ", ".join(proposal.maneuver.value for proposal in proposals) or "no maneuver"
     raise ConfigError(
         f"route {choice!r}: in scenario {scenario.scenario_id} the lanes of agent {scene.object_id[agent]} allow "
@@ -100,20 +104,24 @@ def _logged_route(scene: Scene, agent: int) -> Route:
     if not paths:
         heading = scene.logged[agent, CURRENT_STEP:, 2][scene.valid[agent, CURRENT_STEP:]][-1]
         beyond = np.arange(1.0, LEAST_M)[:, None] * [np.cos(heading), np.sin(heading)]
-        return _of_points(scene, np.concatenate([way, way[-1] + beyond]), "logged way")
+        return _of_points(scene, agent, np.concatenate([way, way[-1] + beyond]), "logged way")
     world = way + scene.scenario.origin
     misfit = [
         float(np.linalg.norm(world[:, None] - path.points[:, :2], axis=-1).min(1).mean())
         + TURN_PENALTY * abs(float(path.turn[-1]))
         for path in paths
     ]
-    return _of_points(scene, paths[int(np.argmin(misfit))].points[:, :2] - scene.scenario.origin, "logged lanes")
+    best = paths[int(np.argmin(misfit))].points[:, :2] - scene.scenario.origin
+    return _of_points(scene, agent, best, "logged lanes")
 
 
 def _paths(scenario: Scenario, agent: int, length_m: float) -> list[LanePath]:
     """Paths along the lanes from an agent's pose, with a lane change and without."""
     driver = CurrentAgent.of(scenario, int(scenario.simulated_indices[agent]))
-    lanes = lanes_for(build_env_scene(scenario).graph, driver.kind)
+    scene = build_env_scene(scenario)
+    lanes = lanes_for(scene.graph, driver.kind)
+    if scene.levels is not None:
+        lanes.usable[_lanes_of_other_levels(scene.graph, driver.pose.position)] = False
     own = own_paths(driver, lanes, length_m=length_m)
     speed = max(driver.speed_mps, 5.0)
     changing = [
@@ -123,6 +131,14 @@ def _paths(scenario: Scenario, agent: int, length_m: float) -> list[LanePath]:
         for path, _ in lane_change_paths(lanes, start, side=side, speed_mps=speed, length_m=length_m)
     ]
     return own + changing
+
+
+def _lanes_of_other_levels(graph: LaneGraph, position: Float[np.ndarray, "3"]) -> Int64[np.ndarray, "l"]:
+    """Indices of the lanes that are near an agent in the plane alone."""
+    offset = graph.points - position
+    is_near = np.linalg.norm(offset[:, :2], axis=1) <= MAX_LANE_DISTANCE_M
+    on_level = is_on_level(offset[:, 2])
+    return np.setdiff1d(graph.owner[is_near & ~on_level], graph.owner[is_near & on_level])
 
 
 def _along_lanes(scene: Scene, agent: int, lane_ids: tuple[int, ...]) -> Float[np.ndarray, "n 2"]:
@@ -139,7 +155,7 @@ def _along_lanes(scene: Scene, agent: int, lane_ids: tuple[int, ...]) -> Float[n
     return line[nearest:]
 
 
-def _of_points(scene: Scene, line: Float[np.ndarray, "n 2"], source: str) -> Route:
+def _of_points(scene: Scene, agent: int, line: Float[np.ndarray, "n 2"], source: str) -> Route:
     """Route along a polyline, with the lanes and limits there."""
     if float(arc_length(line)[-1]) < SPACING_M:
         return NO_ROUTE
@@ -149,11 +165,15 @@ def _of_points(scene: Scene, line: Float[np.ndarray, "n 2"], source: str) -> Rou
     graph = scene.graph
     offset = np.linalg.norm(points[:, None] - (graph.points[:, :2] - scene.scenario.origin), axis=-1)  # [R, P]
     offset[np.abs(wrapped(graph.heading - heading[:, None])) > ALONG_RAD] = np.inf
+    ground = np.zeros(len(points))
+    if scene.levels is not None:
+        ground = scene.levels.follow_lines(points[None], np.array([scene.z[agent] - scene.size[agent, 2] / 2]))[0]
+        offset[~is_on_level(graph.points[:, 2] - ground[:, None])] = np.inf
     nearest = offset.argmin(1)
     on_lane = offset[np.arange(len(points)), nearest] <= NEAR_LANE_M
     owner = graph.owner[nearest]
     limit = np.where(on_lane, graph.speed_limit_mps[owner], 0.0)
-    return Route(points, heading, limit, np.unique(owner[on_lane]), source)
+    return Route(points, heading, ground, limit, np.unique(owner[on_lane]), source)
 
 
 def points_every(line: Float[np.ndarray, "n 2"], spacing_m: float) -> Float[np.ndarray, "m 2"]:

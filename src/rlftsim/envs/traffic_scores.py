@@ -60,6 +60,7 @@ def score_traffic(record: Record) -> TrafficScores:
     overlaps = compute_overlap(
         motion[None, ..., :2].astype(np.float32), motion[None, ..., 2].astype(np.float32), length, width,
         (record.known & others[:, None])[None], ignore_from=0,
+        z=None if scene.levels is None else record.z[None], height=scene.size[:, 2],
     )[0].any(1)  # fmt: skip
     # 2. kinematics over half a second whose states are all known
     speed = np.linalg.norm(np.diff(motion[..., :2], axis=1), axis=-1) / STEP_S  # [A, T]
@@ -105,8 +106,8 @@ def _leaves_road(record: Record) -> Bool[np.ndarray, "A"]:
     if edges is None:
         return np.zeros(len(scene.object_id), bool)
     x, y = np.moveaxis(record.motion[..., :2] + scene.scenario.origin, -1, 0)
-    z = np.broadcast_to(scene.z[:, None], x.shape)
-    states = Trajectories(*(torch.from_numpy(v.copy()).float()[None] for v in (x, y, z, record.motion[..., 2])))
+    motion = (x, y, record.z, record.motion[..., 2])
+    states = Trajectories(*(torch.from_numpy(v.copy()).float()[None] for v in motion))
     size = torch.from_numpy(scene.size).float()
     off = compute_distance_to_road_edge(states, size, edges, max_pairs=MAX_PAIRS)[0].numpy()
     return ((off >= OUTSIDE_M) & record.known).any(1) & (off[:, 0] < OUTSIDE_M)
@@ -122,7 +123,7 @@ def _drives_against(record: Record, vehicles: Bool[np.ndarray, "A"]) -> Bool[np.
     step = np.where(known, np.linalg.norm(np.diff(record.motion[..., :2], axis=1), axis=-1), 0.0)
     moving = np.flatnonzero(vehicles & (step.sum(1) >= WRONG_WAY_M[0]))
     for agent in moving:
-        near = search.tree.query_ball_point(record.motion[agent, 1:, :2], LANE_M)
+        near = search.find_near(record.motion[agent, 1:, :2], LANE_M, record.ground[agent, 1:])
         heading = record.motion[agent, 1:, 2]
         against = [
             bool(points) and bool((np.cos(search.heading[points] - own) < 0).all())

@@ -60,8 +60,10 @@ class World:
     """Scene and agent of each planner-driven agent."""
     size: Float[np.ndarray, "B A 2"]
     """Length and width."""
+    height: Float[np.ndarray, "B A"]
     object_type: Int64[np.ndarray, "B A"]
     logged: Float[np.ndarray, "B A 91 5"]
+    logged_z: Float[np.ndarray, "B A 91"]
     valid: Bool[np.ndarray, "B A 91"]
     policy: Policy | None
     """None where no agent follows a policy."""
@@ -74,6 +76,8 @@ class World:
     """True = the agent is there at a step of the log's time (10 is the current one); replayed ones until it ends."""
     known: Bool[np.ndarray, "B A 91"]
     """True = it is there, and not held in a gap of its log: contacts and scores count these states alone."""
+    has_levels: Bool[np.ndarray, "B"]
+    """True = heights count in the scene, see `levels`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +98,8 @@ class WorldState:
 
     track: tuple[Float[np.ndarray, "B A 5"], ...]
     """Motion at every step of the log's time from 0 to the present one."""
+    z: tuple[Float[np.ndarray, "B A"], ...]
+    """Heights of the centers at the same steps; always those of the current step in scenes without levels."""
     block: Block | None
     """None where no agent follows a policy."""
     noise: Float[Tensor, "B 1 A L n"] | None
@@ -163,11 +169,14 @@ def build_world(
         drivers=drivers,
         actors=np.argwhere(drivers == Driver.PLANNER),
         size=padded([scene.size[:, :2] for scene in scenes], (*shape, 2)),
+        height=padded([scene.size[:, 2] for scene in scenes], shape),
         object_type=padded([scene.object_type for scene in scenes], shape, 0),
         logged=padded([scene.logged for scene in scenes], (*shape, TOTAL_STEPS, 5)),
+        logged_z=padded([scene.logged_z for scene in scenes], (*shape, TOTAL_STEPS)),
         valid=valid,
         there=there,
         known=there & (simulated | valid),
+        has_levels=np.array([scene.levels is not None for scene in scenes]),
         policy=policy if followers else None,
         context=context if followers else None,
         goals=Goals.from_points(batch, goals) if goals and followers else None,
@@ -206,7 +215,8 @@ def begin(world: World, dice: Sequence[Dice]) -> WorldState:
     speed = [np.linalg.norm(scene.logged[lines.agents, CURRENT_STEP, 3:], axis=-1) for scene, lines in _idm(world)]
     places = tuple(np.stack([np.zeros_like(v), v], -1) for v in speed)
     track = tuple(np.moveaxis(world.logged[:, :, : CURRENT_STEP + 1], 2, 0).copy())
-    return WorldState(track, block, noise, (tuple(dice),), places)
+    z = (world.logged_z[:, :, CURRENT_STEP],) * len(track)
+    return WorldState(track, z, block, noise, (tuple(dice),), places)
 
 
 def step_world(world: World, state: WorldState, moved: Float[np.ndarray, "M 5"]) -> WorldState:
@@ -244,7 +254,9 @@ def step_world(world: World, state: WorldState, moved: Float[np.ndarray, "M 5"])
     if any(len(lines.agents) for lines in world.lines):
         present = world.there[:, :, following - 1]
         moves = [
-            advance_idm(lines, place, before[b, :count], present[b, :count], scene, following - 1, IDM)
+            advance_idm(
+                lines, place, before[b, :count], state.z[-1][b, :count], present[b, :count], scene, following - 1, IDM
+            )
             for b, ((scene, lines), place) in enumerate(zip(_idm(world), places))
             for count in [len(scene.object_id)]
         ]
@@ -253,7 +265,29 @@ def step_world(world: World, state: WorldState, moved: Float[np.ndarray, "M 5"])
             motion[b, lines.agents] = moving
     # 3. the planner's agents; padding stays at zero
     motion[world.actors[:, 0], world.actors[:, 1]] = moved
-    return WorldState((*state.track, motion), block, state.noise, dice, places)
+    z = _follow_levels(world, state.z[-1], motion, following) if world.has_levels.any() else state.z[-1]
+    return WorldState((*state.track, motion), (*state.z, z), block, state.noise, dice, places)
+
+
+def _follow_levels(
+    world: World, z: Float[np.ndarray, "B A"], motion: Float[np.ndarray, "B A 5"], step: int
+) -> Float[np.ndarray, "B A"]:
+    """Heights of the centers after a step: replayed agents have logged ones, the others stay on their level's ground.
+
+    Args:
+        world: The scenes.
+        z: Heights before the step.
+        motion: Motion after it.
+        step: Step of the log's time.
+    """
+    z = z.copy()
+    for b, scene in enumerate(world.scenes):
+        if scene.levels is not None:
+            half = scene.size[:, 2] / 2
+            count = len(half)
+            z[b, :count] = scene.levels.follow(motion[b, :count, :2], z[b, :count] - half) + half
+    logged = world.logged_z[:, :, min(step, TOTAL_STEPS - 1)]
+    return np.where(world.has_levels[:, None] & (world.drivers == Driver.REPLAY), logged, z)
 
 
 def fork(world: World, state: WorldState, number: int, noise: Noise = "same") -> tuple[WorldState, ...]:

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Bool, Float
 
-from rlftsim.geometry import boxes_overlap
+from rlftsim.geometry import boxes_overlap, heights_overlap
 
 
 def compute_overlap(
@@ -14,6 +14,8 @@ def compute_overlap(
     valid: Bool[np.ndarray, "N A S"],
     *,
     ignore_from: int | None = None,
+    z: Float[np.ndarray, "N A S"] | None = None,
+    height: Float[np.ndarray, "A"] | None = None,
 ) -> Bool[np.ndarray, "N A S"]:
     """True where an agent's box has an inner point in common with another one.
 
@@ -24,11 +26,14 @@ def compute_overlap(
         width: meters.
         valid: an agent that is not valid overlaps no other.
         ignore_from: a step; two agents that overlap there are never marked for overlapping each other.
+        z: Heights of the centers, meters; without them agents above each other overlap.
+        height: Heights of the boxes, meters; needed with `z`.
     """
     overlap = np.zeros(valid.shape, bool)  # [N, A, S]
     size = np.stack([length, width], axis=-1).astype(np.float64)
     for n in range(len(valid)):
-        _mark_rollout(overlap[n], position[n].astype(np.float64), heading[n], size, valid[n], ignore_from)
+        heights = None if z is None or height is None else (z[n], height)
+        _mark_rollout(overlap[n], position[n].astype(np.float64), heading[n], size, valid[n], ignore_from, heights)
     return overlap
 
 
@@ -39,6 +44,7 @@ def _mark_rollout(
     size: Float[np.ndarray, "A 2"],
     valid: Bool[np.ndarray, "A S"],
     ignore_from: int | None,
+    heights: tuple[Float[np.ndarray, "A S"], Float[np.ndarray, "A"]] | None,
 ) -> None:
     """Mark one rollout's overlaps in `overlap`."""
     radius = np.linalg.norm(size, axis=-1) / 2  # [A], of the circle around a box
@@ -53,6 +59,9 @@ def _mark_rollout(
             continue
         row = other + agent + 1
         hit = boxes_overlap(gap[other, step], heading[agent, step], heading[row, step], size[agent], size[row])
+        if heights is not None:
+            z, height = heights
+            hit &= heights_overlap(z[row, step] - z[agent, step], height[agent, None], height[row])
         if ignore_from is not None:
             # A stroller and its pusher overlap from the beginning, which is no collision.
             hit &= ~np.isin(row, row[hit & (step == ignore_from)])

@@ -35,7 +35,8 @@ PLANNERS: ExtensionPoint[Callable[..., Any]] = ExtensionPoint(
 class Planner(Protocol):
     """Drives one agent. Attribute `action` names its kind of action; without it that is "bicycle".
 
-    Attribute `horizon` is the number of poses of a "trajectory"; without it that is 5.
+    Attribute `horizon` is the number of poses of a "trajectory"; without it that is 5. A bicycle drives backwards where
+    attribute `reverse` is True.
     """
 
     def reset(self, info: dict[str, Any]) -> None:
@@ -62,6 +63,7 @@ class CallablePlanner:
         self.function = function
         self.action = action_of(function)
         self.horizon = horizon_of(function)
+        self.reverse = may_reverse(function)
 
     def reset(self, info: dict[str, Any]) -> None:
         """Nothing: a function has no memory."""
@@ -170,3 +172,8 @@ def action_of(planner: Planner | Callable[..., Any]) -> ActionKind:
 def horizon_of(planner: Planner | Callable[..., Any]) -> int:
     """Number of poses of a planner's trajectories."""
     return getattr(planner, "horizon", LEAST_HORIZON)
+
+
+def may_reverse(planner: Planner | Callable[..., Any]) -> bool:
+    """True = the planner's bicycle may drive backwards."""
+    return getattr(planner, "reverse", False)

@@ -48,9 +48,10 @@ def _steps_between(poses: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n-1 3"
 
 
 class ConstantVelocityPlanner:
-    """Keeps speed and heading: the floor."""
+    """Keeps speed and heading, backwards too: the floor."""
 
     action: ActionKind = "bicycle"
+    reverse = True
 
     def reset(self, info: dict[str, Any]) -> None:
         """Nothing: it has no memory."""

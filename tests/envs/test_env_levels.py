@@ -1,0 +1,140 @@
+"""Bridges: what is above or below a road is not on it; slopes and ramps hide nothing."""
+
+import math
+
+import numpy as np
+import pytest
+
+from rlftsim.envs import EgoEnv, EgoVectorEnv
+from rlftsim.envs.drive import run_planner
+from rlftsim.envs.planners.registry import action_of, load_planner
+from rlftsim.envs.scene import build_env_scene
+from rlftsim.envs.world import Dice, begin, build_world, step_world
+from rlftsim.scenario.types import CURRENT_STEP, MapFeatureType
+from scenes import Mover, build_scenario, junction_map, light, polylines, raised, straight_map
+
+ROAD = slice(len(straight_map()))
+CROSSING = slice(len(straight_map()), None)
+EGO = Mover(speed_mps=9.3)
+BELOW = Mover(x_m=43.4, y_m=0.3, heading_rad=math.pi / 2, speed_mps=0.0)
+AHEAD = Mover(x_m=60.0, y_m=0.2, speed_mps=9.3)
+
+
+def bridge(*movers, up=(0,), road=ROAD, **scenario):
+    """The ego's road 6 m above the one that crosses it, or `road` in its place, and the tracks `up` on it."""
+    drawn = build_scenario("bridge", movers, junction_map(), **scenario)
+    return raised(drawn, lambda x: np.full_like(x, 6.0), road, up)
+
+
+def ramp(*movers):
+    """The ego's road climbs by 6 m over 60 m and crosses the other one at 4.3 m; all tracks are on it."""
+    drawn = build_scenario("ramp", movers, junction_map())
+    return raised(drawn, lambda x: 6.0 * np.clip(x / 60.0, 0.0, 1.0), ROAD, range(len(movers)))
+
+
+def driven(name, scenario):
+    planner = load_planner(name)
+    env = EgoEnv(scenarios=[scenario], action=action_of(planner), stop_on=(), traffic="replay")
+    return run_planner(env, planner, scenario, seed=0)
+
+
+def pushed(scenario, speed=10.0, steps=80, **settings):
+    """Environment after an ego has gone straight ahead."""
+    env = EgoEnv(scenarios=[scenario], traffic="replay", action="pose", stop_on=(), **settings)
+    env.reset(seed=0)
+    for _ in range(steps):
+        env.step(np.array([speed / 10, 0.0, 0.0], np.float32))
+    return env
+
+
+@pytest.mark.parametrize(("road", "up"), [(ROAD, (0,)), (CROSSING, (1,))])
+def test_a_parked_car_under_or_over_the_road_is_not_met(road, up):
+    result = driven("replay", bridge(EGO, BELOW, road=road, up=up))
+    assert result.record.collisions == ()
+    assert (result.planner.time_to_collision, result.planner.least_ttc_s) == (1.0, 3.0)
+    assert result.planner.nuplan_style > 0.8
+    assert driven("replay", build_scenario("flat", (EGO, BELOW), junction_map())).planner.at_fault_collision_rate == 1.0
+
+
+@pytest.mark.parametrize("name", ["idm", "pdm"])
+@pytest.mark.parametrize("lights", [{}, {"lights": light(7, 43.4, 0.3, red_until=91)}])
+def test_planners_drive_over_what_is_below(name, lights):
+    below = driven(name, bridge(EGO, BELOW, **lights)).record.own
+    np.testing.assert_array_equal(below, driven(name, bridge(EGO)).record.own)
+
+
+def test_observations_leave_out_other_levels():
+    env = EgoEnv(scenarios=[bridge(EGO, BELOW, AHEAD, up=(0, 2))], traffic="replay")
+    observation, _ = env.reset(seed=0)
+    assert observation["neighbors"][observation["neighbors_mask"] > 0, 0] == pytest.approx([60.0])
+    edges = observation["edges"][observation["edges_mask"] > 0]
+    assert len(edges) > 0
+    assert not np.any((np.abs(edges[:, 0] - 43.5) < 3.5) & (np.abs(np.abs(edges[:, 1]) - 12.0) < 6.0))
+
+
+@pytest.mark.parametrize("name", ["idm", "pdm"])
+def test_planners_stop_for_a_car_up_the_ramp(name):
+    result = driven(name, ramp(EGO, Mover(x_m=28.0, y_m=0.2, speed_mps=0.0)))
+    assert result.record.collisions == ()
+    gap = result.record.motion[1, -1, 0] - result.record.own[-1, 0] - 4.6
+    assert 0.2 < gap < 4.0
+
+
+def test_an_ego_climbs_with_its_road_and_meets_what_stands_there():
+    # its log stands, so that the lanes alone tell it the height
+    env = pushed(ramp(Mover(speed_mps=0.0), Mover(x_m=75.0, y_m=0.2, speed_mps=0.0)))
+    record = env.result().record
+    np.testing.assert_allclose(record.ground[0, [0, 30, 70]] - 3.0, [0.0, 3.0, 6.0], atol=0.3)
+    assert [one.agent for one in record.collisions] == [1]
+    assert env.result().planner.least_ttc_s < 0.2
+
+
+def test_cars_meet_on_a_steep_road_without_levels():
+    drawn = build_scenario("hill", (Mover(speed_mps=0.0), Mover(x_m=60.0, y_m=0.2, speed_mps=0.0)))
+    hill = raised(drawn, lambda x: 0.2 * x, ROAD, (0, 1))
+    assert build_env_scene(hill).levels is None
+    assert len(pushed(hill).result().record.collisions) == 1
+
+
+@pytest.mark.parametrize(("up", "passes"), [((0, 1), True), ((0, 1, 2), False)])
+def test_idm_traffic_stops_for_cars_on_its_own_road_alone(up, passes):
+    far = Mover(x_m=-50.0, y_m=0.0, speed_mps=0.0)
+    world = build_world([bridge(far, EGO, BELOW, up=up)], None, rules={"ego": "planner", "vehicles": "idm"})
+    state = begin(world, [Dice(0)])
+    for _ in range(80):
+        state = step_world(world, state, world.logged[0, :1, CURRENT_STEP])
+    assert (state.now[0, 1, 0] > state.now[0, 2, 0]) == passes
+
+
+def test_others_above_each_other_do_not_collide():
+    far = Mover(x_m=-40.0, y_m=0.0, speed_mps=0.0)
+    crossing = Mover(x_m=43.4, y_m=-30.0, heading_rad=math.pi / 2, speed_mps=7.0)
+    for up, rate in (((0, 1), 0.0), ((0, 1, 2), 1.0)):
+        assert driven("replay", bridge(far, EGO, crossing, up=up)).traffic.others_collision_rate == rate
+
+
+def test_a_lane_below_says_nothing_about_the_direction_above():
+    kind = MapFeatureType.LANE_SURFACE_STREET
+    stacked = polylines([(kind, [(140.0, 0.1), (-60.0, 0.1)]), (kind, [(-60.0, 0.0), (140.0, 0.0)])])
+    for up, direction in (((), 1.0), ((0,), 0.0)):
+        log = raised(build_scenario("stacked", (EGO,), stacked), lambda x: np.full_like(x, 6.0), slice(len(up)), up)
+        assert driven("replay", log).planner.driving_direction == direction
+
+
+def test_heights_are_those_of_each_scene_in_a_vector():
+    scenarios = [bridge(EGO, BELOW), build_scenario("flat", (EGO, BELOW), junction_map())]
+    settings = {"traffic": "replay", "action": "pose", "stop_on": ()}
+    vector = EgoVectorEnv(2, scenarios=scenarios, **settings)
+    singles = [EgoEnv(scenarios=scenarios, **settings) for _ in scenarios]
+    vector.reset(seed=1)
+    for slot, env in enumerate(singles):
+        env.reset(seed=1 + slot)
+    assert {env.episode.world.scenes[0].scenario.scenario_id for env in singles} == {"bridge", "flat"}
+    forward = np.array([0.93, 0.0, 0.0], np.float32)
+    for _ in range(60):
+        together, rewards, *_ = vector.step(np.tile(forward, (2, 1)))
+        for slot, env in enumerate(singles):
+            alone, reward, *_ = env.step(forward)
+            assert rewards[slot] == reward
+            for name, values in alone.items():
+                np.testing.assert_array_equal(together[name][slot], values)
