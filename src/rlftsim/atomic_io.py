@@ -17,6 +17,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from rlftsim.errors import DataError
+from rlftsim.jobs.files import parse_json
 
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """Errors of the operating system where a file does not fit."""
@@ -186,7 +187,7 @@ def _sort_metadata(path: Path) -> None:
     """Sort the metadata in the header of a safetensors file, whose order differs from process to process."""
     with path.open("r+b") as file:
         size = int.from_bytes(file.read(8), "little")
-        header = json.loads(file.read(size))
+        header = parse_json(file.read(size), "write it again", source=str(path))
         if "__metadata__" in header:
             header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
             text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode().ljust(size)
