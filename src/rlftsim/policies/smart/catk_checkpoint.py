@@ -72,7 +72,7 @@ def import_catk(checkpoint: Path, vocabulary: Sequence[Path]) -> CatkImport:
 
     Raises:
         CheckpointError: a file is damaged or holds foreign objects; keys are missing, unknown, of the wrong shape
-            or unequal where they must be equal (the first of them are listed); the vocabulary does not belong to the weights.
+            or unequal where they must be equal (the first are named); the vocabulary does not belong to the weights.
     """
     weights, settings = _read(checkpoint)
     config, source = _config_of(weights, settings, checkpoint)
