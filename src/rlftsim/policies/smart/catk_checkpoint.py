@@ -72,7 +72,7 @@ def import_catk(checkpoint: Path, vocabulary: Sequence[Path]) -> CatkImport:
 
     Raises:
         CheckpointError: a file is damaged or holds foreign objects; keys are missing, unknown, of the wrong shape
-            or unequal where they must be equal (all of them are listed); the vocabulary does not belong to the weights.
+            or unequal where they must be equal (the first are named); the vocabulary does not belong to the weights.
     """
     weights, settings = _read(checkpoint)
     config, source = _config_of(weights, settings, checkpoint)
@@ -201,7 +201,7 @@ def _translate(weights: dict[str, Tensor], own: dict[str, Tensor], source: str) 
     """Weights under our names, those of a network's state dict.
 
     Raises:
-        CheckpointError: lists everything that is missing, unknown, of the wrong shape or kind, or unequal to its
+        CheckpointError: the first things that are missing, unknown, of the wrong shape or kind, or unequal to its
             second name.
     """
     # shapes of all names that must be there, second names of shared norms included
@@ -211,9 +211,7 @@ def _translate(weights: dict[str, Tensor], own: dict[str, Tensor], source: str) 
     shapes |= {second: shapes[first] for second, first in seconds.items()}
     # collect all problems before refusing: a user mends them at once
     problems = [f"missing {name}" for name in sorted(shapes.keys() - weights.keys())]
-    problems += [
-        f"unknown {name if name.isprintable() else repr(name)}" for name in sorted(weights.keys() - shapes.keys())
-    ]
+    problems += [f"unknown {name[:100]}" for name in sorted(weights.keys() - shapes.keys())]
     for name in sorted(shapes.keys() & weights.keys()):
         value = weights[name]
         if value.shape != shapes[name]:
