@@ -349,8 +349,8 @@ def _contacts(episode: Episode, world: WorldState, motion: Float[np.ndarray, "M 
     if episode.world.has_levels.any():
         z, height = world.z[-1], episode.world.height
         rise = z[scene] - z[scene, agent][:, None]
-        on_level = heights_overlap(rise, height[scene, agent][:, None], height[scene])
-        meets &= on_level | ~episode.world.has_levels[scene][:, None]
+        is_same_level = heights_overlap(rise, height[scene, agent][:, None], height[scene])
+        meets &= is_same_level | ~episode.world.has_levels[scene][:, None]
     return meets
 
 
