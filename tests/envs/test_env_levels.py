@@ -8,6 +8,7 @@ import pytest
 from rlftsim.envs import EgoEnv, EgoVectorEnv
 from rlftsim.envs.drive import run_planner
 from rlftsim.envs.planners.registry import action_of, load_planner
+from rlftsim.envs.result import animation_of
 from rlftsim.envs.scene import build_env_scene
 from rlftsim.envs.world import Dice, begin, build_world, step_world
 from rlftsim.scenario.types import CURRENT_STEP, MapFeatureType
@@ -54,6 +55,16 @@ def test_a_parked_car_under_or_over_the_road_is_not_met(road, up):
     assert (result.planner.time_to_collision, result.planner.least_ttc_s) == (1.0, 3.0)
     assert result.planner.nuplan_style > 0.8
     assert driven("replay", build_scenario("flat", (EGO, BELOW), junction_map())).planner.at_fault_collision_rate == 1.0
+
+
+def test_films_mark_no_overlap_of_cars_above_each_other():
+    for scenario, is_marked in (
+        (bridge(EGO, BELOW), False),
+        (build_scenario("flat", (EGO, BELOW), junction_map()), True),
+    ):
+        record = driven("replay", scenario).record
+        (panel,) = animation_of({"planner": record}).panels
+        assert panel.trajectories.collides.any() == is_marked
 
 
 @pytest.mark.parametrize("name", ["idm", "pdm"])

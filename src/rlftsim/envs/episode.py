@@ -122,7 +122,7 @@ def start(episode: Episode, dice: tuple[Dice, ...]) -> EpisodeState:
     world = begin(episode.world, dice)
     motion = own_motion(episode, world)
     never = np.zeros(episode.num_agents, bool)
-    off = off_road_m(episode, motion, _ground(episode, world), np.arange(episode.num_agents))
+    off = off_road_m(episode, world, np.arange(episode.num_agents))
     return EpisodeState(
         world=world,
         touched=_contacts(episode, world, motion),
@@ -224,7 +224,6 @@ def _step(
     """State 0.1 s later, and the terms of this step."""
     before = own_motion(episode, state.world)
     world = step_world(episode.world, state.world, moved)
-    ground = _ground(episode, world)
     # 1. contacts with tracks that have not been touched
     contacts = _contacts(episode, world, moved) & ~state.touched
     found = [list(known) for known in state.collisions]
@@ -233,7 +232,7 @@ def _step(
         found[row].append(
             collision_of(
                 episode.world.scenes[scene], world.step, int(agent), moved[row], episode.world.size[scene, own],
-                ground[row : row + 1], world.now[scene, agent], episode.world.size[scene, agent],
+                _ground(episode, world, np.array([row])), world.now[scene, agent], episode.world.size[scene, agent],
             )
         )  # fmt: skip
     new = [known[len(earlier) :] for known, earlier in zip(found, state.collisions)]
@@ -244,7 +243,7 @@ def _step(
     clear = state.clear_m - np.hypot(*(moved[:, :2] - before[:, :2]).T) - turned
     unclear = np.flatnonzero((clear <= 0) & ~state.outside)
     if len(unclear):
-        clear[unclear] = _free_way_m(episode, moved, ground, unclear)
+        clear[unclear] = _free_way_m(episode, world, unclear)
     outside = state.outside.copy()
     outside[unclear] = clear[unclear] <= 0
     progress = _progress(episode, moved)
@@ -290,29 +289,27 @@ def look(episode: Episode, state: EpisodeState) -> Observation:
     return observe(episode.world, episode.atlas, state.world, frame=config.frame, steps=config.max_steps)
 
 
-def _ground(episode: Episode, world: WorldState) -> Float[np.ndarray, "M"]:
-    """Height of the ground under the planner-driven agents: that of their boxes' undersides."""
-    scene, agent = episode.world.actors.T
+def _ground(episode: Episode, world: WorldState, rows: Int64[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
+    """Height of the ground under planner-driven agents: that of their boxes' undersides."""
+    scene, agent = episode.world.actors[rows].T
     return world.z[-1][scene, agent] - episode.world.height[scene, agent] / 2
 
 
-def off_road_m(
-    episode: Episode, motion: Float[np.ndarray, "M 5"], ground: Float[np.ndarray, "M"], rows: Int64[np.ndarray, "m"]
-) -> Float[np.ndarray, "m"]:
+def off_road_m(episode: Episode, world: WorldState, rows: Int64[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
     """Signed distance of the corner farthest off the road, negative on it; that of the official metric.
 
     Args:
         episode: the scenes.
-        motion: of the planner-driven agents.
-        ground: Height of the ground under them.
+        world: a state of theirs.
         rows: those that are measured.
     """
     scene, agent = episode.world.actors[rows].T
     if episode.edges is None or not len(rows):
         return np.full(len(rows), -np.inf)
-    corners = clockwise_corners(motion[rows, :2], motion[rows, 2], episode.world.size[scene, agent])
+    motion = world.now[scene, agent]
+    corners = clockwise_corners(motion[:, :2], motion[:, 2], episode.world.size[scene, agent])
     origin = np.stack([episode.world.scenes[b].scenario.origin for b in scene])
-    z = np.repeat(ground[rows, None, None], 4, 1)
+    z = np.repeat(_ground(episode, world, rows)[:, None, None], 4, 1)
     groups = torch.from_numpy(np.concatenate([corners + origin[:, None], z], -1)).float()
     of_scene = torch.from_numpy(scene) if len(episode.world.scenes) > 1 else None
     distance = compute_point_distance_to_road_edge(groups, episode.edges, max_pairs=MAX_PAIRS, scenario=of_scene)
@@ -322,22 +319,21 @@ def off_road_m(
     return np.where(episode.edges.is_known.numpy()[scene], farthest, -np.inf)
 
 
-def _free_way_m(
-    episode: Episode, motion: Float[np.ndarray, "M 5"], ground: Float[np.ndarray, "M"], rows: Int64[np.ndarray, "m"]
-) -> Float[np.ndarray, "m"]:
+def _free_way_m(episode: Episode, world: WorldState, rows: Int64[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
     """Distance that agents may move by before a corner can be 0.3 m off the road; at most 0 where one is.
 
     The search for the official distance is slow. Where all corners are clearly to the left of the simplified edges of
     the observations, these decide, unless edges lie above each other.
     """
     scene, agent = episode.world.actors[rows].T
-    corners = clockwise_corners(motion[rows, :2], motion[rows, 2], episode.world.size[scene, agent])  # [m, 4, 2]
+    motion = world.now[scene, agent]
+    corners = clockwise_corners(motion[:, :2], motion[:, 2], episode.world.size[scene, agent])  # [m, 4, 2]
     distance, side, is_beside = nearest_edges(corners, episode.atlas.edges[scene])
     free = distance.min(1) - SIMPLIFIED_M
     unclear = np.flatnonzero((free <= 0) | ~((side > 0) & is_beside).all(1) | episode.world.has_levels[scene])
     free += OUTSIDE_M
     if len(unclear):
-        free[unclear] = OUTSIDE_M - off_road_m(episode, motion, ground, rows[unclear])
+        free[unclear] = OUTSIDE_M - off_road_m(episode, world, rows[unclear])
     return free
 
 
@@ -353,8 +349,8 @@ def _contacts(episode: Episode, world: WorldState, motion: Float[np.ndarray, "M 
     if episode.world.has_levels.any():
         z, height = world.z[-1], episode.world.height
         rise = z[scene] - z[scene, agent][:, None]
-        on_level = heights_overlap(rise, height[scene, agent][:, None], height[scene])
-        meets &= on_level | ~episode.world.has_levels[scene][:, None]
+        is_same_level = heights_overlap(rise, height[scene, agent][:, None], height[scene])
+        meets &= is_same_level | ~episode.world.has_levels[scene][:, None]
     return meets
 
 

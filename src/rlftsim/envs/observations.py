@@ -344,10 +344,10 @@ def _leave_out_other_levels(
     for name, heights in {**atlas.heights, "neighbors": neighbors}.items():
         difference = heights.differences(distances[name], ground, above_route)
         if name == "neighbors":
-            on_level = heights_overlap(difference, 2 * half, height[scene])
+            is_same_level = heights_overlap(difference, 2 * half, height[scene])
         else:
-            on_level = is_on_level(difference)
-        distances[name][world.has_levels[scene][:, None] & ~on_level] = np.inf
+            is_same_level = is_on_level(difference)
+        distances[name][world.has_levels[scene][:, None] & ~is_same_level] = np.inf
 
 
 def _rows(values: Float[np.ndarray, "M n c"], mask: Bool[np.ndarray, "M n"], length: int) -> np.ndarray:

@@ -13,7 +13,7 @@ from rlftsim.envs.traffic_scores import TrafficScores, score_traffic
 from rlftsim.scenario.types import HISTORY_STEPS
 from rlftsim.viewer.film import to_film
 from rlftsim.viewer.page import Animation, Panel, animation_html, page_html
-from rlftsim.viewer.scene import SceneMotion, build_scene, logged_trajectories
+from rlftsim.viewer.scene import AgentBoxes, SceneMotion, build_scene, logged_trajectories
 
 SCORE_NAMES = tuple(one.name for scores in (PlannerScores, TrafficScores) for one in fields(scores))
 """Names of all scores of an episode."""
@@ -62,13 +62,22 @@ class Result:
         )
 
 
-def motion_of(record: Record) -> SceneMotion:
-    """Motion of all agents of a record, after the logged history."""
+def motion_of(record: Record, agents: AgentBoxes) -> SceneMotion:
+    """Motion of all agents of a record, after the logged history; agents that overlap are marked.
+
+    Args:
+        record: Record of an episode.
+        agents: Boxes of its agents.
+    """
     log = logged_trajectories(record.scene.scenario)
     position = np.concatenate([log.position[0, :, :HISTORY_STEPS], record.motion[:, 1:, :2]], 1)
     heading = np.concatenate([log.heading[0, :, :HISTORY_STEPS], record.motion[:, 1:, 2]], 1)
     valid = np.concatenate([log.valid[0, :, :HISTORY_STEPS], record.there[:, 1:]], 1)
-    return SceneMotion(position[None].astype(np.float32), heading[None].astype(np.float32), valid[None])
+    motion = SceneMotion(position[None].astype(np.float32), heading[None].astype(np.float32), valid[None])
+    if record.scene.levels is None:
+        return motion.with_overlaps(agents)
+    z = np.concatenate([record.scene.logged_z[:, :HISTORY_STEPS], record.z[:, 1:]], 1)
+    return motion.with_overlaps(agents, z[None], record.scene.size[:, 2])
 
 
 def animation_of(records: Mapping[str, Record]) -> Animation:
@@ -79,7 +88,7 @@ def animation_of(records: Mapping[str, Record]) -> Animation:
     """
     scenario = next(iter(records.values())).scene.scenario
     scene = build_scene(scenario)
-    panels = [Panel(title, motion_of(record).with_overlaps(scene.agents)) for title, record in records.items()]
+    panels = [Panel(title, motion_of(record, scene.agents)) for title, record in records.items()]
     return Animation(f"scenario {scenario.scenario_id}", scene, panels)
 
 

@@ -137,8 +137,8 @@ def _lanes_of_other_levels(graph: LaneGraph, position: Float[np.ndarray, "3"]) -
     """Indices of the lanes that are near an agent in the plane alone."""
     offset = graph.points - position
     is_near = np.linalg.norm(offset[:, :2], axis=1) <= MAX_LANE_DISTANCE_M
-    on_level = is_on_level(offset[:, 2])
-    return np.setdiff1d(graph.owner[is_near & ~on_level], graph.owner[is_near & on_level])
+    is_same_level = is_on_level(offset[:, 2])
+    return np.setdiff1d(graph.owner[is_near & ~is_same_level], graph.owner[is_near & is_same_level])
 
 
 def _along_lanes(scene: Scene, agent: int, lane_ids: tuple[int, ...]) -> Float[np.ndarray, "n 2"]:

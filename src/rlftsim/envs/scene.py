@@ -93,7 +93,7 @@ class Scene:
     edges: Float[np.ndarray, "e 4"]
     """Pieces of road edges: x0, y0, x1, y1, the drivable side on the left."""
     edges_z: Float[np.ndarray, "e"]
-    """Height of the middle of each piece."""
+    """Height of the middle of each piece; zeros in scenes without levels."""
     crossings: Float[np.ndarray, "c 8"]
     """Rectangles around crosswalks and speed bumps: four corners."""
     crossings_z: Float[np.ndarray, "c"]
@@ -131,7 +131,9 @@ def build_env_scene(scenario: Scenario) -> Scene:
     size = tracks.size[chosen, CURRENT_STEP].astype(np.float64)
     undersides = np.concatenate([logged[..., :2], (logged_z - size[:, 2:] / 2)[..., None]], -1)[valid]
     on_lanes = np.concatenate([lanes.points, lanes.z[..., None]], -1).reshape(-1, 3)
-    edges, edges_z = _edges(scenario)
+    ground = np.concatenate([on_lanes, undersides])
+    levels = None if "z" in scenario.guessed else build_levels(ground)
+    edges, edges_z = _edges(scenario, levels is not None)
     crossings, crossings_z = _crossings(scenario)
     return Scene(
         scenario=scenario,
@@ -150,7 +152,7 @@ def build_env_scene(scenario: Scenario) -> Scene:
         crossings=crossings,
         crossings_z=crossings_z,
         lights=lights,
-        levels=None if "z" in scenario.guessed else build_levels(np.concatenate([on_lanes, undersides])),
+        levels=levels,
     )
 
 
@@ -204,7 +206,7 @@ def _lane_pieces(scenario: Scenario, graph: LaneGraph, lights: Lights) -> LanePi
     )
 
 
-def _edges(scenario: Scenario) -> tuple[Float[np.ndarray, "e 4"], Float[np.ndarray, "e"]]:
+def _edges(scenario: Scenario, has_levels: bool) -> tuple[Float[np.ndarray, "e 4"], Float[np.ndarray, "e"]]:
     """Pieces of road edges, and their heights."""
     features, found, heights = scenario.map_features, [np.zeros((0, 4))], [np.zeros(0)]
     for index in features.indices_of(ROAD_EDGE_TYPES):
@@ -215,8 +217,11 @@ def _edges(scenario: Scenario) -> tuple[Float[np.ndarray, "e 4"], Float[np.ndarr
             count = max(1, int(np.ceil(np.linalg.norm(end - start) / PIECE_M)))
             cuts = start + np.linspace(0, 1, count + 1)[:, None] * (end - start)
             found.append(np.concatenate([cuts[:-1], cuts[1:]], axis=1))
-            middle = (cuts[:-1] + cuts[1:]) / 2
-            heights.append(line[((line[:, None, :2] - middle) ** 2).sum(-1).argmin(0), 2])
+            if has_levels:
+                middle = (cuts[:-1] + cuts[1:]) / 2
+                heights.append(line[((line[:, None, :2] - middle) ** 2).sum(-1).argmin(0), 2])
+            else:
+                heights.append(np.zeros(count))
     return np.concatenate(found), np.concatenate(heights)
 
 

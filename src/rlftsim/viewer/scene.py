@@ -151,15 +151,26 @@ class SceneMotion:
         kept = {name: None if values is None else values[:num_rollouts] for name, values in vars(self).items()}
         return replace(self, **kept)
 
-    def with_overlaps(self, agents: AgentBoxes) -> "SceneMotion":
+    def with_overlaps(
+        self,
+        agents: AgentBoxes,
+        z: Float[np.ndarray, "N A S"] | None = None,
+        height: Float[np.ndarray, "A"] | None = None,
+    ) -> "SceneMotion":
         """The same with `collides` = the boxes overlap, and did not at the current step.
 
         A logged stroller and its pusher overlap from the beginning, which is no collision. Boxes have sharp corners
         here and rounded ones in the metric, so these are not exactly the metric's collisions.
+
+        Args:
+            agents: Boxes of the agents.
+            z: Heights of their centers, meters; without them agents above each other overlap, as in the metric.
+            height: Heights of the boxes, meters; needed with `z`.
         """
         collides = compute_overlap(
-            self.position, self.heading, agents.length, agents.width, self.valid, ignore_from=CURRENT_STEP
-        )
+            self.position, self.heading, agents.length, agents.width, self.valid, ignore_from=CURRENT_STEP,
+            z=z, height=height,
+        )  # fmt: skip
         return replace(self, collides=collides)
 
     def with_evaluated_flags(
