@@ -29,6 +29,9 @@ PARSERS = {"json", "tomllib", "np", "numpy", "torch", "pickle", "tarfile"}
 NO_FORMAT = {
     "atomic_io": "copies and appends bytes that it does not look at",
     "cluster.ray": "bytes of this program's own processes",
+    "jobs.arrays": "for modules that know the format",
+    "jobs.files": "for modules that know the format",
+    "jobs.tables": "for modules that know the format",
     "lease": "shows the text of a lock, damaged or not",
     "policies.shipped.__init__": "weights in the box",
     "scenario.synthetic.recording": "what SUMO has just written",
