@@ -1,4 +1,5 @@
 import io
+import json
 import math
 import re
 from dataclasses import replace
@@ -149,11 +150,62 @@ def test_other_tables_and_columns_of_text_are_refused_in_one_line(tmp_path):
     text = whole.table.set_column(column, "kinematic", pa.array(["0.5"]))
     for table, message in (
         (text, "damaged evaluation (column kinematic holds string, not double): evaluate again."),
-        (whole.table.drop_columns("kinematic"), "not an evaluation of this version"),
+        (whole.table.drop_columns("kinematic"), "damaged evaluation (no column kinematic): evaluate again."),
     ):
         replace(whole, table=table).write(tmp_path / "edited.parquet")
         with pytest.raises(DataError, match=re.escape(message)):
             Evaluation.read(tmp_path / "edited.parquet")
+
+
+IMPOSSIBLE = {
+    "meta_metric": (-5.0, "meta_metric of scenario s0 is -5, it is in [0, 1]"),
+    "kinematic": (float("inf"), "kinematic of scenario s0 is inf, it is in [0, 1]"),
+    "collision_rate": (1.5, "collision_rate of scenario s0 is 1.5, it is in [0, 1]"),
+    "average_displacement_error": (-1.0, "of scenario s0 is -1, it is finite and not below 0"),
+    "speed_gap": (float("-inf"), "speed_gap of scenario s0 is -inf, it is finite"),
+}
+
+
+@pytest.mark.parametrize("column", IMPOSSIBLE)
+def test_scores_that_cannot_be_are_refused(tmp_path, column):
+    value, words = IMPOSSIBLE[column]
+    evaluation("a", [0.1], columns={column: [value]}).write(tmp_path / "a.parquet")
+    with pytest.raises(DataError, match=re.escape(f"damaged evaluation ({'' if column in words else column}")) as error:
+        Evaluation.read(tmp_path / "a.parquet")
+    assert words in str(error.value)
+
+
+def test_scores_of_rounding_and_of_nothing_are_read(tmp_path):
+    columns = {"kinematic": [1.0 + 1e-9], "speed_gap": [-3.0], "miss_rate": [float("nan")]}
+    evaluation("a", [0.1], columns=columns).write(tmp_path / "a.parquet")
+    assert len(Evaluation.read(tmp_path / "a.parquet")) == 1
+
+
+def empty_cell(table):
+    return table.set_column(0, "scenario_id", pa.array([None], pa.string()))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda table, about: (empty_cell(table), about), "column scenario_id has empty cells"),
+        (lambda table, about: (table, {**about, "name": [1]}), "its name is a list"),
+        (lambda table, about: (table, {**about, "provenance": "x"}), "its provenance is text"),
+        (lambda table, about: (table, {**about, "skipped": [{"scenario_id": 1, "reason": 2}]}), "is no text"),
+        (lambda table, about: (table, "[" * 100_000), "brackets nested more than 64 deep"),
+    ],
+)
+def test_a_description_that_cannot_be_is_refused_in_one_line(tmp_path, change, words):
+    path = tmp_path / "a.parquet"
+    evaluation("a", [0.1]).write(path)
+    table = pq.read_table(path)
+    table, about = change(table, json.loads(table.schema.metadata[b"rlftsim"]))
+    about = about if isinstance(about, str) else json.dumps(about)
+    pq.write_table(table.replace_schema_metadata({"rlftsim": about}), path)
+    with pytest.raises(DataError) as error:
+        Evaluation.read(path)
+    assert words in str(error.value)
+    assert "\n" not in str(error.value)
 
 
 def test_provenance_lists_what_differs():

@@ -16,6 +16,7 @@ import scenes
 from rlftsim.errors import DataError
 from rlftsim.evaluation.rollout_files import find_rollouts, read_states
 from rlftsim.evaluation.wire_format import iterate_fields
+from rlftsim.jobs.arrays import read_npz
 from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.rollout.files import write_rollouts
 from rlftsim.rollout.simulate import simulate
@@ -93,7 +94,7 @@ def test_pickles_are_refused_unopened(tmp_path, name):
 
 def test_objects_inside_an_npz_are_refused_unopened(arrays, tmp_path):
     write_npz(tmp_path / "a.npz", {**arrays, "x": np.array([Bomb()], object)})
-    with pytest.raises(DataError, match=r"is no rollouts file: it holds an array of Python objects.*rollout_formats"):
+    with pytest.raises(DataError, match=r"x\.npy holds Python objects.*no rollouts file.*rollout_formats"):
         read_all(tmp_path)
 
 
@@ -101,7 +102,7 @@ def test_objects_inside_an_npz_are_refused_unopened(arrays, tmp_path):
 def test_an_npz_of_garbage_is_refused_in_our_words(tmp_path, garbage):
     (tmp_path / "garbage.npz").write_bytes(garbage)
     with pytest.raises(
-        DataError, match=r"garbage.npz is no rollouts file: it is not an npz archive, or cut off"
+        DataError, match=r"garbage.npz: cannot be read \(it is not an npz archive, or cut off\): no rollouts file"
     ) as error:
         find_rollouts(tmp_path)
     assert "docs/rollout_formats.md" in str(error.value)
@@ -114,8 +115,23 @@ def test_a_damaged_array_is_refused_in_our_words(arrays, tmp_path):
             part = io.BytesIO()
             np.save(part, value)
             archive.writestr(f"{key}.npy", part.getvalue()[: 200 if key == "x" else None])
-    with pytest.raises(DataError, match="is no rollouts file: an array in it is damaged"):
+    with pytest.raises(DataError, match=r"x\.npy announces an array of another size.*no rollouts file"):
         read_all(tmp_path)
+
+
+def test_arrays_that_unfold_to_more_than_memory_holds_are_refused_by_their_headers(arrays, tmp_path, monkeypatch):
+    monkeypatch.setattr("rlftsim.jobs.arrays.MAX_ARRAY_BYTES", arrays["x"].nbytes * 3)
+    monkeypatch.setattr(np.lib.format, "read_array", lambda *_, **__: pytest.fail("an array was read"))
+    np.savez_compressed(tmp_path / "a.npz", **{name: np.zeros_like(arrays["x"]) for name in AXES})
+    with pytest.raises(DataError, match=r"its arrays unfold to .* GB"):
+        read_npz(tmp_path / "a.npz", AXES, "write it again")
+
+
+@pytest.mark.parametrize("text", ["", "a\nb", "\x1b[31m", "x" * 500])
+def test_an_id_that_no_file_or_terminal_could_hold_is_refused(arrays, tmp_path, text):
+    write_npz(tmp_path / "a.npz", {**arrays, "scenario_id": np.array(text)})
+    with pytest.raises(DataError, match="no text of 1 to 200 printable characters"):
+        find_rollouts(tmp_path)
 
 
 CHANGES = {
@@ -246,7 +262,7 @@ def test_fields_of_any_bytes_lie_inside_and_in_order(data):
 def test_a_file_is_named_once_and_ids_that_occur_twice_are_named(arrays, tmp_path):
     path = tmp_path / "a.npz"
     np.savez(path, **{**arrays, "x": arrays["x"].astype(object)})
-    with pytest.raises(DataError, match="an array of Python objects") as caught:
+    with pytest.raises(DataError, match="holds Python objects") as caught:
         read_all(path)
     assert str(caught.value).count("a.npz") == 1
     ids = arrays["object_ids"].copy()

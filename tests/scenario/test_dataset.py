@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 import scenes
@@ -250,6 +251,49 @@ def test_a_flipped_byte_in_a_shard_is_found_when_its_row_is_read(folder):
     path.write_bytes(data)
     with pytest.raises(DataError, match=r"shard .*00000\.arrow.* damaged .*: delete the file and run"):
         list(ScenarioDataset(folder))
+
+
+def test_a_wrong_offset_in_a_shard_is_refused_instead_of_followed_out_of_the_file(folder):
+    path = shard_of(folder)
+    data = bytearray(path.read_bytes())
+    table = pa.ipc.open_file(pa.BufferReader(bytes(data))).read_all()
+    offsets = bytes(table["tracks.position.x"].chunk(0).buffers()[1])[:8]
+    data[data.find(offsets) + 7] = 0xFF  # the second offset becomes negative
+    path.write_bytes(data)
+    with pytest.raises(DataError, match=r"00000\.arrow is damaged .*: delete the file and run") as error:
+        ScenarioDataset(folder)[0]
+    assert "\n" not in str(error.value)
+
+
+def test_an_index_that_names_another_row_is_refused(folder):
+    table = pq.read_table(folder / "index.parquet")
+    rows = pa.array([99] * len(table), pa.int32())
+    pq.write_table(table.set_column(table.schema.get_field_index("row"), "row", rows), folder / "index.parquet")
+    with pytest.raises(DataError, match="row 99 is damaged"):
+        ScenarioDataset(folder)[0]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"num_scenarios": "two"}, "num_scenarios must be a whole number|Type-check error"),
+        ({"counts": [1]}, "counts are no whole numbers by name|Type-check error"),
+        ({"duplicates": [3]}, "is damaged"),
+    ],
+)
+def test_a_manifest_of_other_types_is_refused(folder, change, words):
+    values = json.loads((folder / "manifest.json").read_text())
+    (folder / "manifest.json").write_text(json.dumps({**values, **change}))
+    with pytest.raises(DataError, match=words):
+        ScenarioDataset(folder)
+
+
+def test_a_shard_outside_the_folder_is_refused(folder):
+    values = json.loads((folder / "manifest.json").read_text())
+    values["shards"][0]["file"] = "../../other.arrow"
+    (folder / "manifest.json").write_text(json.dumps(values))
+    with pytest.raises(DataError, match="leads out of the folder"):
+        ScenarioDataset(folder)
 
 
 def test_a_truncated_shard_is_refused(folder):

@@ -1,9 +1,11 @@
 import copy
+import json
 import resource
 import shutil
 
 import pytest
 import torch
+from safetensors.torch import load_file, save_file
 from torch import nn
 
 from rlftsim.errors import CheckpointError, DataError
@@ -102,7 +104,49 @@ def test_a_damaged_checkpoint_is_refused_in_words(tmp_path, name, damage):
         (path / name).unlink()
     else:
         (path / name).write_bytes(content[: len(content) // 2] if damage == "cut" else b"\xff" * 40)
-    with pytest.raises(CheckpointError, match=r"update-00000002: cannot go on from it .*delete this folder"):
+    with pytest.raises(CheckpointError, match=r"update-00000002.*: delete this folder to go on"):
+        read_checkpoint(path, {"policy": module}, optimizer)
+
+
+def changed(tensors, change):
+    """Tensors of a file whose first one is changed."""
+    name = min(tensors)
+    return tensors | {name: change(tensors[name].clone())}
+
+
+SPOILED = {
+    "a weight that is no number": (
+        "policy",
+        lambda t: changed(t, lambda v: v.fill_(torch.nan)),
+        "policy is not finite",
+    ),
+    "weights of another precision": ("policy", lambda t: changed(t, torch.Tensor.half), "is torch.float16"),
+    "a moment that is no number": ("optimizer", lambda t: changed(t, lambda v: v.fill_(torch.inf)), "is not finite"),
+    "a moment of another shape": ("optimizer", lambda t: changed(t, lambda v: v[:1].clone()), "has shape"),
+    "a moment of no weight": ("optimizer", lambda t: t | {"x.exp_avg": torch.zeros(1)}, "'x.exp_avg' is no moment"),
+    "a moment too few": ("optimizer", lambda t: {n: v for n, v in t.items() if n != min(t)}, "lack moments"),
+}
+
+
+@pytest.mark.parametrize("name", SPOILED)
+def test_weights_and_moments_that_cannot_be_are_refused_and_nothing_is_loaded(tmp_path, name):
+    file, change, words = SPOILED[name]
+    module, optimizer = small_run()
+    path = write_checkpoint(tmp_path, Progress(2), {"policy": module}, optimizer)
+    save_file(change(load_file(path / f"{file}.safetensors")), path / f"{file}.safetensors")
+    other, other_optimizer = small_run(seed=1)
+    before = copy.deepcopy(other.state_dict())
+    with pytest.raises(CheckpointError, match=f"cannot go on from it .*{words}.*delete this folder"):
+        read_checkpoint(path, {"policy": other}, other_optimizer)
+    assert all(torch.equal(value, before[key]) for key, value in other.state_dict().items())
+
+
+@pytest.mark.parametrize("update", ["7", None, -5, 2.5, True, 3])
+def test_a_position_that_is_not_the_folders_is_refused(tmp_path, update):
+    module, optimizer = small_run()
+    path = write_checkpoint(tmp_path, Progress(2), {"policy": module}, optimizer)
+    (path / "progress.json").write_text(json.dumps({"update": update, "numbers": {}}))
+    with pytest.raises(CheckpointError, match=r"its update is .*, not 2\).*delete this folder"):
         read_checkpoint(path, {"policy": module}, optimizer)
 
 

@@ -301,13 +301,14 @@ class Evaluation:
             check_columns(table, SCHEMA)
             table = table.select(SCHEMA.names)
             _check_scores(table)
-            name, skipped = about["name"], tuple(Skipped(**one) for one in about["skipped"])
-            if not all(isinstance(text, str) for one in skipped for text in vars(one).values()):
+            name, skipped = about["name"], about["skipped"]
+            if not all(isinstance(text, str) for one in skipped for text in one.values()):
                 raise DataError("a skipped scenario or its reason is no text")
+            skipped = tuple(Skipped(**one) for one in skipped)
             for given, kind in ((name, str), (about["provenance"], dict)):
                 if not isinstance(given, kind):
                     raise DataError(f"its {'name' if kind is str else 'provenance'} is {describe_kind(given)}")
-        except (TypeError, KeyError, ConfigError, DataError) as error:
+        except (TypeError, KeyError, AttributeError, DataError) as error:
             raise DataError(f"{path}: damaged evaluation ({error}): evaluate again.") from None
         try:
             provenance = Provenance.from_plain(about["provenance"])

@@ -5,6 +5,8 @@ The only module that opens safetensors and npz files. Both announce sizes before
 
 import math
 import struct
+import tokenize
+import warnings
 import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
@@ -21,7 +23,7 @@ MAX_ARRAY_BYTES = 1 << 30
 _TENSOR_DAMAGE = (SafetensorError, OSError, ValueError, TypeError, KeyError, AttributeError, RuntimeError, MemoryError)
 _ARRAY_DAMAGE = (
     *(OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, MemoryError, OverflowError, RuntimeError),
-    *(SyntaxError, TypeError, KeyError, struct.error),  # of headers
+    *(SyntaxError, TypeError, KeyError, struct.error, tokenize.TokenError),  # of headers
 )
 
 
@@ -65,7 +67,8 @@ def read_npz(
         RlftsimError: No npz, damaged, an array of Python objects, or one that unfolds to more than `MAX_ARRAY_BYTES`.
     """
     try:
-        with zipfile.ZipFile(path) as archive:
+        # numpy and Python warn of odd headers
+        with warnings.catch_warnings(action="ignore"), zipfile.ZipFile(path) as archive:
             members = {name: archive.getinfo(f"{name}.npy") for name in names if f"{name}.npy" in archive.namelist()}
             sizes = {name: _read_header(archive, member) for name, member in members.items()}
             if sum(sizes.values()) > MAX_ARRAY_BYTES:

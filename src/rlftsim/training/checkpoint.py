@@ -9,6 +9,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from torch import Tensor, nn
 from torch.optim import Optimizer
@@ -101,8 +102,7 @@ def read_checkpoint(path: Path, modules: dict[str, nn.Module], optimizer: Optimi
         # everything is checked before anything is loaded
         weights = {name: _read(path / f"{name}.safetensors", way_out) for name in modules}
         moments = _read(path / "optimizer.safetensors", way_out)
-        progress = Progress(values.get("update"), values.get("numbers"))  # type: ignore[arg-type]
-        _check_progress(progress, update_of(path))
+        _check_progress(values, update_of(path))
         for name, module in modules.items():
             _check_weights(name, weights[name], module)
         state = _state_of_moments(moments, optimizer)
@@ -114,7 +114,7 @@ def read_checkpoint(path: Path, modules: dict[str, nn.Module], optimizer: Optimi
         module.load_state_dict(weights[name])
     # The groups are the new optimizer's own: learning rate and scales follow the settings, not the file.
     optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
-    return progress
+    return Progress(values["update"], values["numbers"])
 
 
 def _read(path: Path, way_out: str) -> dict[str, Tensor]:
@@ -124,15 +124,15 @@ def _read(path: Path, way_out: str) -> dict[str, Tensor]:
         raise CheckpointError(f"{path} is missing: {way_out}.") from None
 
 
-def _check_progress(progress: Progress, update: int) -> None:
+def _check_progress(values: Mapping[str, Any], update: int) -> None:
     """Check the position of a run against the name of its folder.
 
     Raises:
         ValueError: It is of another update, or a number is missing or not finite.
     """
-    if type(progress.update) is not int or progress.update != update:
-        raise ValueError(f"its update is {progress.update!r}, not {update}")
-    numbers = progress.numbers
+    if type(values.get("update")) is not int or values["update"] != update:
+        raise ValueError(f"its update is {str(values.get('update'))[:40]!r}, not {update}")
+    numbers = values.get("numbers")
     if not isinstance(numbers, dict) or not all(type(v) in (int, float) and math.isfinite(v) for v in numbers.values()):
         raise ValueError("its numbers are not finite numbers by name")
 

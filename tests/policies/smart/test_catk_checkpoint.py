@@ -2,6 +2,7 @@
 
 import json
 import pickle
+import zipfile
 from dataclasses import replace
 
 import numpy as np
@@ -192,6 +193,76 @@ def test_files_of_other_kinds_are_refused(content, words, tables, tmp_path):
     (tmp_path / "x.ckpt").write_bytes(content)
     with pytest.raises(CheckpointError, match=words):
         import_catk(tmp_path / "x.ckpt", tables)
+
+
+def save_packed(content, path):
+    """A checkpoint whose members are compressed, as torch never writes them."""
+    torch.save(content, path)
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in members.items():
+            archive.writestr(name, data)
+
+
+def looped():
+    settings = {"decoder": []}
+    settings["decoder"].append(settings)
+    return settings
+
+
+SPOILED = {
+    "names that are no text": (lambda w: {"state_dict": {3: torch.zeros(1), **w}}, "no weights under 'state_dict'"),
+    "a view of one number": (lambda w: {"state_dict": {**w, HEAD: torch.zeros(1).expand(10**9)}}, "no weights under"),
+    "a sparse tensor": (lambda w: {"state_dict": {**w, HEAD: torch.zeros(5).to_sparse()}}, "no weights under"),
+    "a head of two axes": (lambda w: {"state_dict": {**w, HEAD: torch.zeros(5, 2)}}, "not one number a token"),
+    "settings that hold themselves": (
+        lambda w: {"state_dict": w, "hyper_parameters": {"model_config": looped()}},
+        "hold themselves",
+    ),
+    "settings of enormous sizes": (
+        lambda w: {
+            "state_dict": w,
+            "hyper_parameters": {"model_config": {"decoder": {**SETTINGS, "num_agent_layers": 10**9}}},
+        },
+        "num_decoder_layers must be at most 256",
+    ),
+    "sizes of other weights": (
+        lambda w: {
+            "state_dict": w,
+            "hyper_parameters": {"model_config": {"decoder": {**SETTINGS, "head_dim": 60_000}}},
+        },
+        "weights do not fit",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SPOILED)
+def test_checkpoints_are_checked_before_anything_is_built(name, policy, tables, tmp_path):
+    change, words = SPOILED[name]
+    torch.save(change(export_catk(policy)), tmp_path / "x.ckpt")
+    with pytest.raises(CheckpointError, match=words) as error:
+        import_catk(tmp_path / "x.ckpt", tables)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("config", [[], "x", {"decoder": 3}, {"token_processor": ["x"]}])
+def test_settings_of_other_kinds_count_for_nothing(config, policy, tables, tmp_path):
+    content = {"state_dict": export_catk(policy), "hyper_parameters": {"model_config": config}}
+    torch.save(content, tmp_path / "x.ckpt")
+    assert same(import_catk(tmp_path / "x.ckpt", tables).policy, policy)
+
+
+def test_a_packed_checkpoint_is_refused_before_it_is_unpacked(policy, tables, tmp_path):
+    save_packed({"state_dict": export_catk(policy)}, tmp_path / "x.ckpt")
+    with pytest.raises(CheckpointError, match=r"packed, which torch\.save never does"):
+        import_catk(tmp_path / "x.ckpt", tables)
+
+
+@pytest.mark.parametrize("prefix", ["_orig_mod.", "module."])
+def test_weights_of_compiled_and_distributed_models_are_imported(prefix, policy, tables, tmp_path):
+    save_file({prefix + name: value for name, value in export_catk(policy).items()}, tmp_path / "x.safetensors")
+    assert same(import_catk(tmp_path / "x.safetensors", tables).policy, policy)
 
 
 def test_damaged_and_missing_files_are_refused(policy, tables, tmp_path):

@@ -1,0 +1,82 @@
+import ast
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+import rlftsim
+from rlftsim.errors import CheckpointError, DataError
+from rlftsim.jobs.tables import check_columns, map_arrow, read_parquet, read_parquet_metadata
+
+PACKAGE = Path(rlftsim.__file__).parent
+
+
+def damaged_text():
+    """A column of text whose bytes are no UTF-8."""
+    return pa.Array.from_buffers(pa.string(), 1, pa.array([b"\xff\xfe"], pa.binary()).buffers())
+
+
+def write_arrow(path, table):
+    with pa.ipc.new_file(path, table.schema) as writer:
+        writer.write_table(table)
+    return path
+
+
+def test_text_that_is_no_utf8_is_refused_in_both_formats(tmp_path):
+    table = pa.table({"a": damaged_text()})
+    pq.write_table(table, tmp_path / "a.parquet")
+    with pytest.raises(DataError, match="Invalid UTF8"):
+        read_parquet(tmp_path / "a.parquet", "write it again")
+    with pytest.raises(DataError, match=r"is damaged \(.*Invalid UTF8.*: write it again\.$"):
+        map_arrow(write_arrow(tmp_path / "a.arrow", table), "write it again")
+
+
+def test_a_column_twice_is_refused(tmp_path):
+    table = pa.table([pa.array([1]), pa.array([2])], names=["a", "a"])
+    with pytest.raises(DataError, match="two columns a"):
+        map_arrow(write_arrow(tmp_path / "a.arrow", table), "write it again")
+
+
+def test_a_small_file_that_announces_more_than_memory_holds_is_refused_unread(tmp_path, monkeypatch):
+    monkeypatch.setattr("rlftsim.jobs.tables.MAX_VALUES", 1000)
+    monkeypatch.setattr(pq.ParquetFile, "read", lambda *_: pytest.fail("it was read"))
+    pq.write_table(pa.table({"a": [0] * 1_000_000}), tmp_path / "a.parquet")
+    with pytest.raises(DataError, match=r"announces 1e\+06 values in \d+ bytes"):
+        read_parquet(tmp_path / "a.parquet", "write it again")
+
+
+def test_damage_is_one_line_and_a_missing_file_is_the_callers_to_explain(tmp_path):
+    (tmp_path / "a.parquet").write_bytes(b"PAR1 nonsense PAR1")
+    with pytest.raises(CheckpointError, match=r"a\.parquet: cannot be read \(.*\): write it again\.$") as error:
+        read_parquet(tmp_path / "a.parquet", "write it again", error=CheckpointError)
+    assert "\n" not in str(error.value)
+    assert read_parquet_metadata(tmp_path / "a.parquet") == {}
+    for read in (read_parquet, map_arrow):
+        with pytest.raises(FileNotFoundError):
+            read(tmp_path / "none", "write it")
+    with pytest.raises(DataError, match="cannot be read"):
+        read_parquet(tmp_path, "write it")
+
+
+@pytest.mark.parametrize(
+    ("columns", "words"),
+    [
+        ({"a": [1]}, "no column b"),
+        ({"a": [1], "b": ["x"], "c": [1]}, "unknown column 'c'"),
+        ({"a": [1.0], "b": ["x"]}, "column a holds double, not int64"),
+        ({"a": [1], "b": pa.array([None], pa.string())}, "column b has empty cells"),
+    ],
+)
+def test_columns_other_than_the_schemas_are_named(columns, words):
+    with pytest.raises(DataError, match=words):
+        check_columns(pa.table(columns), pa.schema([("a", pa.int64()), ("b", pa.string())]))
+
+
+def test_no_other_module_opens_parquet_or_arrow_files():
+    openers = {"ParquetFile", "read_table", "read_schema", "memory_map", "open_file", "open_stream", "ParquetDataset"}
+    for path in PACKAGE.rglob("*.py"):
+        if path == PACKAGE / "jobs" / "tables.py":
+            continue
+        names = {node.attr for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Attribute)}
+        assert not names & openers, path
