@@ -12,10 +12,13 @@ from typing import Any, ClassVar, Literal, Union, get_args, get_origin, get_type
 
 class RlftsimError(Exception):
     """Base of every error that this package raises on purpose; the command line prints it as one line without a
-    traceback."""
+    traceback. Its text is short and on one line, whatever a user's text in it holds."""
 
     exit_status: ClassVar[int] = 2
     """Of a command line that it ends: 2 = the command has to be changed."""
+
+    def __str__(self) -> str:
+        return shorten(super().__str__())
 
 
 class DataError(RlftsimError):
@@ -47,9 +50,8 @@ MAX_VALUE, MAX_MESSAGE = 100, 2000
 
 
 def in_short(value: object) -> str:
-    """A value as a message shows it: numbers and text, of which the middle is left out where it is long, anything else
-    by its type."""
-    if not isinstance(value, str | int | float | None):
+    """A value for a message: numbers, texts and lists, without the middle of long ones, all else by its type."""
+    if not isinstance(value, str | int | float | list | tuple | None):
         return type(value).__name__
     if isinstance(value, int) and value.bit_length() > 4 * MAX_VALUE:  # Python writes no number of 5000 digits
         return f"a number of {value.bit_length()} bits"
@@ -64,8 +66,9 @@ def shorten(text: str, most: int = MAX_MESSAGE) -> str:
         most: Characters that are left of it; those left out are counted in their place.
     """
     if len(text) > most:
-        gap = f" ... {len(text) - most} characters ... "
-        text = text[: most // 2] + gap + text[len(text) - most // 2 :]
+        gap = f" ... {len(text) - most} characters and more ... "
+        half = (most - len(gap)) // 2
+        text = text[:half] + gap + text[-half:]
     return "".join(sign if sign.isprintable() else " " for sign in text)
 
 
@@ -92,7 +95,7 @@ def whole_number(name: str, value: object, least: int | None = None) -> int:
     number = _fitted(value, int)
     if number is _MISFIT or (least is not None and number < least):
         limit = "" if least is None else f" of at least {least}"
-        raise ConfigError(f"{name} must be a whole number{limit}, got {value!r}.")
+        raise ConfigError(f"{name} must be a whole number{limit}, got {in_short(value)}.")
     return number
 
 
@@ -112,7 +115,7 @@ def require_types(config: Any) -> None:
         value, hint = getattr(config, one.name), hints[one.name]
         fitted = _fitted(value, hint)
         if fitted is _MISFIT:
-            raise ConfigError(f"{one.name} must be {_in_words(hint)}, got {value!r}.")
+            raise ConfigError(f"{one.name} must be {_in_words(hint)}, got {in_short(value)}.")
         if fitted is not value:
             object.__setattr__(config, one.name, fitted)  # the dataclasses are frozen
 

@@ -24,7 +24,7 @@ from importlib.metadata import EntryPoint, entry_points
 from types import ModuleType
 from typing import Generic, TypeVar
 
-from rlftsim.errors import ConfigError, place_of
+from rlftsim.errors import ConfigError, in_short, place_of
 
 POINTS = {
     "rlftsim.policies": "rlftsim.policies.registry:POLICIES",
@@ -114,7 +114,7 @@ class ExtensionPoint(Generic[Value]):
             near = difflib.get_close_matches(name, names, n=1)
             hint = f"did you mean {near[0]!r}? " if near else ""
             known = f"known are {', '.join(names)}" if names else "there are none"
-            raise ConfigError(f"unknown {self.kind} {name!r}: {hint}{known}.")
+            raise ConfigError(f"unknown {self.kind} {in_short(name)}: {hint}{known}.")
         return found
 
     def find(self, name: str) -> Value | None:

@@ -3,7 +3,7 @@
 import re
 from dataclasses import dataclass
 
-from rlftsim.errors import ConfigError
+from rlftsim.errors import ConfigError, in_short
 
 TERMS = {
     "progress": "distance gained along the route (without one: ahead), in tens of meters",
@@ -36,8 +36,12 @@ def parse_terms(text: str) -> tuple[WeightedTerm, ...]:
     signed = squeezed if squeezed[:1] in ("+", "-") else f"+{squeezed}"
     found = _TERM.findall(signed)
     if not found or "".join(f"{sign}{factor}{'*' if factor else ''}{name}" for sign, factor, name in found) != signed:
-        raise ConfigError(f"reward {text!r} cannot be read: write a sum of terms, such as 'progress - 5*at_fault'.")
+        raise ConfigError(
+            f"reward {in_short(text)} cannot be read: write a sum of terms, such as 'progress - 5*at_fault'."
+        )
     for _, _, name in found:
         if name not in TERMS:
-            raise ConfigError(f"reward {text!r}: no term {name!r}: known are {', '.join(TERMS)}, or 'none' alone.")
+            raise ConfigError(
+                f"reward {in_short(text)}: no term {in_short(name)}: known are {', '.join(TERMS)}, or 'none' alone."
+            )
     return tuple(WeightedTerm(float(f"{sign}{factor or 1}"), name) for sign, factor, name in found)

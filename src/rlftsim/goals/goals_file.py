@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from rlftsim.atomic_io import write_text
-from rlftsim.errors import DataError
+from rlftsim.errors import DataError, in_short
 from rlftsim.jobs.files import describe_kind, parse_json, read_json
 
 FORMAT = "rlftsim-goals-1"
@@ -205,4 +205,4 @@ def _refuse_unknown(found: Mapping[str, Any], known: Sequence[str], place: str) 
         if name not in known:
             near = difflib.get_close_matches(name, known, 1)
             hint = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(known)}."
-            raise DataError(f"{place}: no field {name!r} here: {hint}")
+            raise DataError(f"{place}: no field {in_short(name)} here: {hint}")

@@ -6,7 +6,7 @@ tensor has a feature axis F, its order is that of `FEATURE_NAMES`.
 
 from dataclasses import dataclass
 
-from rlftsim.errors import ConfigError
+from rlftsim.errors import ConfigError, in_short
 
 HISTOGRAM_FEATURES = (
     "linear_speed",
@@ -163,5 +163,5 @@ def metric_by_name(name: str) -> MetricConfig:
         ConfigError: no such configuration; the message lists the known names.
     """
     if name not in METRICS:
-        raise ConfigError(f"Unknown metric {name!r}: known are {', '.join(METRICS)}.")
+        raise ConfigError(f"Unknown metric {in_short(name)}: known are {', '.join(METRICS)}.")
     return METRICS[name]

@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from rlftsim.errors import ConfigError
+from rlftsim.errors import ConfigError, in_short
 from rlftsim.rewards.base import Reward, Sum, checked_reward, sum_by_name
 
 Option = float | int | bool | str
@@ -42,14 +42,16 @@ def parse_reward(text: str) -> tuple[Term, ...]:
         raise
     except (SyntaxError, ValueError):
         raise ConfigError(
-            f"reward {text!r} cannot be read: write a sum of rewards, such as 'mloo + 0.1*collision_offroad'."
+            f"reward {in_short(text)} cannot be read: write a sum of rewards, such as 'mloo + 0.1*collision_offroad'."
         ) from None
     names = [term.name for term in terms]
     for name in names:
         if names.count(name) > 1:
-            raise ConfigError(f"reward {text!r} has {name} {names.count(name)} times: name it once, with one weight.")
+            raise ConfigError(
+                f"reward {in_short(text)} has {name} {names.count(name)} times: name it once, with one weight."
+            )
     if not any(term.weight for term in terms):
-        raise ConfigError(f"reward {text!r} is always 0: give one of its terms a weight.")
+        raise ConfigError(f"reward {in_short(text)} is always 0: give one of its terms a weight.")
     return terms
 
 
@@ -127,7 +129,7 @@ def _options(name: str, reward: Reward | Sum, given: dict[str, Option]) -> tuple
             value = values[option] = float(value)
         # By type and not isinstance: True is an int, and no one means it as a number.
         if type(value) is not type(default):
-            raise ConfigError(f"{where}: expected {type(default).__name__}, got {value!r}.")
+            raise ConfigError(f"{where}: expected {type(default).__name__}, got {in_short(value)}.")
         if isinstance(value, float) and not math.isfinite(value):
-            raise ConfigError(f"{where}: expected a finite number, got {value!r}.")
+            raise ConfigError(f"{where}: expected a finite number, got {in_short(value)}.")
     return tuple((option, values[option]) for option in defaults)

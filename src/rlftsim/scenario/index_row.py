@@ -74,7 +74,8 @@ def classify_ego_maneuver(scenario: Scenario) -> Maneuver:
         return Maneuver.UNKNOWN
     distance_m = np.linalg.norm(tracks.position[ego, steps[-1], :2] - tracks.position[ego, steps[0], :2])
     # both conditions: a slow car in a queue gets away, and a fast one may come back to its start
-    top_speed_mps = np.linalg.norm(tracks.velocity[ego, steps], axis=-1).max()
+    with np.errstate(over="ignore"):  # a velocity of 1e38 m/s is none, and its length is infinite
+        top_speed_mps = np.linalg.norm(tracks.velocity[ego, steps], axis=-1).max()
     if top_speed_mps < _STATIONARY_SPEED_MPS and distance_m < _STATIONARY_DISTANCE_M:
         return Maneuver.STATIONARY
     # unwrapped, so that a turn through pi counts as the small turn it is

@@ -21,7 +21,7 @@ import pyarrow as pa
 from jaxtyping import Bool, Float, Int64
 from scipy.spatial import KDTree
 
-from rlftsim.errors import DataError
+from rlftsim.errors import DataError, in_short
 from rlftsim.geometry import wrapped
 from rlftsim.jobs.tables import read_parquet
 from rlftsim.scenario.consistency import describe_contradictions
@@ -504,7 +504,7 @@ def _numbers_of(rows: _Rows, name: str, kinds: type[IntEnum]) -> Int64[np.ndarra
     for number, value in enumerate(plain):
         if value not in known:
             words = ", ".join(kind.name.lower() for kind in kinds)
-            raise rows.error(np.argmax(inverse == number), f"{name} {values[number]!r} is none of {words}")
+            raise rows.error(np.argmax(inverse == number), f"{name} {in_short(values[number])} is none of {words}")
     return np.array([known[value] for value in plain], np.int64)[inverse]
 
 

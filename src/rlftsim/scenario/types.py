@@ -234,7 +234,7 @@ class Scenario:
         name = self.scenario_id
         if not isinstance(name, str) or not re.fullmatch(r"[^/\\\x00-\x1f]+", name) or name in (".", ".."):
             raise DataError(
-                f"scenario id {name!r} is no file name, and files are named after it: write it as text without "
+                f"scenario id {in_short(name)} is no file name, and files are named after it: write it as text without "
                 "slashes and control characters"
             )
 

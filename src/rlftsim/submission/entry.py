@@ -7,7 +7,7 @@ from typing import Any
 
 from torch import nn
 
-from rlftsim.errors import ConfigError
+from rlftsim.errors import ConfigError, in_short
 from rlftsim.evaluation.submission_pb2 import SimAgentsChallengeSubmission
 from rlftsim.jobs.files import read_toml
 from rlftsim.submission.messages import as_text
@@ -50,7 +50,9 @@ class Entry:
         for name in ("account", "method", "affiliation", "description", "link"):
             value = getattr(self, name)
             if not value.strip() or _is_placeholder(value):
-                raise ConfigError(f"{name} = {value!r} is no entry's: write your own, the server refuses such texts.")
+                raise ConfigError(
+                    f"{name} = {in_short(value)} is no entry's: write your own, the server refuses such texts."
+                )
         if not self.authors or any(_is_placeholder(author) for author in self.authors):
             raise ConfigError(f"authors = {list(self.authors)} are no entry's: name at least one author.")
         if not (_EMAIL.fullmatch(self.account) and self.account.isascii()):
@@ -153,11 +155,11 @@ def _fitted(name: str, value: Any) -> Any:
     """A value of the file as a field of `Entry` has it."""
     if name in _LISTS:
         if not isinstance(value, list) or not all(isinstance(one, str) and one.strip() for one in value):
-            raise ConfigError(f"{name} must be a list of texts, got {value!r}.")
+            raise ConfigError(f"{name} must be a list of texts, got {in_short(value)}.")
         return tuple(value)
     kind, words = (bool, "true or false") if name in _SWITCHES else (str, "text in quotes")
     if not isinstance(value, kind):
-        raise ConfigError(f"{name} must be {words}, got {value!r}.")
+        raise ConfigError(f"{name} must be {words}, got {in_short(value)}.")
     return value
 
 
