@@ -1,6 +1,7 @@
 """Archives in pieces, read by other programs."""
 
 import gzip
+import io
 import os
 import subprocess
 import tarfile
@@ -11,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rlftsim.errors import DataError
+from rlftsim.evaluation.wire_format import read_fields
 from rlftsim.submission.archive import GzipReader, combine_crc32, count_joined, join_pieces, write_piece
 
 
@@ -86,3 +88,18 @@ def test_a_damaged_piece_is_named_and_removed(contents, tmp_path):
     with pytest.raises(DataError, match=r"c\.part was damaged or missing: run the same command again"):
         join_pieces(tmp_path / "a.tar.gz", tmp_path, pieces, delete=False)
     assert not damaged.exists()
+
+
+def test_an_archive_that_unfolds_without_end_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("rlftsim.submission.archive.LEAST_UNPACKED", 1 << 20)
+    (tmp_path / "a.gz").write_bytes(gzip.compress(bytes(1 << 25)))
+    with (tmp_path / "a.gz").open("rb") as file:
+        reader = GzipReader(file)
+        with pytest.raises(DataError, match="unfolds to more than 200 times its size"):
+            reader.finish()
+
+
+def test_a_field_larger_than_the_rollouts_of_any_scenario_is_refused_unread(tmp_path, monkeypatch):
+    monkeypatch.setattr("rlftsim.evaluation.wire_format.MAX_FIELD_BYTES", 100)
+    with pytest.raises(DataError, match="more than any scenario's"):
+        list(read_fields(io.BytesIO(b"\x0a\xc8\x01" + bytes(200)), 203))

@@ -4,7 +4,6 @@ Columns: likelihoods and meta-metrics, higher is better; `*_error` in meters and
 """
 
 import json
-import math
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from html import escape
@@ -69,6 +68,8 @@ SCHEMA = pa.schema(
     ]
 )
 
+LARGEST = 1e7
+"""Beyond are neither meters, nor their rates, nor numbers of agents."""
 ROUNDING = 1e-6
 """Sums of weighted likelihoods may be this far out of [0, 1]."""
 
@@ -327,17 +328,17 @@ def _check_scores(table: pa.Table) -> None:
     """
     for name in table.schema.names[1:]:
         direction = direction_of(name)
-        # likelihoods and rates are in [0, 1] but for rounding, errors and counts in [0, inf), drift is any number
-        lowest = -math.inf if direction == "log" and not name.startswith("num_") else 0.0
+        # likelihoods and rates are in [0, 1] but for rounding, errors and counts not below 0, drift is any number
+        lowest = -LARGEST if direction == "log" and not name.startswith("num_") else 0.0
         is_fraction = name.endswith("_rate") or (direction == "higher" and not name.startswith("num_"))
-        highest = 1.0 + ROUNDING if is_fraction else math.inf
+        highest = 1.0 + ROUNDING if is_fraction else LARGEST
         values = table[name].to_numpy()
-        wrong = np.isinf(values) | (values < lowest - ROUNDING) | (values > highest)
+        wrong = (values < lowest - ROUNDING) | (values > highest)
         if wrong.any():
             row = int(np.flatnonzero(wrong)[0])
-            scenario_id = table["scenario_id"][row].as_py()
-            wanted = "in [0, 1]" if is_fraction else "finite" if lowest < 0 else "finite and not below 0"
-            raise DataError(f"{name} of scenario {scenario_id} is {values[row]:g}, it is {wanted}")
+            scenario_id = table["scenario_id"][row].as_py()[:80]
+            wanted = "in [0, 1]" if is_fraction else f"within {LARGEST:g}" if lowest < 0 else f"in [0, {LARGEST:g}]"
+            raise DataError(f"{name} of scenario {scenario_id} is {values[row]:g}, not {wanted}")
 
 
 def join_evaluations(name: str, provenance: Provenance, parts: list[Evaluation]) -> Evaluation:

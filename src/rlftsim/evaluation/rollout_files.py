@@ -17,7 +17,7 @@ from google.protobuf.message import DecodeError
 
 from rlftsim.errors import DataError
 from rlftsim.evaluation import submission_pb2
-from rlftsim.evaluation.wire_format import BYTES, WireField, iterate_fields
+from rlftsim.evaluation.wire_format import BYTES, MAX_FIELD_BYTES, WireField, iterate_fields
 from rlftsim.jobs.arrays import read_npz
 from rlftsim.realism import SimulatedStates
 from rlftsim.scenario.types import FUTURE_STEPS
@@ -195,7 +195,7 @@ def _entries_of_submission(path: Path) -> Iterator[RolloutEntry]:
             names = [
                 f for f in iterate_fields(file, message.start, message.stop) if (f.number, f.wire_type) == (1, BYTES)
             ]
-            if len(names) != 1:
+            if len(names) != 1 or names[0].stop - names[0].start > MAX_ID_LENGTH:
                 raise DataError(f"the rollouts at byte {message.start} name no scenario")
             file.seek(names[0].start)
             name = file.read(names[0].stop - names[0].start).decode("utf-8", "replace")
@@ -203,6 +203,8 @@ def _entries_of_submission(path: Path) -> Iterator[RolloutEntry]:
 
 
 def _states_of_submission(entry: RolloutEntry) -> SimulatedStates:
+    if entry.stop - entry.start > MAX_FIELD_BYTES:
+        raise DataError(f"its message is {(entry.stop - entry.start) / 1e9:.3g} GB, more than any scenario's")
     with entry.file.open("rb") as file:
         file.seek(entry.start)
         data = file.read(entry.stop - entry.start)

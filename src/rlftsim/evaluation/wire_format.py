@@ -14,6 +14,8 @@ from rlftsim.errors import DataError
 VARINT, FIXED64, BYTES, FIXED32 = 0, 1, 2, 5
 _FIXED_SIZE = {FIXED64: 8, FIXED32: 4}
 _MAX_VARINT_BYTES = 10
+MAX_FIELD_BYTES = 1 << 28
+"""Most bytes of a field that is read whole: 32 rollouts of 128 agents have 5 MB."""
 
 
 class WireField(NamedTuple):
@@ -60,6 +62,8 @@ def read_fields(file: BufferedIOBase, size: int) -> Iterator[WholeField]:
         # checked before the payload is read: a damaged length may be of any size
         if number == 0 or position + len(head) + length > size:
             raise DataError(f"not a protobuf message, or cut off: the field at byte {position} cannot be")
+        if length > MAX_FIELD_BYTES:
+            raise DataError(f"the field at byte {position} is {length / 1e9:.3g} GB, more than any scenario's")
         payload = payload or file.read(length)
         if len(payload) < length:
             raise DataError(f"cut off: the field at byte {position} does not end")

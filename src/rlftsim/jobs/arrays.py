@@ -17,6 +17,7 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from rlftsim.errors import DataError, RlftsimError
+from rlftsim.jobs.files import first_line
 
 MAX_ARRAY_BYTES = 1 << 30
 """Most bytes that arrays read together from one npz may unfold to; zeros are packed a thousand times smaller."""
@@ -47,8 +48,7 @@ def read_tensors(
     except FileNotFoundError:
         raise
     except _TENSOR_DAMAGE as problem:
-        cause = (str(problem) or type(problem).__name__).splitlines()[0][:200]
-        raise error(f"{path}: damaged safetensors file ({cause}): {remedy}.") from None
+        raise error(f"{path}: damaged safetensors file ({first_line(problem)}): {remedy}.") from None
 
 
 def read_npz(
@@ -81,9 +81,8 @@ def read_npz(
     except FileNotFoundError:
         raise
     except _ARRAY_DAMAGE as problem:
-        cause = str(problem).partition("\n")[0][:200] or type(problem).__name__
-        if isinstance(problem, zipfile.BadZipFile | EOFError):
-            cause = "it is not an npz archive, or cut off"
+        is_cut = isinstance(problem, zipfile.BadZipFile | EOFError)
+        cause = "it is not an npz archive, or cut off" if is_cut else first_line(problem)
         raise error(f"{path}: cannot be read ({cause}): {remedy}.") from None
 
 

@@ -135,6 +135,18 @@ def describe_kind(value: object) -> str:
     return _KINDS.get(type(value), "a number")
 
 
+def first_line(problem: BaseException) -> str:
+    """Beginning of the text of an error of a library, printable."""
+    text = getattr(problem, "strerror", None) or str(problem) or type(problem).__name__
+    line = text.strip().splitlines()[0].rstrip(".")[:200] if text.strip() else type(problem).__name__
+    return printable(line)
+
+
+def printable(text: str) -> str:
+    """A text with a space in place of each sign that no terminal shows, such as an end of line."""
+    return "".join(sign if sign.isprintable() else " " for sign in text)
+
+
 def _read_bytes(path: str | PathLike[str], limit: int, remedy: str, error: type[RlftsimError]) -> bytes:
     try:
         with open(path, "rb") as file:
@@ -143,8 +155,7 @@ def _read_bytes(path: str | PathLike[str], limit: int, remedy: str, error: type[
     except FileNotFoundError:
         raise
     except (OSError, ValueError) as problem:  # the latter: a null byte in the name
-        cause = getattr(problem, "strerror", None) or problem
-        raise error(f"{path}: cannot be read ({cause}): {remedy}.") from None
+        raise error(f"{path}: cannot be read ({first_line(problem)}): {remedy}.") from None
     if text is None or len(text) > limit:
         raise error(f"{path}: larger than {limit >> 20} MiB, which no such file is: {remedy}.")
     return text
@@ -163,7 +174,7 @@ def _parse(text: str | bytes, parse: Callable[[str], Any], source: str, remedy: 
     except RecursionError:
         cause = f"brackets nested more than {MAX_DEPTH} deep"
     except ValueError as problem:
-        cause = str(problem)
+        cause = first_line(problem)
     else:
         return value
     raise error(f"{source}: {cause}: {remedy}.") from None

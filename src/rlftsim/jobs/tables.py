@@ -11,6 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from rlftsim.errors import DataError, RlftsimError
+from rlftsim.jobs.files import first_line
 
 MAX_VALUES = 1 << 27
 """Values that a Parquet file may hold, however small it is: 1 GiB of numbers."""
@@ -95,7 +96,7 @@ def _validate_table(table: pa.Table) -> pa.Table:
     table.validate(full=True)
     repeated = [name for name in names if names.count(name) > 1]
     if repeated:
-        raise ValueError(f"two columns {repeated[0][:40]}")
+        raise ValueError(f"two columns {repeated[0][:40]!r}")
     return table
 
 
@@ -109,8 +110,4 @@ def _check_size(metadata: pq.FileMetaData, num_bytes: int) -> None:
 
 
 def _cause_of(problem: BaseException) -> str:
-    """First line of an error of Arrow."""
-    if isinstance(problem, UnicodeDecodeError):
-        return "a name is not text in UTF-8"
-    text = getattr(problem, "strerror", None) or str(problem) or type(problem).__name__
-    return text.strip().splitlines()[0].rstrip(".")[:200]
+    return "a name is not text in UTF-8" if isinstance(problem, UnicodeDecodeError) else first_line(problem)

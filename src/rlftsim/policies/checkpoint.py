@@ -27,7 +27,7 @@ from rlftsim.aliases import current_names
 from rlftsim.atomic_io import save_tensors, write_text
 from rlftsim.errors import CheckpointError, ConfigError
 from rlftsim.jobs.arrays import read_tensors
-from rlftsim.jobs.files import read_json
+from rlftsim.jobs.files import printable, read_json
 from rlftsim.jobs.folder import check_folder
 
 CONFIG, WEIGHTS, CARD = "config.json", "model.safetensors", "README.md"
@@ -291,7 +291,7 @@ def check_shapes(weights: Mapping[str, Tensor], own: Mapping[str, Tensor], *, so
         CheckpointError: Anything differs; the message names the first few.
     """
     problems = [f"missing {k}" for k in sorted(own.keys() - weights.keys())]
-    problems += [f"unknown {k}" for k in sorted(weights.keys() - own.keys())]
+    problems += [f"unknown {k[:100]}" for k in sorted(weights.keys() - own.keys())]
     problems += [
         f"{k} has shape {tuple(weights[k].shape)} instead of {tuple(own[k].shape)}"
         for k in sorted(own.keys() & weights.keys())
@@ -304,7 +304,7 @@ def check_shapes(weights: Mapping[str, Tensor], own: Mapping[str, Tensor], *, so
     ]
     if problems:
         shown = "; ".join(problems[:SHOWN_PROBLEMS]) + (" …" if len(problems) > SHOWN_PROBLEMS else "")
-        raise CheckpointError(f"{source}: {len(problems)} weights do not fit this model: {shown}.")
+        raise CheckpointError(f"{source}: {len(problems)} weights do not fit this model: {printable(shown)}.")
 
 
 class _NoDraws(TorchFunctionMode):

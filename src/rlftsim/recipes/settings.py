@@ -104,7 +104,7 @@ def flags_of_file(path: Path, recipe: Recipe, sections: Sequence[str], run_secti
         names = sorted(known) if is_run or is_recipe else [*run_fields, *sorted(known)]
         near = sorted(inside) or difflib.get_close_matches(unknown[0], names, n=1)
         hint = f"did you mean {near[0]}?" if near else f"sections are {', '.join(sections_of(recipe))}."
-        raise ConfigError(f"{path}: no setting {unknown[0]}: {hint}")
+        raise ConfigError(f"{path}: no setting {unknown[0][:100]}: {hint}")
     # 3. values become words; tyro checks their types
     words: list[str] = []
     for name, value in given.items():

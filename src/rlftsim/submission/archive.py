@@ -23,6 +23,8 @@ from rlftsim.errors import DataError
 LEVEL = 1
 """Of deflate. On rollouts 6 and 9 save less than 1 % and take twice as long."""
 _CHUNK = 1 << 18
+MAX_EXPANSION, LEAST_UNPACKED = 200, 1 << 28
+"""Most bytes that a packed byte stands for, in archives of more than so many bytes: sampled rollouts have 2."""
 _GZIP_HEADER = b"\x1f\x8b\x08\x00" + bytes(4) + b"\x04\xff"  # deflate, no name, no time, fastest, unknown system
 _TAR_RECORD = 10240
 _CRC_POLYNOMIAL = 0xEDB88320
@@ -198,6 +200,7 @@ class GzipReader:
         self._inflate = zlib.decompressobj(16 + zlib.MAX_WBITS)  # checks CRC and length at the end
         self._pending = b""
         self._sha256 = hashlib.sha256()
+        self._unpacked_size = 0
         self.packed_size = 0
         """Bytes read from the file so far."""
 
@@ -224,6 +227,9 @@ class GzipReader:
             self._pending = self._inflate.unconsumed_tail
             parts.append(part)
             size -= len(part)
+            self._unpacked_size += len(part)
+            if self._unpacked_size > max(MAX_EXPANSION * self.packed_size, LEAST_UNPACKED):
+                raise DataError(f"unfolds to more than {MAX_EXPANSION} times its size: no rollouts are packed so small")
         return b"".join(parts)
 
     def finish(self) -> None:

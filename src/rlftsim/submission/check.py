@@ -29,6 +29,7 @@ SHARD_NAME = re.compile(r".*\.binproto(-(\d{5})-of-(\d{5}))?")
 SPLIT_NAME = re.compile(r".*\.tar\.gz\.\d{3}")
 """Name of a part of an archive that was cut for moving it about, see `submission.split_file`."""
 MAX_SHARD_BYTES = 2 * 10**9
+MAX_METADATA_BYTES = 1 << 24
 DOUBTFUL_ARCHIVE_BYTES = 50 * 10**9
 MAX_JUMPS = 1e-3
 """Fraction of trajectories whose first step may be away from constant velocity."""
@@ -169,6 +170,8 @@ class _Pass:
                 self._read_scenario(whole.payload, member.name)
             else:
                 rest += whole.head + whole.payload
+                if len(rest) > MAX_METADATA_BYTES:
+                    raise DataError(f"{member.name}: more than {MAX_METADATA_BYTES} bytes beside rollouts")
         self._read_metadata(bytes(rest), member.name)
 
     def _read_metadata(self, data: bytes, file: str) -> None:

@@ -153,8 +153,8 @@ def check_tables(tables: Mapping[str, Tensor]) -> None:
             the token that stands still. The message begins with the table.
     """
     if tables.keys() != _DTYPES.keys():
-        differing = sorted(tables.keys() ^ _DTYPES.keys())
-        raise DataError(f"{', '.join(_DTYPES)} are wanted; missing or unknown: {', '.join(differing)[:80]}")
+        differing = ", ".join(repr(name[:40]) for name in sorted(tables.keys() ^ _DTYPES.keys())[:3])
+        raise DataError(f"{', '.join(_DTYPES)} are wanted; missing or unknown: {differing}")
     corners, mask, prototypes = (tables[name] for name in _DTYPES)
     num_tokens, num_pieces = (
         table.shape[axis] if table.dim() > axis else 0 for table, axis in ((corners, 1), (prototypes, 0))

@@ -145,7 +145,7 @@ def _check_weights(name: str, weights: Mapping[str, Tensor], module: nn.Module) 
     """
     own = module.state_dict()
     if own.keys() != weights.keys():
-        raise ValueError(f"{name} lacks or adds {min(own.keys() ^ weights.keys())}")
+        raise ValueError(f"{name} lacks or adds {min(own.keys() ^ weights.keys())[:80]!r}")
     for key, value in weights.items():
         if (value.shape, value.dtype) != (own[key].shape, own[key].dtype):
             wanted = f"{own[key].dtype} {tuple(own[key].shape)}"
@@ -169,9 +169,9 @@ def _state_of_moments(moments: Mapping[str, Tensor], optimizer: Optimizer) -> di
         if not 0 <= index < len(parameters):
             raise ValueError(f"{key[:40]!r} is no moment of its {len(parameters)} weights")
         if value.dim() and value.shape != parameters[index].shape:
-            raise ValueError(f"{key} has shape {tuple(value.shape)}, not {tuple(parameters[index].shape)}")
+            raise ValueError(f"{key[:80]!r} has shape {tuple(value.shape)}, not {tuple(parameters[index].shape)}")
         if not value.is_floating_point() or not value.isfinite().all():
-            raise ValueError(f"{key} is not finite, or no number")
+            raise ValueError(f"{key[:80]!r} is not finite, or no number")
         state.setdefault(index, {})[name] = value
     names = {frozenset(one) for one in state.values()}
     if len(names) > 1:

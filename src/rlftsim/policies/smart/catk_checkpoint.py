@@ -15,7 +15,8 @@ from torch import Tensor
 from rlftsim.atomic_io import save_tensors
 from rlftsim.errors import CheckpointError, ConfigError
 from rlftsim.jobs.arrays import read_tensors
-from rlftsim.policies.checkpoint import outline, strip_wrappers
+from rlftsim.jobs.files import printable
+from rlftsim.policies.checkpoint import SHOWN_PROBLEMS, outline, strip_wrappers
 from rlftsim.policies.smart.catk_keys import PREFIX, aliases, catk_name
 from rlftsim.policies.smart.catk_vocabulary import (
     PUBLISHED_AGENT_FILE,
@@ -71,7 +72,7 @@ def import_catk(checkpoint: Path, vocabulary: Sequence[Path]) -> CatkImport:
 
     Raises:
         CheckpointError: a file is damaged or holds foreign objects; keys are missing, unknown, of the wrong shape
-            or unequal where they must be equal (all of them are listed); the vocabulary does not belong to the weights.
+            or unequal where they must be equal (the first are named); the vocabulary does not belong to the weights.
     """
     weights, settings = _read(checkpoint)
     config, source = _config_of(weights, settings, checkpoint)
@@ -200,7 +201,7 @@ def _translate(weights: dict[str, Tensor], own: dict[str, Tensor], source: str) 
     """Weights under our names, those of a network's state dict.
 
     Raises:
-        CheckpointError: lists everything that is missing, unknown, of the wrong shape or kind, or unequal to its
+        CheckpointError: the first things that are missing, unknown, of the wrong shape or kind, or unequal to its
             second name.
     """
     # shapes of all names that must be there, second names of shared norms included
@@ -210,7 +211,7 @@ def _translate(weights: dict[str, Tensor], own: dict[str, Tensor], source: str) 
     shapes |= {second: shapes[first] for second, first in seconds.items()}
     # collect all problems before refusing: a user mends them at once
     problems = [f"missing {name}" for name in sorted(shapes.keys() - weights.keys())]
-    problems += [f"unknown {name}" for name in sorted(weights.keys() - shapes.keys())]
+    problems += [f"unknown {name[:100]}" for name in sorted(weights.keys() - shapes.keys())]
     for name in sorted(shapes.keys() & weights.keys()):
         value = weights[name]
         if value.shape != shapes[name]:
@@ -223,5 +224,6 @@ def _translate(weights: dict[str, Tensor], own: dict[str, Tensor], source: str) 
         if second in weights and first in weights and not torch.equal(weights[second], weights[first]):
             problems.append(f"{second} differs from {first}, which must be the same")
     if problems:
-        raise CheckpointError(f"{source}: {len(problems)} weights do not fit: {'; '.join(problems)}.")
+        shown = "; ".join(problems[:SHOWN_PROBLEMS]) + (" …" if len(problems) > SHOWN_PROBLEMS else "")
+        raise CheckpointError(f"{source}: {len(problems)} weights do not fit: {printable(shown)}.")
     return {key: weights[name] for name, key in names.items()}

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from rlftsim.errors import CheckpointError
+from rlftsim.jobs.files import first_line
 
 
 class _Inert:
@@ -101,8 +102,7 @@ def _unpickle(path: Path) -> Any:
     except CheckpointError:
         raise
     except Exception as error:  # whatever damage makes of the code that reads it
-        first_line = str(error).strip().splitlines()[:1]
-        raise CheckpointError(f"{path}: damaged or not a checkpoint ({' '.join(first_line)}).") from None
+        raise CheckpointError(f"{path}: damaged or not a checkpoint ({first_line(error)}).") from None
 
 
 def _plain(value: Any) -> Any:

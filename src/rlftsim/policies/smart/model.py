@@ -163,7 +163,7 @@ class SmartModel(nn.Module):
         Raises:
             ConfigError: there is no such folder, or its settings contradict each other.
             CheckpointError: a missing or damaged file, another architecture, or keys and shapes that do not fit:
-                names them all.
+                names the first.
         """
         model = read_model(folder, architecture=cls.architecture)
         config, weights = model.build(SmartConfig), model.read_weights()

@@ -129,7 +129,7 @@ class TrafficBotsModel(nn.Module):
         Raises:
             ConfigError: there is no such folder, or its settings contradict each other.
             CheckpointError: a missing or damaged file, another architecture, or keys and shapes that do not fit:
-                names them all.
+                names the first.
         """
         stored = read_model(folder, architecture=cls.architecture)
         config, weights = stored.build(TrafficBotsConfig), stored.read_weights()
