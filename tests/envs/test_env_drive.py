@@ -313,7 +313,6 @@ def test_a_result_that_another_drive_finished_meanwhile_is_not_replaced_by_fewer
 
 def test_unfinished_parts_of_other_settings_outlive_a_repeated_drive(tmp_path, monkeypatch):
     config = DriveConfig("constant_velocity", traffic=("replay",), limit=2)
-    drive(config, tmp_path)
     original, calls = drive_module._drive_scenario, []
 
     def second_fails(*arguments):
@@ -326,8 +325,19 @@ def test_unfinished_parts_of_other_settings_outlive_a_repeated_drive(tmp_path, m
             drive(replace(config, seed=1), tmp_path)
     parts = [*(tmp_path / "constant_velocity-replay.parts").glob("*.json")]
     assert len(parts) == 1
+    others = replace(config, limit=None, scenarios=(open_dataset("synthetic", "validation").scenario_ids[1],))
+    for _ in range(2):
+        drive(others, tmp_path)
+        assert parts[0].exists()
+
+
+def test_a_drive_with_other_dice_is_not_replaced(tmp_path):
+    config = DriveConfig("constant_velocity", traffic=("replay",), limit=1)
     drive(config, tmp_path)
-    assert parts[0].exists()
+    before = (tmp_path / "constant_velocity-replay.parquet").read_bytes()
+    with pytest.raises(ConfigError, match="is the result of another seed: choose another --out"):
+        drive(replace(config, seed=1), tmp_path)
+    assert (tmp_path / "constant_velocity-replay.parquet").read_bytes() == before
 
 
 def test_a_planner_object_is_known_by_the_module_that_makes_it_too(tmp_path, monkeypatch):

@@ -24,7 +24,7 @@ from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.rollout.check import check_policy
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
 from rlftsim.scenario.types import CURRENT_STEP
-from rlftsim.submission.build import build_archive, forecast_size
+from rlftsim.submission.build import build_archive, delete_parts, forecast_size
 from rlftsim.submission.check import check_archive
 from rlftsim.submission.closed_loop import refuse_open_loop, statement
 from rlftsim.submission.messages import round_states
@@ -172,6 +172,25 @@ def test_ctrl_c_leaves_a_folder_that_goes_on(data, whole, tmp_path, monkeypatch)
 def test_parts_go_as_they_are_joined(data, whole, tmp_path):
     assert build(data, tmp_path, delete_parts=True).read_bytes() == whole
     assert not list((tmp_path / "shards").glob("*.part"))
+
+
+def test_only_the_files_of_the_build_are_removed(data, tmp_path):
+    (tmp_path / "shards").mkdir()
+    mine = [tmp_path / "shards" / name for name in ("validation.arrow", ".hidden")]
+    for path in mine:
+        path.write_text("of a user")
+    build(data, tmp_path, delete_parts=True)
+    delete_parts(entries.make_job(data, tmp_path, num_shards=NUM_SHARDS))
+    assert sorted((tmp_path / "shards").iterdir()) == sorted(mine)
+
+
+def test_a_receipt_of_another_file_counts_for_nothing(data, tmp_path):
+    (tmp_path / "shards").mkdir()
+    (tmp_path / "mine.txt").write_text("of a user")
+    receipt = {"file": "../mine.txt", "size": 9, "piece_crc": 0, "raw_size": 9, "raw_crc": 0}
+    (tmp_path / "shards" / "00000.json").write_text(json.dumps(receipt))
+    build(data, tmp_path, delete_parts=True)
+    assert (tmp_path / "mine.txt").read_text() == "of a user"
 
 
 def test_another_plan_is_refused_with_its_difference(data, tmp_path):

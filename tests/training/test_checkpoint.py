@@ -155,3 +155,17 @@ def test_a_checkpoint_of_another_model_is_refused(tmp_path):
     path = write_checkpoint(tmp_path, Progress(2), {"policy": module}, optimizer)
     with pytest.raises(CheckpointError, match="cannot go on from it"):
         read_checkpoint(path, {"policy": nn.Linear(3, 4)}, optimizer)
+
+
+def test_only_files_of_checkpoints_are_removed(tmp_path):
+    module, optimizer = small_run()
+    for mine in ("update-notes", "update-00000001"):
+        (tmp_path / mine).mkdir()
+        (tmp_path / mine / "notes.txt").write_text("of a user")
+    for update in (2, 3, 4):
+        write_checkpoint(tmp_path, Progress(update), {"policy": module}, optimizer)
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "update-00000001", "update-00000003", "update-00000004", "update-notes"
+    }  # fmt: skip
+    assert newest_checkpoint(tmp_path) == tmp_path / "update-00000004"
+    assert all((tmp_path / mine / "notes.txt").exists() for mine in ("update-notes", "update-00000001"))

@@ -187,15 +187,15 @@ def _read_and_refuse(
 ) -> DriveResult | None:
     """The stored result, unless it is of other work, or a limit or a choice would leave out some of its scenarios."""
     found = read_if_readable(path, DriveResult.read)
-    if found is not None:
-        # a planner whose code has changed is driven anew, and so is one of an older version of this package
-        differing = {*_differences(found.settings, settings)} - {"planner_code", "rlftsim_version"}
-        check_same_work(path, sorted(differing), "choose another --out")
     choice = f"limit={config.limit}" if config.limit is not None else "this choice" if config.scenarios else ""
     if found is not None and choice:
         left_out = len({*found.scenario_ids} - {*ids})
         way_out = "name another --out, or drive all scenarios."
         refuse_to_leave_out(path, len(found.scenario_ids), left_out, choice, way_out)
+    if found is not None:
+        # a planner whose code has changed is driven anew, and so is one of an older version of this package
+        differing = {*_differences(found.settings, settings)} - {"planner_code", "rlftsim_version"}
+        check_same_work(path, sorted(differing), "choose another --out")
     return found
 
 
