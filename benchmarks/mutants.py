@@ -50,7 +50,7 @@ def outcomes(rows: list[Row]) -> dict[str, dict[str, Any]]:
     """Counts of verdicts and lines on the faults, by format."""
     by_format = {row.format: [one for one in rows if one.format == row.format] for row in rows}
     return {
-        name: {"counts": sum((row.counts for row in some), Counter({"read": 0, "refused": 0})), "faults": faults(some)}
+        name: {"counts": sum((row.counts for row in some), Counter()), "faults": faults(some)}
         for name, some in by_format.items()
     }
 
