@@ -84,7 +84,7 @@ def route_of(scenario: Scenario, agent: int, choice: RouteChoice) -> Route:
     proposals = propose_from_lanes(scenario, int(scenario.simulated_indices[agent]))
     for proposal in proposals:
         if proposal.maneuver.value == choice:
-            return _of_points(scene, proposal.way[:, :2] - scenario.origin, "maneuver")
+            return _of_points(scene, proposal.path[:, :2] - scenario.origin, "maneuver")
     known = ", ".join(proposal.maneuver.value for proposal in proposals) or "no maneuver"
     raise ConfigError(
         f"route {choice!r}: in scenario {scenario.scenario_id} the lanes of agent {scene.object_id[agent]} allow "
@@ -112,8 +112,8 @@ def _logged_route(scene: Scene, agent: int) -> Route:
 
 def _paths(scenario: Scenario, agent: int, length_m: float) -> list[LanePath]:
     """Paths along the lanes from an agent's pose, with a lane change and without."""
-    driver = CurrentAgent.of(scenario, int(scenario.simulated_indices[agent]))
-    lanes = lanes_for(build_env_scene(scenario).graph, driver.kind)
+    driver = CurrentAgent.from_track(scenario, int(scenario.simulated_indices[agent]))
+    lanes = lanes_for(build_env_scene(scenario).graph, driver.object_type)
     own = own_paths(driver, lanes, length_m=length_m)
     speed = max(driver.speed_mps, 5.0)
     changing = [

@@ -1,4 +1,4 @@
-"""Average displacement error (ADE) of rollouts; reported beside the meta-metric, not part of it."""
+"""Average displacement error (ADE) of rollouts; reported beside the meta-metric, without a weight there."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -12,13 +12,13 @@ def compute_displacement_error(
 ) -> Float[Tensor, "N E"]:
     """Mean distance (3D, m) between rollout and log over the valid steps of the whole scenario.
 
-    The history is the same on both sides: it adds nothing to the sum but its valid steps count in the denominator, so
-    the value is about 80/91 of the error over the future (a rule of the official evaluator).
+    The history is the same on both sides: valid steps of the history count in the denominator only, so the value is
+    about 80/91 of the error over the future (a rule of the official evaluator).
 
     Args:
-        rollout: positions at the T future steps.
-        log: logged positions at the same steps.
-        valid: log validity at all S steps, the future the last T of them.
+        rollout: Simulated positions at the T future steps, m.
+        log: Logged positions at the same T steps, m.
+        valid: Log validity at all S steps; the last T of the S steps are the future.
     """
     difference = rollout - log
     # Written out: the float32 sum of three squares in this order, without a reduction over a tiny axis.
