@@ -142,7 +142,7 @@ def _interpolate(
     value: Float[Tensor, "*shape"], knots: tuple[float, ...], heights: tuple[float, ...]
 ) -> Float[Tensor, "*shape"]:
     """Piecewise linear through the knots, constant outside."""
-    result = torch.full_like(value, heights[0])
-    for (left, low), (right, high) in zip(zip(knots, heights), zip(knots[1:], heights[1:])):
-        result = result + ((value - left) / (right - left)).clamp(0, 1) * (high - low)
-    return result
+    height = torch.full_like(value, heights[0])
+    for (start, low), (end, high) in zip(zip(knots, heights), zip(knots[1:], heights[1:])):
+        height = height + ((value - start) / (end - start)).clamp(0, 1) * (high - low)
+    return height

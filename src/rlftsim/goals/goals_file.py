@@ -182,16 +182,16 @@ class _Object(dict[str, Any]):
     def __init__(self, pairs: Sequence[tuple[str, Any]]):
         super().__init__(pairs)
         names = [name for name, _ in pairs]
-        self.repeated = [name for name in self if names.count(name) > 1]
+        self.repeated_keys = [name for name in self if names.count(name) > 1]
 
 
 def _parse_entry(entry: object, location: str) -> GoalEntry:
     if not isinstance(entry, dict):
         raise DataError(f'{location}: must be an object such as {{"scenario": ..., "agent": ..., "x": ..., "y": ...}}.')
     _check_fields(entry, FIELDS, location)
-    missing = [name for name in FIELDS[:-1] if name not in entry]
-    if missing:
-        raise DataError(f"{location}: {', '.join(missing)} missing: a goal needs scenario, agent, x and y.")
+    missing_fields = [name for name in FIELDS[:-1] if name not in entry]
+    if missing_fields:
+        raise DataError(f"{location}: {', '.join(missing_fields)} missing: a goal needs scenario, agent, x and y.")
     for name in ("scenario", "label"):
         if not isinstance(entry.get(name, ""), str):
             raise DataError(f"{location}: {name} must be text in quotes, is {_describe_type(entry[name])}.")
@@ -223,8 +223,9 @@ def _check_fields(json_object: Mapping[str, Any], fields: Sequence[str], locatio
             matches = difflib.get_close_matches(name, fields, 1)
             hint = f"did you mean {matches[0]!r}?" if matches else f"known are {', '.join(fields)}."
             raise DataError(f"{location}: no field {name!r} here: {hint}")
-    if isinstance(json_object, _Object) and json_object.repeated:
-        raise DataError(f"{location}: {', '.join(json_object.repeated)} is written more than once: keep one of them.")
+    if isinstance(json_object, _Object) and json_object.repeated_keys:
+        names = ", ".join(json_object.repeated_keys)
+        raise DataError(f"{location}: {names} is written more than once: keep one of them.")
 
 
 def _describe_type(value: object) -> str:

@@ -20,7 +20,7 @@ Points = tuple[Int64[np.ndarray, "n"], Float[np.ndarray, "n 2"]]
 PointById = Mapping[int | np.integer, Sequence[float | int] | np.ndarray]
 """Object id -> (x, y). Frame: world, m."""
 
-LISTED = 12
+MAX_LISTED_IDS = 12
 """Object ids that an error message lists at most."""
 
 
@@ -72,10 +72,10 @@ class Goals:
                     "{scenario_id: {object_id: (x, y)}}."
                 )
             by_scenario = {ids[0]: cast(PointById, points)}
-        missing = [key for key in by_scenario if key not in ids]
-        if missing:
+        missing_ids = [key for key in by_scenario if key not in ids]
+        if missing_ids:
             raise ConfigError(
-                f"goals name scenario {missing[0]!r}, which is not in the batch: it has {_join_ids(ids)}."
+                f"goals name scenario {missing_ids[0]!r}, which is not in the batch: it has {_join_ids(ids)}."
             )
         arrays: dict[str, Points] = {}
         for scenario in batch.scenarios:
@@ -215,4 +215,4 @@ def _check_point(point: object, location: str) -> None:
 
 
 def _join_ids(ids: list[str] | list[int]) -> str:
-    return ", ".join(str(i) for i in ids[:LISTED]) + (", ..." if len(ids) > LISTED else "")
+    return ", ".join(str(i) for i in ids[:MAX_LISTED_IDS]) + (", ..." if len(ids) > MAX_LISTED_IDS else "")

@@ -243,8 +243,8 @@ def join_trajectories(groups: Sequence[Trajectories]) -> Trajectories:
 
 
 def _shorten(ids: Sequence[int]) -> str:
-    listed = ", ".join(str(object_id) for object_id in ids[:8])
-    return f"{listed}, ... ({len(ids)} in all)" if len(ids) > 8 else listed
+    text = ", ".join(str(object_id) for object_id in ids[:8])
+    return f"{text}, ... ({len(ids)} in all)" if len(ids) > 8 else text
 
 
 def match_agents(
@@ -263,12 +263,16 @@ def match_agents(
     if np.array_equal(logged_ids, rollout_ids):
         return np.arange(len(logged_ids))
     order = np.argsort(rollout_ids, kind="stable")
-    missing = np.setdiff1d(logged_ids, rollout_ids).tolist()
-    unlogged = np.setdiff1d(rollout_ids, logged_ids).tolist()
-    if missing or unlogged or len(rollout_ids) != len(logged_ids):
+    missing_ids = np.setdiff1d(logged_ids, rollout_ids).tolist()
+    unlogged_ids = np.setdiff1d(rollout_ids, logged_ids).tolist()
+    if missing_ids or unlogged_ids or len(rollout_ids) != len(logged_ids):
         unique, counts = np.unique(rollout_ids, return_counts=True)
-        repeated = unique[counts > 1].tolist()
-        reasons = (("listed twice", repeated), ("missing", missing), ("not simulated in this scenario", unlogged))
+        repeated_ids = unique[counts > 1].tolist()
+        reasons = (
+            ("listed twice", repeated_ids),
+            ("missing", missing_ids),
+            ("not simulated in this scenario", unlogged_ids),
+        )
         raise DataError(
             f"Rollouts of scenario {scenario_id} must hold every track valid at the current step and no other: "
             f"object ids {'; '.join(f'{reason} {_shorten(ids)}' for reason, ids in reasons if ids)}."

@@ -66,8 +66,8 @@ def compute_batch_features(
     # Side by side all have the same number of distinct rollouts.
     can_join = len({rollouts.repeat for rollouts in states}) == 1
     if can_join and states[0].device.type != "cpu":
-        joined = JoinedLogs.from_logs(logs)
-        return (ScenarioFeatures(joined, compute_features(joined, states, compute=compute)),)
+        joined_logs = JoinedLogs.from_logs(logs)
+        return (ScenarioFeatures(joined_logs, compute_features(joined_logs, states, compute=compute)),)
     return tuple(
         ScenarioFeatures(log, compute_features(log, rollouts, compute=compute)) for log, rollouts in zip(logs, states)
     )
@@ -83,12 +83,12 @@ def score_batch_features(features: Sequence[ScenarioFeatures], config: MetricCon
     results = [score_features(scene.log, scene.features, config) for scene in features]
     if isinstance(features[0].log, JoinedLogs):
         return results[0]
-    stacked = {
+    columns = {
         field.name: torch.stack([getattr(result, field.name) for result in results])
         for field in fields(RealismResult)
         if field.name not in ("scenario_ids", "config")
     }
-    return RealismResult(scenario_ids=tuple(r.scenario_ids[0] for r in results), config=config, **stacked)
+    return RealismResult(scenario_ids=tuple(r.scenario_ids[0] for r in results), config=config, **columns)
 
 
 def score_batch(

@@ -333,9 +333,11 @@ def _compute_road_edge(
     # Invalid states may lie anywhere (mostly at the origin), far from every edge, where the search is slow. They take
     # the current position instead; their distance is overwritten below.
     current = agents.trajectories.select_agents(agents.evaluated)
-    filled = Trajectories(*(torch.where(valid, x, logged[:, CURRENT_STEP, None]) for x, logged in zip(future, current)))
+    filled_states = Trajectories(
+        *(torch.where(valid, x, logged[:, CURRENT_STEP, None]) for x, logged in zip(future, current))
+    )
     scenario = None if agents.layout is None else agents.layout.scenario
-    distance = compute_distance_to_road_edge(filled, size, road_edges, max_pairs=max_pairs, scenario=scenario)
+    distance = compute_distance_to_road_edge(filled_states, size, road_edges, max_pairs=max_pairs, scenario=scenario)
     if scenario is not None and road_edges.has_edges is not None:
         valid = valid & road_edges.has_edges[scenario, None]
     return torch.where(valid, distance, INVALID_ROAD_EDGE_M)

@@ -92,9 +92,9 @@ def chunk_segments(
 
     # 2. Values of the segments at their slots [C, U], padding elsewhere.
     def scatter(values: np.ndarray, padding: float) -> Tensor:
-        packed = np.full((len(first_segment), CHUNK_SEGMENTS), padding, np.float32)
-        packed[chunk, slot] = values
-        return torch.from_numpy(packed).to(device)
+        slots = np.full((len(first_segment), CHUNK_SEGMENTS), padding, np.float32)
+        slots[chunk, slot] = values
+        return torch.from_numpy(slots).to(device)
 
     delta = end - start
     squared_length = delta[:, 0] * delta[:, 0] + delta[:, 1] * delta[:, 1]
@@ -272,5 +272,5 @@ def find_nearest_segment(
     blocks = groups.split(size)
     scenarios = [None] * len(blocks) if scenario is None else scenario.split(size)
     keys = [_search_block(block, segments, rule, rows, max_pairs) for block, rows in zip(blocks, scenarios)]
-    packed = torch.cat(keys).view(groups.shape[:2]) & ((1 << _KEY_SHIFT) - 1)
-    return segments.first_segment[packed // CHUNK_SEGMENTS] + packed % CHUNK_SEGMENTS
+    slot = torch.cat(keys).view(groups.shape[:2]) & ((1 << _KEY_SHIFT) - 1)
+    return segments.first_segment[slot // CHUNK_SEGMENTS] + slot % CHUNK_SEGMENTS

@@ -64,7 +64,7 @@ def clean_tracks(batch: ScenarioBatch, *, catk_compat: bool = False) -> CleanTra
     if catk_compat:
         position, velocity, valid = catk_ops.fill_gaps_in_world(batch)
     heading = _hold_jumping_headings(heading, valid)
-    return _begin_earlier(CleanTracks(position, heading, velocity, valid), stepwise=catk_compat)
+    return _extend_backwards(CleanTracks(position, heading, velocity, valid), stepwise=catk_compat)
 
 
 def _fill_gaps(
@@ -104,12 +104,12 @@ def _hold_jumping_headings(heading: Float[Tensor, "B A S"], valid: Bool[Tensor, 
     columns = list(heading.unbind(-1))
     for step in range(1, len(columns)):
         jumps = wrap_angle(columns[step] - columns[step - 1]).abs() > MAX_HEADING_STEP_RAD
-        is_held = jumps & valid[..., step] & valid[..., step - 1]
-        columns[step] = torch.where(is_held, columns[step - 1], columns[step])
+        is_jump = jumps & valid[..., step] & valid[..., step - 1]
+        columns[step] = torch.where(is_jump, columns[step - 1], columns[step])
     return torch.stack(columns, -1)
 
 
-def _begin_earlier(tracks: CleanTracks, *, stepwise: bool) -> CleanTracks:
+def _extend_backwards(tracks: CleanTracks, *, stepwise: bool) -> CleanTracks:
     """Each track extended backwards, at constant velocity, to a multiple of five steps, and at least to step 5.
 
     So every agent has the token that ends at the current step. `stepwise` subtracts steps in turn instead of a product,
@@ -141,11 +141,7 @@ def class_boxes(object_type: Int64[Tensor, "..."]) -> tuple[Float[Tensor, "..."]
 
 
 def tokenize_tracks(
-    tracks: CleanTracks,
-    object_type: Int64[Tensor, "B A"],
-    vocabulary: Vocabulary,
-    *,
-    catk_compat: bool = False,
+    tracks: CleanTracks, object_type: Int64[Tensor, "B A"], vocabulary: Vocabulary, *, catk_compat: bool = False
 ) -> AgentTokens:
     """Rolling matching: at each step the token that ends nearest to the log, from the end of the token before.
 
@@ -185,11 +181,7 @@ Pose = tuple[Float[Tensor, "*batch 2"], Float[Tensor, "*batch"]]
 
 
 def tokens_towards(
-    goal: Pose,
-    pose: Pose,
-    class_id: Int64[Tensor, "*batch"],
-    valid: Bool[Tensor, "*batch"],
-    vocabulary: Vocabulary,
+    goal: Pose, pose: Pose, class_id: Int64[Tensor, "*batch"], valid: Bool[Tensor, "*batch"], vocabulary: Vocabulary
 ) -> Int64[Tensor, "*batch"]:
     """Token that ends nearest to a target pose: smallest sum of corner distances in the frame of the start pose.
 
@@ -296,10 +288,10 @@ def _find_nearest_rows(boxes: Float[Tensor, "n 4 2"], table: Float[Tensor, "V 4 
     center_distance = torch.cdist(boxes.mean(1), table.mean(1), compute_mode="donot_use_mm_for_euclid_dist")
     nearest_centers = center_distance.topk(_CANDIDATES, dim=-1, largest=False, sorted=False)
     candidates = nearest_centers.indices.sort(-1).values
-    best = corner_distances(boxes, table[candidates]).min(-1)
-    nearest = candidates.gather(-1, best.indices[:, None])[:, 0]
+    best_rows = corner_distances(boxes, table[candidates]).min(-1)
+    nearest = candidates.gather(-1, best_rows.indices[:, None])[:, 0]
     # Rows beyond the candidates could still win, or tie within rounding: compare all.
-    is_unsure = 4 * nearest_centers.values.amax(-1) <= best.values * 1.0001 + 1e-4
+    is_unsure = 4 * nearest_centers.values.amax(-1) <= best_rows.values * 1.0001 + 1e-4
     nearest[is_unsure] = corner_distances(boxes[is_unsure], table).argmin(-1)
     return nearest
 

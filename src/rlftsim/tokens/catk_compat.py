@@ -75,8 +75,8 @@ def place_boxes(
     cos, sin = heading.cos(), heading.sin()
     rotation = torch.stack([cos, sin, -sin, cos], -1).unflatten(-1, (2, 2))
     flat = corners.flatten(-3, -2).flatten(0, -3)
-    placed = torch.bmm(flat, rotation.flatten(0, -3)) + position.flatten(0, -2)[:, None]
-    return placed.view(corners.shape)
+    boxes = torch.bmm(flat, rotation.flatten(0, -3)) + position.flatten(0, -2)[:, None]
+    return boxes.view(corners.shape)
 
 
 def build_boxes(

@@ -93,8 +93,8 @@ def tokenize_map(batch: ScenarioBatch, prototypes: Float[Tensor, "V 11 2"]) -> M
 
     # The origin is subtracted before the result is rounded to float32.
     origins = [origin_of(scenario, batch.frame) for scenario in batch.scenarios]
-    centered = [(segments.points - origin).astype(np.float32) for segments, origin in zip(maps, origins)]
-    points = pad(centered, torch.float32)
+    local_points = [(segments.points - origin).astype(np.float32) for segments, origin in zip(maps, origins)]
+    points = pad(local_points, torch.float32)
     heading = pad([segments.heading for segments in maps], torch.float32)
     # Each piece in its own frame, flattened, against the prototypes; `argmin` takes the lowest index on ties.
     local = rotate(points - points[:, :, :1], -heading[..., None]).flatten(2)  # [B, M, 6]

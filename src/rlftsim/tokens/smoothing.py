@@ -44,10 +44,7 @@ def neighbor_weights(
 
 
 def summed_log_prob_nearby(
-    log_probs: Float[Tensor, "R V"],
-    target: Int64[Tensor, "R"],
-    class_id: Int64[Tensor, "R"],
-    vocabulary: Vocabulary,
+    log_probs: Float[Tensor, "R V"], target: Int64[Tensor, "R"], class_id: Int64[Tensor, "R"], vocabulary: Vocabulary
 ) -> Float[Tensor, ""]:
     """Sum over rows of the expected log-probability under `neighbor_weights` of the row's target, nats.
 
@@ -58,8 +55,8 @@ def summed_log_prob_nearby(
         vocabulary: Motion tokens of each class.
     """
     # Rows with the same target are added up first, so that the weights need memory for the U distinct targets only.
-    distinct, group = (class_id * vocabulary.num_tokens + target).unique(return_inverse=True)
-    summed = log_probs.new_zeros(len(distinct), log_probs.shape[-1]).index_add(0, group, log_probs)
-    weights = neighbor_weights(vocabulary, distinct // vocabulary.num_tokens, distinct % vocabulary.num_tokens)
+    targets, group = (class_id * vocabulary.num_tokens + target).unique(return_inverse=True)
+    log_prob_sums = log_probs.new_zeros(len(targets), log_probs.shape[-1]).index_add(0, group, log_probs)
+    weights = neighbor_weights(vocabulary, targets // vocabulary.num_tokens, targets % vocabulary.num_tokens)
     # 0 * -inf would be NaN: masked tokens have log-probability -inf and weight 0.
-    return (weights * torch.where(weights > 0, summed, 0.0)).sum()
+    return (weights * torch.where(weights > 0, log_prob_sums, 0.0)).sum()

@@ -129,10 +129,10 @@ def rule_tokens(cells: GridMotions, config: TrajTokConfig) -> Float32[np.ndarray
     ends = np.stack(np.meshgrid(*axes, indexing="ij"), -1)  # [X, Y, 2], centers of the cells
     heading = _fill_end_headings(mean[..., -1, 2], has_token & has_motions, grid)
     progress = np.linspace(0, 1, STEPS_PER_TOKEN + 1)
-    centered = mean.copy()
-    centered[..., :2] += progress[:, None] * (ends - mean[..., -1, :2])[:, :, None]
+    centered_motions = mean.copy()
+    centered_motions[..., :2] += progress[:, None] * (ends - mean[..., -1, :2])[:, :, None]
     is_by_rule = ~has_motions | is_sharp
-    tokens = np.where(is_by_rule[..., None, None], _build_curves(ends, heading), centered)
+    tokens = np.where(is_by_rule[..., None, None], _build_curves(ends, heading), centered_motions)
     # 3. Exactly symmetric: the middle line is straight, the right half mirrors the left one.
     half = grid.origin[1]
     tokens[:, half, :, 1:] = 0.0
@@ -175,11 +175,11 @@ def _build_curves(ends: Float[np.ndarray, "X Y 2"], heading: Float[np.ndarray, "
     """
     t = np.linspace(0, 1, STEPS_PER_TOKEN + 1)[:, None]
     length = np.hypot(ends[..., 0], ends[..., 1]) * np.where(ends[..., 0] < 0, -1.0, 1.0)
-    start = np.stack([length, np.zeros_like(length)], -1)
-    finish = length[..., None] * np.stack([np.cos(heading), np.sin(heading)], -1)
+    start_tangent = np.stack([length, np.zeros_like(length)], -1)
+    end_tangent = length[..., None] * np.stack([np.cos(heading), np.sin(heading)], -1)
     position = (
-        (t**3 - 2 * t**2 + t) * start[:, :, None]
+        (t**3 - 2 * t**2 + t) * start_tangent[:, :, None]
         + (3 * t**2 - 2 * t**3) * ends[:, :, None]
-        + (t**3 - t**2) * finish[:, :, None]
+        + (t**3 - t**2) * end_tangent[:, :, None]
     )
     return np.concatenate([position, t * heading[..., None, None]], -1)

@@ -60,12 +60,12 @@ def _find_lane_change(scenario: Scenario, track: int, path: Float[np.ndarray, "S
         return None
     lanes = lanes_for(lane_graph(scenario), agent.object_type)
     length_m = float(np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1).sum()) + BEYOND_END_M
-    own = own_paths(agent, lanes, length_m=length_m)
-    if not own or distance_to(own, path[-1]) < LANE_CHANGE_OFFSET_M:
+    paths = own_paths(agent, lanes, length_m=length_m)
+    if not paths or distance_to(paths, path[-1]) < LANE_CHANGE_OFFSET_M:
         return None
     for maneuver, side in LANE_CHANGES:
         # At speed 0 the change is as short as it can be: the path is soon in the middle of the other lane.
-        changes = [lane_change_paths(lanes, start, side=side, speed_mps=0.0, length_m=length_m) for start in own]
+        changes = [lane_change_paths(lanes, start, side=side, speed_mps=0.0, length_m=length_m) for start in paths]
         neighbor_paths = [neighbor_path for candidates in changes for neighbor_path, _ in candidates]
         if neighbor_paths and distance_to(neighbor_paths, path[-1]) < IN_LANE_M:
             return maneuver

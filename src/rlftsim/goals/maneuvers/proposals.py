@@ -257,8 +257,8 @@ def _find_goal(path: LanePath, reach: Reach) -> int | None:
     next_turn = np.abs(turn[np.minimum(index + SETTLING_M, last)] - turn)
     past_turn = np.abs(turn - turn[np.maximum(index - SETTLING_M // 2, 0)])
     candidates = np.flatnonzero((next_turn <= SETTLING_RAD) & (past_turn <= SETTLING_RAD))
-    later = candidates[(candidates >= usual_end) & (candidates <= high)]
-    earlier = candidates[(candidates < usual_end) & (candidates >= low)]
-    if len(later):
-        return int(later[0])
-    return int(earlier[-1]) if len(earlier) else usual_end
+    later_steps = candidates[(candidates >= usual_end) & (candidates <= high)]
+    earlier_steps = candidates[(candidates < usual_end) & (candidates >= low)]
+    if len(later_steps):
+        return int(later_steps[0])
+    return int(earlier_steps[-1]) if len(earlier_steps) else usual_end
