@@ -4,11 +4,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from rlftsim.realism.agents import Trajectories
 from rlftsim.realism.rounding import compute_sqrt
 
 
 def compute_displacement_error(
-    rollout: Float[Tensor, "N E T 3"], log: Float[Tensor, "E T 3"], valid: Bool[Tensor, "E S"]
+    rollout: Trajectories, log: Trajectories, valid: Bool[Tensor, "E S"]
 ) -> Float[Tensor, "N E"]:
     """Mean distance (3D, m) between rollout and log over the valid steps of the whole scenario.
 
@@ -16,13 +17,12 @@ def compute_displacement_error(
     about 80/91 of the error over the future (a rule of the official evaluator).
 
     Args:
-        rollout: Simulated positions at the T future steps, m.
-        log: Logged positions at the same T steps, m.
+        rollout: Simulated states [N, E, T] at the T future steps.
+        log: Logged states [E, T] at the same steps.
         valid: Log validity at all S steps; the last T of the S steps are the future.
     """
-    difference = rollout - log
     # Written out: the float32 sum of three squares in this order, without a reduction over a tiny axis.
-    dx, dy, dz = difference.unbind(-1)
+    dx, dy, dz = rollout.x - log.x, rollout.y - log.y, rollout.z - log.z
     distance = compute_sqrt(dx * dx + dy * dy + dz * dz)  # [N, E, T]
     future_valid = valid[:, -distance.shape[-1] :]
     # where, not a product: an invalid logged state may be anything.

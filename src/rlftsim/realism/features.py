@@ -285,11 +285,7 @@ def _measure_trajectories(
         )  # fmt: skip
     # 4. Displacement from the log.
     logged = agents.trajectories.select_agents(agents.evaluated).from_step(-FUTURE_STEPS)
-    displacement = compute_displacement_error(
-        torch.stack([future.x, future.y, future.z], dim=-1),
-        torch.stack([logged.x, logged.y, logged.z], dim=-1),
-        agents.valid.index_select(0, agents.evaluated),
-    )
+    displacement = compute_displacement_error(future, logged, agents.valid.index_select(0, agents.evaluated))
     return Features(
         **{name: values[..., -FUTURE_STEPS:] for name, values in kinematics._asdict().items()},
         distance_to_nearest_object=nearest,

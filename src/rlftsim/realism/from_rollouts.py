@@ -45,4 +45,5 @@ def logged_states(scenario: Scenario, *, num_rollouts: int, device: torch.device
     tracks, simulated, future = scenario.tracks, scenario.simulated_indices, slice(CURRENT_STEP + 1, TOTAL_STEPS)
     position = torch.from_numpy(tracks.position[simulated, future]).to(device)[None]  # [1, A, T, 3]
     heading = torch.from_numpy(tracks.heading[simulated, future]).to(device)[None]
-    return SimulatedStates(tracks.object_id[simulated], *position.unbind(-1), heading, repeat=num_rollouts)
+    x, y, z = position.unbind(-1)
+    return SimulatedStates(tracks.object_id[simulated], x, y, z, heading, repeat=num_rollouts)

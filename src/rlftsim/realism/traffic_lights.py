@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from rlftsim.realism.map_based import Polylines, select_polylines
 from rlftsim.realism.segment_search import ChunkedSegments, chunk_segments, find_nearest_segment, join_chunks
@@ -48,17 +49,12 @@ def join_signals(maps: Sequence[Signals | None]) -> Signals | None:
     joined = [signals for signals in maps if signals is not None]
     if not joined:
         return None
-    num_signals = max(signals.lane.shape[1] for signals in joined)
 
     def pad(name: str, axis: int) -> Tensor:
         """A field of all scenarios, padded with zeros along the axis of signals: padding is never red."""
-        shape = list(getattr(joined[0], name).shape)
-        shape[0], shape[axis] = len(maps), num_signals
-        padded = getattr(joined[0], name).new_zeros(shape)
-        for row, signals in zip(padded, maps):
-            if signals is not None:
-                row.narrow(axis - 1, 0, signals.lane.shape[1]).copy_(getattr(signals, name)[0])
-        return padded
+        empty = getattr(joined[0], name).narrow(axis, 0, 0)
+        rows = [(empty if signals is None else getattr(signals, name))[0].movedim(axis - 1, 0) for signals in maps]
+        return pad_sequence(rows, batch_first=True).movedim(1, axis).contiguous()
 
     # Lanes keep the numbers that they have in their own scenario: a point finds no other ones.
     num_segments = [0 if signals is None else len(signals.lane_of_segment) for signals in maps]

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32, Float64, Int8, Int64
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from rlftsim.geometry import rotate
 from rlftsim.scenario.batch import ScenarioBatch, origin_of
@@ -83,13 +84,9 @@ def tokenize_map(batch: ScenarioBatch, prototypes: Float[Tensor, "V 11 2"]) -> M
         prototypes: Map prototypes of the vocabulary, each in the frame of the first point.
     """
     maps = [split_map(scenario) for scenario in batch.scenarios]
-    width = max(len(segments.heading) for segments in maps)
 
     def pad(arrays: list[np.ndarray], dtype: torch.dtype) -> Tensor:
-        padded = torch.zeros((len(arrays), width, *arrays[0].shape[1:]), dtype=dtype)
-        for row, array in zip(padded, arrays):
-            row[: len(array)] = torch.from_numpy(array).to(dtype)
-        return padded.to(batch.device)
+        return pad_sequence([torch.from_numpy(array).to(dtype) for array in arrays], batch_first=True).to(batch.device)
 
     # The origin is subtracted before the result is rounded to float32.
     origins = [origin_of(scenario, batch.frame) for scenario in batch.scenarios]
@@ -146,7 +143,8 @@ def split_map(scenario: Scenario) -> MapSegments:
         no_windows = np.zeros((0, WINDOW, 2), np.float32)
         return MapSegments(position, np.zeros(1, np.float32), zeros, zeros, zeros, no_windows)
     points, heading, windows = (np.concatenate(columns) for columns in zip(*groups))
-    return MapSegments(points, heading, *np.concatenate(labels).T, windows)
+    type_, family, light = np.concatenate(labels).T
+    return MapSegments(points, heading, type_, family, light, windows)
 
 
 def _polygon_sides(polygon: Float64[np.ndarray, "n 3"]) -> Float32[np.ndarray, "m 3"]:
