@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from rlftsim.goals.attainment import is_passed, is_reached, is_within, rate, tolerance_m
+from rlftsim.goals.attainment import compute_tolerance, is_passed, is_reached, is_within, rate
 from rlftsim.goals.logged import logged_endpoints, logged_goals
 from rlftsim.policies.registry import load_policy
 from rlftsim.rollout.policy import Policy, is_goal_conditioned
@@ -60,7 +60,7 @@ def measure(
     rollouts = simulate(policy, batch, num_rollouts=num_rollouts, seed=0, goals=goals if conditioned else None)
     ends, agents = logged_endpoints(batch), goals.goal_mask[0, 0]
     goal, heading = ends.position[0, agents], ends.heading[0, agents, None]
-    tolerance = tolerance_m(batch.velocity[0, agents, 10].norm(dim=-1), ends.horizon_s[0, agents])[:, None]
+    tolerance = compute_tolerance(batch.velocity[0, agents, 10].norm(dim=-1), ends.horizon_s[0, agents])[:, None]
     offset = rollouts.position[0][:, agents] - goal[:, None]  # [N, E, T, 2]
     met = is_within(offset, heading, tolerance).any(-1)
     ahead = torch.stack([heading.cos(), heading.sin()], -1)

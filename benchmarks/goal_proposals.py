@@ -16,7 +16,7 @@ import numpy as np
 
 from rlftsim.experiments.goal_proposals import road_test
 from rlftsim.goals.maneuvers.logged import logged_maneuver
-from rlftsim.goals.maneuvers.proposals import Driver, Proposal, no_proposal_reason, propose_from_lanes
+from rlftsim.goals.maneuvers.proposals import CurrentAgent, Proposal, no_proposal_reason, propose_from_lanes
 from rlftsim.goals.maneuvers.reach import BRISK, HORIZON_S
 from rlftsim.scenario.open import open_dataset
 from rlftsim.scenario.types import ObjectType, Scenario
@@ -60,8 +60,8 @@ def is_vehicle(scenario: Scenario, track: int) -> bool:
 
 def panel(number: int, scenario: Scenario, track: int, proposals: tuple[Proposal, ...]) -> GoalPanel:
     """The proposals of one agent."""
-    speed = Driver.of(scenario, track).speed_mps
-    marks = tuple(DrawnGoal(p.object_id, p.position, p.maneuver.value, p.way[:, :2]) for p in proposals)
+    speed = CurrentAgent.from_track(scenario, track).speed_mps
+    marks = tuple(DrawnGoal(p.object_id, p.position, p.maneuver.value, p.path[:, :2]) for p in proposals)
     title = f"{number}: {scenario.scenario_id}, agent {scenario.tracks.object_id[track]}, {speed:.1f} m/s"
     return GoalPanel(title, scenario, marks)
 
@@ -78,19 +78,19 @@ def count(counts: Counter[str], scenario: Scenario, by_track: dict[int, tuple[Pr
         elif logged is not None:
             counts[f"logged {logged.maneuver}, in all"] += 1
             counts[f"logged {logged.maneuver}, proposed"] += logged.maneuver in {p.maneuver for p in proposals}
-        driver = Driver.of(scenario, track)
+        driver = CurrentAgent.from_track(scenario, track)
         for proposal in proposals:
             counts[f"proposed {proposal.maneuver}"] += 1
             counts["proposed, out of reach"] += is_out_of_reach(proposal, driver)
             if test is not None:
-                last = proposal.way[-2:]
+                last = proposal.path[-2:]
                 heading = np.arctan2(*(last[1] - last[0])[1::-1])
                 counts["proposed, off the road"] += bool(test(last[1:], np.array([heading]), driver.size)[0] > 0.1)
 
 
-def is_out_of_reach(proposal: Proposal, driver: Driver) -> bool:
+def is_out_of_reach(proposal: Proposal, driver: CurrentAgent) -> bool:
     """Whether not even full acceleration covers the way, or full braking overshoots it."""
-    way_m = float(np.linalg.norm(np.diff(proposal.way[:, :2], axis=0), axis=1).sum())
+    way_m = float(np.linalg.norm(np.diff(proposal.path[:, :2], axis=0), axis=1).sum())
     most = driver.speed_mps * HORIZON_S + BRISK.acceleration_mps2 * HORIZON_S**2 / 2
     return not driver.speed_mps**2 / (2 * BRISK.braking_mps2) - 1 <= way_m <= most
 

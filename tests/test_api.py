@@ -307,7 +307,7 @@ def test_score_equals_the_command_line(base, data, metric):
         assert len(names) > 15
         # NaN where a likelihood has no scored step
         expected = [rows[scenario.scenario_id][name] for name in names]
-        np.testing.assert_array_equal([float(result.score_of(name)) for name in names], expected)
+        np.testing.assert_array_equal([float(result.find_score(name)) for name in names], expected)
 
 
 @pytest.mark.parametrize("goals", ["none", "logged"])

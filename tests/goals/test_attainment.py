@@ -6,13 +6,13 @@ import torch
 
 import scenes
 from rlftsim.goals.attainment import (
-    closest_m,
+    compute_closest_distance,
+    compute_tolerance,
     is_passed,
     is_reached,
     is_within,
-    outcome_of,
+    measure_outcome,
     rate,
-    tolerance_m,
 )
 from rlftsim.goals.logged import logged_endpoints, logged_goals
 from rlftsim.goals.types import Goals
@@ -38,17 +38,17 @@ def test_reached_means_near_at_the_end_and_passed_near_at_any_step():
     position, goals = along_x(10.0, 12.1, 40.0), goals_at((10.0, 0.0), (10.0, 0.0), (10.0, 2.1))
     assert is_reached(position, goals).tolist() == [[[True, False, False]]]
     assert is_passed(position, goals).tolist() == [[[True, True, False]]]
-    assert closest_m(position, goals)[0, 0, 2] == pytest.approx(2.1)
+    assert compute_closest_distance(position, goals)[0, 0, 2] == pytest.approx(2.1)
 
 
 def test_the_outcome_of_a_goal_is_counted_over_its_rollouts_even_far_from_the_origin():
     # at most 0.5 m apart are numbers of float32 near 8 000 km: x = 10, 40 and 7 m; goal at 10 m, 1 m to the side
     way = torch.stack([along_x(end)[0, 0, 0].double() for end in (10.0, 40.0, 7.0)])
     far = torch.tensor([8.0e6, -8.0e6], dtype=torch.float64)
-    outcome = outcome_of(way + far, (8.0e6 + 10.0, -8.0e6 + 1.0))
+    outcome = measure_outcome(way + far, (8.0e6 + 10.0, -8.0e6 + 1.0))
     assert (outcome.reached, outcome.passed) == (pytest.approx(1 / 3), pytest.approx(2 / 3))
     assert (outcome.best_m, outcome.median_m) == (pytest.approx(1.0), pytest.approx(1.0))
-    few = outcome_of(way[1:] + far, (8.0e6 + 10.0, -8.0e6 + 1.0))
+    few = measure_outcome(way[1:] + far, (8.0e6 + 10.0, -8.0e6 + 1.0))
     assert few.median_m == pytest.approx((1 + math.hypot(3, 1)) / 2)
 
 
@@ -67,7 +67,7 @@ def test_tolerances_are_those_of_the_challenge():
     # Half way between 1.4 and 11 m/s the factor is 0.75.
     speed, horizon = torch.tensor([20.0, 11.0, 1.4, 0.0, 6.2, 20.0]), torch.tensor([8.0, 5.0, 8.0, 3.0, 8.0, 0.5])
     expected = [[6.0, 3.0], [3.6, 1.8], [3.0, 1.5], [1.0, 0.5], [4.5, 2.25], [2.0, 1.0]]
-    torch.testing.assert_close(tolerance_m(speed, horizon), torch.tensor(expected))
+    torch.testing.assert_close(compute_tolerance(speed, horizon), torch.tensor(expected))
 
 
 @pytest.mark.parametrize(("heading", "inside"), [(0.0, True), (math.pi / 2, False)])
@@ -86,7 +86,7 @@ def test_passing_misses_are_those_of_the_evaluation():
     ends = logged_endpoints(batch)
     goals = logged_goals(batch, batch.evaluated_mask)
     position = torch.stack([pushed, states.y], -1)[None] - batch.origin.float()
-    tolerance = tolerance_m(batch.velocity[:, :, 10].norm(dim=-1), ends.horizon_s)[:, None, :, None]
+    tolerance = compute_tolerance(batch.velocity[:, :, 10].norm(dim=-1), ends.horizon_s)[:, None, :, None]
     offset = position - goals.position[..., None, :]
     missed = goals.goal_mask & ~is_within(offset, ends.heading[:, None, :, None], tolerance).any(-1)
     expected = compute_miss_rates(scenario, type(states)(states.object_id, pushed, states.y, states.z, states.heading))

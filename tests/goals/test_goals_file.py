@@ -129,7 +129,7 @@ def test_goals_are_placed_in_the_frame_of_the_batch():
 
 
 def entry(agent=100, x=1040.0, y=-200.0):
-    return GoalEntry("straight", agent, x, y, place="goals.json: goals[3]")
+    return GoalEntry("straight", agent, x, y, location="goals.json: goals[3]")
 
 
 def test_impossible_goals_are_refused():

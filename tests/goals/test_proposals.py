@@ -11,7 +11,7 @@ from rlftsim.goals.maneuvers import lane_paths
 from rlftsim.goals.maneuvers.lane_paths import Pose, lanes_for, neighbor_lanes, path_through, paths_from
 from rlftsim.goals.maneuvers.logged import logged_maneuver
 from rlftsim.goals.maneuvers.proposals import CurrentAgent, no_proposal_reason, propose_from_lanes
-from rlftsim.goals.maneuvers.reach import reach_along
+from rlftsim.goals.maneuvers.reach import compute_reach
 from rlftsim.scenario.lane_graph import lane_graph
 from rlftsim.scenario.maneuver import Maneuver, maneuver_of_turn
 from rlftsim.scenario.types import MapFeatures, ObjectType
@@ -173,12 +173,12 @@ def line(length_m, limit_mps=13.0):
 
 
 def test_reach_on_a_straight_road_is_what_the_formulas_say():
-    reach = reach_along(line(300), 10.0)
-    assert reach.least_m == pytest.approx(100 / 8)  # v2 / 2b with b = 4
+    reach = compute_reach(line(300), 10.0)
+    assert reach.min_m == pytest.approx(100 / 8)  # v2 / 2b with b = 4
     # 1.2 m/s2 up to 13: 2.5 s, 28.75 m; then 5.5 s: 71.5 m
     assert reach.usual_m == pytest.approx(100.25, abs=0.3)
     # 2.5 m/s2 up to 1.2 * 13 = 15.6: 2.24 s, 28.67 m; then 5.76 s: 89.86 m
-    assert reach.most_m == pytest.approx(118.5, abs=0.5)
+    assert reach.max_m == pytest.approx(118.5, abs=0.5)
 
 
 def test_a_curve_that_is_taken_too_fast_is_the_end():
@@ -186,8 +186,8 @@ def test_a_curve_that_is_taken_too_fast_is_the_end():
     arc = np.stack([20 + 10 * np.sin(bend), 10 - 10 * np.cos(bend), 0 * bend], -1)
     points = np.concatenate([line(20).points, arc[1:]])
     path = path_through(points, 0.0, np.full(len(points), 30.0))
-    assert 15 <= reach_along(path, 20.0).most_m <= 22
-    assert reach_along(path, 8.0).most_m > 30
+    assert 15 <= compute_reach(path, 20.0).max_m <= 22
+    assert compute_reach(path, 8.0).max_m > 30
 
 
 @pytest.mark.parametrize(
@@ -221,6 +221,6 @@ def test_without_a_future_nothing_is_logged():
 
 
 def test_drivers_stand_on_the_ground():
-    driver = CurrentAgent.of(driving(), 0)
+    driver = CurrentAgent.from_track(driving(), 0)
     assert driver.pose.position[2] == pytest.approx(3.0 - 0.8)  # half of 1.6 m below the box's center
     assert driver.speed_mps == pytest.approx(8.0)

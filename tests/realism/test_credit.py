@@ -16,7 +16,7 @@ from rlftsim.realism import (
     scenario_log,
     score_features,
 )
-from rlftsim.realism.credit import log_mean_of_exp
+from rlftsim.realism.credit import compute_logarithmic_mean
 
 SLOW = settings(deadline=None, max_examples=15)
 
@@ -86,6 +86,6 @@ def test_a_single_rollout_has_no_credit():
 
 def test_the_logarithmic_mean_lies_between_and_is_smooth_where_both_are_equal():
     logs = torch.tensor([-3.0, -3.0 + 1e-9, -1.0], dtype=torch.float64)
-    means = log_mean_of_exp(logs, torch.full_like(logs, -3.0))
+    means = compute_logarithmic_mean(logs, torch.full_like(logs, -3.0))
     # (e^-1 - e^-3) / 2 by hand
     assert means.tolist() == pytest.approx([0.049787068, 0.049787068, 0.159046186], rel=1e-8)

@@ -146,7 +146,7 @@ def test_the_bound_on_pairs_changes_no_time_to_collision(seed, num_agents, with_
     for pair in range(len(gap)):  # in track order within a row
         row = pairs.row[pair]
         if is_followed[pair] and gap[pair] < nearest[row]:
-            approach = speed.flatten()[pairs.ego[pair]] - speed.flatten()[pairs.other[pair]]
+            approach = speed.flatten()[pairs.ego[pair]] - speed.flatten()[pairs.neighbor[pair]]
             nearest[row] = gap[pair]
             expected[row] = min(5.0, gap[pair] / approach) if approach > 0 else 5.0
     torch.testing.assert_close(compute_time_to_collision(agents, speed), expected.view(2, -1, 5), atol=1e-5, rtol=0)

@@ -25,7 +25,7 @@ from rlftsim.realism import (
     score_features,
 )
 from rlftsim.realism import features as realism_features
-from rlftsim.realism.features import JoinedLogs, compute_joined_features
+from rlftsim.realism.features import JoinedLogs
 
 
 @pytest.fixture(scope="module")
@@ -141,8 +141,8 @@ def test_scenarios_measured_side_by_side_have_the_scores_of_each_alone():
     swapped = (v[:, order] for v in (states[0].x, states[0].y, states[0].z, states[0].heading))
     states[0] = SimulatedStates(states[0].object_id[order], *swapped)
     logs = [scenario_log(scenario, missing_map="neutral") for scenario in scenarios]
-    joined = JoinedLogs.of(logs)
-    features = compute_joined_features(joined, states)
+    joined = JoinedLogs.from_logs(logs)
+    features = compute_features(joined, states)
     expected = score_batch(logs, states)
     result = score_features(joined, features)
     assert result.traffic_light_violation_rate.max() > 0

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import scenes
-from rlftsim.goals.attainment import tolerance_m
+from rlftsim.goals.attainment import compute_tolerance
 from rlftsim.realism import SimulatedStates
 from rlftsim.realism.from_rollouts import logged_states
 from rlftsim.realism.miss import compute_miss_rates
@@ -37,7 +37,7 @@ def test_the_log_itself_misses_nothing():
 
 def test_a_box_not_a_disc(lone):
     states = logged_states(lone, num_rollouts=1)
-    along, sideways = tolerance_m(torch.tensor([speed_of_ego(lone)]), torch.tensor([8.0]))[0].tolist()
+    along, sideways = compute_tolerance(torch.tensor([speed_of_ego(lone)]), torch.tensor([8.0]))[0].tolist()
     heading = float(lone.tracks.heading[lone.ego_index, 90])
     ahead, left = np.array([math.cos(heading), math.sin(heading)]), np.array([-math.sin(heading), math.cos(heading)])
     shifts = (0.97 * along * ahead, 1.03 * along * ahead, -0.97 * sideways * left, 1.03 * sideways * left)

@@ -74,7 +74,7 @@ def test_the_agents_rewards_add_up_to_the_reward_and_to_zero_over_rollouts(name,
 def test_agent_rewards_stand_at_their_agents(measured):
     """The batch's agents come in track order, the metric's by object id."""
     _, _, scenarios, agents = measured
-    for b, item in enumerate(agents.measured):
+    for b, item in enumerate(agents.features):
         credit = compute_credit(item.log, item.features).mloo.sum(-1)
         ids = item.log.agents.evaluated_object_id.tolist()
         for place in scenarios.evaluated_mask[b].nonzero()[:, 0].tolist():
@@ -207,7 +207,7 @@ def test_a_credit_mixing_of_more_than_one_is_refused():
 
 
 def test_scores_by_agent_are_computed_on_first_use(measured):
-    agents = AgentScores(measured[3].measured, measured[3].config, measured[3].num_agents)
+    agents = AgentScores(measured[3].features, measured[3].config, measured[3].num_agents)
     assert "leave_one_out" not in vars(agents)
     _ = agents.collision
     assert "collision" in vars(agents)

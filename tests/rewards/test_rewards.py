@@ -123,7 +123,7 @@ def test_collisions_and_leaving_the_road_count_alike(simulated):
 def test_rates_of_a_rollout_are_those_of_its_evaluated_agents(measured):
     """The parts of the heuristic rewards, counted by hand from the features."""
     scores, _, batch, agents = measured
-    for b, item in enumerate(agents.measured):
+    for b, item in enumerate(agents.features):
         log_valid = torch.from_numpy(batch.scenarios[b].tracks.valid[batch.scenarios[b].evaluated_indices, 11:])
         order = batch.scenarios[b].tracks.object_id[batch.scenarios[b].evaluated_indices].argsort()
         for n in range(4):

@@ -83,9 +83,9 @@ def test_the_log_of_the_sample_scores_as_measured(sample, window, simulated, exp
     assert float(result.meta_metric) == pytest.approx(expected, abs=0.002)
     # one of three: 139344, whose guessed width reaches over the border
     for rate in ("collision_rate", "offroad_rate"):
-        assert float(result.score_of(rate)) == pytest.approx(1 / 3, abs=1e-6)
+        assert float(result.find_score(rate)) == pytest.approx(1 / 3, abs=1e-6)
     if window == "last":
-        parts = [float(result.score_of(name)) for name in ("kinematic", "interactive", "map_based")]
+        parts = [float(result.find_score(name)) for name in ("kinematic", "interactive", "map_based")]
         assert parts == pytest.approx([0.617, 0.947, 1.0], abs=0.001)
 
 

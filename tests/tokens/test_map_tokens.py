@@ -30,15 +30,15 @@ def test_what_is_left_over_becomes_a_shorter_piece():
 
 def test_pieces_point_along_their_polyline():
     pieces = pieces_of((EDGE, [(0.0, 0.0), (0.0, 12.0)]), (LANE, [(30.0, 0.0), (18.0, 0.0)]))
-    lane, edge = pieces.heading[pieces.kind == 0], pieces.heading[pieces.kind == 1]
+    lane, edge = pieces.heading[pieces.family == 0], pieces.heading[pieces.family == 1]
     np.testing.assert_allclose(np.abs(lane), np.pi, atol=1e-4)
     np.testing.assert_allclose(edge, np.pi / 2, atol=1e-4)
 
 
 def test_lanes_come_before_edges_lines_and_polygons():
     pieces = split_map(scenes.junction_with_light())
-    assert set(pieces.kind.tolist()) == {0, 1, 2, 3}
-    assert (np.diff(pieces.kind) >= 0).all()
+    assert set(pieces.family.tolist()) == {0, 1, 2, 3}
+    assert (np.diff(pieces.family) >= 0).all()
 
 
 def test_only_the_lane_with_a_light_has_one():
@@ -68,7 +68,7 @@ def test_a_scenario_without_map_gets_one_piece_out_of_reach(vocabulary):
 
 def test_a_straight_piece_is_named_by_the_straight_prototype(vocabulary):
     tokens = tokenize_map(collate([scenes.straight_road()]), vocabulary.map_prototypes)
-    lanes = (tokens.kind == 0) & tokens.token_mask
+    lanes = (tokens.family == 0) & tokens.token_mask
     assert (tokens.token_id[lanes] == 0).float().mean() > 0.9
 
 

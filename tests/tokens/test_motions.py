@@ -10,10 +10,10 @@ import scenes
 from rlftsim.scenario.types import ObjectType
 from rlftsim.tokens.motions import (
     DistinctSample,
+    extract_motions,
     is_plausible,
-    mirrored,
+    mirror_poses,
     motion_keys,
-    motions_of,
     sample_scenarios,
 )
 
@@ -52,14 +52,14 @@ def test_a_short_stream_is_kept_whole_and_counted():
     sample = DistinctSample(10, 0)
     sample.add(rows(4), rows(4).astype(np.int64))
     sample.add(rows(4), rows(4).astype(np.int64))
-    assert sample.num_seen == 8
+    assert sample.num_rows == 8
     assert len(sample.rows()) == 4
 
 
 @settings(max_examples=30, deadline=None)
 @given(MOTION)
 def test_a_motion_and_its_mirror_image_are_one(motions):
-    assert (motion_keys(motions) == motion_keys(mirrored(motions))).all()
+    assert (motion_keys(motions) == motion_keys(mirror_poses(motions))).all()
 
 
 def test_sampled_scenarios_are_spread_over_the_whole_data_set():
@@ -87,7 +87,7 @@ def test_impossible_motions_are_glitches(speed, turn, class_id, plausible):
 
 def test_a_straight_drive_is_straight_motions():
     scenario = scenes.build_scenario("one", (scenes.Mover(ObjectType.VEHICLE, speed_mps=8.0),))
-    motions = motions_of(scenario).of_class(0)
+    motions = extract_motions(scenario).select_class(0)
     assert len(motions) == 18
     np.testing.assert_allclose(motions[:, :, 0], np.tile(0.8 * np.arange(6), (18, 1)), atol=1e-3)
     np.testing.assert_allclose(motions[:, :, 1:], 0.0, atol=1e-3)

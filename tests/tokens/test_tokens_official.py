@@ -73,7 +73,7 @@ def test_map_pieces_lie_where_the_public_code_puts_them(batch, preprocessed):
 def test_kinds_types_and_lights_of_map_pieces_are_exactly_the_same(batch, preprocessed):
     pieces = split_map(batch.scenarios[0])
     np.testing.assert_array_equal(pieces.type, preprocessed["map_type"])
-    np.testing.assert_array_equal(pieces.kind, preprocessed["map_pl_type"])
+    np.testing.assert_array_equal(pieces.family, preprocessed["map_pl_type"])
     np.testing.assert_array_equal(pieces.light, preprocessed["map_light_type"])
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rlftsim.errors import ConfigError
-from rlftsim.tokens.trajtok import Grid, GridMotions, TrajTokConfig, rule_tokens, smoothed
+from rlftsim.tokens.trajtok import Grid, GridMotions, TrajTokConfig, rule_tokens, smooth_cells
 
 GRID = Grid(x_min_m=-1.0, x_max_m=4.0, x_bins=50, y_max_m=1.0, y_bins=20, min_motions=1)
 CONFIG = TrajTokConfig()
@@ -54,7 +54,7 @@ def test_lonely_cells_go_and_holes_are_filled():
     used[5:16, 5:16] = True
     used[10, 10] = False
     used[25, 25] = True
-    kept = smoothed(used, CONFIG)
+    kept = smooth_cells(used, CONFIG)
     assert kept[10, 10]  # 80 around it
     assert not kept[25, 25]  # none around it
     assert kept[5, 5]  # a corner of the block has 5 * 5 - 1 = 24 around it
@@ -67,14 +67,14 @@ def test_twenty_neighbors_keep_a_cell(around, stays):
     used = np.zeros((9, 9), bool)
     used.flat[:around] = True
     used[4, 4] = True
-    assert smoothed(used, CONFIG)[4, 4] == stays
+    assert smooth_cells(used, CONFIG)[4, 4] == stays
 
 
 @pytest.mark.parametrize(("around", "added"), [(20, False), (21, True)])
 def test_more_than_twenty_neighbors_add_a_cell(around, added):
     used = np.zeros((9, 9), bool)
     used.flat[:around] = True
-    assert smoothed(used, CONFIG)[4, 4] == added
+    assert smooth_cells(used, CONFIG)[4, 4] == added
 
 
 def test_an_added_cell_ends_with_its_neighbors_heading_and_is_under_way_at_both_ends():

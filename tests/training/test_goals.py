@@ -12,7 +12,7 @@ import tiny
 from rlftsim.errors import CheckpointError, ConfigError, DataError
 from rlftsim.goals.attainment import is_reached
 from rlftsim.goals.logged import logged_goals
-from rlftsim.goals.stored import StoredGoals, write_goal_part
+from rlftsim.goals.stored import StoredGoals, write_goal_file
 from rlftsim.goals.types import Goals
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.rewards import parse_reward, reward_by_name, write_reward
@@ -346,7 +346,7 @@ def test_stored_goals_come_to_the_agents_they_are_of(drawn_scenarios, tmp_path):
     scenario = drawn_scenarios[0]
     ids, origin = scenario.tracks.object_id, scenario.origin
     ends = origin + np.array([[5.0, 6.0], [7.0, 8.0]])
-    write_goal_part(tmp_path / "part-0.parquet", {scenario.scenario_id: (ids[[3, 1]], ends)})
+    write_goal_file(tmp_path / "part-0.parquet", {scenario.scenario_id: (ids[[3, 1]], ends)})
     batch = collate(drawn_scenarios[:2])
     goals = StoredGoals(tmp_path).of_batch(batch)
     places = {int(i): n for n, i in enumerate(batch.object_id[0].tolist())}
@@ -366,8 +366,8 @@ def test_stored_goals_come_to_the_agents_they_are_of(drawn_scenarios, tmp_path):
 def test_a_folder_of_goals_says_whose_they_are(drawn_scenarios, tmp_path):
     ids = [scenario.scenario_id for scenario in drawn_scenarios]
     points = np.array([3, 5]), np.zeros((2, 2))
-    write_goal_part(tmp_path / "a" / "part-0.parquet", {ids[0]: points, ids[2]: points})
-    write_goal_part(tmp_path / "b" / "part-0.parquet", {ids[0]: points, ids[2]: (points[0], points[1] + 1e-3)})
+    write_goal_file(tmp_path / "a" / "part-0.parquet", {ids[0]: points, ids[2]: points})
+    write_goal_file(tmp_path / "b" / "part-0.parquet", {ids[0]: points, ids[2]: (points[0], points[1] + 1e-3)})
     stored = StoredGoals(tmp_path / "a")
     assert (stored.count_among(ids), stored.count_among(ids[1:]), stored.count_among(["elsewhere"])) == (2, 1, 0)
     assert stored.fingerprint == StoredGoals(tmp_path / "a").fingerprint != StoredGoals(tmp_path / "b").fingerprint
@@ -480,13 +480,13 @@ def test_augmented_goals_belong_to_a_run_wherever_they_lie(policy, drawn_scenari
     finetune(copy.deepcopy(policy), drawn_scenarios, tmp_path / "run", moved)
     scenario = drawn_scenarios[0]
     point = (scenario.tracks.object_id[:1], scenario.origin[None] + 5.0)
-    write_goal_part(tmp_path / "moved" / "part-000009.parquet", {scenario.scenario_id: point})
+    write_goal_file(tmp_path / "moved" / "part-000009.parquet", {scenario.scenario_id: point})
     with pytest.raises(CheckpointError, match="augmented_goals"):
         finetune(copy.deepcopy(policy), drawn_scenarios, tmp_path / "run", moved)
 
 
 def test_rows_that_are_no_goals_are_refused(tmp_path):
-    write_goal_part(tmp_path / "part-0.parquet", {"s": (np.array([1]), np.array([[np.nan, 0.0]]))})
+    write_goal_file(tmp_path / "part-0.parquet", {"s": (np.array([1]), np.array([[np.nan, 0.0]]))})
     with pytest.raises(DataError, match="rows that are not goals"):
         StoredGoals(tmp_path)
 

@@ -8,7 +8,7 @@ from rich.table import Table
 
 from rlftsim.errors import DataError
 from rlftsim.evaluation.rollout_files import RolloutEntry, read_states
-from rlftsim.goals.attainment import Outcome, outcome_of
+from rlftsim.goals.attainment import Outcome, measure_outcome
 from rlftsim.goals.goals_file import GoalEntry, GoalsFile
 from rlftsim.progress import print_wide
 from rlftsim.realism import SimulatedStates
@@ -33,7 +33,9 @@ def report_outcomes(folder: Path, scenarios: Sequence[Scenario], goals: GoalsFil
     outcomes, pictures = [], []
     for scenario in scenarios:
         states, entries = read_rollouts(folder, scenario), goals.of_scenario(scenario.scenario_id)
-        outcomes += [(entry, outcome_of(states.way_of(entry.agent_id), (entry.x, entry.y))) for entry in entries]
+        outcomes += [
+            (entry, measure_outcome(states.simulated_path(entry.agent_id), (entry.x, entry.y))) for entry in entries
+        ]
         if picture:
             pictures.append(folder / f"{scenario.scenario_id}.png")
             draw_goals(pictures[-1], [picture_of(states, scenario, entries)], panel_inches=PICTURE_INCHES)
@@ -92,5 +94,7 @@ def picture_of(states: SimulatedStates, scenario: Scenario, entries: Sequence[Go
     targeted = [(e.agent_id, np.array([e.x, e.y]), e.label) for e in entries]
     # Without goals the picture shows the agents that the metric evaluates.
     free = [(agent, None, "") for agent in scenario.tracks.object_id[scenario.evaluated_indices].tolist()]
-    marks = tuple(DrawnGoal(*one, driven=states.way_of(one[0]).numpy().astype(np.float64)) for one in targeted or free)
+    marks = tuple(
+        DrawnGoal(*one, driven=states.simulated_path(one[0]).numpy().astype(np.float64)) for one in targeted or free
+    )
     return GoalPanel(scenario.scenario_id, scenario, marks)

@@ -12,7 +12,7 @@ from tyro.conf import Positional
 
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.experiments.goal_proposals import entry_of, label_of, propose
-from rlftsim.goals.goals_file import GoalEntry, GoalsFile, parse_goal, read_goals, refuse_twice, write_goals
+from rlftsim.goals.goals_file import GoalEntry, GoalsFile, check_single_goals, parse_goal, read_goals, write_goals
 from rlftsim.goals.maneuvers.proposals import Proposal, no_proposal_reason
 from rlftsim.goals.placement import distance_m, goal_warnings
 from rlftsim.jobs.folder import check_file
@@ -76,7 +76,7 @@ class Propose:
                 _add_rows(table, scenario, track, proposals, chosen)
                 agent = int(scenario.tracks.object_id[track])
                 marks = [
-                    DrawnGoal(agent, p.position, label_of(p), p.way[:, :2], is_logged=p.is_logged) for p in proposals
+                    DrawnGoal(agent, p.position, label_of(p), p.path[:, :2], is_logged=p.is_logged) for p in proposals
                 ]
                 title = f"{scenario.scenario_id}, agent {agent}"
                 panels.append(GoalPanel(title, scenario, tuple(marks) or (DrawnGoal(agent),)))
@@ -194,7 +194,7 @@ def given_goals(file: Path | None, written: list[str], scenario_ids: list[str] |
     if scenario_ids is None or len(scenario_ids) != 1:
         raise ConfigError("--goal AGENT=X,Y needs one scenario: name it with --scenario, or write a file for --goals.")
     entries = (*found.goals, *(parse_goal(text, scenario_ids[0]) for text in written))
-    refuse_twice(entries)
+    check_single_goals(entries)
     return GoalsFile(entries, found.alternatives)
 
 

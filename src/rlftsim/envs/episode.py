@@ -314,9 +314,9 @@ def off_road_m(episode: Episode, world: WorldState, rows: Int64[np.ndarray, "m"]
     of_scene = torch.from_numpy(scene) if len(episode.world.scenes) > 1 else None
     distance = compute_point_distance_to_road_edge(groups, episode.edges, max_pairs=MAX_PAIRS, scenario=of_scene)
     farthest = distance.amax(-1).double().numpy()
-    if episode.edges.is_known is None:
+    if episode.edges.has_edges is None:
         return farthest
-    return np.where(episode.edges.is_known.numpy()[scene], farthest, -np.inf)
+    return np.where(episode.edges.has_edges.numpy()[scene], farthest, -np.inf)
 
 
 def _free_way_m(episode: Episode, world: WorldState, rows: Int64[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:

@@ -88,7 +88,7 @@ def route_of(scenario: Scenario, agent: int, choice: RouteChoice) -> Route:
     proposals = propose_from_lanes(scenario, int(scenario.simulated_indices[agent]))
     for proposal in proposals:
         if proposal.maneuver.value == choice:
-            return _of_points(scene, agent, proposal.way[:, :2] - scenario.origin, "maneuver")
+            return _of_points(scene, agent, proposal.path[:, :2] - scenario.origin, "maneuver")
     known = ", ".join(proposal.maneuver.value for proposal in proposals) or "no maneuver"
     raise ConfigError(
         f"route {choice!r}: in scenario {scenario.scenario_id} the lanes of agent {scene.object_id[agent]} allow "
@@ -117,9 +117,9 @@ def _logged_route(scene: Scene, agent: int) -> Route:
 
 def _paths(scenario: Scenario, agent: int, length_m: float) -> list[LanePath]:
     """Paths along the lanes from an agent's pose, with a lane change and without."""
-    driver = CurrentAgent.of(scenario, int(scenario.simulated_indices[agent]))
+    driver = CurrentAgent.from_track(scenario, int(scenario.simulated_indices[agent]))
     scene = build_env_scene(scenario)
-    lanes = lanes_for(scene.graph, driver.kind)
+    lanes = lanes_for(scene.graph, driver.object_type)
     if scene.levels is not None:
         lanes.usable[_lanes_of_other_levels(scene.graph, driver.pose.position)] = False
     own = own_paths(driver, lanes, length_m=length_m)

@@ -18,7 +18,7 @@ from rlftsim.evaluation.evaluate import check_jobs, frozen_copy, identity_of, si
 from rlftsim.evaluation.results import EvaluateConfig
 from rlftsim.evaluation.resumable import JsonParts, map_scenarios
 from rlftsim.evaluation.scenario_source import open_held_out
-from rlftsim.goals.attainment import outcome_of
+from rlftsim.goals.attainment import measure_outcome
 from rlftsim.goals.goals_file import GoalEntry
 from rlftsim.goals.placement import goals_of_batch
 from rlftsim.rollout.policy import Policy, device_of, is_goal_conditioned
@@ -126,5 +126,5 @@ def _simulate_goals(job: _Job, position: int) -> dict[str, object]:
     outcomes = []
     for goal in job.goals[scenario_id]:
         states = goal_free or simulated(goals=goals_of_batch([goal], batch))
-        outcomes.append(outcome_of(states.way_of(goal.agent_id), (goal.x, goal.y)))
+        outcomes.append(measure_outcome(states.simulated_path(goal.agent_id), (goal.x, goal.y)))
     return {"reached": [one.reached for one in outcomes], "passed": [one.passed for one in outcomes]}

@@ -365,10 +365,10 @@ def row_of_result(result: RealismResult, scenario: Scenario, states: SimulatedSt
         "meta_metric_light_one": result.meta_metric + missing,
         "miss_rate": misses.at_goal,
         "passing_miss_rate": misses.passing,
-        "min_passing_miss_rate": misses.passing_in_all,
+        "min_passing_miss_rate": misses.passing_in_every_rollout,
         **measure_drift(scenario, states)._asdict(),
     }
-    numbers = {name: float(scores[name] if name in scores else result.score_of(name)) for name in SCORE_COLUMNS}
+    numbers = {name: float(scores[name] if name in scores else result.find_score(name)) for name in SCORE_COLUMNS}
     return {
         "scenario_id": result.scenario_ids[0],
         "num_agents": len(scenario.simulated_indices),

@@ -5,12 +5,11 @@ From strict to lenient:
 * *reached*: within `NEAR_M` of the goal at the last step.
 * *passed*: within `NEAR_M` of the goal at any simulated step.
 * *missed in passing*: outside the goal's box at every simulated step (`realism.miss`). The box is the miss definition
-  of
-  the Waymo motion prediction challenge: along and across the heading at the goal, larger for long horizons, smaller for
-  slow agents.
+  of the Waymo motion prediction challenge: along and across the heading at the goal, larger for long horizons, smaller
+  for slow agents.
 
-Truth values are per (scenario, rollout, agent), False where there is no goal. `rate` averages over the agents that have
-one, `outcome_of` over the rollouts of a single goal.
+Truth values are per (scenario, rollout, agent), False without a goal. `rate` averages over the agents with a goal,
+`measure_outcome` over the rollouts of a single goal.
 """
 
 from dataclasses import dataclass
@@ -33,41 +32,41 @@ SLOW_FACTOR = 0.5
 
 
 def is_reached(position: Float[Tensor, "B N A T 2"], goals: Goals) -> Bool[Tensor, "B N A"]:
-    """True for agents that end within `NEAR_M` of their goal.
+    """True for agents that end within `NEAR_M` of the goal.
 
     Args:
-        position: simulated centers, m.
-        goals: in the same frame; False where an agent has none.
+        position: Simulated centers of the agents, m.
+        goals: Goals in the same frame; the result is False for agents without a goal.
     """
-    return goals.goal_mask & (final_m(position, goals) <= NEAR_M)
+    return goals.goal_mask & (compute_final_distance(position, goals) <= NEAR_M)
 
 
 def is_passed(position: Float[Tensor, "B N A T 2"], goals: Goals) -> Bool[Tensor, "B N A"]:
-    """True for agents that come within `NEAR_M` of their goal at any step.
+    """True for agents that come within `NEAR_M` of the goal at any step.
 
     Args:
-        position: simulated centers, m.
-        goals: in the same frame; False where an agent has none.
+        position: Simulated centers of the agents, m.
+        goals: Goals in the same frame; the result is False for agents without a goal.
     """
-    return goals.goal_mask & (closest_m(position, goals) <= NEAR_M)
+    return goals.goal_mask & (compute_closest_distance(position, goals) <= NEAR_M)
 
 
-def final_m(position: Float[Tensor, "B N A T 2"], goals: Goals) -> Float[Tensor, "B N A"]:
+def compute_final_distance(position: Float[Tensor, "B N A T 2"], goals: Goals) -> Float[Tensor, "B N A"]:
     """Distance to the goal at the last step, m; undefined without a goal.
 
     Args:
-        position: simulated centers, m.
-        goals: in the same frame.
+        position: Simulated centers of the agents, m.
+        goals: Goals in the same frame as the positions.
     """
     return (position[..., -1, :] - goals.position).norm(dim=-1)
 
 
-def closest_m(position: Float[Tensor, "B N A T 2"], goals: Goals) -> Float[Tensor, "B N A"]:
+def compute_closest_distance(position: Float[Tensor, "B N A T 2"], goals: Goals) -> Float[Tensor, "B N A"]:
     """Smallest distance to the goal over all steps, m; undefined without a goal.
 
     Args:
-        position: simulated centers, m.
-        goals: in the same frame.
+        position: Simulated centers of the agents, m.
+        goals: Goals in the same frame as the positions.
     """
     return (position - goals.position[..., None, :]).norm(dim=-1).amin(-1)
 
@@ -81,43 +80,42 @@ class Outcome:
     passed: float
     """Fraction of the rollouts that come within `NEAR_M` at some step."""
     best_m: float
-    """Closest distance in the rollout that comes nearest."""
+    """Closest distance of all rollouts."""
     median_m: float
     """Median over rollouts of the closest distance."""
 
 
-def outcome_of(position: Float[Tensor, "N T 2"], goal: tuple[float, float]) -> Outcome:
+def measure_outcome(position: Float[Tensor, "N T 2"], goal: tuple[float, float]) -> Outcome:
     """Outcome of an agent's goal. Works far from (0, 0), as in the world frame: the difference is taken in float64.
 
     Args:
-        position: simulated centers of the agent, m.
-        goal: x and y, same frame.
+        position: Simulated centers of the agent in N rollouts, m.
+        goal: x and y of the goal in the same frame, m.
     """
     offset = (position.double() - torch.tensor(goal, dtype=torch.float64, device=position.device)).float()
     offset = offset[None, :, None]  # [1, N, 1, T, 2]
-    # From here on the goal is the origin of the frame.
-    here = Goals(torch.zeros_like(offset[..., 0, :]), torch.ones_like(offset[..., 0, 0], dtype=torch.bool))
-    fractions = (float(met.double().mean()) for met in (is_reached(offset, here), is_passed(offset, here)))
-    closest = closest_m(offset, here).double()  # [1, N, 1]
+    origin = Goals(torch.zeros_like(offset[..., 0, :]), torch.ones_like(offset[..., 0, 0], dtype=torch.bool))
+    fractions = (float(is_met.double().mean()) for is_met in (is_reached(offset, origin), is_passed(offset, origin)))
+    closest = compute_closest_distance(offset, origin).double()  # [1, N, 1]
     return Outcome(*fractions, best_m=float(closest.min()), median_m=float(closest.quantile(0.5)))
 
 
-def rate(met: Bool[Tensor, "B N A"], mask: Bool[Tensor, "B N A"]) -> Float[Tensor, "B N"]:
+def rate(is_met: Bool[Tensor, "B N A"], mask: Bool[Tensor, "B N A"]) -> Float[Tensor, "B N"]:
     """Fraction of the masked agents of each rollout; NaN where the mask is empty.
 
     Args:
-        met: what is counted.
-        mask: agents that count.
+        is_met: True = the agent attains the goal, by any of the definitions.
+        mask: True = the agent counts, such as one with a goal.
     """
-    return (met & mask).sum(-1) / mask.sum(-1)
+    return (is_met & mask).sum(-1) / mask.sum(-1)
 
 
-def tolerance_m(speed: Float[Tensor, "*shape"], horizon_s: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape 2"]:
-    """Distance along the heading and sideways that an agent may be off its goal, m (Waymo motion challenge).
+def compute_tolerance(speed: Float[Tensor, "*shape"], horizon_s: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape 2"]:
+    """Distance along the heading and sideways that an agent may be off the goal, m (Waymo motion challenge).
 
     Args:
-        speed: at the current step, m/s.
-        horizon_s: time from the current step to the goal.
+        speed: Speed at the current step, m/s; slow agents have smaller tolerances.
+        horizon_s: Time from the current step to the goal, s; longer times have larger tolerances.
     """
     factor = _interpolate(speed, (SLOW_MPS, FAST_MPS), (SLOW_FACTOR, 1.0))
     widths = [_interpolate(horizon_s, TOLERANCE_HORIZON_S, sizes) for sizes in (ALONG_M, SIDEWAYS_M)]
@@ -130,22 +128,21 @@ def is_within(
     """True for offsets that lie inside the box of a goal.
 
     Args:
-        offset: position minus goal, m.
-        heading: of the box, rad.
-        tolerance: half its length and half its width.
+        offset: Position minus goal, m.
+        heading: Heading of the box, rad, in the frame of the offset.
+        tolerance: Half the length and half the width of the box, m.
     """
-    # Offset rotated into the frame of the box.
     cos, sin = heading.cos(), heading.sin()
-    along = offset[..., 0] * cos + offset[..., 1] * sin
-    sideways = offset[..., 1] * cos - offset[..., 0] * sin
-    return (along.abs() <= tolerance[..., 0]) & (sideways.abs() <= tolerance[..., 1])
+    box_x = offset[..., 0] * cos + offset[..., 1] * sin
+    box_y = offset[..., 1] * cos - offset[..., 0] * sin
+    return (box_x.abs() <= tolerance[..., 0]) & (box_y.abs() <= tolerance[..., 1])
 
 
 def _interpolate(
     value: Float[Tensor, "*shape"], knots: tuple[float, ...], heights: tuple[float, ...]
 ) -> Float[Tensor, "*shape"]:
     """Piecewise linear through the knots, constant outside."""
-    result = torch.full_like(value, heights[0])
-    for (left, low), (right, high) in zip(zip(knots, heights), zip(knots[1:], heights[1:])):
-        result = result + ((value - left) / (right - left)).clamp(0, 1) * (high - low)
-    return result
+    height = torch.full_like(value, heights[0])
+    for (start, low), (end, high) in zip(zip(knots, heights), zip(knots[1:], heights[1:])):
+        height = height + ((value - start) / (end - start)).clamp(0, 1) * (high - low)
+    return height

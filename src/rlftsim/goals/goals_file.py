@@ -1,4 +1,4 @@
-"""Goals as a JSON file, to be read and edited by hand. Frame: world, m, as in the scenario's log.
+"""Goals as a JSON file, for reading and editing by hand. Frame: world, m, as in the scenario's log.
 
     {
      "format": "rlftsim-goals-1",
@@ -33,18 +33,18 @@ UNSHOWABLE = {"Cc": "a control character", "Cs": "half a character"}
 
 @dataclass(frozen=True)
 class GoalEntry:
-    """The goal of one agent of one scenario."""
+    """The goal of an agent in a scenario."""
 
     scenario_id: str
     agent_id: int
     x: float
     y: float
     label: str = ""
-    place: str = field(default="", compare=False)
-    """File and position it was read from, for messages."""
+    location: str = field(default="", compare=False)
+    """File and position of the entry, for messages."""
 
     def __str__(self) -> str:
-        return self.place or f"goal of agent {self.agent_id} in scenario {self.scenario_id}"
+        return self.location or f"goal of agent {self.agent_id} in scenario {self.scenario_id}"
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class GoalsFile:
 
     @property
     def scenario_ids(self) -> tuple[str, ...]:
-        """Scenarios that have goals, in the order of their first ones."""
+        """Scenarios that have goals, in the order of first mention."""
         return tuple(dict.fromkeys(entry.scenario_id for entry in self.goals))
 
     def of_scenario(self, scenario_id: str) -> tuple[GoalEntry, ...]:
@@ -69,10 +69,10 @@ def read_goals(path: Path) -> GoalsFile:
     """Read and check a goals file. `goals.placement` checks it against the scenarios.
 
     Raises:
-        DataError: the file is missing or not JSON, or an entry is wrong: names file, entry and field.
+        DataError: The file is missing or not JSON, or an entry is wrong; the message names file, entry and field.
     """
     try:
-        return _check_goals(read_json(path, _WAY_OUT, expected=object, allow_nan=True), str(path))
+        return _parse_goals(read_json(path, _WAY_OUT, expected=object, allow_nan=True), str(path))
     except FileNotFoundError:
         raise DataError(f"{path}: no such goals file: make one with `rlftsim goals propose`.") from None
 
@@ -81,49 +81,48 @@ def parse_goals(text: str, path: str) -> GoalsFile:
     """Goals of the text of a goals file.
 
     Args:
-        text: its content.
-        path: name of the file, for messages.
+        text: Content of the file, a JSON object.
+        path: Name of the file, for messages.
 
     Raises:
-        DataError: not JSON, or an entry is wrong: names file, entry and field.
+        DataError: Not JSON, or an entry is wrong; the message names file, entry and field.
     """
-    # numbers that are not finite pass, to be refused with their place
-    return _check_goals(parse_json(text, _WAY_OUT, source=path, expected=object, allow_nan=True), path)
+    # numbers that are not finite pass, to be refused with their location
+    return _parse_goals(parse_json(text, _WAY_OUT, source=path, expected=object, allow_nan=True), path)
 
 
-def _check_goals(about: object, path: str) -> GoalsFile:
-    if not isinstance(about, dict) or about.get("format") != FORMAT:
+def _parse_goals(content: object, path: str) -> GoalsFile:
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise DataError(f'{path}: not a goals file of this version: it must be an object with "format": "{FORMAT}".')
-    _refuse_unknown(about, ("format", *SECTIONS), f"{path}")
+    _check_fields(content, ("format", *SECTIONS), path)
     sections: list[tuple[GoalEntry, ...]] = []
     for section in SECTIONS:
-        found, place = about.get(section, []), f"{path}: {section}"
-        if not isinstance(found, list):
-            raise DataError(f"{place}: must be a list of goals, is {describe_kind(found)}.")
-        sections.append(tuple(_entry(one, f"{place}[{number}]") for number, one in enumerate(found)))
-    refuse_twice(sections[0])
+        entries, location = content.get(section, []), f"{path}: {section}"
+        if not isinstance(entries, list):
+            raise DataError(f"{location}: must be a list of goals, is {describe_kind(entries)}.")
+        sections.append(tuple(_parse_entry(entry, f"{location}[{number}]") for number, entry in enumerate(entries)))
+    check_single_goals(sections[0])
     return GoalsFile(*sections)
 
 
 def write_goals(path: Path, file: GoalsFile) -> None:
-    """Write a goals file, one entry a line, atomically.
+    """Write a goals file, an entry per line, atomically.
 
     Args:
-        path: the file; replaced if it exists.
-        file: goals and alternatives; coordinates are rounded to 1 mm.
+        path: File to write; an existing file is replaced.
+        file: Goals and alternatives; coordinates are rounded to 1 mm.
 
     Raises:
-        DataError: it cannot be written.
+        DataError: The file cannot be written.
     """
-    sections = {"goals": file.goals, "alternatives": file.alternatives}
     lines = [f' "format": "{FORMAT}"']
-    for name, entries in sections.items():
-        plain = (
+    for name, entries in zip(SECTIONS, (file.goals, file.alternatives)):
+        rows = (
             {"scenario": entry.scenario_id, "agent": entry.agent_id, "x": round(entry.x, 3), "y": round(entry.y, 3)}
             | ({"label": entry.label} if entry.label else {})
             for entry in entries
         )
-        body = ",\n".join(f"  {json.dumps(entry)}" for entry in plain)
+        body = ",\n".join(f"  {json.dumps(row)}" for row in rows)
         lines.append(f' "{name}": [{f"{chr(10)}{body}{chr(10)} " if body else ""}]')
     write_text(path, "{\n" + ",\n".join(lines) + "\n}\n")
 
@@ -132,13 +131,13 @@ def parse_goal(text: str, scenario_id: str) -> GoalEntry:
     """Goal of a command line, written AGENT=X,Y.
 
     Args:
-        text: such as "12=1034.5,-188.0": object id, then x and y in m, world frame.
-        scenario_id: the scenario that it is meant for.
+        text: Object id, then x and y in m, world frame, such as "12=1034.5,-188.0".
+        scenario_id: Scenario that the goal belongs to.
 
     Raises:
-        DataError: it is written otherwise, or a number is not finite.
+        DataError: The text is written otherwise, or a number is not finite.
     """
-    place = f"--goal {text}"
+    location = f"--goal {text}"
     agent, equals, point = text.partition("=")
     x, comma, y = point.partition(",")
     try:
@@ -146,63 +145,63 @@ def parse_goal(text: str, scenario_id: str) -> GoalEntry:
     except ValueError:
         numbers = {}
     if not (equals and comma and numbers):
-        raise DataError(f"{place}: not AGENT=X,Y: write for example --goal 12=1034.5,-188.0.")
-    return _entry({"scenario": scenario_id, **numbers}, place)
+        raise DataError(f"{location}: not AGENT=X,Y: write for example --goal 12=1034.5,-188.0.")
+    return _parse_entry({"scenario": scenario_id, **numbers}, location)
 
 
-def refuse_twice(entries: Sequence[GoalEntry]) -> None:
+def check_single_goals(entries: Sequence[GoalEntry]) -> None:
     """Check that no agent has two goals.
 
     Raises:
-        DataError: one has: names both entries.
+        DataError: An agent has two; the message names both entries.
     """
-    first: dict[tuple[str, int], GoalEntry] = {}
+    first_entries: dict[tuple[str, int], GoalEntry] = {}
     for entry in entries:
-        other = first.setdefault((entry.scenario_id, entry.agent_id), entry)
-        if other is not entry:
+        first_entry = first_entries.setdefault((entry.scenario_id, entry.agent_id), entry)
+        if first_entry is not entry:
             raise DataError(
-                f"{entry}: agent {entry.agent_id} of scenario {entry.scenario_id} has a goal already ({other}): keep "
-                'one of them; in a file the other may go to "alternatives".'
+                f"{entry}: agent {entry.agent_id} of scenario {entry.scenario_id} has a goal already ({first_entry}): "
+                'keep one of them; in a file the other may go to "alternatives".'
             )
 
 
-def _entry(found: object, place: str) -> GoalEntry:
-    if not isinstance(found, dict):
-        raise DataError(f'{place}: must be an object such as {{"scenario": ..., "agent": ..., "x": ..., "y": ...}}.')
-    _refuse_unknown(found, FIELDS, place)
-    missing = [name for name in FIELDS[:-1] if name not in found]
-    if missing:
-        raise DataError(f"{place}: {', '.join(missing)} missing: a goal needs scenario, agent, x and y.")
+def _parse_entry(entry: object, location: str) -> GoalEntry:
+    if not isinstance(entry, dict):
+        raise DataError(f'{location}: must be an object such as {{"scenario": ..., "agent": ..., "x": ..., "y": ...}}.')
+    _check_fields(entry, FIELDS, location)
+    missing_fields = [name for name in FIELDS[:-1] if name not in entry]
+    if missing_fields:
+        raise DataError(f"{location}: {', '.join(missing_fields)} missing: a goal needs scenario, agent, x and y.")
     for name in ("scenario", "label"):
-        if not isinstance(found.get(name, ""), str):
-            raise DataError(f"{place}: {name} must be text in quotes, is {describe_kind(found[name])}.")
-        for character in found.get(name, ""):
-            unshowable = UNSHOWABLE.get(unicodedata.category(character))
-            if unshowable:
-                raise DataError(
-                    f"{place}: {name} has {unshowable}, U+{ord(character):04X}, that cannot be shown: write it without."
-                )
+        if not isinstance(entry.get(name, ""), str):
+            raise DataError(f"{location}: {name} must be text in quotes, is {describe_kind(entry[name])}.")
+        for character in entry.get(name, ""):
+            category = UNSHOWABLE.get(unicodedata.category(character))
+            if category:
+                code = f"U+{ord(character):04X}"
+                raise DataError(f"{location}: {name} has {category}, {code}, that cannot be shown: write it without.")
     # bool is a subclass of int: `true` is refused first.
-    if isinstance(found["agent"], bool) or not isinstance(found["agent"], int):
-        shown = found["agent"] if isinstance(found["agent"], float) else describe_kind(found["agent"])
-        raise DataError(f"{place}: agent must be a whole number, an object id of the log, is {shown}.")
-    if not -(2**63) <= found["agent"] < 2**63:
-        raise DataError(f"{place}: agent {found['agent']} is no object id, which have 64 bits.")
-    x, y = (_coordinate(found[name], f"{place}: {name}") for name in ("x", "y"))
-    return GoalEntry(found["scenario"], found["agent"], x, y, found.get("label", ""), place)
+    agent = entry["agent"]
+    if isinstance(agent, bool) or not isinstance(agent, int):
+        value = agent if isinstance(agent, float) else describe_kind(agent)
+        raise DataError(f"{location}: agent must be a whole number, an object id of the log, is {value}.")
+    if not -(2**63) <= agent < 2**63:
+        raise DataError(f"{location}: agent {agent} is no object id, which have 64 bits.")
+    x, y = (_parse_coordinate(entry[name], f"{location}: {name}") for name in ("x", "y"))
+    return GoalEntry(entry["scenario"], agent, x, y, entry.get("label", ""), location)
 
 
-def _coordinate(value: object, place: str) -> float:
+def _parse_coordinate(value: object, location: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise DataError(f"{place} must be a number of meters, is {describe_kind(value)}.")
+        raise DataError(f"{location} must be a number of meters, is {describe_kind(value)}.")
     if not math.isfinite(value):
-        raise DataError(f"{place} is {value}: a goal needs a finite point, meters in the world frame of the log.")
+        raise DataError(f"{location} is {value}: a goal needs a finite point, meters in the world frame of the log.")
     return float(value)
 
 
-def _refuse_unknown(found: Mapping[str, Any], known: Sequence[str], place: str) -> None:
-    for name in found:
-        if name not in known:
-            near = difflib.get_close_matches(name, known, 1)
-            hint = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(known)}."
-            raise DataError(f"{place}: no field {in_short(name)} here: {hint}")
+def _check_fields(json_object: Mapping[str, Any], fields: Sequence[str], location: str) -> None:
+    for name in json_object:
+        if name not in fields:
+            matches = difflib.get_close_matches(name, fields, 1)
+            hint = f"did you mean {matches[0]!r}?" if matches else f"known are {', '.join(fields)}."
+            raise DataError(f"{location}: no field {in_short(name)} here: {hint}")

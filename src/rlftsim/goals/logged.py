@@ -27,27 +27,27 @@ def logged_endpoints(batch: ScenarioBatch) -> LoggedEndpoints:
     """Last logged states of the agents of a batch; without logged futures `mask` is False everywhere."""
     valid = batch.valid[:, :, CURRENT_STEP : CURRENT_STEP + 1 + FUTURE_STEPS]  # [B, A, 81] or shorter
     # [B, A], steps after the current one; 0 = never logged in the future
-    last = (valid * torch.arange(valid.shape[2], device=valid.device)).amax(-1)
-    step = CURRENT_STEP + last
+    num_steps = (valid * torch.arange(valid.shape[2], device=valid.device)).amax(-1)
+    step = CURRENT_STEP + num_steps
     return LoggedEndpoints(
-        position=_at(batch.position, step),
-        heading=_at(batch.heading[..., None], step)[..., 0],
-        horizon_s=last * STEP_S,
-        mask=batch.agent_mask & (last > 0),
+        position=_select_step(batch.position, step),
+        heading=_select_step(batch.heading[..., None], step)[..., 0],
+        horizon_s=num_steps * STEP_S,
+        mask=batch.agent_mask & (num_steps > 0),
     )
 
 
-def logged_goals(batch: ScenarioBatch, chosen: Bool[Tensor, "B A"] | None = None) -> Goals:
-    """Each agent's last logged position as its goal, for a single rollout (`Goals.repeat` expands it to N).
+def logged_goals(batch: ScenarioBatch, agent_mask: Bool[Tensor, "B A"] | None = None) -> Goals:
+    """Each agent's last logged position as a goal, for a single rollout (`Goals.repeat` expands the goals to N).
 
     Args:
-        batch: scenarios with futures.
-        chosen: True = the agent gets a goal; None = every agent that has a logged future.
+        batch: Scenarios with logged futures; agents without a future get no goal.
+        agent_mask: True = the agent gets a goal; None = every agent with a logged future does.
     """
     ends = logged_endpoints(batch)
-    return Goals.of_scenarios(ends.position, ends.mask if chosen is None else ends.mask & chosen, batch.frame)
+    return Goals.of_scenarios(ends.position, ends.mask if agent_mask is None else ends.mask & agent_mask, batch.frame)
 
 
-def _at(values: Float[Tensor, "B A S k"], step: Int64[Tensor, "B A"]) -> Float[Tensor, "B A k"]:
+def _select_step(values: Float[Tensor, "B A S k"], step: Int64[Tensor, "B A"]) -> Float[Tensor, "B A k"]:
     index = step[..., None, None].expand(-1, -1, 1, values.shape[-1])  # [B, A, 1, k]
     return values.gather(2, index)[:, :, 0]

@@ -1,4 +1,4 @@
-"""Goals of a file placed into scenarios: impossible ones are refused, doubtful ones get a warning."""
+"""Goals of a file placed into scenarios: impossible goals are refused, doubtful goals get a warning."""
 
 from collections.abc import Sequence
 
@@ -15,19 +15,19 @@ from rlftsim.scenario.types import CURRENT_STEP, HISTORY_STEPS, ObjectType, Scen
 FASTEST_MPS = 60.0
 """A goal that takes a higher average speed is refused."""
 TOP_MPS = {ObjectType.PEDESTRIAN: 2.5, ObjectType.CYCLIST: 8.0}
-"""Speeds that few of these exceed; vehicles are bounded by their acceleration."""
+"""Speeds that few pedestrians and cyclists exceed; vehicles are bounded by acceleration."""
 STANDING_MPS = 0.3
 
 
-def track_of(entry: GoalEntry, scenario: Scenario) -> int:
-    """Track of the agent that an entry gives a goal.
+def find_track(entry: GoalEntry, scenario: Scenario) -> int:
+    """Index of the track of the agent that an entry gives a goal.
 
     Args:
-        entry: a goal in this scenario.
-        scenario: its scenario.
+        entry: Goal of an agent in this scenario.
+        scenario: Scenario of the entry, with the agent's current position.
 
     Raises:
-        DataError: there is no such agent, it is not simulated, or the goal is farther than anything drives.
+        DataError: No such agent, or an agent that is not simulated, or a goal out of reach of any vehicle.
     """
     track = simulated_track(scenario, entry.agent_id, str(entry))
     distance = distance_m(entry, scenario, track)
@@ -44,9 +44,9 @@ def distance_m(entry: GoalEntry, scenario: Scenario, track: int) -> float:
     """Distance from an agent's current position to a goal, m.
 
     Args:
-        entry: the goal.
-        scenario: its scenario.
-        track: index of the agent's track.
+        entry: Goal of the agent, world frame.
+        scenario: Scenario of the entry, with the agent's current position.
+        track: Index of the agent's track in the scenario.
     """
     x, y = scenario.tracks.position[track, CURRENT_STEP, :2].astype(np.float64)
     return float(np.hypot(entry.x - x, entry.y - y))
@@ -56,53 +56,53 @@ def goal_warnings(entry: GoalEntry, scenario: Scenario) -> tuple[str, ...]:
     """Reasons to expect that a goal will not be followed as meant, a line each; empty for an ordinary goal.
 
     Args:
-        entry: a goal in this scenario.
-        scenario: its scenario.
+        entry: Goal of an agent in this scenario.
+        scenario: Scenario of the entry, with the agent's history.
 
     Raises:
-        DataError: the goal is impossible, see `track_of`.
+        DataError: The goal is impossible by the rules of `find_track`.
     """
-    track = track_of(entry, scenario)
+    track = find_track(entry, scenario)
     tracks, distance = scenario.tracks, distance_m(entry, scenario, track)
-    kind = ObjectType(int(tracks.object_type[track]))
+    agent_type = ObjectType(int(tracks.object_type[track]))
     speeds = np.linalg.norm(tracks.velocity[track, :HISTORY_STEPS], axis=-1)  # [11], m/s
     speed = float(speeds[CURRENT_STEP])
-    agent = f"{entry}: agent {entry.agent_id} ({kind.name.lower()}, {speed:.1f} m/s)"
-    found = []
+    agent = f"{entry}: agent {entry.agent_id} ({agent_type.name.lower()}, {speed:.1f} m/s)"
+    warnings = []
     if distance <= NEAR_M:
-        found.append(
+        warnings.append(
             f"{agent} is within {NEAR_M:g} m of its goal already: it counts as passed whatever the agent does."
         )
     # The whole history of 1.1 s counts, not the current step alone: an agent that has just stopped is not parked.
     elif speeds[tracks.valid[track, :HISTORY_STEPS]].max() < STANDING_MPS:
-        found.append(
+        warnings.append(
             f"{agent} stands still, perhaps parked, and its goal is {distance:.0f} m away: it may stay, or set off "
             "unlike any parked vehicle in the data."
         )
     # Mean speed under brisk constant acceleration; an agent that is faster already may stay so.
-    top = max(speed, TOP_MPS.get(kind, speed + BRISK.acceleration_mps2 * HORIZON_S / 2))
-    if distance > top * HORIZON_S + NEAR_M:
-        found.append(
+    top_speed = max(speed, TOP_MPS.get(agent_type, speed + BRISK.acceleration_mps2 * HORIZON_S / 2))
+    if distance > top_speed * HORIZON_S + NEAR_M:
+        warnings.append(
             f"{agent} would need {distance / HORIZON_S:.1f} m/s on average to get to its goal {distance:.0f} m away: "
             "it will most likely stop short of it."
         )
-    return tuple(found)
+    return tuple(warnings)
 
 
 def goals_of_batch(entries: Sequence[GoalEntry], batch: ScenarioBatch) -> Goals:
     """Goals that some entries give to the agents of a batch, for a single rollout, in the frame of the batch.
 
     Args:
-        entries: goals, at most one for each agent; those of other scenarios are ignored.
-        batch: the scenarios.
+        entries: Goals, at most one for each agent; goals in further scenarios are ignored.
+        batch: Scenarios whose agents get the goals.
 
     Raises:
-        DataError: an entry of one of these scenarios is impossible, see `track_of`.
+        DataError: An entry of a scenario in the batch is impossible by the rules of `find_track`.
     """
     points = {}
     for scenario in batch.scenarios:
-        own = [entry for entry in entries if entry.scenario_id == scenario.scenario_id]
-        ids = [scenario.tracks.object_id[track_of(entry, scenario)] for entry in own]
-        places = [(entry.x, entry.y) for entry in own]
-        points[scenario.scenario_id] = np.array(ids, np.int64), np.array(places, np.float64).reshape(-1, 2)
+        scenario_entries = [entry for entry in entries if entry.scenario_id == scenario.scenario_id]
+        ids = [scenario.tracks.object_id[find_track(entry, scenario)] for entry in scenario_entries]
+        positions = np.array([(entry.x, entry.y) for entry in scenario_entries], np.float64).reshape(-1, 2)
+        points[scenario.scenario_id] = np.array(ids, np.int64), positions
     return goals_at(points, batch)

@@ -23,12 +23,12 @@ from rlftsim.scenario.shards import hash_file
 SCHEMA = pa.schema([("scenario_id", pa.string()), ("object_id", pa.int64()), ("x", pa.float64()), ("y", pa.float64())])
 
 
-def write_goal_part(path: Path, goals: Mapping[str, Points]) -> None:
-    """Write one file of such a folder, atomically.
+def write_goal_file(path: Path, goals: Mapping[str, Points]) -> None:
+    """Write a file of such a folder, atomically.
 
     Args:
-        path: the file; a folder's files are read in the order of their names.
-        goals: object ids and points by scenario id.
+        path: File to write; the files of a folder are read in the order of names.
+        goals: Object ids and points by scenario id, world frame, m.
     """
     columns = {
         "scenario_id": np.repeat(list(goals), [len(ids) for ids, _ in goals.values()]),
@@ -56,7 +56,7 @@ class StoredGoals:
     """The goals of a folder, by scenario id.
 
     Raises:
-        DataError: it has no goals, a file is damaged, or a row is not a goal.
+        DataError: The folder has no goals, a file is damaged, or a row is not a goal.
     """
 
     def __init__(self, folder: Path):
@@ -83,21 +83,21 @@ class StoredGoals:
 
     @cached_property
     def fingerprint(self) -> str:
-        """Hash of the files' bytes, in the order of their names."""
+        """Hash of the files' bytes, in the order of names."""
         return hashlib.sha256("".join(map(hash_file, self._files)).encode()).hexdigest()
 
     def count_among(self, scenario_ids: Iterable[str]) -> int:
-        """Number of the given scenarios that have goals here; 0 if they are of another data set."""
+        """Number of the listed scenarios that have goals here; 0 for scenarios of a different data set."""
         return sum(scenario_id in self for scenario_id in scenario_ids)
 
     def of_scenario(self, scenario_id: str) -> Points:
-        """Object ids and goals of one of the scenarios."""
+        """Object ids and goals of a scenario that has goals."""
         rows = self._rows[scenario_id]
-        part = self._table.slice(rows.start, rows.stop - rows.start)
-        ids, x, y = (part[name].to_numpy() for name in ("object_id", "x", "y"))
+        table = self._table.slice(rows.start, rows.stop - rows.start)
+        ids, x, y = (table[name].to_numpy() for name in ("object_id", "x", "y"))
         return ids, np.stack([x, y], -1)
 
     def of_batch(self, batch: ScenarioBatch) -> Goals:
-        """Goals of a batch, for a single rollout, in its frame; scenarios that are not in the folder have none."""
+        """Goals of a batch, for a single rollout, in the batch's frame; scenarios outside the folder have no goals."""
         ids = [scenario.scenario_id for scenario in batch.scenarios if scenario.scenario_id in self]
         return goals_at({scenario_id: self.of_scenario(scenario_id) for scenario_id in ids}, batch)

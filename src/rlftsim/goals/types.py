@@ -15,12 +15,12 @@ from rlftsim.scenario.batch import Frame, ScenarioBatch, origin_of
 from rlftsim.scenario.types import Scenario
 
 Points = tuple[Int64[np.ndarray, "n"], Float[np.ndarray, "n 2"]]
-"""Object ids, each once, and a point of each. Frame: world, m, float64."""
+"""Distinct object ids, and a point for each. Frame: world, m, float64."""
 
 PointById = Mapping[int | np.integer, Sequence[float | int] | np.ndarray]
 """Object id -> (x, y). Frame: world, m."""
 
-LISTED = 12
+MAX_LISTED_IDS = 12
 """Object ids that an error message lists at most."""
 
 
@@ -42,9 +42,9 @@ class Goals:
         """Goals of a single rollout (N = 1); `repeat` expands them to N.
 
         Args:
-            position: goal of each agent, m.
+            position: Goal of each agent, m.
             goal_mask: True = the agent has a goal.
-            frame: of the positions.
+            frame: Frame of the positions, that of the batch.
         """
         return cls(position[:, None], goal_mask[:, None], frame)
 
@@ -53,13 +53,13 @@ class Goals:
         """Goals of agents addressed by object id, for a single rollout.
 
         Args:
-            batch: the scenarios; agents that are not named have no goal.
-            points: `{scenario_id: {object_id: (x, y)}}`, or `{object_id: (x, y)}` for a batch of one scenario. World
-                frame, m.
+            batch: Scenarios of the agents; agents that are not named have no goal.
+            points: `{scenario_id: {object_id: (x, y)}}`, or `{object_id: (x, y)}` for a batch of a single scenario.
+                World frame, m.
 
         Raises:
-            ConfigError: object ids without a scenario id for several scenarios, or a scenario that is not in the batch.
-            DataError: an agent that the scenario lacks or does not simulate, or a point that is not two finite numbers.
+            ConfigError: Object ids without a scenario id for several scenarios, or a scenario that is not in the batch.
+            DataError: An agent that the scenario lacks or does not simulate, or a point that is not two finite numbers.
         """
         ids = [scenario.scenario_id for scenario in batch.scenarios]
         by_scenario: dict[str, PointById] = {
@@ -72,18 +72,20 @@ class Goals:
                     "{scenario_id: {object_id: (x, y)}}."
                 )
             by_scenario = {ids[0]: cast(PointById, points)}
-        missing = [key for key in by_scenario if key not in ids]
-        if missing:
-            raise ConfigError(f"goals name scenario {missing[0]!r}, which is not in the batch: it has {_listed(ids)}.")
-        found: dict[str, Points] = {}
+        missing_ids = [key for key in by_scenario if key not in ids]
+        if missing_ids:
+            raise ConfigError(
+                f"goals name scenario {missing_ids[0]!r}, which is not in the batch: it has {_join_ids(ids)}."
+            )
+        arrays: dict[str, Points] = {}
         for scenario in batch.scenarios:
-            named = by_scenario.get(scenario.scenario_id, {})
-            for object_id, point in named.items():
+            point_by_id = by_scenario.get(scenario.scenario_id, {})
+            for object_id, point in point_by_id.items():
                 simulated_track(scenario, object_id, "goals")
-                _refuse_no_point(point, f"goal of agent {object_id} in scenario {scenario.scenario_id}")
-            positions = np.array([tuple(point) for point in named.values()], np.float64).reshape(-1, 2)
-            found[scenario.scenario_id] = np.array(list(named), np.int64), positions
-        return goals_at(found, batch)
+                _check_point(point, f"goal of agent {object_id} in scenario {scenario.scenario_id}")
+            positions = np.array([tuple(point) for point in point_by_id.values()], np.float64).reshape(-1, 2)
+            arrays[scenario.scenario_id] = np.array(list(point_by_id), np.int64), positions
+        return goals_at(arrays, batch)
 
     @property
     def num_rollouts(self) -> int:
@@ -96,14 +98,14 @@ class Goals:
         return bool(self.goal_mask.any())
 
     def rollouts(self, selected: slice) -> "Goals":
-        """The goals of some of the rollouts."""
+        """The goals of the selected rollouts."""
         return replace(self, position=self.position[:, selected], goal_mask=self.goal_mask[:, selected])
 
     def repeat(self, num_rollouts: int) -> "Goals":
-        """The goals of a single rollout expanded to N, without copies; goals of N rollouts as they are.
+        """The goals of a single rollout expanded to N, without copies; goals of N rollouts unchanged.
 
         Raises:
-            ConfigError: they are of another number of rollouts.
+            ConfigError: The number of rollouts is neither 1 nor N.
         """
         if self.num_rollouts not in (1, num_rollouts):
             raise ConfigError(
@@ -116,16 +118,16 @@ class Goals:
             goal_mask=self.goal_mask.expand(-1, num_rollouts, -1),
         )
 
-    def only(self, chosen: Bool[Tensor, "B #N A"]) -> "Goals":
-        """The same goals, masked to the chosen agents."""
-        return replace(self, goal_mask=self.goal_mask & chosen)
+    def only(self, mask: Bool[Tensor, "B #N A"]) -> "Goals":
+        """The same goals for the masked agents alone; the goals of all other agents are dropped."""
+        return replace(self, goal_mask=self.goal_mask & mask)
 
     def where(self, condition: Bool[Tensor, "B N A"], other: "Goals") -> "Goals":
-        """These goals where a condition is True, other ones elsewhere, like `torch.where`.
+        """These goals where a condition is True, the goals of `other` elsewhere, like `torch.where`.
 
         Args:
-            condition: True = keep this goal (or none, if there is none here).
-            other: goals of the same shape, in the same frame.
+            condition: True = keep the goal, or the lack of a goal.
+            other: Goals of the same shape, in the same frame.
         """
         return replace(
             self,
@@ -134,7 +136,7 @@ class Goals:
         )
 
     def to(self, device: torch.device | str) -> "Goals":
-        """The same goals on another device."""
+        """The same goals on a device."""
         return replace(self, position=self.position.to(device), goal_mask=self.goal_mask.to(device))
 
     def __repr__(self) -> str:
@@ -151,65 +153,66 @@ def goals_at(points: Mapping[str, Points], batch: ScenarioBatch) -> Goals:
     """World-frame points as goals of a batch, for a single rollout, in the batch's frame.
 
     Args:
-        points: by scenario id; those of agents that are not simulated are left out silently (`Goals.from_points`
-            refuses them).
-        batch: scenarios and agents that have no point have no goal.
+        points: Object ids and points by scenario id; agents that are not simulated are left out silently
+            (`Goals.from_points` raises instead).
+        batch: Scenarios of the agents; scenarios and agents without a point have no goal.
     """
     mask = np.zeros(batch.agent_mask.shape, bool)  # [B, A]
     position = np.zeros((*mask.shape, 2), np.float32)  # [B, A, 2]
     for row, scenario in enumerate(batch.scenarios):
         if scenario.scenario_id in points:
-            ids, places = points[scenario.scenario_id]
-            simulated = scenario.tracks.object_id[scenario.simulated_indices]
-            _, agents, given = np.intersect1d(simulated, ids, return_indices=True)
+            ids, world_points = points[scenario.scenario_id]
+            simulated_ids = scenario.tracks.object_id[scenario.simulated_indices]
+            _, agents, entries = np.intersect1d(simulated_ids, ids, return_indices=True)
             mask[row, agents] = True
-            # The origin is subtracted in float64: world coordinates may be kilometers, where float32 has steps of 0.5
-            # mm.
-            position[row, agents] = places[given] - origin_of(scenario, batch.frame)
+            # The origin is subtracted in float64: float32 has steps of 0.5 mm at world coordinates of kilometers.
+            position[row, agents] = world_points[entries] - origin_of(scenario, batch.frame)
     return Goals.of_scenarios(torch.from_numpy(position), torch.from_numpy(mask), batch.frame).to(batch.device)
 
 
 def shown_id(object_id: object) -> str:
-    """An object id for an error message; one that is not a whole number, such as the text "9", is marked."""
+    """An object id for an error message; an id that is not a whole number, such as the text "9", is marked."""
     return str(object_id) if isinstance(object_id, int | np.integer) else f"{object_id!r} (ids are whole numbers)"
 
 
-def simulated_track(scenario: Scenario, object_id: object, place: str) -> int:
+def simulated_track(scenario: Scenario, object_id: object, location: str) -> int:
     """Index of the track of a simulated agent.
 
     Args:
-        scenario: the agent's scenario.
-        object_id: the id it has in the log.
-        place: start of the error message, such as a file and an entry.
+        scenario: Scenario of the agent.
+        object_id: Id of the agent in the log.
+        location: Start of the error message, such as a file and an entry.
 
     Raises:
-        DataError: there is no such agent, or it is not simulated.
+        DataError: No such agent, or an agent that is not simulated.
     """
     tracks, simulated = scenario.tracks, scenario.simulated_indices
-    found = np.flatnonzero(tracks.object_id == object_id)
-    if not len(found):
+    rows = np.flatnonzero(tracks.object_id == object_id)
+    if not len(rows):
         ids = sorted(tracks.object_id[simulated].tolist())
         raise DataError(
-            f"{place}: scenario {scenario.scenario_id} has no agent {shown_id(object_id)}: it simulates {len(ids)} "
-            f"agents: {_listed(ids)}."
+            f"{location}: scenario {scenario.scenario_id} has no agent {shown_id(object_id)}: it simulates {len(ids)} "
+            f"agents: {_join_ids(ids)}."
         )
-    if found[0] not in simulated:
+    if rows[0] not in simulated:
         raise DataError(
-            f"{place}: agent {object_id} is not there at the current step of scenario {scenario.scenario_id}, so it is "
-            "not simulated: choose another one."
+            f"{location}: agent {object_id} is not there at the current step of scenario {scenario.scenario_id}, so it "
+            "is not simulated: choose another one."
         )
-    return int(found[0])
+    return int(rows[0])
 
 
-def _refuse_no_point(point: object, place: str) -> None:
+def _check_point(point: object, location: str) -> None:
     try:
         x, y = point  # type: ignore[misc]
-        finite = math.isfinite(x) and math.isfinite(y)
+        is_finite = math.isfinite(x) and math.isfinite(y)
     except (TypeError, ValueError):
-        finite = False
-    if not finite:
-        raise DataError(f"{place}: {point!r} is not a point: give (x, y), finite, in m, in the world frame of the log.")
+        is_finite = False
+    if not is_finite:
+        raise DataError(
+            f"{location}: {point!r} is not a point: give (x, y), finite, in m, in the world frame of the log."
+        )
 
 
-def _listed(ids: list[str] | list[int]) -> str:
-    return ", ".join(str(i) for i in ids[:LISTED]) + (", ..." if len(ids) > LISTED else "")
+def _join_ids(ids: list[str] | list[int]) -> str:
+    return ", ".join(str(i) for i in ids[:MAX_LISTED_IDS]) + (", ..." if len(ids) > MAX_LISTED_IDS else "")

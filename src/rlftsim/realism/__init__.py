@@ -18,13 +18,7 @@ from rlftsim.realism.config import (
     metric_by_name,
 )
 from rlftsim.realism.credit import Credit, compute_credit, compute_single_credit
-from rlftsim.realism.features import (
-    ComputeConfig,
-    Features,
-    ScenarioLog,
-    compute_features,
-    scenario_log,
-)
+from rlftsim.realism.features import ComputeConfig, Features, ScenarioLog, compute_features, scenario_log
 from rlftsim.realism.meta_metric import RealismResult, score, score_features
 
 __all__ = [

@@ -20,58 +20,55 @@ from rlftsim.realism.likelihood import compute_outcomes
 
 @dataclass(frozen=True, eq=False)
 class AgentScores:
-    """Parts of A agents in the scores of N distinct rollouts of B scenarios; their sum is the rollout's score."""
+    """Shares of A agents in the scores of N distinct rollouts of B scenarios; the shares sum to the rollout's score."""
 
-    measured: tuple[ScenarioFeatures, ...]
+    features: tuple[ScenarioFeatures, ...]
     config: MetricConfig
     num_agents: int
     """A, padding included."""
 
     @cached_property
     def leave_one_out(self) -> Float64[Tensor, "B N A"]:
-        """Parts of mean_j RMM(-j) - RMM(-i), the reward `mloo`; see `Credit.mloo`. Their sum over rollouts is zero."""
-        return self._place(lambda item: compute_credit(item.log, item.features, self.config).mloo.sum(-1))
+        """Shares of mean_j RMM(-j) - RMM(-i), the reward `mloo`; see `Credit.mloo`. The sum over rollouts is zero."""
+        return self._scatter(lambda scene: compute_credit(scene.log, scene.features, self.config).mloo.sum(-1))
 
     @cached_property
     def single(self) -> Float64[Tensor, "B N A"]:
-        """Parts of RMM_i - mean_{j != i} RMM_j, the reward `rloo`; see `compute_single_credit`."""
-        return self._place(lambda item: compute_single_credit(item.log, item.features, self.config).sum(-1))
+        """Shares of RMM_i - mean_{j != i} RMM_j, the reward `rloo`; see `compute_single_credit`."""
+        return self._scatter(lambda scene: compute_single_credit(scene.log, scene.features, self.config).sum(-1))
 
     @cached_property
     def displacement_error(self) -> Float[Tensor, "B N A"]:
-        """Parts of `RealismResult.rollout_displacement_error`, m: an agent's own error over the number of agents E."""
-        return self._place(lambda item: item.features.displacement_error / _num_evaluated(item))
+        """Shares of `RealismResult.rollout_displacement_error`, m: an agent's error over the number of agents E."""
+        return self._scatter_mean(lambda scene: scene.features.displacement_error)
 
     @cached_property
     def collision(self) -> Float[Tensor, "B N A"]:
-        """Parts of `RealismResult.rollout_collision_rate`: 1 / E for each evaluated agent that collides."""
-        return self._place(lambda item: _part_of_rate(item, 0))
+        """Shares of `RealismResult.rollout_collision_rate`: 1 / E for each evaluated agent that collides."""
+        return self._scatter_mean(lambda scene: compute_outcomes(scene.features, scene.log)[:, 0].float())
 
     @cached_property
     def offroad(self) -> Float[Tensor, "B N A"]:
-        """Parts of `RealismResult.rollout_offroad_rate`: 1 / E for each evaluated agent that leaves the road."""
-        return self._place(lambda item: _part_of_rate(item, 1))
+        """Shares of `RealismResult.rollout_offroad_rate`: 1 / E for each evaluated agent that leaves the road."""
+        return self._scatter_mean(lambda scene: compute_outcomes(scene.features, scene.log)[:, 1].float())
 
-    def _place(self, compute: Callable[[ScenarioFeatures], Tensor]) -> Tensor:
-        """Values [N, E] of each scenario's evaluated agents, scattered to their places in the batch: [B, N, A]."""
+    def _scatter_mean(self, compute: Callable[[ScenarioFeatures], Tensor]) -> Tensor:
+        """Values [N, E] over the number of evaluated agents in each scenario, scattered as by `_scatter`."""
+
+        def divide(scene: ScenarioFeatures) -> Tensor:
+            values, layout = compute(scene), scene.log.agents.layout
+            return values / to_agents(sum_over_agents(torch.ones_like(values[0]), layout), layout)
+
+        return self._scatter(divide)
+
+    def _scatter(self, compute: Callable[[ScenarioFeatures], Tensor]) -> Tensor:
+        """Values [N, E] of each scenario's evaluated agents, scattered to the agent axis of the batch: [B, N, A]."""
         rows = []
-        for item in self.measured:
-            values, agents, place = compute(item), item.log.agents, item.log.agents.evaluated
-            if agents.layout is not None:
-                # From places among the agents of all scenarios to those in the padded batch.
-                scenario = agents.layout.scenario
-                place = place - agents.layout.first_agent[scenario] + scenario * self.num_agents
-            row = values.new_zeros(len(values), len(item.log.scenario_ids) * self.num_agents)
-            rows.append(row.index_copy(1, place, values).view(len(values), -1, self.num_agents))
+        for scene in self.features:
+            values, layout, index = compute(scene), scene.log.agents.layout, scene.log.agents.evaluated
+            if layout is not None:
+                # From the index among the agents of all scenarios to that in the padded batch.
+                index = index - layout.first_agent[layout.scenario] + layout.scenario * self.num_agents
+            row = values.new_zeros(len(values), len(scene.log.scenario_ids) * self.num_agents)
+            rows.append(row.index_copy(1, index, values).view(len(values), -1, self.num_agents))
         return torch.cat(rows, 1).transpose(0, 1)
-
-
-def _part_of_rate(item: ScenarioFeatures, outcome: int) -> Float[Tensor, "N E"]:
-    """Part of each evaluated agent in the rate of an outcome (index into `BERNOULLI_FEATURES`)."""
-    return compute_outcomes(item.features, item.log)[:, outcome].float() / _num_evaluated(item)
-
-
-def _num_evaluated(item: ScenarioFeatures) -> Float[Tensor, "E_or_1"]:
-    """Number of evaluated agents of each agent's scenario."""
-    layout, ones = item.log.agents.layout, torch.ones_like(item.features.displacement_error[0])
-    return to_agents(sum_over_agents(ones, layout), layout)

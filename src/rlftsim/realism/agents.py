@@ -1,12 +1,13 @@
-"""Simulated and evaluated agents of the metric: their states in rollouts and in the log. Frame: world.
+"""Simulated and evaluated agents of the metric: states in rollouts and in the log. Frame: world.
 
 Simulated agents are all tracks valid at the current step, in track order; no other agent exists for the metric.
-Evaluated ones are the ego and the tracks to predict, by ascending object id. Sizes and types are those of the current
+Evaluated agents are the ego and the tracks to predict, by ascending object id. Sizes and types are those of the current
 step for all steps, in the log too.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -19,7 +20,7 @@ from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, TOTAL_STEPS, Obje
 
 @dataclass(frozen=True, eq=False)
 class SimulatedStates:
-    """Future states of one scenario's simulated agents in N rollouts, world frame, float32, one device.
+    """Future states of a scenario's simulated agents in N rollouts, world frame, float32, on a single device.
 
     Every agent exists at all T = 80 steps. Agents may come in any order, named by `object_id`.
     """
@@ -31,25 +32,20 @@ class SimulatedStates:
     z: Float[Tensor, "N A T"]
     heading: Float[Tensor, "N A T"]
     repeat: int = 1
-    """Number of identical rollouts that each one represents: 32 equal rollouts are scored at the cost of one."""
-
-    def way_of(self, object_id: int) -> Float[Tensor, "N T 2"]:
-        """Simulated positions of one agent, m."""
-        row = int(np.flatnonzero(self.object_id == object_id)[0])
-        return torch.stack([self.x[:, row], self.y[:, row]], -1)
+    """Number of identical rollouts behind each row: 32 equal rollouts are scored at the cost of a single rollout."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "object_id", np.asarray(self.object_id, np.int64))
-        expected = (*self.x.shape[:1], len(self.object_id), FUTURE_STEPS)
+        expected_shape = (*self.x.shape[:1], len(self.object_id), FUTURE_STEPS)
         for name in ("x", "y", "z", "heading"):
             values = getattr(self, name)
-            if tuple(values.shape) != expected or values.dtype != torch.float32:
+            if tuple(values.shape) != expected_shape or values.dtype != torch.float32:
                 raise DataError(
                     f"Simulated {name} must be float32 of shape [N, A = {len(self.object_id)}, T = {FUTURE_STEPS}], "
                     f"got {values.dtype} {list(values.shape)}: one row per object id, 80 steps at 10 Hz."
                 )
-        if self.repeat < 1 or expected[0] < 1:
-            raise DataError(f"At least one rollout is needed, got {expected[0]} x repeat {self.repeat}.")
+        if self.repeat < 1 or expected_shape[0] < 1:
+            raise DataError(f"At least one rollout is needed, got {expected_shape[0]} x repeat {self.repeat}.")
 
     @property
     def device(self) -> torch.device:
@@ -61,16 +57,21 @@ class SimulatedStates:
         """Number of rollouts, N x repeat."""
         return self.x.shape[0] * self.repeat
 
+    def simulated_path(self, object_id: int) -> Float[Tensor, "N T 2"]:
+        """Simulated positions of an agent, m."""
+        row = int(np.flatnonzero(self.object_id == object_id)[0])
+        return torch.stack([self.x[:, row], self.y[:, row]], -1)
+
     def check_finite(self, scenario_id: str | None = None) -> None:
-        """Refuse rollouts with values that are not finite. It waits for the device, so callers choose when.
+        """Refuse rollouts with values that are not finite. The check waits for the device, so callers choose when.
 
         The metric itself follows the official rules, which count NaN in a histogram's last bin.
 
         Args:
-            scenario_id: for the message; None where the caller names the scenario.
+            scenario_id: Scenario that the message names; None where the caller adds the name.
 
         Raises:
-            DataError: a value is NaN or infinite: names its rollout, object id and step.
+            DataError: A value is NaN or infinite; the message names rollout, object id and step.
         """
         finite = torch.stack([self.x, self.y, self.z, self.heading]).isfinite().all(0)
         if not finite.all():
@@ -82,8 +83,7 @@ class SimulatedStates:
             )
 
 
-@dataclass(frozen=True, eq=False)
-class Trajectories:
+class Trajectories(NamedTuple):
     """States of agents over time, world frame, float32."""
 
     x: Float[Tensor, "... A T"]
@@ -91,46 +91,41 @@ class Trajectories:
     z: Float[Tensor, "... A T"]
     heading: Float[Tensor, "... A T"]
 
-    def of_agents(self, index: Int64[Tensor, "E"]) -> "Trajectories":
+    def select_agents(self, index: Int64[Tensor, "E"]) -> "Trajectories":
         """Trajectories of the agents at `index`."""
-        return Trajectories(*(values.index_select(-2, index) for values in self.fields))
+        return Trajectories(*(values.index_select(-2, index) for values in self))
 
     def from_step(self, first: int) -> "Trajectories":
         """The steps from `first` on; a negative `first` counts from the end."""
-        return Trajectories(*(values[..., first:] for values in self.fields))
-
-    @property
-    def fields(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """x, y, z, heading."""
-        return self.x, self.y, self.z, self.heading
+        return Trajectories(*(values[..., first:] for values in self))
 
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """Places of the agents of B scenarios that lie side by side, so that all are measured together.
+    """Indices of the agents of B scenarios that lie side by side, so that all are measured together.
 
-    E evaluated agents in all, M at most in one scenario; K agents at most in one scenario.
+    E evaluated agents in all, at most M in a scenario; at most K agents in a scenario.
     """
 
     scenario: Int64[Tensor, "E"]
     """Scenario of each evaluated agent."""
     first_agent: Int64[Tensor, "B"]
-    """Place of each scenario's first agent among all."""
+    """Index of each scenario's first agent among all."""
     evaluated: Int64[Tensor, "B M"]
-    """Each scenario's evaluated agents, as places among the E; any where the mask is False."""
+    """Each scenario's evaluated agents, as indices among the E; any where the mask is False."""
     evaluated_mask: Bool[Tensor, "B M"]
-    others: Int64[Tensor, "E K"]
-    """The agents of each evaluated agent's scenario, as places among all; any where the mask is False."""
-    other_mask: Bool[Tensor, "E K"]
+    neighbors: Int64[Tensor, "E K"]
+    """The agents of each evaluated agent's scenario, as indices among all; any where the mask is False."""
+    neighbor_mask: Bool[Tensor, "E K"]
     """False for padding, and for the evaluated agent itself."""
 
 
 def sum_over_agents(values: Float[Tensor, "..."], layout: Layout | None) -> Float[Tensor, "..."]:
-    """Sums over evaluated agents: [..., E] to [...], or to [..., B] where they are those of several scenarios.
+    """Sums over evaluated agents: [..., E] to [...], or to [..., B] for the agents of several scenarios.
 
     Args:
-        values: of each evaluated agent.
-        layout: of several scenarios; None = all agents are of one.
+        values: Value of each evaluated agent, on the last axis [..., E].
+        layout: Arrangement of the agents of several scenarios; None = all agents belong to the same scenario.
     """
     if layout is None:
         return values.sum(-1)
@@ -146,8 +141,8 @@ def to_agents(values: Float[Tensor, "..."], layout: Layout | None) -> Float[Tens
     """A scenario's value for each of its evaluated agents: [...] to [..., 1], or [..., B] to [..., E].
 
     Args:
-        values: of each scenario.
-        layout: of several scenarios; None = there is one.
+        values: Value of each scenario, on the last axis [..., B] if there are several.
+        layout: Arrangement of the agents of several scenarios; None = there is a single scenario.
     """
     return values[..., None] if layout is None else values[..., layout.scenario]
 
@@ -181,11 +176,11 @@ def build_logged_agents(scenario: Scenario, device: torch.device) -> LoggedAgent
     """The simulated agents of a scenario.
 
     Args:
-        scenario: with its future.
-        device: where the tensors go.
+        scenario: Scenario with its logged future, 91 steps.
+        device: Device of the returned tensors; rollouts must lie there to be scored.
 
     Raises:
-        DataError: the scenario has no logged future or no evaluated agent.
+        DataError: The scenario has no logged future or no evaluated agent.
     """
     if not scenario.has_future:
         raise DataError(
@@ -199,7 +194,7 @@ def build_logged_agents(scenario: Scenario, device: torch.device) -> LoggedAgent
         )
     # x, y, z and heading in one array, so that one copy goes to the device: [4, A, 91].
     states = np.concatenate([tracks.position, tracks.heading[..., None]], axis=-1)[simulated, :TOTAL_STEPS]
-    fields = torch.from_numpy(np.ascontiguousarray(np.moveaxis(states, -1, 0))).to(device)
+    trajectories = torch.from_numpy(np.ascontiguousarray(np.moveaxis(states, -1, 0))).to(device)
     object_type = tracks.object_type[evaluated].astype(np.int64)
     return LoggedAgents(
         object_id=tracks.object_id[simulated].astype(np.int64),
@@ -208,97 +203,99 @@ def build_logged_agents(scenario: Scenario, device: torch.device) -> LoggedAgent
         evaluated_object_type=object_type,
         is_vehicle=torch.from_numpy(object_type == ObjectType.VEHICLE).to(device),
         size=torch.from_numpy(tracks.size[simulated, CURRENT_STEP]).to(device),
-        trajectories=Trajectories(*fields.unbind(0)),
+        trajectories=Trajectories(*trajectories.unbind(0)),
         valid=torch.from_numpy(tracks.valid[simulated, :TOTAL_STEPS]).to(device),
     )
 
 
-def join_agents(parts: Sequence[LoggedAgents]) -> LoggedAgents:
+def join_agents(scenes: Sequence[LoggedAgents]) -> LoggedAgents:
     """The agents of several scenarios side by side."""
-    device = parts[0].valid.device
+    device = scenes[0].valid.device
     # On the host, whose arrays know the numbers of agents without waiting for the device.
-    num_agents, num_evaluated = (
-        np.array([len(ids) for ids in column])
-        for column in zip(*((part.object_id, part.evaluated_object_id) for part in parts))
-    )
+    num_agents = np.array([len(agents.object_id) for agents in scenes])
+    num_evaluated = np.array([len(agents.evaluated_object_id) for agents in scenes])
     first_agent, first_evaluated = np.cumsum(num_agents) - num_agents, np.cumsum(num_evaluated) - num_evaluated
-    scenario = np.repeat(np.arange(len(parts)), num_evaluated)  # [E]
+    scenario = np.repeat(np.arange(len(scenes)), num_evaluated)  # [E]
     column, rank = np.arange(num_agents.max()), np.arange(num_evaluated.max())
-    others = np.minimum(first_agent[scenario, None] + column, num_agents.sum() - 1)  # [E, K]
+    neighbors = np.minimum(first_agent[scenario, None] + column, num_agents.sum() - 1)  # [E, K]
     members = np.minimum(first_evaluated[:, None] + rank, num_evaluated.sum() - 1)  # [B, M]
-    is_other, is_member = column < num_agents[scenario, None], rank < num_evaluated[:, None]
-    arrays = (scenario, first_agent, members, is_member, others, is_other)
-    scenario, first_agent, members, is_member, others, is_other = (torch.from_numpy(a).to(device) for a in arrays)
-    evaluated = torch.cat([part.evaluated for part in parts]) + first_agent[scenario]
-    is_other = is_other & (others != evaluated[:, None])
+    is_neighbor, is_member = column < num_agents[scenario, None], rank < num_evaluated[:, None]
+    arrays = (scenario, first_agent, members, is_member, neighbors, is_neighbor)
+    layout = Layout(*(torch.from_numpy(array).to(device) for array in arrays))
+    evaluated = torch.cat([agents.evaluated for agents in scenes]) + layout.first_agent[layout.scenario]
+    layout = replace(layout, neighbor_mask=layout.neighbor_mask & (layout.neighbors != evaluated[:, None]))
     return LoggedAgents(
-        object_id=np.concatenate([part.object_id for part in parts]),
+        object_id=np.concatenate([agents.object_id for agents in scenes]),
         evaluated=evaluated,
-        evaluated_object_id=np.concatenate([part.evaluated_object_id for part in parts]),
-        evaluated_object_type=np.concatenate([part.evaluated_object_type for part in parts]),
-        is_vehicle=torch.cat([part.is_vehicle for part in parts]),
-        size=torch.cat([part.size for part in parts]),
-        trajectories=join_trajectories([part.trajectories for part in parts]),
-        valid=torch.cat([part.valid for part in parts]),
-        layout=Layout(scenario, first_agent, members, is_member, others, is_other),
+        evaluated_object_id=np.concatenate([agents.evaluated_object_id for agents in scenes]),
+        evaluated_object_type=np.concatenate([agents.evaluated_object_type for agents in scenes]),
+        is_vehicle=torch.cat([agents.is_vehicle for agents in scenes]),
+        size=torch.cat([agents.size for agents in scenes]),
+        trajectories=join_trajectories([agents.trajectories for agents in scenes]),
+        valid=torch.cat([agents.valid for agents in scenes]),
+        layout=layout,
     )
 
 
-def join_trajectories(parts: Sequence[Trajectories]) -> Trajectories:
+def join_trajectories(groups: Sequence[Trajectories]) -> Trajectories:
     """Trajectories of several groups of agents side by side."""
-    return Trajectories(*(torch.cat(values, -2) for values in zip(*(part.fields for part in parts))))
+    return Trajectories(*(torch.cat(values, -2) for values in zip(*groups)))
 
 
 def _shorten(ids: Sequence[int]) -> str:
-    listed = ", ".join(str(object_id) for object_id in ids[:8])
-    return f"{listed}, ... ({len(ids)} in all)" if len(ids) > 8 else listed
+    text = ", ".join(str(object_id) for object_id in ids[:8])
+    return f"{text}, ... ({len(ids)} in all)" if len(ids) > 8 else text
 
 
-def match_agents(expected: Int64[np.ndarray, "A"], given: Int64[np.ndarray, "G"], where: str) -> Int64[np.ndarray, "A"]:
-    """Index into `given` of each expected object id.
+def match_agents(
+    logged_ids: Int64[np.ndarray, "A"], rollout_ids: Int64[np.ndarray, "G"], scenario_id: str
+) -> Int64[np.ndarray, "A"]:
+    """Index into `rollout_ids` of each logged object id.
 
     Args:
-        expected: the scenario's simulated agents, in track order.
-        given: the agents of the rollouts, in any order.
-        where: name of the scenario, for the message.
+        logged_ids: Object ids of the scenario's simulated agents, in track order.
+        rollout_ids: Object ids of the agents in the rollouts, in any order.
+        scenario_id: Scenario that the message names.
 
     Raises:
-        DataError: an agent is missing, unknown or listed twice; names the ids.
+        DataError: An agent is missing, unknown or listed twice; the message names the ids.
     """
-    if np.array_equal(expected, given):
-        return np.arange(len(expected))
-    order = np.argsort(given, kind="stable")
-    missing = sorted(set(expected.tolist()) - set(given.tolist()))
-    unknown = sorted(set(given.tolist()) - set(expected.tolist()))
-    if missing or unknown or len(given) != len(expected):
-        unique, counts = np.unique(given, return_counts=True)
-        repeated = unique[counts > 1].tolist()
-        parts = [f"listed twice {_shorten(repeated)}"] if repeated else []
-        parts += [f"missing {_shorten(missing)}"] if missing else []
-        parts += [f"not simulated in this scenario {_shorten(unknown)}"] if unknown else []
-        raise DataError(
-            f"Rollouts of scenario {where} must hold every track valid at the current step and no other: "
-            f"object ids {'; '.join(parts)}."
+    if np.array_equal(logged_ids, rollout_ids):
+        return np.arange(len(logged_ids))
+    order = np.argsort(rollout_ids, kind="stable")
+    missing_ids = np.setdiff1d(logged_ids, rollout_ids).tolist()
+    unlogged_ids = np.setdiff1d(rollout_ids, logged_ids).tolist()
+    if missing_ids or unlogged_ids or len(rollout_ids) != len(logged_ids):
+        unique, counts = np.unique(rollout_ids, return_counts=True)
+        repeated_ids = unique[counts > 1].tolist()
+        reasons = (
+            ("listed twice", repeated_ids),
+            ("missing", missing_ids),
+            ("not simulated in this scenario", unlogged_ids),
         )
-    return order[np.searchsorted(given[order], expected)]
+        raise DataError(
+            f"Rollouts of scenario {scenario_id} must hold every track valid at the current step and no other: "
+            f"object ids {'; '.join(f'{reason} {_shorten(ids)}' for reason, ids in reasons if ids)}."
+        )
+    return order[np.searchsorted(rollout_ids[order], logged_ids)]
 
 
-def join_history(agents: LoggedAgents, states: SimulatedStates, history_steps: int, where: str) -> Trajectories:
+def join_history(agents: LoggedAgents, states: SimulatedStates, history_steps: int, scenario_id: str) -> Trajectories:
     """Rollouts in track order with logged history in front: [N, A, history_steps + 80].
 
     Args:
-        agents: the scenario's agents.
-        states: rollouts of exactly these agents.
-        history_steps: number of logged steps, the current one the last of them.
-        where: name of the scenario, for messages.
+        agents: Agents of the scenario as logged, whose order the result has.
+        states: N rollouts of exactly these agents, in any order.
+        history_steps: Number of logged steps in front; the last of them is the current step.
+        scenario_id: Scenario that messages name.
 
     Raises:
-        DataError: the rollouts' agents are not the scenario's.
+        DataError: The agents of the rollouts are not those of the scenario.
     """
-    order = match_agents(agents.object_id, states.object_id, where)
+    order = match_agents(agents.object_id, states.object_id, scenario_id)
     # Rollouts of our own policies come in track order already: no copy then.
-    is_same = bool((order == np.arange(len(order))).all())
-    index = None if is_same else torch.from_numpy(order).to(states.device)
+    is_ordered = bool((order == np.arange(len(order))).all())
+    index = None if is_ordered else torch.from_numpy(order).to(states.device)
     first = CURRENT_STEP + 1 - history_steps
 
     def prepend(log: Tensor, future: Tensor) -> Tensor:
@@ -307,4 +304,4 @@ def join_history(agents: LoggedAgents, states: SimulatedStates, history_steps: i
         return torch.cat([history, future], dim=-1)
 
     simulated = (states.x, states.y, states.z, states.heading)
-    return Trajectories(*(prepend(log, future) for log, future in zip(agents.trajectories.fields, simulated)))
+    return Trajectories(*(prepend(log, future) for log, future in zip(agents.trajectories, simulated)))

@@ -1,10 +1,10 @@
 """Configurations of the realism meta-metric: ranges, bins, pseudocounts and weights of each year's challenge.
 
-A metric year is one entry here. The numbers are those of the challenge's published configuration files. Wherever a
-tensor has a feature axis F, its order is that of `FEATURE_NAMES`.
+Each metric year is an entry of `METRICS`, with the numbers of the challenge's published configuration files. Every
+feature axis F of a tensor has the order of `FEATURE_NAMES`.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from rlftsim.errors import ConfigError, in_short
 
@@ -46,7 +46,7 @@ class HistogramConfig:
 
 @dataclass(frozen=True)
 class BernoulliConfig:
-    """Two outcomes with additive smoothing; 0.001 is the official message's default and not written in its files."""
+    """Two outcomes with additive smoothing; 0.001 is the official message's default, which no official file writes."""
 
     weight: float
     pseudocount: float = 0.001
@@ -54,7 +54,7 @@ class BernoulliConfig:
 
 @dataclass(frozen=True)
 class MetricConfig:
-    """One year's meta-metric: speeds in m/s and rad/s, accelerations in m/s² and rad/s², distances in m, time in s."""
+    """Meta-metric of a year: speeds in m/s and rad/s, accelerations in m/s² and rad/s², distances in m, time in s."""
 
     name: str
     linear_speed: HistogramConfig
@@ -88,7 +88,7 @@ class MetricConfig:
         return tuple(getattr(self, name).weight for name in FEATURE_NAMES)
 
     def sub_score_weights(self, sub_score: str) -> tuple[float, ...]:
-        """Weight of each feature inside one sub-score, in the order of `FEATURE_NAMES`; they sum to one."""
+        """Weight of each feature inside a sub-score, in the order of `FEATURE_NAMES`; the weights sum to 1."""
         members = SUB_SCORES[sub_score]
         total = sum(getattr(self, name).weight for name in members)
         return tuple(getattr(self, name).weight / total if name in members else 0.0 for name in FEATURE_NAMES)
@@ -110,30 +110,18 @@ METRIC_2025 = MetricConfig(
 """The leaderboard of 2025."""
 
 
-def _metric_of_2024(name: str, *, original_code: bool) -> MetricConfig:
-    # Only two weights differ from 2025: the road edge counts twice as much, traffic lights do not count.
-    base = METRIC_2025
-    return MetricConfig(
-        name=name,
-        linear_speed=base.linear_speed,
-        linear_acceleration=base.linear_acceleration,
-        angular_speed=base.angular_speed,
-        angular_acceleration=base.angular_acceleration,
-        distance_to_nearest_object=base.distance_to_nearest_object,
-        time_to_collision=base.time_to_collision,
-        distance_to_road_edge=HistogramConfig(-20.0, 40.0, 10, 0.10),
-        collision_indication=base.collision_indication,
-        offroad_indication=base.offroad_indication,
-        traffic_light_violation=BernoulliConfig(0.0),
-        time_to_collision_vehicles_only=not original_code,
-        reports_traffic_lights=not original_code,
-    )
-
-
-METRIC_2024 = _metric_of_2024("2024", original_code=False)
+# Only two weights differ from 2025: the road edge counts twice as much, traffic lights do not count.
+METRIC_2024 = replace(
+    METRIC_2025,
+    name="2024",
+    distance_to_road_edge=HistogramConfig(-20.0, 40.0, 10, 0.10),
+    traffic_light_violation=BernoulliConfig(0.0),
+)
 """The configuration file of 2024 read by the code of 2025: time to collision over vehicles only."""
 
-METRIC_2024_ORIGINAL = _metric_of_2024("2024_original_code", original_code=True)
+METRIC_2024_ORIGINAL = replace(
+    METRIC_2024, name="2024_original_code", time_to_collision_vehicles_only=False, reports_traffic_lights=False
+)
 """The leaderboard of 2024: time to collision over all evaluated agents, no traffic lights."""
 
 METRIC_2023 = MetricConfig(
@@ -157,10 +145,10 @@ METRICS = {config.name: config for config in (METRIC_2025, METRIC_2024, METRIC_2
 
 
 def metric_by_name(name: str) -> MetricConfig:
-    """Configuration of a metric year, by its name in `METRICS`.
+    """Configuration of a metric year, by name in `METRICS`.
 
     Raises:
-        ConfigError: no such configuration; the message lists the known names.
+        ConfigError: No such configuration; the message lists the known names.
     """
     if name not in METRICS:
         raise ConfigError(f"Unknown metric {in_short(name)}: known are {', '.join(METRICS)}.")

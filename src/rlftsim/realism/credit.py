@@ -1,12 +1,12 @@
-"""Credit assignment: a rollout's contribution to the meta-metric, split exactly over features and agents.
+"""Credit assignment: the contribution of a rollout to the meta-metric, split exactly over features and agents.
 
 A likelihood is the exponential of a mean over agents, so a difference of two likelihoods x and y is
 
     x - y = L(x, y) (ln x - ln y),        L(x, y) = (x - y) / (ln x - ln y)   (the logarithmic mean; L(x, x) = x)
 
-and ln x - ln y is a sum over agents (and steps): each gets L times its own term. Weighted and summed over features,
-these parts add up to the difference of the meta-metrics exactly. Computed in float64 from the counts that the metric
-has anyway.
+and ln x - ln y is a sum over agents (and steps): each agent gets L times the agent's term. Weighted and summed over
+features, these shares add up to the difference of the meta-metrics exactly. Computed in float64 from the counts that
+the metric has anyway.
 """
 
 from dataclasses import dataclass
@@ -32,17 +32,17 @@ from rlftsim.realism.meta_metric import form_sets
 
 @dataclass(frozen=True, eq=False)
 class Credit:
-    """Contribution of each rollout, RMM of all N minus RMM of the N - 1 others, split over agents and features."""
+    """Contribution of each rollout, RMM of all N minus RMM without the rollout, split over agents and features."""
 
     added: Float64[Tensor, "N E F"]
-    """Part of an evaluated agent (by ascending object id) and feature (`FEATURE_NAMES`); positive = the rollout helps.
-    A feature without weight has 0, one without a scored step NaN."""
+    """Share of an evaluated agent (by ascending object id) and feature (`FEATURE_NAMES`); positive = the rollout helps.
+    A feature without weight has 0, a feature without a scored step NaN."""
     repeat: int = 1
-    """Number of identical rollouts that each of the N represents, all with the same parts."""
+    """Number of identical rollouts behind each of the N, all with the same shares."""
 
     @property
     def by_feature(self) -> Float64[Tensor, "N F"]:
-        """Weight times the feature's likelihood with all rollouts minus that without this one."""
+        """Weight times the feature's likelihood with all rollouts, minus that without the rollout."""
         return self.added.sum(1)
 
     @property
@@ -57,34 +57,33 @@ class Credit:
         return self.added - self.added.mean(0)
 
 
-def log_mean_of_exp(log_x: Float[Tensor, "..."], log_y: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
+def compute_logarithmic_mean(log_x: Float[Tensor, "..."], log_y: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
     """Logarithmic mean of e^log_x and e^log_y; e^log_x where both are equal.
 
     Args:
-        log_x: logarithm of the first number, nats.
-        log_y: logarithm of the second one; broadcast against the first.
+        log_x: Logarithm of the first number, nats.
+        log_y: Logarithm of the second number, nats; broadcast against the first.
     """
     gap = log_x - log_y
-    # L(x, y) = y (x / y - 1) / ln(x / y); expm1 keeps it exact for nearly equal numbers, the inner `where` avoids 0 /
-    # 0.
+    # L(x, y) = y (x / y - 1) / ln(x / y); expm1 is exact for nearly equal numbers, the inner `where` avoids 0 / 0.
     ratio = torch.where(gap == 0, 1.0, torch.expm1(gap) / torch.where(gap == 0, 1.0, gap))
     return log_y.exp() * ratio
 
 
 def compute_credit(log: AnyLog, features: Features, config: MetricConfig = METRIC_2025) -> Credit:
-    """Parts of agents and features in the contribution of each rollout to the meta-metric.
+    """Shares of agents and features in the contribution of each rollout to the meta-metric.
 
     Args:
-        log: the scenario's own part.
-        features: of its rollouts.
-        config: the metric's year.
+        log: Logged side of the scenario, or of several.
+        features: Features of the scenario's rollouts, N distinct ones.
+        config: Year of the metric: bins, weights and rules.
 
     Raises:
-        DataError: fewer than two rollouts, so that none can be left out.
+        DataError: Fewer than two rollouts, so that none can be left out.
     """
-    distinct = _require_two(features)
+    num_distinct = _validate_num_distinct(features)
     # [1 + N, F, E]: of all rollouts, and of all but each
-    terms = _log_likelihood_terms(log, features, config, slice(0, 1 + distinct))
+    terms = _log_likelihood_terms(log, features, config, slice(0, 1 + num_distinct))
     added = split_difference(terms[:1], terms[1:], config, log.agents.layout)  # [N, F, E]
     return Credit(added.transpose(1, 2), features.repeat)
 
@@ -92,42 +91,42 @@ def compute_credit(log: AnyLog, features: Features, config: MetricConfig = METRI
 def compute_single_credit(
     log: AnyLog, features: Features, config: MetricConfig = METRIC_2025
 ) -> Float64[Tensor, "N E F"]:
-    """Parts of agents and features in RMM_i - mean_{j != i} RMM_j, the reward `rloo`.
+    """Shares of agents and features in RMM_i - mean_{j != i} RMM_j, the reward `rloo`.
 
     RMM_i is the meta-metric of rollout i alone. Each difference RMM_i - RMM_j is split separately.
 
     Args:
-        log: the scenario's own part.
-        features: of its rollouts.
-        config: the metric's year.
+        log: Logged side of the scenario, or of several.
+        features: Features of the scenario's rollouts, N distinct ones.
+        config: Year of the metric: bins, weights and rules.
 
     Raises:
-        DataError: fewer than two rollouts, so that there are no others.
+        DataError: Fewer than two rollouts, so that a baseline is missing.
     """
-    distinct = _require_two(features)
+    num_distinct = _validate_num_distinct(features)
     # [N, F, E]: of each rollout alone
-    terms = _log_likelihood_terms(log, features, config, slice(1 + distinct, None))
-    between = split_difference(terms[:, None], terms[None], config, log.agents.layout)  # [N, N, F, E]
+    terms = _log_likelihood_terms(log, features, config, slice(1 + num_distinct, None))
+    differences = split_difference(terms[:, None], terms[None], config, log.agents.layout)  # [N, N, F, E]
     # Pairs of equal rollouts add nothing, so the mean over all others is the sum over distinct ones times their repeat.
-    return (between.sum(1) * (features.repeat / (distinct * features.repeat - 1))).transpose(1, 2)
+    return (differences.sum(1) * (features.repeat / (num_distinct * features.repeat - 1))).transpose(1, 2)
 
 
-def _require_two(features: Features) -> int:
+def _validate_num_distinct(features: Features) -> int:
     """Number of distinct rollouts, of at least two rollouts in all."""
-    distinct = len(features.linear_speed)
-    if distinct * features.repeat < 2:
+    num_distinct = len(features.linear_speed)
+    if num_distinct * features.repeat < 2:
         raise DataError("Credit needs at least 2 rollouts, got 1: without it there is nothing to score.")
-    return distinct
+    return num_distinct
 
 
 def _log_likelihood_terms(
     log: AnyLog, features: Features, config: MetricConfig, sets: slice
 ) -> Float64[Tensor, "S F E"]:
-    """Terms of the agents in each feature's mean log-probability, under some of the sets of `form_sets`, nats."""
+    """Terms of the agents in each feature's mean log-probability, under the selected sets of `form_sets`, nats."""
     target, table = log_target(log, config), histogram_table(config, features.linear_speed.device)
     counts, size = form_sets(count_rollouts(features, log, config), features.repeat)
-    chosen = RolloutCounts(counts.bins[sets].double(), counts.agreement[sets].double(), counts.num_steps)
-    by_agent = compute_agent_log_likelihoods(chosen, size[sets].double(), target, table)
+    counts = RolloutCounts(counts.bins[sets].double(), counts.agreement[sets].double(), counts.num_steps)
+    by_agent = compute_agent_log_likelihoods(counts, size[sets].double(), target, table)
     return by_agent / to_agents(count_terms(target).double(), target.layout)
 
 
@@ -137,11 +136,11 @@ def split_difference(
     """Meta-metric of x minus that of y, split over features and agents.
 
     Args:
-        x: term of each agent (or agent and step, in one axis) in the mean log-probability of each feature, nats.
-        y: the same of other rollouts; broadcast against x.
-        config: the weights.
-        layout: of the agents of several scenarios, whose meta-metrics are split separately; None = there is one.
+        x: Term of each agent (or agent and step, in one axis) in the mean log-probability of each feature, nats.
+        y: Terms under the rollouts to compare with, nats; broadcast against `x`.
+        config: Year of the metric; only the weights count here.
+        layout: Arrangement of the agents of several scenarios, to split the meta-metric of each; None = a single one.
     """
     weight = torch.tensor(config.weights, dtype=x.dtype, device=x.device)[:, None]  # [F, 1]
-    mean = log_mean_of_exp(sum_over_agents(x, layout), sum_over_agents(y, layout))
+    mean = compute_logarithmic_mean(sum_over_agents(x, layout), sum_over_agents(y, layout))
     return torch.where(weight > 0, weight * to_agents(mean, layout) * (x - y), 0.0)

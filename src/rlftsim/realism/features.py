@@ -1,6 +1,6 @@
-"""Features of rollouts and of the log: one typed set of quantities per step.
+"""Features of rollouts and of the log: a typed set of quantities per step.
 
-`ScenarioLog` has everything that depends on the scenario alone; it is computed once per scenario and device.
+`ScenarioLog` has all that depends on the scenario alone, computed once per scenario and device.
 """
 
 from collections import deque
@@ -24,26 +24,17 @@ from rlftsim.realism.agents import (
     join_trajectories,
 )
 from rlftsim.realism.displacement import compute_displacement_error
-from rlftsim.realism.interactive import (
-    PlanarAgents,
-    compute_distance_to_nearest_object,
-    compute_time_to_collision,
-)
+from rlftsim.realism.interactive import PlanarAgents, compute_distance_to_nearest_object, compute_time_to_collision
 from rlftsim.realism.kinematic import compute_ground_speed, compute_kinematics, shrink_validity
-from rlftsim.realism.map_based import (
-    RoadEdges,
-    build_road_edges,
-    compute_distance_to_road_edge,
-    join_road_edges,
-)
+from rlftsim.realism.map_based import RoadEdges, build_road_edges, compute_distance_to_road_edge, join_road_edges
 from rlftsim.realism.traffic_lights import Signals, build_signals, compute_traffic_light_violation, join_signals
 from rlftsim.scenario.derived import cached_on_scenario
 from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, HISTORY_STEPS, Scenario
 
 MissingMap = Literal["error", "neutral"]
 
-HISTORY_USED = 2
-"""Logged steps that future features depend on: an acceleration at the first future step reads two steps before it."""
+NUM_HISTORY_STEPS = 2
+"""Logged steps that future features depend on: an acceleration at the first future step reads the two steps before."""
 INVALID_ROAD_EDGE_M = -1e10
 """Distance to the road edge of invalid agents, as officially; also of all agents in a scenario without road edges."""
 CACHED_LOGS = 64
@@ -56,7 +47,7 @@ class ComputeConfig:
 
     max_pairs: int | None = None
     """Pairs (of agents, of a point and a road edge, ...) computed at once, about 40 bytes each; None: 2^17 on a CPU,
-    where they then stay in its cache, and 2^24 elsewhere."""
+    whose cache holds so many, and 2^24 elsewhere."""
 
     def __post_init__(self) -> None:
         if self.max_pairs is not None and self.max_pairs < 1:
@@ -92,11 +83,11 @@ class Features:
     valid: Bool[Tensor, "N E T"]
     """The log's own validity; True everywhere for rollouts."""
     repeat: int = 1
-    """Number of identical rollouts that each one represents."""
+    """Number of identical rollouts behind each row."""
 
     @property
     def collision(self) -> Bool[Tensor, "N E T"]:
-        """True where an agent overlaps another one."""
+        """True where an agent overlaps a second agent."""
         return self.distance_to_nearest_object < 0
 
     @property
@@ -117,7 +108,7 @@ class Features:
 
 @dataclass(frozen=True, eq=False)
 class ScenarioLog:
-    """The scenario's own part of the metric, on one device. Does not refer to the scenario itself."""
+    """Logged side of a scenario in the metric, on a device; holds no reference to the scenario."""
 
     scenario_id: str
     agents: LoggedAgents
@@ -128,7 +119,7 @@ class ScenarioLog:
 
     @property
     def scenario_ids(self) -> tuple[str, ...]:
-        """The one scenario's id."""
+        """The scenario's id, as the only entry."""
         return (self.scenario_id,)
 
     @property
@@ -141,63 +132,65 @@ class ScenarioLog:
 class JoinedLogs:
     """The logs of several scenarios side by side: a device measures their rollouts in one go."""
 
-    parts: tuple[ScenarioLog, ...]
+    logs: tuple[ScenarioLog, ...]
     agents: LoggedAgents
     road_edges: RoadEdges | None
     signals: Signals | None
 
     @classmethod
-    def of(cls, parts: Sequence[ScenarioLog]) -> "JoinedLogs":
+    def from_logs(cls, logs: Sequence[ScenarioLog]) -> "JoinedLogs":
         """Logs on the same device, side by side."""
         return cls(
-            tuple(parts),
-            join_agents([part.agents for part in parts]),
-            join_road_edges([part.road_edges for part in parts]),
-            join_signals([part.signals for part in parts]),
+            tuple(logs),
+            join_agents([log.agents for log in logs]),
+            join_road_edges([log.road_edges for log in logs]),
+            join_signals([log.signals for log in logs]),
         )
 
     @property
     def scenario_ids(self) -> tuple[str, ...]:
         """Ids of the scenarios."""
-        return tuple(part.scenario_id for part in self.parts)
+        return tuple(log.scenario_id for log in self.logs)
 
     @property
     def leaves_road(self) -> Bool[Tensor, "E"]:
         """True = an evaluated agent that leaves the road at some logged step."""
-        return torch.cat([part.leaves_road for part in self.parts])
+        return torch.cat([log.leaves_road for log in self.logs])
 
 
 AnyLog = ScenarioLog | JoinedLogs
 
 
 def scenario_log(
-    scenario: Scenario,
+    scenario: Scenario | ScenarioLog,
     device: torch.device | str = "cpu",
     *,
     missing_map: MissingMap = "error",
     compute: ComputeConfig = DEFAULT_COMPUTE,
 ) -> ScenarioLog:
-    """The part of the metric that depends on the scenario alone: agents, packed map, log features.
+    """All that the metric computes from the scenario alone: agents, packed map, log features.
 
-    The logs of the last 64 scenarios are cached. The cache does not keep their scenarios in memory.
+    The logs of the last 64 scenarios are cached. The cache does not keep the scenarios in memory.
 
     Args:
-        scenario: with its future.
-        device: where the tensors go.
-        missing_map: without road edges raise ("error"), as the official evaluator does, or count log and rollouts as on
-            the road ("neutral"). Under "neutral" a log in which no future state of an evaluated agent is valid raises
-            no error, either: its scores are NaN.
-        compute: memory bound.
+        scenario: Scenario with its logged future; a log is returned as given.
+        device: Device of the tensors; rollouts must lie there to be scored.
+        missing_map: Answer to a scenario without road edges: "error" raises, as the official evaluator does, "neutral"
+            counts log and rollouts as on the road. Under "neutral" a log in which no future state of an evaluated agent
+            is valid raises no error, either: the scores are NaN.
+        compute: Bound on the memory of the computation; changes no result.
 
     Raises:
-        DataError: no logged future, no evaluated agent, or no road edges.
+        DataError: No logged future, no evaluated agent, or no road edges.
     """
+    if isinstance(scenario, ScenarioLog):
+        return scenario
     device = torch.device(device)
-    known, key = _logs_of(scenario), (device, missing_map, compute)
-    log = known.get(key)
+    logs, key = _cached_logs(scenario), (device, missing_map, compute)
+    log = logs.get(key)
     if log is None:
-        log = known[key] = _build_log(scenario, device, missing_map, compute.pairs_on(device))
-    # Most recently used last; what falls out in front is forgotten by `_logs_of`, too.
+        log = logs[key] = _build_log(scenario, device, missing_map, compute.pairs_on(device))
+    # Most recently used last; what falls out in front is forgotten by `_cached_logs`, too.
     if log in _recent_logs:
         _recent_logs.remove(log)
     _recent_logs.append(log)
@@ -208,8 +201,8 @@ _recent_logs: deque[ScenarioLog] = deque(maxlen=CACHED_LOGS)
 
 
 @cached_on_scenario
-def _logs_of(scenario: Scenario) -> WeakValueDictionary[Hashable, ScenarioLog]:
-    """Logs of a scenario that are still in memory, by their settings."""
+def _cached_logs(scenario: Scenario) -> WeakValueDictionary[Hashable, ScenarioLog]:
+    """Logs of a scenario that are still in memory, by device, answer to a missing map, and memory bound."""
     return WeakValueDictionary()
 
 
@@ -229,56 +222,41 @@ def _build_log(scenario: Scenario, device: torch.device, missing_map: MissingMap
         )
     signals = build_signals(scenario.map_features, scenario.lights, device)
     # [1, A, 91]: to the features the log is a rollout whose history is all logged steps up to the current one.
-    log = Trajectories(*(values[None] for values in agents.trajectories.fields))
+    log = Trajectories(*(values[None] for values in agents.trajectories))
     with torch.no_grad():
-        features = _compute(log, agents, road_edges, signals, is_log=True, max_pairs=max_pairs)
+        features = _measure_trajectories(log, agents, road_edges, signals, is_log=True, max_pairs=max_pairs)
     return ScenarioLog(scenario.scenario_id, agents, road_edges, signals, features)
 
 
-def compute_features(
-    log: ScenarioLog, states: SimulatedStates, *, compute: ComputeConfig = DEFAULT_COMPUTE
-) -> Features:
-    """Features of rollouts, on their device, which must be the log's.
-
-    Args:
-        log: the scenario's own part.
-        states: N rollouts.
-        compute: memory bound.
-
-    Raises:
-        DataError: the rollouts' agents are not the scenario's simulated agents.
-    """
-    return _compute_with_history([log], log, [states], compute)
-
-
-def compute_joined_features(
-    logs: JoinedLogs, states: Sequence[SimulatedStates], *, compute: ComputeConfig = DEFAULT_COMPUTE
-) -> Features:
-    """Features of the rollouts of several scenarios, whose evaluated agents are side by side on axis E.
-
-    Args:
-        logs: the scenarios' own part.
-        states: rollouts of each, all with the same N and repeat.
-        compute: memory bound.
-
-    Raises:
-        DataError: the rollouts' agents are not their scenario's simulated agents.
-    """
-    return _compute_with_history(logs.parts, logs, states, compute)
-
-
 @torch.no_grad()
-def _compute_with_history(
-    parts: Sequence[ScenarioLog], log: AnyLog, states: Sequence[SimulatedStates], compute: ComputeConfig
+def compute_features(
+    log: AnyLog, states: SimulatedStates | Sequence[SimulatedStates], *, compute: ComputeConfig = DEFAULT_COMPUTE
 ) -> Features:
-    histories = [join_history(p.agents, s, HISTORY_USED, p.scenario_id) for p, s in zip(parts, states)]
-    trajectories = histories[0] if len(parts) == 1 else join_trajectories(histories)  # [N, A, 82]
+    """Features of rollouts, on the log's device, where the rollouts must be, too.
+
+    Args:
+        log: Logged side of the scenario, or of several: the evaluated agents of all are then side by side on axis E.
+        states: N rollouts of the scenario, or of each scenario; N and repeat are the same for all.
+        compute: Bound on the memory of the computation; changes no result.
+
+    Raises:
+        DataError: The agents of the rollouts are not the scenario's simulated agents.
+    """
+    logs = log.logs if isinstance(log, JoinedLogs) else (log,)
+    states = [states] if isinstance(states, SimulatedStates) else states
+    histories = [
+        join_history(scene.agents, rollouts, NUM_HISTORY_STEPS, scene.scenario_id)
+        for scene, rollouts in zip(logs, states)
+    ]
+    trajectories = histories[0] if len(histories) == 1 else join_trajectories(histories)  # [N, A, 82]
     max_pairs = compute.pairs_on(states[0].device)
-    features = _compute(trajectories, log.agents, log.road_edges, log.signals, is_log=False, max_pairs=max_pairs)
+    features = _measure_trajectories(
+        trajectories, log.agents, log.road_edges, log.signals, is_log=False, max_pairs=max_pairs
+    )
     return replace(features, repeat=states[0].repeat)
 
 
-def _compute(
+def _measure_trajectories(
     trajectories: Trajectories,
     agents: LoggedAgents,
     road_edges: RoadEdges | None,
@@ -287,8 +265,8 @@ def _compute(
     is_log: bool,
     max_pairs: int,
 ) -> Features:
-    """Features of trajectories [N, A, history + 80], whose history ends with the current step."""
-    evaluated = trajectories.of_agents(agents.evaluated)  # [N, E, history + 80]
+    """Features of trajectories [N, A, history + 80] with a history that ends with the current step."""
+    evaluated = trajectories.select_agents(agents.evaluated)  # [N, E, history + 80]
     future = evaluated.from_step(-FUTURE_STEPS)  # [N, E, 80]
     # Rollouts count as valid at every step, wherever the log is.
     valid = agents.future_valid if is_log else torch.ones_like(agents.future_valid)
@@ -306,12 +284,8 @@ def _compute(
             scenario=None if agents.layout is None else agents.layout.scenario,
         )  # fmt: skip
     # 4. Displacement from the log.
-    logged = agents.trajectories.of_agents(agents.evaluated).from_step(-FUTURE_STEPS)
-    displacement = compute_displacement_error(
-        torch.stack([future.x, future.y, future.z], dim=-1),
-        torch.stack([logged.x, logged.y, logged.z], dim=-1),
-        agents.valid.index_select(0, agents.evaluated),
-    )
+    logged = agents.trajectories.select_agents(agents.evaluated).from_step(-FUTURE_STEPS)
+    displacement = compute_displacement_error(future, logged, agents.valid.index_select(0, agents.evaluated))
     return Features(
         **{name: values[..., -FUTURE_STEPS:] for name, values in kinematics._asdict().items()},
         distance_to_nearest_object=nearest,
@@ -329,18 +303,17 @@ def _compute_interaction(
     """Distance to the nearest object and time to collision, some rollouts at a time."""
     speed = compute_ground_speed(trajectories.x, trajectories.y)[..., -FUTURE_STEPS:]
     future = trajectories.from_step(-FUTURE_STEPS)
-    others, other_mask = (agents.layout.others, agents.layout.other_mask) if agents.layout else (None, None)
-    num_others = len(agents.object_id) if others is None else others.shape[1]
-    rollouts_at_once = max(1, max_pairs // (num_others * len(agents.evaluated) * FUTURE_STEPS))
+    neighbors, mask = (agents.layout.neighbors, agents.layout.neighbor_mask) if agents.layout else (None, None)
+    num_neighbors = len(agents.object_id) if neighbors is None else neighbors.shape[1]
+    chunk_size = max(1, max_pairs // (num_neighbors * len(agents.evaluated) * FUTURE_STEPS))
     log_valid = agents.valid[None, :, -FUTURE_STEPS:] if is_log else None  # [1, A, 80]
     length, width = agents.size[:, 0], agents.size[:, 1]
-    nearest, seconds = [], []
-    parts = zip(*(values.split(rollouts_at_once) for values in (future.x, future.y, future.heading, speed)))
-    for x, y, heading, part_speed in parts:
-        boxes = PlanarAgents(x, y, heading, length, width, agents.evaluated, log_valid, others, other_mask)
-        nearest.append(compute_distance_to_nearest_object(boxes))
-        seconds.append(compute_time_to_collision(boxes, part_speed))
-    return torch.cat(nearest), torch.cat(seconds)
+    distances, seconds = [], []
+    for x, y, heading, chunk_speed in zip(*(v.split(chunk_size) for v in (future.x, future.y, future.heading, speed))):
+        boxes = PlanarAgents(x, y, heading, length, width, agents.evaluated, log_valid, neighbors, mask)
+        distances.append(compute_distance_to_nearest_object(boxes))
+        seconds.append(compute_time_to_collision(boxes, chunk_speed))
+    return torch.cat(distances), torch.cat(seconds)
 
 
 def _compute_road_edge(
@@ -355,15 +328,12 @@ def _compute_road_edge(
     size = agents.size.index_select(0, agents.evaluated)
     # Invalid states may lie anywhere (mostly at the origin), far from every edge, where the search is slow. They take
     # the current position instead; their distance is overwritten below.
-    current = agents.trajectories.of_agents(agents.evaluated)
-    filled = Trajectories(
-        *(
-            torch.where(valid, values, here[:, CURRENT_STEP, None])
-            for values, here in zip(future.fields, current.fields)
-        )
+    current = agents.trajectories.select_agents(agents.evaluated)
+    filled_states = Trajectories(
+        *(torch.where(valid, x, logged[:, CURRENT_STEP, None]) for x, logged in zip(future, current))
     )
     scenario = None if agents.layout is None else agents.layout.scenario
-    distance = compute_distance_to_road_edge(filled, size, road_edges, max_pairs=max_pairs, scenario=scenario)
-    if scenario is not None and road_edges.is_known is not None:
-        valid = valid & road_edges.is_known[scenario, None]
+    distance = compute_distance_to_road_edge(filled_states, size, road_edges, max_pairs=max_pairs, scenario=scenario)
+    if scenario is not None and road_edges.has_edges is not None:
+        valid = valid & road_edges.has_edges[scenario, None]
     return torch.where(valid, distance, INVALID_ROAD_EDGE_M)

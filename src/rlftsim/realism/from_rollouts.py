@@ -1,4 +1,4 @@
-"""Rollouts and logged futures as the metric reads them: world frame, float32, z of the current step."""
+"""Rollouts and logged futures in the metric's form: world frame, float32, z of the current step."""
 
 import torch
 
@@ -6,15 +6,15 @@ from rlftsim.errors import DataError
 from rlftsim.realism.agents import SimulatedStates
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
-from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, TOTAL_STEPS, Scenario
+from rlftsim.scenario.types import CURRENT_STEP, TOTAL_STEPS, Scenario
 
 
 def states_of_rollouts(batch: ScenarioBatch, rollouts: Rollouts) -> tuple[SimulatedStates, ...]:
     """Each scenario's rollouts without padding, in the world frame. Agents keep the height of the current step.
 
     Args:
-        batch: the scenarios that were simulated.
-        rollouts: N rollouts of each, in the frame of the batch.
+        batch: Scenarios that were simulated, padded to the same number of agents.
+        rollouts: N rollouts of each scenario, in the frame of the batch.
     """
     world = batch.to_world(rollouts.position)  # [B, N, A, T, 2]
     states = []
@@ -31,20 +31,19 @@ def logged_states(scenario: Scenario, *, num_rollouts: int, device: torch.device
     """The logged future as N equal rollouts, the oracle. Invalid steps keep what the file stores, as officially.
 
     Args:
-        scenario: with its future.
-        num_rollouts: N; stored once.
-        device: where the tensors go.
+        scenario: Scenario with its logged future, 91 steps.
+        num_rollouts: Number of rollouts N; equal rollouts are stored once.
+        device: Device of the tensors; the metric is computed there.
 
     Raises:
-        DataError: the scenario has no logged future.
+        DataError: The scenario has no logged future.
     """
     if not scenario.has_future:
         raise DataError(
             f"scenario {scenario.scenario_id} has no logged future: the oracle needs training or validation data."
         )
-    chosen, future = scenario.simulated_indices, slice(TOTAL_STEPS - FUTURE_STEPS, TOTAL_STEPS)
-    position = torch.from_numpy(scenario.tracks.position[chosen, future]).to(device)[None]  # [1, A, T, 3]
-    heading = torch.from_numpy(scenario.tracks.heading[chosen, future]).to(device)[None]
-    ids = scenario.tracks.object_id[chosen]
+    tracks, simulated, future = scenario.tracks, scenario.simulated_indices, slice(CURRENT_STEP + 1, TOTAL_STEPS)
+    position = torch.from_numpy(tracks.position[simulated, future]).to(device)[None]  # [1, A, T, 3]
+    heading = torch.from_numpy(tracks.heading[simulated, future]).to(device)[None]
     x, y, z = position.unbind(-1)
-    return SimulatedStates(ids, x, y, z, heading, repeat=num_rollouts)
+    return SimulatedStates(tracks.object_id[simulated], x, y, z, heading, repeat=num_rollouts)

@@ -1,8 +1,8 @@
-"""Speeds and accelerations as the official evaluator computes them: central differences that ignore validity.
+"""Speeds and accelerations by the rules of the official evaluator: central differences that ignore validity.
 
-Source: Waymo Open Sim Agents Challenge, evaluator of 2025. Everything is float32; the step is 0.1 s. A difference at
-    step t needs t - 1 and t + 1 and is NaN where one of them is missing: speeds lose one step at each end,
-    accelerations two.
+Source: Waymo Open Sim Agents Challenge, evaluator of 2025. All values are float32; the step is 0.1 s. A difference at
+    step t needs t - 1 and t + 1 and is NaN where either is missing: speeds lose a step at each end, accelerations
+    two.
 """
 
 from typing import NamedTuple
@@ -45,7 +45,7 @@ def compute_kinematics(
 
     Args:
         position: x, y and z of the box center, m; the height counts, as officially.
-        heading: rad.
+        heading: Heading of the box, rad; differences are wrapped.
     """
     dx, dy, dz = (compute_central_difference(axis) for axis in position)
     linear_speed = compute_sqrt(dx * dx + dy * dy + dz * dz) / STEP_S
@@ -60,20 +60,20 @@ def compute_kinematics(
 
 
 def compute_ground_speed(x: Float[Tensor, "... T"], y: Float[Tensor, "... T"]) -> Float[Tensor, "... T"]:
-    """Speed in the plane, m/s, NaN at both ends. Time to collision uses it, which ignores height.
+    """Speed in the plane, m/s, NaN at both ends; for time to collision, which ignores height.
 
     Args:
-        x: m.
-        y: m.
+        x: First coordinate of the box center over time, m.
+        y: Second coordinate of the box center over time, m.
     """
     dx, dy = compute_central_difference(x), compute_central_difference(y)
     return compute_sqrt(dx * dx + dy * dy) / STEP_S
 
 
 def shrink_validity(valid: Bool[Tensor, "... T"]) -> Bool[Tensor, "... T"]:
-    """True where both neighboring steps are valid, whatever the step itself; False at both ends.
+    """True where both neighboring steps are valid, even if the step between is not; False at both ends.
 
-    Applied to the future's validity once, it is the mask of speeds, applied twice that of accelerations.
+    Applied to the future's validity once, the result is the mask of speeds; applied twice, that of accelerations.
     """
     shrunk = torch.zeros_like(valid)
     shrunk[..., 1:-1] = valid[..., 2:] & valid[..., :-2]

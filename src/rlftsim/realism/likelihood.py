@@ -1,9 +1,9 @@
-"""Likelihoods of the log under the rollouts' histograms, as the official evaluator computes them.
+"""Likelihoods of the log under the rollouts' histograms, by the rules of the official evaluator.
 
-Rollouts enter a score only through counts, so counts are stored per rollout: any set of rollouts (all, all but one, one
-alone) is a sum of them, and scoring every leave-one-out set costs one reduction. Feature axes: H = 7 histogram features
-in the order of `HISTOGRAM_FEATURES`, J = 3 Bernoulli features in that of `BERNOULLI_FEATURES`, F = H + J. K bins. An
-axis B is there where several scenarios are scored together.
+Rollouts enter a score only through counts, so counts are stored per rollout: the counts of any set of rollouts (all,
+all but a single rollout, a rollout alone) are a sum, and scoring every leave-one-out set costs a single reduction.
+Feature axes: H = 7 histogram features in the order of `HISTOGRAM_FEATURES`, J = 3 Bernoulli features in that of
+`BERNOULLI_FEATURES`, F = H + J. K bins. Scores of several scenarios together have an axis B.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from rlftsim.realism.features import CACHED_LOGS, AnyLog, Features, JoinedLogs, 
 
 
 def compute_bin_edges(histogram: HistogramConfig) -> Float[np.ndarray, "K1"]:
-    """Edges of equal-width bins as TensorFlow's float32 linspace rounds them: low + k * step, the last exactly high.
+    """Edges of equal-width bins, rounded like TensorFlow's float32 linspace: low + k * step, the last exactly high.
 
     A float64 linspace rounded to float32 differs by up to 8e-7, enough to move a value to the next bin.
     """
@@ -49,16 +49,15 @@ def histogram_table(config: MetricConfig, device: torch.device) -> HistogramTabl
     """Bins of a metric on a device; cached.
 
     Args:
-        config: the metric's year.
-        device: where the tensors go.
+        config: Year of the metric, with the ranges and numbers of bins.
+        device: Device of the tensors, that of the features to be counted.
     """
     histograms = config.histograms
     edges = np.full((len(histograms), max(h.num_bins for h in histograms) + 1), np.inf, np.float32)
     for row, histogram in enumerate(histograms):
         edges[row, : histogram.num_bins + 1] = compute_bin_edges(histogram)
-    # [H, 4]
-    columns = [[h.low, h.high, h.pseudocount, h.num_bins] for h in histograms]
-    low, high, pseudocount, num_bins = torch.tensor(columns, device=device).unbind(1)
+    rows = [[h.low, h.high, h.pseudocount, h.num_bins] for h in histograms]  # [H, 4]
+    low, high, pseudocount, num_bins = torch.tensor(rows, device=device).unbind(1)
     return HistogramTable(
         edges=torch.from_numpy(edges).to(device),
         low=low,
@@ -77,13 +76,13 @@ def find_bins(values: Float[Tensor, "H m"], table: HistogramTable) -> Int64[Tens
     are counted there.
 
     Args:
-        values: of each histogram feature.
-        table: the metric's bins.
+        values: Values of each histogram feature, m values in the feature's unit.
+        table: Bins of the metric on the device of the values.
     """
     clipped = values.clamp(table.low[:, None], table.high[:, None])
     bins = torch.searchsorted(table.edges, clipped, right=True) - 1
-    last = table.last_bin[:, None]
-    return torch.where(clipped.isnan(), last, torch.minimum(bins, last).clamp_(min=0))
+    last_bin = table.last_bin[:, None]
+    return torch.where(clipped.isnan(), last_bin, torch.minimum(bins, last_bin).clamp_(min=0))
 
 
 def stack_histogram_features(features: Features) -> Float[Tensor, "H N E T"]:
@@ -95,8 +94,8 @@ def count_bins(values: Float[Tensor, "H N E T"], table: HistogramTable) -> Float
     """Histogram of each rollout and agent over all T steps, valid or not.
 
     Args:
-        values: of each histogram feature.
-        table: the metric's bins.
+        values: Values of each histogram feature in N rollouts, in the feature's unit.
+        table: Bins of the metric on the device of the values.
     """
     num_features, num_rollouts, num_agents, _ = values.shape
     bins = find_bins(values.flatten(1), table).view(values.shape).permute(1, 0, 2, 3)
@@ -106,7 +105,7 @@ def count_bins(values: Float[Tensor, "H N E T"], table: HistogramTable) -> Float
 
 @dataclass(frozen=True, eq=False)
 class LogTarget:
-    """The log's side of the likelihoods: its bins, counted, and its outcomes."""
+    """The log's side of the likelihoods: counts of logged bins, and logged outcomes."""
 
     steps_in_bin: Float[Tensor, "H E K"]
     """Number of scored steps whose logged value lies in the bin."""
@@ -123,8 +122,8 @@ def compute_outcomes(features: Features, log: AnyLog) -> Bool[Tensor, "N J E"]:
     Light violations of agents other than vehicles do not count.
 
     Args:
-        features: of rollouts or of the log.
-        log: the scenario's own part.
+        features: Features of N rollouts, or of the log (N = 1).
+        log: Logged side of the scenario, whose validity counts for rollouts, too.
     """
     # The log's validity masks the rollouts, too, as officially.
     log_valid = log.agents.future_valid
@@ -136,8 +135,8 @@ def stack_scored_steps(log: ScenarioLog, config: MetricConfig) -> Bool[Tensor, "
     """Mask of the logged steps at which each histogram feature counts.
 
     Args:
-        log: the scenario's own part.
-        config: the metric's year.
+        log: Logged side of a single scenario.
+        config: Year of the metric; years differ in the agents scored for time to collision.
     """
     features = log.features
     valid, speed, acceleration = features.valid[0], features.speed_valid[0], features.acceleration_valid[0]
@@ -149,23 +148,23 @@ def build_log_target(log: AnyLog, config: MetricConfig) -> LogTarget:
     """Bins and outcomes of the log.
 
     Args:
-        log: the scenario's own part.
-        config: the metric's year.
+        log: Logged side of the scenario, or of several side by side.
+        config: Year of the metric: bins and rules.
     """
     if isinstance(log, JoinedLogs):
-        parts = [log_target(part, config) for part in log.parts]
+        targets = [log_target(scenario_log, config) for scenario_log in log.logs]
         return LogTarget(
-            torch.cat([part.steps_in_bin for part in parts], 1),
-            torch.stack([part.num_scored_steps for part in parts], -1),
-            torch.cat([part.outcome for part in parts], -1),
+            torch.cat([target.steps_in_bin for target in targets], 1),
+            torch.stack([target.num_scored_steps for target in targets], -1),
+            torch.cat([target.outcome for target in targets], -1),
             log.agents.layout,
         )
     table = histogram_table(config, log.agents.valid.device)
     values = stack_histogram_features(log.features)[:, 0]  # [H, E, T]
-    scored = stack_scored_steps(log, config).to(values.dtype)
+    is_scored = stack_scored_steps(log, config).to(values.dtype)
     bins = find_bins(values.flatten(1), table).view(values.shape)
-    steps = values.new_zeros(*values.shape[:2], table.edges.shape[1] - 1).scatter_add_(-1, bins, scored)
-    return LogTarget(steps, scored.sum((1, 2)), compute_outcomes(log.features, log)[0])
+    steps_in_bin = values.new_zeros(*values.shape[:2], table.edges.shape[1] - 1).scatter_add_(-1, bins, is_scored)
+    return LogTarget(steps_in_bin, is_scored.sum((1, 2)), compute_outcomes(log.features, log)[0])
 
 
 log_target = lru_cache(maxsize=CACHED_LOGS)(build_log_target)
@@ -174,7 +173,7 @@ log_target = lru_cache(maxsize=CACHED_LOGS)(build_log_target)
 
 @dataclass(frozen=True, eq=False)
 class RolloutCounts:
-    """Counts of each rollout; the counts of a set of rollouts are the sum over its members."""
+    """Counts of each rollout; the counts of a set of rollouts are the sum over the members."""
 
     bins: Float[Tensor, "N H E K"]
     agreement: Float[Tensor, "N J E"]
@@ -187,9 +186,9 @@ def count_rollouts(features: Features, log: AnyLog, config: MetricConfig) -> Rol
     """Counts of each distinct rollout.
 
     Args:
-        features: of N distinct rollouts.
-        log: the scenario's own part.
-        config: the metric's year.
+        features: Features of N distinct rollouts.
+        log: Logged side of the same scenario, or scenarios.
+        config: Year of the metric: bins and rules.
     """
     values = stack_histogram_features(features)
     table = histogram_table(config, values.device)
@@ -205,9 +204,9 @@ def compute_log_probabilities(
     ln P(k) = ln (count(k) + c) - ln (total + c K), with c the pseudocount and K the feature's own number of bins.
 
     Args:
-        counts: of each set.
-        num_values: values in each histogram: rollouts times steps.
-        table: the metric's bins.
+        counts: Number of values in each bin, for each of S sets of rollouts.
+        num_values: Number of values in each histogram: rollouts times steps.
+        table: Bins of the metric, with the pseudocounts.
     """
     pseudocount = table.pseudocount[:, None, None]
     total = num_values[:, None] + table.pseudocount * table.num_bins  # [S, H]
@@ -219,13 +218,13 @@ def compute_agent_log_likelihoods(
 ) -> Float[Tensor, "S F E"]:
     """Log-likelihood of each agent's log under S sets of rollouts, nats.
 
-    For histogram features the sum over the agent's scored steps, for Bernoulli features that of its one outcome.
+    For histogram features the sum over the agent's scored steps, for Bernoulli features that of the agent's outcome.
 
     Args:
-        counts: summed over each set: `bins` [S, H, E, K], `agreement` [S, J, E].
-        num_rollouts: size of each set.
-        target: the log's side.
-        table: the metric's bins.
+        counts: Counts summed over each set: `bins` [S, H, E, K], `agreement` [S, J, E].
+        num_rollouts: Number of rollouts in each set.
+        target: Logged bins and outcomes, from `log_target`.
+        table: Bins of the metric, with the pseudocounts.
     """
     log_probability = compute_log_probabilities(counts.bins, num_rollouts * counts.num_steps, table)
     histogram = (log_probability * target.steps_in_bin).sum(-1)  # [S, H, E]
@@ -237,23 +236,23 @@ def compute_agent_log_likelihoods(
 
 def count_terms(target: LogTarget) -> Float[Tensor, "F *B"]:
     """Number of terms in a feature's mean log-probability: scored (agent, step) pairs, or agents."""
-    ones = torch.ones_like(target.outcome, dtype=target.num_scored_steps.dtype)  # [J, E]
-    return torch.cat([target.num_scored_steps, sum_over_agents(ones, target.layout)])
+    agent_counts = torch.ones_like(target.outcome, dtype=target.num_scored_steps.dtype)  # [J, E]
+    return torch.cat([target.num_scored_steps, sum_over_agents(agent_counts, target.layout)])
 
 
 def compute_likelihoods(
     counts: RolloutCounts, num_rollouts: Float[Tensor, "S"], target: LogTarget, table: HistogramTable
 ) -> Float[Tensor, "S F *B"]:
-    """Likelihood of the log under S sets of rollouts, one per feature: the exponential of the mean log-probability.
+    """Likelihood of the log under S sets of rollouts, per feature: the exponential of the mean log-probability.
 
-    Histogram features average over all scored (agent, step) pairs together (not over means of agents), Bernoulli ones
-    over all agents. A feature without a scored step is NaN, as in the official evaluator.
+    Histogram features average over all scored (agent, step) pairs together (not over means of agents), Bernoulli
+    features over all agents. A feature without a scored step is NaN, as in the official evaluator.
 
     Args:
-        counts: summed over each set: `bins` [S, H, E, K], `agreement` [S, J, E].
-        num_rollouts: size of each set.
-        target: the log's side.
-        table: the metric's bins.
+        counts: Counts summed over each set: `bins` [S, H, E, K], `agreement` [S, J, E].
+        num_rollouts: Number of rollouts in each set.
+        target: Logged bins and outcomes, from `log_target`.
+        table: Bins of the metric, with the pseudocounts.
     """
     by_agent = compute_agent_log_likelihoods(counts, num_rollouts, target, table)
     return (sum_over_agents(by_agent, target.layout) / count_terms(target)).exp_()

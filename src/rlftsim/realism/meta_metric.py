@@ -1,7 +1,7 @@
-"""The realism meta-metric of rollouts, of all but one of them, and of each alone.
+"""The realism meta-metric of N rollouts, of N - 1 rollouts without each in turn, and of each rollout alone.
 
 Source: Waymo Open Sim Agents Challenge; RLFTSim, equation 1. The rewards of RLFTSim (equation 2) are made of the
-leave-one-out and single-rollout values, which cost one reduction over per-rollout counts.
+leave-one-out and single-rollout values, which cost a single reduction over per-rollout counts.
 """
 
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ from rlftsim.scenario.types import Scenario
 
 @dataclass(frozen=True, eq=False)
 class RealismResult:
-    """Scores of one scenario (no leading axis) or of several (leading axis B).
+    """Scores of a single scenario (no leading axis) or of several (leading axis B).
 
     Likelihoods and meta-metrics: higher is better. N counts repeated rollouts too.
     """
@@ -65,18 +65,18 @@ class RealismResult:
     rollout_traffic_light_violation_rate: Float[Tensor, "*B N"]
 
     def likelihood(self, feature: str) -> Float[Tensor, "*B"]:
-        """Likelihood of one feature of `FEATURE_NAMES`."""
+        """Likelihood of a feature of `FEATURE_NAMES`."""
         return self.likelihoods[..., FEATURE_NAMES.index(feature)]
 
-    def score_of(self, name: str) -> Float[Tensor, "*B"]:
-        """A field by its name, or a feature's likelihood by `FEATURE_likelihood`."""
+    def find_score(self, name: str) -> Float[Tensor, "*B"]:
+        """Field of a name, or the likelihood of a feature for `FEATURE_likelihood`."""
         feature = name.removesuffix("_likelihood")
         return self.likelihood(feature) if feature in FEATURE_NAMES else getattr(self, name)
 
     def to_official_fields(self) -> list[dict[str, object]]:
         """Plain numbers under the official messages' names, an entry per scenario; sub-scores under `buckets`."""
         fields, buckets = (
-            {official: self.score_of(ours).reshape(-1).tolist() for ours, official in names.items()}
+            {official_name: self.find_score(name).reshape(-1).tolist() for name, official_name in names.items()}
             for names in (official_fields(self.config), official_buckets(self.config))
         )
         return [
@@ -90,7 +90,7 @@ class RealismResult:
 
     def __repr__(self) -> str:
         names = {"RMM": "meta_metric", "kinematic": "kinematic", "interactive": "interactive", "map-based": "map_based"}
-        means = " | ".join(f"{shown} {float(getattr(self, name).mean()):.3f}" for shown, name in names.items())
+        means = " | ".join(f"{label} {float(getattr(self, name).mean()):.3f}" for label, name in names.items())
         count = len(self.scenario_ids)
         return means if count == 1 else f"{means} (mean of {count} scenarios)"
 
@@ -108,24 +108,22 @@ def _weigh(likelihoods: Float[Tensor, "... F"], weights: Float[Tensor, "... F"])
 
 
 def form_sets(counts: RolloutCounts, repeat: int) -> tuple[RolloutCounts, Float[Tensor, "S"]]:
-    """Counts and sizes of S = 1 + N + N sets of rollouts: all, all but each one, each one alone.
+    """Counts and sizes of S = 1 + N + N sets of rollouts: all, all without each rollout in turn, each rollout alone.
 
     Args:
-        counts: of N distinct rollouts.
-        repeat: number of identical rollouts that each represents.
+        counts: Counts of N distinct rollouts.
+        repeat: Number of identical rollouts behind each of the N.
     """
-    num_rollouts = len(counts.bins) * repeat
     # Counts are whole numbers below 2^24: sums and differences are exact in float32.
-    all_bins = counts.bins.sum(0, keepdim=True) * repeat
-    all_agreement = counts.agreement.sum(0, keepdim=True) * repeat
+    totals = [values.sum(0, keepdim=True) * repeat for values in (counts.bins, counts.agreement)]
     sets = RolloutCounts(
-        bins=torch.cat([all_bins, all_bins - counts.bins, counts.bins]),
-        agreement=torch.cat([all_agreement, all_agreement - counts.agreement, counts.agreement]),
+        bins=torch.cat([totals[0], totals[0] - counts.bins, counts.bins]),
+        agreement=torch.cat([totals[1], totals[1] - counts.agreement, counts.agreement]),
         num_steps=counts.num_steps,
     )
     size = counts.bins.new_ones(len(sets.bins))
-    size[:1] = num_rollouts
-    size[1 : len(counts.bins) + 1] = num_rollouts - 1
+    size[0] = len(counts.bins) * repeat
+    size[1 : len(counts.bins) + 1] = len(counts.bins) * repeat - 1
     return sets, size
 
 
@@ -134,20 +132,20 @@ def _mean_per_rollout(values: Float[Tensor, "N E"], log: AnyLog, repeat: int) ->
     return mean_over_agents(values, log.agents.layout).movedim(0, -1).repeat_interleave(repeat, dim=-1)
 
 
-def _any_rate(event: Bool[Tensor, "N E T"], log: AnyLog, repeat: int) -> Float[Tensor, "*B N_repeat"]:
+def _compute_rate(event: Bool[Tensor, "N E T"], log: AnyLog, repeat: int) -> Float[Tensor, "*B N_repeat"]:
     """Fraction of a rollout's evaluated agents with an event at any step where the log is valid."""
     return _mean_per_rollout((event & log.agents.future_valid).any(-1).to(torch.float32), log, repeat)
 
 
 def score_features(log: AnyLog, features: Features, config: MetricConfig = METRIC_2025) -> RealismResult:
-    """Scores of rollouts from their features, which several metrics of the same rollouts share.
+    """Scores of rollouts from features, which several metrics of the same rollouts share.
 
     Args:
-        log: the scenario's own part, or those of B scenarios; their scores have an axis B.
-        features: of its rollouts.
-        config: the metric's year.
+        log: Logged side of the scenario, or of B scenarios; the scores of several have an axis B.
+        features: Features of the N distinct rollouts, from `compute_features`.
+        config: Year of the metric: bins, weights and rules.
     """
-    distinct, repeat = len(features.linear_speed), features.repeat
+    num_distinct, repeat = len(features.linear_speed), features.repeat
     # 1. Likelihoods of all sets of rollouts at once.
     sets, size = form_sets(count_rollouts(features, log, config), repeat)
     table = histogram_table(config, features.linear_speed.device)
@@ -155,18 +153,19 @@ def score_features(log: AnyLog, features: Features, config: MetricConfig = METRI
     # 2. Meta-metric of each set; without a rollout there is no score, so leave-one-out values need two.
     weights = _score_weights(config, likelihoods.device)
     rmm = _weigh(likelihoods, weights[0]).movedim(0, -1)  # [*B, S]
-    without_each, alone = (part.repeat_interleave(repeat, dim=-1) for part in rmm[..., 1:].split(distinct, -1))
-    if distinct * repeat == 1:
-        without_each = torch.full_like(without_each, torch.nan)
+    leave_one_out, single = (scores.repeat_interleave(repeat, -1) for scores in rmm[..., 1:].split(num_distinct, -1))
+    if num_distinct * repeat == 1:
+        leave_one_out = torch.full_like(leave_one_out, torch.nan)
     meta_metric, kinematic, interactive, map_based = (_weigh(likelihoods[0], row) for row in weights)
     # 3. Reported beside the metric, for each rollout [*B, N].
     displacement = _mean_per_rollout(features.displacement_error, log, repeat)
-    collision = _any_rate(features.collision, log, repeat)
-    offroad = _any_rate(features.offroad, log, repeat)
-    stays = ~log.leaves_road  # [E]
-    left = ((features.offroad & log.agents.future_valid).any(-1) & stays).to(torch.float32)  # [N, E]
-    left = sum_over_agents(left, log.agents.layout)  # [N, *B]
-    light = _any_rate(features.traffic_light_violation, log, repeat)
+    collision = _compute_rate(features.collision, log, repeat)
+    offroad = _compute_rate(features.offroad, log, repeat)
+    stays_on_road = ~log.leaves_road  # [E]
+    leaves_road = (features.offroad & log.agents.future_valid).any(-1) & stays_on_road  # [N, E]
+    num_leaving = sum_over_agents(leaves_road.to(torch.float32), log.agents.layout).sum(0)  # [*B]
+    num_staying = sum_over_agents(stays_on_road.to(torch.float32), log.agents.layout)
+    light = _compute_rate(features.traffic_light_violation, log, repeat)
     return RealismResult(
         scenario_ids=log.scenario_ids,
         config=config,
@@ -179,10 +178,10 @@ def score_features(log: AnyLog, features: Features, config: MetricConfig = METRI
         min_average_displacement_error=displacement.amin(-1),
         collision_rate=collision.mean(-1),
         offroad_rate=offroad.mean(-1),
-        unlogged_offroad_rate=left.sum(0) / (distinct * sum_over_agents(stays.to(torch.float32), log.agents.layout)),
+        unlogged_offroad_rate=num_leaving / (num_distinct * num_staying),
         traffic_light_violation_rate=light.mean(-1),
-        leave_one_out_meta_metric=without_each,
-        single_meta_metric=alone,
+        leave_one_out_meta_metric=leave_one_out,
+        single_meta_metric=single,
         rollout_displacement_error=displacement,
         rollout_collision_rate=collision,
         rollout_offroad_rate=offroad,
@@ -198,19 +197,17 @@ def score(
     missing_map: MissingMap = "error",
     compute: ComputeConfig = DEFAULT_COMPUTE,
 ) -> RealismResult:
-    """Scores of one scenario's rollouts, on the rollouts' device.
+    """Scores of a scenario's rollouts, on the rollouts' device.
 
     Args:
-        scenario: the logged scenario, or its `scenario_log`.
-        states: its rollouts.
-        config: the metric's year.
-        missing_map: without road edges raise ("error"), or count every agent as on the road ("neutral").
-        compute: memory bound.
+        scenario: Scenario with its logged future, or the `scenario_log` of it.
+        states: N rollouts of exactly the simulated agents, in any order.
+        config: Year of the metric: bins, weights and rules.
+        missing_map: Answer to a scenario without road edges: "error" raises, "neutral" counts all agents as on-road.
+        compute: Bound on the memory of the computation; changes no result.
 
     Raises:
-        DataError: the scenario cannot be scored, or the rollouts' agents are not its simulated agents.
+        DataError: The scenario cannot be scored, or the agents of the rollouts are not the simulated agents.
     """
-    log = scenario
-    if isinstance(log, Scenario):
-        log = scenario_log(log, states.device, missing_map=missing_map, compute=compute)
+    log = scenario_log(scenario, states.device, missing_map=missing_map, compute=compute)
     return score_features(log, compute_features(log, states, compute=compute), config)

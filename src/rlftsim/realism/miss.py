@@ -1,7 +1,8 @@
 """Miss rates by the definition of the Waymo motion prediction challenge. Reported beside the meta-metric.
 
-An agent's goal is its last logged position. It is missed if the simulated position is off, sideways or along the logged
-heading, by more than a tolerance that grows with the horizon and shrinks for slow agents (`goals.attainment`).
+The goal of an agent is the last logged position. A goal is missed if the simulated position is off, sideways or along
+the logged heading, by more than a tolerance that grows with the horizon and shrinks for slow agents
+(`goals.attainment`).
 """
 
 from typing import NamedTuple
@@ -9,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from rlftsim.goals.attainment import is_within, tolerance_m
+from rlftsim.goals.attainment import compute_tolerance, is_within
 from rlftsim.realism.agents import SimulatedStates
 from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, STEP_S, TOTAL_STEPS, Scenario
 
@@ -21,16 +22,16 @@ class MissRates(NamedTuple):
     """Missed at the step at which the goal was logged: fraction of (rollout, evaluated agent) pairs."""
     passing: float
     """Missed at every simulated step: fraction of the same pairs."""
-    passing_in_all: float
+    passing_in_every_rollout: float
     """Missed at every step of every rollout: fraction of evaluated agents, the challenge's way to count predictions."""
 
 
 def compute_miss_rates(scenario: Scenario, states: SimulatedStates) -> MissRates:
-    """Miss rates of one scenario's rollouts.
+    """Miss rates of a scenario's rollouts.
 
     Args:
-        scenario: with its future.
-        states: its rollouts; repeated ones count once, which changes no fraction.
+        scenario: Scenario with its logged future, 91 steps.
+        states: Rollouts of the scenario; repeated rollouts count once, which changes no fraction.
     """
     # 1. Last logged state of each evaluated agent that has a logged future.
     tracks, evaluated = scenario.tracks, scenario.evaluated_indices
@@ -49,8 +50,8 @@ def compute_miss_rates(scenario: Scenario, states: SimulatedStates) -> MissRates
     # 3. True where a simulated position is inside the box of the goal.
     goal = torch.from_numpy(tracks.position[evaluated, goal_step, :2]).to(position)
     heading = torch.from_numpy(tracks.heading[evaluated, goal_step]).to(position)
-    tolerance = tolerance_m(torch.from_numpy(speed), torch.from_numpy((last + 1) * STEP_S)).to(position)
-    met = is_within(position - goal[:, None], heading[:, None], tolerance[:, None])  # [N, E, T]
-    at_goal = met.gather(2, torch.from_numpy(last).to(index).expand(len(met), -1)[..., None])
-    passes = met.any(-1)
-    return MissRates(*(1.0 - float(hits.double().mean()) for hits in (at_goal, passes, passes.any(0))))
+    tolerance = compute_tolerance(torch.from_numpy(speed), torch.from_numpy((last + 1) * STEP_S)).to(position)
+    is_met = is_within(position - goal[:, None], heading[:, None], tolerance[:, None])  # [N, E, T]
+    at_goal = is_met.gather(2, torch.from_numpy(last).to(index).expand(len(is_met), -1)[..., None])
+    is_passed = is_met.any(-1)
+    return MissRates(*(1.0 - float(mask.double().mean()) for mask in (at_goal, is_passed, is_passed.any(0))))

@@ -29,17 +29,17 @@ def is_reported(score: str, config: MetricConfig) -> bool:
     """True if the official result of a year has a score.
 
     Args:
-        score: our name.
-        config: the metric's year.
+        score: Name of the score here, such as `RealismResult` has it; not the official name.
+        config: Year of the metric; results before 2025 may lack traffic lights.
     """
     return config.reports_traffic_lights or LIGHT not in score
 
 
 def official_fields(config: MetricConfig) -> dict[str, str]:
     """Official names of a scenario's scores in a year, by our names."""
-    return {ours: official for ours, official in _FIELDS.items() if is_reported(ours, config)}
+    return {name: official_name for name, official_name in _FIELDS.items() if is_reported(name, config)}
 
 
 def official_buckets(config: MetricConfig) -> dict[str, str]:
-    """Official names of the sub-scores and the figures beside them in a year, by our names."""
-    return {ours: official for ours, official in _BUCKETS.items() if is_reported(ours, config)}
+    """Official names of the sub-scores and of further figures in a year, by our names."""
+    return {name: official_name for name, official_name in _BUCKETS.items() if is_reported(name, config)}

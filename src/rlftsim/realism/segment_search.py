@@ -1,13 +1,14 @@
 """Exact nearest segment among thousands, for thousands of points, without computing every distance.
 
-Segments are cut into chunks of up to 16 neighbors of one polyline with bounding boxes. A group of points that lie
+Segments are cut into chunks of up to 16 neighbors of the same polyline with bounding boxes. A group of points that lie
 close together (an agent's corners over a few steps) shares a list of the chunks nearest to the group's box. Each
-point searches the nearest of them, then every other one whose box is not farther than the best distance so far.
+point searches the nearest listed chunk, then every listed chunk with a box not farther than the best distance so far.
 Points for which a chunk outside the list could still win look at all boxes. The result is always that of a full
 search: the smallest float32 distance, the first segment in polyline-then-segment order among equals. Segments of
-several scenarios may lie side by side; a point then searches those of its own.
+several scenarios may lie side by side; a point then searches those of the point's scenario.
 """
 
+import functools
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -16,12 +17,13 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from rlftsim.realism.rounding import compute_largest_square, compute_sqrt
 
 CHUNK_SEGMENTS = 16
 LISTED_CHUNKS = 12
-_FAR = 1e15
+PADDING_COORDINATE = 1e15
 """Coordinate of padding: never nearest, and its square is still a float32."""
 _KEY_SHIFT = 32
 """Bits of a key that hold the index of the segment."""
@@ -31,7 +33,7 @@ _KEY_SHIFT = 32
 class ChunkedSegments:
     """Segments of polylines in chunks; slots beyond a polyline's last segment are padding far away.
 
-    C chunks of B scenarios, M at most in one of them, U = 16 slots, D dimensions of the boxes.
+    C chunks of B scenarios, at most M in a scenario, U = 16 slots, D dimensions of the boxes.
     """
 
     start: tuple[Float[Tensor, "C U"], ...]
@@ -41,7 +43,7 @@ class ChunkedSegments:
     squared_length: Float[Tensor, "C U"]
     """In the plane; 1 where zero, so that a projection on a segment of no length is 0."""
     low: Float[Tensor, "D B M"]
-    """Lowest corner of the box of each scenario's chunks: no segment of a chunk is nearer than its box. Padding is far
+    """Lowest corner of the box of each scenario's chunks: no segment of a chunk is nearer than the box. Padding is far
     away."""
     high: Float[Tensor, "D B M"]
     first_chunk: Int64[Tensor, "B"]
@@ -51,17 +53,17 @@ class ChunkedSegments:
     first_segment: Int64[Tensor, "C"]
     """Index of a chunk's first segment among all segments."""
 
-    def of_scenario(
+    def select_scenarios(
         self, scenario: Int64[Tensor, "n"] | None
     ) -> tuple[Float[Tensor, "D _ M"], Float[Tensor, "D _ M"], Int64[Tensor, "_ 1"]]:
-        """Corners of the boxes that each of n points searches, and the index of its first chunk; shared if None."""
+        """Corners of the boxes that each of n points searches, and the index of the first chunk; shared if None."""
         if scenario is None:
             return self.low, self.high, self.first_chunk[:, None]
         return self.low[:, scenario], self.high[:, scenario], self.first_chunk[scenario, None]
 
 
 DistanceRule = Callable[[Float[Tensor, "P D"], ChunkedSegments, Int64[Tensor, "P"]], Float[Tensor, "P U"]]
-"""Squared distance of each point to the segments of one chunk."""
+"""Squared distance of each point to the segments of a chunk."""
 
 
 def chunk_segments(
@@ -76,74 +78,68 @@ def chunk_segments(
     """Segments, given in polyline-then-segment order, cut into chunks.
 
     Args:
-        start: first points, float32.
-        end: last points.
-        polyline: polyline of each segment, ascending.
-        bounds: lowest and highest corner of each segment's box; the distance rule of the search must never give less
+        start: First point of each segment, float32, m.
+        end: Last point of each segment, float32, m.
+        polyline: Index of each segment's polyline, ascending.
+        bounds: Lowest and highest corner of each segment's box; the distance rule of the search must never give less
             than the distance to the box.
-        axis_scale: weight of each axis in the distance to a box.
-        device: where the tensors go.
+        axis_scale: Weight of each of the D axes in the distance to a box.
+        device: Device of the tensors, that of the points to be searched for.
     """
     # 1. Chunk and slot of each segment; a chunk never spans two polylines.
-    first_of_polyline = np.searchsorted(polyline, polyline)
-    within = np.arange(len(polyline)) - first_of_polyline
-    opens_chunk = within % CHUNK_SEGMENTS == 0
-    chunk, slot = np.cumsum(opens_chunk) - 1, within % CHUNK_SEGMENTS
-    num_chunks, opening = int(opens_chunk.sum()), np.flatnonzero(opens_chunk)
+    slot = (np.arange(len(polyline)) - np.searchsorted(polyline, polyline)) % CHUNK_SEGMENTS
+    chunk, first_segment = np.cumsum(slot == 0) - 1, np.flatnonzero(slot == 0)
 
     # 2. Values of the segments at their slots [C, U], padding elsewhere.
     def scatter(values: np.ndarray, padding: float) -> Tensor:
-        packed = np.full((num_chunks, CHUNK_SEGMENTS), padding, np.float32)
-        packed[chunk, slot] = values
-        return torch.from_numpy(packed).to(device)
+        slots = np.full((len(first_segment), CHUNK_SEGMENTS), padding, np.float32)
+        slots[chunk, slot] = values
+        return torch.from_numpy(slots).to(device)
 
     delta = end - start
     squared_length = delta[:, 0] * delta[:, 0] + delta[:, 1] * delta[:, 1]
     return ChunkedSegments(
-        start=tuple(scatter(column, _FAR) for column in start.T),
+        start=tuple(scatter(column, PADDING_COORDINATE) for column in start.T),
         delta=tuple(scatter(column, 0.0) for column in delta.T),
         squared_length=scatter(np.where(squared_length > 0, squared_length, 1), 1.0),
-        low=torch.from_numpy(np.minimum.reduceat(bounds[0], opening).T[:, None].copy()).to(device),
-        high=torch.from_numpy(np.maximum.reduceat(bounds[1], opening).T[:, None].copy()).to(device),
+        low=torch.from_numpy(np.minimum.reduceat(bounds[0], first_segment).T[:, None].copy()).to(device),
+        high=torch.from_numpy(np.maximum.reduceat(bounds[1], first_segment).T[:, None].copy()).to(device),
         first_chunk=torch.zeros(1, dtype=torch.int64, device=device),
         axis_scale=axis_scale,
-        first_segment=torch.from_numpy(opening).to(device),
+        first_segment=torch.from_numpy(first_segment).to(device),
     )
 
 
-def join_chunks(parts: Sequence[ChunkedSegments | None], num_segments: Sequence[int]) -> ChunkedSegments:
+def join_chunks(maps: Sequence[ChunkedSegments | None], num_segments: Sequence[int]) -> ChunkedSegments:
     """Segments of several scenarios side by side.
 
     Args:
-        parts: of each scenario, at least one of them; None = a scenario without segments, in which nothing is searched.
-        num_segments: of each scenario.
+        maps: Segments of each scenario, at least one not None; None = a scenario without segments, never searched.
+        num_segments: Number of segments in each scenario, padding not counted.
     """
-    known = [part for part in parts if part is not None]
-    device = known[0].squared_length.device
-    num_chunks = [0 if part is None else len(part.squared_length) for part in parts]
-    boxes = []
-    for name in ("low", "high"):
-        columns = [
-            getattr(part, name)[:, 0].T if part else known[0].low.new_zeros(0, len(known[0].low)) for part in parts
-        ]
-        # [B, M, D] to [D, B, M]
-        boxes.append(torch.nn.utils.rnn.pad_sequence(columns, batch_first=True, padding_value=_FAR).permute(2, 0, 1))
-    first_segment = [
-        part.first_segment + first for part, first in zip(parts, _starts(num_segments)) if part is not None
-    ]
+    joined = [segments for segments in maps if segments is not None]
+    first_chunk = _compute_starts([0 if segments is None else len(segments.squared_length) for segments in maps])
+    first_segment = zip(maps, _compute_starts(num_segments))
+    empty = joined[0].low.new_zeros(0, len(joined[0].low))
+
+    def pad(name: str) -> Tensor:
+        """Corners of the boxes of all scenarios: [D, B, M]."""
+        corners = [empty if segments is None else getattr(segments, name)[:, 0].T for segments in maps]  # [M, D] each
+        return pad_sequence(corners, batch_first=True, padding_value=PADDING_COORDINATE).permute(2, 0, 1)
+
     return ChunkedSegments(
-        start=tuple(torch.cat(columns) for columns in zip(*(part.start for part in known))),
-        delta=tuple(torch.cat(columns) for columns in zip(*(part.delta for part in known))),
-        squared_length=torch.cat([part.squared_length for part in known]),
-        low=boxes[0],
-        high=boxes[1],
-        first_chunk=torch.tensor(_starts(num_chunks), device=device),
-        axis_scale=known[0].axis_scale,
-        first_segment=torch.cat(first_segment),
+        start=tuple(torch.cat(columns) for columns in zip(*(segments.start for segments in joined))),
+        delta=tuple(torch.cat(columns) for columns in zip(*(segments.delta for segments in joined))),
+        squared_length=torch.cat([segments.squared_length for segments in joined]),
+        low=pad("low"),
+        high=pad("high"),
+        first_chunk=torch.tensor(first_chunk, device=empty.device),
+        axis_scale=joined[0].axis_scale,
+        first_segment=torch.cat([segments.first_segment + first for segments, first in first_segment if segments]),
     )
 
 
-def _starts(counts: Sequence[int]) -> list[int]:
+def _compute_starts(counts: Sequence[int]) -> list[int]:
     """Index of the first item of each group."""
     return [0, *itertools.accumulate(counts)][:-1]
 
@@ -153,15 +149,12 @@ def _squared_box_distance(
     boxes: tuple[Float[Tensor, "D ..."], Float[Tensor, "D ..."]],
     axis_scale: tuple[float, ...],
 ) -> Float[Tensor, "..."]:
-    """Squared distance between boxes, each given by its lowest and highest corners; 0 where they touch."""
+    """Squared distance between boxes, each given by the lowest and highest corners; 0 where the boxes touch."""
     squares = []
     for axis, scale in enumerate(axis_scale):
         gap = torch.maximum(boxes[0][axis] - points[1][axis], points[0][axis] - boxes[1][axis]).clamp_(min=0.0)
         squares.append((gap if scale == 1.0 else gap.mul_(scale)).square_())
-    total = squares[0]
-    for square in squares[1:]:
-        total.add_(square)
-    return total
+    return functools.reduce(Tensor.add_, squares)
 
 
 def _to_key(distance: Float[Tensor, "P"], segment: Int64[Tensor, "P"]) -> Int64[Tensor, "P"]:
@@ -183,7 +176,7 @@ def _search_chunks(
     pairs: tuple[Int64[Tensor, "P"], Int64[Tensor, "P"]],
     max_pairs: int,
 ) -> Int64[Tensor, "P"]:
-    """Key of the nearest segment of a chunk for each (point, chunk) pair."""
+    """Key of the nearest segment of a chunk, for each (point, chunk) pair."""
     keys = []
     size = max(1, max_pairs // CHUNK_SEGMENTS)
     for row, chunk in zip(pairs[0].split(size), pairs[1].split(size)):
@@ -204,11 +197,11 @@ def _widen(
     scenario: Int64[Tensor, "n"] | None,
     max_pairs: int,
 ) -> None:
-    """Search all chunks for the points whose list was too short; lowers `key` in place."""
+    """Search all chunks for the points with too short a list; lowers `key` in place."""
     for rows in open_rows.split(max(1, max_pairs // segments.low.shape[-1])):
-        own = points[rows].T[:, :, None]  # [D, r, 1]
-        low, high, first_chunk = segments.of_scenario(None if scenario is None else scenario[rows])
-        bound = _squared_box_distance((own, own), (low, high), segments.axis_scale)  # [r, M]
+        position = points[rows].T[:, :, None]  # [D, r, 1]
+        low, high, first_chunk = segments.select_scenarios(None if scenario is None else scenario[rows])
+        bound = _squared_box_distance((position, position), (low, high), segments.axis_scale)  # [r, M]
         row, chunk = (bound <= _squared_limit(key[rows])[:, None]).nonzero().unbind(-1)
         chunk = chunk + first_chunk.expand(len(rows), 1)[row, 0]
         row = rows[row]
@@ -222,43 +215,38 @@ def _search_block(
     scenario: Int64[Tensor, "G"] | None,
     max_pairs: int,
 ) -> Int64[Tensor, "n"]:
-    """Keys of one block of groups, n = G Q."""
+    """Keys of a block of groups, n = G Q."""
     # 1. The chunks nearest to each group's box, and the bound of the first one that is not listed.
     num_groups, group_size, num_axes = groups.shape
     points, axes = groups.flatten(0, 1), groups.permute(2, 0, 1)
-    low, high, first_chunk = segments.of_scenario(scenario)
+    low, high, first_chunk = segments.select_scenarios(scenario)
     num_chunks = low.shape[-1]
-    listed = min(LISTED_CHUNKS, num_chunks)
-    bound = _squared_box_distance(
-        (axes.amin(-1)[..., None], axes.amax(-1)[..., None]), (low, high), segments.axis_scale
-    )  # [G, M]
-    near, chunks = bound.topk(min(listed + 1, num_chunks), largest=False)
-    chunks = chunks[:, :listed]  # [G, L]
+    num_listed = min(LISTED_CHUNKS, num_chunks)
+    group_box = (axes.amin(-1)[..., None], axes.amax(-1)[..., None])
+    group_bound = _squared_box_distance(group_box, (low, high), segments.axis_scale)  # [G, M]
+    group_bound, chunks = group_bound.topk(min(num_listed + 1, num_chunks), largest=False)
+    chunks = chunks[:, :num_listed]  # [G, L]
     # 2. Each point searches the nearest chunk of its list.
-    own, index = axes[..., None], chunks.expand(num_axes, -1, -1)  # [D, G, Q, 1], [D, G, L]
-    listed_boxes = (
-        low.expand(-1, num_groups, -1).gather(-1, index)[:, :, None],
-        high.expand(-1, num_groups, -1).gather(-1, index)[:, :, None],
-    )
-    bound = _squared_box_distance((own, own), listed_boxes, segments.axis_scale).flatten(0, 1)  # [n, L]
+    position, index = axes[..., None], chunks.expand(num_axes, -1, -1)  # [D, G, Q, 1], [D, G, L]
+    low, high = (corner.expand(-1, num_groups, -1).gather(-1, index)[:, :, None] for corner in (low, high))
+    bound = _squared_box_distance((position, position), (low, high), segments.axis_scale).flatten(0, 1)  # [n, L]
     # Indices of padding may lie beyond the last chunk; it is never searched, but for points of scenarios without any.
     chunks = (chunks + first_chunk).clamp_(max=len(segments.squared_length) - 1).repeat_interleave(group_size, 0)
     rows = torch.arange(len(points), device=points.device)
-    first = bound.argmin(-1, keepdim=True)
-    key = _search_chunks(points, segments, rule, (rows, chunks.gather(1, first).squeeze(1)), max_pairs)
+    nearest_chunk = bound.argmin(-1, keepdim=True)
+    key = _search_chunks(points, segments, rule, (rows, chunks.gather(1, nearest_chunk).squeeze(1)), max_pairs)
     # 3. Then every other listed chunk that may still hold something nearer.
-    may_win = (bound <= _squared_limit(key)[:, None]).scatter_(1, first, False)
+    may_win = (bound <= _squared_limit(key)[:, None]).scatter_(1, nearest_chunk, False)
     row, column = may_win.nonzero().unbind(-1)
     if len(row):
-        key.scatter_reduce_(
-            0, row, _search_chunks(points, segments, rule, (row, chunks[row, column]), max_pairs), "amin"
-        )
+        pairs = row, chunks[row, column]
+        key.scatter_reduce_(0, row, _search_chunks(points, segments, rule, pairs, max_pairs), "amin")
     # 4. Points for which an unlisted chunk may hold something nearer search all boxes.
-    if listed < num_chunks:
-        beyond = near[:, listed].repeat_interleave(group_size)
-        open_rows = (beyond <= _squared_limit(key)).nonzero().squeeze(1)
-        of_point = None if scenario is None else scenario.repeat_interleave(group_size)
-        _widen(points, segments, rule, key, open_rows, of_point, max_pairs)
+    if num_listed < num_chunks:
+        unlisted_bound = group_bound[:, num_listed].repeat_interleave(group_size)
+        open_rows = (unlisted_bound <= _squared_limit(key)).nonzero().squeeze(1)
+        point_scenario = None if scenario is None else scenario.repeat_interleave(group_size)
+        _widen(points, segments, rule, key, open_rows, point_scenario, max_pairs)
     return key
 
 
@@ -273,20 +261,16 @@ def find_nearest_segment(
     """Index of the nearest segment of each point, by `rule`, the first among equals.
 
     Args:
-        groups: G groups of Q nearby points (any grouping is correct, a tight one is fast).
-        segments: cut into chunks, in the same frame as the points.
-        rule: squared distance of points to the segments of a chunk, never below that to the chunk's box.
-        max_pairs: bound on the point-segment or group-box pairs in memory; changes no result.
-        scenario: of each group, where the segments are those of several.
+        groups: G groups of Q nearby points (any grouping is correct, a tight grouping is fast).
+        segments: Segments cut into chunks, in the same frame as the points.
+        rule: Squared distance of points to the segments of a chunk, never below that to the chunk's box.
+        max_pairs: Bound on the point-segment or group-box pairs in memory; changes no result.
+        scenario: Scenario of each group, where the segments are those of several scenarios.
     """
     num_chunks = segments.low.shape[-1]
     size = max(1, max_pairs // max(num_chunks, groups.shape[1] * max(LISTED_CHUNKS, CHUNK_SEGMENTS)))
-    starts = range(0, max(len(groups), 1), size)
-    keys = [
-        _search_block(
-            groups[i : i + size], segments, rule, None if scenario is None else scenario[i : i + size], max_pairs
-        )
-        for i in starts
-    ]
-    packed = torch.cat(keys).view(groups.shape[:2]) & ((1 << _KEY_SHIFT) - 1)
-    return segments.first_segment[packed // CHUNK_SEGMENTS] + packed % CHUNK_SEGMENTS
+    blocks = groups.split(size)
+    scenarios = [None] * len(blocks) if scenario is None else scenario.split(size)
+    keys = [_search_block(block, segments, rule, rows, max_pairs) for block, rows in zip(blocks, scenarios)]
+    slot = torch.cat(keys).view(groups.shape[:2]) & ((1 << _KEY_SHIFT) - 1)
+    return segments.first_segment[slot // CHUNK_SEGMENTS] + slot % CHUNK_SEGMENTS

@@ -1,6 +1,6 @@
-"""Rewards, one file each: from rollouts and their realism to one number per rollout.
+"""Rewards, a file for each: from rollouts and realism scores to a number per rollout.
 
-`expression` reads sums of them, `composition` adds them up and assigns the credit.
+`expression` reads sums of rewards as text, `composition` adds rewards up and assigns the credit.
 """
 
 # Importing a module registers its rewards.

@@ -14,21 +14,21 @@ def collision_offroad(realism: RealismResult, rollouts: Rollouts, batch: Scenari
     """Minus the fractions of evaluated agents that ever collide and that ever leave the road, leave-one-out.
 
     Args:
-        realism: of the rollouts.
-        rollouts: not used.
-        batch: not used.
+        realism: Scores of the same rollouts, a row per scenario.
+        rollouts: Rollouts behind the scores; not read here.
+        batch: Scenarios of the rollouts; not read here.
     """
     return leave_one_out(-(realism.rollout_collision_rate + realism.rollout_offroad_rate))
 
 
 @register_agent_rewards("collision_offroad")
 def collision_offroad_by_agent(agents: AgentScores, rollouts: Rollouts, batch: ScenarioBatch) -> Float[Tensor, "B N A"]:
-    """Each agent's own collisions and off-road driving. A collision of two evaluated agents counts for both.
+    """Collisions and off-road driving of each agent. A collision of two evaluated agents counts for both.
 
     Args:
-        agents: the rollouts' incidents by agent.
-        rollouts: not used.
-        batch: not used.
+        agents: Shares of each agent in the collision and off-road rates of the rollouts.
+        rollouts: Rollouts behind the scores; not read here.
+        batch: Scenarios of the rollouts; not read here.
     """
     return leave_one_out(-(agents.collision + agents.offroad))
 
@@ -37,13 +37,13 @@ def collision_offroad_by_agent(agents: AgentScores, rollouts: Rollouts, batch: S
 def collision_offroad_ade(
     realism: RealismResult, rollouts: Rollouts, batch: ScenarioBatch, *, ade_weight: float = 0.1
 ) -> Float[Tensor, "B N"]:
-    """`collision_offroad` with the displacement error added.
+    """Reward `collision_offroad` with the displacement error added.
 
     Args:
-        realism: of the rollouts.
-        rollouts: not used.
-        batch: not used.
-        ade_weight: reward per meter of ADE, subtracted; the paper does not give it.
+        realism: Scores of the same rollouts, a row per scenario.
+        rollouts: Rollouts behind the scores; not read here.
+        batch: Scenarios of the rollouts; not read here.
+        ade_weight: Reward per meter of ADE, subtracted; the paper gives no number.
     """
     ade = realism.rollout_displacement_error
     return leave_one_out(-(realism.rollout_collision_rate + realism.rollout_offroad_rate + ade_weight * ade))
@@ -53,12 +53,12 @@ def collision_offroad_ade(
 def collision_offroad_ade_by_agent(
     agents: AgentScores, rollouts: Rollouts, batch: ScenarioBatch, *, ade_weight: float = 0.1
 ) -> Float[Tensor, "B N A"]:
-    """Each agent's own incidents and displacement error.
+    """Incidents and displacement error of each agent.
 
     Args:
-        agents: the rollouts' incidents and errors by agent.
-        rollouts: not used.
-        batch: not used.
-        ade_weight: as in `collision_offroad_ade`.
+        agents: Shares of each agent in the rates and the displacement error of the rollouts.
+        rollouts: Rollouts behind the scores; not read here.
+        batch: Scenarios of the rollouts; not read here.
+        ade_weight: Reward per meter of displacement error, subtracted, the same as in the reward itself.
     """
     return leave_one_out(-(agents.collision + agents.offroad + ade_weight * agents.displacement_error))

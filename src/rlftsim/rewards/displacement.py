@@ -17,20 +17,20 @@ def minade_rloo(realism: RealismResult, rollouts: Rollouts, batch: ScenarioBatch
     included.
 
     Args:
-        realism: of the rollouts.
-        rollouts: not used.
-        batch: not used.
+        realism: Scores of the same rollouts, a row per scenario.
+        rollouts: Rollouts behind the scores; not read here.
+        batch: Scenarios of the rollouts; not read here.
     """
     return leave_one_out(-realism.rollout_displacement_error)
 
 
 @register_agent_rewards("minade_rloo")
 def minade_rloo_by_agent(agents: AgentScores, rollouts: Rollouts, batch: ScenarioBatch) -> Float[Tensor, "B N A"]:
-    """Each agent's own error.
+    """Displacement error of each agent.
 
     Args:
-        agents: the rollouts' errors by agent.
-        rollouts: not used.
-        batch: not used.
+        agents: Shares of each agent in the displacement error of the rollouts.
+        rollouts: Rollouts behind the scores; not read here.
+        batch: Scenarios of the rollouts; not read here.
     """
     return leave_one_out(-agents.displacement_error)

@@ -1,38 +1,38 @@
-"""The goal reward, and the paper's mixture of it with realism (RLFTSim, equation 4)."""
+"""The goal reward, and the paper's mixture of goal reward and realism (RLFTSim, equation 4)."""
 
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from rlftsim.errors import ConfigError
-from rlftsim.goals.attainment import NEAR_M, closest_m, final_m
+from rlftsim.goals.attainment import NEAR_M, compute_closest_distance, compute_final_distance
 from rlftsim.realism import AgentScores, RealismResult
-from rlftsim.rewards.base import register_agent_rewards, register_reward, register_sum, require_two
+from rlftsim.rewards.base import check_num_rollouts, register_agent_rewards, register_reward, register_sum
 from rlftsim.rewards.expression import Term
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import CURRENT_STEP
 
-KINDS = {"soft": closest_m, "hard": final_m}
-"""Distance that must be at most 2 m. soft: the least one to the goal over all steps; hard: the final one."""
+GOAL_DISTANCES = {"soft": compute_closest_distance, "hard": compute_final_distance}
+"""Distance to the goal that must be at most 2 m. soft: the smallest distance over all steps; hard: the final one."""
 
 
 @register_reward("goal")
 def goal(
     realism: RealismResult, rollouts: Rollouts, batch: ScenarioBatch, *, kind: str = "soft", partial: bool = False
 ) -> Float[Tensor, "B N"]:
-    """Fraction of the evaluated agents with a goal that meet it, minus the mean of that in the other rollouts.
+    """Fraction of the evaluated agents with a goal that meet the goal, minus the mean in the other rollouts.
 
-    The other rollouts are measured with this one's goals. 0 in scenarios without a goal.
+    The other rollouts are measured with the goals of the rollout at hand. 0 in scenarios without a goal.
 
     Args:
-        realism: not used.
-        rollouts: with their goals; without any the reward is 0.
-        batch: the scenarios.
-        kind: "soft" or "hard", see `KINDS`.
-        partial: agents that miss their goal count by the fraction of the way that they have covered, so a goal that no
+        realism: Scores of the same rollouts; not read here.
+        rollouts: N rollouts of each scenario with goals; without goals the reward is 0.
+        batch: Scenarios of the rollouts, with positions at the current step.
+        kind: "soft" counts the smallest distance to the goal over all steps, "hard" the final distance.
+        partial: True = agents that miss the goal count by the fraction of the distance covered, so that a goal that no
             rollout meets is learned from, too.
     """
     return goal_advantage(rollouts, batch, kind, partial).sum(-1)
@@ -42,14 +42,14 @@ def goal(
 def goal_by_agent(
     agents: AgentScores, rollouts: Rollouts, batch: ScenarioBatch, *, kind: str = "soft", partial: bool = False
 ) -> Float[Tensor, "B N A"]:
-    """Each agent's own part of `goal`.
+    """Share of each agent in the reward `goal`.
 
     Args:
-        agents: not used.
-        rollouts: with their goals.
-        batch: the scenarios.
-        kind: as in `goal`.
-        partial: as in `goal`.
+        agents: Scores of the same rollouts by agent; not read here.
+        rollouts: N rollouts of each scenario with goals; without goals all shares are 0.
+        batch: Scenarios of the rollouts, with positions at the current step.
+        kind: "soft" or "hard", the same as in the reward itself.
+        partial: Fractions for agents that miss the goal, the same as in the reward itself.
     """
     return goal_advantage(rollouts, batch, kind, partial)
 
@@ -62,49 +62,40 @@ def goal_terms(terms: Sequence[Term]) -> list[Term]:
 def goal_advantage(
     rollouts: Rollouts, batch: ScenarioBatch, kind: str = "soft", partial: bool = False
 ) -> Float[Tensor, "B N A"]:
-    """Each agent's part of the fraction of agents that meet their goals, minus its mean in the other rollouts.
+    """Share of each agent in the fraction of agents that meet the goal, minus the mean share in the other rollouts.
 
     Args:
-        rollouts: N of each scenario; their goals may differ between rollouts.
-        batch: the scenarios.
-        kind: "soft" or "hard", see `KINDS`.
-        partial: see `goal`.
+        rollouts: N rollouts of each scenario; goals may differ between rollouts.
+        batch: Scenarios of the rollouts, with positions at the current step.
+        kind: "soft" counts the smallest distance to the goal over all steps, "hard" the final distance.
+        partial: True = agents that miss the goal count by the fraction of the distance covered.
 
     Raises:
-        ConfigError: no such kind.
+        ConfigError: Neither "soft" nor "hard".
     """
-    if kind not in KINDS:
-        raise ConfigError(f"reward goal(kind={kind!r}): known kinds are {', '.join(KINDS)}.")
+    if kind not in GOAL_DISTANCES:
+        raise ConfigError(f"reward goal(kind={kind!r}): known kinds are {', '.join(GOAL_DISTANCES)}.")
     if rollouts.goals is None:
         return rollouts.heading.new_zeros(rollouts.heading.shape[:3])
     goals, position, count = rollouts.goals, rollouts.position, rollouts.num_rollouts
-    counted = counted_agents(rollouts, batch)  # [B, N, A]
+    is_counted = goals.goal_mask & batch.evaluated_mask[:, None]  # [B, N, A]
     # 1. Distances from the goals of rollout i to the agents of rollout j, [B, i, j, A]. Where all rollouts have the
     # same goals, one row serves for all i.
-    num_different = 1 if (goals.position == goals.position[:, :1]).all() else count
-    rows = [KINDS[kind](position, goals.rollouts(slice(i, i + 1)).repeat(count)) for i in range(num_different)]
-    beyond = torch.stack(rows, 1).expand(-1, count, -1, -1) - NEAR_M
+    num_goal_sets = 1 if (goals.position == goals.position[:, :1]).all() else count
+    rows = [GOAL_DISTANCES[kind](position, goals.rollouts(slice(i, i + 1)).repeat(count)) for i in range(num_goal_sets)]
+    excess = torch.stack(rows, 1).expand(-1, count, -1, -1) - NEAR_M
     # 2. Met = 1, missed = 0, or the fraction of the way covered.
-    met = (beyond <= 0).float()
+    attainment = (excess <= 0).float()
     if partial:
         start = batch.position[:, None, :, CURRENT_STEP]
-        ahead = (goals.position - start).norm(dim=-1) - NEAR_M  # [B, N, A]
-        met = torch.maximum(met, 1 - (beyond / ahead.clamp(min=NEAR_M)[:, :, None]).clamp(0, 1))
+        start_excess = (goals.position - start).norm(dim=-1) - NEAR_M  # [B, N, A]
+        progress = 1 - (excess / start_excess.clamp(min=NEAR_M)[:, :, None]).clamp(0, 1)
+        attainment = torch.maximum(attainment, progress)
     # 3. Leave-one-out over j: each rollout's own value against the mean of the others under the same goals.
-    own = met.diagonal(dim1=1, dim2=2).movedim(-1, 1)  # [B, N, A]
-    advantage = (own - met.mean(2)) * (require_two(own) / (own.shape[1] - 1))
-    return torch.where(counted, advantage, 0.0) / counted.sum(-1, keepdim=True).clamp(min=1)
-
-
-def counted_agents(rollouts: Rollouts, batch: ScenarioBatch) -> Bool[Tensor, "B N A"]:
-    """True for the evaluated agents that have a goal.
-
-    Args:
-        rollouts: with goals.
-        batch: the scenarios.
-    """
-    assert rollouts.goals is not None
-    return rollouts.goals.goal_mask & batch.evaluated_mask[:, None]
+    own_attainment = attainment.diagonal(dim1=1, dim2=2).movedim(-1, 1)  # [B, N, A]
+    check_num_rollouts(own_attainment)
+    advantage = (own_attainment - attainment.mean(2)) * (count / (count - 1))
+    return torch.where(is_counted, advantage, 0.0) / is_counted.sum(-1, keepdim=True).clamp(min=1)
 
 
 @register_sum("gcft")
@@ -112,9 +103,9 @@ def gcft(*, goal_weight: float = 0.1, kind: str = "soft", partial: bool = False)
     """Sum of rewards of the paper's goal-conditioned fine-tuning (RLFTSim, equation 4).
 
     Args:
-        goal_weight: the paper's lambda, in [0, 1].
-        kind: as in `goal`.
-        partial: as in `goal`; not in the paper.
+        goal_weight: The paper's lambda in [0, 1]; realism has the weight 1 - `goal_weight`.
+        kind: "soft" or "hard", the same as in the reward `goal`.
+        partial: Fractions for agents that miss the goal, which the paper does not have.
     """
     if not 0 <= goal_weight <= 1:
         raise ConfigError(f"reward gcft(goal_weight={goal_weight}): a weight in [0, 1] is expected.")

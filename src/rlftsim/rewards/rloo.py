@@ -11,12 +11,12 @@ from rlftsim.scenario.batch import ScenarioBatch
 
 @register_reward("rloo")
 def rloo(realism: RealismResult, rollouts: Rollouts, batch: ScenarioBatch) -> Float[Tensor, "B N"]:
-    """RMM of the rollout alone minus the mean of the others' (RLFTSim, section 4.1).
+    """RMM of the rollout alone minus the mean over the other rollouts (RLFTSim, section 4.1).
 
     Args:
-        realism: of the rollouts.
-        rollouts: not used.
-        batch: not used.
+        realism: Scores of the same rollouts, a row per scenario.
+        rollouts: Rollouts behind the scores; not read here.
+        batch: Scenarios of the rollouts; not read here.
     """
     return leave_one_out(realism.single_meta_metric)
 
@@ -26,8 +26,8 @@ def rloo_by_agent(agents: AgentScores, rollouts: Rollouts, batch: ScenarioBatch)
     """Split of `rloo` by the logarithmic mean (`realism.credit`).
 
     Args:
-        agents: the rollouts' scores by agent.
-        rollouts: not used.
-        batch: not used.
+        agents: Shares of each agent in the scores of single rollouts.
+        rollouts: Rollouts behind the scores; not read here.
+        batch: Scenarios of the rollouts; not read here.
     """
     return agents.single

@@ -9,7 +9,7 @@ import numpy as np
 
 from rlftsim.errors import DataError
 from rlftsim.evaluation.explain import Explanation, explain
-from rlftsim.goals.attainment import Outcome, outcome_of
+from rlftsim.goals.attainment import Outcome, measure_outcome
 from rlftsim.goals.goals_file import GoalEntry
 from rlftsim.realism import FEATURE_NAMES, SimulatedStates, metric_by_name
 from rlftsim.realism.config import BERNOULLI_FEATURES
@@ -124,7 +124,7 @@ def score_states(scenario: Scenario, states: SimulatedStates, goals: tuple[GoalE
         goals: of its agents.
         metric: year.
     """
-    outcomes = tuple((goal, outcome_of(states.way_of(goal.agent_id), (goal.x, goal.y))) for goal in goals)
+    outcomes = tuple((goal, measure_outcome(states.simulated_path(goal.agent_id), (goal.x, goal.y))) for goal in goals)
     explanation, reason = None, ""
     if not scenario.has_future:
         reason = "this split withholds the logged future, which realism is measured against: no score."

@@ -332,7 +332,7 @@ def _proposals_of(scenario: Scenario, track: int) -> dict[str, Any]:
     found = []
     for proposal in proposals:
         entry = entry_of(scenario, proposal)
-        way = np.round(proposal.way[:, :2] - scenario.origin, 2)
+        way = np.round(proposal.path[:, :2] - scenario.origin, 2)
         found.append(
             {
                 "maneuver": proposal.maneuver.value,

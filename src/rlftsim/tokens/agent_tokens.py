@@ -1,7 +1,7 @@
 """Tokenization of agents: tracks to motion tokens, by the rules of the public SMART code.
 
-A agents, S steps at 10 Hz, K token steps. Token step k is the motion from step 5k to 5k + 5, its state is the one at
-5k + 5. K is 18 for a whole scenario, 2 where only the history is logged.
+A agents, S steps at 10 Hz, K token steps. Token step k is the motion from step 5k to 5k + 5, with the state at 5k + 5.
+K is 18 for a whole scenario, 2 where only the history is logged.
 """
 
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ MAX_HEADING_STEP_RAD = 1.5
 _ROWS_PER_CHUNK = 512
 _ROWS_PER_CHUNK_ELSEWHERE = 1 << 12
 _CANDIDATES = 64
-"""Tokens whose corners are compared first; all tokens are, where these may not contain the nearest one."""
+"""Tokens whose corners are compared first; all tokens are, where these may not contain the nearest token."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +42,7 @@ class AgentTokens:
 
     token_id: Int64[Tensor, "B A K"]
     position: Float[Tensor, "B A K 2"]
-    """End points of the chosen tokens, not of the log: each token corrects the error of the one before."""
+    """End points of the matched tokens, not of the log: each token corrects the error of the token before."""
     heading: Float[Tensor, "B A K"]
     valid: Bool[Tensor, "B A K"]
     logged_position: Float[Tensor, "B A K 2"]
@@ -54,17 +54,17 @@ class AgentTokens:
 
 
 def clean_tracks(batch: ScenarioBatch, *, catk_compat: bool = False) -> CleanTracks:
-    """Tracks as SMART reads them: gaps interpolated, jumps of heading removed, up to five steps added before the first.
+    """Tracks in SMART's form: gaps interpolated, jumps of heading removed, up to five steps added before the first.
 
     Args:
-        batch: logged tracks.
-        catk_compat: round where the public code rounds, see `tokens.catk_compat`.
+        batch: Scenarios with the logged tracks of all agents.
+        catk_compat: True = round where the public code rounds, by the rules of `tokens.catk_compat`.
     """
     position, heading, velocity, valid = _fill_gaps(batch.position, batch.heading, batch.velocity, batch.valid)
     if catk_compat:
         position, velocity, valid = catk_ops.fill_gaps_in_world(batch)
     heading = _hold_jumping_headings(heading, valid)
-    return _begin_earlier(CleanTracks(position, heading, velocity, valid), stepwise=catk_compat)
+    return _extend_backwards(CleanTracks(position, heading, velocity, valid), stepwise=catk_compat)
 
 
 def _fill_gaps(
@@ -73,30 +73,25 @@ def _fill_gaps(
     velocity: Float[Tensor, "B A S 2"],
     valid: Bool[Tensor, "B A S"],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Linear interpolation between the first and the last valid step; all steps between them become valid."""
+    """Linear interpolation between the first and the last valid step, which makes all steps between valid."""
     # 1. Last valid step at or before each step, and first one at or after it [B, A, S].
     steps = torch.arange(valid.shape[-1], device=valid.device).expand_as(valid)
-    before = torch.where(valid, steps, -1).cummax(-1).values
-    after = torch.where(valid, steps, valid.shape[-1]).flip(-1).cummin(-1).values.flip(-1)
-    inside = (before >= 0) & (after < valid.shape[-1])
-    before, after = torch.where(inside, before, 0), torch.where(inside, after, 0)
+    previous = torch.where(valid, steps, -1).cummax(-1).values
+    following = torch.where(valid, steps, valid.shape[-1]).flip(-1).cummin(-1).values.flip(-1)
+    is_inside = (previous >= 0) & (following < valid.shape[-1])
+    previous, following = torch.where(is_inside, previous, 0), torch.where(is_inside, following, 0)
     # 2. Interpolation; `weight` is 0 at valid steps, where both neighbors are the step itself.
-    weight = (steps - before) / (after - before).clamp(min=1)
+    weight = (steps - previous) / (following - previous).clamp(min=1)
 
     def blend(values: Tensor) -> Tensor:
-        first, last = _take_steps(values, before), _take_steps(values, after)
-        return torch.where(inside[..., None], first + weight[..., None] * (last - first), 0.0)
+        first, last = _take_steps(values, previous), _take_steps(values, following)
+        blended = torch.where(is_inside[..., None], first + weight[..., None] * (last - first), 0.0)
+        return torch.where(valid[..., None], values, blended)
 
     # 3. Headings turn the short way round.
-    turn = wrap_angle(heading.gather(-1, after) - heading.gather(-1, before))
-    filled = torch.where(valid, heading, wrap_angle(heading.gather(-1, before) + weight * turn))
-    filled = torch.where(inside, filled, 0.0)
-    return (
-        torch.where(valid[..., None], position, blend(position)),
-        filled,
-        torch.where(valid[..., None], velocity, blend(velocity)),
-        inside,
-    )
+    turn = wrap_angle(heading.gather(-1, following) - heading.gather(-1, previous))
+    heading = torch.where(valid, heading, wrap_angle(heading.gather(-1, previous) + weight * turn))
+    return blend(position), torch.where(is_inside, heading, 0.0), blend(velocity), is_inside
 
 
 def _take_steps(values: Float[Tensor, "B A S c"], steps: Int64[Tensor, "B A S"]) -> Float[Tensor, "B A S c"]:
@@ -109,34 +104,34 @@ def _hold_jumping_headings(heading: Float[Tensor, "B A S"], valid: Bool[Tensor, 
     columns = list(heading.unbind(-1))
     for step in range(1, len(columns)):
         jumps = wrap_angle(columns[step] - columns[step - 1]).abs() > MAX_HEADING_STEP_RAD
-        hold = jumps & valid[..., step] & valid[..., step - 1]
-        columns[step] = torch.where(hold, columns[step - 1], columns[step])
+        is_jump = jumps & valid[..., step] & valid[..., step - 1]
+        columns[step] = torch.where(is_jump, columns[step - 1], columns[step])
     return torch.stack(columns, -1)
 
 
-def _begin_earlier(tracks: CleanTracks, *, stepwise: bool) -> CleanTracks:
+def _extend_backwards(tracks: CleanTracks, *, stepwise: bool) -> CleanTracks:
     """Each track extended backwards, at constant velocity, to a multiple of five steps, and at least to step 5.
 
-    So every agent has the token that ends at the current step. `stepwise` subtracts one step after the other instead of
-    their product, which rounds differently.
+    So every agent has the token that ends at the current step. `stepwise` subtracts steps in turn instead of a product,
+    which rounds differently.
     """
     num_steps = tracks.valid.shape[-1]
     steps = torch.arange(num_steps, device=tracks.valid.device)
     first = torch.where(tracks.valid, steps, num_steps).amin(-1)  # [B, A]
-    extra = torch.where(first == CURRENT_STEP, STEPS_PER_TOKEN, first % STEPS_PER_TOKEN)
+    num_added = torch.where(first == CURRENT_STEP, STEPS_PER_TOKEN, first % STEPS_PER_TOKEN)
     lead = first[..., None] - steps  # [B, A, S], number of steps before the first one
-    made_up = (lead > 0) & (lead <= extra[..., None]) & (first < num_steps)[..., None]
-    at = first.clamp(max=num_steps - 1)[..., None].expand_as(made_up)
-    velocity = _take_steps(tracks.velocity, at)
-    start = _take_steps(tracks.position, at)
-    back = start - lead[..., None] * STEP_S * velocity
+    is_added = (lead > 0) & (lead <= num_added[..., None]) & (first < num_steps)[..., None]
+    source = first.clamp(max=num_steps - 1)[..., None].expand_as(is_added)
+    velocity = _take_steps(tracks.velocity, source)
+    start = _take_steps(tracks.position, source)
+    position = start - lead[..., None] * STEP_S * velocity
     if stepwise:
-        back = catk_ops.step_back(start[..., 0, :], velocity[..., 0, :], lead)
+        position = catk_ops.step_back(start[..., 0, :], velocity[..., 0, :], lead)
     return CleanTracks(
-        position=torch.where(made_up[..., None], back, tracks.position),
-        heading=torch.where(made_up, tracks.heading.gather(-1, at), tracks.heading),
-        velocity=torch.where(made_up[..., None], velocity, tracks.velocity),
-        valid=tracks.valid | made_up,
+        position=torch.where(is_added[..., None], position, tracks.position),
+        heading=torch.where(is_added, tracks.heading.gather(-1, source), tracks.heading),
+        velocity=torch.where(is_added[..., None], velocity, tracks.velocity),
+        valid=tracks.valid | is_added,
     )
 
 
@@ -146,80 +141,67 @@ def class_boxes(object_type: Int64[Tensor, "..."]) -> tuple[Float[Tensor, "..."]
 
 
 def tokenize_tracks(
-    tracks: CleanTracks,
-    object_type: Int64[Tensor, "B A"],
-    vocabulary: Vocabulary,
-    *,
-    catk_compat: bool = False,
+    tracks: CleanTracks, object_type: Int64[Tensor, "B A"], vocabulary: Vocabulary, *, catk_compat: bool = False
 ) -> AgentTokens:
     """Rolling matching: at each step the token that ends nearest to the log, from the end of the token before.
 
     Args:
-        tracks: from `clean_tracks`.
-        object_type: WOMD's object types.
-        vocabulary: the tokens.
-        catk_compat: round where the public code rounds, see `tokens.catk_compat`.
+        tracks: Tracks without gaps, from `clean_tracks`.
+        object_type: WOMD's object type of each agent, which decides on the class.
+        vocabulary: Motion tokens of each class.
+        catk_compat: True = round where the public code rounds, by the rules of `tokens.catk_compat`.
     """
     # 1. The pose rolls along with the matched tokens; where there is no token it restarts from the log.
     match = _match_placed if catk_compat else _match_in_local_frame
     class_id = class_of_type(object_type)
     position, heading = tracks.position[..., 0, :], tracks.heading[..., 0]
     columns: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
-    ends = range(STEPS_PER_TOKEN, tracks.valid.shape[-1], STEPS_PER_TOKEN)
-    for end in ends:
+    for end in range(STEPS_PER_TOKEN, tracks.valid.shape[-1], STEPS_PER_TOKEN):
         valid = tracks.valid[..., end - STEPS_PER_TOKEN] & tracks.valid[..., end]
-        logged_position, logged_heading = tracks.position[..., end, :], tracks.heading[..., end]
-        logged_pose, pose = (logged_position, logged_heading), (position, heading)
-        token_id, led_position, led_heading = match(logged_pose, pose, class_id, valid, vocabulary)
-        position = torch.where(valid[..., None], led_position, logged_position)
-        heading = torch.where(valid, led_heading, logged_heading)
+        logged_pose = tracks.position[..., end, :], tracks.heading[..., end]
+        token_id, end_position, end_heading = match(logged_pose, (position, heading), class_id, valid, vocabulary)
+        position = torch.where(valid[..., None], end_position, logged_pose[0])
+        heading = torch.where(valid, end_heading, logged_pose[1])
         columns.append((token_id, position * valid[..., None], heading * valid, valid))
     # 2. Columns to tensors [B, A, K].
-    token_id, led_positions, led_headings, valid = (torch.stack([c[i] for c in columns], 2) for i in range(4))
-    logged = slice(STEPS_PER_TOKEN, None, STEPS_PER_TOKEN)
-    logged_position, logged_heading = tracks.position[..., logged, :], tracks.heading[..., logged]
+    token_id, position, heading, valid = (torch.stack(column, 2) for column in zip(*columns))
+    token_ends = slice(STEPS_PER_TOKEN, None, STEPS_PER_TOKEN)
+    logged_position, logged_heading = tracks.position[..., token_ends, :], tracks.heading[..., token_ends]
     # 3. Targets. The public code matches them separately, from the end of each token to the next logged pose.
     next_token_id = token_id.roll(-1, -1)
     if catk_compat:
-        following = (logged_position.roll(-1, -2), logged_heading.roll(-1, -1))
-        next_token_id = tokens_towards(
-            following, (led_positions, led_headings), class_id[..., None].expand_as(valid), valid, vocabulary
-        )
-    return AgentTokens(
-        token_id, led_positions, led_headings, valid,
-        logged_position, logged_heading, tracks.valid[..., logged], next_token_id,
-    )  # fmt: skip
+        next_pose = logged_position.roll(-1, -2), logged_heading.roll(-1, -1)
+        token_class = class_id[..., None].expand_as(valid)
+        next_token_id = tokens_towards(next_pose, (position, heading), token_class, valid, vocabulary)
+    logged_valid = tracks.valid[..., token_ends]
+    return AgentTokens(token_id, position, heading, valid, logged_position, logged_heading, logged_valid, next_token_id)
 
 
 Pose = tuple[Float[Tensor, "*batch 2"], Float[Tensor, "*batch"]]
 
 
 def tokens_towards(
-    goal: Pose,
-    pose: Pose,
-    class_id: Int64[Tensor, "*batch"],
-    valid: Bool[Tensor, "*batch"],
-    vocabulary: Vocabulary,
+    goal: Pose, pose: Pose, class_id: Int64[Tensor, "*batch"], valid: Bool[Tensor, "*batch"], vocabulary: Vocabulary
 ) -> Int64[Tensor, "*batch"]:
     """Token that ends nearest to a target pose: smallest sum of corner distances in the frame of the start pose.
 
     Args:
-        goal: target position (m) and heading (rad).
-        pose: start position and heading, same frame.
-        class_id: index into `CLASS_NAMES`.
-        valid: the result is 0 elsewhere.
-        vocabulary: the tokens.
+        goal: Target position (m) and heading (rad).
+        pose: Position and heading at the start of the token, same frame.
+        class_id: Class of each row, as an index into `CLASS_NAMES`.
+        valid: True = the row is matched; the result is 0 elsewhere.
+        vocabulary: Motion tokens of each class.
     """
     return nearest_tokens(local_boxes(goal, pose, class_id), class_id, valid, vocabulary)
 
 
 def local_boxes(goal: Pose, pose: Pose, class_id: Int64[Tensor, "*batch"]) -> Float[Tensor, "*batch 4 2"]:
-    """Corners of a class's box at a target pose, in the frame of another pose.
+    """Corners of a class's box at a target pose, in the frame of the start pose.
 
     Args:
-        goal: position (m) and heading (rad) of the box.
-        pose: origin and direction of the frame.
-        class_id: index into `CLASS_NAMES`.
+        goal: Position (m) and heading (rad) of the box.
+        pose: Origin and direction of the frame of the result.
+        class_id: Class of each row, as an index into `CLASS_NAMES`.
     """
     length, width = box_of_class(class_id)
     position = rotate(goal[0] - pose[0], -pose[1])
@@ -229,7 +211,7 @@ def local_boxes(goal: Pose, pose: Pose, class_id: Int64[Tensor, "*batch"]) -> Fl
 def _match_in_local_frame(
     logged: Pose, pose: Pose, class_id: Int64[Tensor, "B A"], valid: Bool[Tensor, "B A"], vocabulary: Vocabulary
 ) -> tuple[Int64[Tensor, "B A"], Float[Tensor, "B A 2"], Float[Tensor, "B A"]]:
-    """Token that ends nearest to the logged pose, and the pose at its end."""
+    """Token that ends nearest to the logged pose, and the pose at the token's end."""
     length, width = box_of_class(class_id)
     target = box_corners(*logged, length, width)
     local = rotate(target - pose[0][..., None, :], -pose[1][..., None])
@@ -242,7 +224,7 @@ def _match_placed(
 ) -> tuple[Int64[Tensor, "B A"], Float[Tensor, "B A 2"], Float[Tensor, "B A"]]:
     """As `_match_in_local_frame`, in the public code's order of operations."""
     length, width = box_of_class(class_id)
-    target = catk_ops.boxes_around(*logged, length, width)
+    target = catk_ops.build_boxes(*logged, length, width)
     token_id = catk_ops.nearest_placed_tokens(target, *pose, class_id, valid, vocabulary)
     corners = vocabulary.end_corners()[class_id, token_id]
     return token_id, *pose_of_corners(catk_ops.place_boxes(corners[..., None, :, :], *pose)[..., 0, :, :])
@@ -254,49 +236,48 @@ def nearest_tokens(
     valid: Bool[Tensor, "*batch"],
     vocabulary: Vocabulary,
 ) -> Int64[Tensor, "*batch"]:
-    """Token whose end box has the smallest sum of corner distances to a box; lowest index on ties.
+    """Token with the smallest sum of corner distances between end box and a box; lowest index on ties.
 
     Args:
-        local_corners: boxes in the frame of the token's start.
-        class_id: index into `CLASS_NAMES`.
-        valid: the result is 0 elsewhere.
-        vocabulary: the tokens.
+        local_corners: Corners of the boxes to match, in the frame of the token's start, m.
+        class_id: Class of each row, as an index into `CLASS_NAMES`.
+        valid: True = the row is matched; the result is 0 elsewhere.
+        vocabulary: Motion tokens of each class.
     """
     if class_id.device.type != "cpu":
         # All tokens of each row's class are compared: to select rows, the host would wait for their number.
         boxes = local_corners.reshape(-1, 4, 2).split(_ROWS_PER_CHUNK_ELSEWHERE)
         classes = class_id.flatten().split(_ROWS_PER_CHUNK_ELSEWHERE)
-        tokens = [_nearest_of_class(*chunk, vocabulary=vocabulary) for chunk in zip(boxes, classes)]
+        tokens = [_find_nearest_tokens(*chunk, vocabulary=vocabulary) for chunk in zip(boxes, classes)]
         return torch.cat(tokens).view_as(class_id) * valid
-    out = torch.zeros_like(class_id)
+    token_id = torch.zeros_like(class_id)
     # Classes may have different numbers of tokens: rows are found among those that exist, then mapped to token ids.
     for index, (table, exists) in enumerate(zip(vocabulary.end_corners(), vocabulary.token_mask)):
         rows = ((class_id == index) & valid).nonzero(as_tuple=True)
-        out[rows] = exists.nonzero()[:, 0][nearest_rows(local_corners[rows], table[exists])]
-    return out
+        token_id[rows] = exists.nonzero()[:, 0][nearest_rows(local_corners[rows], table[exists])]
+    return token_id
 
 
-def _nearest_of_class(
+def _find_nearest_tokens(
     boxes: Float[Tensor, "n 4 2"], class_id: Int64[Tensor, "n"], vocabulary: Vocabulary
 ) -> Int64[Tensor, "n"]:
-    """As `nearest_tokens`, one row of the tables of all tokens for each box."""
+    """As `nearest_tokens`, with a row of the tables of all tokens for each box."""
     distance = corner_distances(boxes, vocabulary.end_corners()[class_id])
     return distance.masked_fill(~vocabulary.token_mask[class_id], torch.inf).argmin(-1)
 
 
 def nearest_rows(boxes: Float[Tensor, "n 4 2"], table: Float[Tensor, "V 4 2"]) -> Int64[Tensor, "n"]:
-    """Row of a table whose box has the smallest sum of corner distances to each box; the lowest on ties.
+    """Row of a table with the smallest sum of corner distances to each box; the lowest on ties.
 
     Args:
-        boxes: to be matched.
-        table: candidates, same frame.
+        boxes: Corners of the boxes to match, m.
+        table: Corners of the candidate boxes, in the same frame, m.
     """
-    # In parts, so that the [n, V] tables of distances stay small.
-    parts = [_nearest_of_part(part, table) for part in boxes.split(_ROWS_PER_CHUNK)]
-    return torch.cat(parts) if parts else torch.zeros(0, dtype=torch.int64, device=boxes.device)
+    # In chunks, so that the [n, V] tables of distances stay small.
+    return torch.cat([_find_nearest_rows(chunk, table) for chunk in boxes.split(_ROWS_PER_CHUNK)])
 
 
-def _nearest_of_part(boxes: Float[Tensor, "n 4 2"], table: Float[Tensor, "V 4 2"]) -> Int64[Tensor, "n"]:
+def _find_nearest_rows(boxes: Float[Tensor, "n 4 2"], table: Float[Tensor, "V 4 2"]) -> Int64[Tensor, "n"]:
     """Nearest rows, found by way of the nearest centers; exact.
 
     The distances of the four corners sum to at least four times that of the centers, so only rows with a near center
@@ -304,24 +285,23 @@ def _nearest_of_part(boxes: Float[Tensor, "n 4 2"], table: Float[Tensor, "V 4 2"
     """
     if len(table) <= 2 * _CANDIDATES:
         return corner_distances(boxes, table).argmin(-1)
-    between = torch.cdist(boxes.mean(1), table.mean(1), compute_mode="donot_use_mm_for_euclid_dist")
-    near = between.topk(_CANDIDATES, dim=-1, largest=False, sorted=False)
-    candidates = near.indices.sort(-1).values
-    total = corner_distances(boxes, table[candidates])
-    best = total.min(-1)
-    found = candidates.gather(-1, best.indices[:, None])[:, 0]
+    center_distance = torch.cdist(boxes.mean(1), table.mean(1), compute_mode="donot_use_mm_for_euclid_dist")
+    nearest_centers = center_distance.topk(_CANDIDATES, dim=-1, largest=False, sorted=False)
+    candidates = nearest_centers.indices.sort(-1).values
+    best_rows = corner_distances(boxes, table[candidates]).min(-1)
+    nearest = candidates.gather(-1, best_rows.indices[:, None])[:, 0]
     # Rows beyond the candidates could still win, or tie within rounding: compare all.
-    unsure = 4 * near.values.amax(-1) <= best.values * 1.0001 + 1e-4
-    found[unsure] = corner_distances(boxes[unsure], table).argmin(-1)
-    return found
+    is_unsure = 4 * nearest_centers.values.amax(-1) <= best_rows.values * 1.0001 + 1e-4
+    nearest[is_unsure] = corner_distances(boxes[is_unsure], table).argmin(-1)
+    return nearest
 
 
 def corner_distances(boxes: Float[Tensor, "n 4 2"], table: Float[Tensor, "*n V 4 2"]) -> Float[Tensor, "n V"]:
     """Sum of the distances of the four corners, for each pair of boxes, m.
 
     Args:
-        boxes: n boxes.
-        table: V boxes, the same for all or V for each of the n.
+        boxes: Corners of n boxes, m.
+        table: Corners of V boxes in the same frame, m: the same V boxes for all of the n, or V for each.
     """
     # One corner at a time: [n, V] instead of [n, V, 4, 2] in memory.
     total = sum((boxes[:, None, c] - table[..., c, :]).square().sum(-1).sqrt() for c in range(4))
@@ -338,43 +318,42 @@ def place_pose(
     """Pose at the end of a token.
 
     Args:
-        vocabulary: the tokens.
-        class_id: index into `CLASS_NAMES`.
-        token_id: index of the token.
-        position: start of the token, m.
-        heading: at the start, rad.
+        vocabulary: Motion tokens of each class.
+        class_id: Class of each row, as an index into `CLASS_NAMES`.
+        token_id: Index of the token in the class.
+        position: Position at the start of the token, m.
+        heading: Heading at the start of the token, rad.
     """
-    corners = vocabulary.end_corners()[class_id, token_id]
-    local_position, local_heading = pose_of_corners(corners)
+    local_position, local_heading = pose_of_corners(vocabulary.end_corners()[class_id, token_id])
     return position + rotate(local_position, heading), wrap_angle(heading + local_heading)
 
 
 def tokenize_agents(batch: ScenarioBatch, vocabulary: Vocabulary, *, catk_compat: bool = False) -> AgentTokens:
-    """Tokens of a batch's logged tracks; each scenario's are computed once and cached while it is in memory.
+    """Tokens of a batch's logged tracks, computed once per scenario and cached while the scenario is in memory.
 
     Args:
-        batch: only its scenarios and its frame are used.
-        vocabulary: the tokens.
-        catk_compat: round where the public code rounds, see `tokens.catk_compat`.
+        batch: Batch of which only the scenarios and the frame are read.
+        vocabulary: Motion tokens of each class.
+        catk_compat: True = round where the public code rounds, by the rules of `tokens.catk_compat`.
     """
-    rows = [_tokenize_scenario(s, vocabulary, batch.frame, catk_compat) for s in batch.scenarios]
+    rows = [_tokenize_scenario(scenario, vocabulary, batch.frame, catk_compat) for scenario in batch.scenarios]
     num_agents = batch.agent_mask.shape[1]
     num_tokens = max(row.valid.shape[-1] for row in rows)
 
-    # Every field, padded to the batch's agents and to the longest scenario's tokens.
-    def padded(name: str) -> Tensor:
-        parts = [getattr(row, name)[0] for row in rows]
-        out = torch.zeros((len(parts), num_agents, num_tokens, *parts[0].shape[2:]), dtype=parts[0].dtype)
-        for target, part in zip(out, parts):
-            target[: part.shape[0], : part.shape[1]] = part
-        return out.to(batch.device)
+    def pad(name: str) -> Tensor:
+        """A field of all scenarios, padded to the batch's agents and to the longest scenario's tokens."""
+        columns = [getattr(row, name)[0] for row in rows]
+        padded = columns[0].new_zeros(len(columns), num_agents, num_tokens, *columns[0].shape[2:])
+        for target, column in zip(padded, columns):
+            target[: column.shape[0], : column.shape[1]] = column
+        return padded.to(batch.device)
 
-    return AgentTokens(**{name: padded(name) for name in AgentTokens.__dataclass_fields__})
+    return AgentTokens(**{name: pad(name) for name in AgentTokens.__dataclass_fields__})
 
 
 @cached_on_scenario
 def _tokenize_scenario(scenario: Scenario, vocabulary: Vocabulary, frame: Frame, catk_compat: bool) -> AgentTokens:
-    """Tokens of one scenario on the CPU, cached with the scenario."""
+    """Tokens of a scenario on the CPU, cached with the scenario."""
     batch = collate([scenario], frame=frame)
     tracks = clean_tracks(batch, catk_compat=catk_compat)
     return tokenize_tracks(tracks, batch.object_type, vocabulary.to("cpu"), catk_compat=catk_compat)

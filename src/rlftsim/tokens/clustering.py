@@ -25,9 +25,9 @@ from rlftsim.tokens.motions import (
     DistinctSample,
     boxes,
     end_boxes,
-    mirrored,
+    extract_motions,
+    mirror_poses,
     motion_keys,
-    motions_of,
     sample_scenarios,
     window_keys,
     with_mirror_images,
@@ -81,32 +81,32 @@ def build_vocabulary(
     """Motion tokens of each class and map prototypes from scenarios.
 
     Args:
-        scenarios: each is read once at most.
-        config: sizes and seed; the same scenarios and the same seed give the same vocabulary.
-        origin: written into the vocabulary.
-        show_progress: show a progress bar on standard error.
+        scenarios: Scenarios of the data set; each is read once at most.
+        config: Sizes and seed; the same scenarios and the same seed give the same vocabulary.
+        origin: Command, data and seed, to be stored in the vocabulary.
+        show_progress: True = show a progress bar on standard error.
 
     Returns:
-        The vocabulary, and the radius of the disks of each class in m (None where there are none).
+        The vocabulary, and the radius of the disks of each class in m (None without disks).
 
     Raises:
-        DataError: no scenario, or no usable motion at all.
+        DataError: No scenario, or no usable motion at all.
     """
     if not len(scenarios):
         raise DataError("no scenario to build a vocabulary from: is the data set empty, or the split misspelt?")
     # 1. Motions and map windows of the sampled scenarios, in bounded memory.
-    material = _Material.collect(scenarios, config, show_progress)
-    if not material.num_motions:
+    data = _TokenData.collect(scenarios, config, show_progress)
+    if not data.num_motions:
         raise DataError("no track moves for half a second in these scenarios: nothing to build a vocabulary from.")
     # 2. Tokens of each class [V, 6, 4, 2], then map prototypes [P, 11, 2].
     tables, radii = [], []
     with progress_bar("tokens: make classes and map pieces", len(CLASS_NAMES) + 1, show=show_progress) as advance:
         for index in range(len(CLASS_NAMES)):
-            tokens, radius = _motion_tokens(material, index, config)
+            tokens, radius = _build_motion_tokens(data, index, config)
             tables.append(boxes(tokens, index))
             radii.append(radius)
             advance(note=f"{CLASS_NAMES[index]}: {len(tokens)} tokens")
-        windows = material.windows.rows()
+        windows = data.windows.rows()
         # The classes have seeds [seed, 0..2], the map [seed, 3].
         rng = np.random.default_rng([config.seed, len(CLASS_NAMES)])
         prototypes = cluster_windows(windows, limit=config.num_map_prototypes, coverage=config.coverage, rng=rng)
@@ -121,7 +121,7 @@ def build_vocabulary(
 
 
 @dataclass(frozen=True, eq=False)
-class _Material:
+class _TokenData:
     """Motions and map windows that tokens are made from."""
 
     samples: tuple[DistinctSample, ...]
@@ -131,44 +131,38 @@ class _Material:
     @property
     def num_motions(self) -> int:
         """Number of motions of all classes."""
-        return sum(sample.num_seen for sample in self.samples)
+        return sum(sample.num_rows for sample in self.samples)
 
     @classmethod
-    def collect(cls, scenarios: Scenarios, config: TokensConfig, show_progress: bool) -> "_Material":
-        """Motions and windows of a sample of the scenarios.
-
-        Args:
-            scenarios: the data.
-            config: sizes and seed.
-            show_progress: show a progress bar.
-        """
+    def collect(cls, scenarios: Scenarios, config: TokensConfig, show_progress: bool) -> "_TokenData":
+        """Motions and windows of a sample of the scenarios."""
         samples = tuple(DistinctSample(config.max_segments, config.seed) for _ in CLASS_NAMES)
         cells = tuple(GridMotions(grid) for grid in config.trajtok.grids)
         windows = DistinctSample(config.max_segments, config.seed)
-        chosen = sample_scenarios(len(scenarios), config.max_scenarios, config.seed)
-        with progress_bar("tokens: read", len(chosen), show=show_progress) as advance:
-            for position in chosen:
+        positions = sample_scenarios(len(scenarios), config.max_scenarios, config.seed)
+        with progress_bar("tokens: read", len(positions), show=show_progress) as advance:
+            for position in positions:
                 scenario = scenarios[position]
-                motions = motions_of(scenario)
+                motions = extract_motions(scenario)
                 for index, (sample, grid) in enumerate(zip(samples, cells)):
-                    of_class = motions.of_class(index)
-                    sample.add(of_class, motion_keys(of_class))
-                    grid.add(of_class)
-                pieces = split_map(scenario).windows
-                windows.add(pieces, window_keys(pieces))
+                    class_motions = motions.select_class(index)
+                    sample.add(class_motions, motion_keys(class_motions))
+                    grid.add(class_motions)
+                map_windows = split_map(scenario).windows
+                windows.add(map_windows, window_keys(map_windows))
                 advance()
         return cls(samples, cells, windows)
 
 
-def _motion_tokens(
-    material: _Material, index: int, config: TokensConfig
+def _build_motion_tokens(
+    data: _TokenData, index: int, config: TokensConfig
 ) -> tuple[Float32[np.ndarray, "V 6 3"], float | None]:
-    """Tokens of one class, the first exactly still, and the radius of its disks."""
+    """Tokens of a class, the first exactly still, and the radius of the disks."""
     if config.kind == "trajtok":
-        return rule_tokens(material.cells[index], config.trajtok), None
-    motions = material.samples[index].rows()
+        return rule_tokens(data.cells[index], config.trajtok), None
+    motions = data.samples[index].rows()
     # The data have few fast vehicles: without straight tokens of their own these would have no near token.
-    straight = _unseen_speeds(motions, config) if index == 0 and len(motions) else motions[:0]
+    straight = _fill_speed_gaps(motions, config) if index == 0 and len(motions) else motions[:0]
     tokens, radius = cluster_motions(
         motions,
         index,
@@ -177,38 +171,37 @@ def _motion_tokens(
         mirror=config.mirror,
         rng=np.random.default_rng([config.seed, index]),
     )
-    tokens = _without_dead(tokens, motions, index, config) if len(motions) else tokens
+    tokens = _drop_unused_tokens(tokens, motions, index, config) if len(motions) else tokens
     return np.concatenate([tokens, straight]), radius
 
 
-def _unseen_speeds(motions: Float32[np.ndarray, "n 6 3"], config: TokensConfig) -> Float32[np.ndarray, "s 6 3"]:
-    """Straight motions at constant speeds that the data lack; with larger gaps where they would be too many."""
+def _fill_speed_gaps(motions: Float32[np.ndarray, "n 6 3"], config: TokensConfig) -> Float32[np.ndarray, "s 6 3"]:
+    """Straight motions at constant speeds that the data lack; with larger gaps where the motions would be too many."""
     ends = end_boxes(motions, 0).numpy()
     progress = np.linspace(0, 1, STEPS_PER_TOKEN + 1, dtype=np.float32)
-    gap, room = MAX_GAP_M, int(MAX_STRAIGHT_FRACTION * config.num_tokens)
+    gap, max_tokens = MAX_GAP_M, int(MAX_STRAIGHT_FRACTION * config.num_tokens)
     while True:
-        way = np.arange(1, int(config.straight_up_to_mps * STEPS_PER_TOKEN * STEP_S / gap) + 1) * gap
-        straight = np.zeros((len(way), STEPS_PER_TOKEN + 1, 3), np.float32)
-        straight[..., 0] = way[:, None] * progress
-        lonely = np.array([shape_distance(ends, box).min() > gap for box in end_boxes(straight, 0).numpy()], bool)
-        if lonely.sum() <= room:
-            return straight[lonely]
+        distance = np.arange(1, int(config.straight_up_to_mps * STEPS_PER_TOKEN * STEP_S / gap) + 1) * gap
+        straight = np.zeros((len(distance), STEPS_PER_TOKEN + 1, 3), np.float32)
+        straight[..., 0] = distance[:, None] * progress
+        is_isolated = np.array([shape_distance(ends, box).min() > gap for box in end_boxes(straight, 0).numpy()], bool)
+        if is_isolated.sum() <= max_tokens:
+            return straight[is_isolated]
         gap *= 1.25
 
 
-def _without_dead(
+def _drop_unused_tokens(
     tokens: Float32[np.ndarray, "V 6 3"], motions: Float32[np.ndarray, "n 6 3"], class_index: int, config: TokensConfig
 ) -> Float32[np.ndarray, "W 6 3"]:
-    """The first token and those that are nearest to some motion; both or none of a mirrored pair."""
-    every = with_mirror_images(motions) if config.mirror else motions
-    ends = end_boxes(every, class_index)
+    """The first token and the tokens nearest to some motion; both or none of a mirrored pair."""
+    ends = end_boxes(with_mirror_images(motions) if config.mirror else motions, class_index)
     # Repeated, because without a token's mirror image its motions fall on others.
     while True:
         table = end_boxes(tokens, class_index)
-        used = torch.bincount(nearest_rows(ends, table), minlength=len(tokens)) > 0
-        used[0] = True
+        is_used = torch.bincount(nearest_rows(ends, table), minlength=len(tokens)) > 0
+        is_used[0] = True
         if config.mirror:
-            used &= used[nearest_rows(end_boxes(mirrored(tokens), class_index), table)]
-        if used.all():
+            is_used &= is_used[nearest_rows(end_boxes(mirror_poses(tokens), class_index), table)]
+        if is_used.all():
             return tokens
-        tokens = tokens[used.numpy()]
+        tokens = tokens[is_used.numpy()]

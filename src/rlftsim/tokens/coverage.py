@@ -12,12 +12,12 @@ from rlftsim.progress import progress_bar
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.types import STEP_S, Scenario, Scenarios
 from rlftsim.tokens.agent_tokens import class_boxes, nearest_rows, tokenize_agents
-from rlftsim.tokens.motions import Motions, end_boxes, is_plausible, mirrored, motions_of, sample_scenarios
+from rlftsim.tokens.motions import Motions, end_boxes, extract_motions, is_plausible, mirror_poses, sample_scenarios
 from rlftsim.tokens.vocabulary import CLASS_NAMES, STEPS_PER_TOKEN, Vocabulary, class_of_type
 
 TOKEN_S = STEPS_PER_TOKEN * STEP_S
 MAX_SPEED_BIN_MPS = 45
-"""Number of bins of 1 m/s; the last one has all higher speeds."""
+"""Number of bins of 1 m/s; the last bin has all higher speeds."""
 _EDGES = np.concatenate([[0.0], np.geomspace(1e-5, 1e3, 4001)])
 """Edges of the bins that errors are counted in: a bin is 0.5 % wide."""
 
@@ -66,7 +66,7 @@ class Spread:
 
 @dataclass(eq=False)
 class ClassCoverage:
-    """Coverage of one class's motions by its tokens. Errors are mean distances of the four corners of two boxes."""
+    """Coverage of a class's motions by the tokens. Errors are mean distances of the four corners of two boxes."""
 
     class_name: str
     poses: Float[np.ndarray, "V 5 3"]
@@ -78,7 +78,7 @@ class ClassCoverage:
     is_implausible: Bool[np.ndarray, "V"]
     """True for tokens that cannot be driven or walked, such as a turn of 30 degrees within 0.1 s."""
     asymmetry_m: float
-    """Error of the token whose mirror image is worst represented; 0 = left and right are the same."""
+    """Error of the token with the worst represented mirror image; 0 = left and right are the same."""
     single_m: Spread = field(default_factory=Spread)
     """Error of single motions: distance to the nearest token."""
     rolling_m: Spread = field(default_factory=Spread)
@@ -104,15 +104,15 @@ class ClassCoverage:
 
     @property
     def is_unused(self) -> Bool[np.ndarray, "V"]:
-        """True for tokens that are nearest to no motion, and to no mirror image of one."""
+        """True for tokens that are nearest to no motion, and to no mirror image of a motion."""
         return self.use == 0
 
     @property
     def is_spare(self) -> Bool[np.ndarray, "V"]:
         """True for unused tokens that exist for a speed which the data lack: exactly straight at constant speed."""
         even = self.poses[:, -1:] * np.linspace(0.2, 1.0, STEPS_PER_TOKEN)[:, None]
-        straight = (np.abs(self.poses - even).max((1, 2)) < 1e-4) & (np.abs(self.poses[:, -1, 1:]).max(1) < 1e-4)
-        return self.is_unused & straight & (self.poses[:, -1, 0] > 0.05)
+        is_straight = (np.abs(self.poses - even).max((1, 2)) < 1e-4) & (np.abs(self.poses[:, -1, 1:]).max(1) < 1e-4)
+        return self.is_unused & is_straight & (self.poses[:, -1, 0] > 0.05)
 
     @property
     def is_dead(self) -> Bool[np.ndarray, "V"]:
@@ -137,39 +137,39 @@ def measure_coverage(
     """Coverage of each class: a vocabulary compared with logged motions.
 
     Args:
-        scenarios: the data.
-        vocabulary: built from these scenarios or from others.
-        radii_m: of the disks, from `build_vocabulary`; None = unknown.
-        max_scenarios: number of scenarios read, sampled uniformly; None = all.
-        seed: of the sample.
-        show_progress: show a progress bar on standard error.
+        scenarios: Scenarios of the data set that the motions come from.
+        vocabulary: Vocabulary to measure, built from these or from different scenarios.
+        radii_m: Radius of the disks of each class, m, from `build_vocabulary`; None = unknown.
+        max_scenarios: Number of scenarios that are read, sampled uniformly; None = all.
+        seed: Seed of the sample of scenarios.
+        show_progress: True = show a progress bar on standard error.
     """
-    classes = tuple(_begin(vocabulary, index, radius) for index, radius in enumerate(radii_m))
-    chosen = sample_scenarios(len(scenarios), max_scenarios, seed)
-    with progress_bar("tokens: check", len(chosen), show=show_progress) as advance:
-        for position in chosen:
+    classes = tuple(_start_coverage(vocabulary, index, radius) for index, radius in enumerate(radii_m))
+    positions = sample_scenarios(len(scenarios), max_scenarios, seed)
+    with progress_bar("tokens: check", len(positions), show=show_progress) as advance:
+        for position in positions:
             scenario = scenarios[position]
-            _add_motions(classes, motions_of(scenario), vocabulary)
+            _add_motions(classes, extract_motions(scenario), vocabulary)
             _add_tracks(classes, scenario, vocabulary)
             advance()
     return classes
 
 
-def _begin(vocabulary: Vocabulary, index: int, radius_m: float | None) -> ClassCoverage:
+def _start_coverage(vocabulary: Vocabulary, index: int, radius_m: float | None) -> ClassCoverage:
     exists = vocabulary.token_mask[index]
     poses = vocabulary.poses[index, exists].numpy()
     # The pose at step 0 is the origin.
-    whole = np.concatenate([np.zeros_like(poses[:, :1]), poses], 1)
+    motions = np.concatenate([np.zeros_like(poses[:, :1]), poses], 1)
     # Distance of each token's mirror image to the nearest token.
     table = vocabulary.end_corners()[index, exists]  # [V, 4, 2]
-    reflected = end_boxes(mirrored(poses), index)
+    reflected = end_boxes(mirror_poses(poses), index)
     distance = (table[nearest_rows(reflected, table)] - reflected).norm(dim=-1).mean(-1)
     return ClassCoverage(
         class_name=CLASS_NAMES[index],
         poses=poses,
         use=np.zeros(len(poses), np.int64),
         radius_m=radius_m,
-        is_implausible=~is_plausible(whole, index),
+        is_implausible=~is_plausible(motions, index),
         asymmetry_m=float(distance.max()),
     )
 
@@ -177,16 +177,16 @@ def _begin(vocabulary: Vocabulary, index: int, radius_m: float | None) -> ClassC
 def _add_motions(classes: tuple[ClassCoverage, ...], motions: Motions, vocabulary: Vocabulary) -> None:
     """Add the single motions of a scenario."""
     for index, coverage in enumerate(classes):
-        of_class = motions.of_class(index)
+        class_motions = motions.select_class(index)
         coverage.num_glitches += int(((motions.class_id == index) & ~motions.is_plausible).sum())
-        ends = end_boxes(of_class, index)
+        ends = end_boxes(class_motions, index)
         table = vocabulary.end_corners()[index, vocabulary.token_mask[index]]
         nearest = nearest_rows(ends, table)
-        reflected = nearest_rows(end_boxes(mirrored(of_class), index), table)
+        reflected = nearest_rows(end_boxes(mirror_poses(class_motions), index), table)
         for token_id in (nearest, reflected):
             coverage.use += np.bincount(token_id.numpy(), minlength=len(coverage.use))
         coverage.single_m.add((table[nearest] - ends).norm(dim=-1).mean(-1))
-        speed = np.hypot(of_class[:, -1, 0], of_class[:, -1, 1]) / TOKEN_S
+        speed = np.hypot(class_motions[:, -1, 0], class_motions[:, -1, 1]) / TOKEN_S
         coverage.speed_mps.add(torch.from_numpy(speed))
         slot = np.minimum(speed.astype(int), MAX_SPEED_BIN_MPS - 1)
         coverage.speed_counts += np.bincount(slot, minlength=MAX_SPEED_BIN_MPS)
@@ -198,12 +198,12 @@ def _add_tracks(classes: tuple[ClassCoverage, ...], scenario: Scenario, vocabula
     tokens = tokenize_agents(batch, vocabulary)
     length, width = (side[..., None].expand(tokens.valid.shape) for side in class_boxes(batch.object_type))
     # Boxes where the tokens end and where the log is [1, A, K, 4, 2].
-    led = box_corners(tokens.position, tokens.heading, length, width)
-    logged = box_corners(tokens.logged_position, tokens.logged_heading, length, width)
-    error = (led - logged).norm(dim=-1).mean(-1)
+    token_boxes = box_corners(tokens.position, tokens.heading, length, width)
+    logged_boxes = box_corners(tokens.logged_position, tokens.logged_heading, length, width)
+    error = (token_boxes - logged_boxes).norm(dim=-1).mean(-1)
     turn = wrap_angle(tokens.heading - tokens.logged_heading).abs()
     class_id = class_of_type(batch.object_type)
     for index, coverage in enumerate(classes):
-        where = (class_id == index)[..., None] & tokens.valid
-        coverage.rolling_m.add(error[where])
-        coverage.heading_rad.add(turn[where])
+        mask = (class_id == index)[..., None] & tokens.valid
+        coverage.rolling_m.add(error[mask])
+        coverage.heading_rad.add(turn[mask])

@@ -1,4 +1,4 @@
-"""k-disks: disks of one radius cover the motions, or map pieces, of the data; a token is the mean of a disk.
+"""k-disks: disks of equal radius cover the motions, or map pieces, of the data; a token is the mean of a disk.
 
 The published recipe draws disk centers at random until V tokens exist, at a fixed radius. Here the radius is
 searched: the smallest at which V disks cover a given fraction. So a small vocabulary has wide disks instead of holes.
@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int64
 from scipy.spatial import KDTree
 
-from rlftsim.tokens.motions import end_boxes, mirrored, straightened, with_mirror_images
+from rlftsim.tokens.motions import end_boxes, mirror_poses, straighten_motions, with_mirror_images
 from rlftsim.tokens.vocabulary import STEPS_PER_TOKEN
 
 MIN_RADIUS_M = 0.02
@@ -23,7 +23,7 @@ _STILL = np.zeros((1, STEPS_PER_TOKEN + 1, 3), np.float32)
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """Shapes of k points that disks cover. The distance of two shapes is the mean distance of their points."""
+    """Shapes of k points that disks cover. The distance of two shapes is the mean distance of the points."""
 
     shapes: Float32[np.ndarray, "n k 2"]
     start: Float32[np.ndarray, "k 2"]
@@ -40,30 +40,29 @@ class Cloud:
         """Indices of the shapes within a radius of a shape.
 
         Args:
-            center: any shape.
-            radius_m: greatest distance, m.
+            center: Shape in the middle, in the cloud or not.
+            radius_m: Greatest distance of a shape from the center, m.
         """
         # The means of two shapes are never farther apart than the shapes: the tree over means finds a superset.
-        found = self._tree.query_ball_point(center.mean(0), radius_m * 1.001)  # type: ignore[attr-defined]
-        near = np.asarray(found, np.int64)
-        near.sort()
-        return near[shape_distance(self.shapes[near], center) <= radius_m]
+        indices = self._tree.query_ball_point(center.mean(0), radius_m * 1.001)  # type: ignore[attr-defined]
+        candidates = np.sort(np.asarray(indices, np.int64))
+        return candidates[shape_distance(self.shapes[candidates], center) <= radius_m]
 
 
 @dataclass(frozen=True, eq=False)
 class Disk:
-    """Members of a disk. `is_pair` is True if its mirror image is a disk, too."""
+    """Members of a disk. `is_pair` is True if the mirror image is a disk, too."""
 
     members: Int64[np.ndarray, "m"]
     is_pair: bool
 
 
 def shape_distance(shapes: Float32[np.ndarray, "n k 2"], center: Float32[np.ndarray, "*k 2"]) -> Float[np.ndarray, "n"]:
-    """Mean distance of the points of each shape to those of another one, m.
+    """Mean distance of the points of each shape to the points of a center, m.
 
     Args:
-        shapes: n shapes.
-        center: one shape, or one for each of the n.
+        shapes: Points of n shapes, m.
+        center: Points of a shape, m, the same for all of the n or different for each.
     """
     return np.sqrt(np.square(shapes - center).sum(-1)).mean(-1)
 
@@ -77,44 +76,44 @@ def cluster_motions(
     mirror: bool,
     rng: np.random.Generator,
 ) -> tuple[Float32[np.ndarray, "V 6 3"], float]:
-    """At most `limit` tokens, the first exactly still, and the radius of their disks.
+    """At most `limit` tokens, the first exactly still, and the radius of the disks.
 
     Args:
-        motions: to be covered.
-        class_index: class whose box is compared.
-        limit: V.
-        coverage: fraction of the motions that lie within a disk.
-        mirror: cover mirror images, too, by tokens that come in pairs or are straight.
-        rng: draws the order in which shapes become centers of disks.
+        motions: Motions to cover with disks, mirror images not included.
+        class_index: Class whose box is compared.
+        limit: Greatest number of tokens V.
+        coverage: Fraction of the motions that lie within a disk.
+        mirror: True = cover mirror images, too, by tokens that come in pairs or are straight.
+        rng: Generator of the order in which shapes become centers of disks.
     """
     if not len(motions):
         return _STILL, 0.0
     cloud = _motion_cloud(motions, class_index, mirror)
-    every = with_mirror_images(motions) if mirror else motions
-    order = rng.permutation(len(every))
+    motions = with_mirror_images(motions) if mirror else motions
+    order = rng.permutation(len(motions))
     radius = smallest_radius(cloud, order, coverage=coverage, limit=limit)
     disks, _ = lay_disks(cloud, order, radius, limit)
     tokens = [_STILL]
     for disk in disks[1:]:
-        token = mean_motion(every[disk.members])[None]
+        token = mean_motion(motions[disk.members])[None]
         if disk.is_pair:
-            tokens += [token, mirrored(token)]
+            tokens += [token, mirror_poses(token)]
         else:
             # With mirror images, a disk that is not one of a pair is its own mirror image.
-            tokens.append(straightened(token) if mirror else token)
+            tokens.append(straighten_motions(token) if mirror else token)
     return np.concatenate(tokens), radius
 
 
 def cluster_windows(
     windows: Float32[np.ndarray, "w 11 2"], *, limit: int, coverage: float, rng: np.random.Generator
 ) -> Float32[np.ndarray, "P 11 2"]:
-    """Prototypes of map pieces: a straight one, and the mean of each disk over the windows.
+    """Prototypes of map pieces: a straight piece, and the mean of each disk over the windows.
 
     Args:
-        windows: pieces of 5 m, a point every 0.5 m, in their own frame.
-        limit: P.
-        coverage: fraction of the windows that lie within a disk.
-        rng: draws the order in which windows become centers of disks.
+        windows: Pieces of 5 m, a point every 0.5 m, each in the frame of the first point.
+        limit: Greatest number of prototypes P.
+        coverage: Fraction of the windows that lie within a disk.
+        rng: Generator of the order in which windows become centers of disks.
     """
     straight = np.stack([np.arange(11) * 0.5, np.zeros(11)], -1).astype(np.float32)
     if not len(windows):
@@ -127,71 +126,71 @@ def cluster_windows(
 
 
 def smallest_radius(cloud: Cloud, order: Int64[np.ndarray, "n"], *, coverage: float, limit: int) -> float:
-    """Smallest radius at which `limit` disks cover the given fraction of the shapes, to about 4 %, m.
+    """Smallest radius at which `limit` disks cover a fraction of the shapes, to about 4 %, m.
 
     Args:
-        cloud: the shapes.
-        order: of the centers.
-        coverage: fraction of the shapes within a disk.
-        limit: number of tokens.
+        cloud: Shapes to cover, with mirror images if there are any.
+        order: Order in which the shapes become centers.
+        coverage: Fraction of the shapes that lie within a disk.
+        limit: Greatest number of tokens; a pair of disks counts twice.
     """
     # Bisection of the logarithm: coverage grows with the radius, up to noise from the order.
     low, high = MIN_RADIUS_M, MAX_RADIUS_M
     for _ in range(RADIUS_STEPS):
         middle = float(np.sqrt(low * high))
-        left = lay_disks(cloud, order, middle, limit)[1]
-        low, high = (low, middle) if left.mean() <= 1 - coverage else (middle, high)
+        is_uncovered = lay_disks(cloud, order, middle, limit)[1]
+        low, high = (low, middle) if is_uncovered.mean() <= 1 - coverage else (middle, high)
     return high
 
 
 def lay_disks(
     cloud: Cloud, order: Int64[np.ndarray, "n"], radius_m: float, limit: int
 ) -> tuple[list[Disk], Bool[np.ndarray, "n"]]:
-    """Disks for up to `limit` tokens, and a mask of the shapes outside all of them.
+    """Disks for up to `limit` tokens, and a mask of the shapes outside all disks.
 
-    The first disk is around the cloud's start, each further one around the first shape in `order` that is still
-    outside. If that shape is within the radius of its own straightened form, the disk is centered on that; else its
-    mirror image is a disk, too.
+    The first disk is around the cloud's start, each further disk around the first shape in `order` that is still
+    outside. If the straightened form of that shape is within the radius, the disk is centered there; else the mirror
+    image is a disk, too.
 
     Args:
-        cloud: the shapes.
-        order: in which shapes become centers.
-        radius_m: of all disks.
-        limit: number of tokens; a pair of disks counts twice.
+        cloud: Shapes to cover, with mirror images if there are any.
+        order: Order in which the shapes become centers.
+        radius_m: Radius of all disks, m.
+        limit: Greatest number of tokens; a pair of disks counts twice.
     """
-    left = np.ones(len(cloud.shapes), bool)
+    is_uncovered = np.ones(len(cloud.shapes), bool)
     disks = [Disk(cloud.within(cloud.start, radius_m), is_pair=False)]
-    left[disks[0].members] = False
+    is_uncovered[disks[0].members] = False
     count = 1
-    off_axis = np.inf if cloud.straight is None else shape_distance(cloud.shapes, cloud.straight)
-    is_pair = (off_axis > radius_m) & (cloud.partner is not None) & np.ones(len(left), bool)
-    for center in order:
+    axis_distance = np.inf if cloud.straight is None else shape_distance(cloud.shapes, cloud.straight)
+    is_pair = (axis_distance > radius_m) & (cloud.partner is not None) & np.ones(len(is_uncovered), bool)
+    for index in order:
         if count == limit:
             break
         # A pair does not fit into the last free token; a straight disk further on may.
-        pair = bool(is_pair[center])
-        if not left[center] or count + 1 + pair > limit:
+        num_tokens = 1 + bool(is_pair[index])
+        if not is_uncovered[index] or count + num_tokens > limit:
             continue
-        around = cloud.shapes if pair or cloud.straight is None else cloud.straight
-        members = cloud.within(around[center], radius_m)
-        members = members[left[members]]
-        left[members] = False
+        centers = cloud.shapes if is_pair[index] or cloud.straight is None else cloud.straight
+        members = cloud.within(centers[index], radius_m)
+        members = members[is_uncovered[members]]
+        is_uncovered[members] = False
         if cloud.partner is not None:
-            left[cloud.partner[members]] = False
-        disks.append(Disk(members, pair))
-        count += 1 + pair
-    return disks, left
+            is_uncovered[cloud.partner[members]] = False
+        disks.append(Disk(members, bool(is_pair[index])))
+        count += num_tokens
+    return disks, is_uncovered
 
 
 def _motion_cloud(motions: Float32[np.ndarray, "n 6 3"], class_index: int, mirror: bool) -> Cloud:
-    """End boxes of motions; with `mirror` each is followed by its mirror image."""
+    """End boxes of motions; with `mirror` each is followed by the mirror image."""
     start = end_boxes(_STILL, class_index)[0].numpy()
     if not mirror:
         return Cloud(end_boxes(motions, class_index).numpy(), start)
     # Motion 2i and its mirror image 2i + 1 are partners: i ^ 1.
-    both = with_mirror_images(motions)
-    ends, on_axis = (end_boxes(m, class_index).numpy() for m in (both, straightened(both)))
-    return Cloud(ends, start, np.arange(len(both)) ^ 1, on_axis)
+    motions = with_mirror_images(motions)
+    ends, straight = (end_boxes(poses, class_index).numpy() for poses in (motions, straighten_motions(motions)))
+    return Cloud(ends, start, np.arange(len(motions)) ^ 1, straight)
 
 
 def mean_motion(motions: Float32[np.ndarray, "n 6 3"]) -> Float32[np.ndarray, "6 3"]:

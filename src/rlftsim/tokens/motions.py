@@ -37,18 +37,18 @@ class Motions:
     is_plausible: Bool[np.ndarray, "n"]
     """False = a glitch of the log, not to be learned from."""
 
-    def of_class(self, index: int) -> Float32[np.ndarray, "m 6 3"]:
+    def select_class(self, index: int) -> Float32[np.ndarray, "m 6 3"]:
         """The plausible motions of a class."""
         return self.poses[self.is_plausible & (self.class_id == index)]
 
 
-def motions_of(scenario: Scenario) -> Motions:
-    """Consecutive motions of the simulated agents with at least 30 logged steps, each in the frame of its start."""
+def extract_motions(scenario: Scenario) -> Motions:
+    """Consecutive motions of the simulated agents with at least 30 logged steps, each in the frame of the start."""
     batch = collate([scenario])
     tracks = clean_tracks(batch)
-    enough = batch.valid.sum(-1) >= MIN_VALID_STEPS if scenario.has_future else batch.valid[..., CURRENT_STEP]
+    is_logged = batch.valid.sum(-1) >= MIN_VALID_STEPS if scenario.has_future else batch.valid[..., CURRENT_STEP]
     # [1, A, K]: True = all six steps are valid
-    windows = tracks.valid.unfold(-1, STEPS_PER_TOKEN + 1, STEPS_PER_TOKEN).all(-1) & enough[..., None]
+    windows = tracks.valid.unfold(-1, STEPS_PER_TOKEN + 1, STEPS_PER_TOKEN).all(-1) & is_logged[..., None]
     position = tracks.position.unfold(2, STEPS_PER_TOKEN + 1, STEPS_PER_TOKEN)[windows].transpose(1, 2)  # [n, 6, 2]
     heading = tracks.heading.unfold(2, STEPS_PER_TOKEN + 1, STEPS_PER_TOKEN)[windows]
     local = rotate(position - position[:, :1], -heading[:, :1])
@@ -61,8 +61,8 @@ def is_plausible(poses: Float32[np.ndarray, "n 6 3"], class_id: Int64[np.ndarray
     """True for motions that can be driven, walked or cycled: no step too fast, no turn too sharp.
 
     Args:
-        poses: the motions.
-        class_id: of each motion, or of all.
+        poses: Poses of n motions: x, y (m) and heading (rad).
+        class_id: Class of each motion, or of all.
     """
     step = np.diff(poses, axis=1)
     speed = np.hypot(step[..., 0], step[..., 1]).max(1) / STEP_S
@@ -71,17 +71,17 @@ def is_plausible(poses: Float32[np.ndarray, "n 6 3"], class_id: Int64[np.ndarray
     return (speed <= limit) & (turn <= MAX_STEP_TURN_RAD) & (np.abs(poses[..., 2]) <= MAX_TURN_RAD).all(1)
 
 
-def mirrored(poses: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+def mirror_poses(poses: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
     """The same poses with left and right exchanged."""
     return poses * _MIRROR
 
 
 def with_mirror_images(motions: Float32[np.ndarray, "n 6 3"]) -> Float32[np.ndarray, "m 6 3"]:
-    """Each motion followed by its mirror image."""
-    return np.stack([motions, mirrored(motions)], 1).reshape(-1, *motions.shape[1:])
+    """Each motion followed by the mirror image."""
+    return np.stack([motions, mirror_poses(motions)], 1).reshape(-1, *motions.shape[1:])
 
 
-def straightened(motions: Float32[np.ndarray, "n 6 3"]) -> Float32[np.ndarray, "n 6 3"]:
+def straighten_motions(motions: Float32[np.ndarray, "n 6 3"]) -> Float32[np.ndarray, "n 6 3"]:
     """The motions projected onto the axis of the mirror: same x, y = 0, no turn."""
     return motions * np.array([1, 0, 0], np.float32)
 
@@ -90,8 +90,8 @@ def end_boxes(poses: Float[np.ndarray, "n t 3"], class_index: int) -> Float[Tens
     """Corners of a class's box at the end of each motion.
 
     Args:
-        poses: the motions.
-        class_index: into `CLASS_BOXES_M`.
+        poses: Poses of n motions: x, y (m) and heading (rad).
+        class_index: Class, as an index into `CLASS_BOXES_M`.
     """
     return boxes(poses[:, -1:], class_index)[:, 0]
 
@@ -100,8 +100,8 @@ def boxes(poses: Float[np.ndarray, "n t 3"], class_index: int) -> Float[Tensor, 
     """Corners of a class's box at each pose.
 
     Args:
-        poses: the motions.
-        class_index: into `CLASS_BOXES_M`.
+        poses: Poses of n motions: x, y (m) and heading (rad).
+        class_index: Class, as an index into `CLASS_BOXES_M`.
     """
     tensor = torch.from_numpy(np.ascontiguousarray(poses, dtype=np.float32))
     length, width = (torch.tensor(side) for side in CLASS_BOXES_M[class_index])
@@ -110,12 +110,14 @@ def boxes(poses: Float[np.ndarray, "n t 3"], class_index: int) -> Float[Tensor, 
 
 def motion_keys(poses: Float32[np.ndarray, "n 6 3"]) -> Int64[np.ndarray, "n 6"]:
     """Keys that are equal for motions that agree to 1 cm (at steps 2 and 5), and for mirror images."""
-    key = np.round(poses[:, [2, 5]] / _KEY_M).astype(np.int64).reshape(len(poses), 6)
-    other = np.round(mirrored(poses[:, [2, 5]]) / _KEY_M).astype(np.int64).reshape(len(poses), 6)
+    key, mirror_key = (
+        np.round(values[:, [2, 5]] / _KEY_M).astype(np.int64).reshape(len(poses), 6)
+        for values in (poses, mirror_poses(poses))
+    )
     # Of a key and that of the mirror image take the larger one in lexicographic order.
-    first = np.argmax(key != other, axis=1)
+    first = np.argmax(key != mirror_key, axis=1)
     rows = np.arange(len(key))
-    return np.where((key[rows, first] < other[rows, first])[:, None], other, key)
+    return np.where((key[rows, first] < mirror_key[rows, first])[:, None], mirror_key, key)
 
 
 def window_keys(windows: Float32[np.ndarray, "n 11 2"]) -> Int64[np.ndarray, "n 22"]:
@@ -127,30 +129,29 @@ def sample_scenarios(num_scenarios: int, limit: int | None, seed: int) -> list[i
     """Positions of at most `limit` scenarios, sampled uniformly, in ascending order.
 
     Args:
-        num_scenarios: to sample from.
-        limit: size of the sample; None = all.
-        seed: of the sample.
+        num_scenarios: Number of scenarios to sample from.
+        limit: Greatest size of the sample; None = all scenarios.
+        seed: Seed of the sample; equal seeds, equal samples.
     """
     if limit is None or num_scenarios <= limit:
         return list(range(num_scenarios))
-    chosen = np.random.default_rng(seed).choice(num_scenarios, limit, replace=False)
-    return sorted(chosen.tolist())
+    return sorted(np.random.default_rng(seed).choice(num_scenarios, limit, replace=False).tolist())
 
 
 class DistinctSample:
     """Uniform sample of the distinct rows of a stream of any length, in the memory of twice the sample.
 
     A row's key is hashed; the rows with the smallest hashes stay. So every distinct key has the same probability,
-    whenever and however often it comes, and the same seed samples the same keys in any order.
+    early or late, rare or frequent, and the same seed samples the same keys in any order.
 
     Args:
-        capacity: rows that are kept.
-        seed: of the hash.
+        capacity: Number of rows in the sample.
+        seed: Seed of the hash; equal seeds sample equal keys.
     """
 
     def __init__(self, capacity: int, seed: int):
         self.capacity = capacity
-        self.num_seen = 0
+        self.num_rows = 0
         self._seed = seed
         self._limit = np.uint64(2**64 - 1)
         self._hashes: list[np.ndarray] = []
@@ -160,10 +161,10 @@ class DistinctSample:
         """Add rows to the stream.
 
         Args:
-            rows: to be sampled.
-            keys: equal for rows that count as the same.
+            rows: Rows to sample from.
+            keys: Key of each row, equal for rows that count as the same.
         """
-        self.num_seen += len(rows)
+        self.num_rows += len(rows)
         # splitmix64: 64 well-mixed bits of each row.
         hashes = np.full(len(keys), self._seed, np.uint64)
         for column in keys.astype(np.uint64).T:
@@ -172,9 +173,9 @@ class DistinctSample:
             hashes = (hashes ^ (hashes >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
             hashes ^= hashes >> np.uint64(31)
         # Rows above the limit, the largest hash of a full sample, can never be in it.
-        wanted = hashes < self._limit
-        self._hashes.append(hashes[wanted])
-        self._rows.append(rows[wanted])
+        is_candidate = hashes < self._limit
+        self._hashes.append(hashes[is_candidate])
+        self._rows.append(rows[is_candidate])
         if sum(map(len, self._hashes)) > 2 * self.capacity:
             self._shrink()
 

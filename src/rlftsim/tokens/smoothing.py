@@ -1,9 +1,9 @@
 """Spatial label smoothing (TrajTok): the smoothed probability goes to the tokens that end near the target.
 
-The other tokens of the class get it in proportion to 1 / (1e-4 + d)^2, with d the mean distance in m of their end
-box's corners to those of the target's. (TrajTok's code divides by the sum twice and so hardly smooths; this is the
-formula as intended.) The weights fall off so slowly that a short list of neighbors would lose most of them. So rows
-are computed for the distinct targets of a batch.
+Each other token of the class gets a share in proportion to 1 / (1e-4 + d)^2, with d the mean distance in m between the
+corners of the token's end box and those of the target's. (TrajTok's code divides by the sum twice and so hardly
+smooths; this is the formula as intended.) The weights fall off so slowly that a short list of neighbors would lose
+most of the probability. So rows are computed for the distinct targets of a batch.
 """
 
 import torch
@@ -23,12 +23,12 @@ def neighbor_weights(
 ) -> Float[Tensor, "U V"]:
     """Distribution of the smoothed probability of target tokens: each row sums to 1 over the other tokens of the class.
 
-    All of it is on the target itself where it is the only token.
+    A target that is the only token of the class gets all of the probability.
 
     Args:
-        vocabulary: the tokens.
-        class_id: class of each target.
-        token_id: the targets.
+        vocabulary: Motion tokens of each class.
+        class_id: Class of each of the U targets.
+        token_id: Token of each of the U targets.
     """
     ends = vocabulary.end_corners()
     weights = ends.new_zeros(len(token_id), vocabulary.num_tokens)
@@ -44,22 +44,19 @@ def neighbor_weights(
 
 
 def summed_log_prob_nearby(
-    log_probs: Float[Tensor, "R V"],
-    target: Int64[Tensor, "R"],
-    class_id: Int64[Tensor, "R"],
-    vocabulary: Vocabulary,
+    log_probs: Float[Tensor, "R V"], target: Int64[Tensor, "R"], class_id: Int64[Tensor, "R"], vocabulary: Vocabulary
 ) -> Float[Tensor, ""]:
     """Sum over rows of the expected log-probability under `neighbor_weights` of the row's target, nats.
 
     Args:
-        log_probs: of all tokens, for R rows.
-        target: token of each row.
-        class_id: class of each row.
-        vocabulary: the tokens.
+        log_probs: Log-probabilities of all tokens, for R rows, nats.
+        target: Target token of each row.
+        class_id: Class of each row.
+        vocabulary: Motion tokens of each class.
     """
     # Rows with the same target are added up first, so that the weights need memory for the U distinct targets only.
-    distinct, group = (class_id * vocabulary.num_tokens + target).unique(return_inverse=True)
-    summed = log_probs.new_zeros(len(distinct), log_probs.shape[-1]).index_add(0, group, log_probs)
-    weights = neighbor_weights(vocabulary, distinct // vocabulary.num_tokens, distinct % vocabulary.num_tokens)
+    targets, group = (class_id * vocabulary.num_tokens + target).unique(return_inverse=True)
+    log_prob_sums = log_probs.new_zeros(len(targets), log_probs.shape[-1]).index_add(0, group, log_probs)
+    weights = neighbor_weights(vocabulary, targets // vocabulary.num_tokens, targets % vocabulary.num_tokens)
     # 0 * -inf would be NaN: masked tokens have log-probability -inf and weight 0.
-    return (weights * torch.where(weights > 0, summed, 0.0)).sum()
+    return (weights * torch.where(weights > 0, log_prob_sums, 0.0)).sum()

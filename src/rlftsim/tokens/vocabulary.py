@@ -1,7 +1,7 @@
 """Vocabulary: templates of motions and of map pieces, and their file.
 
-C = 3 classes (vehicle, pedestrian, cyclist), V motion tokens per class, six poses per token at 10 Hz (step 0 is its
-start). Frame of a token: the agent at its start. A token's boxes have the size of the class, never of the agent.
+C = 3 classes (vehicle, pedestrian, cyclist), V motion tokens per class, six poses per token at 10 Hz (step 0 is the
+start). Frame of a token: the agent at the start. A token's boxes have the size of the class, never of the agent.
 """
 
 import json
@@ -44,20 +44,19 @@ FORMAT = "rlftsim-vocabulary-1"
 
 def class_of_type(object_type: Int64[Tensor, "..."]) -> Int64[Tensor, "..."]:
     """Class index of WOMD object types; other and unset types count as vehicles."""
-    # The challenge requires agents of every type to be simulated. A box that can drive is the least wrong model of
-    # them.
-    return _on_device(_CLASS_OF_TYPE, object_type.device)[object_type.clamp(0, ObjectType.OTHER)]
+    # The challenge simulates agents of every type. A box that can drive is the least wrong model of such agents.
+    return _load_table(_CLASS_OF_TYPE, object_type.device)[object_type.clamp(0, ObjectType.OTHER)]
 
 
 def box_of_class(class_id: Int64[Tensor, "..."]) -> tuple[Float[Tensor, "..."], Float[Tensor, "..."]]:
     """Length and width of the box of a class, which tokens are matched with, m."""
-    table = _on_device(CLASS_BOXES_M, class_id.device)[class_id]
+    table = _load_table(CLASS_BOXES_M, class_id.device)[class_id]
     return table[..., 0], table[..., 1]
 
 
 @cache
-def _on_device(table: tuple[Any, ...], device: torch.device) -> Tensor:
-    """A table as a tensor; kept, because the host waits while it copies one to a device."""
+def _load_table(table: tuple[Any, ...], device: torch.device) -> Tensor:
+    """A table as a tensor, cached because the host waits for each copy to a device."""
     return torch.tensor(table, device=device)
 
 
@@ -74,10 +73,10 @@ class Vocabulary:
     map_prototypes: Float[Tensor, "P 11 2"]
     """Pieces of 5 m, a point every 0.5 m, start at the origin with heading 0."""
     origin: str = ""
-    """Command, data and seed that it was made with."""
+    """Command, data and seed of the vocabulary."""
 
     def __deepcopy__(self, memo: object) -> "Vocabulary":
-        """The vocabulary itself: it never changes, and caches keyed by it stay valid for a copy of a policy."""
+        """The same vocabulary, which never changes: caches keyed by the vocabulary stay valid for a policy's copy."""
         return self
 
     @property
@@ -87,10 +86,10 @@ class Vocabulary:
 
     @cached_property
     def class_tokens(self) -> Bool[Tensor, "C1 V"]:
-        """`token_mask` with a row more for `PADDING_CLASS`, which has token 0 alone."""
-        stands = torch.zeros_like(self.token_mask[:1])
-        stands[:, 0] = True
-        return torch.cat([self.token_mask, stands])
+        """`token_mask` with an additional row for `PADDING_CLASS`, which has token 0 alone."""
+        padding_mask = torch.zeros_like(self.token_mask[:1])
+        padding_mask[:, 0] = True
+        return torch.cat([self.token_mask, padding_mask])
 
     def end_corners(self) -> Float[Tensor, "C V 4 2"]:
         """Box at the end of each token."""
@@ -103,21 +102,12 @@ class Vocabulary:
         return torch.cat([position, heading[..., None]], -1)
 
     def to(self, device: torch.device | str) -> "Vocabulary":
-        """The same vocabulary on another device."""
-        return replace(
-            self,
-            corners=self.corners.to(device),
-            token_mask=self.token_mask.to(device),
-            map_prototypes=self.map_prototypes.to(device),
-        )
+        """The same vocabulary on a device."""
+        return replace(self, **{name: getattr(self, name).to(device) for name in _DTYPES})
 
     def save(self, path: Path) -> None:
         """Write a safetensors file, atomically."""
-        tensors = {
-            "corners": self.corners.contiguous(),
-            "token_mask": self.token_mask.contiguous(),
-            "map_prototypes": self.map_prototypes.contiguous(),
-        }
+        tensors = {name: getattr(self, name).contiguous() for name in _DTYPES}
         save_tensors(path, tensors, {"format": FORMAT, "origin": json.dumps(self.origin)})
 
     @classmethod
@@ -125,7 +115,7 @@ class Vocabulary:
         """Vocabulary from a file written by `save`.
 
         Raises:
-            DataError: the file is missing, damaged or not a vocabulary.
+            DataError: The file is missing, damaged or not a vocabulary.
         """
         build = "build it again with `rlftsim tokens`"
         try:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from rlftsim.errors import ConfigError, given, require_positive, require_types
 from rlftsim.goals.logged import logged_goals
-from rlftsim.goals.stored import write_goal_part
+from rlftsim.goals.stored import write_goal_file
 from rlftsim.goals.types import Points
 from rlftsim.progress import progress_bar
 from rlftsim.realism import RealismResult, metric_by_name, score_batch
@@ -100,7 +100,7 @@ def augment_goals(policy: Policy, scenarios: Scenarios, folder: str | os.PathLik
             indices = range(start, min(start + size, len(scenarios)))
             # Files are written whole, so one that exists is finished.
             if not path.exists():
-                write_goal_part(path, dict(_endpoints(policy, scenarios, i, config) for i in indices))
+                write_goal_file(path, dict(_endpoints(policy, scenarios, i, config) for i in indices))
             advance(len(indices))
     return len(scenarios)
 

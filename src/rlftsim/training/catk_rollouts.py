@@ -159,7 +159,7 @@ class _Target:
             return (ends - local_boxes(logged, pose, class_id)[:, None]).norm(dim=-1).mean(-1)
         # The public code compares in the map frame, where float32 rounds coarser: another candidate may win.
         length, width = box_of_class(class_id)
-        boxes = catk_compat.boxes_around(*logged, length, width)
+        boxes = catk_compat.build_boxes(*logged, length, width)
         return (catk_compat.place_boxes(ends, *pose) - boxes[:, None]).norm(dim=-1).mean(-1)
 
 

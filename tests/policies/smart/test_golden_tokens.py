@@ -67,7 +67,7 @@ def test_map_pieces_are_those_of_the_public_code(scenario_a, preprocessed):
     np.testing.assert_array_equal(pieces.points, preprocessed["map_traj_pos"])
     np.testing.assert_array_equal(pieces.heading, preprocessed["map_traj_theta"])
     np.testing.assert_array_equal(pieces.type, preprocessed["map_type"])
-    np.testing.assert_array_equal(pieces.kind, preprocessed["map_pl_type"])
+    np.testing.assert_array_equal(pieces.family, preprocessed["map_pl_type"])
     np.testing.assert_array_equal(pieces.light, preprocessed["map_light_type"])
 
 

@@ -8,7 +8,7 @@ from rlftsim.experiments.goal_proposals import LOGGED, entry_of, propose, split_
 from rlftsim.experiments.suite import ExperimentSuite
 from rlftsim.experiments.suite_goals import held_out
 from rlftsim.goals.goals_file import GoalEntry, GoalsFile, read_goals, write_goals
-from rlftsim.goals.placement import track_of
+from rlftsim.goals.placement import find_track
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.maneuver import BENCHMARK_MANEUVERS, Maneuver
 
@@ -56,7 +56,7 @@ def find_goals(suite: ExperimentSuite) -> list[GoalEntry]:
     for goal in goals:
         maneuver_of(goal)
         scenario = dataset.by_id(goal.scenario_id)
-        if track_of(goal, scenario) != scenario.ego_index:
+        if find_track(goal, scenario) != scenario.ego_index:
             raise DataError(
                 f"{goal}: agent {goal.agent_id} is not the ego of scenario {scenario.scenario_id}, and only the ego "
                 f"may have a goal here: write agent {scenario.tracks.object_id[scenario.ego_index]}, or remove the "

@@ -20,21 +20,21 @@ CRUISE_MPS = {
     MapFeatureType.LANE_SURFACE_STREET: 13.0,
     MapFeatureType.LANE_BIKE: 6.0,
 }
-"""Usual speeds, for lanes without a known speed limit."""
+"""Usual speeds, for lanes without a posted speed limit."""
 CYCLIST_MPS = 6.0
 
 SPACING_M = 1.0
 AT_MOST_PATHS = 200
-"""Paths from one start. Grids of short pieces have thousands, most of them alike."""
+"""Paths from a single start. Grids of short lanes have thousands, most of them alike."""
 MAX_LANE_DISTANCE_M = 2.5
-ALSO_M = 1.0
-"""Lanes at most this much farther than the nearest one count as own lanes, too."""
+LANE_TOLERANCE_M = 1.0
+"""Lanes at most this much farther than the nearest lane count as own lanes, too."""
 SAME_DIRECTION_RAD = np.radians(45.0)
 PARALLEL_RAD = np.radians(15.0)
 NEIGHBOR_M = (2.3, 5.2)
 """Least and greatest distance to the middle of a neighboring lane."""
 EASE_M, EASE_S = 15.0, 2.0
-"""An agent beside the middle of its lane gets there over this distance or, if that is longer, in this time."""
+"""An agent off the middle of the lane gets there over this distance or, if that is longer, in this time."""
 SMOOTHED_M = 2
 """Directions are taken over so many meters ahead and behind: logged points jitter."""
 
@@ -76,12 +76,12 @@ class LanePath:
         """Pose at a point of the path."""
         return Pose(self.points[index], float(self.heading[index]))
 
-    def after(self, head: "LanePath", index: int) -> "LanePath":
-        """This path as the continuation of another one.
+    def prepend(self, head: "LanePath", index: int) -> "LanePath":
+        """This path as the continuation of the beginning of `head`.
 
         Args:
-            head: the path before.
-            index: point of `head` at which this path takes over; excluded.
+            head: Path that comes first; the heading at the start of `head` counts for the turn.
+            index: Point of `head` at which this path takes over; excluded.
         """
         points = np.concatenate([head.points[:index], self.points])
         limits = np.concatenate([head.speed_limit_mps[:index], self.speed_limit_mps])
@@ -90,7 +90,7 @@ class LanePath:
 
 @dataclass(frozen=True, eq=False)
 class Lanes:
-    """The lanes of a map, as an agent of one kind may use them."""
+    """The lanes of a map for agents of a single type."""
 
     graph: LaneGraph
     usable: Bool[np.ndarray, "n"]
@@ -98,100 +98,98 @@ class Lanes:
     """The posted limit, or the usual speed on such a lane."""
 
 
-def lanes_for(graph: LaneGraph, kind: ObjectType) -> Lanes:
+def lanes_for(graph: LaneGraph, agent_type: ObjectType) -> Lanes:
     """Lanes that an agent may use: cyclists all but freeways, vehicles all but bicycle lanes, pedestrians none.
 
     Args:
-        graph: all lanes of the map.
-        kind: of the agent.
+        graph: All lanes of the map.
+        agent_type: Type of the agent, which decides on lanes and speed limits.
     """
-    barred = MapFeatureType.LANE_FREEWAY if kind == ObjectType.CYCLIST else MapFeatureType.LANE_BIKE
-    usable = (graph.lane_type != barred) & (kind != ObjectType.PEDESTRIAN)
-    usual = np.array([CRUISE_MPS[MapFeatureType(int(t))] for t in graph.lane_type])
-    limit = np.where(graph.speed_limit_mps > 0, graph.speed_limit_mps, usual)
-    return Lanes(graph, usable, np.minimum(limit, CYCLIST_MPS) if kind == ObjectType.CYCLIST else limit)
+    barred = MapFeatureType.LANE_FREEWAY if agent_type == ObjectType.CYCLIST else MapFeatureType.LANE_BIKE
+    usable = (graph.lane_type != barred) & (agent_type != ObjectType.PEDESTRIAN)
+    cruise_mps = np.array([CRUISE_MPS[MapFeatureType(int(t))] for t in graph.lane_type])
+    limit = np.where(graph.speed_limit_mps > 0, graph.speed_limit_mps, cruise_mps)
+    return Lanes(graph, usable, np.minimum(limit, CYCLIST_MPS) if agent_type == ObjectType.CYCLIST else limit)
 
 
 def own_lanes(lanes: Lanes, pose: Pose) -> list[int]:
     """Points of the graph, one per lane, of the lanes that an agent is on and drives along, nearest first.
 
     Args:
-        lanes: the usable lanes.
-        pose: of the agent.
+        lanes: Lanes that the agent may use.
+        pose: Current pose of the agent.
     """
     graph = lanes.graph
     distance = np.linalg.norm(graph.points[:, :2] - pose.position[:2], axis=1)
-    near = np.flatnonzero((distance <= MAX_LANE_DISTANCE_M) & lanes.usable[graph.owner])
-    near = near[np.abs(wrapped(graph.heading[near] - pose.heading)) <= SAME_DIRECTION_RAD]
-    nearest = nearest_of_each_lane(graph, near, distance)
-    return [p for p in nearest if distance[p] <= distance[nearest[0]] + ALSO_M]
+    candidates = np.flatnonzero((distance <= MAX_LANE_DISTANCE_M) & lanes.usable[graph.owner])
+    candidates = candidates[np.abs(wrapped(graph.heading[candidates] - pose.heading)) <= SAME_DIRECTION_RAD]
+    nearest = nearest_of_each_lane(graph, candidates, distance)
+    return [p for p in nearest if distance[p] <= distance[nearest[0]] + LANE_TOLERANCE_M]
 
 
 def neighbor_lanes(lanes: Lanes, pose: Pose, *, side: int) -> list[int]:
     """Points of the graph, one per lane, of the parallel lanes beside a pose, nearest first.
 
     Args:
-        lanes: the usable lanes.
-        pose: in the middle of a lane.
-        side: 1 left, -1 right.
+        lanes: Lanes that the agent may use.
+        pose: Pose in the middle of a lane.
+        side: Side of the pose: 1 left, -1 right.
     """
     graph = lanes.graph
-    ahead, sideways = in_frame_of(pose, graph.points)
+    x, y = to_pose_frame(pose, graph.points)
     low, high = NEIGHBOR_M
-    near = (
-        (np.abs(ahead) <= SPACING_M) & (side * sideways >= low) & (side * sideways <= high) & lanes.usable[graph.owner]
-    )
-    near &= np.abs(wrapped(graph.heading - pose.heading)) <= PARALLEL_RAD
-    return nearest_of_each_lane(graph, np.flatnonzero(near), np.hypot(ahead, sideways))
+    is_neighbor = (np.abs(x) <= SPACING_M) & (side * y >= low) & (side * y <= high) & lanes.usable[graph.owner]
+    is_neighbor &= np.abs(wrapped(graph.heading - pose.heading)) <= PARALLEL_RAD
+    return nearest_of_each_lane(graph, np.flatnonzero(is_neighbor), np.hypot(x, y))
 
 
-def in_frame_of(pose: Pose, points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-    """Offsets of points ahead of a pose and to its left, m.
+def to_pose_frame(pose: Pose, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "2 n"]:
+    """Coordinates of points in the frame of a pose, m: x ahead, y to the left.
 
     Args:
-        pose: origin and direction of the frame.
-        points: world frame.
+        pose: Origin and direction of the frame.
+        points: Points in the world frame, m.
     """
     cos, sin = np.cos(pose.heading), np.sin(pose.heading)
     x, y = (points[:, :2] - pose.position[:2]).T
-    return x * cos + y * sin, y * cos - x * sin
+    return np.stack([x * cos + y * sin, y * cos - x * sin])
 
 
 def paths_from(lanes: Lanes, pose: Pose, starts: list[int], *, length_m: float, ease_m: float) -> list[LanePath]:
     """All paths along the lanes from a pose, none with the same lane twice.
 
     Args:
-        lanes: the usable lanes.
-        pose: the start.
-        starts: points of the graph at which the paths join the lanes.
-        length_m: greatest length; shorter where the lanes end.
-        ease_m: distance over which a path comes to the middle of the lane.
+        lanes: Lanes that the agent may use.
+        pose: Pose at the start of every path.
+        starts: Points of the graph at which the paths join the lanes.
+        length_m: Greatest length of a path, m; shorter where the lanes end.
+        ease_m: Distance over which a path comes to the middle of the lane, m.
     """
     # The bound is per start, so that one lane with thousands of continuations leaves room for the others.
     chains = ((start, chain) for start in starts for chain in islice(_chains(lanes, start, length_m), AT_MOST_PATHS))
-    paths = (_path_along(lanes, pose, start, chain, length_m, ease_m) for start, chain in chains)
+    paths = (_follow_chain(lanes, pose, start, chain, length_m, ease_m) for start, chain in chains)
     return [path for path in paths if path is not None]
 
 
 def ease_m(speed_mps: float) -> float:
-    """Distance over which an agent comes to the middle of its lane, m."""
+    """Distance over which an agent comes to the middle of the lane, m."""
     return max(EASE_M, EASE_S * speed_mps)
 
 
 def path_through(points: Float[np.ndarray, "n 3"], start_heading: float, limits: Float[np.ndarray, "n"]) -> LanePath:
-    """A path through points that lie about 1 m apart, with its direction.
+    """A path with directions through points that lie about 1 m apart.
 
     Args:
-        points: resampled to exactly 1 m.
-        start_heading: heading of the agent, to which the turn is relative, rad.
-        limits: speed limit at each point, m/s.
+        points: Points of the path in order, m; resampled to exactly 1 m.
+        start_heading: Heading of the agent, to which the turn is relative, rad.
+        limits: Speed limit at each point, m/s.
     """
-    points, limits = _one_per_meter(points, limits)
+    points, limits = _resample(points, limits)
     last = len(points) - 1
     index = np.arange(last + 1)
-    way = points[np.minimum(index + SMOOTHED_M, last)] - points[np.maximum(index - SMOOTHED_M, 0)]
+    chord = points[np.minimum(index + SMOOTHED_M, last)] - points[np.maximum(index - SMOOTHED_M, 0)]
     # Unwrapped, so that a path that turns round has a turn of pi and not of -pi.
-    direction = np.unwrap(np.arctan2(way[:, 1], way[:, 0]))
+    direction = np.unwrap(np.arctan2(chord[:, 1], chord[:, 0]))
     turn = direction - direction[0] + float(wrapped(direction[:1] - start_heading)[0])
     return LanePath(points, turn, start_heading, limits)
 
@@ -202,51 +200,51 @@ def smooth_step(x: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
     return x * x * (3.0 - 2.0 * x)
 
 
-def shortened(path: LanePath, index: int) -> LanePath:
-    """The path up to one of its points.
+def shorten_path(path: LanePath, index: int) -> LanePath:
+    """The path up to one of the points.
 
     Args:
-        path: the whole path.
-        index: the last point; included.
+        path: Path to cut, from the agent on.
+        index: Last point of the result; included.
     """
-    kept = slice(index + 1)
-    return replace(path, points=path.points[kept], turn=path.turn[kept], speed_limit_mps=path.speed_limit_mps[kept])
+    steps = slice(index + 1)
+    return replace(path, points=path.points[steps], turn=path.turn[steps], speed_limit_mps=path.speed_limit_mps[steps])
 
 
 def nearest_of_each_lane(
     graph: LaneGraph, points: Int64[np.ndarray, "m"], distance: Float[np.ndarray, "P"]
 ) -> list[int]:
-    """Of some points of the graph the nearest of each lane, ordered by distance.
+    """The nearest of the candidate points on each lane, ordered by distance.
 
     Args:
-        graph: all lanes.
-        points: indices of the candidates.
-        distance: of every point of the graph, m.
+        graph: All lanes of the map.
+        points: Indices of the candidates among the points of the graph.
+        distance: Distance of every point of the graph, m.
     """
-    ordered = points[np.argsort(distance[points], kind="stable")]
-    _, first = np.unique(graph.owner[ordered], return_index=True)
-    return ordered[np.sort(first)].tolist()
+    points = points[np.argsort(distance[points], kind="stable")]
+    _, first = np.unique(graph.owner[points], return_index=True)
+    return points[np.sort(first)].tolist()
 
 
 def _chains(lanes: Lanes, start: int, length_m: float) -> Iterator[tuple[int, ...]]:
-    """Sequences of lanes from a point on, depth first, until they are long enough or end."""
+    """Sequences of lanes from a point on, depth first, each until long enough or at an end."""
     graph = lanes.graph
     first = int(graph.owner[start])
-    stack = [((first,), _length(graph.lines[first][start - graph.first[first] :]))]
+    stack = [((first,), _measure_length(graph.lines[first][start - graph.first[first] :]))]
     while stack:
         chain, length = stack.pop()
-        onward = [n for n in graph.successors[chain[-1]] if n not in chain and lanes.usable[n]]
-        if length >= length_m or not onward:
+        successors = [n for n in graph.successors[chain[-1]] if n not in chain and lanes.usable[n]]
+        if length >= length_m or not successors:
             yield chain
             continue
-        stack += [((*chain, n), length + _length(graph.lines[n])) for n in reversed(onward)]
+        stack += [((*chain, n), length + _measure_length(graph.lines[n])) for n in reversed(successors)]
 
 
-def _length(line: Float[np.ndarray, "n 3"]) -> float:
+def _measure_length(line: Float[np.ndarray, "n 3"]) -> float:
     return float(np.linalg.norm(np.diff(line[:, :2], axis=0), axis=1).sum())
 
 
-def _path_along(
+def _follow_chain(
     lanes: Lanes, pose: Pose, start: int, chain: tuple[int, ...], length_m: float, ease_m: float
 ) -> LanePath | None:
     """The path along a chain of lanes; None where the lanes end at once."""
@@ -255,21 +253,21 @@ def _path_along(
     head = graph.lines[chain[0]][start - graph.first[chain[0]] :]
     lines = [head, *(graph.lines[n][1:] for n in chain[1:])]
     middle = np.concatenate(lines)  # [n, 3]
-    if _length(middle) < 2 * SPACING_M:
+    if _measure_length(middle) < 2 * SPACING_M:
         return None
     limits = np.repeat(lanes.speed_limit_mps[list(chain)], [len(line) for line in lines])
-    middle, limits = (values[: int(length_m / SPACING_M) + 1] for values in _one_per_meter(middle, limits))
+    middle, limits = (values[: int(length_m / SPACING_M) + 1] for values in _resample(middle, limits))
     # 2. The agent's offset from the middle at the start fades out along the path.
     offset = pose.position[:2] - middle[0, :2]
-    left = 1.0 - smooth_step(SPACING_M * np.arange(len(middle)) / ease_m)
-    middle[:, :2] += left[:, None] * offset
+    fade = 1.0 - smooth_step(SPACING_M * np.arange(len(middle)) / ease_m)
+    middle[:, :2] += fade[:, None] * offset
     return path_through(middle, pose.heading, limits)
 
 
-def _one_per_meter(
+def _resample(
     points: Float[np.ndarray, "n 3"], values: Float[np.ndarray, "n"]
 ) -> tuple[Float[np.ndarray, "S 3"], Float[np.ndarray, "S"]]:
     """A point every meter along a polyline, and the values there."""
     distance = np.append(0.0, np.linalg.norm(np.diff(points[:, :2], axis=0), axis=1).cumsum())
-    at = np.arange(0.0, distance[-1] + 1e-6, SPACING_M)
-    return np.stack([np.interp(at, distance, axis) for axis in points.T], -1), np.interp(at, distance, values)
+    grid = np.arange(0.0, distance[-1] + 1e-6, SPACING_M)
+    return np.stack([np.interp(grid, distance, axis) for axis in points.T], -1), np.interp(grid, distance, values)

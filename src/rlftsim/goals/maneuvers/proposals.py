@@ -1,6 +1,6 @@
 """Goal proposals from the lanes: a goal for each maneuver that can be completed in time. Frame: world, m.
 
-Straight, left and right follow the lanes from the one that the agent is on. Lane changes end on those beside it. A
+Straight, left and right follow the agent's lane and the lanes behind it. Lane changes end on the neighboring lanes. A
 U-turn follows a lane that turns round, or a half circle into the opposite lanes where a left turn is possible.
 Maneuvers are named by the change of heading (`scenario.maneuver`), so following a road that bends by more than 30
 degrees is a turn. A goal lies where a usual driver is when the simulation ends, or at the end of a turn that is then
@@ -24,9 +24,9 @@ from rlftsim.goals.maneuvers.lane_paths import (
     lanes_for,
     own_lanes,
     paths_from,
-    shortened,
+    shorten_path,
 )
-from rlftsim.goals.maneuvers.reach import BRISK, HORIZON_S, Reach, reach_along
+from rlftsim.goals.maneuvers.reach import BRISK, HORIZON_S, Reach, compute_reach
 from rlftsim.goals.maneuvers.road_lines import crosses_forbidden_line
 from rlftsim.goals.maneuvers.side_paths import LONGEST_UTURN_M, change_length_m, lane_change_paths, uturn_paths
 from rlftsim.scenario.lane_graph import lane_graph
@@ -42,31 +42,31 @@ NEAREST_GOAL_M = 6.0
 """Goals nearer than this are not proposed: the agent hardly moves."""
 SPARE_M = 20.0
 """Paths are searched this far beyond reach, to see if a turn is over."""
-SETTLED_M = 6
-SETTLED_RAD = np.radians(8.0)
+SETTLING_M = 6
+SETTLING_RAD = np.radians(8.0)
 """A turn is over where the path bends less than that over so many meters."""
 LANE_CHANGE_OFFSET_M = 2.0
 """A lane change ends at least so far from every path along the own lane."""
-STILL_BESIDE_M = 6.0
+MAX_LANE_GAP_M = 6.0
 """The own lane is at most so far when a lane change is complete. Otherwise the lanes have parted in a junction."""
 CLIPPED_M = 0.3
 """Distance that a corner may stick out on the way: a box that follows a lane's middle cuts corners, drivers do not."""
 PARKED_MPS = 0.5
-PARKED_ASIDE_M = 1.2
-KINDS = (ObjectType.VEHICLE, ObjectType.CYCLIST)
+PARKED_OFFSET_M = 1.2
+LANE_AGENT_TYPES = (ObjectType.VEHICLE, ObjectType.CYCLIST)
 LANE_CHANGES = ((Maneuver.LANE_CHANGE_LEFT, 1), (Maneuver.LANE_CHANGE_RIGHT, -1))
-"""Each with its side, 1 = left."""
+"""Lane changes and sides, 1 = left."""
 
 
 @dataclass(frozen=True, eq=False)
 class Proposal:
-    """A maneuver and the goal that it leads to."""
+    """A maneuver and the goal at the end."""
 
     object_id: int
     maneuver: Maneuver
     position: Float[np.ndarray, "2"]
     """The goal."""
-    way: Float[np.ndarray, "S 3"]
+    path: Float[np.ndarray, "S 3"]
     """Path to the goal; begins at the agent."""
     is_logged: bool = False
     """True for the maneuver of the log."""
@@ -77,19 +77,19 @@ class CurrentAgent:
     """An agent at the current step."""
 
     object_id: int
-    kind: ObjectType
+    object_type: ObjectType
     pose: Pose
     speed_mps: float
     size: Float[np.ndarray, "3"]
     top_history_mps: float
 
     @classmethod
-    def of(cls, scenario: Scenario, track: int) -> "CurrentAgent":
-        """The agent of a track that is valid at the current step; its pose is on the ground.
+    def from_track(cls, scenario: Scenario, track: int) -> "CurrentAgent":
+        """The agent of a track that is valid at the current step; the pose is on the ground.
 
         Args:
-            scenario: its scenario.
-            track: index of the track.
+            scenario: Scenario of the track; only the history is read.
+            track: Index of the track in the scenario.
         """
         tracks = scenario.tracks
         size = tracks.size[track, CURRENT_STEP].astype(np.float64)
@@ -98,7 +98,7 @@ class CurrentAgent:
         speeds = np.linalg.norm(tracks.velocity[track, :HISTORY_STEPS], axis=-1)
         return cls(
             object_id=int(tracks.object_id[track]),
-            kind=ObjectType(int(tracks.object_type[track])),
+            object_type=ObjectType(int(tracks.object_type[track])),
             pose=Pose(position, float(tracks.heading[track, CURRENT_STEP])),
             speed_mps=float(speeds[CURRENT_STEP]),
             size=size,
@@ -107,49 +107,48 @@ class CurrentAgent:
 
 
 def propose_from_lanes(scenario: Scenario, track: int, road_test: RoadTest | None = None) -> tuple[Proposal, ...]:
-    """One goal for each maneuver that the lanes allow, in the order of `BENCHMARK_MANEUVERS`; the future is not used.
+    """A goal for each maneuver that the lanes allow, in the order of `BENCHMARK_MANEUVERS`; the future is not read.
 
     Args:
-        scenario: the map and the history.
-        track: index of a simulated track.
-        road_test: tests if a path leaves the road; None = paths are not tested.
+        scenario: Scenario with map and history.
+        track: Index of a simulated track in the scenario.
+        road_test: Test whether a path leaves the road; None = paths are not tested.
     """
     if no_proposal_reason(scenario, track) is not None:
         return ()
-    agent = CurrentAgent.of(scenario, track)
-    lanes = lanes_for(lane_graph(scenario), agent.kind)
-    found = sorted(_candidates(scenario, agent, lanes), key=lambda c: c.merit)
-    best: dict[Maneuver, Proposal] = {}
-    for candidate in found:
-        if candidate.maneuver in best:
-            continue
+    agent = CurrentAgent.from_track(scenario, track)
+    lanes = lanes_for(lane_graph(scenario), agent.object_type)
+    proposals: dict[Maneuver, Proposal] = {}
+    for candidate in sorted(_generate_candidates(scenario, agent, lanes), key=lambda candidate: candidate.merit):
         path = candidate.path
-        if road_test is not None:
-            outside = road_test(path.points, path.heading, agent.size)  # [S], m, negative on the road
-            # The goal's box is wholly on the road. On the way corners may stick out a little, and as far as at the
-            # start.
-            if not (outside[-1] <= 0 and outside.max() <= max(CLIPPED_M, float(outside[0]) + CLIPPED_M)):
-                continue
-        best[candidate.maneuver] = Proposal(agent.object_id, candidate.maneuver, path.points[-1, :2], path.points)
-    return tuple(best[m] for m in BENCHMARK_MANEUVERS if m in best)
+        if candidate.maneuver not in proposals and (road_test is None or _stays_on_road(path, agent, road_test)):
+            points = path.points
+            proposals[candidate.maneuver] = Proposal(agent.object_id, candidate.maneuver, points[-1, :2], points)
+    return tuple(proposals[maneuver] for maneuver in BENCHMARK_MANEUVERS if maneuver in proposals)
+
+
+def _stays_on_road(path: LanePath, agent: CurrentAgent, road_test: RoadTest) -> bool:
+    overhang = road_test(path.points, path.heading, agent.size)  # [S], m, negative on the road
+    # The goal's box is wholly on the road. On the way corners may stick out a little, and as far as at the start.
+    return bool(overhang[-1] <= 0 and overhang.max() <= max(CLIPPED_M, float(overhang[0]) + CLIPPED_M))
 
 
 def no_proposal_reason(scenario: Scenario, track: int) -> str | None:
-    """Reason that the lanes propose nothing for a simulated track, in words; None if they may propose something.
+    """Reason that the lanes allow no proposal for a simulated track, in words; None if proposals are possible.
 
     Args:
-        scenario: the map and the history.
-        track: index of a simulated track.
+        scenario: Scenario with map and history.
+        track: Index of a simulated track in the scenario.
     """
-    agent = CurrentAgent.of(scenario, track)
-    if agent.kind not in KINDS:
-        return f"a {agent.kind.name.lower()} does not follow lanes"
-    lanes = lanes_for(lane_graph(scenario), agent.kind)
-    own = own_lanes(lanes, agent.pose)
-    if not own:
+    agent = CurrentAgent.from_track(scenario, track)
+    if agent.object_type not in LANE_AGENT_TYPES:
+        return f"a {agent.object_type.name.lower()} does not follow lanes"
+    lanes = lanes_for(lane_graph(scenario), agent.object_type)
+    lane_points = own_lanes(lanes, agent.pose)
+    if not lane_points:
         return f"no lane within {MAX_LANE_DISTANCE_M:g} m runs in its direction of travel"
-    aside = float(np.linalg.norm(lanes.graph.points[own[0], :2] - agent.pose.position[:2]))
-    if agent.top_history_mps < PARKED_MPS and aside > PARKED_ASIDE_M:
+    offset_m = float(np.linalg.norm(lanes.graph.points[lane_points[0], :2] - agent.pose.position[:2]))
+    if agent.top_history_mps < PARKED_MPS and offset_m > PARKED_OFFSET_M:
         return "it stands beside its lane, probably parked"
     return None
 
@@ -158,9 +157,9 @@ def own_paths(agent: CurrentAgent, lanes: Lanes, *, length_m: float) -> list[Lan
     """Paths along the lanes that an agent is on.
 
     Args:
-        agent: at the current step.
-        lanes: those that it may use.
-        length_m: greatest length of a path.
+        agent: Agent at the current step, where every path begins.
+        lanes: Lanes that the agent may use.
+        length_m: Greatest length of a path, m.
     """
     ease = ease_m(agent.speed_mps)
     return paths_from(lanes, agent.pose, own_lanes(lanes, agent.pose), length_m=length_m, ease_m=ease)
@@ -170,19 +169,15 @@ def distance_to(paths: Iterable[LanePath], point: Float[np.ndarray, "3"]) -> flo
     """Distance to the nearest point of any path, in the plane, m.
 
     Args:
-        paths: at least one.
-        point: world frame.
+        paths: Paths to measure to; at least one.
+        point: Point in the world frame, m; the height is ignored.
     """
     return min(float(np.linalg.norm(path.points[:, :2] - point[:2], axis=1).min()) for path in paths)
 
 
-# ---- candidates
-# --------------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
 class _Candidate:
-    """A path up to its goal."""
+    """A path up to the goal."""
 
     maneuver: Maneuver
     path: LanePath
@@ -191,79 +186,79 @@ class _Candidate:
 
     @property
     def merit(self) -> tuple[bool, float]:
-        """Sort key: complete paths first, then those that turn most like their maneuver."""
+        """Sort key: complete paths first, then paths that turn most like the maneuver."""
         return self.is_cut_short, abs(float(self.path.turn[-1]) - self.maneuver.usual_turn_rad)
 
 
-def _candidates(scenario: Scenario, agent: CurrentAgent, lanes: Lanes) -> Iterator[_Candidate]:
+def _generate_candidates(scenario: Scenario, agent: CurrentAgent, lanes: Lanes) -> Iterator[_Candidate]:
     # No path needs to be longer than the fastest driver gets.
-    top = max(agent.speed_mps, BRISK.over_limit * float(lanes.speed_limit_mps[lanes.usable].max()))
-    gained = BRISK.acceleration_mps2 * HORIZON_S / 2
-    length_m = HORIZON_S * min(top, agent.speed_mps + gained) + SPARE_M
+    top_speed = max(agent.speed_mps, BRISK.over_limit * float(lanes.speed_limit_mps[lanes.usable].max()))
+    speed_gain = BRISK.acceleration_mps2 * HORIZON_S / 2
+    length_m = HORIZON_S * min(top_speed, agent.speed_mps + speed_gain) + SPARE_M
     # 1. Along the own lane and those it continues into: straight, left, right, and lanes that turn round.
-    own = own_paths(agent, lanes, length_m=length_m)
-    yield from _turns(own, agent)
-    if agent.kind != ObjectType.VEHICLE:
+    paths = own_paths(agent, lanes, length_m=length_m)
+    yield from _follow_paths(paths, agent)
+    if agent.object_type != ObjectType.VEHICLE:
         return
     # 2. Into the lanes beside.
-    yield from _lane_changes(scenario, agent, lanes, own, length_m)
-    # 3. Round by a half circle, at the places where a left turn is possible.
+    yield from _change_lanes(scenario, agent, lanes, paths, length_m)
+    # 3. Round by a half circle, where a left turn is possible.
     if agent.size[0] <= LONGEST_UTURN_M:
-        left_turns = [path for path in own if (np.abs(path.turn - np.pi / 2) < np.pi / 4).any()]
-        for path in left_turns:
-            for way in uturn_paths(lanes, path, length_m=length_m):
-                yield from (c for c in _turns([way], agent) if c.maneuver == Maneuver.LEFT_UTURN)
+        for path in paths:
+            if (np.abs(path.turn - np.pi / 2) < np.pi / 4).any():
+                uturns = _follow_paths(uturn_paths(lanes, path, length_m=length_m), agent)
+                yield from (candidate for candidate in uturns if candidate.maneuver == Maneuver.LEFT_UTURN)
 
 
-def _turns(paths: Iterable[LanePath], agent: CurrentAgent) -> Iterator[_Candidate]:
-    """Candidates that follow paths as they are."""
+def _follow_paths(paths: Iterable[LanePath], agent: CurrentAgent) -> Iterator[_Candidate]:
+    """Candidates that follow paths unchanged."""
     for path in paths:
-        reach = reach_along(path, agent.speed_mps)
-        goal = _settled_goal(path, reach)
+        reach = compute_reach(path, agent.speed_mps)
+        goal = _find_goal(path, reach)
         if goal is None:
             continue
         maneuver = maneuver_of_turn(float(path.turn[goal]))
         if maneuver is not None:
-            yield _Candidate(maneuver, shortened(path, goal), goal < int(min(reach.usual_m, path.length_m)))
+            yield _Candidate(maneuver, shorten_path(path, goal), goal < int(min(reach.usual_m, path.length_m)))
 
 
-def _lane_changes(
-    scenario: Scenario, agent: CurrentAgent, lanes: Lanes, own: list[LanePath], length_m: float
+def _change_lanes(
+    scenario: Scenario, agent: CurrentAgent, lanes: Lanes, paths: list[LanePath], length_m: float
 ) -> Iterator[_Candidate]:
-    for path in own:
-        speed = reach_along(path, agent.speed_mps).usual_m / HORIZON_S
+    for own_path in paths:
+        speed = compute_reach(own_path, agent.speed_mps).usual_m / HORIZON_S
         for maneuver, side in LANE_CHANGES:
-            for way, complete in lane_change_paths(lanes, path, side=side, speed_mps=speed, length_m=length_m):
-                # The goal is as far as a usual agent gets, but after the change is complete, and before any turn.
-                reach = reach_along(way, agent.speed_mps)
-                goal = max(int(reach.usual_m), complete)
-                if not reach.least_m <= goal <= min(reach.most_m, way.length_m) or abs(way.turn[goal]) >= STRAIGHT_RAD:
+            for path, end in lane_change_paths(lanes, own_path, side=side, speed_mps=speed, length_m=length_m):
+                # The goal is as far as a usual agent gets, but after the end of the change, and before any turn.
+                reach = compute_reach(path, agent.speed_mps)
+                goal = max(int(reach.usual_m), end)
+                if not reach.min_m <= goal <= min(reach.max_m, path.length_m) or abs(path.turn[goal]) >= STRAIGHT_RAD:
                     continue
-                changed = way.points[complete - int(change_length_m(speed)) : goal + 1]
-                has_left = distance_to(own, way.points[goal]) >= LANE_CHANGE_OFFSET_M
-                is_beside = distance_to(own, way.points[complete]) <= STILL_BESIDE_M
-                if has_left and is_beside and not crosses_forbidden_line(scenario, changed):
-                    yield _Candidate(maneuver, shortened(way, goal), False)
+                change = path.points[end - int(change_length_m(speed)) : goal + 1]
+                has_left = distance_to(paths, path.points[goal]) >= LANE_CHANGE_OFFSET_M
+                is_parallel = distance_to(paths, path.points[end]) <= MAX_LANE_GAP_M
+                if has_left and is_parallel and not crosses_forbidden_line(scenario, change):
+                    yield _Candidate(maneuver, shorten_path(path, goal), False)
 
 
-def _settled_goal(path: LanePath, reach: Reach) -> int | None:
-    """Index of the goal on a path; None if nothing is in reach.
+def _find_goal(path: LanePath, reach: Reach) -> int | None:
+    """Index of the goal on a path; None if no goal is in reach.
 
     The end of usual driving, or further on, where a turn is over. If that is out of reach, before the turn.
     """
-    low = int(np.ceil(max(reach.least_m, NEAREST_GOAL_M)))
-    high = int(min(reach.most_m, path.length_m))
+    low = int(np.ceil(max(reach.min_m, NEAREST_GOAL_M)))
+    high = int(min(reach.max_m, path.length_m))
     if high < low:
         return None
-    usual = min(max(int(reach.usual_m), low), high)
-    # Settled where the path has hardly bent over the last meters and hardly will over the next [S].
+    usual_end = min(max(int(reach.usual_m), low), high)
+    # A turn is over where the path has hardly bent over the last meters and hardly will over the next [S].
     turn, last = path.turn, len(path.turn) - 1
     index = np.arange(last + 1)
-    ahead = np.abs(turn[np.minimum(index + SETTLED_M, last)] - turn)
-    behind = np.abs(turn - turn[np.maximum(index - SETTLED_M // 2, 0)])
-    settled = np.flatnonzero((ahead <= SETTLED_RAD) & (behind <= SETTLED_RAD))
-    beyond = settled[(settled >= usual) & (settled <= high)]
-    before = settled[(settled < usual) & (settled >= low)]
-    if len(beyond):
-        return int(beyond[0])
-    return int(before[-1]) if len(before) else usual
+    next_turn = np.abs(turn[np.minimum(index + SETTLING_M, last)] - turn)
+    past_turn = np.abs(turn - turn[np.maximum(index - SETTLING_M // 2, 0)])
+    candidates = np.flatnonzero((next_turn <= SETTLING_RAD) & (past_turn <= SETTLING_RAD))
+    later_steps = candidates[(candidates >= usual_end) & (candidates <= high)]
+    earlier_steps = candidates[(candidates < usual_end) & (candidates >= low)]
+    if len(later_steps):
+        return int(later_steps[0])
+    return int(earlier_steps[-1]) if len(earlier_steps) else usual_end

@@ -20,21 +20,21 @@ def crosses_forbidden_line(scenario: Scenario, points: Float[np.ndarray, "S 3"])
     """True if a path crosses a line that must not be crossed.
 
     Args:
-        scenario: its map has the lines.
-        points: the path.
+        scenario: Scenario with the lines in the map.
+        points: Points of the path in order, world frame, m.
     """
     start, end = _segments(scenario)  # [n, 2] each
     if not len(start) or len(points) < 2:
         return False
     # Only lines whose bounding box meets that of the path can cross it.
     low, high = points[:, :2].min(0), points[:, :2].max(0)
-    near = (np.maximum(start, end) >= low).all(1) & (np.minimum(start, end) <= high).all(1)
+    may_cross = (np.maximum(start, end) >= low).all(1) & (np.minimum(start, end) <= high).all(1)
     a, b = points[:-1, None, :2], points[1:, None, :2]  # [S - 1, 1, 2]
-    c, d = start[near], end[near]
+    c, d = start[may_cross], end[may_cross]
     # Two segments cross if each has its ends on both sides of the other.
-    path_parts = _side(a, b, c) * _side(a, b, d) < 0
-    line_parts = _side(c, d, a) * _side(c, d, b) < 0
-    return bool((path_parts & line_parts).any())
+    parts_line = _side(a, b, c) * _side(a, b, d) < 0
+    parts_path = _side(c, d, a) * _side(c, d, b) < 0
+    return bool((parts_line & parts_path).any())
 
 
 @cached_on_scenario
@@ -44,13 +44,13 @@ def _segments(scenario: Scenario) -> tuple[Float[np.ndarray, "n 2"], Float[np.nd
     lines = [features.polyline(i)[:, :2].astype(np.float64) for i in features.indices_of(FORBIDDEN)]
     start = np.concatenate([np.zeros((0, 2)), *(line[:-1] for line in lines)])
     end = np.concatenate([np.zeros((0, 2)), *(line[1:] for line in lines)])
-    short = np.linalg.norm(end - start, axis=1) <= GAP_M
-    return start[short], end[short]
+    is_joined = np.linalg.norm(end - start, axis=1) <= GAP_M
+    return start[is_joined], end[is_joined]
 
 
 def _side(
     start: Float[np.ndarray, "... 2"], end: Float[np.ndarray, "... 2"], point: Float[np.ndarray, "... 2"]
 ) -> Float[np.ndarray, "..."]:
-    """Cross product of a segment and the offset to a point: positive to its left, negative to its right."""
-    along, to = end - start, point - start
-    return along[..., 0] * to[..., 1] - along[..., 1] * to[..., 0]
+    """Cross product of a segment and the offset to a point: positive to the left, negative to the right."""
+    direction, offset = end - start, point - start
+    return direction[..., 0] * offset[..., 1] - direction[..., 1] * offset[..., 0]

@@ -50,7 +50,7 @@ from rlftsim.policies.smart.heads import ClassHeads, ContinuationScores, TokenKe
 from rlftsim.policies.smart.neighbors import Neighbors, Poses, group_rows, relative_pose, within
 from rlftsim.policies.smart.token_steps import TokenSteps
 from rlftsim.rollout.rows import place_rows, row_places
-from rlftsim.tokens.map_tokens import NUM_KINDS, NUM_LIGHTS, NUM_TYPES, MapTokens
+from rlftsim.tokens.map_tokens import NUM_FAMILIES, NUM_LIGHTS, NUM_TYPES, MapTokens
 from rlftsim.tokens.vocabulary import CLASS_NAMES
 
 MAX_LOOK_BACK_M = 160.0
@@ -167,7 +167,7 @@ class MapEncoder(nn.Module):
         dim = config.dim
         self.token = MlpEmbedding(22, dim)
         self.feature_type = nn.Embedding(NUM_TYPES, dim)
-        self.kind = nn.Embedding(NUM_KINDS, dim)
+        self.kind = nn.Embedding(NUM_FAMILIES, dim)
         self.light = nn.Embedding(NUM_LIGHTS, dim)
         self.relation = FourierEmbedding(3, dim, config.num_frequencies)
         self.layers = nn.ModuleList(
@@ -184,7 +184,7 @@ class MapEncoder(nn.Module):
         """
         x = self.token(prototypes.flatten(1))[tokens.token_id]  # [B, M, D]
         # categories are added to the shape's embedding: lane or edge, kind of piece, state of its light
-        x = x + self.feature_type(tokens.type) + self.kind(tokens.kind) + self.light(tokens.light)
+        x = x + self.feature_type(tokens.type) + self.kind(tokens.family) + self.light(tokens.light)
         x = x.flatten(0, 1)
         # 1. rows: the tokens that are no padding; each attends to tokens of its own scenario within reach
         rows = tokens.token_mask.flatten().nonzero()[:, 0]
