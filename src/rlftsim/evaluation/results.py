@@ -4,6 +4,7 @@ Columns: likelihoods and meta-metrics, higher is better; `*_error` in meters and
 """
 
 import json
+import math
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from html import escape
@@ -57,17 +58,20 @@ without a light feature have it; `meta_metric` is the official one. Miss rates: 
 `evaluation.drift`."""
 LABELS = {"RMM": "meta_metric"}
 """Name in tables -> column."""
+CLUSTER = "cluster"
+"""Column with the street network or recording of a scenario, where the data set knows it."""
 SCHEMA = pa.schema(
     [
         pa.field("scenario_id", pa.string()),
         pa.field("num_agents", pa.int32()),
         pa.field("num_evaluated", pa.int32()),
+        pa.field(CLUSTER, pa.string()),
         *(pa.field(name, pa.float64()) for name in SCORE_COLUMNS),
     ]
 )
 
-ADDED_COLUMNS = ("unlogged_offroad_rate", *Drift._fields)
-"""Columns that earlier evaluations lack; NaN when such a file is read."""
+ADDED_COLUMNS = (CLUSTER, "unlogged_offroad_rate", *Drift._fields)
+"""Columns that earlier evaluations lack; empty or NaN when such a file is read."""
 
 GoalsGiven = Literal["none", "logged"]
 
@@ -234,6 +238,12 @@ class Evaluation:
         """Scored scenarios, in the order of the rows."""
         return self.table["scenario_id"].to_pylist()
 
+    @cached_property
+    def clusters(self) -> np.ndarray:
+        """Label of each scenario's street network or recording; its own id where that is unknown."""
+        labels = self.table[CLUSTER].to_pylist()
+        return np.array([label or own for label, own in zip(labels, self.scenario_ids)], dtype=object)
+
     def values(self, column: str) -> np.ndarray:
         """A column as float64 [scenarios].
 
@@ -293,7 +303,8 @@ class Evaluation:
                 "again."
             )
         for name in added:
-            table = table.append_column(SCHEMA.field(name), pa.array(np.full(len(table), np.nan)))
+            nothing = None if name == CLUSTER else math.nan
+            table = table.append_column(SCHEMA.field(name), pa.array([nothing] * len(table), SCHEMA.field(name).type))
         table = table.select(SCHEMA.names)
         for field, found in zip(SCHEMA, table.schema):
             if found.type != field.type:
@@ -332,13 +343,16 @@ def join_evaluations(name: str, provenance: Provenance, parts: list[Evaluation])
     return Evaluation(name, provenance, table, tuple(skipped for part in parts for skipped in part.skipped))
 
 
-def row_of_result(result: RealismResult, scenario: Scenario, states: SimulatedStates) -> dict[str, object]:
+def row_of_result(
+    result: RealismResult, scenario: Scenario, states: SimulatedStates, cluster: str | None = None
+) -> dict[str, object]:
     """Row of `SCHEMA` for a scenario's rollouts and their scores.
 
     Args:
         result: scores of the rollouts, one scenario.
         scenario: the scenario, for its miss rates, its drift and numbers of agents.
         states: the rollouts.
+        cluster: Label of its street network or recording; None = unknown.
     """
     # The meta-metric is a weighted sum of likelihoods: a light likelihood of 1 adds its weight times what it lacks.
     light = result.likelihood(LIGHT)
@@ -357,5 +371,6 @@ def row_of_result(result: RealismResult, scenario: Scenario, states: SimulatedSt
         "scenario_id": result.scenario_ids[0],
         "num_agents": len(scenario.simulated_indices),
         "num_evaluated": len(scenario.evaluated_indices),
+        CLUSTER: cluster,
         **numbers,
     }

@@ -2,7 +2,9 @@
 
 import hashlib
 import io
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from os import PathLike
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -39,6 +41,11 @@ class ScenarioSource(Protocol):
     @property
     def guessed(self) -> tuple[str, ...]:
         """Values that are guessed in some scenarios, see `Scenario.guessed`."""
+        ...
+
+    @property
+    def clusters(self) -> Mapping[str, str]:
+        """Street network or recording by scenario id, as far as they are known."""
         ...
 
     def __contains__(self, scenario_id: object) -> bool: ...
@@ -121,6 +128,11 @@ class ConvertedScenarios:
         self.fingerprint = hash_manifest(folder)
         self.sources, self.guessed = self._dataset.sources, self._dataset.guessed
 
+    @cached_property
+    def clusters(self) -> Mapping[str, str]:
+        """Street network or recording by scenario id."""
+        return dict(zip(self._dataset.scenario_ids, self._dataset.clusters))
+
     def __contains__(self, scenario_id: object) -> bool:
         return scenario_id in self._dataset
 
@@ -149,6 +161,7 @@ class LoggedScenarios:
     fingerprint: str
     sources: tuple[str, ...] = ("womd",)
     guessed: tuple[str, ...] = ()
+    clusters: Mapping[str, str] = field(default_factory=dict)
 
     def __contains__(self, scenario_id: object) -> bool:
         return scenario_id in self.places
