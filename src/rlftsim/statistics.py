@@ -57,6 +57,18 @@ def interval_around(mean: float, standard_error: float, count: int | float, *, a
     return MeanInterval(mean, standard_error, (mean - half, mean + half), p_value, int(count))
 
 
+def prediction_interval(values: Shaped[np.ndarray, "n"], *, alpha: float = 0.05) -> MeanInterval:
+    """Mean of some values, with the interval in which the next value lies.
+
+    Args:
+        values: Independent samples, such as the gain of each run.
+        alpha: Probability that the next value lies outside.
+    """
+    mean = mean_interval(values)
+    error = mean.standard_error * math.sqrt(mean.count + 1)  # spread of the values, and error of their mean
+    return interval_around(mean.mean, error, mean.count, alpha=alpha)
+
+
 def cluster_bootstrap(
     values: Shaped[np.ndarray, "*runs n"],
     clusters: Shaped[np.ndarray, "n"],
