@@ -2,9 +2,7 @@
 
 import hashlib
 import io
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -43,11 +41,6 @@ class ScenarioSource(Protocol):
         """Values that are guessed in some scenarios, see `Scenario.guessed`."""
         ...
 
-    @property
-    def clusters(self) -> Mapping[str, str]:
-        """Street network or recording by scenario id, as far as they are known."""
-        ...
-
     def __contains__(self, scenario_id: object) -> bool: ...
 
     def __len__(self) -> int: ...
@@ -58,6 +51,10 @@ class ScenarioSource(Protocol):
         Raises:
             DataError: it is not there, or its bytes are damaged.
         """
+        ...
+
+    def find_cluster(self, scenario_id: str) -> str | None:
+        """Label of a scenario's street network or recording; None where that is not known."""
         ...
 
 
@@ -128,11 +125,6 @@ class ConvertedScenarios:
         self.fingerprint = hash_manifest(folder)
         self.sources, self.guessed = self._dataset.sources, self._dataset.guessed
 
-    @cached_property
-    def clusters(self) -> Mapping[str, str]:
-        """Street network or recording by scenario id."""
-        return dict(zip(self._dataset.scenario_ids, self._dataset.clusters))
-
     def __contains__(self, scenario_id: object) -> bool:
         return scenario_id in self._dataset
 
@@ -142,6 +134,10 @@ class ConvertedScenarios:
     def by_id(self, scenario_id: str) -> Scenario:
         """One scenario, see `ScenarioSource`."""
         return self._dataset.by_id(scenario_id)
+
+    def find_cluster(self, scenario_id: str) -> str | None:
+        """Label of its street network or recording, see `ScenarioSource`."""
+        return self._dataset.find_cluster(scenario_id)
 
 
 @dataclass(frozen=True)
@@ -161,7 +157,6 @@ class LoggedScenarios:
     fingerprint: str
     sources: tuple[str, ...] = ("womd",)
     guessed: tuple[str, ...] = ()
-    clusters: Mapping[str, str] = field(default_factory=dict)
 
     def __contains__(self, scenario_id: object) -> bool:
         return scenario_id in self.places
@@ -181,6 +176,10 @@ class LoggedScenarios:
             return scenario_from_bytes(data)
         except DataError as error:
             raise DataError(f"{place.file}: scenario {scenario_id}: {error}") from error
+
+    def find_cluster(self, scenario_id: str) -> str | None:
+        """None: records do not say which recording they were cut from."""
+        return None
 
 
 def index_tfrecords(source: Path) -> LoggedScenarios:

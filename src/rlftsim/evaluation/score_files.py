@@ -245,7 +245,7 @@ def _score_entry(job: _Job, position: int) -> dict[str, object] | Skipped:
         result = score(scenario_log(scenario), states, metric_by_name(job.config.metric))
     except DataError as error:
         raise DataError(f"{entry}: {error}") from error
-    return row_of_result(result, scenario, states, job.source.clusters.get(entry.scenario_id))
+    return row_of_result(result, scenario, states, job.source.find_cluster(entry.scenario_id))
 
 
 def has_road_edge(scenario: Scenario) -> bool:

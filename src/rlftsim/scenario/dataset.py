@@ -161,6 +161,10 @@ class ScenarioDataset:
         """Label of each scenario's street network or recording, see `find_clusters`."""
         return find_clusters(self)
 
+    def find_cluster(self, scenario_id: str) -> str:
+        """Label of the street network or recording of one scenario."""
+        return self.clusters[self._position[scenario_id]]
+
     @cached_property
     def num_agents(self) -> Int64[np.ndarray, "scenarios"]:
         """Simulated agents of each scenario."""
