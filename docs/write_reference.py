@@ -20,7 +20,7 @@ from pathlib import Path
 
 import rlftsim
 from rlftsim import errors
-from rlftsim.cli.main import OVERVIEW, VERBS, main
+from rlftsim.cli.main import EXAM, OVERVIEW, VERBS, main
 from rlftsim.cli.mistakes import ACTIONS
 from rlftsim.cli.plugins import POINTS
 from rlftsim.plugins import is_ours
@@ -83,7 +83,8 @@ def cli_page(verb: str) -> str:
     text = help_of(verb)
     actions = ACTIONS.search(text)
     parts = [f"# rlftsim {verb}\n", described(text)]
-    for action in actions[1].split(",") if actions else ():
+    of_verb = [name.removeprefix(f"{verb} ") for name in EXAM if name.startswith(f"{verb} ")]
+    for action in (*(actions[1].split(",") if actions else ()), *of_verb):
         parts += [f"## rlftsim {verb} {action}\n", described(help_of(verb, action))]
     return "\n".join(parts)
 

@@ -234,3 +234,36 @@ def test_a_folder_and_a_scenario_with_two_rows_are_refused(tmp_path):
     for pair in ((twice, evaluation("b", [0.1], ["x"])), (evaluation("b", [0.1], ["x"]), twice)):
         with pytest.raises(DataError, match="twice: scenario x has several rows, a pair needs one"):
             compare(*pair)
+
+
+def test_scenarios_of_few_street_networks_count_by_network():
+    networks = [*"aaaaabbbbbcccccddddd"]
+    # every scenario of a network gains alike: twenty scenarios say no more than four
+    gain = np.repeat([0.01, 0.02, 0.03, 0.04], 5)
+    base, tuned = np.full(20, 0.5), 0.5 + gain
+    comparison = compare(evaluation("base", base, clusters=networks), evaluation("tuned", tuned, clusters=networks))
+    row = comparison["meta_metric"]
+    assert comparison.num_clusters == row.num_clusters == 4
+    assert comparison.pairing == "20 scenarios of 4 clusters in both"
+    four = compare_paired("meta_metric", np.full(4, 0.5), 0.5 + np.array([0.01, 0.02, 0.03, 0.04]))
+    assert row.interval == pytest.approx(four.interval, abs=1e-3)
+    assert row.count == 20
+    text = render(format_comparison(comparison))
+    assert "Street networks or recordings of the scenarios: 4." in text
+    # the same without networks: as it always was
+    plain = compare(evaluation("base", base), evaluation("tuned", tuned))
+    assert (plain.num_clusters, plain.caution) == (0, "")
+    assert plain["meta_metric"].interval == compare_paired("meta_metric", base, tuned).interval
+    assert plain["meta_metric"].interval[0] > row.interval[0]
+
+
+def test_scenarios_of_one_street_network_give_no_verdict():
+    a, b = (evaluation(name, values, clusters=["a", "a"]) for name, values in (("a", [0.1, 0.2]), ("b", [0.2, 0.4])))
+    row = compare(a, b)["meta_metric"]
+    assert row.verdict == "no verdict: all 2 scenarios are of one cluster, whose mean differs by +0.1500."
+    assert not row.is_difference
+
+
+def test_the_networks_of_scenarios_are_stored_with_their_scores(tmp_path):
+    evaluation("a", [0.1, 0.2, 0.3], clusters=["x", "x", None]).write(tmp_path / "a.parquet")
+    assert Evaluation.read(tmp_path / "a.parquet").clusters.tolist() == ["x", "x", "s2"]

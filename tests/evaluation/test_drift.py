@@ -1,6 +1,7 @@
 """Drift from the log in scenes drawn by hand: every number is known."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -39,6 +40,13 @@ def test_speeds_are_those_of_agents_that_move_in_the_log():
     drift = measure_drift(log, driven(scenes.Mover(speed_mps=5.0), scenes.Mover(x_m=30.0, speed_mps=2.0)))
     assert drift.speed_gap == pytest.approx(-3.0, abs=1e-3)
     assert (drift.speed_p10, drift.speed_p50, drift.speed_p90) == pytest.approx((5.0, 5.0, 5.0), abs=1e-3)
+
+
+def test_the_speed_of_agents_that_are_not_evaluated_has_a_column_of_its_own():
+    log = scene(scenes.Mover(speed_mps=8.0), scenes.Mover(y_m=5.0, speed_mps=8.0))
+    log = replace(log, tracks_to_predict=np.zeros(0, np.int32), difficulty=np.zeros(0, np.int8))  # the ego alone
+    drift = measure_drift(log, driven(scenes.Mover(speed_mps=8.0), scenes.Mover(y_m=5.0, speed_mps=6.0)))
+    assert (drift.speed_gap, drift.speed_gap_all) == pytest.approx((0.0, -1.0), abs=1e-3)
 
 
 def test_a_second_without_motion_is_a_stop():

@@ -167,6 +167,16 @@ def test_own_verdict_is_kept():
     assert comparison.verdict_text == "Too few to tell."
 
 
+def test_a_difference_without_an_interval_is_drawn_without_one():
+    nothing = (float("nan"), float("nan"))
+    comparison = PairedComparison(
+        "a", "b", 0.01, nothing, nothing[0], 2, differences=[0.0, 0.02], verdict="One network."
+    )
+    page = report_html(Report("t", comparison=comparison))
+    assert "nan" not in page
+    assert page.count("<circle") == 3
+
+
 def test_terminal_table_has_the_same_numbers(report):
     out = io.StringIO()
     Console(file=out, width=120, markup=False).print(report_table(report))

@@ -101,7 +101,7 @@ def test_an_experiment_of_another_package_runs_by_its_name(tmp_path, capsys):
     with installed(tmp_path / "site", "straight_on_package", EXPERIMENT, entry_points):
         words = ["experiment", "straight-on", "--out", str(out), "--limit", "2", "--num-rollouts", "4"]
         assert main(words) == 0
-    assert "straight on against log, 2 scenarios in both" in capsys.readouterr().out
+    assert "straight on against log, 2 scenarios of 1 cluster in both" in capsys.readouterr().out
     names = {f"straight-on.{ending}" for ending in ("md", "json", "png", "svg")}
     assert {path.name for path in out.glob("straight-on.*")} == names
     numbers = json.loads((out / "straight-on.json").read_text())
@@ -117,6 +117,6 @@ def test_a_policy_of_another_package_is_fine_tuned_and_compared(tmp_path, capsys
         settings += ["--finetune.device.accelerator", "cpu", "--finetune.goals.learning-rate-scale", "1"]
         words = ["experiment", "credit", "--base-model", str(tmp_path / "paced"), "--out", str(out), "--device", "cpu"]
         assert main([*words, "--seeds", "1", "--limit", "2", "--num-rollouts", "4", "--jobs", "1", *settings]) == 0
-    assert "MLOO against base, 2 scenarios in both" in capsys.readouterr().out
+    assert "MLOO against base, 2 scenarios of 1 cluster in both" in capsys.readouterr().out
     tuned = json.loads((out / "runs" / "mloo-seed0" / "0.01-epochs" / "model" / "config.json").read_text())
     assert tuned["architecture"] == "paced"

@@ -22,6 +22,7 @@ from rlftsim.scenario.open import SYNTHETIC, dataset_folder
 from rlftsim.workers import usable_cores
 
 QUESTIONS = "; ".join(f"{name}: {experiment_by_name(name).question}" for name in PAPER)
+QUESTIONS += "; exam: Are models better where no choice was made? (see `rlftsim experiment exam --help`)"
 
 
 @dataclass(frozen=True)

@@ -41,6 +41,8 @@ VERBS = {
     "experiment": ("rlftsim.cli.experiment", "RunExperiment"),
 }
 """Module and class of each verb, in the order in which a newcomer needs them."""
+EXAM = {"experiment exam": ("rlftsim.cli.exam", "Exam")}
+"""An experiment that trains nothing, so it has flags of its own."""
 
 OVERVIEW = f"""rlftsim {__version__}: traffic agents that behave like real road users.
 
@@ -69,7 +71,7 @@ usage: rlftsim VERB ...      rlftsim VERB --help explains a verb
   evaluate     evaluate a model with the official realism meta-metric
   compare      compare two evaluations scenario by scenario
   submit       build an archive for the Sim Agents leaderboard, or check one before it is uploaded
-  experiment   repeat an experiment of the paper: a table, verdicts and a figure
+  experiment   repeat an experiment of the paper: a table, verdicts and a figure; or sit the exam
 
   join VERB .. put the shares of a command together that ran on several machines (--share K/N)
 """
@@ -147,6 +149,8 @@ def parse(words: Sequence[str]) -> Any:
     # Imported late: the overview is printed without it.
     from rlftsim.cli.parse import parse as parse_words
 
+    if " ".join(words[:2]) in EXAM:
+        return parse_words([" ".join(words[:2]), *words[2:]], EXAM)
     if words[0] != JOIN:
         return parse_words(words, VERBS)
     command = words[1:]

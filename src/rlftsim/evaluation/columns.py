@@ -112,6 +112,7 @@ DRIFT_COLUMNS = (
         "speed_gap", "speed − log",
         "mean speed of agents that move in the log, minus their logged one; negative = slower", "m/s",
     ),
+    Column("speed_gap_all", "all agents", "the same over all simulated agents, not the evaluated ones alone", "m/s"),
     Column("speed_p10", "speed, 10 %", "10th percentile of the speed of moving agents", "m/s"),
     Column("speed_p50", "50 %", "median speed of moving agents", "m/s"),
     Column("speed_p90", "90 %", "90th percentile of the speed of moving agents", "m/s"),

@@ -6,13 +6,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 from rich.table import Table
 
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.columns import TERMINAL_COLUMNS, TERMINAL_GOAL_COLUMNS, Column, direction_of
 from rlftsim.evaluation.results import LABELS, SCORE_COLUMNS, Evaluation
-from rlftsim.statistics import mean_interval
+from rlftsim.statistics import cluster_bootstrap, mean_interval
+
+FEW_CLUSTERS = 10
+"""Below, an interval is itself uncertain: the spread between clusters is hardly known."""
 
 
 @dataclass(frozen=True)
@@ -29,10 +32,13 @@ class PairedDifference:
     standard_error: float
     """NaN for fewer than two scenarios."""
     interval: tuple[float, float]
-    """Holds the true difference with probability 1 - alpha (Student's t); NaN for fewer than two scenarios."""
+    """Holds the true difference with probability 1 - alpha (Student's t); NaN for fewer than two scenarios, or
+    clusters."""
     p_value: float
     """Two-sided, of a true difference of 0; NaN for fewer than two scenarios."""
     alpha: float
+    num_clusters: int = 0
+    """Street networks or recordings by which interval and p-value count; 0 = each scenario stands for itself."""
 
     def __repr__(self) -> str:
         return f"{self.column}: {self.mean_a:.4f} -> {self.mean_b:.4f}, {self.verdict}"
@@ -49,6 +55,9 @@ class PairedDifference:
             return "nothing to compare: no scenario has a value in both."
         if self.count == 1:
             return f"no verdict: a single scenario, which differs by {self.difference:+.4f}."
+        if math.isnan(self.standard_error):
+            cause = f"all {self.count} scenarios are of one cluster"
+            return f"no verdict: {cause}, whose mean differs by {self.difference:+.4f}."
         # the same difference everywhere: there is no test to make
         if self.standard_error == 0:
             if self.difference == 0:
@@ -78,6 +87,8 @@ class Comparison:
     num_only_b: int
     differences: tuple[PairedDifference, ...]
     """In the order of `SCORE_COLUMNS`."""
+    num_clusters: int = 0
+    """Street networks or recordings that the paired scenarios are of; 0 = each scenario stands for itself."""
 
     def __repr__(self) -> str:
         return f"{self.name_b} against {self.name_a}, {self.pairing}; {self['meta_metric']!r}"
@@ -100,7 +111,18 @@ class Comparison:
         alone = [(self.num_only_a, self.name_a), (self.num_only_b, self.name_b)]
         left_out = "".join(f", {count} only in {name} left out" for count, name in alone if count)
         with_rmm = _with_rmm(self["meta_metric"].count, self.num_paired)
-        return f"{self.num_paired} scenario{'s' if self.num_paired != 1 else ''} in both{with_rmm}{left_out}"
+        clusters = f" of {self.num_clusters} cluster{'s' if self.num_clusters > 1 else ''}" if self.num_clusters else ""
+        return f"{self.num_paired} scenario{'s' if self.num_paired != 1 else ''}{clusters} in both{with_rmm}{left_out}"
+
+    @property
+    def caution(self) -> str:
+        """A sentence on intervals that few clusters make uncertain; empty where there are enough, or none."""
+        if not 0 < self.num_clusters < FEW_CLUSTERS:
+            return ""
+        return (
+            f"Street networks or recordings of the scenarios: {self.num_clusters}. Intervals count these, and so few "
+            "say little about others."
+        )
 
 
 def compare(a: Evaluation, b: Evaluation, *, alpha: float = 0.05) -> Comparison:
@@ -110,6 +132,10 @@ def compare(a: Evaluation, b: Evaluation, *, alpha: float = 0.05) -> Comparison:
         a: the reference, e.g. the base model.
         b: the other one, e.g. the fine-tuned model.
         alpha: probability of calling a difference that is none.
+
+    Returns:
+        Differences with intervals and p-values. Where scenarios share street networks or recordings, these are what
+        counts (`cluster_bootstrap`); else each scenario does (Student's t).
 
     Raises:
         ConfigError: alpha is no probability.
@@ -126,6 +152,8 @@ def compare(a: Evaluation, b: Evaluation, *, alpha: float = 0.05) -> Comparison:
                 "alike."
             )
     rows_a, rows_b = pair_rows(a, b)
+    clusters = a.clusters[rows_a]
+    num_clusters = len(set(clusters)) if len(set(clusters)) < len(rows_a) else 0
     return Comparison(
         name_a=a.name,
         name_b=b.name,
@@ -133,9 +161,16 @@ def compare(a: Evaluation, b: Evaluation, *, alpha: float = 0.05) -> Comparison:
         num_only_a=len(a) - len(rows_a),
         num_only_b=len(b) - len(rows_b),
         differences=tuple(
-            compare_paired(column, a.values(column)[rows_a], b.values(column)[rows_b], alpha=alpha)
+            compare_paired(
+                column,
+                a.values(column)[rows_a],
+                b.values(column)[rows_b],
+                alpha=alpha,
+                clusters=clusters if num_clusters else None,
+            )
             for column in SCORE_COLUMNS
         ),
+        num_clusters=num_clusters,
     )
 
 
@@ -180,7 +215,12 @@ def paired_values(a: Evaluation, b: Evaluation, column: str) -> tuple[list[str],
 
 
 def compare_paired(
-    column: str, a: Float[np.ndarray, "scenarios"], b: Float[np.ndarray, "scenarios"], *, alpha: float = 0.05
+    column: str,
+    a: Float[np.ndarray, "*runs scenarios"],
+    b: Float[np.ndarray, "*runs scenarios"],
+    *,
+    alpha: float = 0.05,
+    clusters: Shaped[np.ndarray, "scenarios"] | None = None,
 ) -> PairedDifference:
     """Paired t-test of two columns; scenarios without a value in both are left out.
 
@@ -189,14 +229,19 @@ def compare_paired(
         a: the reference's values.
         b: the other one's, of the same scenarios in the same order.
         alpha: probability of calling a difference that is none.
+        clusters: Street network or recording of each scenario, by which interval and p-value then count; needed for
+            values of several runs. None = each scenario stands for itself.
     """
-    known = np.isfinite(a) & np.isfinite(b)  # [scenarios]
-    a, b = a[known], b[known]
+    in_both = np.isfinite(a) & np.isfinite(b)
     # a paired t-test is a t-test of the differences: scenarios differ far more than policies do
-    gain = mean_interval(b - a, alpha=alpha)
-    means = (float(a.mean()), float(b.mean())) if gain.count else (math.nan, math.nan)
+    if clusters is None:
+        gain, num_clusters = mean_interval((b - a)[in_both], alpha=alpha), 0
+    else:
+        gain = cluster_bootstrap(np.where(in_both, b - a, np.nan), clusters, level=1 - alpha)
+        num_clusters = len(set(clusters[np.atleast_2d(in_both).any(0)]))
+    means = (float(a[in_both].mean()), float(b[in_both].mean())) if gain.count else (math.nan, math.nan)
     return PairedDifference(
-        column, gain.count, *means, gain.mean, gain.standard_error, gain.interval, gain.p_value, alpha
+        column, gain.count, *means, gain.mean, gain.standard_error, gain.interval, gain.p_value, alpha, num_clusters
     )
 
 
@@ -246,7 +291,12 @@ def format_comparison(comparison: Comparison, *, columns: Sequence[Column] = TER
         comparison: of two evaluations.
         columns: the rows.
     """
-    table = Table(title=f"{comparison.name_b} against {comparison.name_a}: {comparison.pairing}", title_justify="left")
+    table = Table(
+        title=f"{comparison.name_b} against {comparison.name_a}: {comparison.pairing}",
+        title_justify="left",
+        caption=comparison.caution or None,
+        caption_justify="left",
+    )
     table.add_column("", no_wrap=True)
     for name in (comparison.name_a, comparison.name_b, "difference"):
         table.add_column(name, justify="right")

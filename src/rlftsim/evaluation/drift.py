@@ -4,6 +4,7 @@ The meta-metric rewards slow traffic, which hits nothing and stays on the road. 
 at what price a score was reached. They are means over evaluated agents and rollouts of one scenario.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -40,6 +41,8 @@ class Drift(NamedTuple):
 
     speed_gap: float
     """Mean speed of moving agents minus that of their log, m/s; negative = slower than the log."""
+    speed_gap_all: float
+    """The same over all simulated agents, not the evaluated ones alone."""
     speed_p10: float
     """Percentiles of the speed of moving agents, m/s."""
     speed_p50: float
@@ -74,24 +77,31 @@ def measure_drift(scenario: Scenario, states: SimulatedStates) -> Drift:
     evaluated = np.flatnonzero(np.isin(everyone, scenario.evaluated_indices))  # [E], places among all simulated agents
     # 2. Speeds at the steps at which the log has one.
     window = slice(CURRENT_STEP, TOTAL_STEPS)
-    tracked = everyone[evaluated]
-    valid = tracks.valid[tracked, window]
-    valid = valid[:, 1:] & valid[:, :-1]  # [E, 80]
-    logged = np.linalg.norm(np.diff(tracks.position[tracked, window, :2].astype(np.float64), axis=1), axis=-1) / STEP_S
-    speed = np.linalg.norm(velocity[:, evaluated], axis=-1)  # [N, E, 80]
+    valid = tracks.valid[everyone, window]
+    valid = valid[:, 1:] & valid[:, :-1]  # [A, 80]
+    logged = np.linalg.norm(np.diff(tracks.position[everyone, window, :2].astype(np.float64), axis=1), axis=-1) / STEP_S
+    speed = np.linalg.norm(velocity, axis=-1)  # [N, A, 80]
     mean_logged = np.where(valid, logged, 0.0).sum(1) / np.maximum(valid.sum(1), 1)
-    moving = mean_logged >= MOVING_M_S  # [E]
+    moving = mean_logged >= MOVING_M_S  # [A]
+    gap_all = _speed_gap(speed, logged, moving[:, None] & valid)
+    valid, logged, speed, moving = valid[evaluated], logged[evaluated], speed[:, evaluated], moving[evaluated]
+    tracked = everyone[evaluated]
     counted = speed[:, moving[:, None] & valid]  # [N, moving steps]
-    gap, slow, median, fast = [float("nan")] * 4
-    if counted.size:
-        gap = float(counted.mean() - logged[moving[:, None] & valid].mean())
-        slow, median, fast = (float(p) for p in np.percentile(counted, (10, 50, 90)))
+    gap = _speed_gap(speed, logged, moving[:, None] & valid)
+    slow, median, fast = (float(p) for p in np.percentile(counted, (10, 50, 90))) if counted.size else [math.nan] * 3
     # 3. Stops that the log does not have.
     never_stops = moving & ~_stops(logged, valid)
     stops = _stops(speed[:, never_stops], valid[never_stops])  # [N, agents]
     offset, turned = _measure_lanes(scenario, position[:, evaluated, 1:], angle[:, evaluated], tracked)
     contact = _contact_speed(scenario, position[:, :, 1:], angle, velocity, everyone, evaluated)
-    return Drift(gap, slow, median, fast, _mean(stops), *offset, *turned, contact)
+    return Drift(gap, gap_all, slow, median, fast, _mean(stops), *offset, *turned, contact)
+
+
+def _speed_gap(
+    speed: Float[np.ndarray, "N A T"], logged: Float[np.ndarray, "A T"], counted: Bool[np.ndarray, "A T"]
+) -> float:
+    """Mean speed minus the mean logged one at the steps that are counted."""
+    return float(speed[:, counted].mean() - logged[counted].mean()) if counted.any() else math.nan
 
 
 def _mean(values: np.ndarray) -> float:

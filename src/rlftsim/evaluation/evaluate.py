@@ -257,4 +257,5 @@ def _evaluate_scenario(job: _Job, position: int) -> dict[str, object] | Skipped:
     else:
         goals_of = evaluated_ends if config.goals == "logged" else None
         states = simulate_states(job.policy, scenario, config, device, goals_of=goals_of)
-    return row_of_result(score(log, states, metric_by_name(config.metric)), scenario, states)
+    result = score(log, states, metric_by_name(config.metric))
+    return row_of_result(result, scenario, states, job.dataset.find_cluster(scenario.scenario_id))

@@ -261,11 +261,12 @@ def _comparison_html(comparison: PairedComparison | None) -> str:
         return ""
     p_text = "p < 0.0001" if comparison.p_value < 1e-4 else f"p = {comparison.p_value:.2g}"
     sign = "+" if comparison.mean_difference > 0 else ""
+    tested = f"95 % interval {_interval_text(comparison.interval, 4)}, {p_text} ({escape(comparison.test)}), "
     return (
         f"<h2>{escape(_sentence(comparison.second))} against {escape(comparison.first)}, scenario by scenario</h2>"
         f'<div class="card comparison"><div><p class="verdict">{escape(comparison.verdict_text)}</p>'
         f"<p>Mean difference in {escape(comparison.metric)} {sign}{format_number(comparison.mean_difference, 4)}, "
-        f"95 % interval {_interval_text(comparison.interval, 4)}, {p_text} ({escape(comparison.test)}), "
+        f"{tested if math.isfinite(comparison.p_value) else ''}"
         f"{comparison.num_scenarios} scenarios.</p></div>{_difference_svg(comparison)}</div>"
     )
 
@@ -278,7 +279,7 @@ def _difference_svg(comparison: PairedComparison) -> str:
     dots = dots[np.isfinite(dots)]
     # zero belongs to the axis even if all differences lie on one side
     shown = np.concatenate([dots, comparison.interval, [0.0, comparison.mean_difference]])
-    low, high = float(shown.min()), float(shown.max())
+    low, high = float(np.nanmin(shown)), float(np.nanmax(shown))
     if low == high:
         low, high = low - 1, high + 1
 
@@ -299,8 +300,9 @@ def _difference_svg(comparison: PairedComparison) -> str:
         # dots that touch are stacked, up to the upper border
         y = 70 - min(height * 7, 62)
         parts.append(f'<circle cx="{across(value):.1f}" cy="{y}" r="3.2" fill="{color}" opacity=".65"/>')
-    start, stop = (across(v) for v in comparison.interval)
-    parts.append(f'<path d="M{start:.1f} 91H{stop:.1f}" stroke="{tone}" stroke-width="4" stroke-linecap="round"/>')
+    if math.isfinite(comparison.interval[0]):  # no interval over a single scenario or street network
+        start, stop = (across(v) for v in comparison.interval)
+        parts.append(f'<path d="M{start:.1f} 91H{stop:.1f}" stroke="{tone}" stroke-width="4" stroke-linecap="round"/>')
     parts.append(f'<circle cx="{across(comparison.mean_difference):.1f}" cy="91" r="6.5" fill="{tone}"/>')
     dots_label = "a dot per scenario, " if len(dots) else ""
     caption = f"{dots_label}mean and 95 % interval; {escape(comparison.second)} minus {escape(comparison.first)}"

@@ -58,11 +58,14 @@ without a light feature have it; `meta_metric` is the official one. Miss rates: 
 `evaluation.drift`."""
 LABELS = {"RMM": "meta_metric"}
 """Name in tables -> column."""
+CLUSTER = "cluster"
+"""Column with the street network or recording of a scenario; empty where the data set does not know it."""
 SCHEMA = pa.schema(
     [
         pa.field("scenario_id", pa.string()),
         pa.field("num_agents", pa.int32()),
         pa.field("num_evaluated", pa.int32()),
+        pa.field(CLUSTER, pa.string()),
         *(pa.field(name, pa.float64()) for name in SCORE_COLUMNS),
     ]
 )
@@ -71,9 +74,6 @@ LARGEST = 1e7
 """Beyond are neither meters, nor their rates, nor numbers of agents."""
 ROUNDING = 1e-6
 """Sums of weighted likelihoods may be this far out of [0, 1]."""
-
-ADDED_COLUMNS = ("unlogged_offroad_rate", *Drift._fields)
-"""Columns that earlier evaluations lack; NaN when such a file is read."""
 
 GoalsGiven = Literal["none", "logged"]
 
@@ -235,6 +235,12 @@ class Evaluation:
         """Scored scenarios, in the order of the rows."""
         return self.table["scenario_id"].to_pylist()
 
+    @cached_property
+    def clusters(self) -> np.ndarray:
+        """Label of each scenario's street network or recording; its own id where that is unknown."""
+        labels = self.table[CLUSTER].to_pylist()
+        return np.array([label or scenario_id for label, scenario_id in zip(labels, self.scenario_ids)], dtype=object)
+
     def values(self, column: str) -> np.ndarray:
         """A column as float64 [scenarios].
 
@@ -267,7 +273,7 @@ class Evaluation:
 
     @classmethod
     def read(cls, path: str | PathLike[str]) -> "Evaluation":
-        """Read the file that `write` wrote, of this version or an earlier one.
+        """Read the file that `write` wrote.
 
         Raises:
             DataError: no such file, a folder, a damaged file, or not an evaluation of this version.
@@ -289,9 +295,6 @@ class Evaluation:
                 f"{path}: not an evaluation of this version: name a file that `rlftsim evaluate` wrote, or evaluate "
                 "again."
             )
-        for name in ADDED_COLUMNS:
-            if name not in table.schema.names:
-                table = table.append_column(SCHEMA.field(name), pa.array(np.full(len(table), np.nan)))
         try:
             check_columns(table, SCHEMA)
             table = table.select(SCHEMA.names)
@@ -320,7 +323,9 @@ def _check_scores(table: pa.Table) -> None:
     Raises:
         DataError: A number that is out of range or infinite; the message names column and scenario.
     """
-    for name in table.schema.names[1:]:
+    for name in table.schema.names:
+        if table[name].type == pa.string():
+            continue
         direction = direction_of(name)
         # likelihoods and rates are in [0, 1] but for rounding, errors and counts not below 0, drift is any number
         lowest = -LARGEST if direction == "log" and not name.startswith("num_") else 0.0
@@ -348,13 +353,16 @@ def join_evaluations(name: str, provenance: Provenance, parts: list[Evaluation])
     return Evaluation(name, provenance, table, tuple(skipped for part in parts for skipped in part.skipped))
 
 
-def row_of_result(result: RealismResult, scenario: Scenario, states: SimulatedStates) -> dict[str, object]:
+def row_of_result(
+    result: RealismResult, scenario: Scenario, states: SimulatedStates, cluster: str | None = None
+) -> dict[str, object]:
     """Row of `SCHEMA` for a scenario's rollouts and their scores.
 
     Args:
         result: scores of the rollouts, one scenario.
         scenario: the scenario, for its miss rates, its drift and numbers of agents.
         states: the rollouts.
+        cluster: Label of its street network or recording; None = unknown.
     """
     # The meta-metric is a weighted sum of likelihoods: a light likelihood of 1 adds its weight times what it lacks.
     light = result.likelihood(LIGHT)
@@ -373,5 +381,6 @@ def row_of_result(result: RealismResult, scenario: Scenario, states: SimulatedSt
         "scenario_id": result.scenario_ids[0],
         "num_agents": len(scenario.simulated_indices),
         "num_evaluated": len(scenario.evaluated_indices),
+        CLUSTER: cluster or "",
         **numbers,
     }

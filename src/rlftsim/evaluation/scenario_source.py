@@ -53,6 +53,10 @@ class ScenarioSource(Protocol):
         """
         ...
 
+    def find_cluster(self, scenario_id: str) -> str | None:
+        """Label of a scenario's street network or recording; None where that is not known."""
+        ...
+
 
 def open_held_out(
     data: str | PathLike[str] | ScenarioDataset, config: EvaluateConfig
@@ -131,6 +135,10 @@ class ConvertedScenarios:
         """One scenario, see `ScenarioSource`."""
         return self._dataset.by_id(scenario_id)
 
+    def find_cluster(self, scenario_id: str) -> str | None:
+        """Label of its street network or recording, see `ScenarioSource`."""
+        return self._dataset.find_cluster(scenario_id)
+
 
 @dataclass(frozen=True)
 class RecordPlace:
@@ -168,6 +176,10 @@ class LoggedScenarios:
             return scenario_from_bytes(data)
         except DataError as error:
             raise DataError(f"{place.file}: scenario {scenario_id}: {error}") from error
+
+    def find_cluster(self, scenario_id: str) -> str | None:
+        """None: records do not say which recording they were cut from."""
+        return None
 
 
 def index_tfrecords(source: Path) -> LoggedScenarios:

@@ -249,7 +249,7 @@ def _score_entry(job: _Job, position: int) -> dict[str, object] | Skipped:
     except DataError as error:
         raise DataError(f"{entry}: {error}") from error
     warn_of_doubts(scenario, states, entry.file)
-    return row_of_result(result, scenario, states)
+    return row_of_result(result, scenario, states, job.source.find_cluster(entry.scenario_id))
 
 
 def has_road_edge(scenario: Scenario) -> bool:

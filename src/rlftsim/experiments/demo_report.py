@@ -1,5 +1,6 @@
 """Report of the demo: table, paired comparison, learning curves, animations, facts."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -83,7 +84,9 @@ def build_report(
             difference.interval,
             difference.p_value,
             difference.count,
+            test=f"by {difference.num_clusters} street networks" if difference.num_clusters else "paired t-test",
             differences=gains,
+            verdict="" if math.isfinite(difference.p_value) else f"RMM: {difference.verdict}",
         ),
         chart_groups=[
             ChartGroup(

@@ -26,9 +26,8 @@ from typing import Any, overload
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.parquet as pq
-from jaxtyping import Int64
+from jaxtyping import Int64, Shaped
 
 import rlftsim
 from rlftsim.atomic_io import cannot_write, write_text, write_whole
@@ -44,6 +43,7 @@ from rlftsim.scenario.shards import (
     ShardWriter,
     hash_file,
 )
+from rlftsim.scenario.splits import find_clusters, find_split
 from rlftsim.scenario.synthetic.pack import pack_path
 from rlftsim.scenario.tfrecord import SkippedRecord
 from rlftsim.scenario.types import Scenario
@@ -106,7 +106,8 @@ class ScenarioDataset:
     Args:
         folder: the data set, also in a bucket (s3://bucket/folder), of which shards are fetched when they are needed;
             "synthetic" = the one that ships with the package.
-        split: only scenarios of this split, e.g. "training"; None = all.
+        split: only scenarios of this split, e.g. "training"; None = all. "tune" and "exam" are drawn from validation
+            where they are not stored, see `scenario.splits`.
         cache_size: decoded scenarios kept in memory, the least recently used go first (about 1 MB each).
 
     Raises:
@@ -124,13 +125,16 @@ class ScenarioDataset:
         index = load_index(self.folder)
         if len(index) != self.manifest.num_scenarios:
             raise DataError(f"{self.folder / INDEX} does not belong to {MANIFEST}: convert again")
-        if split is not None and split not in self.manifest.counts:
-            known = ", ".join(self.manifest.counts) or "none"
-            raise DataError(
-                f"{self.folder} has no split {split!r}, only {known}: name one of these as the split, in Python "
-                "by load_dataset(name, split)"
-            )
-        self.index = index if split is None else index.filter(pc.field("split") == split)
+        self.index = index
+        if split is not None:
+            is_chosen = find_split(self, split)
+            if split not in self.manifest.counts and not is_chosen.any():
+                known = ", ".join(self.manifest.counts) or "none"
+                raise DataError(
+                    f"{self.folder} has no split {split!r}, only {known}: name one of these as the split, in Python "
+                    "by load_dataset(name, split)"
+                )
+            self.index = index.filter(pa.array(is_chosen))
         """Table with the columns of `INDEX_SCHEMA`, one row per scenario, in the order of positions."""
         self.scenario_ids: list[str] = self.index["scenario_id"].to_pylist()
         self._shard_names: list[str] = self.index["shard"].to_pylist()
@@ -150,6 +154,15 @@ class ScenarioDataset:
     def guessed(self) -> tuple[str, ...]:
         """Values that are guessed in at least one scenario, see `Scenario.guessed`, in alphabetical order."""
         return tuple(sorted({word for words in set(self.index["guessed"].to_pylist()) for word in words.split()}))
+
+    @cached_property
+    def clusters(self) -> Shaped[np.ndarray, "scenarios"]:
+        """Label of each scenario's street network or recording, see `find_clusters`."""
+        return find_clusters(self)
+
+    def find_cluster(self, scenario_id: str) -> str:
+        """Label of the street network or recording of one scenario."""
+        return self.clusters[self._position[scenario_id]]
 
     @cached_property
     def num_agents(self) -> Int64[np.ndarray, "scenarios"]:

@@ -1,0 +1,171 @@
+"""What an exam says: tables, verdicts, a page, JSON, and the lines of the ledger."""
+
+import json
+import math
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from typing import Any
+
+from rlftsim.atomic_io import write_text
+from rlftsim.evaluation.columns import DRIFT_COLUMNS, TERMINAL_COLUMNS, Column, direction_of
+from rlftsim.evaluation.compare import FEW_CLUSTERS, PairedDifference
+from rlftsim.experiments import tables
+from rlftsim.experiments.exam import MARGINS, ExamConfig, ExamResult, ExamRow, Margin
+from rlftsim.experiments.ledger import Ledger
+from rlftsim.experiments.results import finite_or_none
+from rlftsim.experiments.tables import TextTable
+from rlftsim.training.run_folder import describe_environment, to_plain
+
+COLUMNS = (
+    *TERMINAL_COLUMNS,
+    *(column for column in DRIFT_COLUMNS if column.source in ("speed_gap", "speed_gap_all", "unlogged_stop_rate")),
+)
+"""Columns of the tables; the JSON and the ledger have all."""
+
+
+def write_exam(result: ExamResult, config: ExamConfig, ledger: Ledger) -> tuple[Sequence[TextTable], Sequence[str]]:
+    """Write exam.md and exam.json of an exam, then its lines of the ledger.
+
+    Args:
+        result: What was measured.
+        config: Settings that it was measured with.
+        ledger: Ledger that the look is added to.
+
+    Returns:
+        Tables and verdicts.
+    """
+    environment = describe_environment()
+    all_tables = (means_table(result), changes_table(result), margins_table(result))
+    lines = [row.verdict for row in result.rows] + [next_run_line(row) for row in result.rows if len(row.by_run) > 1]
+    lines.append(f"On the split tune the base is most realistic at temperature {result.temperature:g}.")
+    entries = [ledger_entry(row, result, config, environment["commit"]) for row in result.rows]
+    values = {"exam": result.name, "verdicts": lines, "rows": entries, "environment": environment}
+    write_text(result.folder / "exam.json", json.dumps(finite_or_none(values), indent=1) + "\n")
+    write_text(result.folder / "exam.md", page(result, all_tables, lines, environment))
+    ledger.append([finite_or_none(entry) for entry in entries])
+    return all_tables, lines
+
+
+def means_table(result: ExamResult) -> TextTable:
+    """Mean of every column, base first."""
+    return tables.of_rows("Means", [result.base, *(row.mean for row in result.rows)], COLUMNS)
+
+
+def changes_table(result: ExamResult) -> TextTable:
+    """Difference of every column from the base, with its interval and a word where it is none by chance."""
+    rows = [
+        (column.label, *(change_cell(row.changes[column.source], column) for row in result.rows)) for column in COLUMNS
+    ]
+    return TextTable(
+        "Against the base",
+        ("", *(row.name for row in result.rows)),
+        tuple(rows),
+        f"95 % intervals by {counted(result)}.",
+    )
+
+
+def change_cell(change: PairedDifference, column: Column) -> str:
+    """A difference with its interval in the column's unit; better or worse where it is none by chance."""
+    if not math.isfinite(change.difference):
+        return "–"
+    direction = direction_of(column.source)
+    is_better = (change.difference > 0) == (direction == "higher")
+    word = " (changed)" if direction == "log" else " (better)" if is_better else " (worse)"
+    numbers = f"{signed(column, change.difference)} {interval_text(column, change.interval)}"
+    return f"{numbers}{word if change.is_difference else ''}"
+
+
+def margins_table(result: ExamResult) -> TextTable:
+    """Word of each margin and the one-sided bounds that it is judged by."""
+    columns = {column.source: column for column in COLUMNS}
+    rows = []
+    for margin in MARGINS:
+        column = columns[margin.column]
+        if margin.is_relative:
+            column = Column(column.source, column.heading, column.meaning, "%")
+        cells = [
+            f"{row.margins[margin.column]} {interval_text(column, margin.bounds(row.change(margin.column, alpha=0.1)))}"
+            for row in result.rows
+        ]
+        rows.append((f"{column.heading} {limit_text(margin, column)}", *cells))
+    note = "A margin holds if both one-sided 95 % bounds (in brackets) are inside, and is missed if both are outside."
+    return TextTable("Margins", ("", *(row.name for row in result.rows)), tuple(rows), note)
+
+
+def limit_text(margin: Margin, column: Column) -> str:
+    """A margin in the column's unit."""
+    unit = f" {column.unit}" if column.unit else ""
+    if math.isinf(margin.lowest):
+        return f"≤ {signed(column, margin.highest)}{unit}"
+    if math.isinf(margin.highest):
+        return f"≥ {signed(column, margin.lowest)}{unit}"
+    return f"within {column.text(margin.highest)}{unit}"
+
+
+def signed(column: Column, value: float) -> str:
+    """A difference in the column's unit, with its sign."""
+    return f"{'+' if value >= 0 else ''}{column.text(value)}"
+
+
+def interval_text(column: Column, interval: Sequence[float]) -> str:
+    """Both ends of an interval in the column's unit; "[unknown]" where there is none."""
+    return f"[{', '.join(signed(column, end) for end in interval)}]" if math.isfinite(interval[0]) else "[unknown]"
+
+
+def counted(result: ExamResult) -> str:
+    """How intervals count, in words."""
+    row = max(result.rows, key=lambda row: len(row.by_run))
+    num_clusters, num_runs = len(set(row.by_run[0].clusters)), len(row.by_run)
+    runs = " and runs" if num_runs > 1 else ""
+    few = f"; fewer than {FEW_CLUSTERS} say little about others" if num_clusters < FEW_CLUSTERS else ""
+    return f"bootstrap over {num_clusters} street networks or recordings{runs}{few}"
+
+
+def next_run_line(row: ExamRow) -> str:
+    """Gain of each run, and the interval of the next one."""
+    gains, (low, high) = row.gains, row.next_run.interval
+    listed = ", ".join(f"{gain:+.4f}" for gain in gains)
+    return f"{row.name}: RMM by run {listed}; the next run lies in [{low:+.4f}, {high:+.4f}] with 95 %."
+
+
+def ledger_entry(row: ExamRow, result: ExamResult, config: ExamConfig, commit: str | None) -> dict[str, Any]:
+    """A row for machines, as the ledger has it."""
+    return {
+        "date": datetime.now(UTC).date().isoformat(),
+        "commit": commit,
+        "exam": result.name,
+        "looks": result.looks.get(row.name),
+        "recipe": row.name,
+        "models": [model.name for model in row.models],
+        "fingerprints": [model.fingerprint for model in row.models],
+        "seeds": [model.seed for model in row.models],
+        "bases": list(config.bases),
+        "num_scenarios": len(row.by_run[0]),
+        "num_clusters": len(set(row.by_run[0].clusters)),
+        "evaluation": to_plain(row.by_run[0].config),
+        "verdict": row.verdict,
+        "margins": row.margins,
+        "gain_by_run": row.gains.tolist(),
+        "next_run": row.next_run.interval,
+        "columns": {
+            column: {
+                "base": round(change.mean_a, 6),
+                "mean": round(change.mean_b, 6),
+                "difference": round(change.difference, 6),
+                "interval": [round(end, 6) for end in change.interval],
+                "p_value": float(f"{change.p_value:.3g}"),
+            }
+            for column, change in row.changes.items()
+        },
+    }
+
+
+def page(result: ExamResult, all_tables: Sequence[TextTable], lines: Sequence[str], environment: dict[str, Any]) -> str:
+    """The page for people, in Markdown."""
+    looks = ", ".join(f"{recipe} {count}" for recipe, count in result.looks.items())
+    parts = [f"# Exam {result.name}", "\n".join(f"* {line}" for line in lines)]
+    for table in all_tables:
+        parts += [f"## {table.title}", table.markdown(), *([table.note] if table.note else [])]
+    commit = environment["commit"] or "of an installed package"
+    parts += ["## Notes", f"* Looks at this exam: {looks}.\n* Made with `{environment['command']}`, commit {commit}."]
+    return "\n\n".join(parts) + "\n"
