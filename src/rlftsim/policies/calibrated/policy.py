@@ -19,6 +19,7 @@ from rlftsim.goals.types import Goals
 from rlftsim.policies.calibrated.distribution import TiltedDistribution
 from rlftsim.policies.calibrated.features import features_by_name
 from rlftsim.policies.calibrated.traffic import Scene, Traffic, build_scene, join_moments
+from rlftsim.policies.calibrated.table import calibration_table
 from rlftsim.policies.checkpoint import read_model, save_model
 from rlftsim.policies.distributions import CategoricalDistribution
 from rlftsim.rollout.policy import TokenPolicy
@@ -229,9 +230,12 @@ class CalibratedPolicy(nn.Module):
             folder: Created where it is missing.
             card: Text of README.md.
         """
-        self.base.save_pretrained(Path(folder) / BASE, card=card)
+        self.base.save_pretrained(
+            Path(folder) / BASE, card=f"Base of the calibrated model in the folder above.\n\n{card}"
+        )
         if self._calibration:
             write_text(Path(folder) / CALIBRATION, json.dumps(self._calibration, indent=1) + "\n")
+            card = f"{card}\n{calibration_table(self._calibration)}"
         save_model(folder, self, {"features": self.features}, card=card, weights={"eta": self.eta.detach()})
 
     @classmethod
