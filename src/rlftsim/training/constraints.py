@@ -31,23 +31,26 @@ class Constraint:
         return total.amin(1) if self.is_minimum else total.mean(1)
 
     def credit(self, parts: Float[Tensor, "B N A"]) -> Float[Tensor, "B N A"]:
-        """What an agent's decisions in a rollout add to the value, against the mean of the other rollouts.
+        """What an agent's decisions in a rollout add to the value.
 
-        Summed with their score functions over rollouts and agents it is an estimate of the value's gradient.
+        Summed with their score functions over rollouts and agents it is an estimate of the value's gradient, without
+        bias where no agent's part depends on other agents.
         """
-        num_rollouts = parts.shape[1]
-        added = parts / num_rollouts
-        if self.is_minimum:
-            # without any but the least one the value stays
-            (first, second) = parts.sum(-1).topk(2, dim=1, largest=False).indices.unbind(1)  # [B]
-            row = torch.arange(len(parts), device=parts.device)
-            added = torch.zeros_like(parts)
-            added[row, first] = parts[row, first] - parts[row, second]
-        return against_others(added)
+        if not self.is_minimum:
+            return against_others(parts / parts.shape[1])
+        # Without the rollout of the least sum the value is the second one, without any other it is what it was.
+        first, second = parts.sum(-1).topk(2, dim=1, largest=False).indices.unbind(1)  # [B]
+        row, added = torch.arange(len(parts), device=parts.device), torch.zeros_like(parts)
+        added[row, first] = parts[row, first] - parts[row, second]
+        return added
 
 
 def against_others(added: Float[Tensor, "B N A"]) -> Float[Tensor, "B N A"]:
-    """Contributions of rollouts minus the mean of the other rollouts' contributions."""
+    """Contributions of rollouts minus the mean of the other rollouts' contributions.
+
+    Where these depend on the rollout itself, as in `mloo`, its score function times the result is the gradient to first
+    order.
+    """
     num_rollouts = added.shape[1]
     return (added - added.mean(1, keepdim=True)) * (num_rollouts / (num_rollouts - 1))
 

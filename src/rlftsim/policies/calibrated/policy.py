@@ -18,8 +18,8 @@ from rlftsim.errors import CheckpointError, ConfigError
 from rlftsim.goals.types import Goals
 from rlftsim.policies.calibrated.distribution import TiltedDistribution
 from rlftsim.policies.calibrated.features import features_by_name
-from rlftsim.policies.calibrated.traffic import Scene, Traffic, build_scene, join_moments
 from rlftsim.policies.calibrated.table import calibration_table
+from rlftsim.policies.calibrated.traffic import Scene, Traffic, build_scene, join_moments
 from rlftsim.policies.checkpoint import read_model, save_model
 from rlftsim.policies.distributions import CategoricalDistribution
 from rlftsim.rollout.policy import TokenPolicy

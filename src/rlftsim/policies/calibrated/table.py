@@ -40,7 +40,8 @@ Kept as they are, by prediction: {", ".join(calibration["constraints"]) or "noth
 
 {_markdown(("feature", "eta", "t", "RMM", "kinematic", "interactive", "map-based"), earned)}
 
-Measured on {held} scenarios that were held back, with t in parentheses; the length taken is {calibration["length"]:.2f}.
+Measured on {held} scenarios that were held back, with t in parentheses. The length taken is
+{calibration["length"]:.2f}.
 
 {_markdown(("length", "KL", *(heading for heading, _ in CHANGES.values())), tried)}
 """
