@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import torch
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Bool, Float, Int64, Shaped
 from torch import Tensor
 
 from rlftsim.geometry import heading_vector, rotate, wrap_angle
@@ -74,9 +74,13 @@ class Candidates:
         """Part in which features of a pair count: 1 but for the least likely candidates."""
         return ((self.log_ratio + SUPPORT_NATS) / FADE_NATS).clamp(max=1.0)
 
+    def of_pairs(self, values: Shaped[Tensor, "R *more"]) -> Shaped[Tensor, "P *more"]:
+        """Values of the agents, for each of their pairs."""
+        return values.index_select(0, self.row)
+
     def where(self, condition: Bool[Tensor, "R"]) -> Float[Tensor, "P"]:
         """1 for the pairs of agents that a condition holds for, 0 for others."""
-        return condition.float()[self.row]
+        return self.of_pairs(condition.float())
 
     # ---- the agent ------------------------------------------------------------------------------------------------
 
@@ -119,12 +123,12 @@ class Candidates:
     @cached_property
     def speed_change(self) -> Float[Tensor, "P"]:
         """Mean speed of the token minus that of the last decision, within ±1.5 m/s."""
-        return (self.end[:, 0] / self.seconds - self.speed[self.row]).clamp(-1.5, 1.5)
+        return (self.end[:, 0] / self.seconds - self.of_pairs(self.speed)).clamp(-1.5, 1.5)
 
     @cached_property
     def turn_change(self) -> Float[Tensor, "P"]:
         """Turn of the token minus that of the last decision, within ±0.2 rad."""
-        return (self.end[:, 2] - self.traffic.turn[self.place][self.row]).clamp(-0.2, 0.2)
+        return (self.end[:, 2] - self.of_pairs(self.traffic.turn[self.place])).clamp(-0.2, 0.2)
 
     def overlap(self, seconds: float) -> Float[Tensor, "P"]:
         """Overlap of the box at a time, the token's motion going on, with boxes of the six nearest agents that keep
@@ -154,33 +158,42 @@ class Candidates:
         others = self._others
         position = others.position + others.velocity * seconds  # [R, O, 2]
         scale = seconds / self.seconds  # of the token's way, which goes on along the same line
-        # 1. pairs whose token can get near one of the others, [Q]: agents first, most of which have none so near
+        # 1. pairs whose token can get near one of the others, [Q]: first by the longest of the agent's tokens
         is_near = position.norm(dim=-1) < others.reach + self._longest[:, None] * scale
-        pair = is_near.any(-1)[self.row].nonzero()[:, 0]
-        row = self.row[pair]
-        x, y = ((position[..., axis][row] - self.end[pair, axis, None] * scale) for axis in (0, 1))
-        can_touch = is_near[row] & (x.square() + y.square() < others.reach[row].square())
-        touching, other = can_touch.nonzero(as_tuple=True)
-        pair, row = pair[touching], row[touching]
+        pair, other = self.of_pairs(is_near).nonzero(as_tuple=True)
+        row = self.row.index_select(0, pair)
+        other += row * is_near.shape[1]  # among the R x O
+        end = self.end.index_select(0, pair) * scale
+        offset = position.flatten(0, 1).index_select(0, other) - end[:, :2]
+        x, y = offset.unbind(-1)
+        touches = x.square() + y.square() < others.reach.flatten().index_select(0, other).square()
+        pair, other, row, offset, end = (values[touches] for values in (pair, other, row, offset, end))
         # 2. separation along and across the token's heading, of the boxes that enclose the others there
-        heading = self.end[pair, 2] * scale
-        offset = torch.stack([x[touching, other], y[touching, other]], -1)
+        heading = end[:, 2]
         along, across = rotate(offset, -heading).abs().unbind(-1)
-        cos, sin = heading_vector(others.turn[row, other] - heading).abs().unbind(-1)
-        length, width = others.half_size[row, other].unbind(-1)
-        along = along - self._size[row, 0] / 2 - cos * length - sin * width
-        across = across - self._size[row, 1] / 2 - sin * length - cos * width
+        cos, sin = heading_vector(others.turn.flatten().index_select(0, other) - heading).abs().unbind(-1)
+        length, width = others.half_size.flatten(0, 1).index_select(0, other).unbind(-1)
+        own_length, own_width = self._size.index_select(0, row).unbind(-1)
+        along = along - own_length / 2 - cos * length - sin * width
+        across = across - own_width / 2 - sin * length - cos * width
         depth = (1 - torch.maximum(along, across) / MARGIN_M).clamp(0.0, 2.0)
         return torch.zeros_like(self.log_ratio).detach().scatter_reduce(0, pair, depth, "amax")
 
     def _road_edge(self, seconds: float) -> Float[Tensor, "P"]:
-        to_edge, _, sign = self._edge  # [R, 2], [R]
+        inside, way = self._edge_motion
+        inside = self.of_pairs(inside) - way * (seconds / self.seconds)
+        return (1 - inside / MARGIN_M).clamp(0.0, 3.0)
+
+    @cached_property
+    def _edge_motion(self) -> tuple[Float[Tensor, "R"], Float[Tensor, "P"]]:
+        """Distance of the agent's side to the nearest road edge, positive inside the road, and what a token takes off
+        it."""
+        to_edge, _, sign = self._edge
         distance = to_edge.norm(dim=-1)
-        outward = rotate(to_edge / distance.clamp(min=1e-3)[:, None], -self._heading)  # [R, 2] agent's frame
-        way = (self.end[:, :2] * outward[self.row]).sum(-1) * (seconds / self.seconds)
-        inside = sign[self.row] * (distance[self.row] - way) - self._size[self.row, 1] / 2
-        near = (1 - inside / MARGIN_M).clamp(0.0, 3.0)
-        return near * self.where(distance < EDGE_REACH_M)
+        inside = sign * distance - self._size[:, 1] / 2
+        toward = self.of_pairs(rotate(to_edge * (sign / distance.clamp(min=1e-3))[:, None], -self._heading))  # [P, 2]
+        way = self.end[:, 0] * toward[:, 0] + self.end[:, 1] * toward[:, 1]
+        return torch.where(distance < EDGE_REACH_M, inside, torch.inf), way
 
     @cached_property
     def _heading(self) -> Float[Tensor, "R"]:

@@ -43,9 +43,10 @@ class TiltedDistribution(CategoricalDistribution):
     @cached_property
     def logits(self) -> Float[Tensor, "R V"]:
         """float32."""
+        logits = self.base.logits
         if not self.eta.any():
-            return self.base.logits
-        return self.base.logits.index_put(self._pairs, self.values @ self.eta, accumulate=True)
+            return logits
+        return logits.flatten().index_add(0, self._pairs[2], self.values @ self.eta).view_as(logits)
 
     @cached_property
     def values(self) -> Float[Tensor, "P K"]:
@@ -59,8 +60,9 @@ class TiltedDistribution(CategoricalDistribution):
         Args:
             decision: Token ids.
         """
-        row, token = self._pairs
-        weight = (token == self._rows(decision)[row]).float() - self.log_probs.detach().exp()[row, token]
+        row, token, place = self._pairs
+        chosen = token == self._rows(decision).index_select(0, row)
+        weight = chosen.float() - self.log_probs.detach().flatten().index_select(0, place).exp()
         centered = self.values.new_zeros(self._num_rows, len(self.features))
         return self._dense(centered.index_add(0, row, weight[:, None] * self.values.detach()))
 
@@ -73,19 +75,23 @@ class TiltedDistribution(CategoricalDistribution):
         return self.base.logits.amax(-1, keepdim=True)
 
     @cached_property
-    def _pairs(self) -> tuple[Int64[Tensor, "P"], Int64[Tensor, "P"]]:
-        """Row and token of each candidate; rows with a single one have none."""
-        is_likely = self.base.logits > self._peak - SUPPORT_NATS
-        row, token = is_likely.nonzero(as_tuple=True)
-        has_choice = (torch.bincount(row, minlength=self._num_rows) > 1)[row]
-        return row[has_choice], token[has_choice]
+    def _pairs(self) -> tuple[Int64[Tensor, "P"], Int64[Tensor, "P"], Int64[Tensor, "P"]]:
+        """Row and token of each candidate, and its place in the flattened logits; rows with a single one have none."""
+        num_tokens = self.base.logits.shape[1]
+        place = (self.base.logits > self._peak - SUPPORT_NATS).flatten().nonzero()[:, 0]
+        row = place.div(num_tokens, rounding_mode="floor")
+        has_choice = (torch.bincount(row, minlength=self._num_rows) > 1).index_select(0, row)
+        row, place = row[has_choice], place[has_choice]
+        return row, place - row * num_tokens, place
 
     @cached_property
     def _candidates(self) -> Candidates:
-        row, token = self._pairs
+        row, token, place = self._pairs
         has_choice, index = row.unique_consecutive(return_inverse=True)
-        place = tuple(axis[has_choice] for axis in row_places(self.mask, has_all=self._num_rows == self.mask.numel()))
-        place = (*place, torch.zeros_like(has_choice))[:4]  # while simulating there is a single moment
-        end = self.vocabulary.poses[self.scene.class_id[place[0], place[2]][index], token, -1]
-        log_ratio = self.base.logits[row, token] - self._peak[row, 0]
-        return Candidates(self.scene, self.traffic, place, index, end, log_ratio, self.seconds)
+        agent = tuple(axis[has_choice] for axis in row_places(self.mask, has_all=self._num_rows == self.mask.numel()))
+        agent = (*agent, torch.zeros_like(has_choice))[:4]  # while simulating there is a single moment
+        class_id = self.scene.class_id[agent[0], agent[2]].index_select(0, index)
+        ends = self.vocabulary.poses[:, :, -1]  # [C, V, 3]
+        end = ends.flatten(0, 1).index_select(0, class_id * ends.shape[1] + token)
+        log_ratio = self.base.logits.flatten().index_select(0, place) - self._peak[:, 0].index_select(0, row)
+        return Candidates(self.scene, self.traffic, agent, index, end, log_ratio, self.seconds)

@@ -110,13 +110,13 @@ def speed_gap_2_to_4s(c: Candidates) -> Float[Tensor, "P"]:
 @register_feature("turn_to_lane_direction", low=-2.0, high=2.0)
 def turn_to_lane_direction(c: Candidates) -> Float[Tensor, "P"]:
     """Change of turn times the angle of the lane to the heading; positive = towards the lane's direction."""
-    return 10 * c.turn_change * (c.lane_turn * c.is_moving)[c.row]
+    return 10 * c.turn_change * c.of_pairs(c.lane_turn * c.is_moving)
 
 
 @register_feature("turn_to_lane_center", low=-2.0, high=2.0)
 def turn_to_lane_center(c: Candidates) -> Float[Tensor, "P"]:
     """Change of turn times the lateral offset of the lane's center; positive = towards it."""
-    return 2 * c.turn_change * (c.lane_offset * c.is_moving)[c.row]
+    return 2 * c.turn_change * c.of_pairs(c.lane_offset * c.is_moving)
 
 
 # ---- by speed: slow below 4 m/s, middle, fast from 9 m/s -------------------------------------------------------------

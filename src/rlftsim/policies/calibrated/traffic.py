@@ -19,8 +19,8 @@ from rlftsim.scenario.polylines import arc_length, resample_to
 from rlftsim.scenario.types import CURRENT_STEP, LANE_TYPES, ROAD_EDGE_TYPES, Scenario
 from rlftsim.tokens.vocabulary import class_of_type
 
-PIECE_M = 3.0
-"""Longest straight piece that lanes and edges are cut into."""
+PIECE_M = 5.0
+"""Longest straight piece that lanes and edges are cut into; SMART reads maps in pieces of this length, too."""
 METERS_PER_TURN = 3.0
 """Distance that weighs as much as a turn by one radian, when the lane of a pose is looked for."""
 NEAR_PIECES = 4
