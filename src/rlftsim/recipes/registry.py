@@ -48,8 +48,8 @@ class Recipe:
     """None where there is no RoaD."""
     gcsl: GcslConfig | None = field(default_factory=GcslConfig)
     """None likewise."""
-    calibrate: CalibrateConfig | None = field(default_factory=CalibrateConfig)
-    """None likewise."""
+    calibrate: CalibrateConfig | None = None
+    """None for policies without tokens, whose logits features are added to."""
 
     @property
     def model_name(self) -> str:

@@ -12,7 +12,6 @@ from rlftsim.policies.trafficbots.policy import TrafficBotsPolicy
 from rlftsim.recipes.registry import Recipe
 from rlftsim.rollout.policy import Policy
 from rlftsim.tokens.vocabulary import Vocabulary
-from rlftsim.training.calibrate import CalibrateConfig
 from rlftsim.training.catk import CatkConfig
 from rlftsim.training.finetune_config import FinetuneConfig
 from rlftsim.training.goal_relabeling import GcslConfig
@@ -27,7 +26,6 @@ class TrafficBotsRecipe(Recipe):
     model: TrafficBotsConfig = field(default_factory=TrafficBotsConfig)
     catk: CatkConfig | None = None
     gcsl: GcslConfig | None = None
-    calibrate: CalibrateConfig | None = None
 
     @property
     def model_name(self) -> str:

@@ -18,7 +18,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -98,9 +98,6 @@ class CalibrateConfig:
     """Seed of everything that is random in the run."""
     device: DeviceConfig = field(default_factory=DeviceConfig)
 
-    warmup_updates: ClassVar[int] = 0
-    max_skipped_in_a_row: ClassVar[int] = 1
-
     def __post_init__(self) -> None:
         require_types(self)
         require_positive(
@@ -117,6 +114,16 @@ class CalibrateConfig:
             raise ConfigError(f"no constraint {unknown[0]!r}: there are {', '.join(CONSTRAINTS)}.")
         metric_by_name(self.metric)
         object.__setattr__(self, "reward", write_reward(parse_reward(self.reward)))
+
+    @property
+    def warmup_updates(self) -> int:
+        """0: there is no learning rate."""
+        return 0
+
+    @property
+    def max_skipped_in_a_row(self) -> int:
+        """1: no batch is skipped."""
+        return 1
 
     def split(self, num_scenarios: int) -> tuple[list[int], list[int]]:
         """Scenarios for the direction, and those held back for its length.

@@ -49,7 +49,9 @@ class Feature:
         return values.clamp(self.low, self.high)
 
 
-FEATURES: ExtensionPoint[Feature] = ExtensionPoint("feature", "rlftsim.features")
+FEATURES: ExtensionPoint[Feature] = ExtensionPoint(
+    "feature", "rlftsim.features", use=lambda name: features_by_name([name])
+)
 """Features by name, this package's and others'."""
 
 
@@ -88,7 +90,9 @@ def features_by_name(names: Sequence[str]) -> tuple[Feature, ...]:
     features = tuple(FEATURES.get(name) for name in names)
     for name, feature in zip(names, features):
         if not isinstance(feature, Feature):
-            raise ConfigError(f"feature {name!r} is a {type(feature).__name__}: decorate it with register_feature.")
+            raise ConfigError(
+                f"feature {name!r} is of type {type(feature).__name__}: decorate it with register_feature."
+            )
     return features
 
 

@@ -90,7 +90,7 @@ class CalibratedPolicy(nn.Module):
         if not (isinstance(base, nn.Module) and isinstance(base, TokenPolicy)):
             raise ConfigError(f"a {type(base).__name__} cannot be calibrated: it has no weights or no vocabulary.")
         super().__init__()
-        self.base = base
+        self.base: Any = base
         self.features = tuple(features)
         self._features = features_by_name(self.features)
         values = torch.zeros(len(self.features)) if eta is None else torch.tensor(eta, dtype=torch.float32)
@@ -180,7 +180,7 @@ class CalibratedPolicy(nn.Module):
             context: Of `encode`.
             rollouts: Of the same scenarios.
         """
-        scored = self.base.score(context.base, rollouts)
+        scored: Any = self.base.score(context.base, rollouts)
         if not self.eta.any():
             return scored  # which may not need its logits
         moments = [context.scene.begin(rollouts.num_rollouts)]
