@@ -12,10 +12,10 @@ it may not read the logged future. A package of its own announces its features a
     braking = "my_package.features:braking"
 """
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -68,7 +68,7 @@ def register_feature(
     Raises:
         ConfigError: The name is that of a shipped feature, or the bounds are in the wrong order.
     """
-    if not -torch.inf < low < high < torch.inf:
+    if not -math.inf < low < high < math.inf:
         raise ConfigError(f"feature {name!r}: bounds are two finite numbers, low < high, got {low} and {high}.")
 
     def register(compute: Callable[[Candidates], Float[Tensor, "P"]]) -> Feature:
@@ -130,7 +130,7 @@ def _is_between(c: Candidates, low_mps: float, high_mps: float) -> Float[Tensor,
     return c.where(c.is_moving & (c.speed >= low_mps) & (c.speed < high_mps))
 
 
-for _band, _low, _high in (("slow", 0.0, 4.0), ("middle", 4.0, 9.0), ("fast", 9.0, torch.inf)):
+for _band, _low, _high in (("slow", 0.0, 4.0), ("middle", 4.0, 9.0), ("fast", 9.0, math.inf)):
     register_feature(f"temperature_{_band}", low=-SUPPORT_NATS, high=0.0)(
         lambda c, low=_low, high=_high: c.log_ratio * _is_between(c, low, high)
     )
