@@ -270,6 +270,9 @@ class LoadablePolicy(Protocol):
     * `added_fields: ClassVar[dict[str, Any]]`, in a dataclass: name of each field that was added after models had been
       stored -> the value with which the model is as before.
 
+    A policy that holds another one declares `fingerprint_parts: ClassVar[tuple[str, ...]]`, names of submodules whose
+    settings count with its own.
+
     `later_stored` is like `added_fields`, but such a field counts in fingerprints with every value.
     """
 
