@@ -432,7 +432,26 @@ def test_pretraining_and_fine_tuning_by_command(vocabulary, tmp_path, capsys):
     assert run(capsys, *words, "--out", tmp_path / "gcsl", *few)[0] == 0
     assert '"goal_logit_bias": true' in (tmp_path / "gcsl" / "model" / "config.json").read_text()
     assert "goals by indication" in (tmp_path / "gcsl" / "model" / "README.md").read_text()
-    for run_folder in (base, tuned, tmp_path / "catk", tmp_path / "gcsl"):
+    # the same model, calibrated
+    few = settings("calibrate", num_scenarios=2, num_rollouts=2)
+    words = [
+        "finetune",
+        "smart-demo",
+        "--method",
+        "calibrate",
+        "--model",
+        base,
+        *common,
+        "--out",
+        tmp_path / "calibrated",
+    ]
+    assert run(capsys, *words, *few)[0] == 0
+    assert (tmp_path / "calibrated" / "model" / "calibration.png").read_bytes().startswith(b"\x89PNG")
+    status, out, _ = run(capsys, "model", "show", tmp_path / "calibrated")
+    assert status == 0
+    assert "CalibratedPolicy" in out
+    assert "| speed_gap_under_2s |" in out
+    for run_folder in (base, tuned, tmp_path / "catk", tmp_path / "gcsl", tmp_path / "calibrated"):
         assert (run_folder / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
     # the same folder with other settings is another run
     status, _, err = run(

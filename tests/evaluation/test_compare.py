@@ -265,5 +265,5 @@ def test_scenarios_of_one_street_network_give_no_verdict():
 
 
 def test_the_networks_of_scenarios_are_stored_with_their_scores(tmp_path):
-    evaluation("a", [0.1, 0.2, 0.3], clusters=["x", "x", None]).write(tmp_path / "a.parquet")
+    evaluation("a", [0.1, 0.2, 0.3], clusters=["x", "x", ""]).write(tmp_path / "a.parquet")
     assert Evaluation.read(tmp_path / "a.parquet").clusters.tolist() == ["x", "x", "s2"]

@@ -12,6 +12,7 @@ from torch import nn
 from rlftsim._api.sources import policy_of, require_name
 from rlftsim.errors import ConfigError
 from rlftsim.recipes.base import Recipe
+from rlftsim.recipes.calibration import prepare_policy
 from rlftsim.recipes.card import model_card, with_cards_of
 from rlftsim.recipes.registry import RECIPES, recipe_by_name
 from rlftsim.rollout.policy import Policy, device_of
@@ -19,6 +20,7 @@ from rlftsim.scenario.any_form import AnyScenarios, Name, scenarios_of
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.types import Scenarios
 from rlftsim.tokens.clustering import build_vocabulary
+from rlftsim.training.calibrate import CalibrateConfig
 from rlftsim.training.catk import CatkConfig
 from rlftsim.training.finetune_config import FinetuneConfig
 from rlftsim.training.goal_relabeling import GcslConfig
@@ -35,8 +37,8 @@ def recipe(name: str) -> Any:
             recipe of another package.
 
     Returns:
-        A frozen dataclass with the sections tokens, model, pretrain, finetune, catk and gcsl; `dataclasses.replace`
-        makes one with other values.
+        A frozen dataclass with the sections tokens, model, pretrain, finetune, catk, gcsl and calibrate;
+        `dataclasses.replace` makes one with other values.
 
     Raises:
         ConfigError: no such recipe.
@@ -109,7 +111,7 @@ def finetune(
         out: folder of the run; an interrupted run goes on there, a finished one is not repeated, and with a reward and
             more epochs it is trained further. None keeps no files.
         config: settings, such as `FinetuneConfig(reward="mloo", epochs=0.5)` or `recipe("smart-demo").finetune`; those
-            of a recipe's `catk` or `gcsl` choose that method. None stands for the paper's settings.
+            of a recipe's `catk`, `gcsl` or `calibrate` choose that method. None stands for the paper's settings.
 
     Returns:
         The fine-tuned policy, ready to simulate.
@@ -120,11 +122,12 @@ def finetune(
         CheckpointError: `out` holds another run, or the run diverged (the message names its last good checkpoint).
         NotYetError: another run is at work in `out`.
     """
-    _require_config(config, "finetune", FinetuneConfig, CatkConfig, GcslConfig)
+    _require_config(config, "finetune", FinetuneConfig, CatkConfig, GcslConfig, CalibrateConfig)
     training, settings = scenarios_of(scenarios, "training"), config or FinetuneConfig()
     card = _card(f"fine-tuned ({describe_method(settings)})", training, policy)
+    start = prepare_policy(policy_of(policy), settings)
     return _train_copy(
-        policy_of(policy), out, lambda learner, folder: finetune_policy(learner, training, folder, settings, card=card)
+        start, out, lambda learner, folder: finetune_policy(learner, training, folder, settings, card=card)
     )
 
 

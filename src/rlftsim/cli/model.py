@@ -1,4 +1,4 @@
-"""The verb that averages models, and imports and exports checkpoints of the public CAT-K code: model."""
+"""The verb that shows and averages models, and imports and exports checkpoints of the public CAT-K code: model."""
 
 import sys
 from dataclasses import dataclass
@@ -6,12 +6,14 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
+from torch import nn
 from tyro.conf import Positional
 
 from rlftsim import __version__
 from rlftsim.errors import ConfigError
 from rlftsim.jobs.folder import check_file
 from rlftsim.policies.averaging import average_policies
+from rlftsim.policies.checkpoint import read_card
 from rlftsim.policies.registry import load_policy
 from rlftsim.policies.smart.catk_checkpoint import CatkImport, import_catk, write_catk
 from rlftsim.policies.smart.catk_vocabulary import write_catk_vocabulary
@@ -116,11 +118,28 @@ class Average:
 
 
 @dataclass(frozen=True)
+class Show:
+    """Print what a model is: class, number of weights, card, and what the features of a calibrated one earn."""
+
+    model: Positional[str]
+    """Run, model folder or registered name."""
+
+    def run(self) -> int:
+        """Load it, print its card."""
+        policy = load_policy(self.model)
+        weights = sum(p.numel() for p in policy.parameters()) if isinstance(policy, nn.Module) else 0
+        print(f"{self.model}: {type(policy).__name__}, {weights:,} weights\n")
+        print(read_card(self.model, deeper=0) or "No card.")
+        return 0
+
+
+@dataclass(frozen=True)
 class Model:
-    """Average models, import a checkpoint of the public CAT-K code, or export a model to it."""
+    """Show or average models, import a checkpoint of the public CAT-K code, or export a model to it."""
 
     action: (
-        Annotated[Average, tyro.conf.subcommand("average")]
+        Annotated[Show, tyro.conf.subcommand("show")]
+        | Annotated[Average, tyro.conf.subcommand("average")]
         | Annotated[Import, tyro.conf.subcommand("import")]
         | Annotated[Export, tyro.conf.subcommand("export")]
     )

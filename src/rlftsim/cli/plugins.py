@@ -14,6 +14,7 @@ POINTS = {
     "rlftsim.recipes": "rlftsim.recipes.registry:RECIPES",
     "rlftsim.rewards": "rlftsim.rewards:REWARDS",
     "rlftsim.sources": "rlftsim.scenario.sources:SOURCES",
+    "rlftsim.features": "rlftsim.policies.calibrated.features:FEATURES",
     "rlftsim.planners": "rlftsim.envs.planners.registry:PLANNERS",
     "rlftsim.experiments": "rlftsim.experiments.registry:EXPERIMENTS",
     "rlftsim.exporters": "rlftsim.evaluation.exporters:EXPORTERS",

@@ -11,6 +11,7 @@ from tyro.conf import Positional
 
 from rlftsim.cli.recipe_verb import Processes, RecipeVerb, refuse_settings, value_of
 from rlftsim.errors import ConfigError, RlftsimError
+from rlftsim.evaluation.calibration_picture import write_calibration_picture
 from rlftsim.evaluation.learning_curve import write_learning_curve
 from rlftsim.experiments.stages import GoalConditioning, finetune_model, pretrain_policy
 from rlftsim.policies.registry import load_policy
@@ -24,7 +25,7 @@ from rlftsim.training.parallel import is_first_process
 
 VALIDATION = "validation"
 """Split that is validated on where none is named."""
-SECTION_OF_METHOD = {"rlft": "finetune", "catk": "catk", "road": "road", "gcsl": "gcsl"}
+SECTION_OF_METHOD = {"rlft": "finetune", "catk": "catk", "road": "road", "gcsl": "gcsl", "calibrate": "calibrate"}
 ClassName = Literal["vehicle", "pedestrian", "cyclist"]
 RecipeArgument = Annotated[Positional[str], tyro.conf.arg(metavar="RECIPE")]
 
@@ -136,7 +137,8 @@ class Pretrain(RecipeVerb):
 
 @dataclass(frozen=True)
 class Finetune(RecipeVerb):
-    """Fine-tune a model in closed loop: by policy gradient on a realism reward (RLFTSim), by CAT-K or by RoaD.
+    """Fine-tune a model in closed loop: by policy gradient on a realism reward (RLFTSim), by CAT-K, by RoaD or by
+    calibration.
 
     Example: rlftsim finetune smart-tiny --model runs/base --data data/womd --out runs/tuned --finetune.epochs 0.5
 
@@ -144,7 +146,7 @@ class Finetune(RecipeVerb):
     command is repeated.
     """
 
-    sections: ClassVar[tuple[str, ...]] = ("finetune", "catk", "road", "gcsl")
+    sections: ClassVar[tuple[str, ...]] = ("finetune", "catk", "road", "gcsl", "calibrate")
 
     recipe: RecipeArgument
     """Settings to start from; `rlftsim recipe` lists all recipes. The flags below change single fields. The
@@ -155,12 +157,13 @@ class Finetune(RecipeVerb):
     """Folder of a data set, or "synthetic" for the scenarios that ship with the package."""
     out: Path
     """Folder of the run: configuration, metrics, checkpoints, model."""
-    method: Literal["rlft", "catk", "road", "gcsl"] = "rlft"
+    method: Literal["rlft", "catk", "road", "gcsl", "calibrate"] = "rlft"
     """rlft: policy gradient on a realism reward, fields finetune.*. catk: supervised fine-tuning along rollouts
     that choose the token closest to the log among the top K, fields catk.*. road: supervised
     fine-tuning on the model's own rollouts, guided by the log, fields road.*. gcsl: train the goal-conditioned
     weights on the model's own rollouts, relabelled with their endpoints, as a start for rlft with goals
-    (--model OUT), fields gcsl.*."""
+    (--model OUT), fields gcsl.*. calibrate: fit the weights of a few named features on the token logits, no weight of
+    the model, to a realism reward without a change of speed, fields calibrate.*."""
     goal: Literal["concat", "indication"] | None = None
     """Fine-tune with goals, and how the model encodes them. Every agent's goal is its logged endpoint (see
     --finetune.goals.augmented for others). rlft then uses the reward gcft, catk trains the goal-conditioned
@@ -227,6 +230,8 @@ class Finetune(RecipeVerb):
         goals = None if self.goal is None else GoalConditioning(self.goal, self.goal_logit_bias)
         with _learning_curve(self.out):
             model = finetune_model(self.model, scenarios, config, self.out, conditioning=goals, held_out=held_out)
+        if is_first_process():
+            write_calibration_picture(model)
         print(f"model: {model}")
         return 0
 

@@ -24,7 +24,10 @@ def write_learning_curve(run: Path) -> Path | None:
     if not lines:
         return None
     # Only fine-tuning with a reward logs the realism of its own rollouts.
-    charts = finetuning_charts(lines) if "rmm" in lines[0] else imitation_charts(lines)
+    if "credit_std" in lines[0]:  # a calibration has no updates that follow each other
+        charts = [_chart(lines, "Realism of the rollouts", "RMM", rmm="RMM")]
+    else:
+        charts = finetuning_charts(lines) if "rmm" in lines[0] else imitation_charts(lines)
     charts_to_png(run / "learning_curve.png", charts)
     return run / "learning_curve.png"
 

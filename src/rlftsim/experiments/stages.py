@@ -13,6 +13,7 @@ from torch import nn
 
 from rlftsim.errors import ConfigError
 from rlftsim.policies.registry import load_policy
+from rlftsim.recipes.calibration import prepare_policy
 from rlftsim.recipes.card import model_card
 from rlftsim.rollout.policy import ConditionablePolicy
 from rlftsim.scenario.dataset import ScenarioDataset
@@ -124,6 +125,7 @@ def finetune_model(
 
     what = f"fine-tuned ({describe_method(config)}{conditioning or ''}) from {base}"
     card = model_card(what, training.folder, len(training), base)
+    policy = prepare_policy(policy, config)
     return finetune_policy(policy, training, out, config, held_out=held_out, card=card)
 
 

@@ -28,6 +28,7 @@ POLICIES: ExtensionPoint[Callable[..., Any]] = ExtensionPoint(
     {
         "smart": "rlftsim.policies.smart.policy:SmartPolicy",
         "trafficbots": "rlftsim.policies.trafficbots.policy:TrafficBotsPolicy",
+        "calibrated": "rlftsim.policies.calibrated.policy:CalibratedPolicy",
         "constant_velocity": "rlftsim.rollout.baselines:ConstantVelocity",
         "demo-base": "rlftsim.policies.shipped:demo_base",
         "demo-tuned": "rlftsim.policies.shipped:demo_tuned",

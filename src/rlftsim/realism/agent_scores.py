@@ -13,7 +13,7 @@ from torch import Tensor
 
 from rlftsim.realism.agents import sum_over_agents, to_agents
 from rlftsim.realism.batch import ScenarioFeatures
-from rlftsim.realism.config import MetricConfig
+from rlftsim.realism.config import FEATURE_NAMES, SUB_SCORES, MetricConfig
 from rlftsim.realism.credit import compute_credit, compute_single_credit
 from rlftsim.realism.likelihood import compute_outcomes
 
@@ -31,6 +31,16 @@ class AgentScores:
     def leave_one_out(self) -> Float64[Tensor, "B N A"]:
         """Shares of mean_j RMM(-j) - RMM(-i), the reward `mloo`; see `Credit.mloo`. The sum over rollouts is zero."""
         return self._scatter(lambda scene: compute_credit(scene.log, scene.features, self.config).mloo.sum(-1))
+
+    @cached_property
+    def sub_scores(self) -> dict[str, Float64[Tensor, "B N A"]]:
+        """`leave_one_out` in its parts of each sub-score, by name."""
+        credits = {id(item): compute_credit(item.log, item.features, self.config).mloo for item in self.measured}
+        columns = {name: [FEATURE_NAMES.index(one) for one in members] for name, members in SUB_SCORES.items()}
+        return {
+            name: self._place(lambda item, chosen=chosen: credits[id(item)][..., chosen].nan_to_num().sum(-1))
+            for name, chosen in columns.items()
+        }
 
     @cached_property
     def single(self) -> Float64[Tensor, "B N A"]:

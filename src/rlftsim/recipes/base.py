@@ -21,13 +21,14 @@ from rlftsim.errors import ConfigError
 from rlftsim.rollout.policy import Policy
 from rlftsim.tokens.clustering import TokensConfig
 from rlftsim.tokens.vocabulary import Vocabulary
+from rlftsim.training.calibrate import CalibrateConfig
 from rlftsim.training.catk import CatkConfig, RoadConfig
 from rlftsim.training.finetune_config import FinetuneConfig
 from rlftsim.training.goal_relabeling import GcslConfig
 from rlftsim.training.goals import with_goals
 from rlftsim.training.pretrain import PretrainConfig
 
-SECTIONS = ("tokens", "model", "pretrain", "finetune", "catk", "road", "gcsl")
+SECTIONS = ("tokens", "model", "pretrain", "finetune", "catk", "road", "gcsl", "calibrate")
 """Sections that the verbs of the command line know, in the order of their use; see `section_names`."""
 
 
@@ -46,6 +47,8 @@ class Recipe:
     """None where there is no RoaD."""
     gcsl: GcslConfig | None = field(default_factory=GcslConfig)
     """None likewise."""
+    calibrate: CalibrateConfig | None = None
+    """None for policies without tokens, whose logits features are added to."""
 
     @property
     def model_name(self) -> str:
@@ -110,7 +113,7 @@ class Recipe:
 
     def with_processes(self, processes: int | Literal["auto"]) -> "Recipe":
         """The same recipe, trained by so many processes on this machine, see `DeviceConfig.processes`."""
-        methods = {name: getattr(self, name) for name in ("pretrain", "finetune", "catk", "road", "gcsl")}
+        methods = {name: getattr(self, name) for name in SECTIONS[2:]}
         changed = {
             name: replace(method, device=replace(method.device, processes=processes))
             for name, method in methods.items()

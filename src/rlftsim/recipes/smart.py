@@ -15,6 +15,7 @@ from rlftsim.rollout.policy import Policy
 from rlftsim.tokens.alignment import align_vocabulary
 from rlftsim.tokens.clustering import TokensConfig
 from rlftsim.tokens.vocabulary import Vocabulary
+from rlftsim.training.calibrate import CalibrateConfig
 from rlftsim.training.catk import CatkConfig, RoadConfig
 from rlftsim.training.finetune_config import FinetuneConfig
 from rlftsim.training.goal_relabeling import GcslConfig
@@ -30,6 +31,7 @@ class SmartRecipe(Recipe):
     tokens: TokensConfig = field(default_factory=TokensConfig)
     model: SmartConfig = field(default_factory=SmartConfig)
     road: RoadConfig | None = field(default_factory=RoadConfig)
+    calibrate: CalibrateConfig | None = field(default_factory=CalibrateConfig)
 
     @property
     def model_name(self) -> str:

@@ -63,6 +63,8 @@ def _feed_object(digest: "hashlib.blake2b", value: object) -> None:
     if isinstance(value, nn.Module):
         # mode is no setting; submodules are private attributes, so weights come in through the state dict alone
         own.pop("training", None)
+        # a submodule with settings of its own is declared by the class
+        own |= {name: getattr(value, name) for name in getattr(kind, "fingerprint_parts", ())}
         _feed(digest, value.state_dict())
     _feed(digest, own)
 

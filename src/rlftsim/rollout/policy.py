@@ -12,6 +12,7 @@ it is optional and opens one more door:
 | `SharingPolicy` | fine-tuned faster, because passes over the same scenarios share what they have in common |
 | `PretrainablePolicy` | pre-trained on logged tracks, token by token |
 | `ImitatedPolicy` | pre-trained on logged tracks with a loss of its own |
+| `CalibratablePolicy` | calibrated: a few named features of states and tokens get weights |
 | `TokenPolicy` | fine-tuned in closed loop on tokens (CAT-K, goal relabelling) |
 | `GoalConditionedPolicy` | given goals, and trained on them |
 | `ConditionablePolicy` | made goal-conditioned, where a run with goals starts from a goal-free model |
@@ -261,7 +262,9 @@ class LoadablePolicy(Protocol):
     Stored evaluations and runs know a policy by its fingerprint (`rollout.fingerprint`), a hash of its weights, its
     public settings and the name of its class. That name is `architecture` of the class itself, so the class may be
     moved or renamed. A class of nested settings, such as a dataclass in `self.config`, declares its name as
-    `fingerprint_name: ClassVar[str]`; without it that class is known by its module and name, and cannot be moved.
+    `fingerprint_name: ClassVar[str]`; without it that class is known by its module and name, and cannot be moved. A
+    policy that holds another policy declares `fingerprint_parts: ClassVar[tuple[str, ...]]`, names of submodules whose
+    settings count with its own.
     """
 
     architecture: ClassVar[str]
@@ -372,6 +375,29 @@ class TokenPolicy(Policy, Protocol):
     """
 
     vocabulary: Vocabulary
+
+
+@runtime_checkable
+class CalibratablePolicy(TokenPolicy, SavedPolicy, Protocol):
+    """A policy with a weighted sum of named features on its token logits; `policies.calibrated` makes one of any other.
+
+    Its distributions also have `base`, the distribution without the features, and `score_function(decision)`, the
+    gradient [..., K] of the log-probability by the K weights.
+    """
+
+    eta: nn.Parameter
+    """Weights of the features, [K]."""
+    features: tuple[str, ...]
+    """Names of the features."""
+
+    def set_calibration(self, eta: Tensor, calibration: Mapping[str, Any]) -> None:
+        """Take fitted weights, and how they were fitted as values that JSON has, to be saved with them.
+
+        Args:
+            eta: Weights in the order of the features.
+            calibration: Table of what each feature earns, and measured changes.
+        """
+        ...
 
 
 @runtime_checkable

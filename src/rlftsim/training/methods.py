@@ -5,15 +5,16 @@ from pathlib import Path
 
 from rlftsim.errors import ConfigError
 from rlftsim.rollout.policy import Policy
+from rlftsim.training.calibrate import CalibrateConfig, calibrate
 from rlftsim.training.catk import CatkConfig, RoadConfig, catk_finetune
 from rlftsim.training.finetune import finetune
 from rlftsim.training.finetune_config import FinetuneConfig
 from rlftsim.training.goal_relabeling import GcslConfig, gcsl_finetune
 from rlftsim.training.run import TrainingScenarios
 
-FinetuningConfig = FinetuneConfig | CatkConfig | GcslConfig
+FinetuningConfig = FinetuneConfig | CatkConfig | GcslConfig | CalibrateConfig
 """Settings of a fine-tuning; the type says which method: a reward, CAT-K (RoaD with a
-`RoadConfig`), or goal-conditioned supervised learning."""
+`RoadConfig`), goal-conditioned supervised learning, or calibration."""
 
 
 def finetune_policy(
@@ -52,6 +53,8 @@ def finetune_policy(
             return catk_finetune(policy, scenarios, out, config, held_out=held_out, card=card)
         case GcslConfig():
             return gcsl_finetune(policy, scenarios, out, config, card=card)
+        case CalibrateConfig():
+            return calibrate(policy, scenarios, out, config, card=card)
 
 
 def describe_method(config: FinetuningConfig) -> str:
@@ -65,3 +68,5 @@ def describe_method(config: FinetuningConfig) -> str:
             return f"CAT-K, {config.choice}"
         case GcslConfig():
             return "own rollouts, relabelled"
+        case CalibrateConfig():
+            return f"calibration of {len(config.features)} features, {config.reward}"

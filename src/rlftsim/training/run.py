@@ -115,6 +115,9 @@ class Learner:
     def load_numbers(self, numbers: Mapping[str, float]) -> None:
         """Take back the numbers of a checkpoint."""
 
+    def finish(self) -> None:
+        """Make the result of what was learned, where the updates alone do not."""
+
     def finish_update(self, *, is_good: bool) -> None:
         """Take the optimizer's step, or skip it, and count the update either way.
 
@@ -363,6 +366,7 @@ class TrainingRun:
             what_next = f"continues behind update {update_of(newest)}" if newest else "starts anew"
             stop.args = (what_next,)
             raise
+        learner.finish()
         self.folder.close()
         self.folder.finish()
         if learner.result is not learner.policy:  # trained in place: the policy is what the folder holds

@@ -1,0 +1,97 @@
+"""Token distributions with a weighted sum of features on their logits.
+
+R elements, P pairs of an element and a candidate token, K features, V tokens.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+
+from rlftsim.policies.calibrated.candidates import SUPPORT_NATS, Candidates
+from rlftsim.policies.calibrated.features import Feature
+from rlftsim.policies.calibrated.traffic import Scene, Traffic
+from rlftsim.policies.distributions import CategoricalDistribution
+from rlftsim.rollout.rows import row_places
+from rlftsim.tokens.vocabulary import Vocabulary
+
+
+@dataclass(frozen=True, eq=False)
+class TiltedDistribution(CategoricalDistribution):
+    """p(token) proportional to base(token) exp(eta · f(state, token)); the base itself, bit for bit, where eta is 0.
+
+    Features are 0 for tokens that are no candidates, see `Candidates`.
+    """
+
+    base: CategoricalDistribution
+    eta: Float[Tensor, "K"]
+    features: Sequence[Feature]
+    scene: Scene
+    traffic: Traffic
+    vocabulary: Vocabulary
+    seconds: float
+    """Duration of a decision."""
+
+    @property
+    def mask(self) -> Bool[Tensor, "*batch"]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """True = the element decides."""
+        return self.base.mask
+
+    @cached_property
+    def logits(self) -> Float[Tensor, "R V"]:
+        """float32."""
+        logits = self.base.logits
+        if not self.eta.any():
+            return logits
+        return logits.flatten().index_add(0, self._pairs[2], self.values @ self.eta).view_as(logits)
+
+    @cached_property
+    def values(self) -> Float[Tensor, "P K"]:
+        """Features of all candidates."""
+        candidates = self._candidates
+        return torch.stack([feature(candidates) for feature in self.features], -1) * candidates.weight[:, None]
+
+    def score_function(self, decision: Int64[Tensor, "*batch"]) -> Float[Tensor, "*batch K"]:
+        """Gradient of the decisions' log-probability by eta: the features of what was chosen minus their mean.
+
+        Args:
+            decision: Token ids.
+        """
+        row, token, place = self._pairs
+        chosen = token == self._rows(decision).index_select(0, row)
+        weight = chosen.float() - self.log_probs.detach().flatten().index_select(0, place).exp()
+        centered = self.values.new_zeros(self._num_rows, len(self.features))
+        return self._dense(centered.index_add(0, row, weight[:, None] * self.values.detach()))
+
+    @property
+    def _num_rows(self) -> int:
+        return self.base._num_rows
+
+    @cached_property
+    def _peak(self) -> Float[Tensor, "R 1"]:
+        return self.base.logits.amax(-1, keepdim=True)
+
+    @cached_property
+    def _pairs(self) -> tuple[Int64[Tensor, "P"], Int64[Tensor, "P"], Int64[Tensor, "P"]]:
+        """Row and token of each candidate, and its place in the flattened logits; rows with a single one have none."""
+        num_tokens = self.base.logits.shape[1]
+        place = (self.base.logits > self._peak - SUPPORT_NATS).flatten().nonzero()[:, 0]
+        row = place.div(num_tokens, rounding_mode="floor")
+        has_choice = (torch.bincount(row, minlength=self._num_rows) > 1).index_select(0, row)
+        row, place = row[has_choice], place[has_choice]
+        return row, place - row * num_tokens, place
+
+    @cached_property
+    def _candidates(self) -> Candidates:
+        row, token, place = self._pairs
+        has_choice, index = row.unique_consecutive(return_inverse=True)
+        agent = tuple(axis[has_choice] for axis in row_places(self.mask, has_all=self._num_rows == self.mask.numel()))
+        agent = (*agent, torch.zeros_like(has_choice))[:4]  # while simulating there is a single moment
+        class_id = self.scene.class_id[agent[0], agent[2]].index_select(0, index)
+        ends = self.vocabulary.poses[:, :, -1]  # [C, V, 3]
+        end = ends.flatten(0, 1).index_select(0, class_id * ends.shape[1] + token)
+        log_ratio = self.base.logits.flatten().index_select(0, place) - self._peak[:, 0].index_select(0, row)
+        return Candidates(self.scene, self.traffic, agent, index, end, log_ratio, self.seconds)

@@ -1,0 +1,273 @@
+"""A policy with a vocabulary, calibrated: eta · f(state, token) on its logits, with features f that have names.
+
+B scenarios, N rollouts, A agents, L decisions, K features.
+"""
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from rlftsim.atomic_io import write_text
+from rlftsim.errors import CheckpointError, ConfigError
+from rlftsim.goals.types import Goals
+from rlftsim.policies.calibrated.distribution import TiltedDistribution
+from rlftsim.policies.calibrated.features import features_by_name
+from rlftsim.policies.calibrated.table import calibration_table
+from rlftsim.policies.calibrated.traffic import Scene, Traffic, build_scene, join_moments
+from rlftsim.policies.checkpoint import read_model, save_model
+from rlftsim.policies.distributions import CategoricalDistribution
+from rlftsim.rollout.policy import TokenPolicy
+from rlftsim.rollout.types import AgentStates, Rollouts
+from rlftsim.scenario.batch import ScenarioBatch
+from rlftsim.scenario.types import STEP_S
+
+BASE = "base"
+"""Model folder of the policy that is calibrated, inside the folder of the calibrated one."""
+CALIBRATION = "calibration.json"
+"""How eta was fitted and what each feature earns."""
+PASSED_ON = (
+    *("fine_tuned_parts", "head_parts", "goal_parts", "is_goal_conditioned", "teacher_forced"),
+    *("steps_per_decision", "noise_size", "initial_noise_size", "vocabulary"),
+)
+"""Attributes that a calibrated policy has if its base has them, and that are those of the base."""
+
+
+@dataclass(frozen=True, eq=False)
+class CalibratedContext:
+    """Context of the base, and what features look at."""
+
+    base: Any
+    scene: Scene
+
+
+@dataclass(frozen=True, eq=False)
+class CalibratedState:
+    """State of the base, and the agents' motion."""
+
+    base: Any
+    traffic: Traffic
+
+    @property
+    def poses(self) -> Tensor | None:
+        """Of the base."""
+        return self.base.poses
+
+    @property
+    def draws(self) -> Tensor | None:
+        """Of the base."""
+        return self.base.draws
+
+
+class CalibratedPolicy(nn.Module):
+    """A `TokenPolicy` whose token logits get eta · f(state, token) more.
+
+    Log-probabilities, KL and entropy are those of the tilted distribution. Further training changes the weights of the
+    base below a fixed eta; what imitates the log without a rollout (`teacher_forced`) sees the base alone.
+
+    Args:
+        base: Policy with a vocabulary and weights.
+        features: Names of registered features.
+        eta: Their weights; None = zeros, with which it decides as its base, bit for bit.
+        calibration: How eta was fitted, to be stored with it; see `training.calibrate`.
+    """
+
+    architecture = "calibrated"
+    fingerprint_parts = ("base",)
+
+    def __init__(
+        self,
+        base: Any,
+        features: Sequence[str],
+        eta: Sequence[float] | None = None,
+        calibration: Mapping[str, Any] | None = None,
+    ):
+        if not (isinstance(base, nn.Module) and isinstance(base, TokenPolicy)):
+            raise ConfigError(f"a {type(base).__name__} cannot be calibrated: it has no weights or no vocabulary.")
+        super().__init__()
+        self.base: Any = base
+        self.features = tuple(features)
+        self._features = features_by_name(self.features)
+        values = torch.zeros(len(self.features)) if eta is None else torch.tensor(eta, dtype=torch.float32)
+        if values.shape != (len(self.features),):
+            raise ConfigError(
+                f"eta has {len(values)} weights for {len(self.features)} features: it needs one for each."
+            )
+        # A parameter, so that runs can be averaged; never trained by a gradient of the whole model.
+        self.eta = nn.Parameter(values, requires_grad=False)
+        self._calibration = dict(calibration or {})
+        self.train(base.training)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(super().__getattr__("base"), name) if name in PASSED_ON else super().__getattr__(name)
+
+    def __repr__(self) -> str:
+        return f"CalibratedPolicy({self.base!r}, {len(self.features)} features)"
+
+    @property
+    def calibration(self) -> dict[str, Any]:
+        """How eta was fitted; empty where that is not known."""
+        return self._calibration
+
+    def set_calibration(self, eta: Tensor, calibration: Mapping[str, Any]) -> None:
+        """Take fitted weights and how they were fitted.
+
+        Args:
+            eta: [K], in the order of the features.
+            calibration: Values that JSON has.
+        """
+        with torch.no_grad():
+            self.eta.copy_(eta)
+        self._calibration = dict(calibration)
+
+    def requires_grad_(self, requires_grad: bool = True) -> "CalibratedPolicy":
+        """Changes the base alone: eta stays fixed."""
+        self.base.requires_grad_(requires_grad)
+        return self
+
+    # ---- the policy interface -------------------------------------------------------------------------------------
+
+    def encode(self, scenarios: ScenarioBatch) -> CalibratedContext:
+        """Context of the base, lanes and edges of the maps, and the current step."""
+        return CalibratedContext(self.base.encode(scenarios), build_scene(scenarios))
+
+    def begin(
+        self, context: CalibratedContext, num_rollouts: int, goals: Goals | None, noise: Tensor
+    ) -> CalibratedState:
+        """The current step, N times.
+
+        Args:
+            context: Of `encode`.
+            num_rollouts: N of each scenario.
+            goals: For the base.
+            noise: For the base.
+        """
+        base = self.base.begin(context.base, num_rollouts, goals, noise)
+        return CalibratedState(base, context.scene.begin(num_rollouts))
+
+    def decide(self, context: CalibratedContext, state: CalibratedState) -> TiltedDistribution:
+        """Tilted distributions [B, N, A] of the next token.
+
+        Args:
+            context: Of `encode`.
+            state: Before the decision.
+        """
+        return self._tilt(context, self.base.decide(context.base, state.base), state.traffic)
+
+    def advance(
+        self, context: CalibratedContext, state: CalibratedState, decision: Tensor, forced: AgentStates | None = None
+    ) -> CalibratedState:
+        """State after a decision.
+
+        Args:
+            context: Of `encode`.
+            state: Before the decision.
+            decision: Token ids [B, N, A].
+            forced: States imposed from outside.
+        """
+        base = self.base.advance(context.base, state.base, decision, forced)
+        return CalibratedState(base, state.traffic.after(base.poses, self._seconds))
+
+    def score(self, context: CalibratedContext, rollouts: Rollouts) -> CategoricalDistribution:
+        """Tilted distributions [B, N, A, L] along rollouts.
+
+        Args:
+            context: Of `encode`.
+            rollouts: Of the same scenarios.
+        """
+        scored: Any = self.base.score(context.base, rollouts)
+        if not self.eta.any():
+            return scored  # which may not need its logits
+        moments = [context.scene.begin(rollouts.num_rollouts)]
+        path = torch.cat([rollouts.position, rollouts.heading[..., None]], -1)  # [B, N, A, T, 3]
+        for poses in path.split(self.steps_per_decision, 3)[:-1]:
+            moments.append(moments[-1].after(poses, self._seconds))
+        return self._tilt(context, scored, join_moments(moments))
+
+    # ---- variants of the base -------------------------------------------------------------------------------------
+
+    def with_goal_conditioning(self, encoding: Any, *, logit_bias: bool | None = None) -> "CalibratedPolicy":
+        """Calibrated copy whose base is goal-conditioned, see `ConditionablePolicy`.
+
+        Args:
+            encoding: Name of an encoding of goals of the base.
+            logit_bias: Add a goal-progress bias to the logits of the base; None = its default.
+
+        Raises:
+            ConfigError: The base cannot be conditioned, or not so.
+        """
+        if not hasattr(self.base, "with_goal_conditioning"):
+            raise ConfigError(f"a {type(self.base).__name__} cannot be goal-conditioned: leave --goal out.")
+        return self._with_base(self.base.with_goal_conditioning(encoding, logit_bias=logit_bias))
+
+    def with_guidance(self, scale: float) -> "CalibratedPolicy":
+        """Calibrated copy whose base follows goals more closely, see `GoalConditionedPolicy`.
+
+        Args:
+            scale: Factor of what pulls towards goals.
+
+        Raises:
+            ConfigError: The base has nothing that could be scaled.
+        """
+        if not hasattr(self.base, "with_guidance"):
+            raise ConfigError(f"guidance_scale={scale:g} has no effect on a {type(self.base).__name__}: leave it out.")
+        return self._with_base(self.base.with_guidance(scale))
+
+    def _with_base(self, base: Any) -> "CalibratedPolicy":
+        return CalibratedPolicy(base, self.features, self.eta.tolist(), self._calibration).to(self.eta.device)
+
+    # ---- files ----------------------------------------------------------------------------------------------------
+
+    def save_pretrained(self, folder: str | os.PathLike, *, card: str = "") -> None:
+        """Write config.json, eta, calibration.json, README.md and the base's own model folder, `base`.
+
+        Args:
+            folder: Created where it is missing.
+            card: Text of README.md.
+        """
+        self.base.save_pretrained(
+            Path(folder) / BASE, card=f"Base of the calibrated model in the folder above.\n\n{card}"
+        )
+        if self._calibration:
+            write_text(Path(folder) / CALIBRATION, json.dumps(self._calibration, indent=1) + "\n")
+            card = f"{card}\n{calibration_table(self._calibration)}"
+        save_model(folder, self, {"features": self.features}, card=card, weights={"eta": self.eta.detach()})
+
+    @classmethod
+    def from_pretrained(cls, folder: str | os.PathLike) -> "CalibratedPolicy":
+        """Policy of a model folder as `save_pretrained` writes it.
+
+        Raises:
+            ConfigError: There is no such folder, or a feature is not registered here.
+            CheckpointError: A file is missing, damaged or does not fit.
+        """
+        from rlftsim.policies.registry import load_policy  # which knows this class
+
+        stored = read_model(folder, architecture=cls.architecture)
+        eta = stored.read_weights().get("eta")
+        if eta is None or not eta.isfinite().all():
+            raise CheckpointError(f"{stored.folder}: no finite eta among the weights: calibrate again.")
+        base = load_policy(f"{stored.folder / BASE}{os.sep}")
+        try:
+            path = stored.folder / CALIBRATION
+            calibration = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+        except ValueError as error:
+            raise CheckpointError(f"{stored.folder / CALIBRATION}: damaged ({error}): remove it.") from None
+        return stored.build(lambda features: cls(base, features, eta.tolist(), calibration))
+
+    # ---- parts ----------------------------------------------------------------------------------------------------
+
+    @property
+    def _seconds(self) -> float:
+        """Duration of a decision."""
+        return self.steps_per_decision * STEP_S
+
+    def _tilt(self, context: CalibratedContext, dist: Any, traffic: Traffic) -> TiltedDistribution:
+        return TiltedDistribution(
+            dist, self.eta, self._features, context.scene, traffic, self.vocabulary, self._seconds
+        )

@@ -1,0 +1,56 @@
+"""A calibration as a table: what each feature weighs and earns, and what changed on the scenarios held back."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+CHANGES = {
+    "rmm": ("RMM", "+.4f"),
+    "kinematic": ("kinematic", "+.4f"),
+    "interactive": ("interactive", "+.4f"),
+    "map_based": ("map-based", "+.4f"),
+    "min_ade": ("minADE (m)", "+.3f"),
+    "speed": ("speed (m/s)", "+.3f"),
+    "evaluated_speed": ("of evaluated agents (m/s)", "+.3f"),
+}
+"""Heading and format of each change that is shown."""
+
+
+def calibration_table(calibration: Mapping[str, Any]) -> str:
+    """Markdown of a calibration.
+
+    Args:
+        calibration: Values of calibration.json.
+    """
+    fitted, held = calibration["num_scenarios"]
+    scores = ("rmm", "kinematic", "interactive", "map_based")
+    features = sorted(calibration["features"], key=lambda row: -row["rmm"])
+    earned = [
+        [row["feature"], f"{row['eta']:+.3f}", f"{row['t']:+.1f}", *(f"{row[name]:+.4f}" for name in scores)]
+        for row in features
+    ]
+    tried = [
+        [f"{row['length']:g}", f"{row['kl']:.4f}", *(_with_t(row[name], style) for name, (_, style) in CHANGES.items())]
+        for row in calibration["held_back"]
+    ]
+    return f"""## Calibration
+
+What a feature earns in RMM, and of that in which sub-score, is predicted to first order on {fitted} scenarios with
+{calibration["num_rollouts"]} rollouts each; t is that of its gradient over scenarios.
+Kept as they are, by prediction: {", ".join(calibration["constraints"]) or "nothing"}.
+
+{_markdown(("feature", "eta", "t", "RMM", "kinematic", "interactive", "map-based"), earned)}
+
+Measured on {held} scenarios that were held back, with t in parentheses. The length taken is
+{calibration["length"]:.2f}.
+
+{_markdown(("length", "KL", *(heading for heading, _ in CHANGES.values())), tried)}
+"""
+
+
+def _with_t(change: Mapping[str, float], style: str) -> str:
+    return f"{change['change']:{style}} ({change['t']:+.1f})"
+
+
+def _markdown(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    rule = ["---", *["--:"] * (len(headings) - 1)]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in (headings, rule, *rows))

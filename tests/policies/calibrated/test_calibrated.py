@@ -1,0 +1,184 @@
+"""A calibrated policy is a policy like any other, and with eta 0 it is its base."""
+
+import copy
+
+import pytest
+import torch
+
+import scenes
+import tiny
+from rlftsim.errors import CheckpointError, ConfigError
+from rlftsim.policies.averaging import average_policies
+from rlftsim.policies.calibrated.distribution import TiltedDistribution
+from rlftsim.policies.calibrated.features import FEATURES, features_by_name, register_feature
+from rlftsim.policies.calibrated.policy import CalibratedPolicy
+from rlftsim.policies.registry import load_policy
+from rlftsim.rollout.baselines import ConstantVelocity
+from rlftsim.rollout.check import check_policy
+from rlftsim.rollout.fingerprint import fingerprint_policy
+from rlftsim.rollout.simulate import simulate
+from rlftsim.scenario.batch import collate
+from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
+
+SCENES = (scenes.bend(), scenes.bend("pair", 2), scenes.junction_with_light())
+NAMES = tuple(FEATURES.names())
+ETA = [0.3 * (-1) ** index for index in range(len(NAMES))]
+
+
+@pytest.fixture(scope="module")
+def base():
+    config = TokensConfig(num_tokens=48, num_map_prototypes=16)
+    vocabulary = build_vocabulary([*SCENES, scenes.crowd(num_agents=40)], config)[0]
+    return tiny.tiny_policy(vocabulary, tiny.WITHOUT_CHANCE).eval().requires_grad_(False)
+
+
+@pytest.fixture
+def calibrated(base):
+    return CalibratedPolicy(base, NAMES, ETA)
+
+
+def distribution_of(policy, scenario, num_rollouts=2):
+    """Of the first decision that follows another one."""
+    batch = collate([scenario])
+    context = policy.encode(batch)
+    state = policy.begin(context, num_rollouts, None, torch.zeros(1, num_rollouts, batch.agent_mask.shape[1], 0))
+    first = policy.decide(context, state).logits.argmax(-1).view(1, num_rollouts, -1)
+    return policy.decide(context, policy.advance(context, state, first))
+
+
+def test_a_calibrated_policy_keeps_the_contract(base):
+    config = {"max_map_neighbors": None, "map_radius_m": 12.0}
+    with_all_neighbors = tiny.tiny_policy(base.vocabulary, tiny.replace(tiny.WITHOUT_CHANCE, **config)).train()
+    report = check_policy(CalibratedPolicy(with_all_neighbors, NAMES, ETA), SCENES[:2])
+    assert report.is_passed, str(report)
+
+
+def test_with_eta_zero_it_decides_as_its_base_bit_for_bit(base):
+    batch = collate(list(SCENES))
+    plain, off = (simulate(one, batch, num_rollouts=3, seed=1) for one in (base, CalibratedPolicy(base, NAMES)))
+    assert torch.equal(plain.position, off.position)
+    assert torch.equal(plain.log_prob, off.log_prob)
+    scored = [
+        one.score(one.encode(batch), plain).log_prob(plain.decision) for one in (base, CalibratedPolicy(base, NAMES))
+    ]
+    assert torch.equal(*scored)
+
+
+def test_the_score_function_is_the_gradient_of_the_log_probability_by_eta(calibrated):
+    batch = collate(list(SCENES))
+    rollouts, step = simulate(calibrated, batch, num_rollouts=2, seed=0), 1e-2
+    dist = calibrated.score(calibrated.encode(batch), rollouts)
+    assert isinstance(dist, TiltedDistribution)
+    gradient = dist.score_function(rollouts.decision)  # [B, N, A, L, K]
+    for index in range(len(NAMES)):
+        ends = []
+        for sign in (1, -1):
+            moved = copy.deepcopy(calibrated)
+            with torch.no_grad():
+                moved.eta[index] += sign * step
+            ends.append(moved.score(moved.encode(batch), rollouts).log_prob(rollouts.decision))
+        difference = (ends[0] - ends[1]) / (2 * step)
+        torch.testing.assert_close(gradient[..., index], difference, atol=2e-3, rtol=1e-2)
+    assert gradient.abs().amax((0, 1, 2, 3)).count_nonzero() >= 6  # most features have something to say here
+
+
+def test_values_of_features_stay_within_their_bounds(base):
+    dist = distribution_of(CalibratedPolicy(base, NAMES), scenes.crowd(num_agents=40))
+    for feature, values in zip(features_by_name(NAMES), dist.values.unbind(-1)):
+        assert feature.low <= values.min()
+        assert values.max() <= feature.high
+
+
+def test_a_feature_shifts_logits_by_eta_times_its_value_and_only_those_of_candidates(base):
+    name = "speed_fast"
+    dist = distribution_of(CalibratedPolicy(base, [name], [0.5]), SCENES[0])
+    shift = dist.logits - dist.base.logits
+    candidates = torch.zeros_like(shift, dtype=torch.bool)
+    candidates[dist._pairs[:2]] = True
+    assert not shift[~candidates].any()
+    torch.testing.assert_close(shift[dist._pairs[:2]], 0.5 * dist.values[:, 0], atol=1e-5, rtol=0)
+
+
+def test_it_is_saved_and_loaded_with_its_base(calibrated, tmp_path):
+    fitted = {
+        "num_scenarios": [2, 1],
+        "num_rollouts": 4,
+        "constraints": [],
+        "length": 1.0,
+        "features": [],
+        "held_back": [],
+    }
+    calibrated.set_calibration(calibrated.eta.detach(), fitted)
+    calibrated.save_pretrained(tmp_path, card="made by hand")
+    loaded = load_policy(tmp_path)
+    assert isinstance(loaded, CalibratedPolicy)
+    assert loaded.calibration == fitted
+    assert fingerprint_policy(loaded) == fingerprint_policy(calibrated)
+    batch = collate([SCENES[0]])
+    assert torch.equal(*(simulate(one, batch, num_rollouts=2, seed=0).position for one in (loaded, calibrated)))
+    assert fingerprint_policy(load_policy(tmp_path / "base")) == fingerprint_policy(calibrated.base)
+
+
+def test_a_folder_without_finite_weights_is_refused(calibrated, tmp_path):
+    with torch.no_grad():
+        calibrated.eta[0] = torch.nan
+    calibrated.save_pretrained(tmp_path)
+    with pytest.raises(CheckpointError, match="no finite eta"):
+        load_policy(tmp_path)
+
+
+def test_settings_of_the_base_count_in_the_fingerprint(base):
+    other = copy.deepcopy(base)
+    other.config = tiny.replace(base.config, agent_radius_m=base.config.agent_radius_m + 1)
+    assert fingerprint_policy(CalibratedPolicy(base, NAMES)) != fingerprint_policy(CalibratedPolicy(other, NAMES))
+
+
+def test_the_mean_of_two_calibrations_has_the_mean_eta(base):
+    low, high = (CalibratedPolicy(base, NAMES[:2], eta) for eta in ([0.0, 1.0], [1.0, 3.0]))
+    assert average_policies([low, high]).eta.tolist() == [0.5, 2.0]
+
+
+def test_averages_are_of_policies_with_the_same_features(base):
+    with pytest.raises(ConfigError, match="differs from the first"):
+        average_policies([CalibratedPolicy(base, NAMES[:2]), CalibratedPolicy(base, NAMES[1:3])])
+
+
+def test_further_training_moves_the_base_below_a_fixed_eta(calibrated):
+    learner = copy.deepcopy(calibrated).requires_grad_(True)
+    batch = collate([SCENES[0]])
+    rollouts = simulate(calibrated, batch, num_rollouts=2, seed=0)
+    learner.score(learner.encode(batch), rollouts).log_prob(rollouts.decision).sum().backward()
+    assert learner.eta.grad is None
+    assert not learner.eta.requires_grad
+    assert all(p.grad is not None for p in learner.base.network.decoder.head.parameters())
+
+
+@pytest.mark.parametrize(
+    ("make", "reason"),
+    [
+        (lambda base: CalibratedPolicy(ConstantVelocity(), NAMES), "no weights or no vocabulary"),
+        (lambda base: CalibratedPolicy(base, ["speed_slw"]), "did you mean 'speed_slow'"),
+        (lambda base: CalibratedPolicy(base, ["speed_slow"] * 2), "different names"),
+        (lambda base: CalibratedPolicy(base, NAMES, [1.0]), "one for each"),
+        (lambda base: register_feature("wide", low=1.0, high=-1.0), "low < high"),
+    ],
+)
+def test_what_cannot_be_calibrated_is_refused_with_the_reason(base, make, reason):
+    with pytest.raises(ConfigError, match=reason):
+        make(base)
+
+
+def test_a_feature_of_ones_own_works_by_its_name_and_its_shape_is_checked(base):
+    register_feature("half_speed", low=-1.0, high=1.0)(lambda c: 0.5 * c.speed_change)
+    register_feature("by_agent", low=-1.0, high=1.0)(lambda c: c.speed)
+    try:
+        half, whole = (
+            distribution_of(CalibratedPolicy(base, [name]), SCENES[0]) for name in ("half_speed", "speed_fast")
+        )
+        is_fast = whole.values[:, 0] != 0
+        torch.testing.assert_close(half.values[is_fast, 0], 0.5 * whole.values[is_fast, 0])
+        with pytest.raises(ConfigError, match="a number for each"):
+            distribution_of(CalibratedPolicy(base, ["by_agent"], [1.0]), SCENES[0])
+    finally:
+        FEATURES.remove("half_speed")
+        FEATURES.remove("by_agent")
