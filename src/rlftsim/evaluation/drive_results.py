@@ -106,18 +106,19 @@ class DriveResult:
         Raises:
             DataError: not such a file, or one that was cut or edited.
         """
+        way_out = "not a result of `rlftsim drive`, drive again"
         try:
-            table = read_parquet(path, "drive again")
+            table = read_parquet(path, way_out)
         except FileNotFoundError:
             raise DataError(f"{path}: no such result of `rlftsim drive`: drive again.") from None
         metadata = (table.schema.metadata or {}).get(b"rlftsim", b"{}")
-        about = parse_json(metadata, "drive again", source=f"{path}: not a result of `rlftsim drive`")
+        about = parse_json(metadata, way_out, source=str(path))
         try:
             if about["format"] != FORMAT:
                 raise ValueError(f"its format is {str(about['format'])[:40]}, not {FORMAT}")
             settings = DriveSettings(**about["settings"])
             require_types(settings)
-            missing = {name: {**reasons} for name, reasons in about["missing"].items()}
+            missing = {name: dict(reasons.items()) for name, reasons in about["missing"].items()}
             if not all(isinstance(why, str) for reasons in missing.values() for why in reasons.values()):
                 raise TypeError("a reason is no text")
             _require_columns(table)
