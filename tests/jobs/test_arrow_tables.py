@@ -34,7 +34,7 @@ def test_text_that_is_no_utf8_is_refused_in_both_formats(tmp_path):
 
 def test_a_column_twice_is_refused(tmp_path):
     table = pa.table([pa.array([1]), pa.array([2])], names=["a", "a"])
-    with pytest.raises(DataError, match="two columns a"):
+    with pytest.raises(DataError, match="two columns 'a'"):
         map_arrow(write_arrow(tmp_path / "a.arrow", table), "write it again")
 
 

@@ -117,7 +117,7 @@ class Vocabulary:
         Raises:
             DataError: The file is missing, damaged or not a vocabulary.
         """
-        build = "build it again with `rlftsim tokens`"
+        build = "damaged vocabulary, build it again with `rlftsim tokens`"
         try:
             tensors, metadata = read_tensors(path, build)
         except FileNotFoundError:
@@ -128,7 +128,7 @@ class Vocabulary:
         try:
             check_tables(tensors)
         except DataError as error:
-            raise DataError(f"{path}: damaged vocabulary ({error}): {build}.") from None
+            raise DataError(f"{path}: {error}: {build}.") from None
         return cls(**tensors, origin=origin)
 
 

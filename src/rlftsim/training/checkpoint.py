@@ -96,7 +96,7 @@ def read_checkpoint(path: Path, modules: dict[str, nn.Module], optimizer: Optimi
     Raises:
         CheckpointError: damaged, or of another model.
     """
-    way_out = "delete this folder to go on from an older one"
+    way_out = "cannot go on from it, delete this folder to go on from an older one"
     try:
         values = read_json(path / "progress.json", way_out, error=CheckpointError)
         # everything is checked before anything is loaded
@@ -109,7 +109,7 @@ def read_checkpoint(path: Path, modules: dict[str, nn.Module], optimizer: Optimi
     except FileNotFoundError as error:
         raise CheckpointError(f"{path}: {Path(error.filename or '').name or 'a file'} is missing: {way_out}.") from None
     except ValueError as error:
-        raise CheckpointError(f"{path}: cannot go on from it ({error}): {way_out}.") from None
+        raise CheckpointError(f"{path}: {error}: {way_out}.") from None
     for name, module in modules.items():
         module.load_state_dict(weights[name])
     # The groups are the new optimizer's own: learning rate and scales follow the settings, not the file.
