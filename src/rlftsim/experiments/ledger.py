@@ -9,6 +9,7 @@ from typing import Any
 
 from rlftsim.atomic_io import append_text
 from rlftsim.errors import ConfigError, DataError
+from rlftsim.jobs.files import parse_json
 
 
 @dataclass(frozen=True)
@@ -33,9 +34,9 @@ class Ledger:
         entries = []
         for number, line in enumerate(lines, 1):
             try:
-                entry = json.loads(line)
+                entry = parse_json(line, "mend it", source=str(self.path))
                 _ = entry["exam"], entry["looks"], entry["recipe"], entry["date"], set(entry["fingerprints"])
-            except (ValueError, TypeError, KeyError, RecursionError):
+            except (DataError, TypeError, KeyError):
                 raise DataError(
                     f"{self.path}: line {number} is none of a ledger: mend or remove it, or name another --ledger."
                 ) from None

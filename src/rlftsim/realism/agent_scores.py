@@ -35,11 +35,11 @@ class AgentScores:
     @cached_property
     def sub_scores(self) -> dict[str, Float64[Tensor, "B N A"]]:
         """`leave_one_out` in its parts of each sub-score, by name."""
-        credits = {id(item): compute_credit(item.log, item.features, self.config).mloo for item in self.measured}
-        columns = {name: [FEATURE_NAMES.index(one) for one in members] for name, members in SUB_SCORES.items()}
+        credits = {id(scene): compute_credit(scene.log, scene.features, self.config).mloo for scene in self.features}
+        columns = {name: [FEATURE_NAMES.index(feature) for feature in names] for name, names in SUB_SCORES.items()}
         return {
-            name: self._place(lambda item, chosen=chosen: credits[id(item)][..., chosen].nan_to_num().sum(-1))
-            for name, chosen in columns.items()
+            name: self._scatter(lambda scene, index=index: credits[id(scene)][..., index].nan_to_num().sum(-1))
+            for name, index in columns.items()
         }
 
     @cached_property

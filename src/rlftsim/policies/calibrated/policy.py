@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from rlftsim.atomic_io import write_text
 from rlftsim.errors import CheckpointError, ConfigError
 from rlftsim.goals.types import Goals
+from rlftsim.jobs.files import read_json
 from rlftsim.policies.calibrated.distribution import TiltedDistribution
 from rlftsim.policies.calibrated.features import features_by_name
 from rlftsim.policies.calibrated.table import calibration_table
@@ -253,11 +254,8 @@ class CalibratedPolicy(nn.Module):
         if eta is None or not eta.isfinite().all():
             raise CheckpointError(f"{stored.folder}: no finite eta among the weights: calibrate again.")
         base = load_policy(f"{stored.folder / BASE}{os.sep}")
-        try:
-            path = stored.folder / CALIBRATION
-            calibration = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-        except ValueError as error:
-            raise CheckpointError(f"{stored.folder / CALIBRATION}: damaged ({error}): remove it.") from None
+        path = stored.folder / CALIBRATION
+        calibration = read_json(path, "remove it", error=CheckpointError) if path.exists() else {}
         return stored.build(lambda features: cls(base, features, eta.tolist(), calibration))
 
     # ---- parts ----------------------------------------------------------------------------------------------------
