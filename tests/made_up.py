@@ -29,7 +29,7 @@ TINY = SmartRecipe(
 def evaluation(name, meta_metric, ids=None, columns=None, clusters=None, **config):
     """Scores of a policy: the meta-metric as given, other columns too, everything else 0.5."""
     ids = ids or [f"s{k}" for k in range(len(meta_metric))]
-    given = {"meta_metric": meta_metric, **(columns or {}), **({"cluster": clusters} if clusters else {})}
+    given = {"meta_metric": meta_metric, **(columns or {}), "cluster": clusters or [""] * len(meta_metric)}
     others = {"num_agents": 3, "num_evaluated": 2, **dict.fromkeys(SCORE_COLUMNS, 0.5)}
     rows = [{"scenario_id": i, **others, **dict(zip(given, v))} for i, v in zip(ids, zip(*given.values()))]
     provenance = Provenance(EvaluateConfig(**config), "Policy", "f" * 32, "/data", "a" * 64)

@@ -29,7 +29,7 @@ from rlftsim.evaluation.evaluate import EvaluateConfig
 from rlftsim.evaluation.goal_attainment import attain_goals
 from rlftsim.evaluation.reward_variance import measure_variances
 from rlftsim.goals.goals_file import GoalEntry, GoalsFile, write_goals
-from rlftsim.goals.stored import StoredGoals, write_goal_part
+from rlftsim.goals.stored import StoredGoals, write_goal_file
 from rlftsim.policies.checkpoint import read_card
 from rlftsim.policies.smart.catk_checkpoint import export_catk, write_catk
 from rlftsim.policies.smart.catk_vocabulary import write_catk_vocabulary
@@ -290,7 +290,7 @@ def make_stored_goals(folder: Path) -> None:
     for number, one in enumerate(_scenarios()):
         tracks = one.evaluated_indices
         points = one.tracks.position[tracks, -1, :2].astype(float)
-        write_goal_part(
+        write_goal_file(
             folder / "goals" / f"{number}.parquet", {one.scenario_id: (one.tracks.object_id[tracks], points)}
         )
 

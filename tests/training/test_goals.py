@@ -377,7 +377,7 @@ def test_a_folder_without_goals_is_refused(tmp_path):
     with pytest.raises(DataError, match="holds no goals: write them by `rlftsim augment`"):
         StoredGoals(tmp_path)
     (tmp_path / "part-0.parquet").write_bytes(b"no table")
-    with pytest.raises(DataError, match="damaged goals"):
+    with pytest.raises(DataError, match="cannot be read"):
         StoredGoals(tmp_path)
 
 

@@ -1,7 +1,6 @@
 """Goal-conditioned models: fresh weights change nothing, trained ones change goal-conditioned agents only."""
 
 import copy
-import json
 from dataclasses import replace
 
 import pytest
@@ -214,17 +213,6 @@ def test_without_aim_a_model_is_the_papers(encoding, base, batch):
     for model, bias in ((biased, False), (plain, True)):
         with pytest.raises(ConfigError, match=f"goal-conditioned {'without' if bias else 'with'} a goal logit bias"):
             model.with_goal_conditioning(encoding, logit_bias=bias)
-
-
-def test_models_of_before_there_was_an_aim_are_read(base, batch, tmp_path):
-    plain = base.with_goal_conditioning("concat", logit_bias=False)
-    plain.save_pretrained(tmp_path)
-    config = tmp_path / "config.json"
-    values = json.loads(config.read_text())
-    del values["goal_logit_bias"]
-    config.write_text(json.dumps(values))
-    again = SmartPolicy.from_pretrained(tmp_path).eval()
-    assert again.config == plain.config
 
 
 def test_guidance_counts_an_aim_several_times(base, batch):

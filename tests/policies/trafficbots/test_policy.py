@@ -331,7 +331,7 @@ def test_it_is_saved_and_loaded_by_folder(policy, batch, tmp_path):
             config | {"noise_acceleration_mps2": -1.0},
             r"config.json: settings do not fit .*noise_acceleration_mps2 must be positive, got -1",
         ),
-        (lacking, r"missing: noise_correlation; unknown: none"),  # the other one was added later
+        (lacking, r"missing: noise_correlation, noise_pedestrian_yaw_rate_radps; unknown: none"),
     ):
         (tmp_path / "model" / "config.json").write_text(json.dumps(change))
         with pytest.raises(CheckpointError, match=words):
