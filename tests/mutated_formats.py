@@ -24,12 +24,16 @@ from av2_files import write_av2
 from rlftsim.cli.main import main, parse
 from rlftsim.envs import EgoEnv
 from rlftsim.errors import RlftsimError
+from rlftsim.evaluation.calibration_picture import write_calibration_picture
 from rlftsim.evaluation.drive_results import DriveResult
 from rlftsim.evaluation.evaluate import EvaluateConfig
 from rlftsim.evaluation.goal_attainment import attain_goals
 from rlftsim.evaluation.reward_variance import measure_variances
+from rlftsim.experiments.ledger import Ledger
 from rlftsim.goals.goals_file import GoalEntry, GoalsFile, write_goals
 from rlftsim.goals.stored import StoredGoals, write_goal_file
+from rlftsim.policies.calibrated.policy import CalibratedPolicy
+from rlftsim.policies.calibrated.table import CHANGES
 from rlftsim.policies.checkpoint import read_card
 from rlftsim.policies.smart.catk_checkpoint import export_catk, write_catk
 from rlftsim.policies.smart.catk_vocabulary import write_catk_vocabulary
@@ -204,6 +208,29 @@ def make_trafficbots(folder: Path) -> None:
     torch.manual_seed(0)
     recipe = replace(recipe_by_name("trafficbots-demo"), model=TINY_BOTS)
     recipe.new_policy(None).save_pretrained(folder / "model")
+
+
+def make_calibrated(folder: Path) -> None:
+    policy = CalibratedPolicy(tiny.tiny_policy(_vocabulary()), ("speed_slow", "speed_fast"), [0.1, -0.2])
+    scores = {name: 0.01 for name in ("rmm", "kinematic", "interactive", "map_based")}
+    changes = {name: {"change": 0.01, "t": 2.0} for name in CHANGES}
+    calibration = {
+        "num_scenarios": [3, 1], "num_rollouts": 8, "constraints": ["speed"], "length": 0.7,
+        "features": [{"feature": name, "eta": 0.1, "t": 2.0, **scores} for name in policy.features],
+        "held_back": [{"length": 0.7, "kl": 0.01, **changes}],
+    }  # fmt: skip
+    policy.set_calibration(policy.eta, calibration)
+    policy.save_pretrained(folder / "model")
+
+
+def read_calibrated(folder: Path) -> None:
+    read_policy(folder)
+    write_calibration_picture(folder / "model")
+
+
+def make_ledger(folder: Path) -> None:
+    look = {"exam": "e", "looks": 1, "recipe": "r", "date": "2026-01-01", "fingerprints": ["f" * 32]}
+    Ledger(folder / "exam.jsonl").append([look])
 
 
 def read_policy(folder: Path) -> None:
@@ -509,6 +536,12 @@ FORMATS: Mapping[str, Format] = {
         read_policy,
         ("policies.checkpoint", "tokens.vocabulary"),
     ),
+    "calibrated model": Format(
+        {"model/*.json": "json", "model/model.safetensors": "safetensors"},
+        make_calibrated,
+        read_calibrated,
+        ("policies.checkpoint", "policies.calibrated.table"),
+    ),
     "TrafficBots": Format(
         {"model/config.json": "json", "model/*.safetensors": "safetensors"},
         make_trafficbots,
@@ -537,6 +570,12 @@ FORMATS: Mapping[str, Format] = {
         ("training.checkpoint",),
     ),
     "settings": Format({"*.json": "json"}, make_config, read_config, ("recipes.settings",)),
+    "ledger": Format(
+        {"exam.jsonl": "json"},
+        make_ledger,
+        lambda folder: Ledger(folder / "exam.jsonl").count_looks("e", "r", ["f" * 32], again=True),
+        ("experiments.ledger",),
+    ),
     "goals": Format(
         {"goals.json": "json"},
         make_goals,

@@ -32,7 +32,7 @@ CHANGES = {
     "doubles": (lambda t: {"corners": t["corners"].double()}, "corners is torch.float64"),
     "a class that never stands": (
         lambda t: {"token_mask": torch.ones(3, 5).cumsum(1) > 1},
-        "first tokens",
+        "first token",
     ),
     "a table too many": (lambda t: {"more": torch.zeros(1)}, "missing or unknown: 'more'"),
     "a scalar": (lambda t: {"corners": torch.tensor(1.0)}, "corners is torch.float32"),

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from rlftsim.jobs.files import read_json
 from rlftsim.policies.calibrated.policy import CALIBRATION
+from rlftsim.policies.calibrated.table import read_calibration
 from rlftsim.viewer.figure import Interval, draw_intervals, save_figure
 
 
@@ -19,7 +19,7 @@ def write_calibration_picture(model: Path) -> Path | None:
     path = model / CALIBRATION
     if not path.exists():
         return None
-    rows = sorted(read_json(path, "calibrate again")["features"], key=lambda row: -row["rmm"])
+    rows = sorted(read_calibration(path)["features"], key=lambda row: -row["rmm"])
     intervals = []
     for row in rows:
         half = 1.96 * abs(row["rmm"] / row["t"]) if row["t"] else 0.0

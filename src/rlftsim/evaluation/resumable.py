@@ -234,11 +234,16 @@ class EvaluationParts(PartFiles[Mapping[str, object] | Skipped, Evaluation]):
 
     def read(self, group: range) -> Evaluation | None:
         """The rows of a group, see `PartFiles`."""
-        found = read_if_readable(self.part_path(group), Evaluation.read)
-        other = found.provenance.differences(self.provenance) if found is not None else []
-        if other:
-            log.info(f"{self.part_path(group)} is of another {', '.join(other)}: discarded.")
-        return None if other else found
+        path = self.part_path(group)
+        rows = read_if_readable(path, Evaluation.read)
+        if rows is None:
+            return None
+        differences = rows.provenance.differences(self.provenance)
+        if _ids_of(rows).total() != len(group):
+            differences.append("number of scenarios")
+        if differences:
+            log.info(f"{path} is of another {', '.join(differences)}: discarded.")
+        return None if differences else rows
 
     def read_finished(self, scenario_ids: Sequence[str]) -> Evaluation | None:
         """The result of an earlier call for the same scenarios; None if there is none.

@@ -16,10 +16,9 @@ from torch import Tensor, nn
 from rlftsim.atomic_io import write_text
 from rlftsim.errors import CheckpointError, ConfigError
 from rlftsim.goals.types import Goals
-from rlftsim.jobs.files import read_json
 from rlftsim.policies.calibrated.distribution import TiltedDistribution
 from rlftsim.policies.calibrated.features import features_by_name
-from rlftsim.policies.calibrated.table import calibration_table
+from rlftsim.policies.calibrated.table import calibration_table, read_calibration
 from rlftsim.policies.calibrated.traffic import Scene, Traffic, build_scene, join_moments
 from rlftsim.policies.checkpoint import read_model, save_model
 from rlftsim.policies.distributions import CategoricalDistribution
@@ -255,7 +254,7 @@ class CalibratedPolicy(nn.Module):
             raise CheckpointError(f"{stored.folder}: no finite eta among the weights: calibrate again.")
         base = load_policy(f"{stored.folder / BASE}{os.sep}")
         path = stored.folder / CALIBRATION
-        calibration = read_json(path, "remove it", error=CheckpointError) if path.exists() else {}
+        calibration = read_calibration(path) if path.exists() else {}
         return stored.build(lambda features: cls(base, features, eta.tolist(), calibration))
 
     # ---- parts ----------------------------------------------------------------------------------------------------

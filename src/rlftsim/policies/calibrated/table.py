@@ -1,7 +1,11 @@
 """A calibration as a table: what each feature weighs and earns, and what changed on the scenarios held back."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
+
+from rlftsim.errors import CheckpointError
+from rlftsim.jobs.files import read_json
 
 CHANGES = {
     "rmm": ("RMM", "+.4f"),
@@ -13,6 +17,21 @@ CHANGES = {
     "evaluated_speed": ("of evaluated agents (m/s)", "+.3f"),
 }
 """Heading and format of each change that is shown."""
+
+
+def read_calibration(path: Path) -> dict[str, Any]:
+    """Values of a calibration.json.
+
+    Raises:
+        FileNotFoundError: No such file.
+        CheckpointError: Damaged file, or values that are no calibration.
+    """
+    calibration = read_json(path, "remove it", error=CheckpointError)
+    try:
+        calibration_table(calibration)
+    except (KeyError, TypeError, ValueError, AttributeError):
+        raise CheckpointError(f"{path}: no calibration of this version: remove it.") from None
+    return calibration
 
 
 def calibration_table(calibration: Mapping[str, Any]) -> str:
