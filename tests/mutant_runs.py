@@ -28,7 +28,7 @@ PATIENCE_S = 90.0
 """Seconds of waiting, on a machine that has other work."""
 MEMORY_BYTES = 2 << 30
 """Memory above that of the undamaged file."""
-LONGEST_LINE = 500
+LONGEST_LINE = 1000
 FINE = ("read", "refused")
 FAULTS = ("traceback", "signal", "hang", "memory", "warning", "message")
 FAMILIES = ("bytes", "meaning", "hostile")

@@ -45,7 +45,7 @@ class CheckpointError(RlftsimError):
     """A checkpoint or run folder that is damaged or does not fit; the message names the key or file and what to do."""
 
 
-MAX_VALUE, MAX_MESSAGE = 100, 2000
+MAX_VALUE, MAX_MESSAGE = 100, 800
 """Characters of a value in a message, and of a message."""
 
 

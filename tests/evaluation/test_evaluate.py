@@ -324,7 +324,7 @@ def test_a_policy_whose_poses_are_not_finite_is_refused(data, agent):
 
 def test_work_in_parts_is_joined_in_order_and_skipped_scenarios_are_kept(data, tmp_path):
     provenance = evaluate("oracle", data, None, replace(CONFIG, limit=1), name="o").provenance
-    row = dict.fromkeys(("num_agents", "num_evaluated"), 1) | dict.fromkeys(SCORE_COLUMNS, 0.5)
+    row = dict.fromkeys(("num_agents", "num_evaluated"), 1) | dict.fromkeys(SCORE_COLUMNS, 0.5) | {"cluster": ""}
     done = []
 
     def work(position):

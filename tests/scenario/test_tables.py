@@ -195,7 +195,9 @@ def test_a_bad_scenario_costs_itself_alone(tmp_path):
 def test_utm_coordinates_are_refused_where_float32_is_coarse(tmp_path):
     utm = {"x": 664_321.0, "y": 3_999_876.0}
     tracks, lines = ([{**row, **{c: row[c] + utm[c] for c in "xy"}} for row in rows] for rows in (TWO, MAP))
-    where = r"at \(664321, 3999876\) m at step 0, where float32 resolves 0.25 m: subtract an origin near it, in whole"
+    where = (
+        r"at \(664321, 3999876, 1\) m at step 0, where float32 resolves 0.25 m: subtract an origin near it, in whole"
+    )
     with pytest.raises(DataError, match=where):
         convert(write_tables(tmp_path / "d", tracks, [ROW], lines), tmp_path / "data", jobs=1, show_progress=False)
 

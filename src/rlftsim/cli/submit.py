@@ -9,7 +9,7 @@ import tyro
 from tyro.conf import Positional
 
 from rlftsim.cli.machines import Work
-from rlftsim.errors import ConfigError, DataError
+from rlftsim.errors import ConfigError, DataError, shorten
 from rlftsim.evaluation.evaluate import EvaluateConfig, evaluation_name, frozen_copy
 from rlftsim.evaluation.scenario_source import choose_scenarios
 from rlftsim.evaluation.score_files import format_scores
@@ -203,7 +203,8 @@ class Info:
         _print_findings(check)
         if check.metadata is not None:
             for field, value in check.metadata.ListFields():
-                print(f"  {field.name}: {', '.join(map(str, value)) if field.is_repeated else value}")
+                text = ", ".join(map(str, value)) if field.is_repeated else str(value)
+                print(f"  {field.name}: {shorten(text)}")
         if self.split_gb is not None:
             parts = split_file(self.archive, self.split_gb)
             print(f"{len(parts)} parts; join them with: cat {self.archive.name}.??? > {self.archive.name}")

@@ -75,7 +75,10 @@ def read_snapshot(saved: bytes, source: Source) -> tuple[Episode, EpisodeState]:
         raise ConfigError(f"the snapshot was taken with another {different[0]}: make the environment alike.")
     if motion.shape[1:] != (episode.num_agents, 5):
         raise ConfigError("the snapshot was taken with other planner-driven agents: make the environment alike.")
-    dice = [tuple(Dice(**one) for one in row) for row in about["dice"]]
+    try:
+        dice = [tuple(Dice(**values) for values in row) for row in about["dice"]]
+    except TypeError as error:
+        raise DataError(f"a damaged snapshot ({error}): take a new one with snapshot().") from None
     return episode, repeat(episode, start(episode, dice[0]), motion[1:], dice)
 
 
@@ -91,6 +94,9 @@ def _parse(body: bytes) -> tuple[dict[str, Any], np.ndarray]:
         motion = arrays["motion"]
         kinds = {"format": str, "model": str, "scenarios": list, "dice": list, "settings": dict}
         wrong = [name for name, kind in kinds.items() if not isinstance(about.get(name), kind)]
+        goals = about["goals"] or {}
+        if not all(isinstance(value, dict) for value in (goals, *goals.values())):
+            wrong.append("goals")
         is_motion = motion.ndim == 3 and motion.dtype.kind == "f" and np.isfinite(motion).all()
         if wrong or not is_motion or not about["dice"]:
             raise ValueError(f"its {wrong[0] if wrong else 'dice' if is_motion else 'motion'} cannot be used")

@@ -123,8 +123,15 @@ class _Job:
 
 
 def _stored_variances(scenario_id: str, values: Mapping[str, Any]) -> Float[np.ndarray, "..."]:
-    """Stored variances of a scenario [rewards, sizes]; empty for one that cannot be scored."""
-    return np.array(values["variances"], float)
+    """Stored variances of a scenario [rewards, sizes]; empty for one that cannot be scored.
+
+    Raises:
+        ValueError: Values of other axes.
+    """
+    variances = np.array(values["variances"], float)
+    if len(variances) and variances.shape != (len(REWARDS), len(values["sizes"])):
+        raise ValueError(f"variances of axes {variances.shape}")
+    return variances
 
 
 def _measure_scenario(job: _Job, position: int) -> dict[str, object]:

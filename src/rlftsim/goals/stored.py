@@ -20,6 +20,8 @@ from rlftsim.jobs.tables import check_columns, read_parquet
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.shards import hash_file
 
+MAX_COORDINATE_M = 1e7
+"""Farthest coordinate of a goal, meters in the world frame; UTM coordinates stay within."""
 SCHEMA = pa.schema([("scenario_id", pa.string()), ("object_id", pa.int64()), ("x", pa.float64()), ("y", pa.float64())])
 
 
@@ -45,8 +47,9 @@ def _read_goals(file: Path) -> pa.Table:
     table = read_parquet(file, way_out)
     try:
         check_columns(table, SCHEMA)
-        if not np.isfinite([table["x"].to_numpy(), table["y"].to_numpy()]).all():
-            raise DataError("a point is not finite")
+        points = np.abs([table["x"].to_numpy(), table["y"].to_numpy()])
+        if not (points <= MAX_COORDINATE_M).all():  # false for NaN, too
+            raise DataError(f"a point is not within {MAX_COORDINATE_M:g} m of the origin")
     except DataError as error:
         raise DataError(f"{file}: holds rows that are not goals ({error}): {way_out}.") from None
     return table.replace_schema_metadata(None)

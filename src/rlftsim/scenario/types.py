@@ -320,23 +320,31 @@ class Scenario:
             )
 
     def refuse_coarse(self) -> None:
-        """Check that float32 resolves every valid position to a centimeter, as it does up to 131 km from the origin.
+        """Check that float32 resolves every position to a centimeter, as it does up to 131 km from the origin.
 
         Raises:
-            DataError: one lies farther out, as in UTM coordinates. Names track, step, place and what float32 resolves.
+            DataError: A position lies farther out, as in UTM coordinates; the message names track, step, place and
+                what float32 resolves.
         """
         tracks = self.tracks
         with np.errstate(invalid="ignore"):  # states that are not valid may hold infinities
-            spacing = np.spacing(np.abs(tracks.position[..., :2])).max(-1)  # [O, S] distance to the next float32
+            spacing = np.spacing(np.abs(tracks.position)).max(-1)  # [O, S] distance to the next float32
         bad = np.argwhere(tracks.valid & (spacing > COARSEST_M))
+        way_out = "subtract an origin near it, in whole meters, from x and y of tracks, map and lights"
         if len(bad):
             track, step = bad[0]
-            x, y = tracks.position[track, step, :2].tolist()
+            x, y, z = tracks.position[track, step].tolist()
             raise DataError(
-                f"track {tracks.object_id[track]} is at ({x:.0f}, {y:.0f}) m at step {step}, where float32 resolves "
-                f"{spacing[track, step]:g} m: subtract an origin near it, in whole meters, from x and y of tracks, map "
-                "and lights"
+                f"track {tracks.object_id[track]} is at ({x:.0f}, {y:.0f}, {z:.0f}) m at step {step}, where float32 "
+                f"resolves {spacing[track, step]:g} m: {way_out}"
             )
+        for name, points in (("map point", self.map_features.points), ("stop point", self.lights.stop_point)):
+            distant = np.flatnonzero((np.spacing(np.abs(points)) > COARSEST_M).any(-1))
+            if len(distant):
+                x, y, z = points[distant[0]].tolist()
+                raise DataError(
+                    f"{name} {distant[0]} is at ({x:g}, {y:g}, {z:g}) m, too far out for float32: {way_out}"
+                )
 
     @property
     def num_steps(self) -> int:

@@ -4,6 +4,8 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import Literal
 
+from rlftsim.errors import shorten
+
 Severity = Literal["error", "warning"]
 
 CHECKS = {
@@ -51,7 +53,7 @@ class Finding:
         )
         line = f"{', '.join(place for place in places if place)}: {self.text}"
         # names in an archive may hold anything, such as control characters and bytes that are no text
-        return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
+        return shorten("".join(c if c.isprintable() else ascii(c)[1:-1] for c in line))
 
 
 @dataclass

@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
-from rlftsim.errors import require_positive, require_types
+from rlftsim.errors import CheckpointError, require_positive, require_types
 
 
 @dataclass(frozen=True)
@@ -138,8 +138,18 @@ class Alarms:
         return {f"{name}.{key}": value for name, mean in self.means.items() for key, value in vars(mean).items()}
 
     def load_numbers(self, numbers: Mapping[str, float]) -> None:
-        """Take back the numbers of a checkpoint."""
+        """Take back the numbers of a checkpoint.
+
+        Raises:
+            CheckpointError: A number is missing.
+        """
         for name in self.means:
-            start, now, count = (numbers[f"{name}.{key}"] for key in ("start", "now", "count"))
+            try:
+                start, now, count = (numbers[f"{name}.{key}"] for key in ("start", "now", "count"))
+            except KeyError as error:
+                raise CheckpointError(
+                    f"progress.json of the newest checkpoint lacks {error}: delete its folder, the run resumes from an "
+                    "older one."
+                ) from None
             # JSON has one kind of number here: all are floats.
             self.means[name] = Running(start, now, int(count))

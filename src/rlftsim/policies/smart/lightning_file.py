@@ -81,13 +81,20 @@ def _is_weight(name: object, value: Any) -> bool:
     return value.device.type == "cpu" and value.numel() * value.element_size() <= value.untyped_storage().nbytes()
 
 
+def _open_zip(path: Path) -> zipfile.ZipFile:
+    try:
+        return zipfile.ZipFile(path)
+    except (zipfile.BadZipFile, NotImplementedError, ValueError) as error:
+        raise CheckpointError(f"{path}: damaged ({error}): get the file again.") from None
+
+
 def _unpickle(path: Path) -> Any:
     if not path.is_file():
         raise CheckpointError(f"{path}: no such file.")
     if not zipfile.is_zipfile(path):
         raise CheckpointError(f"{path}: neither safetensors nor a Lightning checkpoint (a zip file by torch.save).")
     try:
-        with zipfile.ZipFile(path) as archive:
+        with _open_zip(path) as archive:
             if any(member.compress_type != zipfile.ZIP_STORED for member in archive.infolist()):
                 raise CheckpointError(f"{path}: packed, which torch.save never does: unpack it, or get the file again.")
         # list the classes that the pickle names before any is made
