@@ -15,7 +15,7 @@ from rlftsim.errors import ConfigError, DataError
 from rlftsim.scenario.convert import convert
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.inspect import verify_dataset
-from rlftsim.scenario.sources import infer_split
+from rlftsim.scenario.source import infer_split
 from rlftsim.scenario.womd import read_scenarios
 from rlftsim.workers import Inline, Share, Unfinished
 

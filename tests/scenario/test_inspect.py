@@ -17,7 +17,7 @@ from rlftsim.scenario.dataset import (
     write_index_and_manifest,
 )
 from rlftsim.scenario.inspect import Problem, check_scenario, dataset_stats, verify_dataset
-from rlftsim.scenario.sources import CONTRADICTORY
+from rlftsim.scenario.source import CONTRADICTORY
 from rlftsim.scenario.types import Scenario
 from rlftsim.scenario.womd import scenario_from_bytes
 

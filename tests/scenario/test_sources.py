@@ -11,7 +11,8 @@ import third_party
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.scenario.convert import convert
 from rlftsim.scenario.dataset import ScenarioDataset, read_manifest, write_dataset
-from rlftsim.scenario.sources import SOURCES, DataSource, Unit, find_source, infer_split, read_unit, units_of_files
+from rlftsim.scenario.source import DataSource, Unit, infer_split, read_unit, units_of_files
+from rlftsim.scenario.sources import SOURCES, find_source
 from rlftsim.scenario.tfrecord import SkippedRecord, write_records
 from rlftsim.scenario.womd import WomdSource, scenario_from_bytes
 
@@ -22,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rlftsim.scenario.sources import units_of_files
+from rlftsim.scenario.source import units_of_files
 from rlftsim.scenario.tfrecord import SkippedRecord
 from rlftsim.scenario.types import LightStates, MapFeatures, Scenario, Tracks
 

@@ -21,7 +21,7 @@ from rlftsim.errors import ConfigError, DataError
 from rlftsim.jobs.files import read_json
 from rlftsim.jobs.tables import read_parquet
 from rlftsim.scenario.av2_map import Ground, read_map
-from rlftsim.scenario.sources import BytesRead, Item, Tally, Unit
+from rlftsim.scenario.source import BytesRead, Item, Tally, Unit
 from rlftsim.scenario.tfrecord import SkippedRecord
 from rlftsim.scenario.types import (
     CURRENT_STEP,

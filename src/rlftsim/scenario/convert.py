@@ -36,7 +36,8 @@ from rlftsim.scenario.dataset import (
     write_json,
 )
 from rlftsim.scenario.shards import SCHEMA_VERSION, ShardWriter, hash_file
-from rlftsim.scenario.sources import AUTO, DEFAULT_SOURCE, DataSource, Unit, find_source, read_unit, units_of_urls
+from rlftsim.scenario.source import DataSource, Unit, read_unit, units_of_urls
+from rlftsim.scenario.sources import AUTO, DEFAULT_SOURCE, find_source
 from rlftsim.scenario.tfrecord import OnError, SkippedRecord
 from rlftsim.storage import fetch, find_files, is_url, require_folder
 from rlftsim.workers import Runner, on_this_machine, require_finished, usable_cores

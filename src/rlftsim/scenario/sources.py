@@ -2,7 +2,8 @@
 
 A source is an object (or a class without arguments) under a name in `SOURCES`. One file is enough for a new one:
 
-    from rlftsim.scenario.sources import SOURCES, units_of_files
+    from rlftsim.scenario.source import units_of_files
+    from rlftsim.scenario.sources import SOURCES
 
     @SOURCES.register("my_logs")
     class MyLogs:
@@ -23,96 +24,16 @@ Installed packages announce theirs by the entry-point group `rlftsim.sources`.
 
 import inspect
 import os
-import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from collections.abc import Iterable, Mapping
+from typing import Any
 
-from rlftsim.errors import BadRecordError, ConfigError, DataError
+from rlftsim.errors import ConfigError
 from rlftsim.plugins import ExtensionPoint
-from rlftsim.scenario.consistency import describe_contradictions
-from rlftsim.scenario.shards import refuse_unsound
-from rlftsim.scenario.tfrecord import OnError, SkippedRecord
-from rlftsim.scenario.types import Scenario
+from rlftsim.scenario.source import DataSource
 
 AUTO = "auto"
 DEFAULT_SOURCE = "womd"
 """Reads what no source recognizes, and says what is wrong with it."""
-CONTRADICTORY = "scenarios whose velocities or headings contradict their positions: `rlftsim data verify` names them"
-_SPLIT = re.compile(r"training|validation|testing")
-
-
-@dataclass(frozen=True)
-class Unit:
-    """One piece of work of a source. It becomes one shard of the data set."""
-
-    name: str
-    """Differs from those of all other units of a path; the shard is named after it."""
-    files: tuple[Path, ...]
-    """All files that are read for it. When one of them changes, the unit is converted again."""
-    split: str = "unknown"
-    url: str = ""
-    """Address of its only file, where that is not on this machine; then `files` is empty."""
-    url_bytes: int = 0
-
-    @property
-    def size(self) -> int:
-        """Bytes of the files that are there."""
-        return self.url_bytes + sum(file.stat().st_size for file in self.files if file.exists())
-
-
-class BytesRead(int):
-    """Bytes of a unit that were read since the last report: moves the progress bar. Sources may leave them out."""
-
-
-@dataclass(frozen=True)
-class Tally:
-    """Something that happened in a unit and that its user should know the number of; sums are in the report."""
-
-    what: str
-    count: int
-
-
-Item = Scenario | SkippedRecord | BytesRead | Tally
-"""Yielded by a source: a scenario, the cause why a record is none, progress, or something to be counted."""
-
-
-@runtime_checkable
-class DataSource(Protocol):
-    """Reader of one kind of files.
-
-    It may also have `detects(path) -> bool`, True for files of its kind, which `convert` calls when no source is named.
-    Arguments of a source's class are options of `convert`. A source is pickled when several processes convert.
-    """
-
-    license_note: str
-    """License of the data, for the manifest of the data set."""
-
-    def find(self, path: str | os.PathLike[str]) -> Sequence[Unit]:
-        """Units of work at a path, in a fixed order.
-
-        Raises:
-            DataError: there are none.
-        """
-        ...
-
-    def read(self, unit: Unit) -> Iterator[Item]:
-        """Scenarios of a unit, the same ones in the same order each time.
-
-        A bad record is yielded as a `SkippedRecord`, so that those after it can still be read. A `DataError` that is
-        raised costs the rest of the unit.
-        """
-        ...
-
-    def describe(self) -> Mapping[str, object]:
-        """Plain JSON values for the provenance in the manifest, above all what had to be guessed.
-
-        A unit is converted again when they change.
-        """
-        ...
-
-
 _SHIPPED = {
     DEFAULT_SOURCE: "rlftsim.scenario.womd:WomdSource",
     "av2": "rlftsim.scenario.av2:Av2Source",
@@ -166,91 +87,6 @@ def guessed_note(sources: Iterable[str], guessed: Iterable[str]) -> str:
     return (
         f"Data of {', '.join(names)} with guessed {', '.join(words)}: scores compare with others on the same data only."
     )
-
-
-def read_unit(
-    source: DataSource,
-    unit: Unit,
-    *,
-    on_error: OnError,
-    report: Callable[[SkippedRecord], None],
-    advance: Callable[[int], object] = lambda _: None,
-    tally: Callable[[Tally], object] = lambda _: None,
-) -> Iterator[tuple[int, Scenario]]:
-    """Read a unit; yields the number of the record, from 0, with its scenario.
-
-    Args:
-        source: reader of the unit.
-        unit: one of those that the source has found.
-        on_error: "stop" raises at the first bad record, "skip" reports it and goes on.
-        report: called with each skipped record, only under "skip".
-        advance: called with the number of bytes read since its last call, if the source counts them.
-        tally: called with what the source counts.
-
-    Raises:
-        BadRecordError: under "stop", a bad record: names file, record and cause.
-        DataError: a file cannot be read.
-    """
-    # Errors of the code that consumes the scenarios do not pass through here: only reading is inside the `try`.
-    record = 0
-    try:
-        for item in source.read(unit):
-            if isinstance(item, BytesRead):
-                advance(item)  # no record
-                continue
-            if isinstance(item, Tally):
-                tally(item)
-                continue
-            if isinstance(item, Scenario):
-                try:
-                    refuse_unsound(item)
-                except DataError as error:
-                    item = SkippedRecord(unit.name, record, str(error))
-            if isinstance(item, Scenario):
-                if describe_contradictions(item.tracks):
-                    tally(Tally(CONTRADICTORY, 1))
-                yield record, item
-            elif on_error == "stop":
-                raise DataError(str(item))
-            else:
-                report(item)
-            record += 1
-    except DataError as error:
-        if on_error == "stop":
-            raise BadRecordError(str(error)) from error
-        report(SkippedRecord(unit.name, record, str(error)))
-    except OSError as error:
-        raise DataError(f"{error.filename or unit.name}: cannot be read: {error.strerror or error}") from error
-
-
-def units_of_files(files: Sequence[Path]) -> list[Unit]:
-    """One unit per file, named by its path below the folder that all of them share.
-
-    Args:
-        files: at least one.
-    """
-    common = os.path.commonpath([file.absolute().parent for file in files])
-    return [Unit(file.absolute().relative_to(common).as_posix(), (file,), infer_split(file)) for file in files]
-
-
-def units_of_urls(sizes: Mapping[str, int]) -> list[Unit]:
-    """One unit per remote file, named as by `units_of_files`.
-
-    Args:
-        sizes: bytes of each file by its address; at least one.
-    """
-    paths = {url: Path("/" + url.partition("://")[2].lstrip("/")) for url in sizes}
-    names = units_of_files(list(paths.values()))
-    return [replace(unit, files=(), url=url, url_bytes=sizes[url]) for unit, url in zip(names, paths)]
-
-
-def infer_split(path: Path) -> str:
-    """Split by the name of a file or else of its folder: training, validation, testing or unknown."""
-    for name in (path.name, path.absolute().parent.name):
-        match = _SPLIT.search(name)
-        if match:
-            return match.group()
-    return "unknown"
 
 
 def _source(name: str, options: Mapping[str, object] | None = None) -> DataSource:

@@ -17,8 +17,6 @@ from jaxtyping import Bool, Shaped
 from rlftsim.errors import DataError
 
 VALIDATION, TUNE, EXAM = "validation", "tune", "exam"
-GENERATOR = "rlftsim.scenario.synthetic.generate"
-"""In the provenance of generated scenarios, which lists their street networks."""
 _AV2_WINDOW = re.compile(r"-(0|19)$")
 """End of the id of one of the two windows of a recording."""
 
@@ -56,7 +54,7 @@ def find_networks(dataset: Indexed) -> dict[str, str]:
         DataError: The manifest is damaged there.
     """
     provenance = dataset.manifest.provenance
-    if provenance.get("generator") != GENERATOR:
+    if "networks" not in provenance:
         return {}
     try:
         return {f"shards/{entry['shard']}": "/".join(map(str, entry["seed"])) for entry in provenance["networks"]}

@@ -26,7 +26,7 @@ from rlftsim.geometry import wrapped
 from rlftsim.jobs.tables import read_parquet
 from rlftsim.scenario.consistency import describe_contradictions
 from rlftsim.scenario.polylines import Heights, densify
-from rlftsim.scenario.sources import BytesRead, Item, Unit, units_of_files
+from rlftsim.scenario.source import BytesRead, Item, Unit, units_of_files
 from rlftsim.scenario.tfrecord import SkippedRecord
 from rlftsim.scenario.types import (
     CURRENT_STEP,

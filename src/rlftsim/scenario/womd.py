@@ -16,7 +16,7 @@ from google.protobuf.message import DecodeError
 
 from rlftsim.errors import DataError
 from rlftsim.scenario import womd_pb2
-from rlftsim.scenario.sources import BytesRead, Item, Unit, read_unit, units_of_files
+from rlftsim.scenario.source import BytesRead, Item, Unit, read_unit, units_of_files
 from rlftsim.scenario.tfrecord import RECORD_OVERHEAD_BYTES, OnError, SkippedRecord, log_skipped, read_records
 from rlftsim.scenario.types import (
     CURRENT_STEP,

@@ -26,7 +26,6 @@ from rlftsim.scenario.dataset import (
     write_index_and_manifest,
 )
 from rlftsim.scenario.shards import ShardReader, ShardWriter
-from rlftsim.scenario.splits import GENERATOR
 from rlftsim.scenario.synthetic import sumo
 from rlftsim.scenario.synthetic.windows import cut_scenarios
 from rlftsim.scenario.synthetic.world import simulate_world
@@ -162,7 +161,7 @@ def generate(
 
     # 1. Take over a finished data set of the same arguments, or claim the folder.
     provenance = {
-        "generator": GENERATOR,
+        "generator": __name__,
         "generator_version": GENERATOR_VERSION,
         "sumo_version": sumo.sumo_version(),
         "arguments": {**asdict(request), "splits": dict(request.fractions)},
