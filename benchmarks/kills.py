@@ -146,7 +146,7 @@ def start_fork_server():
 @contextmanager
 def ray_cluster():
     """Two raylets of one core each, in a process of their own: one with Ray's threads is not forked."""
-    import rlftsim.cluster.ray  # noqa: F401 (so that forked commands need not import it)
+    import rlftsim.jobs.ray  # noqa: F401 (so that forked commands need not import it)
 
     script = """
 import sys

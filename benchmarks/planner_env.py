@@ -17,8 +17,8 @@ import torch
 from rlftsim.envs import EgoEnv, EgoVectorEnv
 from rlftsim.envs.drive import DriveConfig, drive
 from rlftsim.evaluation.drive_results import compare_drives, format_drives
+from rlftsim.jobs.progress import print_wide
 from rlftsim.policies.registry import load_policy
-from rlftsim.progress import print_wide
 from rlftsim.rollout.simulate import simulate
 from rlftsim.rollout.types import AgentStates
 from rlftsim.scenario.batch import collate

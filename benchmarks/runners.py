@@ -20,7 +20,7 @@ from collections import Counter
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from rlftsim.workers import Inline, Processes, Share
+from rlftsim.jobs.runner import Inline, Processes, Share
 
 NUM_ITEMS, ITEM_S = 16, 5.0
 MANY = 20_000
@@ -72,7 +72,7 @@ def row_sleep(options):
 
 def row_share(options):
     """Everything that a run has more as a share: two locks, one of them let go and taken again."""
-    from rlftsim.lease import Lease
+    from rlftsim.jobs.lease import Lease
 
     start, number = time.process_time(), 1000
     with tempfile.TemporaryDirectory() as folder:
@@ -111,7 +111,7 @@ def ray_cluster():
 
 
 def row_ray(options):
-    from rlftsim.cluster.ray import RayRunner
+    from rlftsim.jobs.ray import RayRunner
 
     with ray_cluster():
         here, first, second = over_two(Processes(2)), over_two(RayRunner()), over_two(RayRunner())
@@ -122,7 +122,7 @@ def row_ray(options):
 
 
 def row_ray_memory(options):
-    from rlftsim.cluster.ray import RayRunner
+    from rlftsim.jobs.ray import RayRunner
 
     with ray_cluster():
         before = resident_mb()
@@ -134,8 +134,8 @@ def row_ray_memory(options):
 
 def row_ray_kills(options):
     """Kill workers of a Ray cluster at random moments, and now and then a raylet, until 100 are dead."""
-    from rlftsim.cluster.ray import RayRunner
-    from rlftsim.workers import SetAside
+    from rlftsim.jobs.ray import RayRunner
+    from rlftsim.jobs.runner import SetAside
 
     dice, kills, rounds = random.Random(0), Counter(), 0
 

@@ -13,9 +13,7 @@ PACKAGE = Path(rlftsim.__file__).parent
 FLOORS = (
     ("errors",),
     ("jobs",),
-    ("atomic_io", "geometry", "plugins", "progress", "statistics", "threads"),
-    ("workers", "storage"),
-    ("lease", "cluster"),
+    ("geometry", "plugins", "statistics"),
     ("scenario",),
     ("tokens", "goals"),
     ("rollout",),

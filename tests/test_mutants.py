@@ -27,20 +27,20 @@ READS = {
 PARSERS = {"json", "tomllib", "np", "numpy", "torch", "pickle", "tarfile"}
 """Modules whose `load`, `loads` and `open` do."""
 NO_FORMAT = {
-    "atomic_io": "copies and appends bytes that it does not look at",
-    "cluster.ray": "bytes of this program's own processes",
+    "jobs.files": "copies and appends bytes that it does not look at",
+    "jobs.ray": "bytes of this program's own processes",
     "jobs.arrays": "for modules that know the format",
-    "jobs.files": "for modules that know the format",
+    "jobs.documents": "for modules that know the format",
     "jobs.tables": "for modules that know the format",
-    "lease": "shows the text of a lock, damaged or not",
+    "jobs.lease": "shows the text of a lock, damaged or not",
     "policies.shipped.__init__": "weights in the box",
     "scenario.synthetic.recording": "what SUMO has just written",
-    "storage": "copies bytes that it does not look at",
+    "jobs.buckets": "copies bytes that it does not look at",
     "studio.server": "the page in the box",
     "submission.transfer": "copies bytes that it does not look at",
     "training.parallel": "bytes of this program's own processes",
     "viewer.page": "the page in the box",
-    "workers": "the machine's quota, and code that the user runs anyway",
+    "jobs.runner": "the machine's quota, and code that the user runs anyway",
 }
 """Modules that open files, and why they are none of the table of formats."""
 

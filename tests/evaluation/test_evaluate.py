@@ -14,6 +14,7 @@ from rlftsim.evaluation import evaluate as module
 from rlftsim.evaluation.evaluate import EvaluateConfig, Evaluation, evaluate
 from rlftsim.evaluation.results import NUMBERS_VERSION, SCORE_COLUMNS
 from rlftsim.evaluation.resumable import EvaluationParts, resume_evaluation
+from rlftsim.jobs.runner import Inline, Share, Unfinished
 from rlftsim.policies.smart.config import SmartConfig
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.realism import score
@@ -23,7 +24,6 @@ from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
 from rlftsim.scenario.types import HISTORY_STEPS
 from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
-from rlftsim.workers import Inline, Share, Unfinished
 
 CONFIG = EvaluateConfig(num_rollouts=4, rollouts_per_pass=2)
 

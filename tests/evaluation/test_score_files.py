@@ -17,6 +17,7 @@ from rlftsim.evaluation.evaluate import EvaluateConfig, evaluate
 from rlftsim.evaluation.results import SCORE_COLUMNS, Evaluation
 from rlftsim.evaluation.scenario_source import open_scenarios
 from rlftsim.evaluation.score_files import ScoreConfig, format_scores, score_rollouts, to_json
+from rlftsim.jobs.runner import Inline, Share, Unfinished
 from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.rollout.files import write_rollouts
 from rlftsim.rollout.simulate import simulate
@@ -24,7 +25,6 @@ from rlftsim.scenario import womd_pb2
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import write_dataset
 from rlftsim.scenario.tfrecord import write_records
-from rlftsim.workers import Inline, Share, Unfinished
 
 CONFIG = ScoreConfig(jobs=1)
 SCENARIOS = [

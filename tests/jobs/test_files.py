@@ -1,101 +1,202 @@
-import ast
-import math
+"""Files are there whole or not at all."""
+
+import errno
+import os
+import resource
+import stat
+import subprocess
+import sys
+import threading
 from pathlib import Path
 
 import pytest
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file
 
-import rlftsim
-from rlftsim.errors import CheckpointError, DataError
-from rlftsim.jobs.files import MAX_DEPTH, parse_json, read_json, read_toml
+from rlftsim.errors import DataError
+from rlftsim.jobs.files import (
+    append_text,
+    errors_name,
+    remove_folder,
+    remove_temporaries,
+    save_tensors,
+    write_text,
+    write_whole,
+)
 
-PACKAGE = Path(rlftsim.__file__).parent
+
+def names(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_a_failed_write_leaves_the_old_file_and_no_other(tmp_path, monkeypatch):
+    write_text(tmp_path / "page.html", "old")
+
+    def fail(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", fail)
+    with pytest.raises(DataError, match=r"cannot write .*page\.html \(No space left on device\): make room"):
+        write_text(tmp_path / "page.html", "new")
+    assert names(tmp_path) == ["page.html"]
+    assert (tmp_path / "page.html").read_text() == "old"
+
+
+def test_what_killed_writers_left_of_a_file_is_removed_and_nothing_else(tmp_path):
+    for name in (".a[1].json.host.12.tmp", ".a[1].json.other-host.7.tmp", ".b.json.host.12.tmp", "a[1].json"):
+        (tmp_path / name).touch()
+    remove_temporaries(tmp_path / "a[1].json")
+    assert names(tmp_path) == [".b.json.host.12.tmp", "a[1].json"]
+
+
+def test_an_interrupted_write_leaves_nothing(tmp_path):
+    def stopped(path):
+        path.write_text("half")
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_whole(tmp_path / "page.html", stopped)
+    assert names(tmp_path) == []
+
+
+def test_a_folder_that_is_a_file_is_named(tmp_path):
+    (tmp_path / "runs").write_text("")
+    cause = r"cannot write .*runs/config\.json \((Not a directory|File exists)\)"
+    with pytest.raises(DataError, match=rf"{cause}: \S+/runs is a file, not a folder: choose another place\.$"):
+        write_text(tmp_path / "runs" / "config.json", "{}")
+
+
+def test_only_a_full_disk_needs_room(tmp_path):
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(DataError, match=r"cannot write .*/folder \(Is a directory\): it is a folder: name a file\.$"):
+        write_text(tmp_path / "folder", "text")
+    with pytest.raises(DataError, match=r"\(Permission denied\): choose another place"), errors_name(tmp_path):
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+
+@pytest.mark.parametrize("cause", [errno.EACCES, errno.EROFS])
+def test_a_place_where_tensors_may_not_be_written_needs_no_room(cause, tmp_path, monkeypatch):
+    def refused(*_, **__):
+        text = f'{os.strerror(cause)} (os error {cause}) at path "{tmp_path}/.tmpKuy0Um"'
+        raise SafetensorError(f"Error while serializing: I/O error: {text}")
+
+    monkeypatch.setattr("rlftsim.jobs.files.save_file", refused)
+    with pytest.raises(DataError, match=rf"safetensors \({os.strerror(cause)}\): choose another place, then run"):
+        save_tensors(tmp_path / "a.safetensors", {"x": torch.zeros(3)})
+
+
+def test_tensors_come_back_and_all_users_may_read_them(tmp_path):
+    save_tensors(tmp_path / "new" / "a.safetensors", {"x": torch.arange(6.0).view(2, 3).T})
+    assert torch.equal(load_file(tmp_path / "new" / "a.safetensors")["x"], torch.arange(6.0).view(2, 3).T)
+    mask = os.umask(0)
+    os.umask(mask)
+    assert stat.S_IMODE((tmp_path / "new" / "a.safetensors").stat().st_mode) == 0o666 & ~mask
+
+
+@pytest.fixture
+def full_disk():
+    """No file may grow beyond a kilobyte, as if the disk were full behind it."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1024, before[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 @pytest.mark.parametrize(
-    ("text", "cause"),
+    "write",
     [
-        ("[" * 100_000, "nested more than 64 deep"),
-        ('{"a":' * 900 + "1" + "}" * 900, "nested more than 64 deep"),
-        ('{"a": 1, "b": 2, "a": 3}', "'a' is written more than once"),
-        ('{"a": NaN}', "NaN is no finite number"),
-        ('{"a": -1e999}', "-1e999 is no finite number"),
-        ('{"a": ' + "9" * 5000 + "}", "a whole number of 5000 digits"),
-        ('{"a": "\\ud800"}', "half a character, U+D800"),
-        ('{"a": 1', "not JSON, line 1, column 8"),
-        (b"\xff\xfe{", "not text in UTF-8"),
-        ("[1]", "holds a list instead of an object"),
-        ("7", "holds a number instead of an object"),
-        ("", "not JSON, line 1, column 1"),
+        lambda path: write_text(path, "x" * 5000),
+        lambda path: append_text(path, "x" * 5000),
+        lambda path: save_tensors(path, {"x": torch.zeros(5000)}),
+        lambda path: write_whole(path, lambda temporary: temporary.write_bytes(b"x" * 5000)),
     ],
+    ids=["write_text", "append_text", "save_tensors", "write_whole"],
 )
-def test_json_that_no_reader_could_use_is_refused_in_one_line_with_the_way_out(text, cause):
-    with pytest.raises(CheckpointError) as error:
-        parse_json(text, "write it again", source="model/config.json", error=CheckpointError)
-    message = str(error.value)
-    assert message.startswith("model/config.json: ")
-    assert cause in message
-    assert message.endswith(": write it again.")
-    assert "\n" not in message
-    assert len(message) < 200
+def test_a_write_that_does_not_fit_names_its_path_in_one_line(write, tmp_path, full_disk):
+    (tmp_path / "run").mkdir()
+    with pytest.raises(DataError, match=r"cannot write .*run/file \(.+\): make room or choose another place") as caught:
+        write(tmp_path / "run" / "file")
+    assert "\n" not in str(caught.value)
+    assert [name for name in names(tmp_path / "run") if name.startswith(".")] == []  # no temporary file
 
 
-def test_json_is_read_with_a_mark_in_front_to_the_greatest_depth(tmp_path):
-    path = tmp_path / "a.json"
-    path.write_bytes(b"\xef\xbb\xbf" + b'{"a": ' + b"[" * (MAX_DEPTH - 1) + b"]" * (MAX_DEPTH - 1) + b', "b": 1e3}')
-    assert read_json(path, "write it again")["b"] == 1000.0
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="a device that is always full")
+def test_a_full_disk_is_named_where_lines_are_added():
+    with pytest.raises(DataError, match=r"cannot write /dev/full \(No space left on device\): make room"):
+        append_text(Path("/dev/full"), "a line\n")
 
 
-def test_metrics_may_hold_nan():
-    assert math.isnan(parse_json('{"loss": NaN}', "train again", source="line 1", allow_nan=True)["loss"])
+def test_lines_are_added_to_what_is_there(tmp_path):
+    append_text(tmp_path / "lines", "one\n")
+    append_text(tmp_path / "lines", "two\n")
+    assert (tmp_path / "lines").read_text() == "one\ntwo\n"
 
 
-def test_a_missing_file_is_the_callers_to_explain_and_a_folder_is_refused(tmp_path):
-    with pytest.raises(FileNotFoundError):
-        read_json(tmp_path / "no.json", "write it")
-    with pytest.raises(DataError, match=r"cannot be read .*: write it\.$"):
-        read_json(tmp_path, "write it")
+def test_errors_that_are_not_of_the_system_pass_as_they_are(tmp_path):
+    with pytest.raises(KeyError), errors_name(tmp_path):
+        raise KeyError("x")
 
 
-@pytest.mark.parametrize(("read", "size"), [(read_json, 65 << 20), (read_toml, 2 << 20)])
-def test_a_text_larger_than_any_is_refused_before_it_is_read(tmp_path, read, size):
-    with (tmp_path / "large").open("wb") as file:
-        file.truncate(size)
-    with pytest.raises(DataError, match=r"larger than \d+ MiB"):
-        read(tmp_path / "large", "write it again")
+def test_a_symbolic_link_stays_and_its_target_is_replaced_whole(tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    target, link = tmp_path / "elsewhere" / "goals.json", tmp_path / "goals.json"
+    target.write_text("old")
+    link.symlink_to(target)
+    write_text(link, "new")
+    assert (link.is_symlink(), target.read_text()) == (True, "new")
+    assert names(tmp_path / "elsewhere") == ["goals.json"]
+    (tmp_path / "to_nothing").symlink_to("elsewhere/later.json")
+    write_text(tmp_path / "to_nothing", "new")
+    assert (tmp_path / "elsewhere" / "later.json").read_text() == "new"
 
 
-def test_a_device_without_end_is_read_to_the_limit_only(monkeypatch):
-    monkeypatch.setattr("rlftsim.jobs.files.MAX_TEXT_BYTES", 1000)
-    with pytest.raises(DataError, match="larger than"):
-        read_json("/dev/zero", "write it again")
+def test_a_pipe_is_written_through_and_stays(tmp_path):
+    pipe, received = tmp_path / "pipe", []
+    os.mkfifo(pipe)
+    reader = threading.Thread(target=lambda: received.append(pipe.read_text()))
+    reader.start()
+    write_text(pipe, "bytes")
+    reader.join(timeout=10)
+    assert received == ["bytes"]
+    assert stat.S_ISFIFO(pipe.stat().st_mode)
+    assert names(tmp_path) == ["pipe"]
 
 
-def test_toml_is_read_with_a_mark_in_front(tmp_path):
-    (tmp_path / "e.toml").write_bytes(b'\xef\xbb\xbfname = "a"\r\nborn = 2020-01-01\r\n')
-    assert read_toml(tmp_path / "e.toml", "write one")["name"] == "a"
+def test_a_device_is_written_through_and_stays(tmp_path):
+    device = tmp_path / "null"
+    try:
+        os.mknod(device, 0o666 | stat.S_IFCHR, os.makedev(1, 3))
+    except PermissionError:
+        pytest.skip("needs root")
+    write_text(device, "nothing")
+    assert stat.S_ISCHR(device.stat().st_mode)
 
 
-@pytest.mark.parametrize(
-    ("text", "cause"),
-    [
-        (b"x = " + b"[" * 3000, "nested more than 64 deep"),
-        (b"x = 1\nx = 2", "not TOML: "),
-        (b"x = \xff", "not text in UTF-8"),
-    ],
-)
-def test_toml_that_is_damaged_is_refused_in_one_line(tmp_path, text, cause):
-    (tmp_path / "e.toml").write_bytes(text)
-    with pytest.raises(DataError) as error:
-        read_toml(tmp_path / "e.toml", "write one")
-    assert cause in str(error.value)
-    assert "\n" not in str(error.value)
+def test_a_folder_is_removed_only_with_what_its_writer_names(tmp_path):
+    folder = tmp_path / "update-00000001"
+    folder.mkdir()
+    for name in ("policy.safetensors", ".policy.safetensors.host.7.tmp", "notes.txt"):
+        (folder / name).touch()
+    remove_folder(folder, ["policy.safetensors", "missing.json"])
+    assert names(folder) == ["notes.txt"]
+    (folder / "notes.txt").unlink()
+    remove_folder(folder, [])
+    remove_folder(folder, [])
+    assert names(tmp_path) == []
 
 
-def test_no_other_module_parses_json_or_toml():
-    for path in PACKAGE.rglob("*.py"):
-        if path == PACKAGE / "jobs" / "files.py":
-            continue
-        for node in ast.walk(ast.parse(path.read_text())):
-            is_parser = isinstance(node, ast.Attribute) and node.attr in ("loads", "load")
-            assert not (is_parser and isinstance(node.value, ast.Name) and node.value.id in ("json", "tomllib")), path
-            assert not (isinstance(node, ast.ImportFrom) and node.module in ("json", "tomllib")), path
+def test_tensors_have_the_same_bytes_in_each_process(tmp_path):
+    code = """
+import sys
+from pathlib import Path
+import torch
+from rlftsim.jobs.files import save_tensors
+tensors = {f"t{i}": torch.arange(i, dtype=torch.float32 if i % 2 else torch.int64) for i in range(6)}
+save_tensors(Path(sys.argv[1]), tensors, {f"näme {i}": '"\\n' * i for i in range(12)})
+"""
+    paths = [tmp_path / f"{n}.safetensors" for n in range(3)]
+    for path in paths:
+        subprocess.run([sys.executable, "-c", code, str(path)], check=True)
+    assert len({path.read_bytes() for path in paths}) == 1
+    assert load_file(paths[0])["t4"].tolist() == [0, 1, 2, 3]

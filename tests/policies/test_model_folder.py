@@ -5,9 +5,9 @@ import pytest
 import torch
 from torch import nn
 
-from rlftsim.atomic_io import save_tensors
 from rlftsim.errors import CheckpointError
 from rlftsim.jobs.arrays import read_tensors
+from rlftsim.jobs.files import save_tensors
 from rlftsim.policies.checkpoint import SHIPPED_MODELS, load_strictly
 from rlftsim.policies.registry import load_policy
 

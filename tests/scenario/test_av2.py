@@ -17,6 +17,7 @@ import scenes
 from av2_files import clipped_edges, crop_box, left_of_nearest, map_archive, track_rows, write_av2
 from rlftsim.cli.main import main
 from rlftsim.errors import ConfigError, DataError
+from rlftsim.jobs.runner import Inline, Joining, Share, Unfinished
 from rlftsim.realism import metric_by_name, scenario_log, score
 from rlftsim.realism.from_rollouts import logged_states
 from rlftsim.scenario import av2_map
@@ -34,7 +35,6 @@ from rlftsim.scenario.types import (
     MapFeatureType,
     ObjectType,
 )
-from rlftsim.workers import Inline, Joining, Share, Unfinished
 
 SAMPLE = "0a1e6f0a-1817-4a98-b02e-db8c9327d151"
 

@@ -9,17 +9,17 @@ import pytest
 
 import rlftsim as rs
 from full_disk import limit_files_to
-from rlftsim import storage
 from rlftsim.cli.main import main
 from rlftsim.errors import ConfigError, DataError, NotYetError
 from rlftsim.evaluation.evaluate import EvaluateConfig, evaluate
-from rlftsim.lease import Lease, remote_lease
+from rlftsim.jobs import buckets
+from rlftsim.jobs.buckets import fetch_shard
+from rlftsim.jobs.lease import Lease, remote_lease
+from rlftsim.jobs.runner import Inline, Share, Unfinished
 from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.scenario.convert import convert
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
 from rlftsim.scenario.transfer import pull_dataset, push_dataset
-from rlftsim.storage import fetch_shard
-from rlftsim.workers import Inline, Share, Unfinished
 
 
 @pytest.fixture(scope="module")
@@ -72,13 +72,13 @@ def contents(folder):
 @pytest.fixture
 def fetched(monkeypatch):
     """Addresses of the files that are fetched, in turn."""
-    names, fetch = [], storage.fetch
+    names, fetch = [], buckets.fetch
 
     def count(url, path, sha256=None):
         names.append(url.partition("bucket/")[2])
         return fetch(url, path, sha256)
 
-    monkeypatch.setattr(storage, "fetch", count)
+    monkeypatch.setattr(buckets, "fetch", count)
     return names
 
 
@@ -127,7 +127,7 @@ def test_an_evaluation_from_a_bucket_is_shared_and_refuses_a_second_driver(bucke
 
 def test_sources_in_a_bucket_are_converted_to_the_same_bytes(bucket, source, data, tmp_path):
     for path in source.rglob("*tfrecord*"):
-        storage.publish(path, f"{bucket}/womd/{path.relative_to(source).as_posix()}")
+        buckets.publish(path, f"{bucket}/womd/{path.relative_to(source).as_posix()}")
     for place in (f"{bucket}/womd", f"{bucket}/womd/training/*tfrecord*"):
         convert(place, tmp_path / "from_bucket", jobs=1, show_progress=False)
         assert contents(tmp_path / "from_bucket") == contents(data)
@@ -137,7 +137,7 @@ def test_sources_in_a_bucket_are_converted_to_the_same_bytes(bucket, source, dat
 
 def cut_push(folder, url, monkeypatch):
     """A push that ends when all shards are there."""
-    publish = storage.publish
+    publish = buckets.publish
 
     def cut(path, url):
         if path.name == "index.parquet":
@@ -175,11 +175,11 @@ def test_two_pushes_to_one_place_do_not_mix_and_a_killed_one_is_taken_over(
         renew()
         with pytest.raises(NotYetError, match=owner + rf" or remove {url}/\.lease if it is gone"):
             push_dataset(data, url, show_progress=False)
-    storage.put_text(f"{url}/.lease", "gone process 1 since 2026-01-01T00:00:00+00:00\n", is_new=True)
+    buckets.put_text(f"{url}/.lease", "gone process 1 since 2026-01-01T00:00:00+00:00\n", is_new=True)
     push_dataset(data, url, show_progress=False)
     assert f"{url}: taken over from gone process 1, silent for " in capsys.readouterr().err
     with pytest.raises(DataError, match="there is no such file"):
-        storage.get_text(f"{url}/.lease")
+        buckets.get_text(f"{url}/.lease")
     pull_dataset(url, tmp_path / "back", show_progress=False)
     assert contents(tmp_path / "back") == contents(data)
 
@@ -187,10 +187,10 @@ def test_two_pushes_to_one_place_do_not_mix_and_a_killed_one_is_taken_over(
 def test_a_push_that_was_taken_over_leaves_the_new_owner_alone(tmp_path):
     url, other = f"file://{tmp_path}", "other process 1 since 2026-01-01T00:00:00+00:00\n"
     with remote_lease(url, "is copying to") as renew:
-        storage.put_text(f"{url}/.lease", other, is_new=False)
+        buckets.put_text(f"{url}/.lease", other, is_new=False)
         with pytest.raises(NotYetError, match=f"other process 1 has taken over {url}"):
             renew()
-    assert storage.get_text(f"{url}/.lease") == other
+    assert buckets.get_text(f"{url}/.lease") == other
 
 
 def test_a_push_to_a_folder_leaves_whole_files_or_none(data, tmp_path, monkeypatch):
@@ -204,7 +204,7 @@ def test_a_push_to_a_folder_leaves_whole_files_or_none(data, tmp_path, monkeypat
         limit_files_to(size // 2),
         pytest.raises(DataError, match=r"^cannot write file://.* \(File too large\): make room there"),
     ):
-        storage.publish(data / manifest, f"file://{there}/{manifest}")
+        buckets.publish(data / manifest, f"file://{there}/{manifest}")
     with (
         limit_files_to(10),
         pytest.raises(DataError, match=r"^cannot write file://.*/\.lease \(File too large\): make room"),
@@ -255,7 +255,7 @@ def test_a_pull_that_is_cut_short_goes_on_and_disturbs_no_other_work(bucket, dat
     def cut(url, path, sha256):
         if fetched:
             raise DataError("cut")
-        fetched.append(storage.fetch(url, path, sha256))
+        fetched.append(buckets.fetch(url, path, sha256))
 
     with monkeypatch.context() as patch:
         patch.setattr("rlftsim.scenario.transfer.fetch", cut)
@@ -289,7 +289,7 @@ def test_a_shard_that_was_replaced_in_the_bucket_is_refused(bucket, data, tmp_pa
     push_dataset(data, f"{bucket}/set", show_progress=False)
     entry = json.loads((data / "manifest.json").read_text())["shards"][0]["file"]
     (tmp_path / "other").write_bytes(b"other")
-    storage.publish(tmp_path / "other", f"{bucket}/set/{entry}")
+    buckets.publish(tmp_path / "other", f"{bucket}/set/{entry}")
     with pytest.raises(DataError, match="damaged or replaced: its checksum is not that of the manifest"):
         ScenarioDataset(f"{bucket}/set")[0]
     assert not list((tmp_path / "cache").rglob("*.tmp"))
@@ -301,7 +301,7 @@ def test_the_cache_keeps_what_was_used_last(tmp_path, monkeypatch):
     shas = {}
     for number in range(3):
         (tmp_path / str(number)).write_bytes(bytes([number]) * 1000)
-        shas[number] = storage.fetch(f"file://{tmp_path}/{number}", tmp_path / "any")
+        shas[number] = buckets.fetch(f"file://{tmp_path}/{number}", tmp_path / "any")
     kept = {}
     for age, number in enumerate((0, 1, 0, 2)):
         path = fetch_shard(f"file://{tmp_path}/{number}", shas[number])
@@ -313,7 +313,7 @@ def test_the_cache_keeps_what_was_used_last(tmp_path, monkeypatch):
 def test_the_cache_gets_rid_of_what_killed_processes_left(tmp_path, monkeypatch):
     monkeypatch.setenv("RLFTSIM_CACHE", str(tmp_path / "cache"))
     (tmp_path / "file").write_bytes(b"shard")
-    sha = storage.fetch(f"file://{tmp_path}/file", tmp_path / "any")
+    sha = buckets.fetch(f"file://{tmp_path}/file", tmp_path / "any")
     shards = tmp_path / "cache" / "shards"
     shards.mkdir(parents=True)
     same, old, recent = (shards / f".{name}.machine.12.tmp" for name in (sha, "old", "recent"))
@@ -390,7 +390,7 @@ def test_sources_at_a_file_address_are_converted_to_the_same_bytes(source, data,
 def test_a_full_disk_is_not_blamed_on_the_bucket(tmp_path):
     (tmp_path / "source").write_bytes(bytes(100_000))
     with limit_files_to(20_000), pytest.raises(DataError, match=r"cannot write .*copy .*: make room or choose another"):
-        storage.fetch(f"file://{tmp_path}/source", tmp_path / "copy")
+        buckets.fetch(f"file://{tmp_path}/source", tmp_path / "copy")
     assert [path.name for path in tmp_path.iterdir()] == ["source"]
 
 

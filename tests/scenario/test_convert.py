@@ -12,12 +12,12 @@ import pytest
 
 from rlftsim.cli.main import main
 from rlftsim.errors import ConfigError, DataError
+from rlftsim.jobs.runner import Inline, Share, Unfinished
 from rlftsim.scenario.convert import convert
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.inspect import verify_dataset
 from rlftsim.scenario.source import infer_split
 from rlftsim.scenario.womd import read_scenarios
-from rlftsim.workers import Inline, Share, Unfinished
 
 
 @pytest.fixture

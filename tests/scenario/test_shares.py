@@ -13,16 +13,16 @@ from typing import get_type_hints
 import pytest
 
 from full_disk import limit_files_to
-from rlftsim import lease
 from rlftsim.cli.machines import Machines, Work
 from rlftsim.cli.main import HAVE_SHARES, VERBS, main
 from rlftsim.cli.submit import Build
 from rlftsim.errors import ConfigError, DataError, NotYetError
 from rlftsim.evaluation.evaluate import EvaluateConfig, evaluate
-from rlftsim.lease import Lease
+from rlftsim.jobs import lease
+from rlftsim.jobs.lease import Lease
+from rlftsim.jobs.runner import Inline, Share, Unfinished
 from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.scenario.convert import convert
-from rlftsim.workers import Inline, Share, Unfinished
 
 CONFIG = EvaluateConfig(num_rollouts=2, limit=9)
 

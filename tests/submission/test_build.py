@@ -20,6 +20,7 @@ import scenes
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.evaluate import simulate_states
 from rlftsim.evaluation.rollout_files import find_rollouts, read_states
+from rlftsim.jobs.runner import Inline, Share, Unfinished
 from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.rollout.check import check_policy
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
@@ -29,7 +30,6 @@ from rlftsim.submission.check import check_archive
 from rlftsim.submission.closed_loop import refuse_open_loop, statement
 from rlftsim.submission.messages import round_states
 from rlftsim.submission.plan import refuse_incomplete, refuse_other_sources
-from rlftsim.workers import Inline, Share, Unfinished
 
 NUM_SHARDS = 6
 

@@ -8,13 +8,13 @@ import torch
 
 import tiny
 from rlftsim.errors import CheckpointError, ConfigError, NotYetError
-from rlftsim.lease import Lease
+from rlftsim.jobs.lease import Lease
+from rlftsim.jobs.runner import Inline
 from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.training import imitation
 from rlftsim.training.goal_relabeling import GcslConfig, gcsl_finetune
 from rlftsim.training.run import require_trainable
 from rlftsim.training.run_folder import read_metrics
-from rlftsim.workers import Inline
 
 GCSL = GcslConfig(epochs=1.0, batch_size=1, num_rollouts=2, device=tiny.CPU)
 

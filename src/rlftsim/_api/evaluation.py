@@ -14,11 +14,11 @@ from rlftsim.evaluation import evaluate as evaluation
 from rlftsim.evaluation.compare import Comparison
 from rlftsim.evaluation.compare import compare as compare_evaluations
 from rlftsim.evaluation.results import EvaluateConfig, Evaluation
+from rlftsim.jobs.buckets import require_folder
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import Policy, Sampling
 from rlftsim.scenario.any_form import AnyScenarios, Name, scenarios_of
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
-from rlftsim.storage import require_folder
 
 ORACLE = "oracle"
 

@@ -12,7 +12,7 @@ from rlftsim.evaluation.evaluate import frozen_copy
 from rlftsim.goals.maneuvers.reach import HORIZON_S
 from rlftsim.goals.placement import FASTEST_MPS
 from rlftsim.goals.types import Goals, PointById
-from rlftsim.progress import progress_bar
+from rlftsim.jobs.progress import progress_bar
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import Policy, Sampling, device_of, is_goal_conditioned, is_training
 from rlftsim.rollout.simulate import simulate as simulate_batch

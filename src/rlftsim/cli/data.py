@@ -10,15 +10,15 @@ from tyro.conf import Positional
 
 from rlftsim.cli.machines import Machines, Work
 from rlftsim.errors import ConfigError
-from rlftsim.progress import print_wide
+from rlftsim.jobs.buckets import is_url
+from rlftsim.jobs.progress import print_wide
+from rlftsim.jobs.runner import usable_cores
 from rlftsim.scenario.convert import convert
 from rlftsim.scenario.inspect import DatasetStats, dataset_stats, verify_dataset
 from rlftsim.scenario.open import dataset_folder
 from rlftsim.scenario.synthetic.generate import generate
 from rlftsim.scenario.tfrecord import count_lost
 from rlftsim.scenario.transfer import pull_dataset, push_dataset
-from rlftsim.storage import is_url
-from rlftsim.workers import usable_cores
 
 MAX_LISTED = 20
 

@@ -6,9 +6,9 @@ from typing import Literal
 
 from rlftsim.evaluation.evaluate import EvaluateConfig
 from rlftsim.experiments.demo import DemoConfig, run_demo
+from rlftsim.jobs.runner import usable_cores
 from rlftsim.recipes.smart import smart_demo_quick, smart_demo_rlftsim
 from rlftsim.scenario.synthetic import pack_path
-from rlftsim.workers import usable_cores
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from rlftsim.errors import ConfigError
-from rlftsim.progress import print_wide
+from rlftsim.jobs.progress import print_wide
 from rlftsim.scenario.inspect import verify_dataset
 from rlftsim.scenario.synthetic import pack_path
 

@@ -9,7 +9,7 @@ import tyro
 from tyro.conf import Positional
 
 from rlftsim.evaluation.drive_results import format_drives
-from rlftsim.progress import print_wide
+from rlftsim.jobs.progress import print_wide
 
 
 @dataclass(frozen=True)

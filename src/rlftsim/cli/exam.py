@@ -11,10 +11,10 @@ from rlftsim.evaluation.evaluate import EvaluateConfig, evaluation_name
 from rlftsim.experiments.exam import CHECKOUT, LEDGER, ExamConfig, take_exam
 from rlftsim.experiments.exam_report import write_exam
 from rlftsim.experiments.ledger import Ledger
+from rlftsim.jobs.progress import print_wide
+from rlftsim.jobs.runner import usable_cores
 from rlftsim.policies.registry import Device, find_device
-from rlftsim.progress import print_wide
 from rlftsim.scenario.open import SYNTHETIC
-from rlftsim.workers import usable_cores
 
 
 @dataclass(frozen=True)

@@ -15,11 +15,11 @@ from rlftsim.experiments.model_specs import VARIED
 from rlftsim.experiments.registry import PAPER, experiment_by_name
 from rlftsim.experiments.results import run_experiment
 from rlftsim.experiments.suite import ExperimentSuite
+from rlftsim.jobs.progress import log, print_wide
+from rlftsim.jobs.runner import usable_cores
 from rlftsim.policies.registry import Device, find_device
-from rlftsim.progress import log, print_wide
 from rlftsim.recipes.base import SECTIONS
 from rlftsim.scenario.open import SYNTHETIC, dataset_folder
-from rlftsim.workers import usable_cores
 
 QUESTIONS = "; ".join(f"{name}: {experiment_by_name(name).question}" for name in PAPER)
 QUESTIONS += "; exam: Are models better where no choice was made? (see `rlftsim experiment exam --help`)"

@@ -10,7 +10,7 @@ from rlftsim.errors import DataError
 from rlftsim.evaluation.rollout_files import RolloutEntry, read_states
 from rlftsim.goals.attainment import Outcome, measure_outcome
 from rlftsim.goals.goals_file import GoalEntry, GoalsFile
-from rlftsim.progress import print_wide
+from rlftsim.jobs.progress import print_wide
 from rlftsim.realism import SimulatedStates
 from rlftsim.scenario.types import Scenario
 from rlftsim.viewer.goal_picture import DrawnGoal, GoalPanel, draw_goals

@@ -16,7 +16,7 @@ from rlftsim.goals.goals_file import GoalEntry, GoalsFile, check_single_goals, p
 from rlftsim.goals.maneuvers.proposals import Proposal, no_proposal_reason
 from rlftsim.goals.placement import distance_m, goal_warnings
 from rlftsim.jobs.folder import check_file
-from rlftsim.progress import log, print_wide
+from rlftsim.jobs.progress import log, print_wide
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.open import dataset_folder, refuse_unknown
 from rlftsim.scenario.types import CURRENT_STEP, ObjectType, Scenario

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rlftsim.errors import ConfigError
-from rlftsim.workers import Inline, OnDeath, Processes, Runner, Share
+from rlftsim.jobs.runner import Inline, OnDeath, Processes, Runner, Share
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Machines:
         if self.share is not None and self.ray is not None:
             raise ConfigError("--share and --ray are two ways to use several machines: choose one.")
         if self.ray is not None:
-            from rlftsim.cluster.ray import RayRunner
+            from rlftsim.jobs.ray import RayRunner
 
             return RayRunner(self.ray, on_death, self.item_log)
         here = Processes(jobs, on_death, self.item_log) if jobs > 1 else Inline(self.item_log)

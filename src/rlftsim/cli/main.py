@@ -15,7 +15,7 @@ from typing import Any
 from rlftsim import __version__
 from rlftsim.errors import ConfigError, RlftsimError, in_short, shorten
 from rlftsim.jobs.interruption import signals_like_ctrl_c
-from rlftsim.threads import keep_freed_memory
+from rlftsim.jobs.threads import keep_freed_memory
 
 VERBS = {
     "demo": ("rlftsim.cli.demo", "Demo"),

@@ -14,7 +14,7 @@ from typing import Any
 from rlftsim.cli.mistakes import FLAG, explain, flags_of
 from rlftsim.cli.stand_ins import stand_ins
 from rlftsim.errors import ConfigError
-from rlftsim.progress import log
+from rlftsim.jobs.progress import log
 
 HELP = ("-h", "--help")
 COUNTS = (

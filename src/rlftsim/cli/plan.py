@@ -13,14 +13,14 @@ from rich.table import Table
 from rlftsim.errors import DataError
 from rlftsim.evaluation.evaluate import EvaluateConfig, frozen_copy, simulate_states
 from rlftsim.evaluation.resumable import EvaluationParts
+from rlftsim.jobs.progress import progress_bar
+from rlftsim.jobs.threads import one_thread
 from rlftsim.policies.registry import load_policy
-from rlftsim.progress import progress_bar
 from rlftsim.realism import scenario_log, score
 from rlftsim.rollout.policy import device_of
 from rlftsim.scenario.convert import convert
 from rlftsim.scenario.open import open_dataset
 from rlftsim.submission.messages import encode_rollouts
-from rlftsim.threads import one_thread
 
 Plan = Literal["convert", "evaluate", "submit"]
 WOMD_SCENARIOS: dict[Plan, int] = {"convert": 576_000, "evaluate": 44_100, "submit": 44_920}

@@ -7,7 +7,7 @@ from importlib.metadata import entry_points
 from rich.table import Table
 
 from rlftsim.errors import ConfigError
-from rlftsim.progress import print_wide
+from rlftsim.jobs.progress import print_wide
 
 POINTS = {
     "rlftsim.policies": "rlftsim.policies.registry:POLICIES",

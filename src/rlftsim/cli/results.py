@@ -17,8 +17,8 @@ from rlftsim.evaluation.evaluate import EvaluateConfig, evaluate, evaluation_nam
 from rlftsim.evaluation.explain_page import explain_rollouts
 from rlftsim.evaluation.results import Evaluation
 from rlftsim.evaluation.score_files import ScoreConfig, format_scores, score_rollouts, to_json
+from rlftsim.jobs.progress import print_wide
 from rlftsim.policies.registry import Device, load_policy_or_oracle, with_guidance
-from rlftsim.progress import print_wide
 from rlftsim.scenario.open import dataset_folder
 
 

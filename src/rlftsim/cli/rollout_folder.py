@@ -5,12 +5,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from rlftsim.atomic_io import write_text
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.rollout_files import find_rollouts, read_states
-from rlftsim.jobs.files import read_json
+from rlftsim.jobs.documents import read_json
+from rlftsim.jobs.files import write_text
 from rlftsim.jobs.folder import check_folder
-from rlftsim.progress import log
+from rlftsim.jobs.progress import log
 
 ABOUT = "rollouts.json"
 """Model and settings of the rollouts in a folder."""

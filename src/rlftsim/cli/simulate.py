@@ -13,8 +13,8 @@ from rlftsim.cli.rollout_folder import claim_folder, left_to_simulate
 from rlftsim.errors import ConfigError
 from rlftsim.evaluation.exporters import exporter_by_name
 from rlftsim.goals.placement import goals_of_batch
+from rlftsim.jobs.progress import log, progress_bar
 from rlftsim.policies.registry import Device, load_policy, with_guidance
-from rlftsim.progress import log, progress_bar
 from rlftsim.rollout.files import write_rollouts
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import Sampling, device_of, is_goal_conditioned

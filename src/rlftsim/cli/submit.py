@@ -14,8 +14,8 @@ from rlftsim.evaluation.evaluate import EvaluateConfig, evaluation_name, frozen_
 from rlftsim.evaluation.scenario_source import choose_scenarios
 from rlftsim.evaluation.score_files import format_scores
 from rlftsim.jobs.folder import check_file
+from rlftsim.jobs.progress import print_wide
 from rlftsim.policies.registry import Device, load_policy
-from rlftsim.progress import print_wide
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.simulate import refuse_sampling
 from rlftsim.scenario.open import open_dataset

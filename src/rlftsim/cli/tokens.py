@@ -12,8 +12,8 @@ from rich.table import Table
 from rlftsim.cli.recipe_verb import DEFAULT_RECIPE, RecipeVerb, value_of
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.jobs.folder import check_file
+from rlftsim.jobs.progress import log, print_wide
 from rlftsim.policies.smart.catk_vocabulary import read_catk_vocabulary
-from rlftsim.progress import log, print_wide
 from rlftsim.recipes.base import Recipe
 from rlftsim.recipes.registry import recipe_by_name
 from rlftsim.scenario.open import open_dataset

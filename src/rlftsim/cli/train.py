@@ -14,8 +14,8 @@ from rlftsim.errors import ConfigError, RlftsimError
 from rlftsim.evaluation.calibration_picture import write_calibration_picture
 from rlftsim.evaluation.learning_curve import write_learning_curve
 from rlftsim.experiments.stages import GoalConditioning, finetune_model, pretrain_policy
+from rlftsim.jobs.progress import log
 from rlftsim.policies.registry import load_policy
-from rlftsim.progress import log
 from rlftsim.recipes.base import Recipe
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.open import open_dataset, splits_of

@@ -31,13 +31,13 @@ from rlftsim.evaluation.resumable import (
     refuse_to_leave_out,
 )
 from rlftsim.evaluation.scenario_source import hash_manifest
-from rlftsim.lease import Lease
-from rlftsim.progress import log
+from rlftsim.jobs.lease import Lease
+from rlftsim.jobs.progress import log
+from rlftsim.jobs.runner import on_this_machine
 from rlftsim.scenario.open import dataset_folder
 from rlftsim.scenario.types import Scenario
 from rlftsim.statistics import mean_interval
 from rlftsim.viewer.film import to_film
-from rlftsim.workers import on_this_machine
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from rlftsim.envs.episode import Episode, EpisodeState, repeat, start
 from rlftsim.envs.source import Source
 from rlftsim.envs.world import Dice
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.jobs.files import parse_json
+from rlftsim.jobs.documents import parse_json
 from rlftsim.scenario.types import CURRENT_STEP
 
 FORMAT = "rlftsim-snapshot-1"

@@ -11,13 +11,13 @@ from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.episode import Episode, ScenarioGoals, build_episode
 from rlftsim.envs.world import build_world
 from rlftsim.errors import ConfigError, in_short
+from rlftsim.jobs.threads import one_thread
 from rlftsim.policies.registry import load_policy
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import Policy, device_of, is_goal_conditioned, is_training
 from rlftsim.scenario.any_form import AnyScenarios, scenarios_of
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.types import Scenario, Scenarios, scenario_ids_of
-from rlftsim.threads import one_thread
 
 KEPT_CONTEXTS = 16
 """Encoded scenarios that are kept: encoding is most of the cost of a reset."""

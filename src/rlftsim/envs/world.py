@@ -27,12 +27,12 @@ from rlftsim.envs.idm import IdmConfig, IdmLines, advance_idm, idm_lines
 from rlftsim.envs.scene import Scene, build_env_scene
 from rlftsim.errors import ConfigError, in_short
 from rlftsim.goals.types import Goals, PointById
+from rlftsim.jobs.threads import one_thread
 from rlftsim.rollout.noise import draw_noise
 from rlftsim.rollout.policy import Policy, Sampling, device_of
 from rlftsim.rollout.types import AgentStates
 from rlftsim.scenario.batch import ScenarioBatch, collate
 from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, STEP_S, TOTAL_STEPS, Scenario
-from rlftsim.threads import one_thread
 
 IDM = IdmConfig()
 Noise = Literal["same", "new"]

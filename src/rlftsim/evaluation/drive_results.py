@@ -12,11 +12,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from rich.table import Table
 
-from rlftsim.atomic_io import write_whole
 from rlftsim.errors import DataError, require_types
 from rlftsim.evaluation.columns import ARROWS, direction_of, format_number
 from rlftsim.evaluation.compare import PairedDifference, compare_paired
-from rlftsim.jobs.files import parse_json
+from rlftsim.jobs.documents import parse_json
+from rlftsim.jobs.files import write_whole
 from rlftsim.jobs.tables import read_parquet, read_parquet_metadata
 from rlftsim.statistics import mean_interval
 

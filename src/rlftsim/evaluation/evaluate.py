@@ -28,6 +28,8 @@ from rlftsim.evaluation.resumable import EvaluationParts, groups_of, resume_eval
 from rlftsim.evaluation.scenario_source import choose_scenarios, hash_manifest, open_held_out
 from rlftsim.goals.logged import logged_goals
 from rlftsim.goals.types import Goals
+from rlftsim.jobs.buckets import require_folder
+from rlftsim.jobs.runner import Runner, on_this_machine
 from rlftsim.realism import SimulatedStates, metric_by_name, scenario_log, score
 from rlftsim.realism.from_rollouts import logged_states, states_of_rollouts
 from rlftsim.rollout.fingerprint import fingerprint_policy
@@ -36,8 +38,6 @@ from rlftsim.rollout.simulate import refuse_sampling, simulate
 from rlftsim.scenario.batch import ScenarioBatch, collate
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.types import Scenario
-from rlftsim.storage import require_folder
-from rlftsim.workers import Runner, on_this_machine
 
 __all__ = [
     "EvaluateConfig",
@@ -76,7 +76,7 @@ def evaluate(
         name: of the row and the file; None = class and fingerprint of the policy. Unfinished work and results of
             another policy, data set or setting under this name are replaced, with a message on stderr, but never a
             result of more scenarios by one with a limit.
-        runner: does the work in place of `config.jobs` processes, see `rlftsim.workers`.
+        runner: does the work in place of `config.jobs` processes, see `rlftsim.jobs.runner`.
         show_progress: False = no progress and time left on stderr.
 
     Raises:

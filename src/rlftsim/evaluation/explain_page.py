@@ -9,21 +9,21 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from rlftsim.atomic_io import write_text
 from rlftsim.evaluation.explain import WHOLE_FUTURE, Explanation, FeatureHistogram, explain
 from rlftsim.evaluation.rollout_files import RolloutEntry, find_rollouts, read_states
 from rlftsim.evaluation.scenario_source import ScenarioSource, open_scenarios
 from rlftsim.evaluation.score_files import ScoreConfig, check_entries, has_road_edge
+from rlftsim.jobs.files import write_text
 from rlftsim.jobs.folder import check_folder
-from rlftsim.progress import progress_bar
+from rlftsim.jobs.progress import progress_bar
+from rlftsim.jobs.runner import Runner, on_this_machine
+from rlftsim.jobs.threads import one_thread
 from rlftsim.realism import metric_by_name
 from rlftsim.realism.config import BERNOULLI_FEATURES, FEATURE_NAMES, HISTOGRAM_FEATURES
 from rlftsim.scenario.types import STEP_S
-from rlftsim.threads import one_thread
 from rlftsim.viewer.chart import Chart, Curve, chart_html
 from rlftsim.viewer.page import Animation, Panel, animation_html, page_html
 from rlftsim.viewer.scene import build_scene, logged_trajectories
-from rlftsim.workers import Runner, on_this_machine
 
 MAX_STRIPS = 10
 """Rows of (feature, agent) drawn over time."""
@@ -76,7 +76,7 @@ def explain_rollouts(
         scenarios: converted data set, or tfrecords (file, folder or glob).
         out: folder of the pages, made if missing.
         config: metric, handling of missing maps and scenarios, processes.
-        runner: does the work in place of `config.jobs` processes, see `rlftsim.workers`. A share writes its pages.
+        runner: does the work in place of `config.jobs` processes, see `rlftsim.jobs.runner`. A share writes its pages.
         show_progress: False = no progress bar.
 
     Raises:

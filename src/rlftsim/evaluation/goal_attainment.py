@@ -21,10 +21,10 @@ from rlftsim.evaluation.scenario_source import open_held_out
 from rlftsim.goals.attainment import measure_outcome
 from rlftsim.goals.goals_file import GoalEntry
 from rlftsim.goals.placement import goals_of_batch
+from rlftsim.jobs.runner import on_this_machine
 from rlftsim.rollout.policy import Policy, device_of, is_goal_conditioned
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import ScenarioDataset
-from rlftsim.workers import on_this_machine
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 from rich.table import Table
 
-from rlftsim.atomic_io import write_text
 from rlftsim.evaluation.columns import COLUMNS, DRIFT_COLUMNS, Column, format_number
 from rlftsim.evaluation.results import Evaluation
+from rlftsim.jobs.files import write_text
 from rlftsim.statistics import MeanInterval
 from rlftsim.viewer.chart import Chart, chart_html, format_tick, nice_ticks
 from rlftsim.viewer.page import Animation, animation_html, page_html, read_asset

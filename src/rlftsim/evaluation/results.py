@@ -16,11 +16,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 import rlftsim
-from rlftsim.atomic_io import write_whole
 from rlftsim.errors import ConfigError, DataError, require_types
 from rlftsim.evaluation.columns import SCORES, direction_of
 from rlftsim.evaluation.drift import Drift, measure_drift
-from rlftsim.jobs.files import describe_kind, parse_json
+from rlftsim.jobs.documents import describe_kind, parse_json
+from rlftsim.jobs.files import write_whole
 from rlftsim.jobs.tables import check_columns, read_parquet
 from rlftsim.realism import FEATURE_NAMES, RealismResult, SimulatedStates, metric_by_name
 from rlftsim.realism.miss import compute_miss_rates

@@ -18,15 +18,15 @@ from typing import Any, ClassVar, Generic, Protocol, TypeVar, runtime_checkable
 
 import pyarrow as pa
 
-from rlftsim.atomic_io import remove_folder, remove_temporaries, write_text
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.results import SCHEMA, Evaluation, Provenance, Skipped, join_evaluations
-from rlftsim.jobs.files import read_json
+from rlftsim.jobs.documents import read_json
+from rlftsim.jobs.files import remove_folder, remove_temporaries, write_text
 from rlftsim.jobs.folder import check_folder, check_name
-from rlftsim.lease import Lease, remove_locks
-from rlftsim.progress import log, progress_bar
-from rlftsim.threads import one_thread
-from rlftsim.workers import Inline, Joining, Runner, Share, require_finished
+from rlftsim.jobs.lease import Lease, remove_locks
+from rlftsim.jobs.progress import log, progress_bar
+from rlftsim.jobs.runner import Inline, Joining, Runner, Share, require_finished
+from rlftsim.jobs.threads import one_thread
 
 Result = TypeVar("Result")
 """Result of one scenario, as the work on it returns it."""

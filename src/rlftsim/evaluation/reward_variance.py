@@ -22,12 +22,12 @@ from rlftsim.evaluation.evaluate import check_jobs, frozen_copy, identity_of, si
 from rlftsim.evaluation.results import EvaluateConfig
 from rlftsim.evaluation.resumable import JsonParts, map_scenarios
 from rlftsim.evaluation.scenario_source import choose_scenarios, open_held_out
+from rlftsim.jobs.runner import on_this_machine
 from rlftsim.realism import Features, ScenarioLog, compute_features, metric_by_name, scenario_log, score_features
 from rlftsim.rewards.base import leave_one_out
 from rlftsim.rewards.mloo import compute_mloo
 from rlftsim.rollout.policy import Policy, device_of
 from rlftsim.scenario.dataset import ScenarioDataset
-from rlftsim.workers import on_this_machine
 
 SIZES = (2, 3, 4, 6, 8, 12, 16, 24, 32)
 REWARDS = ("mloo", "rloo")

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float32
 
 from rlftsim.evaluation.rollout_files import AXES
-from rlftsim.progress import log
+from rlftsim.jobs.progress import log
 from rlftsim.realism import SimulatedStates
 from rlftsim.scenario.types import CURRENT_STEP, HISTORY_STEPS, STEP_S, TOTAL_STEPS, Scenario
 

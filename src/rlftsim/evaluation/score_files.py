@@ -30,12 +30,12 @@ from rlftsim.evaluation.resumable import EvaluationParts, groups_of, resume_eval
 from rlftsim.evaluation.rollout_checks import warn_of_doubts
 from rlftsim.evaluation.rollout_files import RolloutEntry, find_rollouts, read_states
 from rlftsim.evaluation.scenario_source import ScenarioSource, open_scenarios
-from rlftsim.progress import log
+from rlftsim.jobs.progress import log
+from rlftsim.jobs.runner import Runner, on_this_machine, usable_cores
 from rlftsim.realism import MetricConfig, metric_by_name, scenario_log, score
 from rlftsim.realism.map_based import select_polylines
 from rlftsim.realism.official_names import is_reported, official_buckets, official_fields
 from rlftsim.scenario.types import ROAD_EDGE_TYPES, Scenario
-from rlftsim.workers import Runner, on_this_machine, usable_cores
 
 _NO_ROAD_EDGE = "has no road edge, so the distance to it is undefined"
 
@@ -93,7 +93,7 @@ def score_rollouts(
         out: folder of the result, made if missing; None keeps nothing.
         config: metric, handling of missing maps and scenarios, processes.
         name: of the row and the file; None = the name of `rollouts`.
-        runner: does the work in place of `config.jobs` processes, see `rlftsim.workers`.
+        runner: does the work in place of `config.jobs` processes, see `rlftsim.jobs.runner`.
         show_progress: False = no progress and time left on stderr.
 
     Raises:

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import Any
 
-from rlftsim.atomic_io import write_text
 from rlftsim.evaluation.columns import DRIFT_COLUMNS, TERMINAL_COLUMNS, Column, direction_of
 from rlftsim.evaluation.compare import FEW_CLUSTERS, PairedDifference
 from rlftsim.experiments import tables
@@ -14,6 +13,7 @@ from rlftsim.experiments.exam import MARGINS, ExamConfig, ExamResult, ExamRow, M
 from rlftsim.experiments.ledger import Ledger
 from rlftsim.experiments.results import finite_or_none
 from rlftsim.experiments.tables import TextTable
+from rlftsim.jobs.files import write_text
 from rlftsim.training.run_folder import describe_environment, to_plain
 
 COLUMNS = (

@@ -7,9 +7,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from rlftsim.atomic_io import append_text
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.jobs.files import parse_json
+from rlftsim.jobs.documents import parse_json
+from rlftsim.jobs.files import append_text
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,9 @@ from typing import Any, Generic, TypeVar
 
 from matplotlib.figure import Figure
 
-from rlftsim.atomic_io import write_text
 from rlftsim.experiments.suite import ExperimentSuite
 from rlftsim.experiments.tables import TextTable
+from rlftsim.jobs.files import write_text
 from rlftsim.jobs.folder import check_folder
 from rlftsim.training.run_folder import describe_environment, to_plain
 from rlftsim.viewer.figure import save_figure

@@ -4,7 +4,7 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 
-from rlftsim.progress import log
+from rlftsim.jobs.progress import log
 
 
 class StageProgress:

@@ -31,8 +31,8 @@ from rlftsim.experiments.stages import (
     pretrain_policy,
     start_from_shorter_run,
 )
+from rlftsim.jobs.progress import log
 from rlftsim.policies.registry import Device, load_policy, load_policy_or_oracle, with_guidance
-from rlftsim.progress import log
 from rlftsim.recipes.base import Recipe
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import ConditionablePolicy, Policy, TokenPolicy

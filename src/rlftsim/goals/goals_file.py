@@ -19,9 +19,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from rlftsim.atomic_io import write_text
 from rlftsim.errors import DataError, in_short
-from rlftsim.jobs.files import describe_kind, parse_json, read_json
+from rlftsim.jobs.documents import describe_kind, parse_json, read_json
+from rlftsim.jobs.files import write_text
 
 FORMAT = "rlftsim-goals-1"
 FIELDS = ("scenario", "agent", "x", "y", "label")

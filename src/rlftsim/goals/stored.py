@@ -13,9 +13,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from rlftsim.atomic_io import write_whole
 from rlftsim.errors import DataError
 from rlftsim.goals.types import Goals, Points, goals_at
+from rlftsim.jobs.files import write_whole
 from rlftsim.jobs.tables import check_columns, read_parquet
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.shards import hash_file

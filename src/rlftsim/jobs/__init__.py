@@ -1,1 +1,1 @@
-"""Long work: whole files, result folders."""
+"""Long work: whole files, result folders, processes, shares of machines, buckets, progress."""

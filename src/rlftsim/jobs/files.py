@@ -1,200 +1,196 @@
-"""JSON and TOML from files that anybody may have written, damaged or edited.
+"""Files that are written whole or not at all: under another name beside their own, then renamed."""
 
-The only module that parses either: size, depth, repeated names and numbers are checked here.
-"""
-
+import errno
 import json
-import math
-import tomllib
-from collections import Counter
-from collections.abc import Callable
-from os import PathLike, fstat
-from typing import Any
+import os
+import re
+import shutil
+import socket
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, nullcontext, suppress
+from glob import escape
+from pathlib import Path
 
-from rlftsim.errors import DataError, RlftsimError
+from safetensors import SafetensorError
+from safetensors.torch import save_file
+from torch import Tensor
 
-MAX_TEXT_BYTES = 64 << 20
-"""Largest text that is parsed; the largest that this package writes is the manifest of a data set, some MB."""
-MAX_TOML_BYTES = 1 << 20
-"""The same of TOML, which is written by hand and parsed slowly."""
-MAX_DEPTH = 64
-"""Brackets that may be nested; deeper ones exhaust the stack of whatever walks through the values."""
-LONGEST_INTEGER = 40
-"""Digits of a whole number: the seeds of numpy have 39."""
-LONGEST_NAME = 40
-"""Characters of a name that a message repeats."""
-_KINDS = {dict: "an object", list: "a list", str: "text", bool: "true or false", type(None): "null"}
+from rlftsim.errors import DataError
+from rlftsim.jobs.documents import parse_json
+
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""Errors of the operating system where a file does not fit."""
+_TEMPORARY = re.compile(r"\..+\.\d+\.tmp")
+"""Names that `temporary_beside` gives."""
+_ERROR_NUMBER = re.compile(r"\(os error (\d+)\)")
+"""Where safetensors writes the number of an error of the operating system."""
 
 
-def read_json(
-    path: str | PathLike[str],
-    remedy: str,
-    *,
-    expected: type = dict,
-    allow_nan: bool = False,
-    error: type[RlftsimError] = DataError,
-) -> Any:
-    """Value of a JSON file in UTF-8, with or without a mark in front.
-
-    Args:
-        path: JSON file of at most `MAX_TEXT_BYTES`.
-        remedy: Way out at the end of every message, such as "convert again".
-        expected: Type of the outermost value; `object` takes all.
-        allow_nan: True takes NaN and infinities, too, which are no JSON.
-        error: Class of the errors raised.
+@contextmanager
+def errors_name(path: Path) -> Iterator[None]:
+    """Turn an error of the operating system, such as a full disk, into one line that names a path and the way out.
 
     Raises:
-        FileNotFoundError: No such file; the caller knows what was looked for.
-        RlftsimError: The file cannot be read, or `parse_json` refuses its text.
+        DataError: in place of an OSError.
     """
-    text = _read_bytes(path, MAX_TEXT_BYTES, remedy, error)
-    return parse_json(text, remedy, source=str(path), expected=expected, allow_nan=allow_nan, error=error)
-
-
-def parse_json(
-    text: str | bytes,
-    remedy: str,
-    *,
-    source: str,
-    expected: type = dict,
-    allow_nan: bool = False,
-    error: type[RlftsimError] = DataError,
-) -> Any:
-    """Value of a JSON text.
-
-    Args:
-        text: Whole text, bytes in UTF-8.
-        remedy: Way out at the end of every message, such as "evaluate again".
-        source: File, and where in it the text stands, for messages.
-        expected: Type of the outermost value; `object` takes all.
-        allow_nan: True takes NaN and infinities, too, which are no JSON.
-        error: Class of the errors raised.
-
-    Raises:
-        RlftsimError: Damaged text, brackets nested too deeply, a name twice, a number out of range, or a value of
-            another type.
-    """
-
-    def parse_float(digits: str) -> float:
-        number = float(digits)
-        if not (allow_nan or math.isfinite(number)):
-            raise ValueError(f"{digits[:LONGEST_NAME]} is no finite number")
-        return number
-
-    def parse_int(digits: str) -> int:
-        if len(digits) > LONGEST_INTEGER:
-            raise ValueError(f"a whole number of {len(digits)} digits")
-        return int(digits)
-
-    def parse(decoded: str) -> Any:
-        try:
-            value = json.loads(
-                decoded,
-                parse_float=parse_float,
-                parse_constant=parse_float,
-                parse_int=parse_int,
-                object_pairs_hook=_build_object,
-            )
-            # escapes such as \ud800 are halves of characters, which no file, terminal or picture can hold
-            if "\\u" in decoded:
-                json.dumps(value, ensure_ascii=False).encode()
-        except json.JSONDecodeError as problem:
-            raise ValueError(f"not JSON, line {problem.lineno}, column {problem.colno}: {problem.msg}") from None
-        return value
-
-    value = _parse(text, parse, source, remedy, error)
-    if not isinstance(value, expected):
-        raise error(f"{source}: holds {describe_kind(value)} instead of {_KINDS[expected]}: {remedy}.")
-    return value
-
-
-def read_toml(path: str | PathLike[str], remedy: str, *, error: type[RlftsimError] = DataError) -> dict[str, Any]:
-    """Values of a TOML file in UTF-8 by name, with or without a mark in front.
-
-    Args:
-        path: TOML file of at most `MAX_TOML_BYTES`.
-        remedy: Way out at the end of every message.
-        error: Class of the errors raised.
-
-    Raises:
-        FileNotFoundError: No such file; the caller knows what was looked for.
-        RlftsimError: The file cannot be read, is no TOML, or nests brackets too deeply.
-    """
-
-    def parse(decoded: str) -> dict[str, Any]:
-        try:
-            return tomllib.loads(decoded)
-        except tomllib.TOMLDecodeError as problem:
-            raise ValueError(f"not TOML: {problem}") from None
-
-    return _parse(_read_bytes(path, MAX_TOML_BYTES, remedy, error), parse, str(path), remedy, error)
-
-
-def describe_kind(value: object) -> str:
-    """Kind of a value of JSON or TOML in words, for messages."""
-    return _KINDS.get(type(value), "a number")
-
-
-def first_line(problem: BaseException) -> str:
-    """Beginning of the text of an error of a library, printable."""
-    text = getattr(problem, "strerror", None) or str(problem) or type(problem).__name__
-    line = text.strip().splitlines()[0].rstrip(".")[:200] if text.strip() else type(problem).__name__
-    return printable(line)
-
-
-def printable(text: str) -> str:
-    """A text with a space in place of each sign that no terminal shows, such as an end of line."""
-    return "".join(sign if sign.isprintable() else " " for sign in text)
-
-
-def _read_bytes(path: str | PathLike[str], limit: int, remedy: str, error: type[RlftsimError]) -> bytes:
     try:
-        with open(path, "rb") as file:
-            # a device or a pipe has no size, so the bytes that come are counted, too
-            text = file.read(limit + 1) if fstat(file.fileno()).st_size <= limit else None
-    except FileNotFoundError:
-        raise
-    except (OSError, ValueError) as problem:  # the latter: a null byte in the name
-        raise error(f"{path}: cannot be read ({first_line(problem)}): {remedy}.") from None
-    if text is None or len(text) > limit:
-        raise error(f"{path}: larger than {limit >> 20} MiB, which no such file is: {remedy}.")
-    return text
+        yield
+    except OSError as error:
+        raise cannot_write(path, error) from None
 
 
-def _parse(text: str | bytes, parse: Callable[[str], Any], source: str, remedy: str, error: type[RlftsimError]) -> Any:
-    """Parsed text, with every cause of failure in one line."""
-    try:
-        decoded = text.decode("utf-8-sig") if isinstance(text, bytes) else text.removeprefix("\ufeff")
-        value = parse(decoded)
-        _check_depth(value)
-    except UnicodeDecodeError:
-        cause = "not text in UTF-8"
-    except UnicodeEncodeError as problem:
-        cause = f"half a character, U+{ord(problem.object[problem.start]):04X}, in a text"
-    except RecursionError:
-        cause = f"brackets nested more than {MAX_DEPTH} deep"
-    except ValueError as problem:
-        cause = first_line(problem)
-    else:
-        return value
-    raise error(f"{source}: {cause}: {remedy}.") from None
+def cannot_write(path: Path, error: OSError) -> DataError:
+    """Error of a file that cannot be written, with a way out that fits the cause.
+
+    Args:
+        path: of the file.
+        error: of the operating system, such as that of a full disk.
+    """
+    remedy = "choose another place, then run the same command again."
+    # some libraries tell no error number: a full disk is the likeliest cause there
+    if error.errno in (None, *NO_ROOM):
+        remedy = f"make room or {remedy}"
+    elif isinstance(error, FileExistsError | NotADirectoryError):
+        # the file stands where the path needs a folder
+        file = next((place for place in (path, *path.parents) if place.is_file()), None)
+        remedy = f"{file} is a file, not a folder: choose another place." if file else remedy
+    elif isinstance(error, IsADirectoryError):
+        remedy = "it is a folder: name a file."
+    return DataError(f"cannot write {path} ({error.strerror or error}): {remedy}")
 
 
-def _build_object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """An object of JSON, in which no name is written twice; `json` would keep the last value."""
-    values = dict(pairs)
-    if len(values) < len(pairs):
-        repeated = Counter(name for name, _ in pairs).most_common(1)[0][0]
-        raise ValueError(f"{repeated[:LONGEST_NAME]!r} is written more than once")
-    return values
+def write_whole(path: Path, write: Callable[[Path], object]) -> None:
+    """Let `write` fill a temporary file beside `path`, then give it that name. A missing folder is created.
+
+    A symbolic link stays, and what it leads to is replaced. Devices and pipes stay, too: they get the finished bytes.
+
+    Args:
+        path: of the file.
+        write: called with the path of the temporary file.
+
+    Raises:
+        DataError: the file cannot be written, such as on a full disk. Then, and after any other error, nothing is left
+            behind and a file that was there before is untouched.
+    """
+    target = Path(os.path.realpath(path)) if path.is_symlink() else path
+    # Asked of the path: /dev/stdout leads to a pipe, which has no path of its own.
+    is_stream = path.exists() and not (path.is_file() or path.is_dir())
+    folder = tempfile.TemporaryDirectory() if is_stream else nullcontext(target.parent)
+    with errors_name(path), folder as place:
+        temporary = temporary_beside(Path(place) / target.name)
+        try:
+            temporary.parent.mkdir(parents=True, exist_ok=True)
+            write(temporary)
+            # On disk before it gets the name: after a power cut the name must not stand for an empty file.
+            with temporary.open("rb") as file:
+                os.fsync(file.fileno())
+                if is_stream:
+                    with path.open("wb") as stream:
+                        shutil.copyfileobj(file, stream)
+            if not is_stream:
+                temporary.replace(target)
+        finally:
+            if temporary.is_file():
+                temporary.unlink()
 
 
-def _check_depth(value: Any) -> None:
-    """Raise a RecursionError where lists and objects are nested more than `MAX_DEPTH` deep."""
-    level = [value] if isinstance(value, dict | list) else []
-    for _ in range(MAX_DEPTH + 1):
-        groups = [group.values() if isinstance(group, dict) else group for group in level]
-        level = [inner for group in groups for inner in group if isinstance(inner, dict | list)]
-        if not level:
-            return
-    raise RecursionError
+def temporary_beside(path: Path) -> Path:
+    """Name for a file until it is whole: of this process alone, on all machines that see the folder."""
+    # Beside the file, as a rename is atomic within a file system only.
+    return path.with_name(f".{path.name}.{socket.gethostname()}.{os.getpid()}.tmp")
+
+
+def remove_temporaries(path: Path) -> None:
+    """Remove what killed processes left beside a file that they were writing. No process may be writing it now."""
+    for leftover in path.parent.glob(f".{escape(path.name)}.*.tmp"):
+        leftover.unlink(missing_ok=True)
+
+
+def remove_temporaries_below(folder: Path) -> None:
+    """Remove what killed processes left anywhere in a folder, and nothing else. No process may be writing there now."""
+    for path in folder.rglob(".*.tmp"):
+        if _TEMPORARY.fullmatch(path.name):
+            path.unlink(missing_ok=True)
+
+
+def remove_folder(folder: Path, names: Iterable[str]) -> None:
+    """Remove files of the given names and what killed processes left of them, then the folder if nothing else is in it.
+
+    Args:
+        folder: May be missing. Files of other names, and folders in it, stay.
+        names: Files that the caller has written there.
+    """
+    for name in names:
+        (folder / name).unlink(missing_ok=True)
+        remove_temporaries(folder / name)
+    with suppress(OSError):  # it holds something else, or is gone
+        folder.rmdir()
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text in UTF-8.
+
+    Args:
+        path: of the file; its folder is created if missing.
+        text: the whole content.
+
+    Raises:
+        DataError: as `write_whole`.
+    """
+    write_whole(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+
+
+def append_text(path: Path, text: str) -> None:
+    """Add a text to the end of a file, in UTF-8. Unlike the others this may leave a part of it.
+
+    Args:
+        path: of the file, created if missing.
+        text: whole lines, so that a reader can drop one that was cut short.
+
+    Raises:
+        DataError: the file cannot be written, such as on a full disk.
+    """
+    with errors_name(path), path.open("a", encoding="utf-8") as file:
+        file.write(text)
+
+
+def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: dict[str, str] | None = None) -> None:
+    """Write named tensors as safetensors, the same bytes in each process, readable by all that may read the folder.
+
+    Args:
+        path: of the file.
+        tensors: on any device.
+        metadata: stored in the file's header.
+
+    Raises:
+        DataError: as `write_whole`.
+    """
+
+    def write(temporary: Path) -> None:
+        contiguous = {name: t.detach().cpu().contiguous() for name, t in tensors.items()}
+        try:
+            save_file(contiguous, temporary, metadata=metadata)
+            _sort_metadata(temporary)
+        except SafetensorError as error:  # safetensors reports a full disk by an error of its own
+            number = _ERROR_NUMBER.search(str(error))
+            raise (OSError(int(number[1]), os.strerror(int(number[1]))) if number else OSError(str(error))) from None
+        # safetensors writes files that only their owner may read, whatever the umask.
+        mask = os.umask(0)
+        os.umask(mask)
+        temporary.chmod(0o666 & ~mask)
+
+    write_whole(path, write)
+
+
+def _sort_metadata(path: Path) -> None:
+    """Sort the metadata in the header of a safetensors file, whose order differs from process to process."""
+    with path.open("r+b") as file:
+        size = int.from_bytes(file.read(8), "little")
+        header = parse_json(file.read(size), "write it again", source=str(path))
+        if "__metadata__" in header:
+            header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+            text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode().ljust(size)
+            assert len(text) == size, "both write JSON without spaces"
+            file.seek(8)
+            file.write(text)

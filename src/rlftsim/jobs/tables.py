@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from rlftsim.errors import DataError, RlftsimError
-from rlftsim.jobs.files import first_line
+from rlftsim.jobs.documents import first_line
 
 MAX_VALUES = 1 << 27
 """Values that a Parquet file may hold, however small it is: 1 GiB of numbers."""

@@ -23,10 +23,10 @@ import torch
 from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
-from rlftsim.atomic_io import save_tensors, write_text
 from rlftsim.errors import CheckpointError, ConfigError
 from rlftsim.jobs.arrays import read_tensors
-from rlftsim.jobs.files import printable, read_json
+from rlftsim.jobs.documents import printable, read_json
+from rlftsim.jobs.files import save_tensors, write_text
 from rlftsim.jobs.folder import check_folder
 
 CONFIG, WEIGHTS, CARD = "config.json", "model.safetensors", "README.md"

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 from rlftsim.errors import ConfigError
-from rlftsim.jobs.files import read_json
+from rlftsim.jobs.documents import read_json
 from rlftsim.recipes.base import SECTIONS, Recipe, section_names
 from rlftsim.training.run_folder import RUN_INPUTS, flatten, to_plain
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rlftsim.atomic_io import write_whole
+from rlftsim.jobs.files import write_whole
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import CURRENT_STEP

@@ -9,12 +9,12 @@ from torch import Tensor
 
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.goals.types import Goals
+from rlftsim.jobs.threads import one_thread
 from rlftsim.rollout.noise import draw_noise
 from rlftsim.rollout.policy import DecisionDistribution, Policy, Sampling, device_of
 from rlftsim.rollout.types import AgentStates, Rollouts
 from rlftsim.scenario.batch import ScenarioBatch, collate
 from rlftsim.scenario.types import FUTURE_STEPS, Scenarios
-from rlftsim.threads import one_thread
 
 Choose = Callable[[DecisionDistribution, Any, Sampling, Tensor], Tensor]
 Force = Callable[[Any, int], AgentStates | None]

@@ -18,7 +18,7 @@ import numpy as np
 import pyarrow as pa
 
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.jobs.files import read_json
+from rlftsim.jobs.documents import read_json
 from rlftsim.jobs.tables import read_parquet
 from rlftsim.scenario.av2_map import Ground, read_map
 from rlftsim.scenario.source import BytesRead, Item, Tally, Unit

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.jobs.files import read_json
+from rlftsim.jobs.documents import read_json
 from rlftsim.scenario.polylines import Heights, arc_length, densify, resample_to
 from rlftsim.scenario.types import LaneTopology, MapFeatures, MapFeatureType
 

@@ -16,12 +16,14 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from rlftsim.atomic_io import remove_temporaries_below
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.jobs.files import parse_json, read_json
+from rlftsim.jobs.buckets import fetch, find_files, is_url, require_folder
+from rlftsim.jobs.documents import parse_json, read_json
+from rlftsim.jobs.files import remove_temporaries_below
 from rlftsim.jobs.folder import check_folder, check_name
-from rlftsim.lease import Lease
-from rlftsim.progress import progress_bar
+from rlftsim.jobs.lease import Lease
+from rlftsim.jobs.progress import progress_bar
+from rlftsim.jobs.runner import Runner, on_this_machine, require_finished, usable_cores
 from rlftsim.scenario.dataset import (
     INCOMPLETE,
     MANIFEST,
@@ -39,8 +41,6 @@ from rlftsim.scenario.shards import SCHEMA_VERSION, ShardWriter, hash_file
 from rlftsim.scenario.source import DataSource, Unit, read_unit, units_of_urls
 from rlftsim.scenario.sources import AUTO, DEFAULT_SOURCE, find_source
 from rlftsim.scenario.tfrecord import OnError, SkippedRecord
-from rlftsim.storage import fetch, find_files, is_url, require_folder
-from rlftsim.workers import Runner, on_this_machine, require_finished, usable_cores
 
 _INCOMPLETE_TEXT = "A conversion runs here or was interrupted: run the same command again, it goes on."
 _RECEIPTS = "*.arrow.json"
@@ -128,7 +128,7 @@ def convert(
             of the file or its folder, else "unknown".
         on_error: "skip" leaves bad files and records out and reports them, "stop" raises at the first.
         jobs: processes that work at the same time; None = one per usable core.
-        runner: does the work in place of such processes, see `rlftsim.workers`.
+        runner: does the work in place of such processes, see `rlftsim.jobs.runner`.
         license_note: license of the data, for the manifest; None = that of the data source.
         options: of the data source, such as {"window": "first"} for "av2": arguments of its class.
         show_progress: False shows no progress bar on stderr.

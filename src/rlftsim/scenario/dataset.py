@@ -30,9 +30,10 @@ import pyarrow.parquet as pq
 from jaxtyping import Int64, Shaped
 
 import rlftsim
-from rlftsim.atomic_io import cannot_write, write_text, write_whole
 from rlftsim.errors import ConfigError, DataError, require_types, whole_number
-from rlftsim.jobs.files import read_json
+from rlftsim.jobs.buckets import ORIGIN, fetch_shard, is_url, mirror, require_folder
+from rlftsim.jobs.documents import read_json
+from rlftsim.jobs.files import cannot_write, write_text, write_whole
 from rlftsim.jobs.folder import check_folder
 from rlftsim.jobs.tables import check_columns, read_parquet
 from rlftsim.scenario.index_row import AGENT_COLUMNS
@@ -47,7 +48,6 @@ from rlftsim.scenario.splits import find_clusters, find_split
 from rlftsim.scenario.synthetic.pack import pack_path
 from rlftsim.scenario.tfrecord import SkippedRecord
 from rlftsim.scenario.types import Scenario
-from rlftsim.storage import ORIGIN, fetch_shard, is_url, mirror, require_folder
 
 FORMAT = "rlftsim scenarios"
 MANIFEST, INDEX, INCOMPLETE, SHARDS = "manifest.json", "index.parquet", "INCOMPLETE", "shards"

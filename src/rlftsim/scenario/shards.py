@@ -16,8 +16,8 @@ import google_crc32c
 import numpy as np
 import pyarrow as pa
 
-from rlftsim.atomic_io import cannot_write, temporary_beside
 from rlftsim.errors import DataError
+from rlftsim.jobs.files import cannot_write, temporary_beside
 from rlftsim.jobs.tables import map_arrow
 from rlftsim.scenario.codec import decode_array, encode_array
 from rlftsim.scenario.index_row import IndexRow, compute_index_row

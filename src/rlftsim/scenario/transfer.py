@@ -4,15 +4,15 @@ import os
 import shutil
 from pathlib import Path
 
-from rlftsim.atomic_io import remove_temporaries_below
 from rlftsim.errors import DataError
+from rlftsim.jobs.buckets import fetch, folder_address, mirror, publish, remove, require_writable
+from rlftsim.jobs.files import remove_temporaries_below
 from rlftsim.jobs.folder import check_folder
-from rlftsim.lease import Lease, remote_lease
-from rlftsim.progress import progress_bar
+from rlftsim.jobs.lease import Lease, remote_lease
+from rlftsim.jobs.progress import progress_bar
+from rlftsim.jobs.runner import Inline
 from rlftsim.scenario.dataset import INCOMPLETE, INDEX, MANIFEST, Manifest, parse_manifest, read_manifest
 from rlftsim.scenario.shards import hash_file
-from rlftsim.storage import fetch, folder_address, mirror, publish, remove, require_writable
-from rlftsim.workers import Inline
 
 
 def push_dataset(folder: str | os.PathLike[str], url: str, *, show_progress: bool = True) -> Manifest:

@@ -3,8 +3,8 @@
 import json
 from pathlib import Path
 
-from rlftsim.atomic_io import errors_name, write_text, write_whole
 from rlftsim.goals.goals_file import parse_goals, write_goals
+from rlftsim.jobs.files import errors_name, write_text, write_whole
 from rlftsim.realism.from_rollouts import states_of_rollouts
 from rlftsim.rollout.files import write_rollouts
 from rlftsim.scenario.batch import collate

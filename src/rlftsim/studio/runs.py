@@ -18,8 +18,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rlftsim.errors import RlftsimError
+from rlftsim.jobs.progress import log
 from rlftsim.policies.registry import with_guidance
-from rlftsim.progress import log
 from rlftsim.rollout.policy import Sampling, device_of
 from rlftsim.rollout.simulate import simulate
 from rlftsim.rollout.types import Rollouts

@@ -14,8 +14,8 @@ from types import FrameType, TracebackType
 
 import uvicorn
 
-from rlftsim.atomic_io import errors_name
 from rlftsim.errors import ConfigError
+from rlftsim.jobs.files import errors_name
 from rlftsim.studio.guard import LOCAL_NAMES, Access, new_token
 from rlftsim.studio.runs import Worker
 from rlftsim.studio.server import create_app

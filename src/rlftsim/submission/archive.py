@@ -17,8 +17,8 @@ from itertools import chain
 from pathlib import Path
 from typing import BinaryIO
 
-from rlftsim.atomic_io import errors_name, temporary_beside
 from rlftsim.errors import DataError
+from rlftsim.jobs.files import errors_name, temporary_beside
 
 LEVEL = 1
 """Of deflate. On rollouts 6 and 9 save less than 1 % and take twice as long."""

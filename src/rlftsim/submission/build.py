@@ -16,7 +16,11 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 
-from rlftsim.atomic_io import (
+from rlftsim.errors import ConfigError, DataError, require_types
+from rlftsim.evaluation.evaluate import check_jobs, simulate_states
+from rlftsim.evaluation.results import EvaluateConfig
+from rlftsim.jobs.documents import read_json
+from rlftsim.jobs.files import (
     errors_name,
     remove_folder,
     remove_temporaries,
@@ -24,13 +28,11 @@ from rlftsim.atomic_io import (
     temporary_beside,
     write_text,
 )
-from rlftsim.errors import ConfigError, DataError, require_types
-from rlftsim.evaluation.evaluate import check_jobs, simulate_states
-from rlftsim.evaluation.results import EvaluateConfig
-from rlftsim.jobs.files import read_json
 from rlftsim.jobs.folder import check_folder
-from rlftsim.lease import Lease, remove_locks
-from rlftsim.progress import log, progress_bar
+from rlftsim.jobs.lease import Lease, remove_locks
+from rlftsim.jobs.progress import log, progress_bar
+from rlftsim.jobs.runner import Runner, on_this_machine, require_finished
+from rlftsim.jobs.threads import one_thread
 from rlftsim.rollout.policy import Policy, device_of
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.types import Scenario
@@ -38,8 +40,6 @@ from rlftsim.submission.archive import Piece, count_joined, join_pieces, write_p
 from rlftsim.submission.messages import decode_rollouts, encode_rollouts, encode_varint, round_states
 from rlftsim.submission.plan import GZIP_RATIO, PLAN, Plan
 from rlftsim.submission.scenario_checks import check_rollouts
-from rlftsim.threads import one_thread
-from rlftsim.workers import Runner, on_this_machine, require_finished
 
 ARCHIVE = "submission.tar.gz"
 _SHARDS, _LOCK = "shards", ".lock"
@@ -83,7 +83,7 @@ def build_archive(
 
     Args:
         job: policy, data, plan and settings.
-        runner: does the work in place of the settings' processes, see `rlftsim.workers`.
+        runner: does the work in place of the settings' processes, see `rlftsim.jobs.runner`.
         delete_parts: remove each compressed shard as soon as it is in the archive. Halves the disk space.
         show_progress: False = no progress bar.
 

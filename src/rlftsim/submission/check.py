@@ -16,7 +16,7 @@ from google.protobuf.message import DecodeError
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.submission_pb2 import SimAgentsChallengeSubmission
 from rlftsim.evaluation.wire_format import BYTES, read_fields
-from rlftsim.progress import progress_bar
+from rlftsim.jobs.progress import progress_bar
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.types import Scenario
 from rlftsim.submission.archive import GzipReader

@@ -9,7 +9,7 @@ from torch import nn
 
 from rlftsim.errors import ConfigError, in_short
 from rlftsim.evaluation.submission_pb2 import SimAgentsChallengeSubmission
-from rlftsim.jobs.files import read_toml
+from rlftsim.jobs.documents import read_toml
 from rlftsim.submission.messages import as_text
 
 MAX_METHOD_LENGTH = 40

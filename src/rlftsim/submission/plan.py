@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from rlftsim.atomic_io import write_text
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.results import NUMBERS_VERSION, EvaluateConfig
-from rlftsim.jobs.files import read_json
+from rlftsim.jobs.documents import read_json
+from rlftsim.jobs.files import write_text
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.tfrecord import count_lost
 from rlftsim.submission.messages import NUM_SCENES, TRAJECTORY_BYTES

@@ -9,10 +9,10 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from rlftsim.atomic_io import remove_temporaries, write_text
 from rlftsim.errors import DataError
 from rlftsim.evaluation.results import EvaluateConfig, Evaluation
-from rlftsim.jobs.files import read_json
+from rlftsim.jobs.documents import read_json
+from rlftsim.jobs.files import remove_temporaries, write_text
 from rlftsim.policies.checkpoint import read_card
 from rlftsim.submission.check import ArchiveCheck
 from rlftsim.submission.findings import CHECKS, Finding

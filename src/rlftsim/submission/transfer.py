@@ -5,8 +5,8 @@ import os
 from glob import escape
 from pathlib import Path
 
-from rlftsim.atomic_io import errors_name, remove_temporaries, temporary_beside
 from rlftsim.errors import ConfigError
+from rlftsim.jobs.files import errors_name, remove_temporaries, temporary_beside
 
 _CHUNK = 1 << 22
 

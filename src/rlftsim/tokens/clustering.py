@@ -16,7 +16,7 @@ from rlftsim.errors import (
     require_positive,
     require_types,
 )
-from rlftsim.progress import progress_bar
+from rlftsim.jobs.progress import progress_bar
 from rlftsim.scenario.types import STEP_S, Scenarios
 from rlftsim.tokens.agent_tokens import nearest_rows
 from rlftsim.tokens.kdisks import cluster_motions, cluster_windows, shape_distance

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from rlftsim.geometry import box_corners, wrap_angle
-from rlftsim.progress import progress_bar
+from rlftsim.jobs.progress import progress_bar
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.types import STEP_S, Scenario, Scenarios
 from rlftsim.tokens.agent_tokens import class_boxes, nearest_rows, tokenize_agents

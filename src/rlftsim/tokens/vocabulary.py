@@ -15,11 +15,11 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from rlftsim.atomic_io import save_tensors
 from rlftsim.errors import DataError
 from rlftsim.geometry import pose_of_corners
 from rlftsim.jobs.arrays import read_tensors
-from rlftsim.jobs.files import parse_json
+from rlftsim.jobs.documents import parse_json
+from rlftsim.jobs.files import save_tensors
 from rlftsim.scenario.types import ObjectType
 
 STEPS_PER_TOKEN = 5

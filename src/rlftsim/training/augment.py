@@ -17,7 +17,7 @@ from rlftsim.errors import ConfigError, given, require_positive, require_types
 from rlftsim.goals.logged import logged_goals
 from rlftsim.goals.stored import write_goal_file
 from rlftsim.goals.types import Points
-from rlftsim.progress import progress_bar
+from rlftsim.jobs.progress import progress_bar
 from rlftsim.realism import RealismResult, metric_by_name, score_batch
 from rlftsim.realism.from_rollouts import states_of_rollouts
 from rlftsim.rollout.policy import Policy, Sampling, device_of

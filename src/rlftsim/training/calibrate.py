@@ -26,7 +26,7 @@ from jaxtyping import Float64
 from torch import Tensor, nn
 
 from rlftsim.errors import ConfigError, require_positive, require_types
-from rlftsim.progress import log
+from rlftsim.jobs.progress import log
 from rlftsim.realism import AgentScores, RealismResult, compute_batch_features, metric_by_name, score_batch_features
 from rlftsim.realism.from_rollouts import states_of_rollouts
 from rlftsim.rewards import compute_rewards, parse_reward, write_reward

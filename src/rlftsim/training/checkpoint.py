@@ -14,10 +14,10 @@ from typing import Any
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from rlftsim.atomic_io import errors_name, remove_folder, save_tensors, write_text
 from rlftsim.errors import CheckpointError
 from rlftsim.jobs.arrays import read_tensors
-from rlftsim.jobs.files import read_json
+from rlftsim.jobs.documents import read_json
+from rlftsim.jobs.files import errors_name, remove_folder, save_tensors, write_text
 
 PREFIX = "update-"
 KEPT = 2

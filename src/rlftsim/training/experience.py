@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rlftsim.goals.attainment import is_passed, is_reached, rate
+from rlftsim.jobs.threads import one_thread
 from rlftsim.realism import AgentScores, RealismResult, compute_batch_features, metric_by_name, score_batch_features
 from rlftsim.realism.from_rollouts import states_of_rollouts
 from rlftsim.rewards import Rewards, Term, compute_rewards, parse_reward
@@ -18,7 +19,6 @@ from rlftsim.rollout.simulate import simulate
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import CURRENT_STEP, STEP_S
-from rlftsim.threads import one_thread
 from rlftsim.training.finetune_config import FinetuneConfig
 from rlftsim.training.goals import GoalConfig, StoredGoals, choose_goals
 from rlftsim.training.parallel import Fabric, all_gather, all_reduce_sum

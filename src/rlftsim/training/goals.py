@@ -7,7 +7,7 @@ from rlftsim.errors import ConfigError, DataError, require_finite, require_not_n
 from rlftsim.goals.logged import logged_goals
 from rlftsim.goals.stored import StoredGoals
 from rlftsim.goals.types import Goals
-from rlftsim.progress import log
+from rlftsim.jobs.progress import log
 from rlftsim.rollout.noise import draw_noise
 from rlftsim.rollout.policy import ConditionablePolicy, Policy, is_goal_conditioned
 from rlftsim.scenario.batch import ScenarioBatch

@@ -20,8 +20,8 @@ import torch
 from torch import Tensor, nn
 
 from rlftsim.errors import ConfigError, require_not_negative, require_positive, require_types
+from rlftsim.jobs.runner import usable_cores
 from rlftsim.training.batches import balance_by_cost
-from rlftsim.workers import usable_cores
 
 MIN_SCENARIOS = 32
 """Data sets of fewer scenarios are trained on by one process, unless another number is given. (A limit of the data

@@ -22,8 +22,9 @@ from torch.optim import Optimizer
 from rlftsim.errors import CheckpointError, ConfigError, DataError, NotYetError
 from rlftsim.jobs.folder import check_folder
 from rlftsim.jobs.interruption import ctrl_c_waits
-from rlftsim.lease import Lease
-from rlftsim.progress import log, progress_bar
+from rlftsim.jobs.lease import Lease
+from rlftsim.jobs.progress import log, progress_bar
+from rlftsim.jobs.runner import Inline
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.types import Scenario, Scenarios
@@ -33,7 +34,6 @@ from rlftsim.training.data import batch_with_futures, scenarios_of_update
 from rlftsim.training.parallel import DeviceConfig, Fabric, all_reduce_sum, local_indices, num_sharing_memory
 from rlftsim.training.processes import in_processes
 from rlftsim.training.run_folder import RunFolder, describe_inputs, flatten, stored_settings
-from rlftsim.workers import Inline
 
 TrainingScenarios = Scenarios | Scenario
 """Scenarios that a training function takes: a data set, a list, or a single scenario."""

@@ -23,9 +23,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rlftsim import __version__
-from rlftsim.atomic_io import append_text, errors_name, write_text
 from rlftsim.errors import CheckpointError, DataError
-from rlftsim.jobs.files import parse_json, read_json
+from rlftsim.jobs.documents import parse_json, read_json
+from rlftsim.jobs.files import append_text, errors_name, write_text
 from rlftsim.jobs.folder import check_folder
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.scenario.dataset import ScenarioDataset

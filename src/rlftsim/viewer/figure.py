@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import NullFormatter, NullLocator
 
-from rlftsim.atomic_io import write_whole
 from rlftsim.errors import ConfigError
+from rlftsim.jobs.files import write_whole
 
 COLORS = ("#1d63d8", "#e07b00", "#11754b", "#a21caf", "#79828f", "#24292f")
 """Colors of curves; the first four are those of `palette.css`, in the same order."""

@@ -10,8 +10,8 @@ from jaxtyping import UInt8
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 
-from rlftsim.atomic_io import write_whole
 from rlftsim.errors import ConfigError
+from rlftsim.jobs.files import write_whole
 from rlftsim.scenario.types import CURRENT_STEP
 from rlftsim.viewer.page import Animation, Panel
 from rlftsim.viewer.picture import agent_shapes, draw_scene, light_dots

@@ -11,8 +11,8 @@ from typing import Any
 
 from torch import Tensor
 
-from rlftsim.atomic_io import write_text
 from rlftsim.errors import ConfigError, DataError
+from rlftsim.jobs.files import write_text
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.any_form import AnyScenarios, scenarios_of
 from rlftsim.scenario.types import Scenario, register_html

@@ -10,8 +10,8 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from rlftsim.atomic_io import write_text
 from rlftsim.errors import DataError
+from rlftsim.jobs.files import write_text
 from rlftsim.viewer.scene import SceneMotion, SceneView
 
 SPEEDS = (0.25, 0.5, 1, 2, 4)

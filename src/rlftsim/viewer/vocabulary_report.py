@@ -14,8 +14,8 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, LogNorm
 from matplotlib.figure import Figure
 
-from rlftsim.atomic_io import cannot_write, remove_folder, write_text
 from rlftsim.errors import DataError
+from rlftsim.jobs.files import cannot_write, remove_folder, write_text
 from rlftsim.tokens.coverage import MAX_SPEED_BIN_MPS, ClassCoverage, Spread
 from rlftsim.viewer.figure import COLORS, INK, save_figure
 

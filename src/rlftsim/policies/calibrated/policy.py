@@ -13,9 +13,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from rlftsim.atomic_io import write_text
 from rlftsim.errors import CheckpointError, ConfigError
 from rlftsim.goals.types import Goals
+from rlftsim.jobs.files import write_text
 from rlftsim.policies.calibrated.distribution import TiltedDistribution
 from rlftsim.policies.calibrated.features import features_by_name
 from rlftsim.policies.calibrated.table import calibration_table, read_calibration

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from rlftsim.errors import CheckpointError
-from rlftsim.jobs.files import read_json
+from rlftsim.jobs.documents import read_json
 
 CHANGES = {
     "rmm": ("RMM", "+.4f"),

@@ -12,10 +12,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from rlftsim.atomic_io import save_tensors
 from rlftsim.errors import CheckpointError, ConfigError
 from rlftsim.jobs.arrays import read_tensors
-from rlftsim.jobs.files import printable
+from rlftsim.jobs.documents import printable
+from rlftsim.jobs.files import save_tensors
 from rlftsim.policies.checkpoint import SHOWN_PROBLEMS, outline, strip_wrappers
 from rlftsim.policies.smart.catk_keys import PREFIX, aliases, catk_name
 from rlftsim.policies.smart.catk_vocabulary import (

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from rlftsim.atomic_io import write_whole
 from rlftsim.errors import CheckpointError, DataError
 from rlftsim.jobs.arrays import read_npz
+from rlftsim.jobs.files import write_whole
 from rlftsim.tokens.vocabulary import MAX_COORDINATE_M, MAX_TOKENS, STEPS_PER_TOKEN, Vocabulary
 
 MOTION_TABLES = ("veh", "ped", "cyc")

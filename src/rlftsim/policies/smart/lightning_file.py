@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from rlftsim.errors import CheckpointError
-from rlftsim.jobs.files import first_line
+from rlftsim.jobs.documents import first_line
 
 
 class _Inert:

@@ -10,12 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
-from rlftsim.atomic_io import remove_temporaries_below, write_text
 from rlftsim.errors import ConfigError, DataError, RlftsimError
-from rlftsim.jobs.files import read_json
+from rlftsim.jobs.documents import read_json
+from rlftsim.jobs.files import remove_temporaries_below, write_text
 from rlftsim.jobs.folder import check_folder
-from rlftsim.lease import Lease
-from rlftsim.progress import progress_bar
+from rlftsim.jobs.lease import Lease
+from rlftsim.jobs.progress import progress_bar
+from rlftsim.jobs.runner import Advance, Runner, on_this_machine, require_begun, require_finished
 from rlftsim.scenario.dataset import (
     INCOMPLETE,
     MANIFEST,
@@ -30,7 +31,6 @@ from rlftsim.scenario.synthetic import sumo
 from rlftsim.scenario.synthetic.windows import cut_scenarios
 from rlftsim.scenario.synthetic.world import simulate_world
 from rlftsim.scenario.types import Scenario
-from rlftsim.workers import Advance, Runner, on_this_machine, require_begun, require_finished
 
 GENERATOR_VERSION = 1
 LICENSE_NOTE = "CC0-1.0: synthetic scenarios, no rights reserved."
@@ -137,7 +137,7 @@ def generate(
         num_scenarios: in all splits together.
         seed: source of all networks.
         jobs: networks made at the same time; does not change the result.
-        runner: does the work in place of such processes, see `rlftsim.workers`.
+        runner: does the work in place of such processes, see `rlftsim.jobs.runner`.
         splits: fraction of the scenarios by split, which share no network; None = 80 % training, 20 % validation.
         scenarios_per_network: scenarios cut from one city; a freeway gives half as many.
         show_progress: False draws no progress bar.

@@ -19,8 +19,8 @@ from typing import Any
 
 import rlftsim
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.progress import log
-from rlftsim.workers import (
+from rlftsim.jobs.progress import log
+from rlftsim.jobs.runner import (
     OUT_OF_MEMORY,
     Advance,
     Attempts,
@@ -58,8 +58,8 @@ class RayRunner:
 
     Args:
         address: of the cluster, such as "10.0.0.1:6379"; "auto" = the one that runs on this machine.
-        on_death: see `rlftsim.workers.OnDeath`.
-        item_log: see `rlftsim.workers.log_item`.
+        on_death: see `rlftsim.jobs.runner.OnDeath`.
+        item_log: see `rlftsim.jobs.runner.log_item`.
     """
 
     address: str = "auto"

@@ -8,11 +8,11 @@ import sys
 import pytest
 import torch
 
-from rlftsim.threads import one_thread
+from rlftsim.jobs.threads import one_thread
 
 FAULTS = """
 import resource, sys, torch
-from rlftsim.threads import keep_freed_memory
+from rlftsim.jobs.threads import keep_freed_memory
 if sys.argv[1] == "keep":
     keep_freed_memory()
 def step():

@@ -17,8 +17,8 @@ import rlftsim
 from rlftsim.cli.main import main
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.evaluate import EvaluateConfig, evaluate
+from rlftsim.jobs.runner import SetAside
 from rlftsim.rollout.baselines import ConstantVelocity
-from rlftsim.workers import SetAside
 
 pytestmark = pytest.mark.slow
 PACKAGE = Path(rlftsim.__file__).parent
@@ -29,7 +29,7 @@ def ignore(count):
 
 
 def runner():
-    from rlftsim.cluster.ray import RayRunner
+    from rlftsim.jobs.ray import RayRunner
 
     return RayRunner()
 
@@ -64,7 +64,7 @@ def cluster():
 
 def test_an_address_without_a_cluster_is_refused_in_one_line():
     pytest.importorskip("ray", reason='Ray is not installed: pip install "rlftsim[ray]"')
-    from rlftsim.cluster.ray import RayRunner
+    from rlftsim.jobs.ray import RayRunner
 
     with pytest.raises(
         ConfigError, match=r"^--ray 127\.0\.0\.1:1: no Ray cluster there \(.*\): `ray start` makes one\.$"
@@ -81,7 +81,7 @@ def test_results_come_in_order_and_poison_is_set_aside(cluster):
 
 
 def test_a_process_reserves_memory_by_the_size_of_the_model_and_leaves_a_line_of_json(cluster, tmp_path):
-    from rlftsim.cluster.ray import BYTES_OF_A_PROCESS, RayRunner
+    from rlftsim.jobs.ray import BYTES_OF_A_PROCESS, RayRunner
 
     runner = RayRunner(item_log=tmp_path / "items.jsonl")
     (small,) = runner.run(ray_tasks.reserved_memory, [0], advance=ignore)
@@ -122,7 +122,7 @@ def test_the_command_of_the_documents_works_on_the_cluster(cluster, tmp_path, mo
 
 
 def test_a_machine_with_another_version_or_without_the_folder_is_refused(cluster):
-    from rlftsim.cluster.ray import _work
+    from rlftsim.jobs.ray import _work
 
     for driver, message in (
         (("0.0", "."), r"the cluster has rlftsim .*, this machine 0\.0: install the same on all"),
@@ -176,6 +176,6 @@ def test_without_ray_the_flag_says_how_to_get_it(monkeypatch):
     from rlftsim.cli.machines import Machines
 
     monkeypatch.setitem(sys.modules, "ray", None)
-    monkeypatch.delitem(sys.modules, "rlftsim.cluster.ray", raising=False)
+    monkeypatch.delitem(sys.modules, "rlftsim.jobs.ray", raising=False)
     with pytest.raises(ConfigError, match=r'Ray is not installed: pip install "rlftsim\[ray\]", or use --jobs or'):
         Machines(ray="auto").runner(1, "skip")

@@ -3,7 +3,7 @@
     Inline()                this process
     Processes(4)            four processes of this machine
     Share(3, 64, runner)    every 64th item, from the third on; other machines do the others (`--share 3/64`)
-    RayRunner("auto")       a Ray cluster (`rlftsim.cluster.ray`, the extra "ray")
+    RayRunner("auto")       a Ray cluster (`rlftsim.jobs.ray`, the extra "ray")
 
 Each piece writes a file of its own, and the same one whenever it is done again. So it does not matter where it is
 done, nor how often: a run that was stopped in any way is resumed by doing the pieces that have no file.
@@ -33,11 +33,11 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any, Literal, Protocol, runtime_checkable
 
-from rlftsim.atomic_io import append_text
 from rlftsim.errors import ConfigError, DataError, NotYetError, RlftsimError
+from rlftsim.jobs.files import append_text
 from rlftsim.jobs.interruption import ctrl_c_blocked
-from rlftsim.progress import log
-from rlftsim.threads import keep_freed_memory
+from rlftsim.jobs.progress import log
+from rlftsim.jobs.threads import keep_freed_memory
 
 Advance = Callable[[int], None]
 Task = Callable[[Any, Advance, Callable[[], bool]], Any]

@@ -15,11 +15,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import TextIO
 
-from rlftsim.atomic_io import errors_name
 from rlftsim.errors import DataError, NotYetError
-from rlftsim.progress import log
-from rlftsim.storage import get_text, put_text, remove
-from rlftsim.workers import Runner, Share, Unfinished, require_begun
+from rlftsim.jobs.buckets import get_text, put_text, remove
+from rlftsim.jobs.files import errors_name
+from rlftsim.jobs.progress import log
+from rlftsim.jobs.runner import Runner, Share, Unfinished, require_begun
 
 SECONDS_TO_WAIT = 10.0
 """A share waits so long for a driver that may only be putting the result together, or for its predecessor to end."""

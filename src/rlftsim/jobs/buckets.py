@@ -14,7 +14,8 @@ from glob import has_magic
 from pathlib import Path
 from typing import Any
 
-from rlftsim.atomic_io import (
+from rlftsim.errors import ConfigError, DataError, RlftsimError
+from rlftsim.jobs.files import (
     NO_ROOM,
     errors_name,
     remove_temporaries,
@@ -23,7 +24,6 @@ from rlftsim.atomic_io import (
     write_text,
     write_whole,
 )
-from rlftsim.errors import ConfigError, DataError, RlftsimError
 
 ORIGIN = "origin.txt"
 """File in a local copy of a remote data set's index: the address of its shards."""

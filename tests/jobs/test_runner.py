@@ -14,17 +14,17 @@ import pytest
 
 import rlftsim
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.workers import Inline, Processes, SetAside, Share, Unfinished, on_this_machine, require_finished
+from rlftsim.jobs.runner import Inline, Processes, SetAside, Share, Unfinished, on_this_machine, require_finished
 
 SCRIPT = """
-import rlftsim.workers
+import rlftsim.jobs.runner
 
 def double(item, advance, is_stopped):
     advance(1)
     return 2 * item
 
 def main():
-    runner = rlftsim.workers.on_this_machine({jobs}, 3)
+    runner = rlftsim.jobs.runner.on_this_machine({jobs}, 3)
     print(runner.run(double, [1, 2, 3], advance=lambda count: None))
 
 {call}
@@ -88,8 +88,8 @@ def test_each_finished_item_leaves_a_line_of_json(tmp_path):
 def test_a_container_may_have_fewer_cores_than_the_machine(quota, cores, tmp_path, monkeypatch):
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(6)), raising=False)
     (tmp_path / "cpu.max").write_text(quota)
-    monkeypatch.setattr(rlftsim.workers, "CPU_QUOTA", tmp_path / "cpu.max")
-    assert rlftsim.workers.usable_cores() == cores
+    monkeypatch.setattr(rlftsim.jobs.runner, "CPU_QUOTA", tmp_path / "cpu.max")
+    assert rlftsim.jobs.runner.usable_cores() == cores
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
@@ -172,10 +172,10 @@ def test_a_script_with_the_main_guard_may_start_processes(tmp_path):
 INTERRUPTED = """
 import os, signal, time
 from multiprocessing import active_children
-import rlftsim.workers
+import rlftsim.jobs.runner
 
 if __name__ == "__main__":
-    start = rlftsim.workers._Worker.__init__
+    start = rlftsim.jobs.runner._Worker.__init__
 
     def start_then_interrupt(worker):
         start(worker)
@@ -183,9 +183,9 @@ if __name__ == "__main__":
             time.sleep({seconds})
             os.killpg(0, signal.SIGINT)  # as a terminal does, to the processes that are starting, too
 
-    rlftsim.workers._Worker.__init__ = start_then_interrupt
+    rlftsim.jobs.runner._Worker.__init__ = start_then_interrupt
     try:
-        rlftsim.workers.Processes(2).run(print, ["an item", "another"], advance=lambda count: None)
+        rlftsim.jobs.runner.Processes(2).run(print, ["an item", "another"], advance=lambda count: None)
     except KeyboardInterrupt:
         print("stopped", active_children())
 """

@@ -1,1 +1,0 @@
-"""Runners for clusters that need a library of their own."""

@@ -1,0 +1,200 @@
+"""JSON and TOML from files that anybody may have written, damaged or edited.
+
+The only module that parses either: size, depth, repeated names and numbers are checked here.
+"""
+
+import json
+import math
+import tomllib
+from collections import Counter
+from collections.abc import Callable
+from os import PathLike, fstat
+from typing import Any
+
+from rlftsim.errors import DataError, RlftsimError
+
+MAX_TEXT_BYTES = 64 << 20
+"""Largest text that is parsed; the largest that this package writes is the manifest of a data set, some MB."""
+MAX_TOML_BYTES = 1 << 20
+"""The same of TOML, which is written by hand and parsed slowly."""
+MAX_DEPTH = 64
+"""Brackets that may be nested; deeper ones exhaust the stack of whatever walks through the values."""
+LONGEST_INTEGER = 40
+"""Digits of a whole number: the seeds of numpy have 39."""
+LONGEST_NAME = 40
+"""Characters of a name that a message repeats."""
+_KINDS = {dict: "an object", list: "a list", str: "text", bool: "true or false", type(None): "null"}
+
+
+def read_json(
+    path: str | PathLike[str],
+    remedy: str,
+    *,
+    expected: type = dict,
+    allow_nan: bool = False,
+    error: type[RlftsimError] = DataError,
+) -> Any:
+    """Value of a JSON file in UTF-8, with or without a mark in front.
+
+    Args:
+        path: JSON file of at most `MAX_TEXT_BYTES`.
+        remedy: Way out at the end of every message, such as "convert again".
+        expected: Type of the outermost value; `object` takes all.
+        allow_nan: True takes NaN and infinities, too, which are no JSON.
+        error: Class of the errors raised.
+
+    Raises:
+        FileNotFoundError: No such file; the caller knows what was looked for.
+        RlftsimError: The file cannot be read, or `parse_json` refuses its text.
+    """
+    text = _read_bytes(path, MAX_TEXT_BYTES, remedy, error)
+    return parse_json(text, remedy, source=str(path), expected=expected, allow_nan=allow_nan, error=error)
+
+
+def parse_json(
+    text: str | bytes,
+    remedy: str,
+    *,
+    source: str,
+    expected: type = dict,
+    allow_nan: bool = False,
+    error: type[RlftsimError] = DataError,
+) -> Any:
+    """Value of a JSON text.
+
+    Args:
+        text: Whole text, bytes in UTF-8.
+        remedy: Way out at the end of every message, such as "evaluate again".
+        source: File, and where in it the text stands, for messages.
+        expected: Type of the outermost value; `object` takes all.
+        allow_nan: True takes NaN and infinities, too, which are no JSON.
+        error: Class of the errors raised.
+
+    Raises:
+        RlftsimError: Damaged text, brackets nested too deeply, a name twice, a number out of range, or a value of
+            another type.
+    """
+
+    def parse_float(digits: str) -> float:
+        number = float(digits)
+        if not (allow_nan or math.isfinite(number)):
+            raise ValueError(f"{digits[:LONGEST_NAME]} is no finite number")
+        return number
+
+    def parse_int(digits: str) -> int:
+        if len(digits) > LONGEST_INTEGER:
+            raise ValueError(f"a whole number of {len(digits)} digits")
+        return int(digits)
+
+    def parse(decoded: str) -> Any:
+        try:
+            value = json.loads(
+                decoded,
+                parse_float=parse_float,
+                parse_constant=parse_float,
+                parse_int=parse_int,
+                object_pairs_hook=_build_object,
+            )
+            # escapes such as \ud800 are halves of characters, which no file, terminal or picture can hold
+            if "\\u" in decoded:
+                json.dumps(value, ensure_ascii=False).encode()
+        except json.JSONDecodeError as problem:
+            raise ValueError(f"not JSON, line {problem.lineno}, column {problem.colno}: {problem.msg}") from None
+        return value
+
+    value = _parse(text, parse, source, remedy, error)
+    if not isinstance(value, expected):
+        raise error(f"{source}: holds {describe_kind(value)} instead of {_KINDS[expected]}: {remedy}.")
+    return value
+
+
+def read_toml(path: str | PathLike[str], remedy: str, *, error: type[RlftsimError] = DataError) -> dict[str, Any]:
+    """Values of a TOML file in UTF-8 by name, with or without a mark in front.
+
+    Args:
+        path: TOML file of at most `MAX_TOML_BYTES`.
+        remedy: Way out at the end of every message.
+        error: Class of the errors raised.
+
+    Raises:
+        FileNotFoundError: No such file; the caller knows what was looked for.
+        RlftsimError: The file cannot be read, is no TOML, or nests brackets too deeply.
+    """
+
+    def parse(decoded: str) -> dict[str, Any]:
+        try:
+            return tomllib.loads(decoded)
+        except tomllib.TOMLDecodeError as problem:
+            raise ValueError(f"not TOML: {problem}") from None
+
+    return _parse(_read_bytes(path, MAX_TOML_BYTES, remedy, error), parse, str(path), remedy, error)
+
+
+def describe_kind(value: object) -> str:
+    """Kind of a value of JSON or TOML in words, for messages."""
+    return _KINDS.get(type(value), "a number")
+
+
+def first_line(problem: BaseException) -> str:
+    """Beginning of the text of an error of a library, printable."""
+    text = getattr(problem, "strerror", None) or str(problem) or type(problem).__name__
+    line = text.strip().splitlines()[0].rstrip(".")[:200] if text.strip() else type(problem).__name__
+    return printable(line)
+
+
+def printable(text: str) -> str:
+    """A text with a space in place of each sign that no terminal shows, such as an end of line."""
+    return "".join(sign if sign.isprintable() else " " for sign in text)
+
+
+def _read_bytes(path: str | PathLike[str], limit: int, remedy: str, error: type[RlftsimError]) -> bytes:
+    try:
+        with open(path, "rb") as file:
+            # a device or a pipe has no size, so the bytes that come are counted, too
+            text = file.read(limit + 1) if fstat(file.fileno()).st_size <= limit else None
+    except FileNotFoundError:
+        raise
+    except (OSError, ValueError) as problem:  # the latter: a null byte in the name
+        raise error(f"{path}: cannot be read ({first_line(problem)}): {remedy}.") from None
+    if text is None or len(text) > limit:
+        raise error(f"{path}: larger than {limit >> 20} MiB, which no such file is: {remedy}.")
+    return text
+
+
+def _parse(text: str | bytes, parse: Callable[[str], Any], source: str, remedy: str, error: type[RlftsimError]) -> Any:
+    """Parsed text, with every cause of failure in one line."""
+    try:
+        decoded = text.decode("utf-8-sig") if isinstance(text, bytes) else text.removeprefix("\ufeff")
+        value = parse(decoded)
+        _check_depth(value)
+    except UnicodeDecodeError:
+        cause = "not text in UTF-8"
+    except UnicodeEncodeError as problem:
+        cause = f"half a character, U+{ord(problem.object[problem.start]):04X}, in a text"
+    except RecursionError:
+        cause = f"brackets nested more than {MAX_DEPTH} deep"
+    except ValueError as problem:
+        cause = first_line(problem)
+    else:
+        return value
+    raise error(f"{source}: {cause}: {remedy}.") from None
+
+
+def _build_object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object of JSON, in which no name is written twice; `json` would keep the last value."""
+    values = dict(pairs)
+    if len(values) < len(pairs):
+        repeated = Counter(name for name, _ in pairs).most_common(1)[0][0]
+        raise ValueError(f"{repeated[:LONGEST_NAME]!r} is written more than once")
+    return values
+
+
+def _check_depth(value: Any) -> None:
+    """Raise a RecursionError where lists and objects are nested more than `MAX_DEPTH` deep."""
+    level = [value] if isinstance(value, dict | list) else []
+    for _ in range(MAX_DEPTH + 1):
+        groups = [group.values() if isinstance(group, dict) else group for group in level]
+        level = [inner for group in groups for inner in group if isinstance(inner, dict | list)]
+        if not level:
+            return
+    raise RecursionError
