@@ -60,7 +60,7 @@ SCRIPT = """
 import os, signal, sys, time
 from multiprocessing import active_children
 from rlftsim.jobs.interruption import signals_like_ctrl_c
-from rlftsim.jobs.runner import Processes
+from rlftsim.jobs.processes import Processes
 
 def work(item, advance, is_stopped):
     if item == 0:

@@ -10,7 +10,7 @@ import pytest
 import rlftsim
 from rlftsim.evaluation.results import Evaluation
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(rlftsim.__file__).parents[1])}
 
 pytestmark = pytest.mark.slow

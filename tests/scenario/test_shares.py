@@ -13,14 +13,13 @@ from typing import get_type_hints
 import pytest
 
 from full_disk import limit_files_to
-from rlftsim.cli.machines import Machines, Work
 from rlftsim.cli.main import HAVE_SHARES, VERBS, main
 from rlftsim.cli.submit import Build
 from rlftsim.errors import ConfigError, DataError, NotYetError
 from rlftsim.evaluation.evaluate import EvaluateConfig, evaluate
-from rlftsim.jobs import lease
-from rlftsim.jobs.lease import Lease
-from rlftsim.jobs.runner import Inline, Share, Unfinished
+from rlftsim.jobs import folder as folders
+from rlftsim.jobs.folder import Lease
+from rlftsim.jobs.runner import Inline, Machines, Share, Unfinished, Work
 from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.scenario.convert import convert
 
@@ -30,7 +29,7 @@ CONFIG = EvaluateConfig(num_rollouts=2, limit=9)
 @pytest.fixture
 def impatient(monkeypatch):
     """A share waits for others no longer than this."""
-    monkeypatch.setattr(lease, "SECONDS_TO_WAIT", 0.3)
+    monkeypatch.setattr(folders, "SECONDS_TO_WAIT", 0.3)
 
 
 @pytest.fixture
@@ -183,7 +182,7 @@ def test_a_share_takes_over_from_a_driver_that_was_stopped(tmp_path):
     start = time.monotonic()
     with wait_behind(killed, lambda: killed.__exit__(None, None, None)) as mine:
         assert not mine.is_alone
-    assert 0.2 < time.monotonic() - start < lease.SECONDS_TO_WAIT
+    assert 0.2 < time.monotonic() - start < folders.SECONDS_TO_WAIT
 
 
 def test_the_commands_that_join_takes_are_those_with_shares():

@@ -9,7 +9,6 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional
 
-from rlftsim.cli.machines import Work
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.compare import columns_of, compare, format_comparison, format_table
 from rlftsim.evaluation.drive_results import DriveResult, format_drive_comparison, format_drives, is_drive_result
@@ -18,6 +17,7 @@ from rlftsim.evaluation.explain_page import explain_rollouts
 from rlftsim.evaluation.results import Evaluation
 from rlftsim.evaluation.score_files import ScoreConfig, format_scores, score_rollouts, to_json
 from rlftsim.jobs.progress import print_wide
+from rlftsim.jobs.runner import Work
 from rlftsim.policies.registry import Device, load_policy_or_oracle, with_guidance
 from rlftsim.scenario.open import dataset_folder
 

@@ -25,15 +25,15 @@ from rlftsim.evaluation.drive_results import DriveResult, DriveSettings
 from rlftsim.evaluation.resumable import (
     JsonParts,
     check_same_work,
+    check_scenarios_stay,
     finish_result,
     map_scenarios,
-    read_if_readable,
-    refuse_to_leave_out,
+    read_stored,
 )
 from rlftsim.evaluation.scenario_source import hash_manifest
-from rlftsim.jobs.lease import Lease
+from rlftsim.jobs.folder import Lease
 from rlftsim.jobs.progress import log
-from rlftsim.jobs.runner import on_this_machine
+from rlftsim.jobs.runner import choose_runner
 from rlftsim.scenario.open import dataset_folder
 from rlftsim.scenario.types import Scenario
 from rlftsim.statistics import mean_interval
@@ -187,12 +187,12 @@ def _read_and_refuse(
     config: DriveConfig, settings: DriveSettings, ids: Sequence[str], path: Path
 ) -> DriveResult | None:
     """The stored result, unless it is of other work, or a limit or a choice would leave out some of its scenarios."""
-    found = read_if_readable(path, DriveResult.read)
+    found = read_stored(path, DriveResult.read)
     choice = f"limit={config.limit}" if config.limit is not None else "this choice" if config.scenarios else ""
     if found is not None and choice:
         left_out = len({*found.scenario_ids} - {*ids})
         way_out = "name another --out, or drive all scenarios."
-        refuse_to_leave_out(path, len(found.scenario_ids), left_out, choice, way_out)
+        check_scenarios_stay(path, len(found.scenario_ids), left_out, choice, way_out)
     if found is not None:
         # a planner whose code has changed is driven anew, and so is one of an older version of this package
         differing = {*_differences(found.settings, settings)} - {"planner_code", "rlftsim_version"}
@@ -211,7 +211,7 @@ def _drive_traffic(config: DriveConfig, settings: DriveSettings, ids: Sequence[s
     """
     identity = {"settings": settings.what_counts()}
     files = JsonParts(path.with_suffix(".parts"), ids, dict.fromkeys(ids, identity), {}, _row_and_missing)
-    runner = on_this_machine(config.jobs, len(ids))
+    runner = choose_runner(config.jobs, len(ids))
 
     def make(lease: Lease) -> DriveResult:
         parts = map_scenarios(

@@ -28,8 +28,8 @@ from rlftsim.evaluation.resumable import EvaluationParts, groups_of, resume_eval
 from rlftsim.evaluation.scenario_source import choose_scenarios, hash_manifest, open_held_out
 from rlftsim.goals.logged import logged_goals
 from rlftsim.goals.types import Goals
-from rlftsim.jobs.buckets import require_folder
-from rlftsim.jobs.runner import Runner, on_this_machine
+from rlftsim.jobs.buckets import validate_folder
+from rlftsim.jobs.runner import Runner, choose_runner
 from rlftsim.realism import SimulatedStates, metric_by_name, scenario_log, score
 from rlftsim.realism.from_rollouts import logged_states, states_of_rollouts
 from rlftsim.rollout.fingerprint import fingerprint_policy
@@ -111,8 +111,8 @@ def evaluate(
         dataset.scenario_ids[: len(positions)],
         name,
         provenance,
-        None if out is None else require_folder(out),
-        runner=runner or on_this_machine(config.jobs, len(groups_of(len(positions), EvaluationParts.group_size))),
+        None if out is None else validate_folder(out),
+        runner=runner or choose_runner(config.jobs, len(groups_of(len(positions), EvaluationParts.group_size))),
         title=f"evaluate {name}",
         show_progress=show_progress,
     )
@@ -134,7 +134,7 @@ def evaluated_ends(batch: ScenarioBatch) -> Goals:
     return logged_goals(batch, batch.evaluated_mask)
 
 
-def identity_of(policy: Policy, dataset: ScenarioDataset, config: EvaluateConfig) -> dict[str, object]:
+def describe_measurement(policy: Policy, dataset: ScenarioDataset, config: EvaluateConfig) -> dict[str, object]:
     """Plain values by which a stored measurement is known to be this one, for `JsonParts`.
 
     Args:

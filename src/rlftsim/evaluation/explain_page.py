@@ -16,7 +16,7 @@ from rlftsim.evaluation.score_files import ScoreConfig, check_entries, has_road_
 from rlftsim.jobs.files import write_text
 from rlftsim.jobs.folder import check_folder
 from rlftsim.jobs.progress import progress_bar
-from rlftsim.jobs.runner import Runner, on_this_machine
+from rlftsim.jobs.runner import Runner, choose_runner
 from rlftsim.jobs.threads import one_thread
 from rlftsim.realism import metric_by_name
 from rlftsim.realism.config import BERNOULLI_FEATURES, FEATURE_NAMES, HISTOGRAM_FEATURES
@@ -91,11 +91,11 @@ def explain_rollouts(
         name = entry.scenario_id.replace("/", "_") or "scenario"
         numbered = (name, *(f"{name}-{k}" for k in range(2, len(entries) + 2)))
         pages[next(path for path in (Path(out) / f"{n}.html" for n in numbered) if path not in pages)] = entry
-    runner = runner or on_this_machine(config.num_jobs, len(pages))
-    own = runner.own(list(pages.items()))
+    runner = runner or choose_runner(config.num_jobs, len(pages))
+    own = runner.select(list(pages.items()))
     with progress_bar("explain", len(own), show=show_progress) as advance, one_thread():
         written = runner.run(
-            partial(_write_page, source, config), own, advance=advance, name_of=lambda item: item[0].name
+            partial(_write_page, source, config), own, advance=advance, describe=lambda item: item[0].name
         )
     return [page for (page, _), is_written in zip(own, written) if is_written]
 

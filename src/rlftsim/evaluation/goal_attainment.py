@@ -14,14 +14,14 @@ from typing import Any
 import torch
 
 from rlftsim import __version__
-from rlftsim.evaluation.evaluate import check_jobs, frozen_copy, identity_of, simulate_encoded
+from rlftsim.evaluation.evaluate import check_jobs, describe_measurement, frozen_copy, simulate_encoded
 from rlftsim.evaluation.results import EvaluateConfig
 from rlftsim.evaluation.resumable import JsonParts, map_scenarios
 from rlftsim.evaluation.scenario_source import open_held_out
 from rlftsim.goals.attainment import measure_outcome
 from rlftsim.goals.goals_file import GoalEntry
 from rlftsim.goals.placement import goals_of_batch
-from rlftsim.jobs.runner import on_this_machine
+from rlftsim.jobs.runner import choose_runner
 from rlftsim.rollout.policy import Policy, device_of, is_goal_conditioned
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import ScenarioDataset
@@ -79,13 +79,13 @@ def attain_goals(
     for goal in goals:
         by_scenario.setdefault(goal.scenario_id, []).append(goal)
     # The goals' labels are not compared: renaming one measures nothing anew.
-    common = identity_of(policy, dataset, config)
+    common = describe_measurement(policy, dataset, config)
     points = {i: [[goal.agent_id, goal.x, goal.y] for goal in own] for i, own in by_scenario.items()}
     identity = {scenario_id: common | {"goals": own} for scenario_id, own in points.items()}
     ids, information = tuple(by_scenario), {"package_version": __version__}
     files = JsonParts(Path(out), ids, identity, information, partial(_attained, by_scenario))
     work = partial(_simulate_goals, _Job(frozen_copy(policy), dataset, config, by_scenario))
-    runner = on_this_machine(config.jobs, len(ids))
+    runner = choose_runner(config.jobs, len(ids))
     parts = map_scenarios(work, len(ids), files, runner=runner, title=title, show_progress=show_progress)
     # Files are by scenario, goals may come in any order.
     found = {_key(one.entry): one for part in parts for one in part}

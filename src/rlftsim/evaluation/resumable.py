@@ -22,10 +22,9 @@ from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.results import SCHEMA, Evaluation, Provenance, Skipped, join_evaluations
 from rlftsim.jobs.documents import read_json
 from rlftsim.jobs.files import remove_folder, remove_temporaries, write_text
-from rlftsim.jobs.folder import check_folder, check_name
-from rlftsim.jobs.lease import Lease, remove_locks
+from rlftsim.jobs.folder import Lease, check_folder, check_name, remove_locks
 from rlftsim.jobs.progress import log, progress_bar
-from rlftsim.jobs.runner import Inline, Joining, Runner, Share, require_finished
+from rlftsim.jobs.runner import Inline, Joining, Runner, Share, check_finished
 from rlftsim.jobs.threads import one_thread
 
 Result = TypeVar("Result")
@@ -94,7 +93,7 @@ def map_scenarios(
         DataError: another process removed finished files meanwhile.
     """
     groups = groups_of(num_scenarios, files.group_size)
-    own = runner.own(groups)
+    own = runner.select(groups)
     missing = [group for group in own if files.read(group) is None]
     total, left = (sum(len(group) for group in some) for some in (own, missing))
     with progress_bar(title, total, total - left, show=show_progress) as advance, one_thread():
@@ -102,13 +101,13 @@ def map_scenarios(
             partial(_work_on_group, work, files),
             missing,
             advance=advance,
-            name_of=lambda group: f"scenarios {group.start} to {group.stop - 1}",
+            describe=lambda group: f"scenarios {group.start} to {group.stop - 1}",
         )
     if lease is not None:
         lease.finish(title)
     # Read back even what was just written: a resumed and an uninterrupted call go the same way from here.
     parts = [part for part in map(files.read, groups) if part is not None]
-    require_finished(runner, len(groups) - len(parts), len(groups), title)
+    check_finished(runner, len(groups) - len(parts), len(groups), title)
     return parts
 
 
@@ -235,7 +234,7 @@ class EvaluationParts(PartFiles[Mapping[str, object] | Skipped, Evaluation]):
     def read(self, group: range) -> Evaluation | None:
         """The rows of a group, see `PartFiles`."""
         path = self.part_path(group)
-        rows = read_if_readable(path, Evaluation.read)
+        rows = read_stored(path, Evaluation.read)
         if rows is None:
             return None
         differences = rows.provenance.differences(self.provenance)
@@ -251,7 +250,7 @@ class EvaluationParts(PartFiles[Mapping[str, object] | Skipped, Evaluation]):
         Raises:
             ConfigError: a result is there of other work, or with scenarios that a limit would leave out.
         """
-        found = read_if_readable(self.result_path, Evaluation.read)
+        found = read_stored(self.result_path, Evaluation.read)
         if found is None:
             return None
         # Before anything else: also a result of another policy or setting is worth more than a quick look.
@@ -260,7 +259,7 @@ class EvaluationParts(PartFiles[Mapping[str, object] | Skipped, Evaluation]):
             num_found = _ids_of(found).total()
             way_out = "name this one apart with --name, or leave the limit out."
             num_left_out = (_ids_of(found) - Counter(scenario_ids)).total()
-            refuse_to_leave_out(self.result_path, num_found, num_left_out, f"limit={limit}", way_out)
+            check_scenarios_stay(self.result_path, num_found, num_left_out, f"limit={limit}", way_out)
         other = found.provenance.differences(self.provenance)
         if other == ["rlftsim_version"]:
             log.info(f"{self.result_path} is of another version's numbers: it will be replaced.")
@@ -275,7 +274,7 @@ class EvaluationParts(PartFiles[Mapping[str, object] | Skipped, Evaluation]):
 
     def has_others(self, scenario_ids: Collection[str]) -> bool:
         """True if a group has other scenarios or settings, see `PartFiles`."""
-        parts = (read_if_readable(path, Evaluation.read) for path in self.folder.glob("*.parquet"))
+        parts = (read_stored(path, Evaluation.read) for path in self.folder.glob("*.parquet"))
         return any(
             part is not None
             and bool(part.provenance.differences(self.provenance) or _ids_of(part).keys() - {*scenario_ids})
@@ -421,7 +420,7 @@ def check_same_work(path: Path, differing: Sequence[str], way_out: str) -> None:
         raise ConfigError(f"{path} is the result of another {', '.join(differing)}: {way_out}, or remove the file.")
 
 
-def refuse_to_leave_out(path: Path, num_stored: int, num_left_out: int, choice: str, way_out: str) -> None:
+def check_scenarios_stay(path: Path, num_stored: int, num_left_out: int, choice: str, way_out: str) -> None:
     """Refuse to replace a result by one without some of its scenarios, of a quick look.
 
     Args:
@@ -441,7 +440,7 @@ def refuse_to_leave_out(path: Path, num_stored: int, num_left_out: int, choice: 
         )
 
 
-def read_if_readable(path: Path, read: Callable[[Path], Stored]) -> Stored | None:
+def read_stored(path: Path, read: Callable[[Path], Stored]) -> Stored | None:
     """A stored result; None if there is none, or a damaged one, which a message names.
 
     Args:

@@ -18,11 +18,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.evaluation.evaluate import check_jobs, frozen_copy, identity_of, simulate_states
+from rlftsim.evaluation.evaluate import check_jobs, describe_measurement, frozen_copy, simulate_states
 from rlftsim.evaluation.results import EvaluateConfig
 from rlftsim.evaluation.resumable import JsonParts, map_scenarios
 from rlftsim.evaluation.scenario_source import choose_scenarios, open_held_out
-from rlftsim.jobs.runner import on_this_machine
+from rlftsim.jobs.runner import choose_runner
 from rlftsim.realism import Features, ScenarioLog, compute_features, metric_by_name, scenario_log, score_features
 from rlftsim.rewards.base import leave_one_out
 from rlftsim.rewards.mloo import compute_mloo
@@ -78,10 +78,10 @@ def measure_variances(
         )
     check_jobs(config, device_of(policy))
     ids = [dataset.scenario_ids[i] for i in choose_scenarios(dataset, config)]
-    identity = {"sizes": list(sizes), **identity_of(policy, dataset, config)}
+    identity = {"sizes": list(sizes), **describe_measurement(policy, dataset, config)}
     files = JsonParts(Path(out), ids, dict.fromkeys(ids, identity), {}, _stored_variances)
     work = partial(_measure_scenario, _Job(frozen_copy(policy), dataset, config, sizes))
-    runner = on_this_machine(config.jobs, len(ids))
+    runner = choose_runner(config.jobs, len(ids))
     parts = map_scenarios(work, len(ids), files, runner=runner, title="variances", show_progress=show_progress)
     # [rewards, sizes] each; a scenario that cannot be scored has an empty array
     kept = {scenario_id: values for scenario_id, values in zip(ids, parts) if len(values)}

@@ -31,7 +31,7 @@ from rlftsim.evaluation.rollout_checks import warn_of_doubts
 from rlftsim.evaluation.rollout_files import RolloutEntry, find_rollouts, read_states
 from rlftsim.evaluation.scenario_source import ScenarioSource, open_scenarios
 from rlftsim.jobs.progress import log
-from rlftsim.jobs.runner import Runner, on_this_machine, usable_cores
+from rlftsim.jobs.runner import Runner, choose_runner, usable_cores
 from rlftsim.realism import MetricConfig, metric_by_name, scenario_log, score
 from rlftsim.realism.map_based import select_polylines
 from rlftsim.realism.official_names import is_reported, official_buckets, official_fields
@@ -128,7 +128,7 @@ def score_rollouts(
         name,
         provenance,
         None if out is None else Path(out),
-        runner=runner or on_this_machine(config.num_jobs, len(groups_of(len(entries), EvaluationParts.group_size))),
+        runner=runner or choose_runner(config.num_jobs, len(groups_of(len(entries), EvaluationParts.group_size))),
         title=f"score {name}",
         show_progress=show_progress,
     )

@@ -17,13 +17,12 @@ from functools import partial
 from pathlib import Path
 
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.jobs.buckets import fetch, find_files, is_url, require_folder
+from rlftsim.jobs.buckets import fetch, find_files, is_url, validate_folder
 from rlftsim.jobs.documents import parse_json, read_json
 from rlftsim.jobs.files import remove_temporaries_below
-from rlftsim.jobs.folder import check_folder, check_name
-from rlftsim.jobs.lease import Lease
+from rlftsim.jobs.folder import Lease, check_folder, check_name
 from rlftsim.jobs.progress import progress_bar
-from rlftsim.jobs.runner import Runner, on_this_machine, require_finished, usable_cores
+from rlftsim.jobs.runner import Runner, check_finished, choose_runner, usable_cores
 from rlftsim.scenario.dataset import (
     INCOMPLETE,
     MANIFEST,
@@ -146,7 +145,7 @@ def convert(
     if split is not None:
         check_name(split, "a split's name")
     # 1. Refuse a destination that holds anything but a data set or an unfinished conversion.
-    folder = require_folder(destination)
+    folder = validate_folder(destination)
     check_folder(folder, "data set")
     if folder.exists() and not (folder / INCOMPLETE).exists():
         if (folder / MANIFEST).exists():
@@ -172,8 +171,8 @@ def convert(
         raise DataError(f"{source}: its data source has two units of one name for {repeated[0]}: names must differ.")
 
     # 3. Make the shards that earlier runs have not finished, then index and manifest.
-    runner = runner or on_this_machine(jobs or usable_cores(), len(tasks), on_death=on_error)
-    own = runner.own(tasks)
+    runner = runner or choose_runner(jobs or usable_cores(), len(tasks), on_death=on_error)
+    own = runner.select(tasks)
     names = {task.shard for task in own}
     others = [task for task in tasks if task.shard not in names]
     _refuse_other_settings(others, _known_shards(folder), data_source)
@@ -186,7 +185,7 @@ def convert(
         total = sum(task.unit.size for task in own)
         with progress_bar("converting", total, unit="bytes", show=show_progress) as advance:
             convert_one = partial(_convert_unit, source=data_source)
-            outcomes = runner.run(convert_one, own, advance=advance, name_of=lambda task: task.unit.name)
+            outcomes = runner.run(convert_one, own, advance=advance, describe=lambda task: task.unit.name)
         lease.finish("convert")
         # Shards of other shares are taken over by size and split: each share has compared the checksums of its own.
         known = _known_shards(folder)
@@ -194,7 +193,7 @@ def convert(
         made = {file: shard.entry for file, shard in known.items()}
         made |= {outcome.entry.file: outcome.entry for outcome in outcomes}
         entries = [made[task.shard] for task in tasks if task.shard in made and _is_of(made[task.shard], task)]
-        require_finished(runner, len(tasks) - len(entries), len(tasks), "convert")
+        check_finished(runner, len(tasks) - len(entries), len(tasks), "convert")
         remove_temporaries_below(folder)  # of processes that were killed
         earlier = _earlier_manifest(folder)
         manifest = _finish(folder, entries, data_source, license_note, lease)

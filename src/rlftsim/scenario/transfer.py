@@ -5,10 +5,9 @@ import shutil
 from pathlib import Path
 
 from rlftsim.errors import DataError
-from rlftsim.jobs.buckets import fetch, folder_address, mirror, publish, remove, require_writable
+from rlftsim.jobs.buckets import check_writable, fetch, folder_address, mirror, publish, remote_lease, remove
 from rlftsim.jobs.files import remove_temporaries_below
-from rlftsim.jobs.folder import check_folder
-from rlftsim.jobs.lease import Lease, remote_lease
+from rlftsim.jobs.folder import Lease, check_folder
 from rlftsim.jobs.progress import progress_bar
 from rlftsim.jobs.runner import Inline
 from rlftsim.scenario.dataset import INCOMPLETE, INDEX, MANIFEST, Manifest, parse_manifest, read_manifest
@@ -32,7 +31,7 @@ def push_dataset(folder: str | os.PathLike[str], url: str, *, show_progress: boo
         NotYetError: another process copies a data set there.
     """
     folder, url = Path(folder), folder_address(url)
-    require_writable(url)
+    check_writable(url)
     manifest = read_manifest(folder)
     with remote_lease(url, "is copying to") as renew:
         try:

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from rlftsim.errors import DataError
-from rlftsim.jobs.files import errors_name, temporary_beside
+from rlftsim.jobs.files import errors_name, temporary_path
 
 LEVEL = 1
 """Of deflate. On rollouts 6 and 9 save less than 1 % and take twice as long."""
@@ -62,7 +62,7 @@ def write_piece(source: Path, name: str, destination: Path) -> Piece:
     header = entry.tobuf(tarfile.USTAR_FORMAT)
     padding = bytes(-entry.size % tarfile.BLOCKSIZE)
     deflate = zlib.compressobj(LEVEL, zlib.DEFLATED, -zlib.MAX_WBITS)
-    temporary = temporary_beside(destination)
+    temporary = temporary_path(destination)
     raw_size = raw_crc = size = piece_crc = 0
     try:
         with errors_name(destination), source.open("rb") as contents, temporary.open("wb") as out:

@@ -25,13 +25,12 @@ from rlftsim.jobs.files import (
     remove_folder,
     remove_temporaries,
     remove_temporaries_below,
-    temporary_beside,
+    temporary_path,
     write_text,
 )
-from rlftsim.jobs.folder import check_folder
-from rlftsim.jobs.lease import Lease, remove_locks
+from rlftsim.jobs.folder import Lease, check_folder, remove_locks
 from rlftsim.jobs.progress import log, progress_bar
-from rlftsim.jobs.runner import Runner, on_this_machine, require_finished
+from rlftsim.jobs.runner import Runner, check_finished, choose_runner
 from rlftsim.jobs.threads import one_thread
 from rlftsim.rollout.policy import Policy, device_of
 from rlftsim.scenario.dataset import ScenarioDataset
@@ -97,7 +96,7 @@ def build_archive(
     check_jobs(job.config, device_of(job.policy))
     archive = job.folder / ARCHIVE
     numbers = range(len(job.plan.shards))
-    runner = runner or on_this_machine(job.config.jobs, len(numbers))
+    runner = runner or choose_runner(job.config.jobs, len(numbers))
     if archive.exists():
         if not (job.folder / PLAN).exists():
             raise DataError(f"{archive} is there without its {PLAN}: name another --out, or remove it.")
@@ -112,17 +111,17 @@ def build_archive(
             remove_temporaries_below(shards)
         receipts = [job.receipt(n) for n in numbers]
         num_joined = count_joined(archive, shards, receipts)
-        own = runner.own(numbers)
+        own = runner.select(numbers)
         missing = [n for n in own if n >= num_joined and (receipts[n] is None or not job.piece_path(n).exists())]
         total, left = (sum(len(job.plan.shards[n]) for n in some) for some in (own, missing))
         _forecast(job, len(missing))
         with progress_bar("submit", total, total - left, show=show_progress) as advance, one_thread():
-            runner.run(partial(_build_shard, job), missing, advance=advance, name_of=job.plan.shard_name)
+            runner.run(partial(_build_shard, job), missing, advance=advance, describe=job.plan.shard_name)
         lease.finish("submit")
         remove_temporaries_below(shards)
         remove_temporaries(job.folder / PLAN)
         pieces = [piece for piece in map(job.receipt, numbers) if piece is not None]
-        require_finished(runner, len(numbers) - len(pieces), len(numbers), "submit")
+        check_finished(runner, len(numbers) - len(pieces), len(numbers), "submit")
         join_pieces(archive, shards, pieces, delete=delete_parts)
         lease.remove()
     return archive
@@ -151,7 +150,7 @@ def _forecast(job: Job, num_missing: int) -> None:
 def _build_shard(job: Job, number: int, advance: Callable[[int], None], is_stopped: Callable[[], bool]) -> None:
     """Simulate the scenarios of a shard, write it, compress it, sign for it."""
     name = job.plan.shard_name(number)
-    raw = temporary_beside(job.folder / _SHARDS / name)
+    raw = temporary_path(job.folder / _SHARDS / name)
     try:
         with errors_name(raw), raw.open("wb") as file:
             file.write(job.metadata)

@@ -6,7 +6,7 @@ from glob import escape
 from pathlib import Path
 
 from rlftsim.errors import ConfigError
-from rlftsim.jobs.files import errors_name, remove_temporaries, temporary_beside
+from rlftsim.jobs.files import errors_name, remove_temporaries, temporary_path
 
 _CHUNK = 1 << 22
 
@@ -32,7 +32,7 @@ def split_file(path: Path, part_gb: float) -> list[Path]:
     try:
         with path.open("rb") as source:
             for part in parts:
-                with errors_name(part), temporary_beside(part).open("wb") as out:
+                with errors_name(part), temporary_path(part).open("wb") as out:
                     left = part_bytes
                     while left and (chunk := source.read(min(left, _CHUNK))):
                         out.write(chunk)
@@ -42,7 +42,7 @@ def split_file(path: Path, part_gb: float) -> list[Path]:
         for old in path.parent.glob(f"{escape(path.name)}.[0-9][0-9][0-9]"):
             old.unlink()  # `cat` would join those of an earlier, finer cut, too
         for part in parts:
-            temporary_beside(part).replace(part)
+            temporary_path(part).replace(part)
     finally:
         for part in parts:
             remove_temporaries(part)

@@ -13,10 +13,10 @@ import numpy as np
 from rlftsim.errors import ConfigError, DataError, RlftsimError
 from rlftsim.jobs.documents import read_json
 from rlftsim.jobs.files import remove_temporaries_below, write_text
-from rlftsim.jobs.folder import check_folder
-from rlftsim.jobs.lease import Lease
+from rlftsim.jobs.folder import Lease, check_folder
+from rlftsim.jobs.processes import Advance
 from rlftsim.jobs.progress import progress_bar
-from rlftsim.jobs.runner import Advance, Runner, on_this_machine, require_begun, require_finished
+from rlftsim.jobs.runner import Runner, check_begun, check_finished, choose_runner
 from rlftsim.scenario.dataset import (
     INCOMPLETE,
     MANIFEST,
@@ -154,8 +154,8 @@ def generate(
     folder = Path(destination)
     check_folder(folder, "data set")
     tasks = plan_networks(request)
-    runner = runner or on_this_machine(jobs, len(tasks))
-    require_begun(runner, folder)
+    runner = runner or choose_runner(jobs, len(tasks))
+    check_begun(runner, folder)
     if not sumo.is_available():
         raise ConfigError(sumo.INSTALL_HINT)
 
@@ -186,16 +186,16 @@ def generate(
     # 2. Make the shards that are not there yet.
     paths = [folder / SHARDS / task.shard_name for task in tasks]
     with Lease(folder / SHARDS / ".lock", runner, "makes scenarios in") as lease:
-        own = runner.own(tasks)
+        own = runner.select(tasks)
         todo = [task for task in own if not (folder / SHARDS / task.shard_name).exists()]
         total, left = (sum(task.num_scenarios for task in some) for some in (own, todo))
         with progress_bar("synthetic scenarios", total, total - left, show=show_progress) as advance:
             runner.run(
-                partial(_write_shard, folder=folder), todo, advance=advance, name_of=lambda task: task.shard_name
+                partial(_write_shard, folder=folder), todo, advance=advance, describe=lambda task: task.shard_name
             )
         lease.finish("synthetic scenarios")
         num_missing = sum(not path.exists() for path in paths)
-        require_finished(runner, num_missing, len(tasks), "synthetic scenarios")
+        check_finished(runner, num_missing, len(tasks), "synthetic scenarios")
         remove_temporaries_below(folder)  # of processes that were killed
 
         # 3. Index and manifest.
