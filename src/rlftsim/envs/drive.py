@@ -23,15 +23,13 @@ from rlftsim.envs.traffic_scores import blamed_others_rate, realism_of_others
 from rlftsim.errors import ConfigError, DataError, whole_number
 from rlftsim.evaluation.drive_results import DriveResult, DriveSettings
 from rlftsim.evaluation.resumable import (
-    JsonParts,
+    ScenarioValues,
     check_same_work,
     check_scenarios_stay,
     finish_result,
-    map_scenarios,
     read_stored,
 )
 from rlftsim.evaluation.scenario_source import hash_manifest
-from rlftsim.jobs.folder import Lease
 from rlftsim.jobs.progress import log
 from rlftsim.jobs.runner import choose_runner
 from rlftsim.scenario.open import dataset_folder
@@ -210,17 +208,21 @@ def _drive_traffic(config: DriveConfig, settings: DriveSettings, ids: Sequence[s
         path: of its file; finished scenarios lie beside it until all are there.
     """
     identity = {"settings": settings.what_counts()}
-    files = JsonParts(path.with_suffix(".parts"), ids, dict.fromkeys(ids, identity), {}, _row_and_missing)
-    runner = choose_runner(config.jobs, len(ids))
+    return finish_result(
+        f"{config.planner} in {settings.traffic}",
+        ids,
+        partial(_drive_scenario, config, settings.traffic, ids),
+        path=path,
+        format=ScenarioValues(path.with_suffix(".parts"), ids, dict.fromkeys(ids, identity), _row_and_missing),
+        find=partial(_read_finished, config, settings, ids, path),
+        combine=partial(_combine, settings),
+        runner=choose_runner(config.jobs, len(ids)),
+    )
 
-    def make(lease: Lease) -> DriveResult:
-        parts = map_scenarios(
-            partial(_drive_scenario, config, settings.traffic, ids), len(ids), files,
-            runner=runner, title=f"{config.planner} in {settings.traffic}", lease=lease,
-        )  # fmt: skip
-        return DriveResult.of(settings, [row for row, _ in parts], {row["scenario_id"]: why for row, why in parts})
 
-    return finish_result(partial(_read_finished, config, settings, ids, path), make, path, files, ids, runner)
+def _combine(settings: DriveSettings, rows: Sequence[tuple[dict[str, Any], dict[str, str]]]) -> DriveResult:
+    """Result of the rows of all scenarios and the scores that each cannot give."""
+    return DriveResult.of(settings, [row for row, _ in rows], {row["scenario_id"]: missing for row, missing in rows})
 
 
 def _row_and_missing(scenario_id: str, values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:

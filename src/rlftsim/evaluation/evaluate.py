@@ -4,6 +4,7 @@ An interrupted evaluation is resumed by the same call, see `evaluation.resumable
 """
 
 import copy
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -24,7 +25,7 @@ from rlftsim.evaluation.results import (
     Skipped,
     row_of_result,
 )
-from rlftsim.evaluation.resumable import EvaluationParts, groups_of, resume_evaluation
+from rlftsim.evaluation.resumable import ScenarioRows, resume_evaluation
 from rlftsim.evaluation.scenario_source import choose_scenarios, hash_manifest, open_held_out
 from rlftsim.goals.logged import logged_goals
 from rlftsim.goals.types import Goals
@@ -107,13 +108,13 @@ def evaluate(
         guessed=dataset.guessed,
     )
     return resume_evaluation(
-        partial(_evaluate_scenario, _Job(frozen, dataset, config)),
+        f"evaluate {name}",
         dataset.scenario_ids[: len(positions)],
-        name,
-        provenance,
-        None if out is None else validate_folder(out),
-        runner=runner or choose_runner(config.jobs, len(groups_of(len(positions), EvaluationParts.group_size))),
-        title=f"evaluate {name}",
+        partial(_evaluate_scenario, _Job(frozen, dataset, config)),
+        name=name,
+        provenance=provenance,
+        out=None if out is None else validate_folder(out),
+        runner=runner or choose_runner(config.jobs, math.ceil(len(positions) / ScenarioRows.items_per_file)),
         show_progress=show_progress,
     )
 

@@ -26,7 +26,7 @@ from rlftsim.evaluation.results import (
     Skipped,
     row_of_result,
 )
-from rlftsim.evaluation.resumable import EvaluationParts, groups_of, resume_evaluation
+from rlftsim.evaluation.resumable import ScenarioRows, resume_evaluation
 from rlftsim.evaluation.rollout_checks import warn_of_doubts
 from rlftsim.evaluation.rollout_files import RolloutEntry, find_rollouts, read_states
 from rlftsim.evaluation.scenario_source import ScenarioSource, open_scenarios
@@ -123,13 +123,13 @@ def score_rollouts(
     )
     name = name or rollouts.resolve().name.removesuffix(".npz").removesuffix(".binproto").removesuffix(".pb")
     result = resume_evaluation(
-        partial(_score_entry, _Job(tuple(entries), source, config, num_rollouts)),
+        f"score {name}",
         [entry.scenario_id for entry in entries],
-        name,
-        provenance,
-        None if out is None else Path(out),
-        runner=runner or choose_runner(config.num_jobs, len(groups_of(len(entries), EvaluationParts.group_size))),
-        title=f"score {name}",
+        partial(_score_entry, _Job(tuple(entries), source, config, num_rollouts)),
+        name=name,
+        provenance=provenance,
+        out=None if out is None else Path(out),
+        runner=runner or choose_runner(config.num_jobs, math.ceil(len(entries) / ScenarioRows.items_per_file)),
         show_progress=show_progress,
     )
     # The result may be a stored one, made under missing_map="skip".
