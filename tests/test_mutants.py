@@ -21,7 +21,7 @@ READS = {
     "read_bytes", "read_text", "read_table", "read_schema", "read_metadata", "ParquetFile", "memory_map", "open_file",
     "open_stream", "safe_open", "load_file", "is_zipfile", "ZipFile", "FromString", "ParseFromString",
     "read_json", "parse_json", "read_toml", "read_tensors", "read_npz", "read_parquet",
-    "read_parquet_metadata", "map_arrow",
+    "read_parquet_metadata", "map_arrow", "find_differences",
 }  # fmt: skip
 """Calls that open a file or parse its bytes, by their last name."""
 PARSERS = {"json", "tomllib", "np", "numpy", "torch", "pickle", "tarfile"}
