@@ -15,7 +15,7 @@ from typing import Any, Literal, TypeVar
 import torch
 from torch import nn
 
-from rlftsim.errors import ConfigError, DataError
+from rlftsim.errors import ConfigError, DataError, whole_number
 from rlftsim.evaluation.results import (
     NUMBERS_VERSION,
     EvaluateConfig,
@@ -94,7 +94,7 @@ def evaluate(
     # Everything that can be refused is refused before anything is simulated or written.
     dataset, config = open_held_out(data, config)
     positions = choose_scenarios(dataset, config)
-    check_jobs(config, device_of(policy))
+    check_jobs(config.jobs, device_of(policy))
     frozen: Policy | Oracle = frozen_copy(policy)
     if frozen != "oracle":
         refuse_sampling(frozen, dataset, config.sampling)
@@ -151,19 +151,21 @@ def describe_measurement(policy: Policy, dataset: ScenarioDataset, config: Evalu
     }
 
 
-def check_jobs(config: EvaluateConfig, device: torch.device) -> None:
-    """Check that no several processes are asked for where the policy is on a GPU.
+def check_jobs(jobs: int, device: torch.device, setting: str = "evaluate.jobs") -> None:
+    """Check a number of processes; a policy on a GPU is used by a single one.
 
     Args:
-        config: Settings with the number of processes.
+        jobs: Number of processes, at least 1.
         device: Device of the policy; several processes need "cpu".
+        setting: Name of the setting, for messages.
 
     Raises:
-        ConfigError: More than one process, and another device.
+        ConfigError: No process, or several and another device.
     """
-    if config.jobs > 1 and device.type != "cpu":
+    whole_number(setting, jobs, 1)
+    if jobs > 1 and device.type != "cpu":
         raise ConfigError(
-            f"evaluate.jobs={config.jobs} works on CPUs only, the policy is on {device}: use --jobs 1 or --device cpu."
+            f"{setting}={jobs} works on CPUs only, the policy is on {device}: use --jobs 1 or --device cpu."
         )
 
 

@@ -73,7 +73,7 @@ def attain_goals(
         ConfigError: Several processes for a policy on a GPU.
     """
     dataset, config = open_held_out(data, config)
-    check_jobs(config, device_of(policy))
+    check_jobs(config.jobs, device_of(policy))
     by_scenario: dict[str, list[GoalEntry]] = {}
     for goal in goals:
         by_scenario.setdefault(goal.scenario_id, []).append(goal)

@@ -75,7 +75,7 @@ def measure_variances(
             "a slope over N = 2, 3, 4, ... needs 4 rollouts at least, "
             f"got {config.num_rollouts}: set --num-rollouts 32."
         )
-    check_jobs(config, device_of(policy))
+    check_jobs(config.jobs, device_of(policy))
     ids = [dataset.scenario_ids[i] for i in choose_scenarios(dataset, config)]
     identity = {"sizes": list(sizes), **describe_measurement(policy, dataset, config)}
     stored = measure_scenarios(

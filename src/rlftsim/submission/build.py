@@ -93,7 +93,7 @@ def build_archive(
         Unfinished: `runner` is a share, which is done, while others are not.
     """
     check_folder(job.folder, "submission")
-    check_jobs(job.config, device_of(job.policy))
+    check_jobs(job.config.jobs, device_of(job.policy))
     archive = job.folder / ARCHIVE
     numbers = range(len(job.plan.shards))
     runner = runner or choose_runner(job.config.jobs, len(numbers))
