@@ -153,13 +153,13 @@ def _read_finished(config: DriveConfig, settings: DriveSettings, ids: Sequence[s
     """The result of an earlier call for the same scenarios in one kind of traffic; None if there is none.
 
     Args:
-        config: of the call.
-        settings: of the result.
-        ids: its scenarios.
-        path: of its file.
+        config: Planner, data and scenarios of the call.
+        settings: Values that the result must agree with.
+        ids: Ids of the scenarios that the result must have, in this order.
+        path: File of the result.
 
     Raises:
-        ConfigError: a result of other scenarios is there, which a limit or a choice would replace.
+        ConfigError: The stored result has other scenarios, which a limit or a choice would replace.
     """
     found = _read_and_refuse(config, settings, ids, path)
     if found is None:
@@ -202,10 +202,10 @@ def _drive_traffic(config: DriveConfig, settings: DriveSettings, ids: Sequence[s
     """Drive what is missing in one kind of traffic and write the result, unless it is finished.
 
     Args:
-        config: of the call.
-        settings: of the result.
-        ids: its scenarios.
-        path: of its file; finished scenarios lie beside it until all are there.
+        config: Planner, data, scenarios and processes of the call.
+        settings: Values that the result must agree with.
+        ids: Ids of the scenarios of the result.
+        path: File of the result; finished scenarios lie beside this file until all are there.
     """
     identity = {"settings": settings.what_counts()}
     return finish_result(

@@ -2,9 +2,9 @@
 
 import hashlib
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from html import escape
+from operator import itemgetter
 from os import PathLike
 from pathlib import Path
 
@@ -18,7 +18,8 @@ from rlftsim.evaluation.scenario_source import ScenarioSource, open_scenarios
 from rlftsim.evaluation.score_files import ScoreConfig, check_entries, has_road_edge, hash_entries
 from rlftsim.jobs.files import remove_folder, write_text
 from rlftsim.jobs.folder import Lease, check_folder
-from rlftsim.jobs.items import ResultFormat, run_items
+from rlftsim.jobs.items import WholeFiles, run_items
+from rlftsim.jobs.processes import Advance
 from rlftsim.jobs.runner import Runner, choose_runner
 from rlftsim.realism import metric_by_name
 from rlftsim.realism.config import BERNOULLI_FEATURES, FEATURE_NAMES, HISTOGRAM_FEATURES
@@ -96,50 +97,37 @@ def explain_rollouts(
         numbered = (name, *(f"{name}-{k}" for k in range(2, len(entries) + 2)))
         items[next(page for page in (f"{n}.html" for n in numbered) if page not in items)] = entry
     identity = repr((hash_entries(entries), source.fingerprint, config.metric, config.missing_map, __version__))
-    pages = _Pages(Path(out) / f"pages-{hashlib.sha256(identity.encode()).hexdigest()[:12]}.parts", source, config)
+    pages = Path(out) / f"pages-{hashlib.sha256(identity.encode()).hexdigest()[:12]}.parts"
     runner = runner or choose_runner(config.num_jobs, len(items))
-    with Lease(pages.folder / ".lock", runner, "works in") as lease:
+    with Lease(pages / ".lock", runner, "works in") as lease:
         finished = run_items(
-            "explain", list(items.items()), partial(_write_page, pages),
-            format=pages, lease=lease, runner=runner, show_progress=show_progress,
+            "explain", list(items.items()), partial(_write_page, pages, source, config),
+            format=WholeFiles(pages, itemgetter(0)), lease=lease, runner=runner, show_progress=show_progress,
         )  # fmt: skip
         written = [page.replace(Path(out) / page.name) for page in finished if page.stat().st_size]
         lease.remove()
-        remove_folder(pages.folder, items)
+        remove_folder(pages, items)
     return written
 
 
-@dataclass(frozen=True, eq=False)
-class _Pages(ResultFormat[tuple[str, RolloutEntry], Path]):
-    """Finished pages of an unfinished call, by name and rollouts; an empty file where there is nothing to explain."""
-
-    folder: Path
-    source: ScenarioSource
-    config: ScoreConfig
-
-    def read(self, item: tuple[str, RolloutEntry]) -> Path | None:
-        """The file of a page, see `ResultFormat`."""
-        path = self.folder / item[0]
-        return path if path.exists() else None
-
-    def describe(self, item: tuple[str, RolloutEntry]) -> str:
-        """Name of a page, see `ResultFormat`."""
-        return item[0]
-
-
 def _write_page(
-    pages: _Pages, item: tuple[str, RolloutEntry], advance: Callable[[int], None], is_stopped: Callable[[], bool]
+    folder: Path,
+    source: ScenarioSource,
+    config: ScoreConfig,
+    item: tuple[str, RolloutEntry],
+    advance: Advance,
+    is_stopped: Callable[[], bool],
 ) -> None:
-    """Write a page, unless the work is being stopped."""
+    """Write a page, empty where there is nothing to explain, unless the work is being stopped."""
     if is_stopped():
         return
     name, entry = item
-    scenario = pages.source.by_id(entry.scenario_id) if entry.scenario_id in pages.source else None
+    scenario = source.by_id(entry.scenario_id) if entry.scenario_id in source else None
     html = ""
     # Without road edges there is no score to explain; scoring says so.
-    if scenario is not None and (pages.config.missing_map == "error" or has_road_edge(scenario)):
-        html = explanation_html(explain(scenario, read_states(entry), metric_by_name(pages.config.metric)))
-    write_text(pages.folder / name, html)
+    if scenario is not None and (config.missing_map == "error" or has_road_edge(scenario)):
+        html = explanation_html(explain(scenario, read_states(entry), metric_by_name(config.metric)))
+    write_text(folder / name, html)
     advance(1)
 
 

@@ -78,9 +78,9 @@ def attain_goals(
     for goal in goals:
         by_scenario.setdefault(goal.scenario_id, []).append(goal)
     # The goals' labels are not compared: renaming one measures nothing anew.
-    common = describe_measurement(policy, dataset, config)
+    measurement = describe_measurement(policy, dataset, config)
     identity = {
-        scenario_id: common | {"goals": [[goal.agent_id, goal.x, goal.y] for goal in scenario_goals]}
+        scenario_id: measurement | {"goals": [[goal.agent_id, goal.x, goal.y] for goal in scenario_goals]}
         for scenario_id, scenario_goals in by_scenario.items()
     }
     stored = measure_scenarios(

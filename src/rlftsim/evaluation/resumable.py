@@ -41,7 +41,7 @@ class ScenarioFormat(GroupFormat[Stored, Result]):
         """Names of the files in the folder that groups of the scenarios may have written, damaged ones included."""
 
     @abstractmethod
-    def has_others(self, scenario_ids: Collection[str]) -> bool:
+    def has_other_groups(self, scenario_ids: Collection[str]) -> bool:
         """True if the folder holds finished groups of scenarios beside those listed, or of other settings."""
 
 
@@ -78,7 +78,7 @@ class ScenarioValues(ScenarioFormat[Stored, Mapping[str, object]]):
         """A name per scenario, see `ScenarioFormat`."""
         return [f"{scenario_id}.json" for scenario_id in scenario_ids]
 
-    def has_others(self, scenario_ids: Collection[str]) -> bool:
+    def has_other_groups(self, scenario_ids: Collection[str]) -> bool:
         """True if there are files of other scenarios or settings, see `ScenarioFormat`."""
         for name in (path.stem for path in self.folder.glob("*.json")):
             with suppress(DataError, FileNotFoundError):  # a damaged file holds nothing
@@ -169,7 +169,7 @@ class ScenarioRows(ScenarioFormat[Evaluation, Mapping[str, object] | Skipped]):
         """Names of groups of any size, see `ScenarioFormat`."""
         return [path.name for path in self.folder.glob("*.parquet") if _GROUP_NAME.fullmatch(path.stem)]
 
-    def has_others(self, scenario_ids: Collection[str]) -> bool:
+    def has_other_groups(self, scenario_ids: Collection[str]) -> bool:
         """True if a group has other scenarios or settings, see `ScenarioFormat`."""
         stored = (read_stored(path, Evaluation.read) for path in self.folder.glob("*.parquet"))
         return any(
@@ -269,7 +269,7 @@ class Writable(Protocol):
         ...
 
 
-Kept = TypeVar("Kept", bound=Writable)
+FinishedResult = TypeVar("FinishedResult", bound=Writable)
 
 
 def finish_result(
@@ -279,11 +279,11 @@ def finish_result(
     *,
     path: Path,
     format: ScenarioFormat[Stored, Result],
-    find: Callable[[], Kept | None],
-    combine: Callable[[list[Stored]], Kept],
+    find: Callable[[], FinishedResult | None],
+    combine: Callable[[list[Stored]], FinishedResult],
     runner: Runner,
     show_progress: bool = True,
-) -> Kept:
+) -> FinishedResult:
     """The result that an earlier call finished, or the one that is made now and written to its file.
 
     Args:
@@ -330,7 +330,7 @@ def _remove_groups(format: ScenarioFormat[Any, Any], scenario_ids: Sequence[str]
     """
     is_share = isinstance(runner, Share | Joining)
     has_shares = any(format.folder.glob(".lock.*-of-*")) and not is_share
-    if not has_shares and not format.has_others({*scenario_ids}):
+    if not has_shares and not format.has_other_groups({*scenario_ids}):
         remove_locks(format.folder / ".lock")
         remove_folder(format.folder, format.file_names({*scenario_ids}))
 

@@ -16,7 +16,7 @@ from rlftsim.goals.placement import goals_of_batch
 from rlftsim.jobs.documents import read_json
 from rlftsim.jobs.files import remove_temporaries_below
 from rlftsim.jobs.folder import Lease, check_folder, write_identity
-from rlftsim.jobs.items import ResultFormat, run_items
+from rlftsim.jobs.items import WholeFiles, run_items
 from rlftsim.jobs.processes import Advance
 from rlftsim.jobs.progress import log
 from rlftsim.jobs.runner import Runner
@@ -74,7 +74,10 @@ def simulate_folder(
         NotYetError: Another driver is at work in the folder.
         SetAside, Unfinished: See `run_items`.
     """
-    identity, rollouts = simulation.describe(model), _RolloutFiles(out, simulation.num_rollouts)
+    identity, rollouts = (
+        simulation.describe(model),
+        _RolloutFiles(out, "{}.npz".format, num_rollouts=simulation.num_rollouts),
+    )
     check_folder(out, "set of rollouts")
     _check_identity(out, identity)  # before the folder gets a lock file
     with Lease(out / ".lock", runner, "works in") as lease:
@@ -87,17 +90,11 @@ def simulate_folder(
     return paths
 
 
-@dataclass(frozen=True)
-class _RolloutFiles(ResultFormat[str, Path]):
+@dataclass(frozen=True, eq=False)
+class _RolloutFiles(WholeFiles[str]):
     """Rollouts by scenario id, see `rollout.files`."""
 
-    folder: Path
-    num_rollouts: int
-
-    def read(self, item: str) -> Path | None:
-        """The file of a scenario, see `ResultFormat`."""
-        path = self.folder / f"{item}.npz"
-        return path if path.exists() else None
+    num_rollouts: int = 1
 
     def is_finished(self, item: str) -> bool:
         """True for a file whose arrays have the right checksums, types and shapes; a warning names any other file."""
@@ -113,10 +110,6 @@ class _RolloutFiles(ResultFormat[str, Path]):
             cause = str(error).removeprefix(f"{path} ").rstrip(".")
         log.warning(f"{path} is simulated again: {cause}.")
         return False
-
-    def describe(self, item: str) -> str:
-        """The scenario in words, see `ResultFormat`."""
-        return f"scenario {item}"
 
 
 def _simulate_scenario(

@@ -193,7 +193,7 @@ def check_entries(entries: Sequence[RolloutEntry], source: ScenarioSource, confi
 
     Args:
         entries: Rollouts in files, in the order of the scores.
-        source: Scenarios by id.
+        source: Scenarios that the rollouts may belong to, by id.
         config: Setting `missing_scenario`: rollouts without scenario are an error, or left out.
         path: Data set or tfrecords that the scenarios come from, for messages.
 

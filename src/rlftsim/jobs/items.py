@@ -5,7 +5,9 @@ It does not matter where an item is done, nor how often: the same item always wr
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any, ClassVar, Generic, Literal, TypeVar
 
 from rlftsim.jobs.folder import Lease
@@ -39,6 +41,30 @@ class ResultFormat(ABC, Generic[Item, Stored]):
     def describe(self, item: Item) -> str:
         """Name of an item in messages and in the log of finished items."""
         return str(item)
+
+
+@dataclass(frozen=True, eq=False)
+class WholeFiles(ResultFormat[Item, Path]):
+    """A file for each item, which is there when it is whole; the file itself is the result."""
+
+    folder: Path
+    name: Callable[[Item], str]
+    """Name of an item's file, also in messages."""
+    units: Callable[[Item], int] | None = None
+    """Units of progress that an item stands for; None = each item for a single unit."""
+
+    def read(self, item: Item) -> Path | None:
+        """The file of an item, see `ResultFormat`."""
+        path = self.folder / self.name(item)
+        return path if path.exists() else None
+
+    def count_units(self, item: Item) -> int:
+        """Value of `units`, see `ResultFormat`."""
+        return self.units(item) if self.units else 1
+
+    def describe(self, item: Item) -> str:
+        """Name of the file, see `ResultFormat`."""
+        return self.name(item)
 
 
 class GroupFormat(ResultFormat[range, Stored], Generic[Stored, Result]):

@@ -36,7 +36,7 @@ from rlftsim.jobs.runner import Runner, choose_runner
 from rlftsim.rollout.policy import Policy, device_of
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.types import Scenario
-from rlftsim.submission.archive import Piece, count_joined, join_pieces, write_piece
+from rlftsim.submission.archive import PackedShard, count_joined, join_shards, pack_shard
 from rlftsim.submission.messages import decode_rollouts, encode_rollouts, encode_varint, round_states
 from rlftsim.submission.plan import GZIP_RATIO, PLAN, Plan
 from rlftsim.submission.scenario_checks import check_rollouts
@@ -58,7 +58,7 @@ class Job:
     round_m: float | None
     folder: Path
 
-    def piece_path(self, number: int) -> Path:
+    def shard_path(self, number: int) -> Path:
         """File of a finished shard."""
         return self.folder / _SHARDS / f"{number:05d}.part"
 
@@ -66,30 +66,30 @@ class Job:
         """Receipt of a finished shard."""
         return self.folder / _SHARDS / f"{number:05d}.json"
 
-    def receipt(self, number: int) -> Piece | None:
+    def receipt(self, number: int) -> PackedShard | None:
         """A finished shard; None if there is none. Its file may be in the archive already."""
         try:
-            piece = Piece(**read_json(self.receipt_path(number), "build again"))
-            require_types(piece)
+            shard = PackedShard(**read_json(self.receipt_path(number), "build again"))
+            require_types(shard)
         except (DataError, ConfigError, FileNotFoundError, TypeError):
             return None
-        return piece if piece.file == self.piece_path(number).name else None
+        return shard if shard.file == self.shard_path(number).name else None
 
 
 @dataclass(frozen=True)
-class _Pieces(ResultFormat[int, Piece]):
+class _Receipts(ResultFormat[int, PackedShard]):
     """Finished shards by number, as their receipts tell; the first ones may be in the unfinished archive alone."""
 
     job: Job
     num_joined: int
 
-    def read(self, item: int) -> Piece | None:
+    def read(self, item: int) -> PackedShard | None:
         """The receipt of a shard, see `ResultFormat`."""
         return self.job.receipt(item)
 
     def is_finished(self, item: int) -> bool:
         """True for a shard with receipt and file, or in the archive, see `ResultFormat`."""
-        return item < self.num_joined or (self.read(item) is not None and self.job.piece_path(item).exists())
+        return item < self.num_joined or (self.read(item) is not None and self.job.shard_path(item).exists())
 
     def count_units(self, item: int) -> int:
         """Number of scenarios, see `ResultFormat`."""
@@ -134,22 +134,22 @@ def build_archive(
         shards.mkdir(exist_ok=True)
         if lease.is_alone:
             remove_temporaries_below(shards)
-        receipts = _Pieces(job, count_joined(archive, shards, [job.receipt(n) for n in numbers]))
+        receipts = _Receipts(job, count_joined(archive, shards, [job.receipt(n) for n in numbers]))
         _forecast(job, sum(not receipts.is_finished(n) for n in runner.select(numbers)))
-        pieces = run_items(
+        packed_shards = run_items(
             "submit", numbers, partial(_build_shard, job),
             format=receipts, lease=lease, runner=runner, show_progress=show_progress,
         )  # fmt: skip
         remove_temporaries_below(shards)
         remove_temporaries(job.folder / PLAN)
-        join_pieces(archive, shards, pieces, delete=delete_parts)
+        join_shards(archive, shards, packed_shards, delete=delete_parts)
         lease.remove()
     return archive
 
 
 def delete_parts(job: Job) -> None:
     """Remove the compressed shards of a finished archive, and the receipts."""
-    paths = [path for n in range(len(job.plan.shards)) for path in (job.piece_path(n), job.receipt_path(n))]
+    paths = [path for n in range(len(job.plan.shards)) for path in (job.shard_path(n), job.receipt_path(n))]
     remove_folder(job.folder / _SHARDS, [path.name for path in paths])
 
 
@@ -180,15 +180,15 @@ def _build_shard(job: Job, number: int, advance: Advance, is_stopped: Callable[[
                 message = _simulate_message(job, job.data[position], name)
                 file.write(b"\x0a" + encode_varint(len(message)) + message)
                 advance(1)
-        piece = write_piece(raw, name, job.piece_path(number))
+        shard = pack_shard(raw, name, job.shard_path(number))
     finally:
         raw.unlink(missing_ok=True)
     is_first = not any(job.receipt_path(n).exists() for n in range(len(job.plan.shards)))
-    write_text(job.receipt_path(number), json.dumps(asdict(piece)) + "\n")
+    write_text(job.receipt_path(number), json.dumps(asdict(shard)) + "\n")
     if is_first:
-        size = forecast_size(job.plan, number, piece)
+        size = forecast_size(job.plan, number, shard)
         log.info(
-            f"  first shard: compressed to {piece.size / piece.raw_size:.3f}, so the archive will have "
+            f"  first shard: compressed to {shard.size / shard.raw_size:.3f}, so the archive will have "
             f"about {size / 1e9:.3g} GB."
         )
 
@@ -203,12 +203,12 @@ def _simulate_message(job: Job, scenario: Scenario, shard: str) -> bytes:
     return message
 
 
-def forecast_size(plan: Plan, number: int, piece: Piece) -> float:
+def forecast_size(plan: Plan, number: int, shard: PackedShard) -> float:
     """Bytes that the archive will have, from one finished shard.
 
     Args:
         plan: Plan of the archive, with the number of agents in each shard.
         number: Number of the finished shard in the plan.
-        piece: The finished shard, whose size stands for those of the others.
+        shard: The finished shard, whose size stands for those of the others.
     """
-    return piece.size / plan.num_agents[number] * sum(plan.num_agents)
+    return shard.size / plan.num_agents[number] * sum(plan.num_agents)

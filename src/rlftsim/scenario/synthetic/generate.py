@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import islice
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ import numpy as np
 from rlftsim.errors import ConfigError, DataError, RlftsimError
 from rlftsim.jobs.files import remove_temporaries_below, write_text
 from rlftsim.jobs.folder import Lease, check_folder, find_differences
-from rlftsim.jobs.items import ResultFormat, run_items
+from rlftsim.jobs.items import WholeFiles, run_items
 from rlftsim.jobs.processes import Advance
 from rlftsim.jobs.runner import Runner, check_begun, choose_runner
 from rlftsim.scenario.dataset import (
@@ -185,11 +186,12 @@ def generate(
         write_text(marker, json.dumps(provenance, indent=1))
 
     # 2. Make the shards that are not there yet.
-    shards = _Shards(folder / SHARDS)
-    with Lease(shards.folder / ".lock", runner, "makes scenarios in") as lease:
+    shards = folder / SHARDS
+    with Lease(shards / ".lock", runner, "makes scenarios in") as lease:
         paths = run_items(
-            "synthetic scenarios", tasks, partial(_write_shard, shards),
-            format=shards, lease=lease, runner=runner, show_progress=show_progress,
+            "synthetic scenarios", tasks, partial(_write_shard, shards), lease=lease, runner=runner,
+            format=WholeFiles(shards, attrgetter("shard_name"), attrgetter("num_scenarios")),
+            show_progress=show_progress,
         )  # fmt: skip
         remove_temporaries_below(folder)  # of processes that were killed
 
@@ -201,31 +203,11 @@ def generate(
     return manifest
 
 
-@dataclass(frozen=True)
-class _Shards(ResultFormat[NetworkTask, Path]):
-    """A shard for the scenarios of a network, which is there when it is whole."""
-
-    folder: Path
-
-    def read(self, item: NetworkTask) -> Path | None:
-        """The file of a shard, see `ResultFormat`."""
-        path = self.folder / item.shard_name
-        return path if path.exists() else None
-
-    def count_units(self, item: NetworkTask) -> int:
-        """Number of scenarios, see `ResultFormat`."""
-        return item.num_scenarios
-
-    def describe(self, item: NetworkTask) -> str:
-        """Name of the shard, see `ResultFormat`."""
-        return item.shard_name
-
-
-def _write_shard(shards: _Shards, task: NetworkTask, advance: Advance, is_stopped: Callable[[], bool]) -> None:
+def _write_shard(folder: Path, task: NetworkTask, advance: Advance, is_stopped: Callable[[], bool]) -> None:
     """Write the scenarios of a task, unless the run is being stopped."""
     if is_stopped():
         return
-    writer = ShardWriter(shards.folder / task.shard_name)
+    writer = ShardWriter(folder / task.shard_name)
     try:
         for scenario in generate_scenarios(task):
             writer.add(scenario, task.split)
