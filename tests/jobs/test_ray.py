@@ -40,7 +40,7 @@ def cluster():
     ray = pytest.importorskip("ray", reason='Ray is not installed: pip install "rlftsim[ray]"')
     from ray.cluster_utils import Cluster
 
-    folders = [str(PACKAGE.parent), str(Path(__file__).parent)]
+    folders = [str(PACKAGE.parent), str(Path(__file__).parents[1])]
     before = os.environ.get("PYTHONPATH")
     os.environ["PYTHONPATH"] = os.pathsep.join(folders)  # for the processes of the cluster
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
