@@ -16,10 +16,10 @@ import rlftsim
 from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.drivers import TRAFFIC, Traffic
 from rlftsim.envs.ego_env import EgoEnv
-from rlftsim.envs.planners.registry import Planner, action_of, hash_code, horizon_of, load_planner, may_reverse
-from rlftsim.envs.result import SCORE_NAMES, Result, animation_of
+from rlftsim.envs.planners.registry import Planner, hash_code, load_planner, read_action_settings
+from rlftsim.envs.result import SCORE_NAMES, Result, build_animation
 from rlftsim.envs.source import Source
-from rlftsim.envs.traffic_scores import blamed_others_rate, realism_of_others
+from rlftsim.envs.traffic_scores import blamed_others_rate, compute_traffic_realism
 from rlftsim.errors import ConfigError, DataError, whole_number
 from rlftsim.evaluation.drive_results import DriveResult, DriveSettings
 from rlftsim.evaluation.resumable import (
@@ -77,11 +77,9 @@ class DriveConfig:
 
     def settings(self, traffic: str) -> EnvConfig:
         """Settings of the environment for one kind of traffic: nothing ends an episode, and nothing is rewarded."""
-        planner = load_planner(self.planner)
         return EnvConfig(
-            data=self.data, split=self.split, model=self.model, traffic=cast(Traffic, traffic),
-            action=action_of(planner), horizon=horizon_of(planner), reverse=may_reverse(planner), stop_on=(),
-            reward="none",
+            data=self.data, split=self.split, model=self.model, traffic=cast(Traffic, traffic), stop_on=(),
+            reward="none", **read_action_settings(load_planner(self.planner)),
         )  # fmt: skip
 
 
@@ -247,7 +245,7 @@ def _drive_scenario(config: DriveConfig, traffic: str, ids: Sequence[str], posit
     # a rollout that cannot give a score leaves it to the others
     means = {name: mean_interval(np.array([row[name] for row in rows])).mean for name in rows[0]}
     means["blamed_others_rate"] = blamed_others_rate([one for result in results for one in result.record.collisions])
-    realism = realism_of_others([result.record for result in results])
+    realism = compute_traffic_realism([result.record for result in results])
     row = {"scenario_id": ids[position], "traffic": traffic, **means, "others_realism": realism}
     return {"row": row, "missing": results[0].missing}
 
@@ -272,5 +270,5 @@ def film(config: DriveConfig, out: Path) -> Path:
         result = run_planner(env, load_planner(config.planner), scenario, seed=config.seed)
         records[f"{config.planner} in {traffic}"] = result.record
     path = out / f"{scenario.scenario_id}.webp"
-    to_film(path, animation_of(records), every=2, dots_per_inch=70)
+    to_film(path, build_animation(records), every=2, dots_per_inch=70)
     return path

@@ -7,9 +7,9 @@ import gymnasium
 import numpy as np
 
 from rlftsim.envs.episode import Episode, EpisodeState, advance, look, start
-from rlftsim.envs.record import record_of
-from rlftsim.envs.resets import about, chosen, config_of, fresh_seed, note_of
-from rlftsim.envs.result import Result, animation_of, page_of
+from rlftsim.envs.record import build_record
+from rlftsim.envs.resets import about, build_config, chosen, describe_step, draw_seed
+from rlftsim.envs.result import Result, build_animation, build_page
 from rlftsim.envs.snapshot import read_snapshot, write_snapshot
 from rlftsim.envs.source import Source
 from rlftsim.envs.spaces import action_space, observation_space, shown
@@ -45,7 +45,7 @@ class EgoEnv(gymnasium.Env):
         source: Source | None = None,
         **settings: Any,
     ):
-        self.source = source or Source(config_of(settings), scenarios, policy)
+        self.source = source or Source(build_config(settings), scenarios, policy)
         self.config = self.source.config
         self.render_mode = self.config.render_mode
         self.action_space = action_space(self.source.controls)
@@ -86,7 +86,7 @@ class EgoEnv(gymnasium.Env):
             ConfigError: an unknown option or scenario.
         """
         if seed is None and self._begun is None:
-            seed = fresh_seed()
+            seed = draw_seed()
         super().reset(seed=seed)
         if seed is not None:
             self._seed, self._count = seed, 0
@@ -117,7 +117,7 @@ class EgoEnv(gymnasium.Env):
         state, outcome = advance(episode, state, [action])
         self._begun = episode, state
         terminated, truncated = bool(outcome.terminated[0]), bool(outcome.truncated[0])
-        return self._look(), float(outcome.reward[0]), terminated, truncated, note_of(episode, state, outcome, 0)
+        return self._look(), float(outcome.reward[0]), terminated, truncated, describe_step(episode, state, outcome, 0)
 
     def fork(self, number: int, noise: Noise = "same") -> list["EgoEnv"]:
         """Environments that go on from here, which share all that does not change.
@@ -136,19 +136,19 @@ class EgoEnv(gymnasium.Env):
 
     def result(self) -> Result:
         """Scores of the episode so far."""
-        return Result(record_of(self.episode, self.state))
+        return Result(build_record(self.episode, self.state))
 
     def render(self) -> Any:
         """Picture of the scene [height, width, 3], or a page that plays the episode so far, by `render_mode`."""
         if self.render_mode is None:
             return None
-        record = record_of(self.episode, self.state)
+        record = build_record(self.episode, self.state)
         if self.render_mode == "html":
-            return page_of({"planner": record})
+            return build_page({"planner": record})
         if self._camera is None or self._camera.animation.scene.scenario_id != record.scene.scenario.scenario_id:
-            self._camera = Camera(animation_of({"planner": record}), RENDER_DOTS_PER_INCH)
+            self._camera = Camera(build_animation({"planner": record}), RENDER_DOTS_PER_INCH)
         present = record.motion[None, :, -1:].astype(np.float32)  # [1, A, 1, 5]
-        motion = SceneMotion(present[..., :2], present[..., 2], record.there[None, :, -1:])
+        motion = SceneMotion(present[..., :2], present[..., 2], record.is_present[None, :, -1:])
         return self._camera.frame([Panel("planner", motion)], 0, len(self.state.world.track) - 1)
 
     def snapshot(self) -> bytes:

@@ -11,13 +11,13 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int64
 
-from rlftsim.envs.actions import Actors, Controls, checked
+from rlftsim.envs.actions import Actors, Controls, validate_actions
 from rlftsim.envs.config import EnvConfig
-from rlftsim.envs.contact import Collision, collision_of
+from rlftsim.envs.contact import Collision, classify_collision
 from rlftsim.envs.observations import Atlas, Observation, build_atlas, observe
 from rlftsim.envs.rewards import WeightedTerm, parse_terms
 from rlftsim.envs.road import MAX_PAIRS, OUTSIDE_M, nearest_edges, road_edges
-from rlftsim.envs.route import SPACING_M, route_of
+from rlftsim.envs.route import SPACING_M, find_route
 from rlftsim.envs.world import Dice, World, WorldState, begin, step_world, with_dice
 from rlftsim.geometry import boxes_overlap, clockwise_corners, heights_overlap, wrapped
 from rlftsim.goals.types import PointById
@@ -49,7 +49,7 @@ class Episode:
         """M."""
         return len(self.world.actors)
 
-    def name_of(self, row: int) -> str:
+    def agent_name(self, row: int) -> str:
         """Scenario and object id of a planner-driven agent."""
         scene, agent = self.world.actors[row]
         view = self.world.scenes[scene]
@@ -85,7 +85,7 @@ class Outcome:
     """Every term of `rewards.TERMS`, unweighted."""
     terminated: Bool[np.ndarray, "M"]
     truncated: Bool[np.ndarray, "M"]
-    clipped: Bool[np.ndarray, "M"]
+    is_clipped: Bool[np.ndarray, "M"]
 
 
 def build_episode(
@@ -103,7 +103,7 @@ def build_episode(
         goals: that the world was built with.
     """
     routes = tuple(
-        route_of(
+        find_route(
             world.scenes[scene].scenario, int(agent), config.route if agent == world.scenes[scene].ego else "logged"
         )
         for scene, agent in world.actors
@@ -148,8 +148,10 @@ def advance(episode: Episode, state: EpisodeState, action: Any) -> tuple[Episode
     """
     motion = own_motion(episode, state.world)
     scene, agent = episode.world.actors.T
-    actors = Actors(episode.name_of, motion, episode.world.size[scene, agent], episode.world.object_type[scene, agent])
-    action = checked(action, episode.controls, episode.name_of, episode.num_agents)
+    actors = Actors(
+        episode.agent_name, motion, episode.world.size[scene, agent], episode.world.object_type[scene, agent]
+    )
+    action = validate_actions(action, episode.controls, episode.agent_name, episode.num_agents)
     moves = episode.controls.move(action, actors)
     terms = {}
     for step in range(episode.controls.steps):
@@ -168,7 +170,7 @@ def advance(episode: Episode, state: EpisodeState, action: Any) -> tuple[Episode
         terms=terms,
         terminated=terminated,
         truncated=ends & ~terminated & is_over,
-        clipped=moves.clipped,
+        is_clipped=moves.is_clipped,
     )
 
 
@@ -230,9 +232,9 @@ def _step(
     for row, agent in np.argwhere(contacts & ~state.ended[:, None]):
         scene, own = episode.world.actors[row]
         found[row].append(
-            collision_of(
+            classify_collision(
                 episode.world.scenes[scene], world.step, int(agent), moved[row], episode.world.size[scene, own],
-                _ground(episode, world, np.array([row])), world.now[scene, agent], episode.world.size[scene, agent],
+                _ground(episode, world, np.array([row])), world.motion[scene, agent], episode.world.size[scene, agent],
             )
         )  # fmt: skip
     new = [known[len(earlier) :] for known, earlier in zip(found, state.collisions)]
@@ -275,7 +277,7 @@ def own_motion(episode: Episode, world: WorldState) -> Float[np.ndarray, "M 5"]:
         world: a state of theirs.
     """
     scene, agent = episode.world.actors.T
-    return world.now[scene, agent]
+    return world.motion[scene, agent]
 
 
 def look(episode: Episode, state: EpisodeState) -> Observation:
@@ -306,7 +308,7 @@ def off_road_m(episode: Episode, world: WorldState, rows: Int64[np.ndarray, "m"]
     scene, agent = episode.world.actors[rows].T
     if episode.edges is None or not len(rows):
         return np.full(len(rows), -np.inf)
-    motion = world.now[scene, agent]
+    motion = world.motion[scene, agent]
     corners = clockwise_corners(motion[:, :2], motion[:, 2], episode.world.size[scene, agent])
     origin = np.stack([episode.world.scenes[b].scenario.origin for b in scene])
     z = np.repeat(_ground(episode, world, rows)[:, None, None], 4, 1)
@@ -326,7 +328,7 @@ def _free_way_m(episode: Episode, world: WorldState, rows: Int64[np.ndarray, "m"
     the observations, these decide, unless edges lie above each other.
     """
     scene, agent = episode.world.actors[rows].T
-    motion = world.now[scene, agent]
+    motion = world.motion[scene, agent]
     corners = clockwise_corners(motion[:, :2], motion[:, 2], episode.world.size[scene, agent])  # [m, 4, 2]
     distance, side, is_beside = nearest_edges(corners, episode.atlas.edges[scene])
     free = distance.min(1) - SIMPLIFIED_M
@@ -341,9 +343,9 @@ def _contacts(episode: Episode, world: WorldState, motion: Float[np.ndarray, "M 
     """Tracks that each planner-driven agent overlaps now."""
     scene, agent = episode.world.actors.T
     size = episode.world.size
-    known = episode.world.known[scene, :, len(world.track) - 1]
+    known = episode.world.is_observed[scene, :, len(world.track) - 1]
     known[np.arange(len(scene)), agent] = False
-    others = world.now[scene]  # [M, A, 5]
+    others = world.motion[scene]  # [M, A, 5]
     gap = others[..., :2] - motion[:, None, :2]
     meets = known & boxes_overlap(gap, motion[:, None, 2], others[..., 2], size[scene, agent][:, None], size[scene])
     if episode.world.has_levels.any():

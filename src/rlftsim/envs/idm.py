@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 
 from rlftsim.envs.actions import signed_speed
 from rlftsim.envs.levels import RouteHeights, is_on_level
-from rlftsim.envs.route import headings_of, points_every
+from rlftsim.envs.route import compute_headings, sample_line
 from rlftsim.envs.scene import RED, YELLOW, Scene
 from rlftsim.geometry import heights_overlap, wrapped
 from rlftsim.scenario.polylines import arc_length
@@ -44,7 +44,7 @@ class IdmConfig:
     hardest_braking_mps2: float = 8.0
 
 
-def idm_acceleration(
+def compute_idm_acceleration(
     speed: Float[np.ndarray, "*m"],
     wanted: Float[np.ndarray, "*#m"],
     gap: Float[np.ndarray, "*m"],
@@ -127,7 +127,7 @@ class IdmLines:
     """The fastest logged speed, at least that of `IdmConfig` unless the agent backs up."""
 
 
-def idm_lines(scene: Scene, agents: np.ndarray, config: IdmConfig) -> IdmLines:
+def build_idm_lines(scene: Scene, agents: np.ndarray, config: IdmConfig) -> IdmLines:
     """Lines of those of some agents that drive in their logs; the others stay parked.
 
     Args:
@@ -138,12 +138,12 @@ def idm_lines(scene: Scene, agents: np.ndarray, config: IdmConfig) -> IdmLines:
     fastest = np.linalg.norm(scene.logged[agents, CURRENT_STEP:, 3:], axis=-1).max(1, initial=0.0)
     agents, fastest = agents[fastest >= PARKED_MPS], fastest[fastest >= PARKED_MPS]
     logged_paths = [_logged_path(scene, int(agent)) for agent in agents]
-    lines = [points_every(path[:, :2], 1.0) for path in logged_paths]
+    lines = [sample_line(path[:, :2], 1.0) for path in logged_paths]
     longest = max((len(line) for line in lines), default=1)
     points = np.stack([np.pad(line, ((0, longest - len(line)), (0, 0)), mode="edge") for line in lines] or [
         np.zeros((1, 2))
     ])[: len(agents)]  # fmt: skip
-    heading = np.stack([np.pad(headings_of(line), (0, longest - len(line)), mode="edge") for line in lines] or [
+    heading = np.stack([np.pad(compute_headings(line), (0, longest - len(line)), mode="edge") for line in lines] or [
         np.zeros(1)
     ])[: len(agents)]  # fmt: skip
     backs_up = np.zeros(heading.shape, bool)
@@ -223,7 +223,7 @@ def advance_idm(
     to_stop = to_stop.min(1, initial=np.inf)
     lead, gap = np.where(to_stop < gap, 0.0, lead), np.minimum(gap, to_stop)
     # 3. Along the line by the mean speed of the step.
-    acceleration = idm_acceleration(speed, lines.wanted_mps, gap, lead, config)
+    acceleration = compute_idm_acceleration(speed, lines.wanted_mps, gap, lead, config)
     new_speed = np.maximum(speed + acceleration * STEP_S, 0.0)
     way = np.minimum(way + (speed + new_speed) / 2 * STEP_S, lines.points.shape[1] - 1.001)
     low = way.astype(int)

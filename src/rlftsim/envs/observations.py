@@ -15,8 +15,8 @@ from jaxtyping import Bool, Float, Float32, Int8, Int64
 from rlftsim.envs.actions import WHEELBASE_PER_LENGTH, signed_speed
 from rlftsim.envs.drivers import Driver
 from rlftsim.envs.levels import RouteHeights, is_on_level
-from rlftsim.envs.route import Route, headings_of
-from rlftsim.envs.scene import GREEN, PIECE_POINTS, RED, YELLOW
+from rlftsim.envs.route import Route, compute_headings
+from rlftsim.envs.scene import GREEN, RED, SEGMENT_POINTS, YELLOW
 from rlftsim.envs.world import World, WorldState, padded
 from rlftsim.geometry import heights_overlap, wrapped
 from rlftsim.scenario.types import STEP_S, TOTAL_STEPS
@@ -86,7 +86,7 @@ SHAPES: dict[str, tuple[int, ...]] = {
     "neighbors": (NEIGHBORS, 10),
     "neighbors_mask": (NEIGHBORS,),
     "neighbors_history": (NEIGHBORS, 4 * HISTORY),
-    "lanes": (LANES, 2 * PIECE_POINTS + 5),
+    "lanes": (LANES, 2 * SEGMENT_POINTS + 5),
     "lanes_mask": (LANES,),
     "edges": (EDGES, 4),
     "edges_mask": (EDGES,),
@@ -152,17 +152,17 @@ def build_atlas(world: World, routes: tuple[Route, ...]) -> Atlas:
         np.pad(s.lights.point, ((0, num_lights + 1 - len(s.lights.lane)), (0, 0)), constant_values=_FAR_M)
         for s in scenes
     ]
-    facts = [np.stack([s.lanes.kind, s.lanes.limit_mps, s.lanes.has_stop_sign], -1) for s in scenes]
+    facts = [np.stack([s.lanes.lane_type, s.lanes.limit_mps, s.lanes.has_stop_sign], -1) for s in scenes]
     edges, crossings = _stack([s.edges for s in scenes], _FAR_M), _stack([s.crossings for s in scenes], _FAR_M)
     on_route = [np.isin(owner[b], route.lanes) for (b, _), route in zip(world.actors, routes)]
-    lane_middle, edge_middle = points[:, :, PIECE_POINTS // 2], (edges[..., :2] + edges[..., 2:]) / 2
+    lane_middle, edge_middle = points[:, :, SEGMENT_POINTS // 2], (edges[..., :2] + edges[..., 2:]) / 2
     crossing_middle = crossings.reshape(*crossings.shape[:2], 4, 2).mean(2)
     route_points = _stack([route.points for route in routes] or [np.zeros((0, 2))], _FAR_M)
     route_ground = _stack([route.ground for route in routes] or [np.zeros(0)], 0.0)
     heights: dict[str, RouteHeights] = {}
     if world.has_levels.any():
         things = {
-            "lanes": (lane_middle, [s.lanes.z[:, PIECE_POINTS // 2] for s in scenes]),
+            "lanes": (lane_middle, [s.lanes.z[:, SEGMENT_POINTS // 2] for s in scenes]),
             "edges": (edge_middle, [s.edges_z for s in scenes]),
             "crossings": (crossing_middle, [s.crossings_z for s in scenes]),
             "lights": (np.stack(light_point), [s.lights.z for s in scenes]),
@@ -173,7 +173,7 @@ def build_atlas(world: World, routes: tuple[Route, ...]) -> Atlas:
             heights[name] = RouteHeights.measure(middle[of_scene], padded_z[of_scene], route_points, route_ground)
     return Atlas(
         lane_points=points,
-        lane_heading=headings_of(points),
+        lane_heading=compute_headings(points),
         lane_middle=lane_middle,
         lane_facts=_stack(facts, 0.0),
         lane_light=lane_light,
@@ -214,14 +214,14 @@ def observe(world: World, atlas: Atlas, state: WorldState, *, frame: Frame = "eg
     """
     scene, agent = world.actors.T
     row, count = np.arange(len(scene)), len(scene)
-    now = state.now[scene, agent]  # [M, 5]
+    now = state.motion[scene, agent]  # [M, 5]
     log_step = len(state.track) - 1
     is_own = frame == "ego"
     origin, angle = (now[:, :2], now[:, 2]) if is_own else (np.zeros((count, 2)), np.zeros(count))
 
     # 1. Motion over the last 11 steps [M, 11, A, 5], and the other agents that are there, nearest first.
     past = np.stack(state.track[-HISTORY - 1 :], 1)[scene]
-    there = np.moveaxis(world.there[scene, :, log_step - HISTORY : log_step + 1], 2, 1)  # [M, 11, A]
+    there = np.moveaxis(world.is_present[scene, :, log_step - HISTORY : log_step + 1], 2, 1)  # [M, 11, A]
     away = _distance(now, past[:, -1])
     away[~there[:, -1]] = np.inf
     away[row, agent] = np.inf
@@ -340,7 +340,9 @@ def _leave_out_other_levels(
     ground = z[scene, agent] - half[:, 0]
     above_route = ground - atlas.route_ground[np.arange(len(scene)), nearest_on_route]
     # a box as high as the agent's whose height difference is 0 stands on the same ground
-    neighbors = RouteHeights.measure(state.now[scene][..., :2], z[scene] - half, atlas.route_points, atlas.route_ground)
+    neighbors = RouteHeights.measure(
+        state.motion[scene][..., :2], z[scene] - half, atlas.route_points, atlas.route_ground
+    )
     for name, heights in {**atlas.heights, "neighbors": neighbors}.items():
         difference = heights.differences(distances[name], ground, above_route)
         if name == "neighbors":
@@ -422,6 +424,6 @@ def _about_itself(
     return np.stack([
         speed, (speed - signed_speed(before)) / STEP_S, yaw_rate, steering, length, world.size[scene, agent, 1],
         np.where(on_lane, np.cos(to_lane), 0.0), np.where(on_lane, np.sin(to_lane), 0.0),
-        np.where(on_lane, lateral, 0.0), np.where(on_lane, limit[row, best // PIECE_POINTS], 0.0),
+        np.where(on_lane, lateral, 0.0), np.where(on_lane, limit[row, best // SEGMENT_POINTS], 0.0),
         np.full(len(own), STEP_S * steps_left), world.object_type[scene, agent],
     ], -1)  # fmt: skip

@@ -9,11 +9,11 @@ from gymnasium.spaces import Space
 from gymnasium.utils import seeding
 from pettingzoo import ParallelEnv
 
-from rlftsim.envs.actions import checked
+from rlftsim.envs.actions import validate_actions
 from rlftsim.envs.config import EnvConfig
-from rlftsim.envs.drivers import Driver, drivers_of
+from rlftsim.envs.drivers import Driver, assign_drivers
 from rlftsim.envs.episode import Episode, EpisodeState, advance, look, start
-from rlftsim.envs.resets import OPTIONS, about, chosen, config_of, fresh_seed, note_of
+from rlftsim.envs.resets import OPTIONS, about, build_config, chosen, describe_step, draw_seed
 from rlftsim.envs.scene import build_env_scene
 from rlftsim.envs.source import Source
 from rlftsim.envs.spaces import action_space, observation_space, shown
@@ -51,7 +51,7 @@ def parallel_env(
         if not controlled:
             raise ConfigError("controlled is empty: name at least one object id, or a group such as 'vehicles'.")
     rules = dict.fromkeys([controlled] if isinstance(controlled, str) else controlled, "planner")
-    return TrafficParallelEnv(controlled, Source(config_of(settings), scenarios, policy, rules))
+    return TrafficParallelEnv(controlled, Source(build_config(settings), scenarios, policy, rules))
 
 
 class TrafficParallelEnv(ParallelEnv):
@@ -70,7 +70,7 @@ class TrafficParallelEnv(ParallelEnv):
             raise ConfigError("this environment renders nothing and observes 'dict' or 'flat': change these.")
         self.source, self.render_mode = source, None
         self._spaces = observation_space(config.observation), action_space(source.controls)
-        self._seed = fresh_seed()
+        self._seed = draw_seed()
         self._random, _ = seeding.np_random(self._seed)
         self._count = 0
         self._begun: tuple[Episode, EpisodeState] | None = None
@@ -85,7 +85,7 @@ class TrafficParallelEnv(ParallelEnv):
         found: dict[str, None] = {}
         for scenario_id in self.source.scenario_ids:
             scene = build_env_scene(self.source.scenario(scenario_id))
-            planned = scene.object_id[drivers_of(scene, self.source.rules) == Driver.PLANNER]
+            planned = scene.object_id[assign_drivers(scene, self.source.rules) == Driver.PLANNER]
             found.update(dict.fromkeys(map(str, planned.tolist())))
         return list(found)
 
@@ -148,13 +148,15 @@ class TrafficParallelEnv(ParallelEnv):
         array = np.zeros((len(self._names), *controls.limits.shape))
         for row, name in enumerate(self._names):
             if name in acting:
-                array[row] = checked([actions[name]], controls, lambda _, row=row: episode.name_of(row), 1)[0]
+                array[row] = validate_actions([actions[name]], controls, lambda _, row=row: episode.agent_name(row), 1)[
+                    0
+                ]
         state, outcome = advance(episode, state, array)
         self._begun = episode, state
         rows = {name: self._names.index(name) for name in acting}
         terminated = {name: bool(outcome.terminated[row]) for name, row in rows.items()}
         truncated = {name: bool(outcome.truncated[row]) for name, row in rows.items()}
-        infos = {name: note_of(episode, state, outcome, row) for name, row in rows.items()}
+        infos = {name: describe_step(episode, state, outcome, row) for name, row in rows.items()}
         self.agents = [name for name in acting if not (terminated[name] or truncated[name])]
         rewards = {name: float(outcome.reward[row]) for name, row in rows.items()}
         return self._observe(acting), rewards, terminated, truncated, infos

@@ -105,7 +105,7 @@ def score_planner(record: Record) -> PlannerScores:
         red_light_rate=_red_light(record),
         least_ttc_s=least_time_to_collision(record),
         off_road_m=math.nan if "off_road_m" in missing else max(0.0, float(off_road(record).max())),
-        route_completion=_gained(record.route, record.own) / whole if whole else math.nan,
+        route_completion=_gained(record.route, record.agent_motion) / whole if whole else math.nan,
         speed_change_mps=max((one.speed_change_mps for one in found), default=0.0),
         mean_jerk_mps3=float(jerk.mean()) if len(jerk) else math.nan,
         jerk_95_mps3=float(np.quantile(jerk, 0.95)) if len(jerk) else math.nan,
@@ -170,7 +170,7 @@ def off_road(record: Record) -> Float[np.ndarray, "T1"]:
     scene, edges = record.scene, road_edges(record.scene.scenario)
     if edges is None:
         return np.full(record.steps + 1, -np.inf)
-    own = record.own
+    own = record.agent_motion
     corners = (
         clockwise_corners(own[:, :2], own[:, 2], scene.size[record.agent]) + scene.scenario.origin
     )  # [T + 1, 4, 2]
@@ -186,7 +186,7 @@ def _gained(route: Route, own: Float[np.ndarray, "T1 5"]) -> float:
 
 
 def _progress_ratio(record: Record) -> float:
-    ego = _gained(record.logged_route, record.own)
+    ego = _gained(record.logged_route, record.agent_motion)
     logged = record.scene.logged[record.agent, CURRENT_STEP : CURRENT_STEP + record.steps + 1]
     if ego < -PROGRESS_M:
         return 0.0
@@ -203,10 +203,10 @@ def _lane_headings(record: Record) -> tuple[Float[np.ndarray, "T1"], Float[np.nd
     junction = np.zeros(record.steps + 1, bool)
     if search is None:
         return angle, limit, junction
-    near = search.find_near(record.own[:, :2], LANE_M, record.ground[record.agent])
+    near = search.find_points(record.agent_motion[:, :2], LANE_M, record.ground[record.agent])
     for step, points in enumerate(near):
         if points:
-            turn = np.abs(wrapped(search.heading[points] - record.own[step, 2]))
+            turn = np.abs(wrapped(search.heading[points] - record.agent_motion[step, 2]))
             best = points[int(turn.argmin())]
             angle[step] = turn.min()
             limit[step] = record.scene.graph.speed_limit_mps[search.lane[best]]
@@ -216,7 +216,7 @@ def _lane_headings(record: Record) -> tuple[Float[np.ndarray, "T1"], Float[np.nd
 
 def _direction_score(record: Record) -> float:
     angle, _, _ = _lane_headings(record)
-    step = np.linalg.norm(np.diff(record.own[:, :2], axis=0), axis=1)
+    step = np.linalg.norm(np.diff(record.agent_motion[:, :2], axis=0), axis=1)
     against = np.where(np.nan_to_num(angle[1:]) > np.pi / 2, step, 0.0)
     window = min(WRONG_WAY_STEPS, len(against))
     most = np.convolve(against, np.ones(window), "valid").max() if window else 0.0
@@ -225,7 +225,7 @@ def _direction_score(record: Record) -> float:
 
 def _speed_score(record: Record) -> float:
     _, limit, _ = _lane_headings(record)
-    speed = np.linalg.norm(record.own[:, 3:], axis=1)
+    speed = np.linalg.norm(record.agent_motion[:, 3:], axis=1)
     over = np.where(limit > 0, np.maximum(speed - limit, 0.0), 0.0)[1:]
     return max(0.0, 1.0 - float(over.mean()) / OVER_SPEED_MPS) if len(over) else 1.0
 
@@ -236,7 +236,7 @@ def least_time_to_collision(record: Record) -> float:
     Tracks ahead and crossing ones count. Those beside the agent do only while it is not in one lane, or in a junction;
     those behind, and those it has touched already, never do.
     """
-    own, others = record.own, record.motion
+    own, others = record.agent_motion, record.motion
     size = record.scene.size[:, :2]
     speed, other_speed = (np.linalg.norm(motion[..., 3:], axis=-1) for motion in (own, others))
     offset = others[..., :2] - own[:, :2]  # [A, T + 1, 2]
@@ -244,7 +244,7 @@ def least_time_to_collision(record: Record) -> float:
     crossing = np.abs(np.sin(others[..., 2] - own[:, 2])) > np.sin(CROSSING_RAD)
     _, _, junction = _lane_headings(record)
     beside = ~in_one_lane(record.scene, own, size[record.agent], record.ground[record.agent]) | junction
-    counts = record.known & (bearing < BEHIND_RAD) & ((bearing < AHEAD_RAD) | crossing | beside)
+    counts = record.is_observed & (bearing < BEHIND_RAD) & ((bearing < AHEAD_RAD) | crossing | beside)
     counts[record.agent] = False
     counts &= speed > TTC_MOVING_MPS
     for one in record.collisions:
@@ -293,7 +293,7 @@ class _Kinematics:
 
 
 def _kinematics(record: Record) -> _Kinematics:
-    own = record.own
+    own = record.agent_motion
     if len(own) < 5:  # too short for any derivative
         return _Kinematics(*[np.zeros(0)] * 6)
     # odd windows that fit a short record
@@ -346,7 +346,7 @@ def _red_light(record: Record) -> float:
     signals = _signals(record.scene.scenario)
     if signals is None:
         return 0.0
-    x, y = torch.from_numpy(record.own[:, :2] + record.scene.scenario.origin).float().T[:, None, None]
+    x, y = torch.from_numpy(record.agent_motion[:, :2] + record.scene.scenario.origin).float().T[:, None, None]
     passed = compute_traffic_light_violation(
         x, y, torch.ones(1, 1, record.steps, dtype=torch.bool), signals, first_step=CURRENT_STEP, max_pairs=MAX_PAIRS
     )
@@ -358,5 +358,5 @@ def _displacement(record: Record) -> float:
     known = record.scene.valid[record.agent, steps]
     if not known.any():
         return math.nan
-    offset = record.own[1:, :2] - record.scene.logged[record.agent, steps, :2]
+    offset = record.agent_motion[1:, :2] - record.scene.logged[record.agent, steps, :2]
     return float(np.linalg.norm(offset[known], axis=1).mean())

@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.episode import Episode, EpisodeState, Outcome
-from rlftsim.envs.record import record_of
+from rlftsim.envs.record import build_record
 from rlftsim.envs.result import Result
 from rlftsim.envs.source import Source
 from rlftsim.envs.world import Dice
@@ -18,7 +18,7 @@ OPTIONS = ("scenario", "rollout", "goals")
 """Options of a reset."""
 
 
-def config_of(settings: dict[str, Any]) -> EnvConfig:
+def build_config(settings: dict[str, Any]) -> EnvConfig:
     """Settings by name.
 
     Raises:
@@ -30,7 +30,7 @@ def config_of(settings: dict[str, Any]) -> EnvConfig:
     return EnvConfig(**settings)
 
 
-def fresh_seed() -> int:
+def draw_seed() -> int:
     """A seed where none is given: one that fits an array of int64 and gives the same episodes again."""
     return int(np.random.default_rng().integers(2**31))
 
@@ -78,12 +78,12 @@ def about(episode: Episode, state: EpisodeState, row: int, source: Source) -> di
         "step": 0,
         "route": episode.atlas.routes[row].source,
         "model": source.fingerprint,
-        "lights_held": lights_are_held(episode, state, row),
+        "lights_held": has_frozen_lights(episode, state, row),
         "logged": logged_poses(episode, row),
     }
 
 
-def note_of(episode: Episode, state: EpisodeState, outcome: Outcome, row: int) -> dict[str, Any]:
+def describe_step(episode: Episode, state: EpisodeState, outcome: Outcome, row: int) -> dict[str, Any]:
     """Information after an action; at the end of the agent's episode with its `Result`.
 
     Args:
@@ -95,11 +95,11 @@ def note_of(episode: Episode, state: EpisodeState, outcome: Outcome, row: int) -
     note: dict[str, Any] = {
         "step": state.world.step,
         "terms": {name: float(value[row]) for name, value in outcome.terms.items()},
-        "clipped": bool(outcome.clipped[row]),
-        "lights_held": lights_are_held(episode, state, row),
+        "clipped": bool(outcome.is_clipped[row]),
+        "lights_held": has_frozen_lights(episode, state, row),
     }
     if outcome.terminated[row] or outcome.truncated[row]:
-        note["result"] = Result(record_of(episode, state, row))
+        note["result"] = Result(build_record(episode, state, row))
     return note
 
 
@@ -116,7 +116,7 @@ def logged_poses(episode: Episode, row: int) -> Float[np.ndarray, "81 3"]:
     return poses
 
 
-def lights_are_held(episode: Episode, state: EpisodeState, row: int) -> bool:
+def has_frozen_lights(episode: Episode, state: EpisodeState, row: int) -> bool:
     """True where lights keep their last state as the log has no further ones.
 
     Args:

@@ -67,7 +67,7 @@ NO_ROUTE = Route(np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros(0), np.zer
 
 
 @cached_on_scenario
-def route_of(scenario: Scenario, agent: int, choice: RouteChoice) -> Route:
+def find_route(scenario: Scenario, agent: int, choice: RouteChoice) -> Route:
     """Route of an agent; without lanes there is none.
 
     Args:
@@ -159,8 +159,8 @@ def _of_points(scene: Scene, agent: int, line: Float[np.ndarray, "n 2"], source:
     """Route along a polyline, with the lanes and limits there."""
     if float(arc_length(line)[-1]) < SPACING_M:
         return NO_ROUTE
-    points = points_every(line, SPACING_M)
-    heading = headings_of(points)
+    points = sample_line(line, SPACING_M)
+    heading = compute_headings(points)
     # lanes and limits: of the nearest lane point that runs the same way
     graph = scene.graph
     offset = np.linalg.norm(points[:, None] - (graph.points[:, :2] - scene.scenario.origin), axis=-1)  # [R, P]
@@ -176,7 +176,7 @@ def _of_points(scene: Scene, agent: int, line: Float[np.ndarray, "n 2"], source:
     return Route(points, heading, ground, limit, np.unique(owner[on_lane]), source)
 
 
-def points_every(line: Float[np.ndarray, "n 2"], spacing_m: float) -> Float[np.ndarray, "m 2"]:
+def sample_line(line: Float[np.ndarray, "n 2"], spacing_m: float) -> Float[np.ndarray, "m 2"]:
     """Points along a polyline from its start on.
 
     Args:
@@ -188,7 +188,7 @@ def points_every(line: Float[np.ndarray, "n 2"], spacing_m: float) -> Float[np.n
     return np.stack([np.interp(at, along, line[:, k]) for k in range(2)], axis=1)
 
 
-def headings_of(lines: Float[np.ndarray, "*lines n 2"]) -> Float[np.ndarray, "*lines n"]:
+def compute_headings(lines: Float[np.ndarray, "*lines n 2"]) -> Float[np.ndarray, "*lines n"]:
     """Direction of polylines from each point to the next, rad; at the last point that of the segment before it."""
     ahead = np.diff(lines, axis=-2, append=2 * lines[..., -1:, :] - lines[..., -2:-1, :])
     return np.arctan2(ahead[..., 1], ahead[..., 0])

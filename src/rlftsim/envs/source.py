@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from rlftsim.envs.actions import Controls, controls_of
+from rlftsim.envs.actions import Controls, build_controls
 from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.episode import Episode, ScenarioGoals, build_episode
 from rlftsim.envs.world import build_world
@@ -61,7 +61,7 @@ class Source:
             policy if policy is not None else load_policy(config.model, config.device) if needs_policy else None
         )
         self.fingerprint = fingerprint_policy(self.policy) if self.policy is not None else "none"
-        self.controls: Controls = controls_of(
+        self.controls: Controls = build_controls(
             config.action, self.policy, horizon=config.horizon, tracker=config.tracker, reverse=config.reverse,
             hard_braking=config.hard_braking,
         )  # fmt: skip

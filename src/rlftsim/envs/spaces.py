@@ -6,7 +6,7 @@ import numpy as np
 from gymnasium import spaces
 
 from rlftsim.envs.actions import Controls
-from rlftsim.envs.config import ObservationKind
+from rlftsim.envs.config import ObservationFormat
 from rlftsim.envs.observations import BOUND, SHAPES, Observation
 
 
@@ -18,7 +18,7 @@ def action_space(controls: Controls) -> spaces.Space:
     return spaces.Box(-limits, limits, dtype=np.float32)
 
 
-def observation_space(kind: ObservationKind) -> spaces.Space:
+def observation_space(kind: ObservationFormat) -> spaces.Space:
     """Space of one agent's observations; "arrays" has the space of "dict"."""
     if kind == "flat":
         return spaces.Box(-BOUND, BOUND, (sum(math.prod(shape) for shape in SHAPES.values()),), np.float32)
@@ -30,7 +30,7 @@ def observation_space(kind: ObservationKind) -> spaces.Space:
     })  # fmt: skip
 
 
-def shown(observation: Observation, kind: ObservationKind, row: int | None = None):
+def shown(observation: Observation, kind: ObservationFormat, row: int | None = None):
     """An observation in the form of its space.
 
     Args:

@@ -59,18 +59,18 @@ def score_traffic(record: Record) -> TrafficScores:
     length, width = scene.size[:, 0].astype(np.float32), scene.size[:, 1].astype(np.float32)
     overlaps = compute_overlap(
         motion[None, ..., :2].astype(np.float32), motion[None, ..., 2].astype(np.float32), length, width,
-        (record.known & others[:, None])[None], ignore_from=0,
+        (record.is_observed & others[:, None])[None], ignore_from=0,
         z=None if scene.levels is None else record.z[None], height=scene.size[:, 2],
     )[0].any(1)  # fmt: skip
     # 2. kinematics over half a second whose states are all known
     speed = np.linalg.norm(np.diff(motion[..., :2], axis=1), axis=-1) / STEP_S  # [A, T]
     speeds = _runs(speed, SPAN_STEPS + 1)
     change = np.abs(speeds[..., -1] - speeds[..., 0]) / (SPAN_STEPS * STEP_S)
-    jolt = (change > INFEASIBLE_ACCELERATION_MPS2) & _runs(record.known, SPAN_STEPS + 2).all(-1)
+    jolt = (change > INFEASIBLE_ACCELERATION_MPS2) & _runs(record.is_observed, SPAN_STEPS + 2).all(-1)
     driven = _runs(speed, SPAN_STEPS).sum(-1) * STEP_S
     headings = _runs(motion[..., 2], SPAN_STEPS + 1)
     turn = np.abs(wrapped(headings[..., -1] - headings[..., 0]))
-    fast = (driven > SLOW_MPS * SPAN_STEPS * STEP_S) & _runs(record.known, SPAN_STEPS + 1).all(-1)
+    fast = (driven > SLOW_MPS * SPAN_STEPS * STEP_S) & _runs(record.is_observed, SPAN_STEPS + 1).all(-1)
     tight = np.where(fast, turn / np.maximum(driven, 1e-3), 0.0) > INFEASIBLE_CURVATURE
     return TrafficScores(
         ego_contacts=float(len(record.collisions)),
@@ -110,7 +110,7 @@ def _leaves_road(record: Record) -> Bool[np.ndarray, "A"]:
     states = Trajectories(*(torch.from_numpy(v.copy()).float()[None] for v in motion))
     size = torch.from_numpy(scene.size).float()
     off = compute_distance_to_road_edge(states, size, edges, max_pairs=MAX_PAIRS)[0].numpy()
-    return ((off >= OUTSIDE_M) & record.known).any(1) & (off[:, 0] < OUTSIDE_M)
+    return ((off >= OUTSIDE_M) & record.is_observed).any(1) & (off[:, 0] < OUTSIDE_M)
 
 
 def _drives_against(record: Record, vehicles: Bool[np.ndarray, "A"]) -> Bool[np.ndarray, "A"]:
@@ -119,11 +119,11 @@ def _drives_against(record: Record, vehicles: Bool[np.ndarray, "A"]) -> Bool[np.
     if search is None:
         return found
     # a replayed agent jumps over the gaps of its log
-    known = record.known[:, 1:] & record.known[:, :-1]
+    known = record.is_observed[:, 1:] & record.is_observed[:, :-1]
     step = np.where(known, np.linalg.norm(np.diff(record.motion[..., :2], axis=1), axis=-1), 0.0)
     moving = np.flatnonzero(vehicles & (step.sum(1) >= WRONG_WAY_M[0]))
     for agent in moving:
-        near = search.find_near(record.motion[agent, 1:, :2], LANE_M, record.ground[agent, 1:])
+        near = search.find_points(record.motion[agent, 1:, :2], LANE_M, record.ground[agent, 1:])
         heading = record.motion[agent, 1:, 2]
         against = [
             bool(points) and bool((np.cos(search.heading[points] - own) < 0).all())
@@ -145,7 +145,7 @@ class _WithoutEgo(Scenario):
         return chosen[np.argsort(self.tracks.object_id[chosen], kind="stable")]
 
 
-def realism_of_others(records: Sequence[Record], config: MetricConfig = METRIC_2025) -> float:
+def compute_traffic_realism(records: Sequence[Record], config: MetricConfig = METRIC_2025) -> float:
     """Realism meta-metric of the agents to predict, the ego left out, over rollouts of one scenario.
 
     NaN where it cannot be measured: no future, no road edges, an episode that ended early, or no other agent to

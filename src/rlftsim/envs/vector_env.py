@@ -10,10 +10,10 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from jaxtyping import Bool, Int64
 
-from rlftsim.envs.actions import checked
+from rlftsim.envs.actions import validate_actions
 from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.episode import Episode, EpisodeState, advance, look, start
-from rlftsim.envs.resets import about, chosen, config_of, fresh_seed, note_of
+from rlftsim.envs.resets import about, build_config, chosen, describe_step, draw_seed
 from rlftsim.envs.source import Source
 from rlftsim.envs.spaces import action_space, observation_space, shown
 from rlftsim.errors import ConfigError, in_short, whole_number
@@ -70,7 +70,7 @@ class EgoVectorEnv(VectorEnv):
         policy: Policy | None = None,
         **settings: Any,
     ):
-        config: EnvConfig = config_of(settings)
+        config: EnvConfig = build_config(settings)
         if config.render_mode is not None or config.observation == "arrays":
             raise ConfigError("a vector of environments renders nothing and observes 'dict' or 'flat': change these.")
         self.source = Source(config, scenarios, policy)
@@ -132,7 +132,7 @@ class EgoVectorEnv(VectorEnv):
             raise ConfigError(f"seed has {len(seeds)} numbers, it must be one number or {self.num_envs}.")
         for i, given in enumerate(seeds):
             if len(self._slots) <= i or given is not None:
-                used = fresh_seed() if given is None else given
+                used = draw_seed() if given is None else given
                 self._slots[i : i + 1] = [_Slot(seeding.np_random(used)[0], used)]
         notes: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         self._reset(np.flatnonzero(mask), options, notes)
@@ -171,7 +171,7 @@ class EgoVectorEnv(VectorEnv):
             raise ConfigError("these environments have no episodes yet: call reset() first.")
         controls = self.source.controls
         # all slots before any of them moves
-        actions = checked(actions, controls, self._name_of, self.num_envs)
+        actions = validate_actions(actions, controls, self._name_of, self.num_envs)
         over = np.flatnonzero(self._over)
         if self.autoreset_mode == AutoresetMode.DISABLED and len(over):
             raise ConfigError(f"the episode of slot {over[0]} is over: reset it with options={{'reset_mask': ...}}.")
@@ -194,7 +194,7 @@ class EgoVectorEnv(VectorEnv):
             rewards[slots] = outcome.reward[group.live]
             terminated[slots], truncated[slots] = outcome.terminated[group.live], outcome.truncated[group.live]
             for row, slot in zip(group.live, slots):
-                notes[slot] = note_of(group.episode, group.state, outcome, int(row))
+                notes[slot] = describe_step(group.episode, group.state, outcome, int(row))
         self._over = terminated | truncated
         # 3. the same step resets at once and hands over the last observation beside the first
         ended = np.flatnonzero(self._over)
@@ -208,7 +208,7 @@ class EgoVectorEnv(VectorEnv):
 
     def _name_of(self, slot: int) -> str:
         group = next(group for group in self._groups if slot in group.slots)
-        return f"slot {slot}, {group.episode.name_of(int(np.flatnonzero(group.slots == slot)[0]))}"
+        return f"slot {slot}, {group.episode.agent_name(int(np.flatnonzero(group.slots == slot)[0]))}"
 
     def _reset(self, which: np.ndarray, options: dict[str, Any], notes: list[dict[str, Any]]) -> None:
         """Begin episodes of some slots, which form a group, and note what there is to say about them."""

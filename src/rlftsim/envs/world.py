@@ -22,8 +22,8 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from rlftsim.envs.drivers import Driver, Rules, drivers_of
-from rlftsim.envs.idm import IdmConfig, IdmLines, advance_idm, idm_lines
+from rlftsim.envs.drivers import Driver, Rules, assign_drivers
+from rlftsim.envs.idm import IdmConfig, IdmLines, advance_idm, build_idm_lines
 from rlftsim.envs.scene import Scene, build_env_scene
 from rlftsim.errors import ConfigError, in_short
 from rlftsim.goals.types import Goals, PointById
@@ -72,9 +72,9 @@ class World:
     sampling: Sampling
     lines: tuple[IdmLines, ...]
     """Of the IDM-driven agents of each scene."""
-    there: Bool[np.ndarray, "B A 91"]
+    is_present: Bool[np.ndarray, "B A 91"]
     """True = the agent is there at a step of the log's time (10 is the current one); replayed ones until it ends."""
-    known: Bool[np.ndarray, "B A 91"]
+    is_observed: Bool[np.ndarray, "B A 91"]
     """True = it is there, and not held in a gap of its log: contacts and scores count these states alone."""
     has_levels: Bool[np.ndarray, "B"]
     """True = heights count in the scene, see `levels`."""
@@ -115,7 +115,7 @@ class WorldState:
         return len(self.track) - 1 - CURRENT_STEP
 
     @property
-    def now(self) -> Float[np.ndarray, "B A 5"]:
+    def motion(self) -> Float[np.ndarray, "B A 5"]:
         """Present motion."""
         return self.track[-1]
 
@@ -134,7 +134,7 @@ def build_world(
     Args:
         scenarios: at least one.
         policy: the traffic model; it is left out where the rules give it no agent.
-        rules: agents to driver, see `drivers_of`.
+        rules: agents to driver, see `assign_drivers`.
         goals: of agents that follow the policy, scenario id to object id to (x, y), world frame.
         sampling: temperature and truncation of its decisions.
         context: `policy.encode` of these scenarios, if it is known.
@@ -145,7 +145,7 @@ def build_world(
     scenes = tuple(build_env_scene(scenario) for scenario in scenarios)
     batch = collate(scenarios)
     shape = tuple(batch.agent_mask.shape)
-    drivers = padded([drivers_of(scene, rules) for scene in scenes], shape, -1)
+    drivers = padded([assign_drivers(scene, rules) for scene in scenes], shape, -1)
     followers = bool((drivers == Driver.POLICY).any())
     if followers and policy is None:
         raise ConfigError("some agents follow the policy, but there is no model: name one, or give them other drivers.")
@@ -174,14 +174,14 @@ def build_world(
         logged=padded([scene.logged for scene in scenes], (*shape, TOTAL_STEPS, 5)),
         logged_z=padded([scene.logged_z for scene in scenes], (*shape, TOTAL_STEPS)),
         valid=valid,
-        there=there,
-        known=there & (simulated | valid),
+        is_present=there,
+        is_observed=there & (simulated | valid),
         has_levels=np.array([scene.levels is not None for scene in scenes]),
         policy=policy if followers else None,
         context=context if followers else None,
         goals=Goals.from_points(batch, goals) if goals and followers else None,
         sampling=sampling,
-        lines=tuple(idm_lines(scene, rows, IDM) for scene, rows in zip(scenes, idm_rows)),
+        lines=tuple(build_idm_lines(scene, rows, IDM) for scene, rows in zip(scenes, idm_rows)),
     )
 
 
@@ -230,7 +230,7 @@ def step_world(world: World, state: WorldState, moved: Float[np.ndarray, "M 5"])
     block, dice = state.block, state.dice
     following = len(state.track)  # step of the log's time that is being computed
     motion = world.logged[:, :, min(following, world.logged.shape[2] - 1)].copy()  # replayed agents
-    before = state.now
+    before = state.motion
     # 1. agents of the policy, and those that keep their velocity
     if block is not None:
         assert world.policy is not None
@@ -252,7 +252,7 @@ def step_world(world: World, state: WorldState, moved: Float[np.ndarray, "M 5"])
     motion[driven] = before[driven]
     motion[driven, 3:] = 0.0  # parked ones stay; those with a line move below
     if any(len(lines.agents) for lines in world.lines):
-        present = world.there[:, :, following - 1]
+        present = world.is_present[:, :, following - 1]
         moves = [
             advance_idm(
                 lines, place, before[b, :count], state.z[-1][b, :count], present[b, :count], scene, following - 1, IDM

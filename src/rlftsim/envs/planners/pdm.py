@@ -14,13 +14,13 @@ from jaxtyping import Bool, Float
 from rlftsim.envs.actions import (
     ACCELERATION_MPS2,
     STEERING_RAD,
-    ActionKind,
+    ActionType,
     Bicycle,
     pursue,
     pursuit_m,
     signed_speed,
 )
-from rlftsim.envs.idm import LOOKAHEAD_M, IdmConfig, find_leaders, idm_acceleration
+from rlftsim.envs.idm import LOOKAHEAD_M, IdmConfig, compute_idm_acceleration, find_leaders
 from rlftsim.envs.planner_scores import ACCELERATION, JERK, LATERAL
 from rlftsim.envs.planners.view import View, read_view
 from rlftsim.envs.road import OUTSIDE_M, nearest_edges
@@ -51,7 +51,7 @@ class Proposals:
 class PdmPlanner:
     """The best of 15 proposals: 5 fractions of the wanted speed times 3 offsets from the route."""
 
-    action: ActionKind = "bicycle"
+    action: ActionType = "bicycle"
 
     def __init__(self) -> None:
         self._plan = np.zeros((0, 2), np.float32)
@@ -97,7 +97,7 @@ def simulate_proposals(view: View) -> Proposals:
         to_stop = np.where(to_stop > -1.0, np.maximum(to_stop, 0.0), np.inf)
         gap, lead = np.minimum(gap, to_stop), np.where(to_stop < gap, 0.0, lead)
         speed = np.maximum(signed_speed(motion), 0.0)
-        acceleration = np.maximum(idm_acceleration(speed, wanted, gap, lead, CONFIG), -ACCELERATION_MPS2)
+        acceleration = np.maximum(compute_idm_acceleration(speed, wanted, gap, lead, CONFIG), -ACCELERATION_MPS2)
         # 2. pure pursuit of the line
         target = lines[row, np.minimum(place + pursuit_m(speed).astype(int), lines.shape[1] - 1)] - motion[:, :2]
         cos, sin = np.cos(motion[:, 2]), np.sin(motion[:, 2])

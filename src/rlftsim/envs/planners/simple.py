@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from rlftsim.envs.actions import ActionKind
+from rlftsim.envs.actions import ActionType
 from rlftsim.errors import DataError
 from rlftsim.geometry import wrapped
 
@@ -13,7 +13,7 @@ from rlftsim.geometry import wrapped
 class Replay:
     """Drives as logged. With replayed traffic it gives the log back, so it tests the whole loop."""
 
-    action: ActionKind = "pose"
+    action: ActionType = "pose"
 
     def __init__(self) -> None:
         self._steps = np.zeros((0, 3), np.float32)
@@ -50,7 +50,7 @@ def _steps_between(poses: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n-1 3"
 class ConstantVelocityPlanner:
     """Keeps speed and heading, backwards too: the floor."""
 
-    action: ActionKind = "bicycle"
+    action: ActionType = "bicycle"
     reverse = True
 
     def reset(self, info: dict[str, Any]) -> None:

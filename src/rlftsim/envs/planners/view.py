@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rlftsim.envs.idm import LOOKAHEAD_M, ON_LINE_M
-from rlftsim.envs.route import headings_of, points_every
+from rlftsim.envs.route import compute_headings, sample_line
 
 STRAIGHT_M = 80.0
 """Without a route a planner drives straight on."""
@@ -41,12 +41,12 @@ def read_view(observation: dict[str, Any]) -> View:
     # beyond its end the route goes straight on, so that a planner never stops for want of a line
     last = line[-1] - line[-2]
     last /= max(float(np.linalg.norm(last)), 1e-6)
-    line = points_every(np.vstack([line, line[-1] + LOOKAHEAD_M * last]), 1.0)
+    line = sample_line(np.vstack([line, line[-1] + LOOKAHEAD_M * last]), 1.0)
     return View(
         speed=float(ego[0]),
         size=ego[4:6],
         line=line,
-        heading=np.unwrap(headings_of(line)),
+        heading=np.unwrap(compute_headings(line)),
         limit_mps=float(route[0, 2]) if len(route) else 0.0,
         others=np.concatenate(
             [neighbors[:, :2], np.arctan2(neighbors[:, 3], neighbors[:, 2])[:, None], neighbors[:, 4:6]], 1
