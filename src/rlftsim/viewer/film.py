@@ -11,7 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 
 from rlftsim.errors import ConfigError
-from rlftsim.jobs.files import write_whole
+from rlftsim.jobs.files import write_atomically
 from rlftsim.scenario.types import CURRENT_STEP
 from rlftsim.viewer.page import Animation, Panel
 from rlftsim.viewer.picture import agent_shapes, draw_scene, light_dots
@@ -42,7 +42,7 @@ def to_film(path: str | os.PathLike[str], animation: Animation, *, every: int = 
     # The last frame stays for a while, or the end could not be seen before a player starts again.
     films = list(_frames(animation, every, dots_per_inch))
     films += films[-1:] * round(HOLD_AT_END_S * STEPS_PER_SECOND / every)
-    write_whole(path, lambda temporary: WRITERS[path.suffix](temporary, films, STEPS_PER_SECOND / every))
+    write_atomically(path, lambda temporary: WRITERS[path.suffix](temporary, films, STEPS_PER_SECOND / every))
 
 
 class Camera:
