@@ -88,8 +88,8 @@ def drive(config: DriveConfig, out: Path | None = None) -> list[DriveResult]:
     file, with a message. A planner whose file has changed is driven anew.
 
     Args:
-        config: what is driven.
-        out: folder for the files; None keeps none.
+        config: Planner, data, kinds of traffic and number of rollouts.
+        out: Folder for the Parquet files; None = results are returned and not written.
 
     Raises:
         ConfigError: an unknown planner, kind of traffic or scenario, or a result of other scenarios that a limit or a
@@ -124,11 +124,11 @@ def run_planner(env: EgoEnv, planner: Planner, scenario: Scenario, *, seed: int,
     """Drive one scenario from the current step to the end.
 
     Args:
-        env: whose actions are those of the planner.
-        planner: drives.
-        scenario: one of the environment's.
-        seed: of the traffic.
-        rollout: number of the dice.
+        env: Environment whose type of action is the planner's.
+        planner: Planner that drives, made by `load_planner`.
+        scenario: Scenario of the environment to drive to the end.
+        seed: Seed of the traffic; equal seeds, equal traffic for every planner.
+        rollout: Number of the rollout, 0 or more; each has dice of its own.
 
     Raises:
         DataError: the planner calls exit(). Any other error of the planner passes as it is.
@@ -262,8 +262,8 @@ def film(config: DriveConfig, out: Path) -> Path:
     """Write a film of the first scenario, the kinds of traffic side by side; returns its path.
 
     Args:
-        config: what is driven.
-        out: folder for the file.
+        config: Planner, data, kinds of traffic and number of rollouts.
+        out: Folder for the film SCENARIO.webp.
     """
     records = {}
     for traffic in config.traffic:

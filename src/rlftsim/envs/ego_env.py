@@ -29,10 +29,10 @@ class EgoEnv(gymnasium.Env):
     """One scenario at a time; `gymnasium.make("rlftsim.envs:rlftsim/Ego-v0", ...)` makes it.
 
     Args:
-        scenarios: in place of the data set `data`: one, several or a data set.
-        policy: in place of the traffic model `model`.
-        settings: fields of `EnvConfig` by name.
-        source: scenarios, model and settings that are loaded already, in place of all others.
+        scenarios: Scenario, list of scenarios or data set, in place of the setting `data`.
+        policy: Traffic model in place of the one that the setting `model` names, in evaluation mode.
+        settings: Fields of `EnvConfig` by name; the other fields have their defaults.
+        source: Scenarios, model and settings that are loaded already, in place of the other arguments.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array", "html"], "render_fps": 10}
@@ -78,9 +78,9 @@ class EgoEnv(gymnasium.Env):
         """Begin an episode.
 
         Args:
-            seed: of the choice of scenarios and of the traffic. Same seed, same episode.
-            options: "scenario" (an id; else one is drawn), "rollout" (a number; else 0, 1, ... since the last seed),
-                "goals" ({object id: (x, y)} of agents that follow the policy, world frame).
+            seed: Seed of the order of scenarios and of the traffic; equal seeds, equal episodes.
+            options: Choices by name: "scenario" (an id; else drawn), "rollout" (a number; else 0, 1, ... since the last
+                seed), "goals" ({object id: (x, y)} of agents that follow the policy, world frame).
 
         Raises:
             ConfigError: an unknown option or scenario.
@@ -106,7 +106,7 @@ class EgoEnv(gymnasium.Env):
         """Carry out one action.
 
         Args:
-            action: of the action space.
+            action: Planner action, a member of `action_space`.
 
         Raises:
             ConfigError: before `reset`, after the end, or an action with a NaN or of another shape.
@@ -123,8 +123,8 @@ class EgoEnv(gymnasium.Env):
         """Environments that go on from here, which share all that does not change.
 
         Args:
-            number: of branches.
-            noise: "same" = they meet the same dice; "new" = other ones from the next decision of the traffic on.
+            number: Number of branches to return.
+            noise: "same" = all branches meet equal dice; "new" = new dice from the next decision of the traffic on.
         """
         episode, state = self._running
         branches = []
@@ -159,7 +159,7 @@ class EgoEnv(gymnasium.Env):
         """Go on from a snapshot: the episode is run again with the planner's stored motion, which gives equal bits.
 
         Args:
-            saved: of `snapshot`.
+            saved: Bytes that `snapshot` returned.
 
         Raises:
             ConfigError: of another model, or of other settings.

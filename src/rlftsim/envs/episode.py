@@ -97,10 +97,10 @@ def build_episode(
     """Episode in a world.
 
     Args:
-        world: the scenes.
-        controls: of the actions.
-        config: settings.
-        goals: that the world was built with.
+        world: Scenes that step together, with the drivers of all agents.
+        controls: Controls that turn actions into motion.
+        config: Settings of reward, route, ends and observations.
+        goals: Goals that the world was built with, for snapshots.
     """
     routes = tuple(
         find_route(
@@ -116,8 +116,8 @@ def start(episode: Episode, dice: tuple[Dice, ...]) -> EpisodeState:
     """The first state.
 
     Args:
-        episode: the scenes.
-        dice: of each.
+        episode: Episode whose world, map and settings do not change.
+        dice: Randomness of the traffic, per scene.
     """
     world = begin(episode.world, dice)
     motion = own_motion(episode, world)
@@ -139,9 +139,9 @@ def advance(episode: Episode, state: EpisodeState, action: Any) -> tuple[Episode
     """State and outcome after one action of every planner-driven agent.
 
     Args:
-        episode: the scenes.
-        state: before.
-        action: [M, *shape]; those of agents whose episode is over are ignored.
+        episode: Episode whose world, map and settings do not change.
+        state: State before the action; not changed.
+        action: Planner actions [M, *shape]; those of agents whose episode is over are ignored.
 
     Raises:
         ConfigError: no numbers, a NaN, another shape, or an action that an agent cannot take.
@@ -183,10 +183,10 @@ def repeat(
     """The state after steps whose motion is known.
 
     Args:
-        episode: the scenes.
-        state: the first.
-        motion: of the planner-driven agents.
-        dice: of each decision of the traffic, and of those that follow.
+        episode: Episode whose world, map and settings do not change.
+        state: First state of the episode.
+        motion: Motion of the planner-driven agents after each step.
+        dice: Dice of each scene at each decision of the traffic; the last entry is for decisions to come.
     """
     policy = episode.world.policy
     for step, moved in enumerate(motion):
@@ -273,8 +273,8 @@ def own_motion(episode: Episode, world: WorldState) -> Float[np.ndarray, "M 5"]:
     """Present motion of the planner-driven agents.
 
     Args:
-        episode: the scenes.
-        world: a state of theirs.
+        episode: Episode whose world, map and settings do not change.
+        world: State of the episode's scenes, at any step.
     """
     scene, agent = episode.world.actors.T
     return world.motion[scene, agent]
@@ -284,8 +284,8 @@ def look(episode: Episode, state: EpisodeState) -> Observation:
     """Observations of all planner-driven agents.
 
     Args:
-        episode: the scenes.
-        state: the present one.
+        episode: Episode whose world, map and settings do not change.
+        state: Present state of the episode.
     """
     config = episode.config
     return observe(episode.world, episode.atlas, state.world, frame=config.frame, steps=config.max_steps)
@@ -301,9 +301,9 @@ def off_road_m(episode: Episode, world: WorldState, rows: Int64[np.ndarray, "m"]
     """Signed distance of the corner farthest off the road, negative on it; that of the official metric.
 
     Args:
-        episode: the scenes.
-        world: a state of theirs.
-        rows: those that are measured.
+        episode: Episode whose world, map and settings do not change.
+        world: State of the episode's scenes, at any step.
+        rows: Rows of the planner-driven agents to measure.
     """
     scene, agent = episode.world.actors[rows].T
     if episode.edges is None or not len(rows):

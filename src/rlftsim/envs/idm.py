@@ -54,11 +54,11 @@ def compute_idm_acceleration(
     """Acceleration, m/s².
 
     Args:
-        speed: of the agent, m/s.
-        wanted: its speed on a free road.
-        gap: from bumper to bumper; infinite without a leader.
-        lead_speed: of the leader.
-        config: parameters.
+        speed: Speed of each agent, m/s.
+        wanted: Speed of each agent on a free road, m/s.
+        gap: Distance from bumper to bumper, m; infinite without a leader.
+        lead_speed: Speed of the leader along the line, m/s.
+        config: Parameters of the driver model.
     """
     closing = speed * (speed - lead_speed) / (2 * np.sqrt(config.acceleration_mps2 * config.braking_mps2))
     wanted_gap = config.gap_m + np.maximum(0.0, speed * config.headway_s + closing)
@@ -78,12 +78,12 @@ def find_leaders(
     """Gap to the first box that meets the swept line and its speed along the line; infinite and 0 without one.
 
     Args:
-        line: points ahead of each agent, one every meter.
-        heading: direction of the line there, rad.
-        size: length and width of the agents.
-        others: x, y, heading, vx, vy of the boxes that each agent may meet.
-        other_size: their length and width.
-        mask: True = such a box.
+        line: Points ahead of each agent, a meter apart, map frame.
+        heading: Direction of the line at each point, rad.
+        size: Length and width of the agents, m.
+        others: Motion x, y, heading, vx, vy of the boxes that each agent may meet.
+        other_size: Length and width of these boxes, m.
+        mask: True = a box that can be a leader; False = padding.
     """
     if not others.shape[1]:
         return np.full(len(line), np.inf), np.zeros(len(line))
@@ -131,9 +131,9 @@ def build_idm_lines(scene: Scene, agents: np.ndarray, config: IdmConfig) -> IdmL
     """Lines of those of some agents that drive in their logs; the others stay parked.
 
     Args:
-        scene: the scenario.
-        agents: rows of vehicles.
-        config: parameters.
+        scene: Scene with the log, the lights and the levels of the agents.
+        agents: Rows of the IDM-driven vehicles in the scene's agent axis.
+        config: Parameters of the driver model.
     """
     fastest = np.linalg.norm(scene.logged[agents, CURRENT_STEP:, 3:], axis=-1).max(1, initial=0.0)
     agents, fastest = agents[fastest >= PARKED_MPS], fastest[fastest >= PARKED_MPS]
@@ -189,14 +189,14 @@ def advance_idm(
     """Places and states of the IDM-driven agents of a scenario after 0.1 s.
 
     Args:
-        lines: their ways.
-        place: distance along the line, and speed.
-        motion: x, y, heading, vx, vy of all agents.
-        z: Heights of their centers.
-        present: False = the agent is not there.
-        scene: the scenario.
-        step: of the log, for the lights.
-        config: parameters.
+        lines: Lines of the IDM-driven agents, from their current poses on.
+        place: Distance along the line, m, and speed, m/s.
+        motion: Motion x, y, heading, vx, vy of all agents before the step.
+        z: Heights of the centers of all agents, m.
+        present: False = the agent has left the scene and is no leader.
+        scene: Scene with the log, the lights and the levels of the agents.
+        step: Step of the log, which the states of the lights are read at.
+        config: Parameters of the driver model.
     """
     way, speed = place.T
     rows, size = np.arange(len(lines.agents)), scene.size[:, :2]

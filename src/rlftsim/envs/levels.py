@@ -45,7 +45,7 @@ class Levels:
         """Height of the ground along lines whose points are a few meters apart.
 
         Args:
-            lines: Points.
+            lines: Points of the lines, map frame, m.
             ground: Height of the ground at the start of each line.
         """
         heights = [ground]
@@ -95,7 +95,7 @@ class RouteHeights:
 
         Args:
             points: Positions of the things.
-            z: Their heights.
+            z: Heights of the things, m.
             route: Points of the routes; those beyond the end are far away.
             route_z: Heights of the ground there.
         """

@@ -138,8 +138,8 @@ def build_atlas(world: World, routes: tuple[Route, ...]) -> Atlas:
     """Maps and routes of a world.
 
     Args:
-        world: the scenes.
-        routes: of the planner-driven agents.
+        world: Scenes that step together, with the drivers of all agents.
+        routes: Routes of the M planner-driven agents, in the order of `world.actors`.
     """
     scenes = world.scenes
     points = _stack([scene.lanes.points for scene in scenes], _FAR_M)
@@ -206,11 +206,11 @@ def observe(world: World, atlas: Atlas, state: WorldState, *, frame: Frame = "eg
     """Observations of the planner-driven agents at the present step.
 
     Args:
-        world: the scenes.
-        atlas: their maps and routes.
-        state: the present one.
-        frame: "ego" = each agent's own frame, "world" = the map frame.
-        steps: length of the episode, for the time that is left.
+        world: Scenes that step together, with the drivers of all agents.
+        atlas: Maps and routes of the world, cut once per episode.
+        state: Present state of the world.
+        frame: Frame of all positions: "ego" = each agent's own frame, "world" = the map frame.
+        steps: Length of the episode in steps of 0.1 s, for the time that is left.
     """
     scene, agent = world.actors.T
     row, count = np.arange(len(scene)), len(scene)
@@ -328,9 +328,9 @@ def _leave_out_other_levels(
     """Put what lies above or below the roads of the observing agents infinitely far away.
 
     Args:
-        world: The scenes.
-        atlas: Their maps and routes.
-        state: The present one.
+        world: Scenes that step together.
+        atlas: Maps and routes of the world.
+        state: Present state of the world.
         nearest_on_route: Index of the route's point nearest to each agent.
         distances: Distances from each agent to rows of the map and to "neighbors", changed in place.
     """

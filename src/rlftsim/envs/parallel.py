@@ -34,10 +34,10 @@ def parallel_env(
     """A PettingZoo parallel environment.
 
     Args:
-        controlled: planner-driven agents: "ego", "tracks_to_predict", "vehicles", or object ids.
-        scenarios: in place of the data set `data`.
-        policy: in place of the traffic model `model`.
-        settings: fields of `EnvConfig` by name.
+        controlled: Planner-driven agents: "ego", "tracks_to_predict", "vehicles", or object ids.
+        scenarios: Scenario, list of scenarios or data set, in place of the setting `data`.
+        policy: Traffic model in place of the one that the setting `model` names, in evaluation mode.
+        settings: Fields of `EnvConfig` by name; the other fields have their defaults.
 
     Raises:
         ConfigError: settings that do not fit each other, or no agents.
@@ -58,8 +58,8 @@ class TrafficParallelEnv(ParallelEnv):
     """Planner-driven agents of one scene, named by their object ids.
 
     Args:
-        controlled: planner-driven agents.
-        source: scenarios, model and settings.
+        controlled: Planner-driven agents: a group such as "vehicles", or object ids.
+        source: Scenarios, traffic model and settings, with the rules of the planner-driven agents.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"name": "rlftsim/Traffic-v0", "render_modes": [], "is_parallelizable": True}
@@ -101,9 +101,9 @@ class TrafficParallelEnv(ParallelEnv):
         """Begin an episode.
 
         Args:
-            seed: of the choice of scenarios and of the traffic.
-            options: "scenario", "rollout" and "goals", as of `EgoEnv`; PettingZoo allows further ones, which are
-                ignored.
+            seed: Seed of the order of scenarios and of the traffic; equal seeds, equal episodes.
+            options: Choices "scenario", "rollout" and "goals", as of `EgoEnv`; further names are ignored, as
+                PettingZoo allows them.
 
         Raises:
             ConfigError: an unknown scenario, or no planner-driven agent in it.
@@ -128,7 +128,7 @@ class TrafficParallelEnv(ParallelEnv):
         """Carry out one action of every agent that is left; those whose episode is over stand still.
 
         Args:
-            actions: by agent.
+            actions: Agent name to planner action, for every name in `agents`.
 
         Raises:
             ConfigError: before `reset`, after the end, an agent without an action, or one with a NaN or of another

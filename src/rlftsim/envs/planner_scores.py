@@ -84,7 +84,7 @@ def score_planner(record: Record) -> PlannerScores:
     """All scores of one episode.
 
     Args:
-        record: of the episode; one that ended early is scored for as long as it lasted.
+        record: Record of the episode; a short episode is scored for as long as it lasted.
     """
     parts, missing = _parts(record), missing_scores(record)
     early = _parts(record.first(PDMS_STEPS))

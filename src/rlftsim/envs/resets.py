@@ -41,11 +41,11 @@ def chosen(
     """Scenario, dice and goals of a reset.
 
     Args:
-        random: draws the scenario.
-        source: supplies the scenarios.
-        options: of the reset.
-        seed: of the traffic.
-        count: episodes since the seed, the number of the rollout.
+        random: Generator that draws the scenario, also where the options name one.
+        source: Scenarios to choose from.
+        options: Options of the reset by name; other names than `OPTIONS` are refused.
+        seed: Seed of the traffic, a whole number.
+        count: Number of episodes since the seed, which is the rollout's number.
 
     Raises:
         ConfigError: an option that there is not.
@@ -63,10 +63,10 @@ def about(episode: Episode, state: EpisodeState, row: int, source: Source) -> di
     """Information at the beginning of an episode.
 
     Args:
-        episode: of the agent.
-        state: its first.
-        row: of the agent.
-        source: of the environment.
+        episode: Episode that the agent drives in.
+        state: First state of the episode.
+        row: Index of the agent among the planner-driven agents [M].
+        source: Source of the environment, for the fingerprint of its traffic model.
     """
     scene_row, agent = episode.world.actors[row]
     scene, dice = episode.world.scenes[scene_row], state.world.dice[-1][scene_row]
@@ -87,10 +87,10 @@ def describe_step(episode: Episode, state: EpisodeState, outcome: Outcome, row: 
     """Information after an action; at the end of the agent's episode with its `Result`.
 
     Args:
-        episode: of the agent.
-        state: after the action.
-        outcome: of the action.
-        row: of the agent.
+        episode: Episode that the agent drives in.
+        state: State of the episode after the action.
+        outcome: Rewards and ends that the action led to.
+        row: Index of the agent among the planner-driven agents [M].
     """
     note: dict[str, Any] = {
         "step": state.world.step,
@@ -107,8 +107,8 @@ def logged_poses(episode: Episode, row: int) -> Float[np.ndarray, "81 3"]:
     """Logged poses of an agent from the current step on, map frame; NaN where there is no state.
 
     Args:
-        episode: of the agent.
-        row: of the agent.
+        episode: Episode that the agent drives in.
+        row: Index of the agent among the planner-driven agents [M].
     """
     scene, agent = episode.world.actors[row]
     poses = episode.world.logged[scene, agent, CURRENT_STEP:, :3].copy()
@@ -120,9 +120,9 @@ def has_frozen_lights(episode: Episode, state: EpisodeState, row: int) -> bool:
     """True where lights keep their last state as the log has no further ones.
 
     Args:
-        episode: of the agent.
-        state: the present one.
-        row: of the agent.
+        episode: Episode that the agent drives in.
+        state: Present state of the episode.
+        row: Index of the agent among the planner-driven agents [M].
     """
     lights = episode.world.scenes[episode.world.actors[row][0]].lights
     return 0 <= lights.last_observed < len(state.world.track) - 1

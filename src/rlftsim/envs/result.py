@@ -49,8 +49,8 @@ class Result:
         """Write a film, .mp4 or .webp.
 
         Args:
-            path: file to write.
-            title: above the picture.
+            path: File to write; its ending .mp4 or .webp decides the format.
+            title: Title above the picture, such as the planner's name.
         """
         to_film(path, build_animation({title: self.record}))
 
@@ -66,8 +66,8 @@ def to_scene_motion(record: Record, agents: AgentBoxes) -> SceneMotion:
     """Motion of all agents of a record, after the logged history; agents that overlap are marked.
 
     Args:
-        record: Record of an episode.
-        agents: Boxes of its agents.
+        record: Record of an episode, from the current step on.
+        agents: Boxes of the same agents, for marks where they overlap.
     """
     log = logged_trajectories(record.scene.scenario)
     position = np.concatenate([log.position[0, :, :HISTORY_STEPS], record.motion[:, 1:, :2]], 1)
@@ -84,7 +84,7 @@ def build_animation(records: Mapping[str, Record]) -> Animation:
     """Records of one scenario side by side, by title; agents that overlap are marked.
 
     Args:
-        records: at least one.
+        records: Title to record, at least one, all of the same scenario.
     """
     scenario = next(iter(records.values())).scene.scenario
     scene = build_scene(scenario)
@@ -96,7 +96,7 @@ def build_page(records: Mapping[str, Record]) -> str:
     """A page that plays records of one scenario side by side.
 
     Args:
-        records: by title, at least one.
+        records: Title to record, at least one, all of the same scenario.
     """
     animation = build_animation(records)
     return page_html(animation.title, animation_html(animation))

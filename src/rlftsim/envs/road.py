@@ -29,8 +29,8 @@ def nearest_edges(
     """Distance of each point to the nearest edge, its side of that edge, and True where it is beside it.
 
     Args:
-        points: m.
-        edges: x0, y0, x1, y1, at least one; the drivable side is on the left.
+        points: Points to measure, map frame, m.
+        edges: Segments x0, y0, x1, y1, at least one, m; the drivable side is on the left.
 
     Returns:
         Distances, m; a positive number for points on the left, a negative one on the right; False for points beyond

@@ -71,9 +71,9 @@ def find_route(scenario: Scenario, agent: int, choice: RouteChoice) -> Route:
     """Route of an agent; without lanes there is none.
 
     Args:
-        scenario: the scenario.
-        agent: row of the agent among the simulated ones.
-        choice: "logged" for the lanes that it drove, "none", a maneuver that the lanes allow, or lane ids.
+        scenario: Scenario whose lanes and log give the route.
+        agent: Row of the agent among the simulated agents.
+        choice: Kind of route: "logged" for the lanes of its log, "none", a maneuver that the lanes allow, or lane ids.
 
     Raises:
         ConfigError: no such lane or maneuver.
@@ -180,8 +180,8 @@ def sample_line(line: Float[np.ndarray, "n 2"], spacing_m: float) -> Float[np.nd
     """Points along a polyline from its start on.
 
     Args:
-        line: the polyline.
-        spacing_m: distance from point to point.
+        line: Points of the polyline, at least two, m.
+        spacing_m: Distance from point to point along the line, m.
     """
     along = arc_length(line)
     at = np.arange(0.0, along[-1] + 1e-6, spacing_m)

@@ -31,9 +31,9 @@ def write_snapshot(episode: Episode, state: EpisodeState, fingerprint: str) -> b
     """Bytes of an episode.
 
     Args:
-        episode: the scenes.
-        state: the present one.
-        fingerprint: of the traffic model.
+        episode: Episode whose world, map and settings do not change.
+        state: Present state of the episode.
+        fingerprint: Fingerprint of the traffic model, which a reader must have, too.
     """
     scene, agent = episode.world.actors.T
     about = {
@@ -54,8 +54,8 @@ def read_snapshot(saved: bytes, source: Source) -> tuple[Episode, EpisodeState]:
     """Episode and state of a snapshot.
 
     Args:
-        saved: of `write_snapshot`.
-        source: of the environment that goes on with it.
+        saved: Bytes that `write_snapshot` returned.
+        source: Source of the environment that continues the episode.
 
     Raises:
         DataError: no snapshot, or a damaged one.

@@ -27,10 +27,10 @@ class Source:
     """Scenarios, traffic model and settings of an environment.
 
     Args:
-        config: settings.
-        scenarios: in place of the data set that the settings name; of another name the same split.
-        policy: in place of the model that the settings name.
-        controlled: rules of the planner-driven agents, which come first.
+        config: Settings of the environment; `data` and `model` name what is loaded here.
+        scenarios: Scenarios in place of the data set in `config`; a data set by name is read in the split of `config`.
+        policy: Traffic model in place of the one that `config` names, in evaluation mode.
+        controlled: Rules of the planner-driven agents, which come before the drivers of `config`; None = the ego.
 
     Raises:
         ConfigError: settings that do not fit each other.
@@ -85,8 +85,8 @@ class Source:
         """An episode in some scenarios, which step together.
 
         Args:
-            scenarios: at least one.
-            goals: scenario id to object id to (x, y) of agents that follow the policy.
+            scenarios: Scenarios of the episode, at least one, which step together.
+            goals: Scenario id to object id to (x, y) of agents that follow the policy, world frame, m.
 
         Raises:
             ConfigError: drivers that do not fit, or goals for a policy that does not follow any.

@@ -34,9 +34,9 @@ def shown(observation: Observation, kind: ObservationFormat, row: int | None = N
     """An observation in the form of its space.
 
     Args:
-        observation: of M agents.
-        kind: of the space.
-        row: one of them; None = all.
+        observation: Observation of M agents.
+        kind: Form of the observation, as the setting `observation` has it.
+        row: Row of a single agent; None = all agents, with a leading axis M.
     """
     if kind == "arrays":
         return observation

@@ -152,8 +152,8 @@ def compute_traffic_realism(records: Sequence[Record], config: MetricConfig = ME
     predict.
 
     Args:
-        records: episodes of one scenario, at least one.
-        config: the metric's year.
+        records: Records of the same scenario, at least one, a rollout each.
+        config: Version of the metric; 2025 by default.
     """
     scene = records[0].scene
     scenario = _WithoutEgo(**{one.name: getattr(scene.scenario, one.name) for one in fields(Scenario)})

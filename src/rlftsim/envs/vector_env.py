@@ -52,11 +52,12 @@ class EgoVectorEnv(VectorEnv):
     end early are reset on their own and form smaller groups, so `stop_on=()` is fastest.
 
     Args:
-        num_envs: number of slots.
-        autoreset_mode: of Gymnasium: at the next step, in the same step, or by `reset(options={"reset_mask": ...})`.
-        scenarios: in place of the data set `data`.
-        policy: in place of the traffic model `model`.
-        settings: fields of `EnvConfig` by name; pictures and pages are those of `EgoEnv` alone.
+        num_envs: Number of slots, each with an episode of its own.
+        autoreset_mode: Time of Gymnasium's automatic resets: at the next step, in the same step, or by
+            `reset(options={"reset_mask": ...})`.
+        scenarios: Scenario, list of scenarios or data set, in place of the setting `data`.
+        policy: Traffic model in place of the one that the setting `model` names, in evaluation mode.
+        settings: Fields of `EnvConfig` by name; pictures and pages are those of `EgoEnv` alone.
     """
 
     metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
@@ -94,8 +95,8 @@ class EgoVectorEnv(VectorEnv):
         """Begin episodes in all slots, or in those of `options["reset_mask"]`.
 
         Args:
-            seed: s gives slot i the seed s + i; or one seed for each.
-            options: as of `EgoEnv`, the same for all.
+            seed: Number s, which gives slot i the seed s + i; or a list with a seed per slot.
+            options: Options of `EgoEnv.reset`, the same for all slots.
 
         Raises:
             ConfigError: an unknown option or scenario.
@@ -112,8 +113,8 @@ class EgoVectorEnv(VectorEnv):
         """As `reset`, with the infos of each slot by themselves.
 
         Args:
-            seed: s gives slot i the seed s + i; or one seed for each.
-            options: as of `EgoEnv`, the same for all, and "reset_mask".
+            seed: Number s, which gives slot i the seed s + i; or a list with a seed per slot.
+            options: Options of `EgoEnv.reset`, the same for all slots, and "reset_mask" [num_envs].
 
         Raises:
             ConfigError: an unknown option or scenario.
@@ -144,7 +145,7 @@ class EgoVectorEnv(VectorEnv):
         """Carry out one action in every slot.
 
         Args:
-            actions: of the action space.
+            actions: Planner actions [num_envs, ...], in the units of the action space.
 
         Raises:
             ConfigError: as `step_slots`.
@@ -161,7 +162,7 @@ class EgoVectorEnv(VectorEnv):
         """As `step`, with the infos of each slot by themselves.
 
         Args:
-            actions: of the action space.
+            actions: Planner actions [num_envs, ...], in the units of the action space.
 
         Raises:
             ConfigError: before `reset`, or an action with a NaN or of another shape; with autoreset disabled a slot

@@ -132,12 +132,12 @@ def build_world(
     """The world of some scenarios, which step together.
 
     Args:
-        scenarios: at least one.
-        policy: the traffic model; it is left out where the rules give it no agent.
-        rules: agents to driver, see `assign_drivers`.
-        goals: of agents that follow the policy, scenario id to object id to (x, y), world frame.
-        sampling: temperature and truncation of its decisions.
-        context: `policy.encode` of these scenarios, if it is known.
+        scenarios: Scenarios that step together, at least one.
+        policy: Traffic model; left out where the rules give no agent to it.
+        rules: Agents to driver, the first match wins, see `assign_drivers`.
+        goals: Scenario id to object id to (x, y) of agents that follow the policy, world frame, m.
+        sampling: Temperature and truncation of the policy's decisions.
+        context: Result of `policy.encode` for these scenarios; None = computed here.
 
     Raises:
         ConfigError: a rule that does not fit, or agents that follow a policy where there is none.
@@ -189,9 +189,9 @@ def padded(parts: list[np.ndarray], shape: tuple[int, ...], fill: float | int | 
     """Arrays that differ in the length of their first axis, in one array.
 
     Args:
-        parts: at least one.
-        shape: of the result; its first axis has an entry for each part.
-        fill: value beyond a part's end.
+        parts: Arrays of the same type, at least one.
+        shape: Shape of the result; its first axis has an entry for each array.
+        fill: Value beyond the end of each array.
     """
     out = np.full((len(parts), *shape[1:]), fill, parts[0].dtype)
     for row, part in zip(out, parts):
@@ -203,8 +203,8 @@ def begin(world: World, dice: Sequence[Dice]) -> WorldState:
     """The world at the current step of its logs.
 
     Args:
-        world: the scenes.
-        dice: of each scene.
+        world: Scenes that step together, with the drivers of all agents.
+        dice: Randomness of the traffic, per scene.
     """
     block = noise = None
     if world.policy is not None:
@@ -223,9 +223,9 @@ def step_world(world: World, state: WorldState, moved: Float[np.ndarray, "M 5"])
     """The state 0.1 s later.
 
     Args:
-        world: the scenes.
-        state: before the step.
-        moved: motion of the planner-driven agents after the step, in the order of `world.actors`.
+        world: Scenes that step together, with the drivers of all agents.
+        state: State before the step; not changed.
+        moved: Motion of the planner-driven agents after the step, in the order of `world.actors`.
     """
     block, dice = state.block, state.dice
     following = len(state.track)  # step of the log's time that is being computed
@@ -275,10 +275,10 @@ def _follow_levels(
     """Heights of the centers after a step: replayed agents have logged ones, the others stay on their level's ground.
 
     Args:
-        world: The scenes.
-        z: Heights before the step.
-        motion: Motion after it.
-        step: Step of the log's time.
+        world: Scenes that step together.
+        z: Heights of the centers before the step, m.
+        motion: Motion of all agents after the step.
+        step: Step of the log's time after the step, 11 to 90.
     """
     z = z.copy()
     for b, scene in enumerate(world.scenes):
@@ -294,11 +294,11 @@ def fork(world: World, state: WorldState, number: int, noise: Noise = "same") ->
     """States that go on from the same one: nothing is copied but the noise of the decisions to come.
 
     Args:
-        world: the scenes.
-        state: where the branches begin.
-        number: of branches.
-        noise: "same" = all meet the dice of `state`; "new" = branch i meets those of rollout + 1 + i, from the next
-            decision on.
+        world: Scenes that step together, with the drivers of all agents.
+        state: State where the branches begin; not changed.
+        number: Number of branches to return.
+        noise: Dice of the branches: "same" = all meet the dice of `state`; "new" = branch i meets those of
+            rollout + 1 + i, from the next decision on.
 
     Raises:
         ConfigError: another word for the noise.
@@ -317,9 +317,9 @@ def with_dice(world: World, state: WorldState, dice: Sequence[Dice]) -> WorldSta
     """The same state with other dice from the next decision on.
 
     Args:
-        world: the scenes.
-        state: of these.
-        dice: of each scene.
+        world: Scenes that step together, with the drivers of all agents.
+        state: State of these scenes; not changed.
+        dice: Randomness of the traffic, per scene.
     """
     noise = None if state.noise is None else _decision_noise(world, dice)
     return replace(state, noise=noise, dice=(*state.dice[:-1], tuple(dice)))

@@ -14,7 +14,7 @@ class IdmPlanner:
     """The intelligent driver model along the route, steered by pure pursuit.
 
     Args:
-        config: parameters; the wanted speed holds where no limit is known.
+        config: Parameters of the driver model; `speed_mps` holds where the route has no speed limit.
     """
 
     action: ActionType = "bicycle"

@@ -113,8 +113,8 @@ def collisions(view: View, motion: Float[np.ndarray, "n T1 5"]) -> Bool[np.ndarr
     """True from the step on at which a proposal meets a box that is not behind it; overlaps at the start are left out.
 
     Args:
-        view: of the agent.
-        motion: of the proposals.
+        view: What the planner sees, in the ego frame: x ahead, meters.
+        motion: Motion of the proposals, ego frame at the time of planning.
     """
     time = STEP_S * np.arange(motion.shape[1])
     meets = _meets(view, motion, np.stack([_coasted(view.others, t) for t in time]))  # [n, T + 1, K]
@@ -128,9 +128,9 @@ def score_proposals(
     """NC · DDC · DAC · (5 progress + 5 TTC + 2 comfort) / 12 of each proposal.
 
     Args:
-        view: of the agent.
-        motion: of the proposals.
-        collides: as `collisions` returns it.
+        view: What the planner sees, in the ego frame: x ahead, meters.
+        motion: Motion of the proposals, ego frame at the time of planning.
+        collides: True from the step of a collision on, as `collisions` returns it.
     """
     n = len(motion)
     # 1. what must not happen: collisions, driving against the route, leaving the road
