@@ -101,23 +101,23 @@ def drive(config: DriveConfig, out: Path | None = None) -> list[DriveResult]:
     ids = list(config.scenarios or environments[0].source.scenario_ids)[: config.limit]
     for scenario_id in ids:
         environments[0].source.scenario(scenario_id)
-    common = {
+    common_settings = {
         "planner": config.planner, "dataset": config.data, "split": config.split, "num_rollouts": config.num_rollouts,
         "seed": config.seed, "rlftsim_version": rlftsim.__version__,
         "planner_code": hash_code(config.planner),
         "manifest_sha256": hash_manifest(dataset_folder(config.data)),
     }  # fmt: skip
-    kinds = [
-        DriveSettings(traffic=traffic, model=env.source.fingerprint, **common)
+    drive_settings = [
+        DriveSettings(traffic=traffic, model=env.source.fingerprint, **common_settings)
         for traffic, env in zip(config.traffic, environments)
     ]
     # processes hand their rows over in files, so even results that are not kept need a folder
     with tempfile.TemporaryDirectory() as nowhere:
         name = config.planner.replace(":", ".")
         paths = [(out or Path(nowhere)) / f"{name}-{traffic}.parquet" for traffic in config.traffic]
-        for settings, path in zip(kinds, paths):
+        for settings, path in zip(drive_settings, paths):
             _read_and_refuse(config, settings, ids, path)
-        return [_drive_traffic(config, kind, ids, path) for kind, path in zip(kinds, paths)]
+        return [_drive_traffic(config, settings, ids, path) for settings, path in zip(drive_settings, paths)]
 
 
 def run_planner(env: EgoEnv, planner: Planner, scenario: Scenario, *, seed: int, rollout: int = 0) -> Result:
@@ -159,41 +159,41 @@ def _read_finished(config: DriveConfig, settings: DriveSettings, ids: Sequence[s
     Raises:
         ConfigError: The stored result has other scenarios, which a limit or a choice would replace.
     """
-    found = _read_and_refuse(config, settings, ids, path)
-    if found is None:
+    result = _read_and_refuse(config, settings, ids, path)
+    if result is None:
         return None
-    differing = _differences(found.settings, settings)
-    if found.scenario_ids != list(ids):
+    differing = _differences(result.settings, settings)
+    if result.scenario_ids != list(ids):
         differing.append("choice of scenarios")
     if differing:
         log.info(f"{path} is of another {', '.join(differing)}: it will be replaced.")
         return None
     # code beside the planner's file, or its weights, may have changed
     log.info(f"{path} is finished and is read: remove it to drive anew.")
-    return found
+    return result
 
 
-def _differences(stored: DriveSettings, wanted: DriveSettings) -> list[str]:
+def _differences(stored: DriveSettings, current: DriveSettings) -> list[str]:
     """Names of the values that count and differ."""
-    before, now = stored.what_counts(), wanted.what_counts()
-    return [name for name in now if before.get(name) != now[name]]
+    stored_values, values = stored.what_counts(), current.what_counts()
+    return [name for name in values if stored_values.get(name) != values[name]]
 
 
 def _read_and_refuse(
     config: DriveConfig, settings: DriveSettings, ids: Sequence[str], path: Path
 ) -> DriveResult | None:
     """The stored result, unless it is of other work, or a limit or a choice would leave out some of its scenarios."""
-    found = read_stored(path, DriveResult.read)
+    result = read_stored(path, DriveResult.read)
     choice = f"limit={config.limit}" if config.limit is not None else "this choice" if config.scenarios else ""
-    if found is not None and choice:
-        left_out = len({*found.scenario_ids} - {*ids})
+    if result is not None and choice:
+        left_out = len({*result.scenario_ids} - {*ids})
         way_out = "name another --out, or drive all scenarios."
-        check_scenarios_stay(path, len(found.scenario_ids), left_out, choice, way_out)
-    if found is not None:
+        check_scenarios_stay(path, len(result.scenario_ids), left_out, choice, way_out)
+    if result is not None:
         # a planner whose code has changed is driven anew, and so is one of an older version of this package
-        differing = {*_differences(found.settings, settings)} - {"planner_code", "rlftsim_version"}
+        differing = {*_differences(result.settings, settings)} - {"planner_code", "rlftsim_version"}
         check_same_work(path, sorted(differing), "choose another --out")
-    return found
+    return result
 
 
 def _drive_traffic(config: DriveConfig, settings: DriveSettings, ids: Sequence[str], path: Path) -> DriveResult:
@@ -246,7 +246,8 @@ def _drive_scenario(config: DriveConfig, traffic: str, ids: Sequence[str], posit
     rows = [result.scores for result in results]
     # a rollout that cannot give a score leaves it to the others
     means = {name: mean_interval(np.array([row[name] for row in rows])).mean for name in rows[0]}
-    means["blamed_others_rate"] = blamed_others_rate([one for result in results for one in result.record.collisions])
+    collisions = [collision for result in results for collision in result.record.collisions]
+    means["blamed_others_rate"] = blamed_others_rate(collisions)
     realism = compute_traffic_realism([result.record for result in results])
     row = {"scenario_id": ids[position], "traffic": traffic, **means, "others_realism": realism}
     return {"row": row, "missing": results[0].missing}

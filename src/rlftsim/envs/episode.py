@@ -158,8 +158,8 @@ def advance(episode: Episode, state: EpisodeState, action: Any) -> tuple[Episode
         # an agent whose episode is over stands still
         stands = np.concatenate([motion[:, :3], np.zeros((len(motion), 2))], -1)
         moved = np.where(state.ended[:, None], stands, moves.motion[:, step])
-        state, now = _step(episode, state, moved)
-        terms = {name: terms.get(name, 0.0) + value for name, value in now.items()}
+        state, step_terms = _step(episode, state, moved)
+        terms = {name: terms.get(name, 0.0) + value for name, value in step_terms.items()}
     following = _with_ends(episode, state)
     ends = following.ended & ~state.ended
     is_over = state.world.step >= episode.config.max_steps
@@ -207,7 +207,7 @@ def _with_dice(episode: Episode, state: EpisodeState, dice: tuple[Dice, ...]) ->
 def _stopped(episode: Episode, state: EpisodeState) -> Bool[np.ndarray, "M"]:
     """True = an event of `stop_on` has happened to the agent."""
     events = {
-        "collision": np.array([bool(found) for found in state.collisions], bool),
+        "collision": np.array([bool(collisions) for collisions in state.collisions], bool),
         "offroad": state.outside,
         "goal": state.at_goal,
     }
@@ -224,25 +224,25 @@ def _step(
     episode: Episode, state: EpisodeState, moved: Float[np.ndarray, "M 5"]
 ) -> tuple[EpisodeState, dict[str, Float[np.ndarray, "M"]]]:
     """State 0.1 s later, and the terms of this step."""
-    before = own_motion(episode, state.world)
+    previous = own_motion(episode, state.world)
     world = step_world(episode.world, state.world, moved)
     # 1. contacts with tracks that have not been touched
     contacts = _contacts(episode, world, moved) & ~state.touched
-    found = [list(known) for known in state.collisions]
+    collisions = [list(earlier) for earlier in state.collisions]
     for row, agent in np.argwhere(contacts & ~state.ended[:, None]):
-        scene, own = episode.world.actors[row]
-        found[row].append(
+        scene, ego = episode.world.actors[row]
+        collisions[row].append(
             classify_collision(
-                episode.world.scenes[scene], world.step, int(agent), moved[row], episode.world.size[scene, own],
+                episode.world.scenes[scene], world.step, int(agent), moved[row], episode.world.size[scene, ego],
                 _ground(episode, world, np.array([row])), world.motion[scene, agent], episode.world.size[scene, agent],
             )
         )  # fmt: skip
-    new = [known[len(earlier) :] for known, earlier in zip(found, state.collisions)]
+    new_collisions = [current[len(earlier) :] for current, earlier in zip(collisions, state.collisions)]
     # 2. road and route
     scene, agent = episode.world.actors.T
     half_diagonal = np.hypot(*episode.world.size[scene, agent].T) / 2
-    turned = np.abs(wrapped(moved[:, 2] - before[:, 2])) * half_diagonal
-    clear = state.clear_m - np.hypot(*(moved[:, :2] - before[:, :2]).T) - turned
+    turned = np.abs(wrapped(moved[:, 2] - previous[:, 2])) * half_diagonal
+    clear = state.clear_m - np.hypot(*(moved[:, :2] - previous[:, :2]).T) - turned
     unclear = np.flatnonzero((clear <= 0) & ~state.outside)
     if len(unclear):
         clear[unclear] = _free_way_m(episode, world, unclear)
@@ -251,20 +251,20 @@ def _step(
     progress = _progress(episode, moved)
     gained = progress - state.progress
     routeless = episode.atlas.route_length == 0
-    step = moved[:, :2] - before[:, :2]
-    ahead = np.cos(moved[:, 2]) * step[:, 0] + np.sin(moved[:, 2]) * step[:, 1]
+    step = moved[:, :2] - previous[:, :2]
+    forward = np.cos(moved[:, 2]) * step[:, 0] + np.sin(moved[:, 2]) * step[:, 1]
     ends = episode.atlas.route_points[np.arange(episode.num_agents), np.maximum(episode.atlas.route_length - 1, 0)]
     near_end = np.linalg.norm(moved[:, :2] - ends, axis=-1) <= AT_GOAL_M
     at_goal = state.at_goal | (near_end & ~routeless)
     terms = {
-        "progress": np.where(routeless, ahead, gained) / 10.0,
-        "collision": np.array([float(len(own)) for own in new]),
-        "at_fault": np.array([float(sum(one.at_fault for one in own)) for own in new]),
+        "progress": np.where(routeless, forward, gained) / 10.0,
+        "collision": np.array([float(len(contacts)) for contacts in new_collisions]),
+        "at_fault": np.array([float(sum(collision.at_fault for collision in contacts)) for contacts in new_collisions]),
         "offroad": (outside & ~state.outside).astype(float),
         "goal": (at_goal & ~state.at_goal).astype(float),
     }
     following = EpisodeState(
-        world, state.touched | contacts, tuple(map(tuple, found)), outside, at_goal, clear, progress, state.ended
+        world, state.touched | contacts, tuple(map(tuple, collisions)), outside, at_goal, clear, progress, state.ended
     )
     return following, terms
 
@@ -330,9 +330,9 @@ def _free_way_m(episode: Episode, world: WorldState, rows: Int64[np.ndarray, "m"
     scene, agent = episode.world.actors[rows].T
     motion = world.motion[scene, agent]
     corners = clockwise_corners(motion[:, :2], motion[:, 2], episode.world.size[scene, agent])  # [m, 4, 2]
-    distance, side, is_beside = nearest_edges(corners, episode.atlas.edges[scene])
+    distance, side, is_alongside = nearest_edges(corners, episode.atlas.edges[scene])
     free = distance.min(1) - SIMPLIFIED_M
-    unclear = np.flatnonzero((free <= 0) | ~((side > 0) & is_beside).all(1) | episode.world.has_levels[scene])
+    unclear = np.flatnonzero((free <= 0) | ~((side > 0) & is_alongside).all(1) | episode.world.has_levels[scene])
     free += OUTSIDE_M
     if len(unclear):
         free[unclear] = OUTSIDE_M - off_road_m(episode, world, rows[unclear])
@@ -343,11 +343,11 @@ def _contacts(episode: Episode, world: WorldState, motion: Float[np.ndarray, "M 
     """Tracks that each planner-driven agent overlaps now."""
     scene, agent = episode.world.actors.T
     size = episode.world.size
-    known = episode.world.is_observed[scene, :, len(world.track) - 1]
-    known[np.arange(len(scene)), agent] = False
-    others = world.motion[scene]  # [M, A, 5]
-    gap = others[..., :2] - motion[:, None, :2]
-    meets = known & boxes_overlap(gap, motion[:, None, 2], others[..., 2], size[scene, agent][:, None], size[scene])
+    is_touchable = episode.world.is_observed[scene, :, len(world.track) - 1]
+    is_touchable[np.arange(len(scene)), agent] = False
+    tracks = world.motion[scene]  # [M, A, 5]
+    gap, agent_size = tracks[..., :2] - motion[:, None, :2], size[scene, agent][:, None]
+    meets = is_touchable & boxes_overlap(gap, motion[:, None, 2], tracks[..., 2], agent_size, size[scene])
     if episode.world.has_levels.any():
         z, height = world.z[-1], episode.world.height
         rise = z[scene] - z[scene, agent][:, None]
@@ -363,5 +363,5 @@ def _progress(episode: Episode, motion: Float[np.ndarray, "M 5"]) -> Float[np.nd
     dy = motion[:, 1:2] - atlas.route_points[..., 1]
     nearest = (dx * dx + dy * dy).argmin(1)
     heading = atlas.route_heading[row, nearest]
-    ahead = np.cos(heading) * dx[row, nearest] + np.sin(heading) * dy[row, nearest]
-    return np.where(atlas.route_length > 0, SPACING_M * nearest + ahead, 0.0)
+    forward = np.cos(heading) * dx[row, nearest] + np.sin(heading) * dy[row, nearest]
+    return np.where(atlas.route_length > 0, SPACING_M * nearest + forward, 0.0)

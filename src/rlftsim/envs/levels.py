@@ -108,18 +108,18 @@ class RouteHeights:
         return cls(z, above, distance)
 
     def differences(
-        self, away: Float[np.ndarray, "M n"], ground: Float[np.ndarray, "M"], above_route: Float[np.ndarray, "M"]
+        self, distances: Float[np.ndarray, "M n"], ground: Float[np.ndarray, "M"], above_route: Float[np.ndarray, "M"]
     ) -> Float[np.ndarray, "M n"]:
         """Height differences between things and the road that leads there, less what slopes explain.
 
         Args:
-            away: Distance from each agent to each thing.
+            distances: Distance from each agent to each thing.
             ground: Height of the ground under the agents.
             above_route: The same above the nearest point of the route.
         """
-        is_near_route = self.distance < away
+        is_near_route = self.distance < distances
         rise = np.where(is_near_route, self.above_route - above_route[:, None], self.z - ground[:, None])
-        return np.maximum(np.abs(rise) - GRADE * np.where(is_near_route, self.distance, away), 0.0)
+        return np.maximum(np.abs(rise) - GRADE * np.where(is_near_route, self.distance, distances), 0.0)
 
 
 def is_on_level(difference: Float[np.ndarray, "*shape"]) -> Bool[np.ndarray, "*shape"]:

@@ -45,7 +45,8 @@ def parallel_env(
     if not isinstance(controlled, str):
         try:
             # names of agents are their ids as text
-            controlled = list(dict.fromkeys(int(one) if isinstance(one, str) else index(one) for one in controlled))
+            ids = (int(name) if isinstance(name, str) else index(name) for name in controlled)
+            controlled = list(dict.fromkeys(ids))
         except (TypeError, ValueError):
             raise ConfigError("controlled must be a group such as 'vehicles', or a list of object ids.") from None
         if not controlled:
@@ -82,12 +83,12 @@ class TrafficParallelEnv(ParallelEnv):
     def _all_agents(self, controlled: Controlled) -> list[str]:
         if not isinstance(controlled, str):
             return [str(object_id) for object_id in controlled]
-        found: dict[str, None] = {}
+        names: dict[str, None] = {}
         for scenario_id in self.source.scenario_ids:
             scene = build_env_scene(self.source.scenario(scenario_id))
-            planned = scene.object_id[assign_drivers(scene, self.source.rules) == Driver.PLANNER]
-            found.update(dict.fromkeys(map(str, planned.tolist())))
-        return list(found)
+            planner_ids = scene.object_id[assign_drivers(scene, self.source.rules) == Driver.PLANNER]
+            names.update(dict.fromkeys(map(str, planner_ids.tolist())))
+        return list(names)
 
     def observation_space(self, agent: str) -> Space:
         """Space of an agent's observations, the same for all."""
@@ -111,8 +112,8 @@ class TrafficParallelEnv(ParallelEnv):
         if seed is not None:
             self._random, _ = seeding.np_random(seed)
             self._seed, self._count = seed, 0
-        known = {name: value for name, value in (options or {}).items() if name in OPTIONS}
-        scenario_id, dice, goals = chosen(self._random, self.source, known, self._seed, self._count)
+        environment_options = {name: value for name, value in (options or {}).items() if name in OPTIONS}
+        scenario_id, dice, goals = chosen(self._random, self.source, environment_options, self._seed, self._count)
         self._count += 1
         scenario = self.source.scenario(scenario_id)
         episode = self.source.episode([scenario], {scenario_id: goals} if goals else None)
@@ -163,5 +164,5 @@ class TrafficParallelEnv(ParallelEnv):
 
     def _observe(self, names: list[str]) -> dict[str, Any]:
         assert self._begun is not None
-        seen, kind = look(*self._begun), self.source.config.observation
-        return {name: shown(seen, kind, self._names.index(name)) for name in names}
+        observation, form = look(*self._begun), self.source.config.observation
+        return {name: shown(observation, form, self._names.index(name)) for name in names}

@@ -24,9 +24,9 @@ def build_config(settings: dict[str, Any]) -> EnvConfig:
     Raises:
         ConfigError: one that there is not.
     """
-    unknown = [name for name in settings if name not in EnvConfig.__dataclass_fields__]
-    if unknown:
-        raise ConfigError(f"no setting {unknown[0]!r}: known are {', '.join(EnvConfig.__dataclass_fields__)}.")
+    unknown_fields = [name for name in settings if name not in EnvConfig.__dataclass_fields__]
+    if unknown_fields:
+        raise ConfigError(f"no setting {unknown_fields[0]!r}: known are {', '.join(EnvConfig.__dataclass_fields__)}.")
     return EnvConfig(**settings)
 
 
@@ -50,11 +50,11 @@ def chosen(
     Raises:
         ConfigError: an option that there is not.
     """
-    unknown = [name for name in options if name not in OPTIONS]
-    if unknown:
-        raise ConfigError(f"reset has no option {unknown[0]!r}: known are {', '.join(OPTIONS)}.")
-    drawn = int(random.integers(len(source.scenario_ids)))
-    scenario_id = options.get("scenario", source.scenario_ids[drawn])
+    unknown_options = [name for name in options if name not in OPTIONS]
+    if unknown_options:
+        raise ConfigError(f"reset has no option {unknown_options[0]!r}: known are {', '.join(OPTIONS)}.")
+    index = int(random.integers(len(source.scenario_ids)))
+    scenario_id = options.get("scenario", source.scenario_ids[index])
     rollout = whole_number("rollout", options.get("rollout", count), 0)
     return scenario_id, Dice(seed, rollout), options.get("goals")
 

@@ -76,9 +76,9 @@ class Source:
         try:
             return self.scenarios[self.scenario_ids.index(scenario_id)]
         except ValueError:
-            some = ", ".join(self.scenario_ids[:3])
+            examples = ", ".join(self.scenario_ids[:3])
             raise ConfigError(
-                f"no scenario {scenario_id!r}: this environment has {len(self.scenario_ids)}, such as {some}."
+                f"no scenario {scenario_id!r}: this environment has {len(self.scenario_ids)}, such as {examples}."
             ) from None
 
     def episode(self, scenarios: list[Scenario], goals: ScenarioGoals | None = None) -> Episode:

@@ -131,10 +131,10 @@ class EgoVectorEnv(VectorEnv):
             seeds = [None if seed is None else whole_number("seed", seed, 0) + i for i in range(self.num_envs)]
         if len(seeds) != self.num_envs:
             raise ConfigError(f"seed has {len(seeds)} numbers, it must be one number or {self.num_envs}.")
-        for i, given in enumerate(seeds):
-            if len(self._slots) <= i or given is not None:
-                used = draw_seed() if given is None else given
-                self._slots[i : i + 1] = [_Slot(seeding.np_random(used)[0], used)]
+        for i, slot_seed in enumerate(seeds):
+            if len(self._slots) <= i or slot_seed is not None:
+                new_seed = draw_seed() if slot_seed is None else slot_seed
+                self._slots[i : i + 1] = [_Slot(seeding.np_random(new_seed)[0], new_seed)]
         notes: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         self._reset(np.flatnonzero(mask), options, notes)
         return self._observe(), notes
@@ -203,45 +203,48 @@ class EgoVectorEnv(VectorEnv):
             last, final = self._observe(), {slot: notes[slot] for slot in ended}
             self._reset(ended, {}, notes)
             for slot in ended:
-                seen = {name: values[slot] for name, values in last.items()} if isinstance(last, dict) else last[slot]
-                notes[slot] |= {"final_obs": seen, "final_info": final[slot]}
+                is_dict = isinstance(last, dict)
+                final_observation = {name: values[slot] for name, values in last.items()} if is_dict else last[slot]
+                notes[slot] |= {"final_obs": final_observation, "final_info": final[slot]}
         return self._observe(), rewards, terminated, truncated, notes
 
     def _name_of(self, slot: int) -> str:
         group = next(group for group in self._groups if slot in group.slots)
         return f"slot {slot}, {group.episode.agent_name(int(np.flatnonzero(group.slots == slot)[0]))}"
 
-    def _reset(self, which: np.ndarray, options: dict[str, Any], notes: list[dict[str, Any]]) -> None:
+    def _reset(self, slots: np.ndarray, options: dict[str, Any], notes: list[dict[str, Any]]) -> None:
         """Begin episodes of some slots, which form a group, and note what there is to say about them."""
         picks = []
-        for i in which:
+        for i in slots:
             slot = self._slots[i]
             picks.append(chosen(slot.random, self.source, options, slot.seed, slot.count))
             slot.count += 1
         scenarios = [self.source.scenario(scenario_id) for scenario_id, _, _ in picks]
-        goals = {scenario_id: own for scenario_id, _, own in picks if own}
+        goals = {scenario_id: scenario_goals for scenario_id, _, scenario_goals in picks if scenario_goals}
         episode = self.source.episode(scenarios, goals or None)
         if episode.num_agents != len(picks):
             raise ConfigError("the planner drives more than the egos: take rlftsim.envs.parallel_env.")
         state = start(episode, tuple(dice for _, dice, _ in picks))
         # groups lose the slots that went on, and are dropped when they have none left
-        kept = [replace(group, slots=np.where(np.isin(group.slots, which), -1, group.slots)) for group in self._groups]
-        self._groups = [*(group for group in kept if len(group.live)), _Group(episode, state, np.array(which))]
-        self._over[which] = False
-        for row, i in enumerate(which):
+        groups = [
+            replace(group, slots=np.where(np.isin(group.slots, slots), -1, group.slots)) for group in self._groups
+        ]
+        self._groups = [*(group for group in groups if len(group.live)), _Group(episode, state, np.array(slots))]
+        self._over[slots] = False
+        for row, i in enumerate(slots):
             notes[i] = about(episode, state, row, self.source)
 
     def _observe(self) -> Any:
         """Observations of all slots in order."""
-        kind = self.source.config.observation
-        seen: list[Any] = [shown(look(group.episode, group.state), kind) for group in self._groups]
-        if len(seen) == 1 and len(self._groups[0].live) == self.num_envs:
-            return seen[0]  # a group of all slots has them in order
+        form = self.source.config.observation
+        observations: list[Any] = [shown(look(group.episode, group.state), form) for group in self._groups]
+        if len(observations) == 1 and len(self._groups[0].live) == self.num_envs:
+            return observations[0]  # a group of all slots has them in order
         order = np.argsort(np.concatenate([group.slots[group.live] for group in self._groups]))
 
         def joined(arrays: list[np.ndarray]) -> np.ndarray:
             return np.concatenate([array[group.live] for array, group in zip(arrays, self._groups)])[order]
 
-        if kind == "flat":
-            return joined(seen)
-        return {name: joined([one[name] for one in seen]) for name in seen[0]}
+        if form == "flat":
+            return joined(observations)
+        return {name: joined([one[name] for one in observations]) for name in observations[0]}

@@ -159,8 +159,8 @@ def build_world(
     # from the current step on all agents exist, but replayed ones are gone after the last state of their log
     goes_on = np.maximum.accumulate(valid[..., ::-1], axis=-1)[..., ::-1]
     simulated = (drivers != Driver.REPLAY)[..., None]
-    there = mask[..., None] & (simulated | goes_on)
-    there[..., : CURRENT_STEP + 1] = valid[..., : CURRENT_STEP + 1]
+    is_present = mask[..., None] & (simulated | goes_on)
+    is_present[..., : CURRENT_STEP + 1] = valid[..., : CURRENT_STEP + 1]
     idm_rows = [np.flatnonzero(row[: len(scene.object_id)] == Driver.IDM) for row, scene in zip(drivers, scenes)]
     return World(
         scenes=scenes,
@@ -174,8 +174,8 @@ def build_world(
         logged=padded([scene.logged for scene in scenes], (*shape, TOTAL_STEPS, 5)),
         logged_z=padded([scene.logged_z for scene in scenes], (*shape, TOTAL_STEPS)),
         valid=valid,
-        is_present=there,
-        is_observed=there & (simulated | valid),
+        is_present=is_present,
+        is_observed=is_present & (simulated | valid),
         has_levels=np.array([scene.levels is not None for scene in scenes]),
         policy=policy if followers else None,
         context=context if followers else None,
@@ -185,17 +185,17 @@ def build_world(
     )
 
 
-def padded(parts: list[np.ndarray], shape: tuple[int, ...], fill: float | int | bool = 0.0) -> np.ndarray:
+def padded(arrays: list[np.ndarray], shape: tuple[int, ...], fill: float | int | bool = 0.0) -> np.ndarray:
     """Arrays that differ in the length of their first axis, in one array.
 
     Args:
-        parts: Arrays of the same type, at least one.
+        arrays: Arrays of the same type, at least one.
         shape: Shape of the result; its first axis has an entry for each array.
         fill: Value beyond the end of each array.
     """
-    out = np.full((len(parts), *shape[1:]), fill, parts[0].dtype)
-    for row, part in zip(out, parts):
-        row[: len(part)] = part
+    out = np.full((len(arrays), *shape[1:]), fill, arrays[0].dtype)
+    for row, array in zip(out, arrays):
+        row[: len(array)] = array
     return out
 
 
@@ -213,10 +213,10 @@ def begin(world: World, dice: Sequence[Dice]) -> WorldState:
             block = Block(world.policy.begin(world.context, 1, world.goals, initial), None, None)
         noise = _decision_noise(world, dice)
     speed = [np.linalg.norm(scene.logged[lines.agents, CURRENT_STEP, 3:], axis=-1) for scene, lines in _idm(world)]
-    places = tuple(np.stack([np.zeros_like(v), v], -1) for v in speed)
+    idm_states = tuple(np.stack([np.zeros_like(v), v], -1) for v in speed)
     track = tuple(np.moveaxis(world.logged[:, :, : CURRENT_STEP + 1], 2, 0).copy())
     z = (world.logged_z[:, :, CURRENT_STEP],) * len(track)
-    return WorldState(track, z, block, noise, (tuple(dice),), places)
+    return WorldState(track, z, block, noise, (tuple(dice),), idm_states)
 
 
 def step_world(world: World, state: WorldState, moved: Float[np.ndarray, "M 5"]) -> WorldState:
@@ -230,7 +230,7 @@ def step_world(world: World, state: WorldState, moved: Float[np.ndarray, "M 5"])
     block, dice = state.block, state.dice
     following = len(state.track)  # step of the log's time that is being computed
     motion = world.logged[:, :, min(following, world.logged.shape[2] - 1)].copy()  # replayed agents
-    before = state.motion
+    previous = state.motion
     # 1. agents of the policy, and those that keep their velocity
     if block is not None:
         assert world.policy is not None
@@ -239,34 +239,41 @@ def step_world(world: World, state: WorldState, moved: Float[np.ndarray, "M 5"])
             dice = (*dice, dice[-1])
         assert block.poses is not None
         poses = block.poses[:, :, state.step % world.policy.steps_per_decision]
-        velocity = (poses[..., :2] - before[..., :2]) / STEP_S
+        velocity = (poses[..., :2] - previous[..., :2]) / STEP_S
         follows = world.drivers == Driver.POLICY
         motion[follows] = np.concatenate([poses, velocity], -1)[follows]
     coasts = world.drivers == Driver.CONSTANT_VELOCITY
     if coasts.any():
-        motion[coasts] = before[coasts]
-        motion[coasts, :2] += STEP_S * before[coasts, 3:]
+        motion[coasts] = previous[coasts]
+        motion[coasts, :2] += STEP_S * previous[coasts, 3:]
     # 2. IDM-driven vehicles
-    places = state.places
+    idm_states = state.places
     driven = world.drivers == Driver.IDM
-    motion[driven] = before[driven]
+    motion[driven] = previous[driven]
     motion[driven, 3:] = 0.0  # parked ones stay; those with a line move below
     if any(len(lines.agents) for lines in world.lines):
         present = world.is_present[:, :, following - 1]
         moves = [
             advance_idm(
-                lines, place, before[b, :count], state.z[-1][b, :count], present[b, :count], scene, following - 1, IDM
+                lines,
+                idm_state,
+                previous[b, :count],
+                state.z[-1][b, :count],
+                present[b, :count],
+                scene,
+                following - 1,
+                IDM,
             )
-            for b, ((scene, lines), place) in enumerate(zip(_idm(world), places))
+            for b, ((scene, lines), idm_state) in enumerate(zip(_idm(world), idm_states))
             for count in [len(scene.object_id)]
         ]
-        places = tuple(place for place, _ in moves)
+        idm_states = tuple(idm_state for idm_state, _ in moves)
         for b, (lines, (_, moving)) in enumerate(zip(world.lines, moves)):
             motion[b, lines.agents] = moving
     # 3. the planner's agents; padding stays at zero
     motion[world.actors[:, 0], world.actors[:, 1]] = moved
     z = _follow_levels(world, state.z[-1], motion, following) if world.has_levels.any() else state.z[-1]
-    return WorldState((*state.track, motion), (*state.z, z), block, state.noise, dice, places)
+    return WorldState((*state.track, motion), (*state.z, z), block, state.noise, dice, idm_states)
 
 
 def _follow_levels(
@@ -332,14 +339,14 @@ def _decide(world: World, state: WorldState) -> Block:
     assert block is not None
     assert state.noise is not None
     with one_thread(), torch.no_grad():
-        before = block.before
+        policy_state = block.before
         if block.decision is not None:
-            before = policy.advance(world.context, before, block.decision, _forced(world, state))
-        distribution = policy.decide(world.context, before)
+            policy_state = policy.advance(world.context, policy_state, block.decision, _forced(world, state))
+        distribution = policy.decide(world.context, policy_state)
         index = state.step // policy.steps_per_decision
         decision = distribution.sample(world.sampling, state.noise[..., index, :])
-        poses = policy.advance(world.context, before, decision).poses
-    return Block(before, decision, poses[:, 0].cpu().numpy().astype(np.float64))
+        poses = policy.advance(world.context, policy_state, decision).poses
+    return Block(policy_state, decision, poses[:, 0].cpu().numpy().astype(np.float64))
 
 
 def _forced(world: World, state: WorldState) -> AgentStates | None:
@@ -364,8 +371,11 @@ def _decision_noise(world: World, dice: Sequence[Dice]) -> Tensor:
 def _noise(world: World, dice: Sequence[Dice], purpose: str, per_agent: int) -> Float[Tensor, "B 1 A k"]:
     """Noise of scenes with dice of their own, as `simulate` draws it for each of them."""
     return torch.cat([
-        draw_noise(one, range(d.rollout, d.rollout + 1), seed=d.seed, purpose=purpose, per_agent=per_agent)
-        for one, d in zip(world.batch.split(1), dice)
+        draw_noise(
+            scenario_batch, range(scene_dice.rollout, scene_dice.rollout + 1), seed=scene_dice.seed, purpose=purpose,
+            per_agent=per_agent,
+        )
+        for scenario_batch, scene_dice in zip(world.batch.split(1), dice)
     ])  # fmt: skip
 
 

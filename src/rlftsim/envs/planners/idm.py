@@ -29,15 +29,15 @@ class IdmPlanner:
         """Acceleration behind the leader, steering for the route."""
         view = read_view(observation)
         window = slice(0, LOOKAHEAD_M)
-        others = np.ones((1, len(view.others)), bool)
+        is_box = np.ones((1, len(view.others)), bool)
         gap, lead = find_leaders(
             view.line[None, window], view.heading[None, window], view.size[None], view.others[None],
-            view.other_size[None], others,
+            view.other_size[None], is_box,
         )  # fmt: skip
         to_stop = np.maximum(view.stop_m - view.size[0] / 2, 0.0)
         gap, lead = np.minimum(gap, to_stop), np.where(to_stop < gap, 0.0, lead)
-        wanted, speed = np.array([view.limit_mps or self.config.speed_mps]), np.array([max(view.speed, 0.0)])
-        acceleration = compute_idm_acceleration(speed, wanted, gap, lead, self.config)
-        far = np.flatnonzero(np.linalg.norm(view.line, axis=1) >= pursuit_m(speed))
-        steering = pursue(view.line[None, far[0] if len(far) else -1], view.size[:1])
+        free_speed, speed = np.array([view.limit_mps or self.config.speed_mps]), np.array([max(view.speed, 0.0)])
+        acceleration = compute_idm_acceleration(speed, free_speed, gap, lead, self.config)
+        far_points = np.flatnonzero(np.linalg.norm(view.line, axis=1) >= pursuit_m(speed))
+        steering = pursue(view.line[None, far_points[0] if len(far_points) else -1], view.size[:1])
         return np.clip([acceleration[0] / ACCELERATION_MPS2, steering[0] / STEERING_RAD], -1, 1).astype(np.float32)

@@ -34,9 +34,9 @@ class View:
 
 def read_view(observation: dict[str, Any]) -> View:
     """View of an observation in the agent's frame, of kind "dict"."""
-    ego, known = observation["ego"].astype(float), observation["neighbors_mask"].astype(bool)
+    ego, is_neighbor = observation["ego"].astype(float), observation["neighbors_mask"].astype(bool)
     route = observation["route"][observation["route_mask"].astype(bool)].astype(float)
-    neighbors = observation["neighbors"][known].astype(float)
+    neighbors = observation["neighbors"][is_neighbor].astype(float)
     line = route[:, :2] if len(route) > 1 else np.array([[0.0, 0.0], [STRAIGHT_M, 0.0]])
     # beyond its end the route goes straight on, so that a planner never stops for want of a line
     last = line[-1] - line[-2]
@@ -63,7 +63,7 @@ def _stop(observation: dict[str, Any], line: Float[np.ndarray, "P 2"], length: f
     points = lights[waits, :2]
     if not len(points):
         return np.inf
-    away = np.linalg.norm(line[:, None] - points, axis=-1)  # [P, T]
+    distance = np.linalg.norm(line[:, None] - points, axis=-1)  # [P, T]
     # a stop point that the front has passed is behind
-    on_line = (away.min(0) <= ON_LINE_M) & (points[:, 0] >= length / 2 - 1.0)
-    return float(away.argmin(0)[on_line].min()) if on_line.any() else np.inf
+    on_line = (distance.min(0) <= ON_LINE_M) & (points[:, 0] >= length / 2 - 1.0)
+    return float(distance.argmin(0)[on_line].min()) if on_line.any() else np.inf
