@@ -259,8 +259,8 @@ class TrajectoryControls(Controls):
         _check_vehicles(actors, "trajectory with the bicycle")
         # Steers for the point ahead; has the speed of the first pose, so that errors along do not remain.
         speed = signed_speed(actors.motion)
-        is_far = np.linalg.norm(poses[..., :2], axis=-1) >= pursuit_m(speed)[:, None]  # [M, H]
-        target = np.where(is_far.any(1), is_far.argmax(1), poses.shape[1] - 1)
+        is_beyond_pursuit = np.linalg.norm(poses[..., :2], axis=-1) >= pursuit_m(speed)[:, None]  # [M, H]
+        target = np.where(is_beyond_pursuit.any(1), is_beyond_pursuit.argmax(1), poses.shape[1] - 1)
         steering = pursue(poses[np.arange(len(poses)), target, :2], actors.size[:, 0])
         acceleration = (poses[:, 0, 0] / STEP_S - speed) / STEP_S
         lowest = -np.where(speed > 0, self.tracker.max_braking, ACCELERATION_MPS2)

@@ -230,7 +230,7 @@ def _row_and_missing(scenario_id: str, values: Mapping[str, Any]) -> tuple[dict[
         KeyError, TypeError, ValueError: the file was cut or edited.
     """
     row, missing = values["row"], values["missing"]
-    if row["scenario_id"] != scenario_id or not all(isinstance(why, str) for why in missing.values()):
+    if row["scenario_id"] != scenario_id or not all(isinstance(reason, str) for reason in missing.values()):
         raise ValueError("of another scenario, or without a reason")
     numbers = {name: float(row[name]) for name in (*SCORE_NAMES, "blamed_others_rate", "others_realism")}
     return {"scenario_id": scenario_id, "traffic": values["settings"]["traffic"], **numbers}, missing

@@ -8,11 +8,11 @@ import numpy as np
 
 from rlftsim.envs.episode import Episode, EpisodeState, advance, look, start
 from rlftsim.envs.record import build_record
-from rlftsim.envs.resets import about, build_config, chosen, describe_step, draw_seed
+from rlftsim.envs.resets import build_config, choose_scenario, describe_start, describe_step, draw_seed
 from rlftsim.envs.result import Result, build_animation, build_page
 from rlftsim.envs.snapshot import read_snapshot, write_snapshot
 from rlftsim.envs.source import Source
-from rlftsim.envs.spaces import action_space, observation_space, shown
+from rlftsim.envs.spaces import action_space, format_observation, observation_space
 from rlftsim.envs.world import Noise, fork
 from rlftsim.errors import ConfigError
 from rlftsim.rollout.policy import Policy
@@ -90,7 +90,7 @@ class EgoEnv(gymnasium.Env):
         super().reset(seed=seed)
         if seed is not None:
             self._seed, self._count = seed, 0
-        scenario_id, dice, goals = chosen(self.np_random, self.source, options or {}, self._seed, self._count)
+        scenario_id, dice, goals = choose_scenario(self.np_random, self.source, options or {}, self._seed, self._count)
         self._count += 1
         scenario = self.source.scenario(scenario_id)
         episode = self.source.episode([scenario], {scenario_id: goals} if goals else None)
@@ -100,7 +100,7 @@ class EgoEnv(gymnasium.Env):
                 "take rlftsim.envs.parallel_env."
             )
         self._begun = episode, start(episode, (dice,))
-        return self._look(), about(episode, self.state, 0, self.source)
+        return self._look(), describe_start(episode, self.state, 0, self.source)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Carry out one action.
@@ -166,7 +166,7 @@ class EgoEnv(gymnasium.Env):
             DataError: no snapshot, or a damaged one.
         """
         self._go_on(*read_snapshot(saved, self.source))
-        return self._look(), about(self.episode, self.state, 0, self.source)
+        return self._look(), describe_start(self.episode, self.state, 0, self.source)
 
     def _go_on(self, episode: Episode, state: EpisodeState) -> None:
         """Take over a running episode; the next ones follow from its seed, with the next rollouts."""
@@ -175,4 +175,4 @@ class EgoEnv(gymnasium.Env):
         self._begun, self._seed, self._count = (episode, state), dice.seed, dice.rollout + 1
 
     def _look(self) -> Any:
-        return shown(look(self.episode, self.state), self.config.observation, 0)
+        return format_observation(look(self.episode, self.state), self.config.observation, 0)

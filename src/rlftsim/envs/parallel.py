@@ -13,10 +13,10 @@ from rlftsim.envs.actions import validate_actions
 from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.drivers import Driver, assign_drivers
 from rlftsim.envs.episode import Episode, EpisodeState, advance, look, start
-from rlftsim.envs.resets import OPTIONS, about, build_config, chosen, describe_step, draw_seed
+from rlftsim.envs.resets import OPTIONS, build_config, choose_scenario, describe_start, describe_step, draw_seed
 from rlftsim.envs.scene import build_env_scene
 from rlftsim.envs.source import Source
-from rlftsim.envs.spaces import action_space, observation_space, shown
+from rlftsim.envs.spaces import action_space, format_observation, observation_space
 from rlftsim.errors import ConfigError, in_short
 from rlftsim.rollout.policy import Policy
 from rlftsim.scenario.any_form import AnyScenarios
@@ -113,7 +113,9 @@ class TrafficParallelEnv(ParallelEnv):
             self._random, _ = seeding.np_random(seed)
             self._seed, self._count = seed, 0
         environment_options = {name: value for name, value in (options or {}).items() if name in OPTIONS}
-        scenario_id, dice, goals = chosen(self._random, self.source, environment_options, self._seed, self._count)
+        scenario_id, dice, goals = choose_scenario(
+            self._random, self.source, environment_options, self._seed, self._count
+        )
         self._count += 1
         scenario = self.source.scenario(scenario_id)
         episode = self.source.episode([scenario], {scenario_id: goals} if goals else None)
@@ -122,7 +124,7 @@ class TrafficParallelEnv(ParallelEnv):
         scene = episode.world.scenes[0]
         self._names = [str(scene.object_id[agent]) for _, agent in episode.world.actors]
         self.agents = list(self._names)
-        infos = {name: about(episode, state, row, self.source) for row, name in enumerate(self._names)}
+        infos = {name: describe_start(episode, state, row, self.source) for row, name in enumerate(self._names)}
         return self._observe(self.agents), infos
 
     def step(self, actions: dict[str, Any]) -> tuple[dict, dict, dict, dict, dict]:
@@ -165,4 +167,4 @@ class TrafficParallelEnv(ParallelEnv):
     def _observe(self, names: list[str]) -> dict[str, Any]:
         assert self._begun is not None
         observation, form = look(*self._begun), self.source.config.observation
-        return {name: shown(observation, form, self._names.index(name)) for name in names}
+        return {name: format_observation(observation, form, self._names.index(name)) for name in names}

@@ -86,8 +86,8 @@ def score_planner(record: Record) -> PlannerScores:
     Args:
         record: Record of the episode; a short episode is scored for as long as it lasted.
     """
-    components, missing = _parts(record), missing_scores(record)
-    early_components = _parts(record.first(PDMS_STEPS))
+    components, missing = _score_components(record), missing_scores(record)
+    early_components = _score_components(record.first(PDMS_STEPS))
     multiplied = ("no_at_fault_collision", "drivable_area", "making_progress", "driving_direction")
     nuplan = math.prod(components[name] for name in multiplied if math.isfinite(components[name]))
     # NAVSIM: a collision with a standing object costs half, and the driving direction has weight 0
@@ -131,7 +131,7 @@ def missing_scores(record: Record) -> dict[str, str]:
     return reasons
 
 
-def _parts(record: Record) -> dict[str, float]:
+def _score_components(record: Record) -> dict[str, float]:
     """The eight parts of the score."""
     missing = missing_scores(record)
     ratio = math.nan if "progress" in missing else _progress_ratio(record)

@@ -35,7 +35,7 @@ def draw_seed() -> int:
     return int(np.random.default_rng().integers(2**31))
 
 
-def chosen(
+def choose_scenario(
     random: np.random.Generator, source: Source, options: dict[str, Any], seed: int, count: int
 ) -> tuple[str, Dice, Any]:
     """Scenario, dice and goals of a reset.
@@ -59,7 +59,7 @@ def chosen(
     return scenario_id, Dice(seed, rollout), options.get("goals")
 
 
-def about(episode: Episode, state: EpisodeState, row: int, source: Source) -> dict[str, Any]:
+def describe_start(episode: Episode, state: EpisodeState, row: int, source: Source) -> dict[str, Any]:
     """Information at the beginning of an episode.
 
     Args:

@@ -15,7 +15,7 @@ from rlftsim.viewer.film import to_film
 from rlftsim.viewer.page import Animation, Panel, animation_html, page_html
 from rlftsim.viewer.scene import AgentBoxes, SceneMotion, build_scene, logged_trajectories
 
-SCORE_NAMES = tuple(one.name for scores in (PlannerScores, TrafficScores) for one in fields(scores))
+SCORE_NAMES = tuple(field.name for scores in (PlannerScores, TrafficScores) for field in fields(scores))
 """Names of all scores of an episode."""
 
 

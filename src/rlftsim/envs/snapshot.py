@@ -68,7 +68,7 @@ def read_snapshot(saved: bytes, source: Source) -> tuple[Episode, EpisodeState]:
         raise DataError("a snapshot of another version: take a new one with snapshot().")
     if about["model"] != source.fingerprint:
         raise ConfigError("the snapshot is of another traffic model: make the environment with the same one.")
-    goals: Any = {name: {int(i): p for i, p in own.items()} for name, own in (about["goals"] or {}).items()}
+    goals: Any = {name: {int(i): p for i, p in points.items()} for name, points in (about["goals"] or {}).items()}
     episode = source.episode([source.scenario(name) for name in about["scenarios"]], goals or None)
     differences = [name for name, value in _settings(episode).items() if about["settings"].get(name) != value]
     if differences:

@@ -52,14 +52,14 @@ class TrafficScores:
 def score_traffic(record: Record) -> TrafficScores:
     """Events of the other agents in one episode."""
     scene, motion = record.scene, record.motion
-    is_other = np.arange(len(scene.object_id)) != record.agent
-    is_other_vehicle = is_other & (scene.object_type == ObjectType.VEHICLE)
+    is_traffic = np.arange(len(scene.object_id)) != record.agent
+    is_vehicle = is_traffic & (scene.object_type == ObjectType.VEHICLE)
     has_edges, has_lanes = (find(scene.scenario) is not None for find in (road_edges, lane_search))
     # 1. contacts among the others; those that begin with an overlap do not count
     length, width = scene.size[:, 0].astype(np.float32), scene.size[:, 1].astype(np.float32)
     overlaps = compute_overlap(
         motion[None, ..., :2].astype(np.float32), motion[None, ..., 2].astype(np.float32), length, width,
-        (record.is_observed & is_other[:, None])[None], ignore_from=0,
+        (record.is_observed & is_traffic[:, None])[None], ignore_from=0,
         z=None if scene.levels is None else record.z[None], height=scene.size[:, 2],
     )[0].any(1)  # fmt: skip
     # 2. kinematics over half a second whose states are all known
@@ -75,11 +75,11 @@ def score_traffic(record: Record) -> TrafficScores:
     return TrafficScores(
         ego_contacts=float(len(record.collisions)),
         risky_approach_rate=float(least_time_to_collision(record) < RISKY_TTC_S),
-        others_collision_rate=_rate(overlaps, is_other),
-        others_offroad_rate=_rate(_leaves_road(record), is_other_vehicle & has_edges),
-        others_wrong_way_rate=_rate(_drives_against(record, is_other_vehicle), is_other_vehicle & has_lanes),
-        others_acceleration_rate=_rate(np.any(jolt, axis=1), is_other_vehicle),
-        others_steering_rate=_rate(np.any(tight, axis=1), is_other_vehicle),
+        others_collision_rate=_rate(overlaps, is_traffic),
+        others_offroad_rate=_rate(_leaves_road(record), is_vehicle & has_edges),
+        others_wrong_way_rate=_rate(_drives_against(record, is_vehicle), is_vehicle & has_lanes),
+        others_acceleration_rate=_rate(np.any(jolt, axis=1), is_vehicle),
+        others_steering_rate=_rate(np.any(tight, axis=1), is_vehicle),
         blamed_others_rate=blamed_others_rate(record.collisions),
     )
 

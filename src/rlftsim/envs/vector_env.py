@@ -13,9 +13,9 @@ from jaxtyping import Bool, Int64
 from rlftsim.envs.actions import validate_actions
 from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.episode import Episode, EpisodeState, advance, look, start
-from rlftsim.envs.resets import about, build_config, chosen, describe_step, draw_seed
+from rlftsim.envs.resets import build_config, choose_scenario, describe_start, describe_step, draw_seed
 from rlftsim.envs.source import Source
-from rlftsim.envs.spaces import action_space, observation_space, shown
+from rlftsim.envs.spaces import action_space, format_observation, observation_space
 from rlftsim.errors import ConfigError, in_short, whole_number
 from rlftsim.rollout.policy import Policy
 from rlftsim.scenario.any_form import AnyScenarios
@@ -126,7 +126,7 @@ class EgoVectorEnv(VectorEnv):
         if not self._groups and not mask.all():
             raise ConfigError("the first reset begins an episode in every slot: leave out reset_mask.")
         if isinstance(seed, list | tuple | np.ndarray):
-            seeds = [None if one is None else whole_number("seed", one, 0) for one in seed]
+            seeds = [None if number is None else whole_number("seed", number, 0) for number in seed]
         else:
             seeds = [None if seed is None else whole_number("seed", seed, 0) + i for i in range(self.num_envs)]
         if len(seeds) != self.num_envs:
@@ -217,7 +217,7 @@ class EgoVectorEnv(VectorEnv):
         picks = []
         for i in slots:
             slot = self._slots[i]
-            picks.append(chosen(slot.random, self.source, options, slot.seed, slot.count))
+            picks.append(choose_scenario(slot.random, self.source, options, slot.seed, slot.count))
             slot.count += 1
         scenarios = [self.source.scenario(scenario_id) for scenario_id, _, _ in picks]
         goals = {scenario_id: scenario_goals for scenario_id, _, scenario_goals in picks if scenario_goals}
@@ -232,12 +232,12 @@ class EgoVectorEnv(VectorEnv):
         self._groups = [*(group for group in groups if len(group.live)), _Group(episode, state, np.array(slots))]
         self._over[slots] = False
         for row, i in enumerate(slots):
-            notes[i] = about(episode, state, row, self.source)
+            notes[i] = describe_start(episode, state, row, self.source)
 
     def _observe(self) -> Any:
         """Observations of all slots in order."""
         form = self.source.config.observation
-        observations: list[Any] = [shown(look(group.episode, group.state), form) for group in self._groups]
+        observations: list[Any] = [format_observation(look(group.episode, group.state), form) for group in self._groups]
         if len(observations) == 1 and len(self._groups[0].live) == self.num_envs:
             return observations[0]  # a group of all slots has them in order
         order = np.argsort(np.concatenate([group.slots[group.live] for group in self._groups]))
@@ -247,4 +247,4 @@ class EgoVectorEnv(VectorEnv):
 
         if form == "flat":
             return joined(observations)
-        return {name: joined([one[name] for one in observations]) for name in observations[0]}
+        return {name: joined([arrays[name] for arrays in observations]) for name in observations[0]}

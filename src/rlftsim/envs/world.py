@@ -84,7 +84,7 @@ class World:
 class Block:
     """Decisions of the policy that are being carried out."""
 
-    before: Any
+    policy_state: Any
     """State of the policy before them."""
     decision: Tensor | None
     """None before the first block."""
@@ -106,7 +106,7 @@ class WorldState:
     """Of all decisions of the episode."""
     dice: tuple[tuple[Dice, ...], ...]
     """Dice of each scene, at each decision taken so far and for all that follow (the last entry)."""
-    places: tuple[Float[np.ndarray, "_ 2"], ...]
+    idm_states: tuple[Float[np.ndarray, "_ 2"], ...]
     """Distance along the line, and speed, of the IDM-driven agents of each scene."""
 
     @property
@@ -247,7 +247,7 @@ def step_world(world: World, state: WorldState, moved: Float[np.ndarray, "M 5"])
         motion[coasts] = previous[coasts]
         motion[coasts, :2] += STEP_S * previous[coasts, 3:]
     # 2. IDM-driven vehicles
-    idm_states = state.places
+    idm_states = state.idm_states
     driven = world.drivers == Driver.IDM
     motion[driven] = previous[driven]
     motion[driven, 3:] = 0.0  # parked ones stay; those with a line move below
@@ -339,7 +339,7 @@ def _decide(world: World, state: WorldState) -> Block:
     assert block is not None
     assert state.noise is not None
     with one_thread(), torch.no_grad():
-        policy_state = block.before
+        policy_state = block.policy_state
         if block.decision is not None:
             policy_state = policy.advance(world.context, policy_state, block.decision, _forced(world, state))
         distribution = policy.decide(world.context, policy_state)

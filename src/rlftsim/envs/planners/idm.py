@@ -29,10 +29,10 @@ class IdmPlanner:
         """Acceleration behind the leader, steering for the route."""
         view = read_view(observation)
         window = slice(0, LOOKAHEAD_M)
-        is_box = np.ones((1, len(view.others)), bool)
+        is_box = np.ones((1, len(view.boxes)), bool)
         gap, lead = find_leaders(
-            view.line[None, window], view.heading[None, window], view.size[None], view.others[None],
-            view.other_size[None], is_box,
+            view.line[None, window], view.heading[None, window], view.size[None], view.boxes[None],
+            view.box_size[None], is_box,
         )  # fmt: skip
         to_stop = np.maximum(view.stop_m - view.size[0] / 2, 0.0)
         gap, lead = np.minimum(gap, to_stop), np.where(to_stop < gap, 0.0, lead)

@@ -85,10 +85,10 @@ def simulate_proposals(view: View) -> Proposals:
     lines = view.line + offset[:, None, None] * normal  # [n, P, 2]
     motion = np.tile([0.0, 0.0, 0.0, view.speed, 0.0], (n, 1))
     row, size = np.arange(n), np.tile(view.size, (n, 1))
-    mask, other_size = np.ones((n, len(view.others)), bool), np.tile(view.other_size, (n, 1, 1))
+    mask, other_size = np.ones((n, len(view.boxes)), bool), np.tile(view.box_size, (n, 1, 1))
     states, controls = [motion], []
     for step in range(STEPS):
-        boxes = np.tile(_coasted(view.others, step * STEP_S), (n, 1, 1))
+        boxes = np.tile(_coasted(view.boxes, step * STEP_S), (n, 1, 1))
         # 1. place on the line, and the leader from there on
         line_index = np.linalg.norm(lines - motion[:, None, :2], axis=-1).argmin(1)
         window = np.minimum(line_index[:, None] + np.arange(LOOKAHEAD_M), lines.shape[1] - 1)
@@ -117,7 +117,7 @@ def collisions(view: View, motion: Float[np.ndarray, "n T1 5"]) -> Bool[np.ndarr
         motion: Motion of the proposals, ego frame at the time of planning.
     """
     time = STEP_S * np.arange(motion.shape[1])
-    meets = _meets(view, motion, np.stack([_coasted(view.others, t) for t in time]))  # [n, T + 1, K]
+    meets = _meets(view, motion, np.stack([_coasted(view.boxes, t) for t in time]))  # [n, T + 1, K]
     meets &= ~meets[:, :1]
     return np.logical_or.accumulate(meets.any(-1), axis=1)
 
@@ -149,7 +149,7 @@ def score_proposals(
     for delay_s in TTC_S:
         coasted = sparse.copy()
         coasted[..., :2] += delay_s * sparse[..., 3:]
-        meets = _meets(view, coasted, np.stack([_coasted(view.others, t + delay_s) for t in time]))
+        meets = _meets(view, coasted, np.stack([_coasted(view.boxes, t + delay_s) for t in time]))
         risky |= (meets & (signed_speed(sparse) > 0.1)[..., None]).any((1, 2))
     speed = signed_speed(motion)
     acceleration = np.diff(speed, axis=1) / STEP_S
@@ -166,7 +166,7 @@ def _meets(
 ) -> Bool[np.ndarray, "n t K"]:
     """True where a proposal overlaps a box that is not behind it."""
     offset = boxes[..., :2] - motion[..., None, :2]  # [n, t, K, 2]
-    meets = boxes_overlap(offset, motion[..., None, 2], boxes[..., 2], view.size, view.other_size)
+    meets = boxes_overlap(offset, motion[..., None, 2], boxes[..., 2], view.size, view.box_size)
     forward = offset[..., 0] * np.cos(motion[..., None, 2]) + offset[..., 1] * np.sin(motion[..., None, 2])
     return meets & (forward > -view.size[0] / 2)
 

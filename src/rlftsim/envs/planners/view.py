@@ -24,9 +24,9 @@ class View:
     heading: Float[np.ndarray, "P"]
     limit_mps: float
     """Speed limit here; 0 = unknown."""
-    others: Float[np.ndarray, "K 5"]
+    boxes: Float[np.ndarray, "K 5"]
     """x, y, heading, vx, vy."""
-    other_size: Float[np.ndarray, "K 2"]
+    box_size: Float[np.ndarray, "K 2"]
     stop_m: float
     """Distance along the line to the nearest red or yellow light on it; infinite without one."""
     edges: Float[np.ndarray, "E 4"]
@@ -48,10 +48,10 @@ def read_view(observation: dict[str, Any]) -> View:
         line=line,
         heading=np.unwrap(compute_headings(line)),
         limit_mps=float(route[0, 2]) if len(route) else 0.0,
-        others=np.concatenate(
+        boxes=np.concatenate(
             [neighbors[:, :2], np.arctan2(neighbors[:, 3], neighbors[:, 2])[:, None], neighbors[:, 4:6]], 1
         ),
-        other_size=neighbors[:, 6:8],
+        box_size=neighbors[:, 6:8],
         stop_m=_stop(observation, line, float(ego[4])),
         edges=observation["edges"][observation["edges_mask"].astype(bool)].astype(float),
     )
