@@ -193,7 +193,7 @@ def test_an_experiment_of_ones_own_needs_two_functions(done):
         run=lambda suite: suite.evaluate(ROWS),
         summarize=lambda rows, suite: ExperimentResult(
             title="Mine",
-            tables=(tables.of_rows("Ours", rows.values(), SCORES),),
+            tables=(tables.build_table("Ours", rows.values(), SCORES),),
             verdicts=(rows["oracle"].against(rows["base"]),),
             numbers={"nothing": float("nan")},
         ),

@@ -241,7 +241,7 @@ class ExamResult:
     """Looks at this exam by candidate, this one included."""
 
 
-def take_exam(config: ExamConfig, out: Path, ledger: Ledger, *, again: bool = False) -> ExamResult:
+def take_exam(config: ExamConfig, out: Path, ledger: Ledger, *, is_repeat: bool = False) -> ExamResult:
     """Evaluate base and candidates on an exam; what an interrupted call finished is not done again.
 
     The result is neither written nor in the ledger: see `experiments.exam_report`.
@@ -250,17 +250,18 @@ def take_exam(config: ExamConfig, out: Path, ledger: Ledger, *, again: bool = Fa
         config: Models, scenarios and settings.
         out: Folder for everything.
         ledger: Looks at exams so far.
-        again: True allows a further look at a recipe or model that has sat this exam.
+        is_repeat: True allows a further look at a recipe or model that has sat this exam.
 
     Raises:
-        ConfigError: A recipe or model has sat the exam and `again` is not set, no commit and no seed, or no SUMO.
+        ConfigError: A recipe or model has sat the exam and `is_repeat` is not set, no commit and no seed, or no SUMO.
         DataError: The data set has no split exam.
     """
     # 1. Refuse a second look before anything is simulated.
     names = (name for row in (config.bases, *config.candidates.values()) for name in row)
     models = {name: Examinee(name, load_policy(name, config.device)) for name in dict.fromkeys(names)}
     looks = {
-        recipe: 1 + ledger.count_looks(config.exam_name, recipe, [models[n].fingerprint for n in row], again=again)
+        recipe: 1
+        + ledger.count_looks(config.exam_name, recipe, [models[n].fingerprint for n in row], is_repeat=is_repeat)
         for recipe, row in config.candidates.items()
     }
     # 2. Scenarios of the exam.

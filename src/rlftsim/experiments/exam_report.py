@@ -11,7 +11,7 @@ from rlftsim.evaluation.compare import FEW_CLUSTERS, PairedDifference
 from rlftsim.experiments import tables
 from rlftsim.experiments.exam import MARGINS, ExamConfig, ExamResult, ExamRow, Margin
 from rlftsim.experiments.ledger import Ledger
-from rlftsim.experiments.results import finite_or_none
+from rlftsim.experiments.results import to_finite
 from rlftsim.experiments.tables import TextTable
 from rlftsim.jobs.files import write_text
 from rlftsim.training.run_folder import describe_environment, to_plain
@@ -40,15 +40,15 @@ def write_exam(result: ExamResult, config: ExamConfig, ledger: Ledger) -> tuple[
     lines.append(f"On the split tune the base is most realistic at temperature {result.temperature:g}.")
     entries = [ledger_entry(row, result, config, environment["commit"]) for row in result.rows]
     values = {"exam": result.name, "verdicts": lines, "rows": entries, "environment": environment}
-    write_text(result.folder / "exam.json", json.dumps(finite_or_none(values), indent=1) + "\n")
+    write_text(result.folder / "exam.json", json.dumps(to_finite(values), indent=1) + "\n")
     write_text(result.folder / "exam.md", page(result, all_tables, lines, environment))
-    ledger.append([finite_or_none(entry) for entry in entries])
+    ledger.append([to_finite(entry) for entry in entries])
     return all_tables, lines
 
 
 def means_table(result: ExamResult) -> TextTable:
     """Mean of every column, base first."""
-    return tables.of_rows("Means", [result.base, *(row.mean for row in result.rows)], COLUMNS)
+    return tables.build_table("Means", [result.base, *(row.mean for row in result.rows)], COLUMNS)
 
 
 def changes_table(result: ExamResult) -> TextTable:

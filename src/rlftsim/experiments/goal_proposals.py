@@ -59,7 +59,7 @@ def propose(scenario: Scenario, track: int) -> tuple[Proposal, ...]:
     return tuple(sorted([*kept, logged], key=lambda proposal: order.index(proposal.maneuver)))
 
 
-def entry_of(scenario: Scenario, proposal: Proposal) -> GoalEntry:
+def to_goal_entry(scenario: Scenario, proposal: Proposal) -> GoalEntry:
     """A proposal as an entry of a goals file.
 
     Args:
@@ -67,10 +67,10 @@ def entry_of(scenario: Scenario, proposal: Proposal) -> GoalEntry:
         proposal: for the agent.
     """
     x, y = proposal.position
-    return GoalEntry(scenario.scenario_id, proposal.object_id, float(x), float(y), label_of(proposal))
+    return GoalEntry(scenario.scenario_id, proposal.object_id, float(x), float(y), format_label(proposal))
 
 
-def label_of(proposal: Proposal) -> str:
+def format_label(proposal: Proposal) -> str:
     """Label of a proposal: its maneuver, with an ending for the logged one."""
     return f"{proposal.maneuver.value}{LOGGED if proposal.is_logged else ''}"
 

@@ -43,17 +43,17 @@ class Ledger:
             entries.append(entry)
         return entries
 
-    def count_looks(self, exam: str, recipe: str, fingerprints: Sequence[str], *, again: bool) -> int:
+    def count_looks(self, exam: str, recipe: str, fingerprints: Sequence[str], *, is_repeat: bool) -> int:
         """Earlier looks at an exam by a recipe of this name or one of these models.
 
         Args:
             exam: Name of the exam.
             recipe: Name of the recipe.
             fingerprints: Models of the recipe.
-            again: True = a further look is wanted.
+            is_repeat: True = a further look is wanted.
 
         Raises:
-            ConfigError: There was a look, and `again` is not set.
+            ConfigError: There was a look, and `is_repeat` is not set.
         """
         earlier = [
             entry
@@ -62,7 +62,7 @@ class Ledger:
             and entry["exam"] == exam
             and (entry["recipe"] == recipe or set(entry["fingerprints"]) & {*fingerprints})
         ]
-        if earlier and not again:
+        if earlier and not is_repeat:
             raise ConfigError(
                 f"{recipe} sat the exam {exam} on {earlier[-1]['date']} ({self.path}): whoever looks twice chooses on "
                 "the exam. Choose on the split tune, or add --again, which is counted."

@@ -75,7 +75,7 @@ def run_experiment(name: str, experiment: Experiment[Any], suite: ExperimentSuit
     """
     check_folder(suite.out, "results")
     if experiment.needs_goals:
-        suite.require_goals()
+        suite.check_goals()
     # 1. Train and evaluate what is missing, then make tables of stored results alone.
     result = experiment.summarize(experiment.run(suite), suite)
     # 2. Figure and films, before the page that shows them.
@@ -84,7 +84,7 @@ def run_experiment(name: str, experiment: Experiment[Any], suite: ExperimentSuit
             save_figure(suite.out / f"{name}.{ending}", result.figure)
     for number, animation in enumerate(result.animations, 1):
         for ending, every in FILMS.items():
-            to_film(suite.out / f"{name}-{number}{ending}", animation, every=every)
+            to_film(suite.out / f"{name}-{number}{ending}", animation, steps_per_frame=every)
     if result.animations:
         write_page(suite.out / f"{name}.html", result.title, result.animations, caption=experiment.question)
     # 3. Everything for machines, with the settings that the numbers depend on.
@@ -103,7 +103,7 @@ def run_experiment(name: str, experiment: Experiment[Any], suite: ExperimentSuit
         "evaluation": to_plain(suite.evaluation),
         "environment": describe_environment(),
     }
-    write_text(suite.out / f"{name}.json", json.dumps(finite_or_none(for_machines), indent=1) + "\n")
+    write_text(suite.out / f"{name}.json", json.dumps(to_finite(for_machines), indent=1) + "\n")
     # 4. The page for people.
     write_text(suite.out / f"{name}.md", _markdown(name, experiment, result, suite))
     return result
@@ -132,11 +132,11 @@ def _markdown(name: str, experiment: Experiment[Any], result: ExperimentResult, 
     return "\n\n".join(parts) + "\n"
 
 
-def finite_or_none(value: Any) -> Any:
+def to_finite(value: Any) -> Any:
     """The same for JSON, with None for numbers that are not finite."""
     if isinstance(value, Mapping):
-        return {str(key): finite_or_none(inner) for key, inner in value.items()}
+        return {str(key): to_finite(inner) for key, inner in value.items()}
     if isinstance(value, list | tuple):
-        return [finite_or_none(inner) for inner in value]
+        return [to_finite(inner) for inner in value]
     # JSON has no NaN or infinity.
     return None if isinstance(value, float) and not math.isfinite(value) else value

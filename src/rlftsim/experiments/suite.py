@@ -123,7 +123,7 @@ class ExperimentSuite:
                 found[spec] = evaluate(policy, self.data, folder, config, name=self.evaluation_name(spec, goals))
         return {name: Row(name, tuple(found[spec] for spec in row)) for name, row in rows.items()}
 
-    def require_goals(self) -> None:
+    def check_goals(self) -> None:
         """Refuse a recipe or a base model that cannot be given goals, before anything is trained.
 
         Raises:

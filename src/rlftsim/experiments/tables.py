@@ -1,7 +1,7 @@
 """Tables and figures of an experiment's rows.
 
-tables.of_rows("Ours", rows.values(), SCORES)     a table, mean ± standard error
-tables.numbers(rows.values(), SCORES)             the same for machines
+tables.build_table("Ours", rows.values(), SCORES)     a table, mean ± standard error
+tables.to_numbers(rows.values(), SCORES)             the same for machines
 tables.draw_gains(base, [tuned, other])           paired differences with their intervals
 """
 
@@ -44,7 +44,7 @@ class TextTable:
         return table
 
 
-def of_rows(title: str, rows: Iterable[Row], columns: Sequence[Column]) -> TextTable:
+def build_table(title: str, rows: Iterable[Row], columns: Sequence[Column]) -> TextTable:
     """Table of scores: mean ± standard error over scenarios, of each scenario's mean over the seeds.
 
     Args:
@@ -64,11 +64,11 @@ def of_rows(title: str, rows: Iterable[Row], columns: Sequence[Column]) -> TextT
     return TextTable(title, ("", *(c.label for c in columns)), tuple(cells), note)
 
 
-def numbers(rows: Iterable[Row], columns: Sequence[Column]) -> dict[str, Any]:
+def to_numbers(rows: Iterable[Row], columns: Sequence[Column]) -> dict[str, Any]:
     """Means with standard errors and 95 % intervals, and the mean of every seed, by row and column.
 
     Args:
-        rows: as in `of_rows`.
+        rows: as in `build_table`.
         columns: scores; keys are the column names of evaluations ("meta_metric").
     """
     return {

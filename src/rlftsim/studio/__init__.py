@@ -9,7 +9,7 @@ ES modules; they share `viewer/drawing.js` with the pages that stand alone. Need
 from rlftsim.errors import ConfigError
 
 
-def require_extra() -> None:
+def check_extra() -> None:
     """Check that the server's libraries are installed.
 
     Raises:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from rlftsim.errors import ConfigError, in_short
 from rlftsim.scenario.any_form import Name
-from rlftsim.studio import require_extra
+from rlftsim.studio import check_extra
 
 if TYPE_CHECKING:
     from rlftsim.studio.serving import Studio
@@ -81,7 +81,7 @@ def open_studio(
     Raises:
         RlftsimError: no such data set, split or model, a policy in place of a name, or the extra is not installed.
     """
-    require_extra()
+    check_extra()
     # Not at the top: `import rlftsim` works without the extra.
     from rlftsim.studio.serving import Studio
     from rlftsim.studio.session import Session

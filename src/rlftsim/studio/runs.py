@@ -104,7 +104,7 @@ class Run:
         """
         if not 0 <= variant < len(self.variants):
             raise Refusal(f"run {self.name} has no variant {variant}.", status=404)
-        parts, wanted = self.simulated[variant].parts, chunks_of(self.body.num_rollouts)
+        parts, wanted = self.simulated[variant].parts, split_rollouts(self.body.num_rollouts)
         if any(ids not in parts for ids in wanted):
             raise Refusal("these rollouts are not complete yet: wait until the run is done.", status=409)
         return join([parts[ids] for ids in wanted])
@@ -122,7 +122,7 @@ class Run:
         return scored
 
 
-def chunks_of(num_rollouts: int) -> list[range]:
+def split_rollouts(num_rollouts: int) -> list[range]:
     """Rollouts that are simulated at once: 4, 4, 8, 16, then 32 each."""
     found: list[range] = []
     while (first := found[-1].stop if found else 0) < num_rollouts:
@@ -239,7 +239,7 @@ class Worker:
             simulated.append(self._known.setdefault(variant, Simulated()))
             self._known.move_to_end(variant)
         # The first chunk of every variant, then the rest; goal-free rollouts only matter for the score, so they end.
-        chunks = [(v, ids) for ids in chunks_of(body.num_rollouts) for v in range(len(variants))]
+        chunks = [(v, ids) for ids in split_rollouts(body.num_rollouts) for v in range(len(variants))]
         chunks.sort(key=lambda chunk: free_variant(variants, chunk[0]) == chunk[0] and has_goals(variants, chunk[0]))
         return Run(name, body, variants, tuple(simulated), chunks)
 

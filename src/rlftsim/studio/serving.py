@@ -124,7 +124,7 @@ class Studio:
         self.stop()
 
 
-def token_of(path: Path) -> str:
+def load_token(path: Path) -> str:
     """Token of a file, which is made where it is missing, readable by its owner only.
 
     Raises:

@@ -13,7 +13,7 @@ import numpy as np
 
 import rlftsim
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.experiments.goal_proposals import entry_of, label_of, propose
+from rlftsim.experiments.goal_proposals import format_label, propose, to_goal_entry
 from rlftsim.goals.goals_file import GoalEntry
 from rlftsim.goals.maneuvers.proposals import no_proposal_reason
 from rlftsim.goals.placement import goal_warnings
@@ -331,12 +331,12 @@ def _proposals_of(scenario: Scenario, track: int) -> dict[str, Any]:
     reason = "" if proposals else no_proposal_reason(scenario, track) or "no maneuver can be completed in time"
     found = []
     for proposal in proposals:
-        entry = entry_of(scenario, proposal)
+        entry = to_goal_entry(scenario, proposal)
         way = np.round(proposal.path[:, :2] - scenario.origin, 2)
         found.append(
             {
                 "maneuver": proposal.maneuver.value,
-                "label": label_of(proposal),
+                "label": format_label(proposal),
                 "logged": proposal.is_logged,
                 # As a goals file stores it, so that saved and simulated goals are the same.
                 "x": round(entry.x, 3),

@@ -195,7 +195,7 @@ def draw_verdicts(names: Sequence[str], verdicts: Int[np.ndarray, "n n"], *, tit
     return figure
 
 
-def refuse_no_picture(path: Path) -> None:
+def check_picture_path(path: Path) -> None:
     """Check that a file name has the ending of a picture.
 
     Raises:
@@ -217,7 +217,7 @@ def save_figure(path: Path, figure: Figure, *, dots_per_inch: int = DOTS_PER_INC
         ConfigError: another ending.
         DataError: the file cannot be written.
     """
-    refuse_no_picture(path)
+    check_picture_path(path)
     kind = path.suffix.removeprefix(".")
     FigureCanvasAgg(figure)
     # No dates and a fixed salt for ids: the same figure gives the same bytes.

@@ -22,14 +22,16 @@ HOLD_AT_END_S = 1.0
 Frame = UInt8[np.ndarray, "height width 3"]
 
 
-def to_film(path: str | os.PathLike[str], animation: Animation, *, every: int = 1, dots_per_inch: int = 110) -> None:
+def to_film(
+    path: str | os.PathLike[str], animation: Animation, *, steps_per_frame: int = 1, dots_per_inch: int = 110
+) -> None:
     """Write a film of an animation's first rollouts, from the current step on, in real time.
 
     Args:
         path: file to write, .mp4 (H.264) or .webp (plays wherever pictures are shown); nothing half-written is left
             there.
         animation: scene and panels.
-        every: steps of 0.1 s between frames.
+        steps_per_frame: steps of 0.1 s between frames.
         dots_per_inch: 110 makes a panel 440 pixels wide.
 
     Raises:
@@ -40,9 +42,9 @@ def to_film(path: str | os.PathLike[str], animation: Animation, *, every: int = 
     if path.suffix not in WRITERS:
         raise ConfigError(f"{path}: a film is {' or '.join(WRITERS)}, choose one of these endings.")
     # The last frame stays for a while, or the end could not be seen before a player starts again.
-    films = list(_frames(animation, every, dots_per_inch))
-    films += films[-1:] * round(HOLD_AT_END_S * STEPS_PER_SECOND / every)
-    write_whole(path, lambda temporary: WRITERS[path.suffix](temporary, films, STEPS_PER_SECOND / every))
+    films = list(_frames(animation, steps_per_frame, dots_per_inch))
+    films += films[-1:] * round(HOLD_AT_END_S * STEPS_PER_SECOND / steps_per_frame)
+    write_whole(path, lambda temporary: WRITERS[path.suffix](temporary, films, STEPS_PER_SECOND / steps_per_frame))
 
 
 class Camera:
@@ -84,11 +86,11 @@ class Camera:
         return drawn[: len(drawn) // 2 * 2, : drawn.shape[1] // 2 * 2].copy()
 
 
-def _frames(animation: Animation, every: int, dots_per_inch: int) -> Iterator[Frame]:
+def _frames(animation: Animation, steps_per_frame: int, dots_per_inch: int) -> Iterator[Frame]:
     """Frames of a film, one every so many steps."""
     camera = Camera(animation, dots_per_inch)
     num_steps = max(panel.trajectories.num_steps for panel in animation.panels)
-    for step in range(CURRENT_STEP, num_steps, every):
+    for step in range(CURRENT_STEP, num_steps, steps_per_frame):
         yield camera.frame(animation.panels, step)
 
 

@@ -57,7 +57,7 @@ class Cell:
         return f'<iframe style="{style}" sandbox="allow-scripts" srcdoc="{escape(self.page)}"></iframe>'
 
 
-def require_rollouts(function: str, scenarios: object, *rollouts: object) -> None:
+def check_rollouts(function: str, scenarios: object, *rollouts: object) -> None:
     """Refuse something else in place of rollouts, mostly arguments in the other order.
 
     Args:
@@ -107,7 +107,7 @@ def show(scenario: AnyScenarios, *rollouts: Rollouts, titles: str | Sequence[str
         DataError: no data set of this name, or without this split, or a scenario with other agents than the simulated
             one.
     """
-    require_rollouts("show", scenario, *rollouts)
+    check_rollouts("show", scenario, *rollouts)
     titles = (titles,) if isinstance(titles, str) else titles
     if len(titles) > len(rollouts):
         raise ConfigError(f"{len(titles)} titles for {len(rollouts)} rollouts: give one each, or none.")

@@ -173,7 +173,7 @@ def _legend_html(animation: Animation) -> str:
         entries.append(
             ("".join(f'<circle cx="{x}" cy="8" r="3.5" fill="var(--{c})"/>' for x, c in dots), "traffic light")
         )
-    if any(line.kind == "stop_sign" for line in animation.scene.lines):
+    if any(line.style == "stop_sign" for line in animation.scene.lines):
         octagon = '<path d="M18 5.5v5L14.5 14h-5L6 10.5v-5L9.5 2h5z" fill="var(--stop)"/>'
         octagon += '<path d="M8.5 7h7v2h-7z" fill="var(--surface)"/>'
         entries.append((octagon, "stop sign"))

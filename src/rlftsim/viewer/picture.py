@@ -125,32 +125,32 @@ def draw_map(axis: Axes, scene: SceneView, *, points_per_m: float) -> None:
         points_per_m: points (1/72 inch) on paper for a meter, so that lanes are as wide as they are in the world.
     """
     # Autoscaling is off for every collection: the limits show the focus of the scene, not the whole map.
-    by_kind: dict[str, list[np.ndarray]] = {}
+    by_style: dict[str, list[np.ndarray]] = {}
     for line in scene.lines:
-        by_kind.setdefault(line.kind, []).append(line.points)
-    axis.add_collection(PolyCollection(by_kind.get("driveway", []), facecolor=COLORS["road"], zorder=1), autolim=False)
+        by_style.setdefault(line.style, []).append(line.points)
+    axis.add_collection(PolyCollection(by_style.get("driveway", []), facecolor=COLORS["road"], zorder=1), autolim=False)
     # Lanes are logged as center lines; wide strokes with round ends make them a road surface without gaps.
-    for kind, width in LANE_WIDTH_M.items():
+    for style, width in LANE_WIDTH_M.items():
         lanes = LineCollection(
-            by_kind.get(kind, []), colors=COLORS["road"], lw=width * points_per_m, capstyle="round", zorder=1
+            by_style.get(style, []), colors=COLORS["road"], lw=width * points_per_m, capstyle="round", zorder=1
         )
         axis.add_collection(lanes, autolim=False)
-    for kind in ("crosswalk", "speed_bump"):
+    for style in ("crosswalk", "speed_bump"):
         areas = PolyCollection(
-            by_kind.get(kind, []), facecolor=COLORS["crosswalk"], edgecolor=COLORS["edge"], lw=0.4, zorder=1
+            by_style.get(style, []), facecolor=COLORS["crosswalk"], edgecolor=COLORS["edge"], lw=0.4, zorder=1
         )
         axis.add_collection(areas, autolim=False)
-    for kind, dashes in (
+    for style, dashes in (
         ("white", "-"),
         ("white_broken", (0, (4, 6))),
         ("yellow", "-"),
         ("yellow_broken", (0, (4, 6))),
     ):
-        color = COLORS[kind.removesuffix("_broken")]
+        color = COLORS[style.removesuffix("_broken")]
         axis.add_collection(
-            LineCollection(by_kind.get(kind, []), colors=color, lw=0.9, linestyles=[dashes]), autolim=False
+            LineCollection(by_style.get(style, []), colors=color, lw=0.9, linestyles=[dashes]), autolim=False
         )
-    axis.add_collection(LineCollection(by_kind.get("edge", []), colors=COLORS["edge"], lw=1.1), autolim=False)
+    axis.add_collection(LineCollection(by_style.get("edge", []), colors=COLORS["edge"], lw=1.1), autolim=False)
 
 
 def draw_paths(axis: Axes, agents: AgentBoxes, panel: Panel, step: int) -> None:

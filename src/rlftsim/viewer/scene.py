@@ -30,7 +30,7 @@ SIMPLIFY_TOLERANCE_M = 0.1
 MIN_FOCUS_RADIUS_M, MAX_FOCUS_RADIUS_M = 30.0, 80.0
 UNSEEN_LIGHT = "-"
 
-MAP_KINDS = {
+MAP_STYLES = {
     MapFeatureType.LANE_UNDEFINED: "lane",
     MapFeatureType.LANE_FREEWAY: "lane",
     MapFeatureType.LANE_SURFACE_STREET: "lane",
@@ -59,8 +59,8 @@ MAP_KINDS = {
 class MapLine:
     """One map feature: a polyline, a polygon (crosswalk, speed bump, driveway) or a point (stop sign)."""
 
-    kind: str
-    """A value of `MAP_KINDS`."""
+    style: str
+    """A value of `MAP_STYLES`."""
     points: Float[np.ndarray, "n 2"]
     """Map frame, meters."""
 
@@ -110,7 +110,7 @@ class SceneView:
         for line in self.lines:
             # x0, y0, then differences from point to point
             steps = np.diff(_centi(line.points), axis=0, prepend=np.zeros((1, 2), np.int64))
-            kinds.setdefault(line.kind, []).append(steps.ravel().tolist())
+            kinds.setdefault(line.style, []).append(steps.ravel().tolist())
         agents = self.agents
         roles = np.where(agents.is_ego, 2, agents.evaluated_mask.astype(int))
         columns = (agents.object_id, agents.object_type, _centi(agents.length), _centi(agents.width), roles)
@@ -229,7 +229,7 @@ def build_scene(scenario: Scenario) -> SceneView:
         points = features.polyline(index)[:, :2].astype(np.float64) - scenario.origin  # [n, 2]
         points = points[np.isfinite(points).all(-1)]
         if len(points):
-            lines.append(MapLine(MAP_KINDS[MapFeatureType(int(features.feature_type[index]))], simplify(points)))
+            lines.append(MapLine(MAP_STYLES[MapFeatureType(int(features.feature_type[index]))], simplify(points)))
     return SceneView(
         scenario_id=scenario.scenario_id,
         lines=tuple(lines),

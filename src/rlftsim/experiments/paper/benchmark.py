@@ -38,10 +38,10 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
     """The table, the differences, and the part of the gap to the oracle that fine-tuning closes."""
     base, tuned = rows[REFERENCE], rows[TUNED]
     imitations = [rows[name] for name in IMITATIONS if name in rows]
-    closed = {row.name: gap_closed(base.mean, row.mean, rows[CEILING].mean) for row in (*imitations, tuned)}
+    closed = {row.name: compute_gap_closed(base.mean, row.mean, rows[CEILING].mean) for row in (*imitations, tuned)}
     return ExperimentResult(
         title="Benchmark: realism of the base model, closed-loop imitation and RLFTSim",
-        tables=(tables.of_rows("Ours", rows.values(), SCORES), published.BENCHMARK),
+        tables=(tables.build_table("Ours", rows.values(), SCORES), published.BENCHMARK),
         verdicts=(
             *(tuned.against(base), tuned.seeds_against(base)),
             *(
@@ -62,7 +62,7 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
             "would give.",
         ),
         numbers={
-            "rows": tables.numbers(rows.values(), SCORES),
+            "rows": tables.to_numbers(rows.values(), SCORES),
             "gain_by_seed": {row.name: row.gains_over(base).tolist() for row in (*imitations, tuned)},
             "gap_closed": {name: {"fraction": g.fraction, "interval": g.interval} for name, g in closed.items()},
         },
@@ -85,7 +85,7 @@ class GapClosed:
         return f"{self.fraction:.1%} of the gap from base to oracle closed, {interval}."
 
 
-def gap_closed(base: Evaluation, tuned: Evaluation, ceiling: Evaluation) -> GapClosed:
+def compute_gap_closed(base: Evaluation, tuned: Evaluation, ceiling: Evaluation) -> GapClosed:
     """Mean gain over mean gap of the meta-metric, scenarios paired.
 
     Args:

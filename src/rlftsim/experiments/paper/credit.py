@@ -25,7 +25,7 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
     base, plain, split = rows.values()
     return ExperimentResult(
         title="Credit assignment: MLOO for whole rollouts, and for each agent",
-        tables=(tables.of_rows("Ours", rows.values(), COLUMNS),),
+        tables=(tables.build_table("Ours", rows.values(), COLUMNS),),
         verdicts=(
             *(split.against(plain), plain.against(base), split.against(base)),
             *(plain.seeds_against(base), split.seeds_against(base)),
@@ -34,7 +34,7 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
             suite.budget.note,
             "The paper gives every decision of a rollout the same reward; it has no number for the other.",
         ),
-        numbers={"rows": tables.numbers(rows.values(), COLUMNS)},
+        numbers={"rows": tables.to_numbers(rows.values(), COLUMNS)},
         figure=tables.draw_gains(base, [plain, split]),
     )
 

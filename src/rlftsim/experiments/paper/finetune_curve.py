@@ -92,7 +92,7 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
         verdicts += [rows[point(second, length)].against(rows[point(first, length)]) for length in epochs]
     return ExperimentResult(
         title="Realism against epochs of fine-tuning",
-        tables=(tables.of_rows("Ours", rows.values(), SCORES[:4]), published.CURVE),
+        tables=(tables.build_table("Ours", rows.values(), SCORES[:4]), published.CURVE),
         verdicts=tuple(verdicts),
         notes=(
             "At equal epochs all curves had the same number of updates of as many scenarios; RLFTSim simulates "
@@ -101,7 +101,7 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
             "CAT-K are runs of their own, because its learning rate falls towards the end.",
             "The best point of a curve is chosen with the scenarios it is evaluated on, which flatters it a little.",
         ),
-        numbers={"rows": tables.numbers(rows.values(), SCORES[:4]), "epochs": epochs},
+        numbers={"rows": tables.to_numbers(rows.values(), SCORES[:4]), "epochs": epochs},
         figure=draw_bands(
             bands,
             title="Realism against fine-tuning",

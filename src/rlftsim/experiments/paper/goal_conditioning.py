@@ -88,8 +88,8 @@ def summarize(rows: GoalRows, suite: ExperimentSuite) -> ExperimentResult:
     return ExperimentResult(
         title="Goal conditioning: goals that agents miss, and the cost in realism",
         tables=(
-            tables.of_rows("Ours: goals are the logged endpoints", [start, *conditioned], GOAL_COLUMNS),
-            tables.of_rows("Ours: the same models without goals", [start, *without_goals], GOAL_COLUMNS),
+            tables.build_table("Ours: goals are the logged endpoints", [start, *conditioned], GOAL_COLUMNS),
+            tables.build_table("Ours: the same models without goals", [start, *without_goals], GOAL_COLUMNS),
             published.GOALS,
         ),
         verdicts=(
@@ -108,7 +108,7 @@ def summarize(rows: GoalRows, suite: ExperimentSuite) -> ExperimentResult:
             "endpoint; percentage of agents and rollouts. In all rollouts: percentage of agents that miss in every "
             "one of them.",
         ),
-        numbers={"rows": tables.numbers([start, *conditioned, *without_goals], GOAL_COLUMNS)},
+        numbers={"rows": tables.to_numbers([start, *conditioned, *without_goals], GOAL_COLUMNS)},
         figure=draw_intervals(
             intervals,
             title="Agents that never pass their goal",

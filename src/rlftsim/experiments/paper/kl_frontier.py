@@ -81,9 +81,9 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
     return ExperimentResult(
         title="Rewards at equal KL to the base model",
         tables=(
-            tables.of_rows(f"At a KL of {kl:.4f} nats a decision", (base, *equal.values()), COLUMNS),
+            tables.build_table(f"At a KL of {kl:.4f} nats a decision", (base, *equal.values()), COLUMNS),
             replace(matrix.tables[0], title="Row against column, at that KL"),
-            tables.of_rows("Measured", (base, *measured), COLUMNS),
+            tables.build_table("Measured", (base, *measured), COLUMNS),
             published.REWARDS,
         ),
         verdicts=(_verdict_on_the_order(equal, kl), *(row.against(base) for row in equal.values()), *matrix.verdicts),
@@ -95,8 +95,8 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
         ),
         numbers={
             "kl": kl,
-            "at_equal_kl": tables.numbers((base, *equal.values()), COLUMNS),
-            "measured": tables.numbers((base, *measured), COLUMNS),
+            "at_equal_kl": tables.to_numbers((base, *equal.values()), COLUMNS),
+            "measured": tables.to_numbers((base, *measured), COLUMNS),
             "t_test": matrix.numbers,
         },
         figure=draw_bands(

@@ -74,7 +74,7 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
     bases = [row for name, row in rows.items() if BEFORE in name]
     return ExperimentResult(
         title="Model agnosticism: RLFTSim on two architectures",
-        tables=(tables.of_rows("Ours", rows.values(), SCORES), published.AGNOSTICISM),
+        tables=(tables.build_table("Ours", rows.values(), SCORES), published.AGNOSTICISM),
         verdicts=(
             *(base.against(rows[FLOOR]) for base in bases),
             *(verdict for before, after in pairs for verdict in _gain(before, after)),
@@ -85,7 +85,7 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
             "Mean actions: rollouts at temperature 0, without exploration noise.",
         ),
         numbers={
-            "rows": tables.numbers(rows.values(), SCORES),
+            "rows": tables.to_numbers(rows.values(), SCORES),
             "gain_by_seed": {after.name: after.gains_over(before).tolist() for before, after in pairs},
         },
         figure=tables.draw_gains(rows[FLOOR], [row for name, row in rows.items() if name != FLOOR]),

@@ -34,7 +34,7 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
         title="Oracle: the log against itself",
         tables=(
             feature_table(features, weights, row.mean),
-            tables.of_rows("Ours, in all", [row], SCORES),
+            tables.build_table("Ours, in all", [row], SCORES),
             published.ORACLE,
         ),
         verdicts=(
@@ -43,7 +43,7 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
         ),
         notes=("A likelihood is missing (–) where no scenario has a step at which the feature counts.",),
         numbers={
-            "rows": tables.numbers([row], SCORES),
+            "rows": tables.to_numbers([row], SCORES),
             "features": {
                 name: {"weight": weights[name], "likelihood": e.mean, "standard_error": e.standard_error}
                 for name, e in features.items()

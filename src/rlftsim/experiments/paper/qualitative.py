@@ -91,7 +91,7 @@ def summarize(pairs: Pairs, suite: ExperimentSuite) -> ExperimentResult:
     return ExperimentResult(
         title="The same scenario with the same noise, before and after fine-tuning",
         tables=(
-            tables.of_rows("All held-out scenarios", [before, after], SCORES),
+            tables.build_table("All held-out scenarios", [before, after], SCORES),
             tables.TextTable("Shown", headings, cells, note),
         ),
         verdicts=tuple(f"{heading}, {after.against(before, column)}" for heading, column in VERDICTS.items()),
@@ -103,7 +103,7 @@ def summarize(pairs: Pairs, suite: ExperimentSuite) -> ExperimentResult:
             suite.budget.note,
         ),
         numbers={
-            "rows": tables.numbers([before, after], SCORES),
+            "rows": tables.to_numbers([before, after], SCORES),
             "pairs": [
                 {"scenario_id": p.scenario_id, "rollout": p.rollout, "rates": p.rates, "events": p.events}
                 for p in pairs.shown.values()

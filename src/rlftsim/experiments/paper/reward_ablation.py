@@ -50,7 +50,7 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
     return ExperimentResult(
         title="Rewards: the same budget of fine-tuning with each of them",
         tables=(
-            tables.of_rows("Ours", rows.values(), COLUMNS),
+            tables.build_table("Ours", rows.values(), COLUMNS),
             *((distances,) if distances.rows else ()),
             published.REWARDS,
             published.HEURISTICS,
@@ -66,7 +66,7 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
             "Equal budgets are not equal distances: rewards differ in size, so they pull with different force "
             "against the same KL penalty, and in a short run its controller does not catch up.",
         ),
-        numbers={"rows": tables.numbers(rows.values(), COLUMNS)},
+        numbers={"rows": tables.to_numbers(rows.values(), COLUMNS)},
         figure=tables.draw_gains(base, tuned),
     )
 

@@ -26,7 +26,7 @@ def run(suite: ExperimentSuite) -> Variances:
     return measure_variances(policy, suite.data, suite.out / "variances", suite.evaluation)
 
 
-def slope_of(variance: Float[np.ndarray, "sizes"], sizes: Sequence[int], first: int = 0) -> float:
+def fit_slope(variance: Float[np.ndarray, "sizes"], sizes: Sequence[int], first: int = 0) -> float:
     """Slope of the straight line fitted to logarithms; NaN where a variance is zero.
 
     Args:
@@ -65,7 +65,7 @@ class Scaling:
     """Over the scenarios' own slopes, by the smallest size they are fitted to."""
 
 
-def scaling_of(variance: Float[np.ndarray, "scenarios sizes"], sizes: Sequence[int]) -> Scaling:
+def fit_scaling(variance: Float[np.ndarray, "scenarios sizes"], sizes: Sequence[int]) -> Scaling:
     """Fit of one reward; scenarios in which a reward never varies are left out.
 
     Args:
@@ -75,7 +75,7 @@ def scaling_of(variance: Float[np.ndarray, "scenarios sizes"], sizes: Sequence[i
     varied = np.log(variance[(variance > 0).all(1)])  # [varied scenarios, sizes]
     middle, spread = varied.mean(0), varied.std(0)
     slopes = {
-        first: mean_interval(np.array([slope_of(line, sizes, first) for line in np.exp(varied)]))
+        first: mean_interval(np.array([fit_slope(line, sizes, first) for line in np.exp(varied)]))
         for first in FROM_SIZES
         if sum(size >= first for size in sizes) >= MIN_SIZES_FOR_A_SLOPE
     }
@@ -92,10 +92,10 @@ def summarize(measured: Variances, suite: ExperimentSuite) -> ExperimentResult:
         suite: for the notes.
     """
     sizes = measured.sizes
-    scalings = {name: scaling_of(values, sizes) for name, values in measured.by_reward.items()}
+    scalings = {name: fit_scaling(values, sizes) for name, values in measured.by_reward.items()}
     # slopes of the laws over the same N, so that both have the same curvature at small N
     expected = {
-        (name, first): slope_of(curve, sizes, first)
+        (name, first): fit_slope(curve, sizes, first)
         for name, curve in law(sizes).items()
         for first in scalings[name].slopes
     }
