@@ -200,7 +200,7 @@ def frontier(suite, gain_per_nat):
     """Made-up runs that end at a KL of 0.045, but for minADE's, which ends at 0.03, and their evaluations."""
     rows, specs = {"base": row("base", EASE.tolist())}, kl_frontier.specs(suite.num_seeds)
     for number, name in enumerate(kl_frontier.REWARDS):
-        for part in kl_frontier.PARTS:
+        for part in kl_frontier.FRACTIONS:
             reached = min(0.045 * part, 0.03 if name.startswith("minADE") else 0.045)
             for one in specs[kl_frontier.point(name, part)]:
                 run = suite.model_folder(one)

@@ -1,4 +1,4 @@
-"""Basis of the experiments in which only the ego has a goal, given alone: models, rates by scenario, verdicts, curves."""
+"""Basis of the experiments in which only the ego has a goal, given alone: models, rates by scenario, curves."""
 
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -9,6 +9,7 @@ from rlftsim.evaluation.scenario_source import choose_scenarios
 from rlftsim.experiments.model_specs import BASE, ModelSpec
 from rlftsim.experiments.paper.goal_conditioning import GOAL_FREE, GUIDED, START
 from rlftsim.experiments.suite import ExperimentSuite
+from rlftsim.experiments.tables import TextTable
 from rlftsim.goals.goals_file import GoalEntry
 from rlftsim.policies.registry import load_policy
 from rlftsim.scenario.dataset import ScenarioDataset
@@ -41,18 +42,12 @@ def measure_attainment(
         goals: Goals of the suite's scenarios; each is given alone, whatever goals its scenario has besides.
         name: Name of the folder of outcomes, that of the experiment.
     """
-    models, folder = suite.models(list(rows.values())), suite.out / "attainment" / name
-    return {
-        row: attain_goals(
-            load_policy(models[spec], suite.device),
-            suite.data,
-            folder / suite.evaluation_name(spec),
-            suite.evaluation,
-            goals,
-            title=f"goals, {row}",
-        )
-        for row, spec in rows.items()
-    }
+    models, attained = suite.models(list(rows.values())), {}
+    for row, spec in rows.items():
+        out = suite.out / "attainment" / name / suite.evaluation_name(spec)
+        policy = load_policy(models[spec], suite.device)
+        attained[row] = attain_goals(policy, suite.data, out, suite.evaluation, goals, title=f"goals, {row}")
+    return attained
 
 
 def compute_scenario_rates(outcomes: Iterable[Attained], rate: str) -> dict[str, float]:
@@ -74,14 +69,21 @@ def estimate_mean(values: Iterable[float]) -> MeanInterval:
     return mean_interval(np.array(list(values), float))
 
 
-def estimate_gain(start_rates: Mapping[str, float], rates: Mapping[str, float]) -> MeanInterval:
-    """Mean gain of rates, paired by scenario.
+def build_rate_table(
+    title: str, headings: Sequence[str], curves: Mapping[str, Sequence[MeanInterval]], unit: str = ""
+) -> TextTable:
+    """Table of mean rates in percent with their standard errors.
 
     Args:
-        start_rates: Rates of the goal-free model by scenario id.
-        rates: Rates of the compared model; all of these scenarios are in `start_rates`.
+        title: Title above the table.
+        headings: Headings of the columns of rates.
+        curves: Rates by row, one for each heading; all rows have the same goals.
+        unit: Words of the note that say what is counted, such as "percentage of rollouts, ".
     """
-    return estimate_mean(rate - start_rates[scenario_id] for scenario_id, rate in rates.items())
+    count = max(mean.count for curve in curves.values() for mean in curve)
+    cells = tuple((row, *map(format_rate, curve)) for row, curve in curves.items())
+    note = f"Ego of {count} held-out scenarios; {unit}mean ± standard error over scenarios."
+    return TextTable(title, ("", *headings), cells, note)
 
 
 def format_rate(rate: MeanInterval) -> str:
@@ -92,8 +94,14 @@ def format_rate(rate: MeanInterval) -> str:
     return f"{100 * rate.mean:.1f}{error}"
 
 
-def format_verdict(gain: MeanInterval) -> str:
-    """Verdict on a paired difference of rates, in percentage points."""
+def format_verdict(start_rates: Mapping[str, float], rates: Mapping[str, float]) -> str:
+    """Verdict on the mean gain of rates, paired by scenario, in percentage points.
+
+    Args:
+        start_rates: Rates of the goal-free model by scenario id.
+        rates: Rates of the compared model; all of these scenarios are in `start_rates`.
+    """
+    gain = estimate_mean(rate - start_rates[scenario_id] for scenario_id, rate in rates.items())
     if gain.count < 2:
         return "no verdict: fewer than two scenarios."
     low, high = (100 * limit for limit in gain.interval)

@@ -9,7 +9,6 @@ from rlftsim.experiments.paper.controllability import RATES, ROWS, Attainment
 from rlftsim.experiments.paper.goal_conditioning import GUIDED, START
 from rlftsim.experiments.results import Experiment, ExperimentResult
 from rlftsim.experiments.suite import ExperimentSuite
-from rlftsim.experiments.tables import TextTable
 from rlftsim.goals.goals_file import GoalEntry
 from rlftsim.scenario.types import STEP_S, TOTAL_STEPS, Scenario
 from rlftsim.viewer.figure import Subplot, draw_subplots
@@ -81,8 +80,8 @@ def summarize(attained: Attainment, suite: ExperimentSuite) -> ExperimentResult:
     """
 
     def compute_rates(row: str, rate: str, *offsets_s: int) -> dict[str, float]:
-        labels = {f"{h:+d} s" for h in offsets_s}
-        return controllability.compute_scenario_rates((a for a in attained[row] if a.entry.label in labels), rate)
+        compared = {f"{h:+d} s" for h in offsets_s}
+        return controllability.compute_scenario_rates((a for a in attained[row] if a.entry.label in compared), rate)
 
     curves = {
         rate: {
@@ -91,19 +90,20 @@ def summarize(attained: Attainment, suite: ExperimentSuite) -> ExperimentResult:
         }
         for rate in RATES
     }
-    tables, verdicts, moved_offsets = [], [], [h for h in OFFSETS_S if h]
-    for rate, heading in RATES.items():
-        cells = tuple((row, *map(controllability.format_rate, curve)) for row, curve in curves[rate].items())
-        count = max(mean.count for curve in curves[rate].values() for mean in curve)
-        note = f"Ego of {count} held-out scenarios; percentage of rollouts, mean ± standard error over scenarios."
-        headings = ("", *(f"{h:+d} s" for h in OFFSETS_S))
-        tables.append(TextTable(f"Ours: {heading} ↑ against H", headings, cells, note))
-        for row in GUIDED:
-            gain = controllability.estimate_gain(*(compute_rates(name, rate, *moved_offsets) for name in (START, row)))
-            verdicts.append(f"{row} against {START}, {rate}, H ≠ 0: {controllability.format_verdict(gain)}")
+    labels, verdicts = [f"{h:+d} s" for h in OFFSETS_S], []
+    for rate in RATES:
+        start_rates, *rates = (compute_rates(row, rate, *filter(None, OFFSETS_S)) for row in (START, *GUIDED))
+        for row, row_rates in zip(GUIDED, rates):
+            verdict = controllability.format_verdict(start_rates, row_rates)
+            verdicts.append(f"{row} against {START}, {rate}, H ≠ 0: {verdict}")
     return ExperimentResult(
         title="Kinematic controllability: goals of the ego that it would pass earlier or later",
-        tables=tuple(tables),
+        tables=tuple(
+            controllability.build_rate_table(
+                f"Ours: {heading} ↑ against H", labels, curves[rate], "percentage of rollouts, "
+            )
+            for rate, heading in RATES.items()
+        ),
         verdicts=tuple(verdicts),
         notes=(
             suite.budget.note,

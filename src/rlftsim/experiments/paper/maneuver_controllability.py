@@ -53,10 +53,14 @@ def summarize(attained: Attainment, suite: ExperimentSuite) -> ExperimentResult:
         for rate in (*RATES, *GOAL_RATES)
     }
     by_maneuver: ByManeuver = {
-        (rate, row, condition): _estimate_maneuvers(attained[row], rate, condition)
+        # Here the goal is the unit, not the scenario: a scenario has one goal of a maneuver or none.
+        (rate, row, condition): {
+            m: estimate_mean(getattr(a, rate) for a in filter(is_in, attained[row]) if parse_maneuver(a.entry) == m)
+            for m in BENCHMARK_MANEUVERS
+        }
         for rate in RATES
         for row in rows
-        for condition in IN_CONDITION
+        for condition, is_in in IN_CONDITION.items()
     }
     # All rows have the same goals: maneuvers without any are not drawn.
     drawn_maneuvers = [
@@ -74,7 +78,14 @@ def summarize(attained: Attainment, suite: ExperimentSuite) -> ExperimentResult:
     ]
     return ExperimentResult(
         title="Maneuver controllability: the ego's goal is its logged maneuver, or an alternative",
-        tables=(*_tabulate_conditions(overall), *_tabulate_maneuvers(by_maneuver, rows), published.MANEUVERS),
+        tables=(
+            *(
+                controllability.build_rate_table(f"Ours: {heading} ↑", CONDITIONS, overall[rate])
+                for rate, heading in (RATES | GOAL_RATES).items()
+            ),
+            *_tabulate_maneuvers(by_maneuver, rows),
+            published.MANEUVERS,
+        ),
         verdicts=tuple(_format_gain(attained, row, rate) for rate in (*RATES, "passed_once") for row in GUIDED),
         notes=(
             suite.budget.note,
@@ -126,26 +137,6 @@ def _compute_rates(outcomes: Sequence[Attained], rate: str, condition: str) -> d
     return controllability.compute_scenario_rates(filter(IN_CONDITION[condition], outcomes), rate)
 
 
-def _estimate_maneuvers(outcomes: Sequence[Attained], rate: str, condition: str) -> dict[Maneuver, MeanInterval]:
-    """Mean rate over the goals of a condition, by maneuver."""
-    # Here the goal is the unit, not the scenario: a scenario has one goal of a maneuver or none.
-    values: dict[Maneuver, list[float]] = {m: [] for m in BENCHMARK_MANEUVERS}
-    for outcome in filter(IN_CONDITION[condition], outcomes):
-        values[parse_maneuver(outcome.entry)].append(getattr(outcome, rate))
-    return {m: estimate_mean(rates) for m, rates in values.items()}
-
-
-def _tabulate_conditions(overall: Mapping[str, Mapping[str, Sequence[MeanInterval]]]) -> list[TextTable]:
-    """A table for each rate: rows by conditions."""
-    tables = []
-    for rate, heading in (RATES | GOAL_RATES).items():
-        cells = tuple((row, *map(format_rate, rates)) for row, rates in overall[rate].items())
-        count = max(mean.count for mean in next(iter(overall[rate].values())))
-        note = f"Ego of {count} held-out scenarios; mean ± standard error over scenarios."
-        tables.append(TextTable(f"Ours: {heading} ↑", ("", *CONDITIONS), cells, note))
-    return tables
-
-
 def _tabulate_maneuvers(by_maneuver: ByManeuver, rows: Sequence[str]) -> list[TextTable]:
     """A table for each condition: rows by maneuvers, with the number of goals of each."""
 
@@ -166,9 +157,9 @@ def _tabulate_maneuvers(by_maneuver: ByManeuver, rows: Sequence[str]) -> list[Te
 def _format_gain(attained: Attainment, row: str, rate: str) -> str:
     """Verdict on a variant against the goal-free model, alternatives only."""
     start_rates, rates = (_compute_rates(attained[name], rate, ALTERNATIVE) for name in (START, row))
-    gain, mean = controllability.estimate_gain(start_rates, rates), estimate_mean(start_rates.values()).mean
-    factor = f" ({(mean + gain.mean) / mean:.2f} times)" if mean > 0 else ""
-    verdict = controllability.format_verdict(gain)
+    start_mean, mean = (estimate_mean(values[i] for i in rates).mean for values in (start_rates, rates))
+    factor = f" ({mean / start_mean:.2f} times)" if start_mean > 0 else ""
+    verdict = controllability.format_verdict(start_rates, rates)
     return f"{row} against {START}, {rate.replace('_', ' ')}, alternatives only{factor}: {verdict}"
 
 
