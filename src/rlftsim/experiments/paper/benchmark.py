@@ -44,11 +44,7 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
         tables=(tables.build_table("Ours", rows.values(), SCORES), published.BENCHMARK),
         verdicts=(
             *(tuned.against(base), tuned.seeds_against(base)),
-            *(
-                verdict
-                for row in imitations
-                for verdict in (row.against(base), row.seeds_against(base), tuned.against(row))
-            ),
+            *(v for row in imitations for v in (row.against(base), row.seeds_against(base), tuned.against(row))),
             *(f"{name}: {gap}" for name, gap in closed.items()),
         ),
         notes=(
@@ -89,26 +85,26 @@ def compute_gap_closed(base: Evaluation, tuned: Evaluation, ceiling: Evaluation)
     """Mean gain over mean gap of the meta-metric, scenarios paired.
 
     Args:
-        base: start of the gap.
-        tuned: model whose gain is measured.
-        ceiling: end of the gap, such as the oracle.
+        base: Evaluation of the base model, the start of the gap.
+        tuned: Evaluation of the model whose gain is measured.
+        ceiling: Evaluation of the oracle, the end of the gap.
 
     Raises:
-        DataError: no scenario in common.
+        DataError: No scenario in common.
     """
-    ids, before, after = paired_values(base, tuned, RMM)
-    above = dict(zip(ceiling.scenario_ids, ceiling.values(RMM)))
-    best = np.array([above.get(i, np.nan) for i in ids])
+    ids, base_scores, tuned_scores = paired_values(base, tuned, RMM)
+    by_id = dict(zip(ceiling.scenario_ids, ceiling.values(RMM)))
+    gain, gap = tuned_scores - base_scores, np.array([by_id.get(i, np.nan) for i in ids]) - base_scores
     # A scenario counts where all three have a score.
-    known = np.isfinite(before) & np.isfinite(after) & np.isfinite(best)
-    gain, gap = (after - before)[known], (best - before)[known]  # [scenarios]
+    is_scored = np.isfinite(gain) & np.isfinite(gap)
+    gain, gap = gain[is_scored], gap[is_scored]  # [scenarios]
     if not len(gain):
         return GapClosed(np.nan, (np.nan, np.nan))
     # Bootstrap: scenarios are drawn again and again with replacement, a few resamples at a time for memory.
     rng, means = np.random.default_rng(0), []
     for _ in range(NUM_RESAMPLES // RESAMPLES_AT_ONCE):
-        drawn = rng.integers(len(gain), size=(RESAMPLES_AT_ONCE, len(gain)))  # [resamples, scenarios]
-        means.append((gain[drawn].mean(1), gap[drawn].mean(1)))
+        resamples = rng.integers(len(gain), size=(RESAMPLES_AT_ONCE, len(gain)))  # [resamples, scenarios]
+        means.append((gain[resamples].mean(1), gap[resamples].mean(1)))
     mean_gain, mean_gap = np.concatenate(means, axis=1)  # [NUM_RESAMPLES] each
     # Ratio of means, not mean of ratios: scenarios in which the base model is as good as the oracle have no ratio.
     with np.errstate(divide="ignore", invalid="ignore"):

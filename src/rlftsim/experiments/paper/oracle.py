@@ -33,7 +33,7 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
     return ExperimentResult(
         title="Oracle: the log against itself",
         tables=(
-            feature_table(features, weights, row.mean),
+            build_feature_table(features, weights, row.mean),
             tables.build_table("Ours, in all", [row], SCORES),
             published.ORACLE,
         ),
@@ -50,7 +50,7 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
             },
         },
         figure=draw_intervals(
-            [Interval(_words(name), e.mean, *e.interval) for name, e in features.items()],
+            [Interval(name.replace("_", " "), e.mean, *e.interval) for name, e in features.items()],
             title="Likelihood of the log under itself",
             x_label="mean over scenarios, 95 % interval",
             zero=False,
@@ -58,31 +58,28 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
     )
 
 
-def feature_table(
+def build_feature_table(
     features: Mapping[str, MeanInterval], weights: Mapping[str, float], evaluation: Evaluation
 ) -> tables.TextTable:
     """Table of the features' weights, likelihoods and costs.
 
     Args:
-        features: likelihoods by name of the feature.
-        weights: weights in the meta-metric. The cost of a feature is weight × (1 − likelihood).
-        evaluation: the oracle's.
+        features: Mean likelihood of each feature over scenarios, by the feature's name.
+        weights: Weights in the meta-metric by the same names. The cost of a feature is weight × (1 − likelihood).
+        evaluation: Evaluation of the oracle, for the facts of the note.
     """
     rows = []
     for name, estimate in features.items():
-        error = f" ± {estimate.standard_error:.4f}" if math.isfinite(estimate.standard_error) else ""
-        known = math.isfinite(estimate.mean)
-        likelihood = f"{format_number(estimate.mean, 4)}{error}" if known else "–"
-        # Weights add up to 1, so the costs add up to what the meta-metric lacks to 1, if no feature is missing.
-        cost = format_number(weights[name] * (1 - estimate.mean), 4) if known else "–"
-        rows.append((_words(name), f"{weights[name]:g}", likelihood, cost))
+        likelihood, cost = "–", "–"
+        if math.isfinite(estimate.mean):
+            error = f" ± {estimate.standard_error:.4f}" if math.isfinite(estimate.standard_error) else ""
+            likelihood = f"{format_number(estimate.mean, 4)}{error}"
+            # Weights add up to 1, so the costs add up to what the meta-metric lacks to 1, if no feature is missing.
+            cost = format_number(weights[name] * (1 - estimate.mean), 4)
+        rows.append((name.replace("_", " "), f"{weights[name]:g}", likelihood, cost))
     note = f"{len(evaluation)} scenarios, metric {evaluation.config.metric}; mean ± standard error."
     headings = ("feature", "weight", "likelihood ↑", "missing to 1, weighted ↓")
     return tables.TextTable("Ours, by feature", headings, tuple(rows), note)
-
-
-def _words(name: str) -> str:
-    return name.replace("_", " ")
 
 
 EXPERIMENT = Experiment(
