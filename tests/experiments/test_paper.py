@@ -29,7 +29,7 @@ from rlftsim.experiments.paper import (
 from rlftsim.experiments.registry import EXPERIMENTS, PAPER
 from rlftsim.experiments.results import ExperimentResult, run_experiment, to_finite
 from rlftsim.experiments.rows import mean_of_seeds
-from rlftsim.experiments.stage_progress import StageProgress
+from rlftsim.experiments.stage_progress import Stage, run_stages
 from rlftsim.experiments.suite import ExperimentSuite
 from rlftsim.recipes.base import Recipe
 from rlftsim.rewards.base import leave_one_out
@@ -439,17 +439,10 @@ def test_numbers_for_machines_are_never_nan():
 
 
 def test_progress_counts_stages_and_estimates_the_rest(capsys):
-    progress = StageProgress({"fine-tune a": False, "fine-tune b": False, "evaluate a": True})
-    with progress.stage("fine-tune a"):
-        pass
-    with progress.stage("fine-tune b"):
-        pass
-    with progress.stage("fine-tune b"):  # needed twice, counted once
-        pass
+    stages = [Stage(f"fine-tune {name}", False, lambda: None) for name in ("a", "b", "b")]  # b: needed twice
+    run_stages([*stages, Stage("evaluate a", True, lambda: None)])
     err = capsys.readouterr().err
     assert "1/3  fine-tune a\n" in err
     assert "2/3  fine-tune b  (less than a minute to go)" in err
     assert err.count("fine-tune b") == 1
-    with progress.stage("evaluate a"):
-        pass
-    assert "3/3  evaluate a  (finished before)" in capsys.readouterr().err
+    assert "3/3  evaluate a  (finished before)" in err

@@ -31,7 +31,7 @@ def run(suite: ExperimentSuite) -> dict[str, Row]:
         CEILING: (ORACLE,),
         FLOOR: (CONSTANT_VELOCITY,),
     }
-    return suite.evaluate(suite.feasible(rows))
+    return suite.evaluate(suite.select_feasible(rows))
 
 
 def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResult:

@@ -54,7 +54,7 @@ def specs(num_seeds: int, epochs: float) -> dict[str, tuple[ModelSpec, ...]]:
 
 def run(suite: ExperimentSuite) -> dict[str, Row]:
     """Rows of all points, without CAT-K for a policy that it cannot train."""
-    return suite.evaluate(suite.feasible(specs(suite.num_seeds, suite.recipe.finetune.epochs)))
+    return suite.evaluate(suite.select_feasible(specs(suite.num_seeds, suite.recipe.finetune.epochs)))
 
 
 def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResult:
