@@ -62,7 +62,7 @@ class Margin:
         return (low / change.mean_a, high / change.mean_a) if self.is_relative else (low, high)
 
     def judge(self, change: PairedDifference) -> str:
-        """A word: holds, missed or undecided, by one-sided 95 % bounds; unknown without an interval.
+        """Word for a change: holds, missed or undecided, by one-sided 95 % bounds; unknown without an interval.
 
         Args:
             change: Difference from the base at alpha = 0.1, whose ends are these bounds.
@@ -144,12 +144,12 @@ class Examinee:
 
     @property
     def has_noise(self) -> bool:
-        """True if it draws its decisions, which a temperature changes."""
+        """True if the policy draws its decisions, which a temperature changes."""
         return bool(self.policy.noise_size or self.policy.initial_noise_size)
 
     @property
     def seed(self) -> int | None:
-        """Seed of the run that trained it; None where it is of no run."""
+        """Seed of the run that trained the model; None for a model of no run."""
         folder = Path(self.name)
         return stored_settings(folder.parent if folder.name == "model" else folder).get("seed")
 
@@ -188,11 +188,11 @@ class ExamRow:
             column: One of `SCORE_COLUMNS`.
             alpha: Probability that the interval misses the true difference.
         """
-        before, after = (
+        reference_scores, scores = (
             np.stack([evaluation.values(column) for evaluation in evaluations])
             for evaluations in (self.references, self.by_run)
         )  # [runs, scenarios]
-        return compare_paired(column, before, after, alpha=alpha, clusters=self.by_run[0].clusters)
+        return compare_paired(column, reference_scores, scores, alpha=alpha, clusters=self.by_run[0].clusters)
 
     @cached_property
     def changes(self) -> dict[str, PairedDifference]:
@@ -219,11 +219,11 @@ class ExamRow:
     def verdict(self) -> str:
         """Result of the exam in a line: gain, and the margins that do not hold."""
         gain, words = self.changes[RMM], set(self.margins.values())
-        others = [f"{column} {word}" for column, word in self.margins.items() if word != "holds"]
+        exceptions = [f"{column} {word}" for column, word in self.margins.items() if word != "holds"]
         passed = gain.is_difference and gain.difference > 0 and words == {"holds"}
         failed = (gain.is_difference and gain.difference < 0) or "missed" in words
         result = "passes" if passed else "fails" if failed else "undecided"
-        return f"{self.name} {result}: RMM {gain.verdict} Margins: {', '.join(others) or 'all hold'}."
+        return f"{self.name} {result}: RMM {gain.verdict} Margins: {', '.join(exceptions) or 'all hold'}."
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,7 +248,7 @@ def take_exam(config: ExamConfig, out: Path, ledger: Ledger, *, is_repeat: bool 
 
     Args:
         config: Models, scenarios and settings.
-        out: Folder for everything.
+        out: Folder for scenarios, evaluations and results of all exams.
         ledger: Looks at exams so far.
         is_repeat: True allows a further look at a recipe or model that has sat this exam.
 
@@ -288,7 +288,7 @@ def take_exam(config: ExamConfig, out: Path, ledger: Ledger, *, is_repeat: bool 
 
 
 def find_temperature(bases: Sequence[Examinee], config: ExamConfig, out: Path) -> float:
-    """Temperature at which the base is most realistic on the split tune; the only one, if there is no other to try.
+    """Temperature at which the base is most realistic on the split tune; a single candidate is not tried.
 
     Args:
         bases: Base models, whose mean counts.
@@ -341,7 +341,7 @@ def find_seed() -> int:
     # an installed package may lie inside of somebody else's repository, whose commit says nothing
     if (CHECKOUT / ".git").exists():
         git = ["git", "-C", str(CHECKOUT), "rev-parse", "HEAD"]
-        found = subprocess.run(git, capture_output=True, text=True, check=False)
-        if found.returncode == 0:
-            return int(found.stdout[:8], 16)
+        process = subprocess.run(git, capture_output=True, text=True, check=False)
+        if process.returncode == 0:
+            return int(process.stdout[:8], 16)
     raise ConfigError("the seed of an exam follows from the commit, and this is no checkout: give one by --seed.")

@@ -20,7 +20,7 @@ class Ledger:
 
     @cached_property
     def entries(self) -> list[Mapping[str, Any]]:
-        """The lines of the file.
+        """Entries of the file, a mapping for each line.
 
         Raises:
             DataError: The file cannot be read, or a line of it is none of a ledger.
@@ -49,8 +49,8 @@ class Ledger:
         Args:
             exam: Name of the exam.
             recipe: Name of the recipe.
-            fingerprints: Models of the recipe.
-            is_repeat: True = a further look is wanted.
+            fingerprints: Fingerprints of the recipe's models, which may have sat under another name.
+            is_repeat: True allows a further look, which is counted; False refuses one.
 
         Raises:
             ConfigError: There was a look, and `is_repeat` is not set.
