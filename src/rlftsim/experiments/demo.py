@@ -35,8 +35,8 @@ def run_demo(config: DemoConfig, out: Path) -> DemoResult:
     """Run the pipeline; stages that are finished are not repeated.
 
     Args:
-        config: Recipe, data and sizes; a folder of other settings is refused by the stage that made it.
-        out: Folder for everything; the report is `out/report.html`.
+        config: Recipe, data and sizes; a folder of other settings is refused by the stage that made the folder.
+        out: Folder for runs, evaluations and the report `out/report.html`.
 
     Raises:
         RlftsimError: A stage failed; the message says which file and why.

@@ -58,8 +58,8 @@ def build_report(
         comparison: Fine-tuned against base model, scenarios paired.
         animations: Scenes that play in the report.
         config: Recipe, data and sizes that the report describes.
-        out: Folder with the runs `pretrain` and `finetune`, whose learning curves are drawn.
-        seconds: Time of each stage by its title.
+        out: Folder with the runs `pretrain` and `finetune`, for the learning curves.
+        seconds: Time of each stage by title.
     """
     base, tuned = evaluations[:2]
     difference, (_, gains) = comparison["meta_metric"], _compute_gains(base, tuned)
@@ -133,10 +133,10 @@ def _compute_gains(base: Evaluation, tuned: Evaluation) -> tuple[list[str], np.n
 
 
 def animate(policies: Mapping[str, Policy], evaluations: Sequence[Evaluation], config: DemoConfig) -> list[Animation]:
-    """Log, base and fine-tuned model side by side: in the scenarios that gained most, and in an ordinary one.
+    """Log, base and fine-tuned model side by side: in the scenarios that gained most, and in an ordinary scenario.
 
     Args:
-        policies: Models by the titles of their panels.
+        policies: Models by the titles of the panels.
         evaluations: Evaluations of base and fine-tuned model first, which choose the scenarios.
         config: Data, seed, number of animations, and of rollouts in each panel.
     """

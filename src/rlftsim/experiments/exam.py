@@ -1,12 +1,12 @@
-"""The exam: candidates against the model they started from, on scenarios that no choice was made on, looked at once.
+"""The exam: candidates against the base model, on scenarios that no choice was made on, looked at once.
 
-OUT/tune/                        the base at some temperatures on the split `tune`, which chooses the best one
-OUT/synthetic-200-SEED/          an exam: its name says which
-    scenarios/                   its data set, where the exam is generated
+OUT/tune/                        the base at some temperatures on the split `tune`, which chooses the best
+OUT/synthetic-200-SEED/          an exam, named after data and seed
+    scenarios/                   data set of a generated exam
     evaluations/*.parquet        scores of every model
     exam.md, exam.json           tables, margins and verdicts
 
-The seed of a generated exam follows from the commit of the package, so nobody can have tuned on it. A ledger counts the
+The seed of a generated exam follows from the commit of the package, so no model can have been tuned on the exam. A ledger counts the
 looks at every exam.
 """
 
@@ -48,16 +48,16 @@ BASE = "base"
 
 @dataclass(frozen=True)
 class Margin:
-    """Change of a column that a candidate may not exceed, however much realism it gains."""
+    """Change of a column that a candidate may not exceed, however much realism the candidate gains."""
 
     column: str
     lowest: float = -math.inf
     highest: float = math.inf
     is_relative: bool = False
-    """The change is a fraction of the base's mean."""
+    """True = the change is a fraction of the base's mean."""
 
     def bounds(self, change: PairedDifference) -> tuple[float, float]:
-        """Ends of a change's interval, as fractions of the base's mean where the margin is one."""
+        """Ends of a change's interval, as fractions of the base's mean where the margin is relative."""
         low, high = change.interval
         return (low / change.mean_a, high / change.mean_a) if self.is_relative else (low, high)
 
@@ -92,14 +92,14 @@ class ExamConfig:
     """Models, scenarios and settings of an exam."""
 
     candidates: Mapping[str, Sequence[str]]
-    """Models by the name of their row; several are runs of one recipe with different seeds."""
+    """Models by the name of the row; several are runs of the same recipe with different seeds."""
     bases: Sequence[str] = ("demo-base",)
-    """Model that the candidates started from; of several each has an equal part of every row's models, in their
+    """Model that the candidates started from; of several, each has an equal share of every row's models, in the same
     order."""
     data: str = SYNTHETIC
     """Data set whose split exam is taken; "synthetic" generates an exam."""
     seed: int | None = None
-    """Seed of a generated exam; None = it follows from the commit."""
+    """Seed of a generated exam; None = the seed follows from the commit."""
     num_scenarios: int = 200
     """Scenarios of a generated exam."""
     temperatures: Sequence[float] = (0.7, 0.8, 0.9, 1.0, 1.1)
@@ -154,11 +154,11 @@ class Examinee:
         return stored_settings(folder.parent if folder.name == "model" else folder).get("seed")
 
     def evaluate(self, scenarios: ScenarioDataset, out: Path, config: EvaluateConfig) -> Evaluation:
-        """Scores of the scenarios, read from the folder where they are finished.
+        """Scores of the scenarios, read from the folder where finished.
 
         Args:
             scenarios: Split of a data set.
-            out: Folder of the evaluation, whose name tells models and temperatures apart.
+            out: Folder of the evaluation; the name of the file tells models and temperatures apart.
             config: Rollouts, metric and temperature.
         """
         suffix = f"-temperature-{config.temperature:g}" if config.temperature != 1 else ""
@@ -168,7 +168,7 @@ class Examinee:
 
 @dataclass(frozen=True, eq=False)
 class ExamRow:
-    """Evaluations of a row's models, one for each run, beside those of the base model of each."""
+    """Evaluations of a row's models, a run each, beside those of the base model of each run."""
 
     name: str
     models: Sequence[Examinee]
@@ -178,7 +178,7 @@ class ExamRow:
 
     @property
     def mean(self) -> Row:
-        """The same as a row of other experiments."""
+        """The same as a row of experiments."""
         return Row(self.name, tuple(self.by_run))
 
     def change(self, column: str, alpha: float = 0.05) -> PairedDifference:
@@ -212,7 +212,7 @@ class ExamRow:
 
     @property
     def next_run(self) -> MeanInterval:
-        """Mean gain in RMM, with the interval in which another run of the recipe lies; NaN for a single run."""
+        """Mean gain in RMM, with the interval in which a further run of the recipe lies; NaN for a single run."""
         return prediction_interval(self.gains)
 
     @property
@@ -228,7 +228,7 @@ class ExamRow:
 
 @dataclass(frozen=True, eq=False)
 class ExamResult:
-    """Rows of an exam and where it is described."""
+    """Rows of an exam and the folder of the results."""
 
     name: str
     folder: Path
@@ -238,7 +238,7 @@ class ExamResult:
     rows: Sequence[ExamRow]
     """The base at its best temperature, if that is not 1, then the candidates."""
     looks: Mapping[str, int]
-    """Looks at this exam by candidate, this one included."""
+    """Looks at this exam by candidate, the present look included."""
 
 
 def take_exam(config: ExamConfig, out: Path, ledger: Ledger, *, is_repeat: bool = False) -> ExamResult:
@@ -333,7 +333,7 @@ def generate_exam(config: ExamConfig, folder: Path) -> ScenarioDataset:
 
 
 def find_seed() -> int:
-    """Seed that follows from the commit of the checkout: its first eight hexadecimal digits.
+    """Seed that follows from the commit of the checkout: the first eight hexadecimal digits.
 
     Raises:
         ConfigError: The package does not run from a checkout.

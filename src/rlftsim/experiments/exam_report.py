@@ -1,4 +1,4 @@
-"""What an exam says: tables, verdicts, a page, JSON, and the lines of the ledger."""
+"""Result of an exam: tables, verdicts, a page, JSON, and the lines of the ledger."""
 
 import json
 import math
@@ -24,7 +24,7 @@ COLUMNS = (
 
 
 def write_exam(result: ExamResult, config: ExamConfig, ledger: Ledger) -> tuple[Sequence[TextTable], Sequence[str]]:
-    """Write exam.md and exam.json of an exam, then its lines of the ledger.
+    """Write exam.md and exam.json of an exam, then the lines of the ledger.
 
     Args:
         result: Rows that `take_exam` measured.
@@ -52,7 +52,7 @@ def build_means_table(result: ExamResult) -> TextTable:
 
 
 def build_changes_table(result: ExamResult) -> TextTable:
-    """Difference of every column from the base, with an interval, and a word where chance does not explain it."""
+    """Difference of every column from the base, with interval and word as in `format_change`."""
     rows = [
         (column.label, *(format_change(row.changes[column.source], column) for row in result.rows))
         for column in COLUMNS
@@ -62,7 +62,7 @@ def build_changes_table(result: ExamResult) -> TextTable:
 
 
 def format_change(change: PairedDifference, column: Column) -> str:
-    """A difference with its interval in the column's unit; better or worse where chance does not explain it."""
+    """Difference with interval in the column's unit, and a word where chance does not explain the difference."""
     if not math.isfinite(change.difference):
         return "–"
     direction = direction_of(column.source)
@@ -73,7 +73,7 @@ def format_change(change: PairedDifference, column: Column) -> str:
 
 
 def build_margins_table(result: ExamResult) -> TextTable:
-    """Word of each margin and the one-sided bounds that it is judged by."""
+    """Word of each margin and the one-sided bounds that decide the word."""
     columns = {column.source: column for column in COLUMNS}
     rows = []
     for margin in MARGINS:
@@ -99,12 +99,12 @@ def format_margin(margin: Margin, column: Column) -> str:
 
 
 def format_signed(column: Column, value: float) -> str:
-    """A difference in the column's unit, with its sign."""
+    """Difference in the column's unit, with a sign."""
     return f"{'+' if value >= 0 else ''}{column.text(value)}"
 
 
 def format_interval(column: Column, interval: Sequence[float]) -> str:
-    """Both ends of an interval in the column's unit; "[unknown]" where there is none."""
+    """Both ends of an interval in the column's unit; "[unknown]" without an interval."""
     return (
         f"[{', '.join(format_signed(column, end) for end in interval)}]" if math.isfinite(interval[0]) else "[unknown]"
     )
@@ -120,14 +120,14 @@ def describe_bootstrap(result: ExamResult) -> str:
 
 
 def format_next_run(row: ExamRow) -> str:
-    """Gain of each run, and the interval of the next one."""
+    """Gain of each run, and the interval of the next run."""
     gains, (low, high) = row.gains, row.next_run.interval
     listed = ", ".join(f"{gain:+.4f}" for gain in gains)
     return f"{row.name}: RMM by run {listed}; the next run lies in [{low:+.4f}, {high:+.4f}] with 95 %."
 
 
 def build_ledger_entry(row: ExamRow, result: ExamResult, config: ExamConfig, commit: str | None) -> dict[str, Any]:
-    """A row for machines, as the ledger has it."""
+    """Row for machines, an entry of the ledger."""
     return {
         "date": datetime.now(UTC).date().isoformat(),
         "commit": commit,

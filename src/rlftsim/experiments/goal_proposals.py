@@ -44,10 +44,10 @@ def _outside_m(
 
 
 def propose(scenario: Scenario, track: int) -> tuple[Proposal, ...]:
-    """Proposals for an agent in the order of the maneuvers: the logged maneuver to its logged end, others along lanes.
+    """Proposals for an agent in the order of the maneuvers: the logged maneuver, and alternatives along lanes.
 
     Args:
-        scenario: Scenario of the agent; without its future there is no logged maneuver.
+        scenario: Scenario of the agent; without a logged future there is no logged maneuver.
         track: Row of the agent in `scenario.tracks`.
     """
     logged = logged_maneuver(scenario, track)

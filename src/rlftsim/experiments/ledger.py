@@ -1,4 +1,4 @@
-"""A ledger of looks at exams: a line of JSON for each, in a file that only grows."""
+"""Ledger of looks at exams: a line of JSON for each look, in a file that only grows."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -23,7 +23,7 @@ class Ledger:
         """Entries of the file, a mapping for each line.
 
         Raises:
-            DataError: The file cannot be read, or a line of it is none of a ledger.
+            DataError: The file cannot be read, or has a line that is no entry of a ledger.
         """
         try:
             lines = self.path.read_text(encoding="utf-8").splitlines()
@@ -44,12 +44,12 @@ class Ledger:
         return entries
 
     def count_looks(self, exam: str, recipe: str, fingerprints: Sequence[str], *, is_repeat: bool) -> int:
-        """Earlier looks at an exam by a recipe of this name or one of these models.
+        """Number of earlier looks at an exam by a recipe of this name or any of these models.
 
         Args:
             exam: Name of the exam.
             recipe: Name of the recipe.
-            fingerprints: Fingerprints of the recipe's models, which may have sat under another name.
+            fingerprints: Fingerprints of the recipe's models, which may have sat under a former name.
             is_repeat: True allows a further look, which is counted; False refuses one.
 
         Raises:

@@ -1,5 +1,5 @@
-"""Models that experiments compare: baselines, pre-trained models, and fine-tunings of them. Descriptions only,
-nothing runs here."""
+"""Models that experiments compare: baselines, pre-trained models, and fine-tuned models. Descriptions only,
+no training runs here."""
 
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -17,7 +17,7 @@ WEAK_EPOCHS = 1.0
 
 @dataclass(frozen=True)
 class Baseline:
-    """A policy without weights: the log itself, or constant velocity."""
+    """A policy without weights: the log, or constant velocity."""
 
     name: Literal["oracle", "constant_velocity"]
 
@@ -31,7 +31,7 @@ class Base:
 
     @property
     def name(self) -> str:
-        """Name of its files."""
+        """Name of the model's files."""
         return "base" if self.epochs is None else f"base-{self.epochs:g}-epochs"
 
 
@@ -40,7 +40,7 @@ GoalRewardType = Literal["soft", "hard"]
 
 @dataclass(frozen=True)
 class GoalTraining:
-    """Goal conditioning that a fine-tuning adds to a model, and the goal reward it is trained with."""
+    """Goal conditioning that a fine-tuning adds to a model, and the goal reward of the training."""
 
     encoding: str
     """Encoding of goals, an argument of the policy's `with_goal_conditioning`: SMART has "concat" and "indication"."""
@@ -52,13 +52,13 @@ class GoalTraining:
 
     @property
     def name(self) -> str:
-        """Part of the name of its files; the weight is not in it."""
+        """Part of the name of the model's files, without the weight."""
         return self.encoding if self.reward_type is None else f"{self.encoding}-{self.reward_type}"
 
 
 @dataclass(frozen=True)
 class FineTuned:
-    """A base model after fine-tuning. All other settings are the recipe's, so all of them have the same budget."""
+    """A base model after fine-tuning. All further settings are the recipe's, so the budget is equal."""
 
     method: str = "mloo"
     """Name of a reward, or "catk", "road" or "gcsl"."""
@@ -74,7 +74,7 @@ class FineTuned:
 
     @property
     def name(self) -> str:
-        """Name of its files, without the epochs."""
+        """Name of the model's files, without the epochs."""
         # default values add nothing to a name, which becomes a file's
         credit = "" if self.credit == "rollout" else f"-{self.credit}"
         base = "" if self.base == Base() else f"-from-{self.base.name}"
@@ -101,7 +101,7 @@ class FineTuned:
 
 @dataclass(frozen=True)
 class Guided:
-    """A goal-conditioned model with guidance: its goal logit bias is scaled, nothing is trained. See
+    """A goal-conditioned model with guidance: the goal logit bias is scaled, without training. See
     `SmartPolicy.with_guidance`."""
 
     of: FineTuned
@@ -109,7 +109,7 @@ class Guided:
 
     @property
     def name(self) -> str:
-        """Name of its files."""
+        """Name of the model's files."""
         return f"{self.of.name}-guided-{self.scale:g}"
 
 
@@ -145,7 +145,7 @@ class Budget:
 
 
 def over_seeds(spec: FineTuned, num_seeds: int) -> tuple[FineTuned, ...]:
-    """The same fine-tuning with several seeds: one row of a table.
+    """The same fine-tuning with several seeds: a row of a table.
 
     Args:
         spec: Fine-tuning of any seed, which is replaced.
@@ -158,7 +158,7 @@ def finetune_config(spec: FineTuned, recipe: FinetuneConfig) -> FinetuneConfig:
     """Settings of a fine-tuning with a reward.
 
     Args:
-        spec: Fine-tuning whose method is the name of the reward.
+        spec: Fine-tuning with the name of the reward as method.
         recipe: Settings that the spec leaves open. Without a goal training in the spec, goals are switched off.
 
     Raises:

@@ -1,5 +1,5 @@
-"""An animation of one scenario as two policies simulate it, in the rollout in which their collisions and road
-departures differ most."""
+"""Animation of a scenario that two policies simulate, in the rollout in which collisions and road departures differ
+most."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from rlftsim.viewer.scene import build_scene, rollout_trajectories
 
 @dataclass(frozen=True, eq=False)
 class PairedAnimation:
-    """One rollout of a scenario by two policies with the same noise."""
+    """A rollout of a scenario by two policies with the same noise."""
 
     scenario_id: str
     rollout: int
@@ -38,9 +38,9 @@ def animate_pair(
 
     Args:
         rank: Rank of the scenario in words, such as "1. of 40", for the caption.
-        scenario: Scenario with its future; simulated as in an evaluation, with the suite's seed and sampling.
-        policies: Two policies by their names, the base model first.
-        suite: Settings of the evaluation, and its device.
+        scenario: Scenario with a logged future; simulated as in an evaluation, with the suite's seed and sampling.
+        policies: Two policies by name, the base model first.
+        suite: Suite with the settings and the device of evaluations.
         prefers_increase: True takes the rollout of the largest increase, False that of the largest decrease.
     """
     device = find_device(suite.device)

@@ -1,4 +1,4 @@
-"""Experiments by name. A package of your own adds one, see `rlftsim.plugins`; `rlftsim experiment NAME` then runs it:
+"""Experiments by name. `rlftsim experiment NAME` also runs those of installed packages, see `rlftsim.plugins`:
 
 [project.entry-points."rlftsim.experiments"]
 my-table = "my_package.my_table:EXPERIMENT"

@@ -1,8 +1,8 @@
-"""An experiment and its result: tables, verdicts and a figure, written as Markdown, JSON and pictures.
+"""Experiments and results: tables, verdicts and a figure, written as Markdown, JSON and pictures.
 
 A new experiment is two functions: `run` trains and evaluates, `summarize` makes tables and verdicts of that.
 `experiments.tables` makes tables of rows, `Row.against` makes verdicts. `EXPERIMENTS` in
-`experiments.registry` has them by name.
+`experiments.registry` has all experiments by name.
 """
 
 import json
@@ -51,27 +51,27 @@ class Experiment(Generic[Measured]):
 
     question: str
     run: Callable[[ExperimentSuite], Measured]
-    """Trains and evaluates what is missing, and returns what `summarize` needs: mostly the rows of a table."""
+    """Trains and evaluates missing models, and returns the input of `summarize`: mostly the rows of a table."""
     summarize: Callable[[Measured, ExperimentSuite], ExperimentResult]
     """Computes from stored results alone."""
     default_seeds: int = 1
     needs_goals: bool = False
-    """True = it trains goal-conditioned models, so a model that cannot be given goals is refused at once."""
+    """True = goal-conditioned models are trained, so a model that cannot be given goals is refused at once."""
 
 
 def run_experiment(name: str, experiment: Experiment[Any], suite: ExperimentSuite) -> ExperimentResult:
-    """Run what is missing of an experiment and write its result, each file whole or not at all.
+    """Run the missing stages of an experiment and write the result, each file whole or not at all.
 
-    Always NAME.md and NAME.json; with a figure NAME.png and NAME.svg; with animations NAME.html, where they
-    can be played, and films of each: NAME-1.webp, NAME-1.mp4, ...
+    Always NAME.md and NAME.json; with a figure NAME.png and NAME.svg; with animations NAME.html, a page
+    with players, and films of each: NAME-1.webp, NAME-1.mp4, ...
 
     Args:
-        name: Name of the experiment, which its files begin with.
+        name: Name of the experiment, with which all files begin.
         experiment: Question and the two functions that answer it.
-        suite: Suite whose folder gets the files; models and evaluations that it already has are not made again.
+        suite: Suite with the folder of the files; models and evaluations in the folder are not made again.
 
     Raises:
-        RlftsimError: A stage failed; the message says which and why.
+        RlftsimError: A stage failed; the message names stage and cause.
     """
     check_folder(suite.out, "results")
     if experiment.needs_goals:

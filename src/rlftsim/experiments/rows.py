@@ -1,4 +1,4 @@
-"""A row of an experiment: one model specification, evaluated for each seed, and compared with other rows."""
+"""Row of an experiment: a model specification, evaluated for each seed, and compared with further rows."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ RMM = "meta_metric"
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """Evaluations of one model specification on the same scenarios, one for each seed."""
+    """Evaluations of a model specification on the same scenarios, in the order of the seeds."""
 
     name: str
     by_seed: tuple[Evaluation, ...]
@@ -29,7 +29,7 @@ class Row:
         return mean_of_seeds(self.name, self.by_seed)
 
     def against(self, reference: "Row", column: str = RMM, *, alpha: float = 0.05) -> str:
-        """Verdict of a paired t-test in one line, such as "tuned against base, 40 scenarios in both: difference, ...".
+        """Verdict of a paired t-test in a line, such as "tuned against base, 40 scenarios in both: difference, ...".
 
         Args:
             reference: Row to compare with, such as the base model; the difference is this row minus the reference.
@@ -40,20 +40,20 @@ class Row:
         return f"{self.name} against {reference.name}, {comparison.pairing}: {comparison[column].verdict}"
 
     def gains_over(self, reference: "Row", column: str = RMM) -> Float[np.ndarray, "seeds"]:
-        """Difference of the means to a reference row, one for each seed of this row.
+        """Difference of the means to a reference row, for each seed of this row.
 
         Args:
-            reference: Row to compare with; its seeds are averaged.
+            reference: Row to compare with; the reference's seeds are averaged.
             column: Name of the score to compare, a column of `Evaluation`.
         """
         level = reference.mean.mean_and_error(column).mean
         return np.array([evaluation.mean_and_error(column).mean - level for evaluation in self.by_seed])
 
     def seeds_against(self, reference: "Row") -> str:
-        """Gain in RMM of every seed in one line, with a 95 % interval over the seeds where there are several.
+        """Gain in RMM of every seed in a line, with a 95 % interval over the seeds where there are several.
 
-        This interval answers another question than a paired t-test over scenarios: the gain that another run
-        would have.
+        The interval does not answer the question of a paired t-test over scenarios, but tells the gain that a
+        further run would have.
         """
         gains = self.gains_over(reference)
         line = f"{self.name} minus {reference.name}, RMM by seed: {', '.join(f'{gain:+.4f}' for gain in gains)}"
@@ -68,11 +68,11 @@ class Row:
 def mean_of_seeds(
     name: str, evaluations: Sequence[Evaluation], *, weights: Sequence[float] | None = None
 ) -> Evaluation:
-    """An evaluation whose scores are means over evaluations of the same scenarios, scenario by scenario.
+    """Evaluation with mean scores over evaluations of the same scenarios, scenario by scenario.
 
     Args:
         name: Name of the mean in tables and messages.
-        evaluations: Evaluations of the same scenarios, one for each seed.
+        evaluations: Evaluations of the same scenarios, in the order of the seeds.
         weights: Weight of each evaluation in the mean, with a sum of 1; None = equal weights.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Stages of an experiment, run in order with their number, title and time left in the log."""
+"""Stages of an experiment, run in order with number, title and time left in the log."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -19,7 +19,7 @@ class Stage:
 
 
 def run_stages(stages: Sequence[Stage]) -> None:
-    """Run stages and log a line for each: its number, and about how long the remaining stages take.
+    """Run stages and log a line for each: number, title, and about how long the remaining stages take.
 
     Args:
         stages: Stages in order. A title that comes again is neither counted nor logged again.

@@ -1,4 +1,4 @@
-"""Experiment suite: a folder in which models are trained and evaluated once, for all experiments that need them.
+"""Experiment suite: a folder in which models are trained and evaluated once, for all experiments.
 
 config.json, environment.json   settings of the suite; a folder of other settings is refused
 vocabulary.safetensors          motion and map tokens
@@ -9,7 +9,7 @@ variances/                      see `evaluation.reward_variance`
 attainment/                     goals reached and passed, see `evaluation.goal_attainment`
 NAME.md, NAME.json, NAME.png    results of an experiment
 
-Stages are shared: a model that one experiment has trained is found by the next.
+Stages are shared: a model that an experiment has trained is found by the next.
 """
 
 from collections.abc import Mapping, Sequence
@@ -47,7 +47,7 @@ GOALS_SUFFIX: Mapping[GoalsGiven, str] = {"none": "", "logged": "-logged-goals"}
 
 @dataclass(frozen=True)
 class ExperimentSuite:
-    """A folder of stages and the settings they share.
+    """A folder of stages and the shared settings.
 
     Raises:
         CheckpointError: The folder belongs to other settings, data or base model.
@@ -105,11 +105,11 @@ class ExperimentSuite:
         return Budget(config.num_updates(len(self.training)), config.batch_size, config.num_rollouts)
 
     def evaluate(self, rows: Mapping[str, Sequence[ModelSpec]], *, goals: GoalsGiven = "none") -> dict[str, Row]:
-        """Rows of a table, by their names; models that are missing are trained and evaluated.
+        """Rows of a table by name; missing models are trained and evaluated.
 
         Args:
-            rows: Specifications of each row by its name: a single one, or the same model with several seeds.
-            goals: Goals of the evaluated agents: "none", or "logged" for their logged endpoints.
+            rows: Specifications by row: a single model, or the same model with several seeds.
+            goals: Goals of the evaluated agents: "none", or "logged" for the logged endpoints.
         """
         self._open_folder(writes=True)
         config, folder = replace(self.evaluation, goals=goals), self.out / "evaluations"
@@ -130,7 +130,7 @@ class ExperimentSuite:
         return {name: Row(name, tuple(evaluations[spec] for spec in row)) for name, row in rows.items()}
 
     def check_goals(self) -> None:
-        """Check that the recipe and the base model can be given goals, before anything is trained.
+        """Check that the recipe and the base model can be given goals, before any model is trained.
 
         Raises:
             ConfigError: A recipe without goal relabeling, or a base model that cannot be given goals.
@@ -152,7 +152,7 @@ class ExperimentSuite:
         """Rows of methods that can train the suite's policies; a warning names the rows that are left out.
 
         Args:
-            rows: Specifications of each row by its name, as `evaluate` takes them.
+            rows: Specifications by row, as for `evaluate`.
         """
         # CAT-K and goal relabeling learn tokens; a recipe may leave either out.
         if self.base_model is None:
@@ -214,7 +214,7 @@ class ExperimentSuite:
     # ---- stages ---------------------------------------------------------------------------------------------------
 
     def _training_stages(self, spec: ModelSpec) -> list[Stage]:
-        """Trainings that a specification needs, each with its base model's before it."""
+        """Trainings that a specification needs, those of base models first."""
         stages = []
         for model in self._lineage(spec):
             verb, train = ("pre-train", self._pretrain) if isinstance(model, Base) else ("fine-tune", self._finetune)
@@ -233,7 +233,7 @@ class ExperimentSuite:
         return [*(self._lineage(spec.base) if isinstance(spec, FineTuned) else ()), spec]
 
     def _find_model(self, spec: ModelSpec) -> str:
-        """Name or folder of a policy whose trainings are finished."""
+        """Name or folder of a policy after all trainings."""
         if isinstance(spec, Baseline):
             return spec.name
         if spec == BASE and self.base_model:

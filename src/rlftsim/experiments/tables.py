@@ -2,7 +2,7 @@
 
 tables.build_table("Ours", rows.values(), SCORES)     a table, mean ± standard error
 tables.to_numbers(rows.values(), SCORES)              the same for machines
-tables.draw_gains(base, [tuned, imitated])            paired differences with their intervals
+tables.draw_gains(base, [tuned, imitated])            paired differences with intervals
 """
 
 from collections.abc import Iterable, Sequence
@@ -54,7 +54,7 @@ def build_table(title: str, rows: Iterable[Row], columns: Sequence[Column]) -> T
 
     Args:
         title: Title above the table.
-        rows: Rows that were evaluated on the same scenarios in the same way; the first gives the note its facts.
+        rows: Rows that were evaluated on the same scenarios in the same way; the facts of the note are the first row's.
         columns: Scores to show, such as `evaluation.columns.SCORES`.
     """
     rows = list(rows)
@@ -89,7 +89,7 @@ def to_numbers(rows: Iterable[Row], columns: Sequence[Column]) -> dict[str, Any]
 
 
 def draw_gains(base: Row, rows: Iterable[Row]) -> Figure:
-    """Figure of paired differences in RMM with their 95 % intervals.
+    """Figure of paired differences in RMM with 95 % intervals.
 
     Args:
         base: Row to compare with, such as the base model.
@@ -107,13 +107,13 @@ def draw_gains(base: Row, rows: Iterable[Row]) -> Figure:
 def build_gain_band(
     name: str, start: Row, points: Sequence[tuple[float, Row]], *, level: float = 0.0, color: int = 0
 ) -> Band:
-    """Curve of paired gains in RMM with their 95 % intervals, from no gain at x = 0 on.
+    """Curve of paired gains in RMM with 95 % intervals, from no gain at x = 0 on.
 
     Args:
         name: Name of the curve in the legend.
         start: Row that the gains are measured from. Scenarios being harder or easier in all rows is not in the band.
         points: Position on the horizontal axis (above 0) and row of each further point, from left to right.
-        level: Height of the start on the vertical axis; 0 draws the gains themselves.
+        level: Height of the start on the vertical axis; 0 draws plain gains.
         color: Index into `viewer.figure.COLORS`.
     """
     gains = [compare(start.mean, row.mean)[RMM] for _, row in points]

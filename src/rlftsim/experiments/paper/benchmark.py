@@ -1,4 +1,4 @@
-"""Table 1, extended: base model, CAT-K, RoaD and RLFTSim, between constant velocity and the log itself (the oracle)."""
+"""Table 1, extended: base model, CAT-K, RoaD and RLFTSim, between constant velocity and the log (the oracle)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ RESAMPLES_AT_ONCE = 100
 
 
 def run(suite: ExperimentSuite) -> dict[str, Row]:
-    """Rows of the table, without closed-loop imitation for a policy that it cannot train."""
+    """Rows of the table; closed-loop imitation is left out for a policy without tokens."""
     rows = {
         REFERENCE: (BASE,),
         **{name: over_seeds(FineTuned(method), suite.num_seeds) for name, method in IMITATIONS.items()},
@@ -86,7 +86,7 @@ def compute_gap_closed(base: Evaluation, tuned: Evaluation, ceiling: Evaluation)
 
     Args:
         base: Evaluation of the base model, the start of the gap.
-        tuned: Evaluation of the model whose gain is measured.
+        tuned: Evaluation of the fine-tuned model, for the gain.
         ceiling: Evaluation of the oracle, the end of the gap.
 
     Raises:

@@ -25,7 +25,7 @@ Attainment = Mapping[str, tuple[Attained, ...]]
 
 
 def open_held_out(suite: ExperimentSuite) -> tuple[ScenarioDataset, tuple[str, ...]]:
-    """Scenarios that a suite measures on, and their ids."""
+    """Held-out scenarios of a suite, and the ids to measure on."""
     dataset = ScenarioDataset(suite.data, suite.evaluation.split)
     return dataset, tuple(dataset.scenario_ids[i] for i in choose_scenarios(dataset, suite.evaluation))
 
@@ -36,10 +36,10 @@ def measure_attainment(
     """Attainment of every goal by each row's model, in the order of the goals; missing models are trained.
 
     Args:
-        suite: Scenarios, settings and models; outcomes that its folder already has are read, not measured again.
-        rows: Model specifications by the names of their rows. Models without goal conditioning are measured against
+        suite: Scenarios, settings and models; outcomes that the folder already has are read, not measured again.
+        rows: Model specifications by row. Models without goal conditioning are measured against
             the same goals, as a baseline.
-        goals: Goals of the suite's scenarios; each is given alone, whatever goals its scenario has besides.
+        goals: Goals of the suite's scenarios; each is given alone, whatever goals the scenario has besides.
         name: Name of the folder of outcomes, that of the experiment.
     """
     models, attained = suite.models(list(rows.values())), {}
@@ -65,20 +65,20 @@ def compute_scenario_rates(outcomes: Iterable[Attained], rate: str) -> dict[str,
 
 
 def estimate_mean(values: Iterable[float]) -> MeanInterval:
-    """Mean of rates with its interval; NaN without a single rate."""
+    """Mean of rates with an interval; NaN without a single rate."""
     return mean_interval(np.array(list(values), float))
 
 
 def build_rate_table(
     title: str, headings: Sequence[str], curves: Mapping[str, Sequence[MeanInterval]], unit: str = ""
 ) -> TextTable:
-    """Table of mean rates in percent with their standard errors.
+    """Table of mean rates in percent with standard errors.
 
     Args:
         title: Title above the table.
         headings: Headings of the columns of rates.
-        curves: Rates by row, one for each heading; all rows have the same goals.
-        unit: Words of the note that say what is counted, such as "percentage of rollouts, ".
+        curves: Rates by row, as many as headings; all rows have the same goals.
+        unit: Words of the note for the unit of the rates, such as "percentage of rollouts, ".
     """
     count = max(mean.count for curve in curves.values() for mean in curve)
     cells = tuple((row, *map(format_rate, curve)) for row, curve in curves.items())
@@ -87,7 +87,7 @@ def build_rate_table(
 
 
 def format_rate(rate: MeanInterval) -> str:
-    """Mean rate in percent with its standard error, where there is one; a dash without a single rate."""
+    """Mean rate in percent with standard error; a dash without a single rate."""
     if not rate.count:
         return "–"
     error = f" ± {100 * rate.standard_error:.1f}" if rate.count > 1 else ""

@@ -1,4 +1,4 @@
-"""Credit assignment: the leave-one-out reward given to whole rollouts, beside one that is split over agents."""
+"""Credit assignment: the leave-one-out reward given to whole rollouts, or split over agents."""
 
 from collections.abc import Mapping
 

@@ -53,7 +53,7 @@ def specs(num_seeds: int, epochs: float) -> dict[str, tuple[ModelSpec, ...]]:
 
 
 def run(suite: ExperimentSuite) -> dict[str, Row]:
-    """Rows of all points, without CAT-K for a policy that it cannot train."""
+    """Rows of all points; CAT-K is left out for a policy without tokens."""
     return suite.evaluate(suite.select_feasible(specs(suite.num_seeds, suite.recipe.finetune.epochs)))
 
 
@@ -62,7 +62,7 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
 
     Args:
         rows: Rows that `run` returned, by the names that `name_start` and `point` give.
-        suite: Suite whose recipe has the epochs; nothing is trained or evaluated here.
+        suite: Suite with the recipe's epochs; no model is trained or evaluated here.
     """
     epochs = [fraction * suite.recipe.finetune.epochs for fraction in EPOCHS_FRACTIONS]
     verdicts, bands = [], []

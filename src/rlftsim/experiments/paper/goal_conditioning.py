@@ -44,7 +44,7 @@ GUIDED = {f"{name}, guided": Guided(spec, GUIDANCE_SCALE) for name, spec in VARI
 
 @dataclass(frozen=True)
 class GoalRows:
-    """Rows of the goal-free model, and by name of the goal-conditioned ones."""
+    """Rows of the goal-free model, and by name of the goal-conditioned models."""
 
     start: Row
     relabelled: Mapping[str, Row]
@@ -56,8 +56,8 @@ class GoalRows:
 
 
 def run(suite: ExperimentSuite) -> GoalRows:
-    """Rows of all models. Of the goal-free and the relabelled models only seed 0 is trained: the others start
-    from it."""
+    """Rows of all models. Of the goal-free and the relabelled models only seed 0 is trained, where the
+    further trainings start."""
     variants = {name: over_seeds(spec, suite.num_seeds) for name, spec in VARIANTS.items()}
     # The guided models of all seeds, not only those of seed 0 that `GUIDED` has.
     guided = {
@@ -77,7 +77,7 @@ def summarize(rows: GoalRows, suite: ExperimentSuite) -> ExperimentResult:
 
     Args:
         rows: Rows that `run` returned; all are compared with the goal-free model.
-        suite: Suite whose budget the notes state; nothing is trained or evaluated here.
+        suite: Suite with the budget for the notes; no model is trained or evaluated here.
     """
     start = rows.start
     conditioned = [*rows.relabelled.values(), *rows.variants.values(), *rows.guided.values()]

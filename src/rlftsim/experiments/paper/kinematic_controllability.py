@@ -1,4 +1,4 @@
-"""Goals of the ego on its logged path, earlier or later than its logged endpoint."""
+"""Goals of the ego on the logged path, earlier or later than the logged endpoint."""
 
 import numpy as np
 from jaxtyping import Float
@@ -24,11 +24,11 @@ MAX_CURVATURE_PER_M = 0.2
 
 
 def find_goal(scenario: Scenario, offset_s: int) -> GoalEntry | None:
-    """Logged position of the ego, or its extrapolation at constant speed and steering; None where the log has neither.
+    """Logged position of the ego, or an extrapolation at constant speed and steering; None where the log has neither.
 
     Args:
-        scenario: Scenario with its logged future; without a future there is no goal.
-        offset_s: Seconds after the end of the log; negative ones lie before the end.
+        scenario: Scenario with a logged future; without a future there is no goal.
+        offset_s: Seconds after the end of the log; negative seconds lie before the end.
     """
     tracks, ego = scenario.tracks, scenario.ego_index
     # Up to the end of the log its own positions; after it an extrapolation from the last one.
@@ -76,7 +76,7 @@ def summarize(attained: Attainment, suite: ExperimentSuite) -> ExperimentResult:
 
     Args:
         attained: Outcomes that `run` returned; the labels of the goals have the offsets.
-        suite: Suite whose budget the notes state; nothing is trained or evaluated here.
+        suite: Suite with the budget for the notes; no model is trained or evaluated here.
     """
 
     def compute_rates(row: str, rate: str, *offsets_s: int) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""Table 2 at equal distance: what each reward gains for the KL to the base model that it spends."""
+"""Table 2 at equal distance: gain of each reward for the KL to the base model that the training spends."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -24,7 +24,7 @@ COLUMNS = (*SCORES, DRIFT_COLUMNS[0])
 
 
 def point(reward: str, fraction: float) -> str:
-    """Name of a point's row: the reward, and the fraction of its runs, one of `FRACTIONS`."""
+    """Name of a point's row: the reward, and the fraction of the runs, of `FRACTIONS`."""
     return f"{reward}, {fraction:.0%} of the run"
 
 
@@ -52,7 +52,7 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
 
     Args:
         rows: Rows that `run` returned, by the names that `point` gives.
-        suite: Suite whose folder has the runs, whose KL is read from their metrics.
+        suite: Suite with the folder of the runs, whose metrics have the KL.
     """
     base, runs, frontiers = rows[REFERENCE], specs(suite.num_seeds), {}
     for name in REWARDS:
@@ -100,11 +100,11 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
 
 
 def interpolate_row(name: str, frontier: Sequence[tuple[float, Row]], kl: float) -> Row:
-    """A row whose scores are interpolated, scenario by scenario and seed by seed.
+    """Row with interpolated scores, scenario by scenario and seed by seed.
 
     Args:
         name: Name of the row in tables.
-        frontier: Rows with their KL to the base model, smallest first; the first may have a single seed.
+        frontier: Rows with the KL to the base model, smallest first; the first may have a single seed.
         kl: KL to interpolate at, nats a decision, between those of the first and the last row.
     """
     upper = next(number for number, (point_kl, _) in enumerate(frontier) if number and point_kl >= kl)

@@ -1,4 +1,4 @@
-"""Maneuvers as goals of the ego: the logged one, an alternative that the lanes allow, or either."""
+"""Maneuvers as goals of the ego: the logged maneuver, an alternative that the lanes allow, or either."""
 
 from collections.abc import Callable, Mapping, Sequence
 
@@ -43,7 +43,7 @@ def summarize(attained: Attainment, suite: ExperimentSuite) -> ExperimentResult:
 
     Args:
         attained: Outcomes that `run` returned; the labels of the goals have the maneuvers.
-        suite: Suite whose budget the notes state; nothing is trained or evaluated here.
+        suite: Suite with the budget for the notes; no model is trained or evaluated here.
     """
     rows = list(attained)
     overall = {

@@ -21,10 +21,10 @@ def goals_path(suite: ExperimentSuite) -> Path:
 
 
 def propose_goals(dataset: ScenarioDataset, scenario_ids: Sequence[str]) -> GoalsFile:
-    """Logged and alternative maneuvers of every ego that has both. The logged ones are the file's goals.
+    """Logged and alternative maneuvers of every ego that has both. The logged maneuvers are the file's goals.
 
     Args:
-        dataset: Scenarios with their logged futures.
+        dataset: Scenarios with logged futures.
         scenario_ids: Ids of the scenarios to propose goals for, in the order of the file.
     """
     logged, alternatives = [], []
@@ -39,7 +39,7 @@ def propose_goals(dataset: ScenarioDataset, scenario_ids: Sequence[str]) -> Goal
 
 
 def find_goals(suite: ExperimentSuite) -> list[GoalEntry]:
-    """Goals of the suite's held-out scenarios from its goals file, which is written first if there is none.
+    """Goals of the suite's held-out scenarios from the suite's goals file, which is written first if there is none.
 
     Raises:
         DataError: No ego has two maneuvers, or the file was edited and makes no sense.
@@ -69,7 +69,7 @@ def find_goals(suite: ExperimentSuite) -> list[GoalEntry]:
 
 
 def is_logged(goal: GoalEntry) -> bool:
-    """True if the goal's maneuver is the logged one."""
+    """True if the goal's maneuver is the logged maneuver."""
     return split_label(goal.label)[1]
 
 

@@ -1,4 +1,4 @@
-"""Another architecture: base model and RLFTSim for SMART and for TrafficBots, in one table."""
+"""A second architecture: base model and RLFTSim for SMART and for TrafficBots, in a single table."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -23,7 +23,7 @@ ALPHA = 1e-3
 
 
 def run(suite: ExperimentSuite) -> dict[str, Row]:
-    """Rows of both architectures; twice for models without tokens: with their exploration noise, and without."""
+    """Rows of both architectures; twice for models without tokens: with exploration noise, and without."""
     pair = suites(suite)  # first, which refuses models of the wrong architecture
     rows = suite.evaluate({FLOOR: (CONSTANT_VELOCITY,)})
     for architecture in pair:
@@ -41,10 +41,10 @@ def run(suite: ExperimentSuite) -> dict[str, Row]:
 
 
 def suites(suite: ExperimentSuite) -> tuple[ExperimentSuite, ExperimentSuite]:
-    """The suite, and a suite for its recipe's counterpart in a folder inside of it.
+    """The suite, and a suite for the recipe's counterpart in an inner folder.
 
     Raises:
-        ConfigError: The recipe names no counterpart, or a base model is not of its recipe's architecture.
+        ConfigError: The recipe names no counterpart, or a base model is not of the recipe's architecture.
     """
     name = suite.recipe.counterpart
     if name is None:
@@ -59,7 +59,7 @@ def suites(suite: ExperimentSuite) -> tuple[ExperimentSuite, ExperimentSuite]:
 
 
 def _evaluate_mean_actions(suite: ExperimentSuite, name: str, specs: Sequence[ModelSpec]) -> Row:
-    """Row of the same models at temperature 0: rollouts differ by what is drawn once."""
+    """Row of the same models at temperature 0: rollouts differ by the draws at the start."""
     config, folder = replace(suite.evaluation, temperature=0.0), suite.out / "evaluations"
     evaluations = []
     for spec, model in suite.models(specs).items():

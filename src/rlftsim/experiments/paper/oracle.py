@@ -1,7 +1,7 @@
-"""The oracle: the log itself as rollouts, scored feature by feature. It is the ceiling of the metric.
+"""The oracle: the log as rollouts, scored feature by feature, the ceiling of the metric.
 
-It scores below 1, because the histogram of a single logged future, which is smoothed, never gives one bin all
-the probability.
+The oracle scores below 1, because the histogram of a single logged future, which is smoothed, never gives a single
+bin all the probability.
 """
 
 import math
@@ -26,7 +26,7 @@ def run(suite: ExperimentSuite) -> dict[str, Row]:
 
 
 def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResult:
-    """Likelihood of the log under its own histograms, and the features that keep it below 1."""
+    """Likelihood of the log under the log's own histograms, and the features that keep the score below 1."""
     row = rows["oracle"]
     weights: dict[str, float] = dict(zip(FEATURE_NAMES, metric_by_name(row.mean.config.metric).weights))
     features = {name: row.mean.mean_and_error(f"{name}_likelihood") for name in FEATURE_NAMES}

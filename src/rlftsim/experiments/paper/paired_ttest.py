@@ -23,7 +23,7 @@ def summarize(measured: Mapping[str, Row], suite: ExperimentSuite) -> Experiment
 
     Args:
         measured: Rows of the reward ablation by name, in any order.
-        suite: Suite whose budget and seeds the notes state; nothing is trained or evaluated here.
+        suite: Suite with budget and seeds for the notes; no model is trained or evaluated here.
     """
     # Best first, so that a perfect order has + above the diagonal and − below it.
     rows = sorted(measured.values(), key=lambda row: -row.mean.mean_and_error(RMM).mean)

@@ -1,8 +1,8 @@
 """The same scenario with the same noise before and after fine-tuning.
 
-Nothing is picked by eye. Scenarios are sorted by the decrease in the rate of evaluated agents that collide or
-leave the road. Shown are those of the largest decrease, the one in the middle, and the one of the largest
-increase; of each, the rollout with the largest change.
+No scenario is picked by eye. Scenarios are sorted by the decrease in the rate of evaluated agents that collide or
+leave the road. Shown are those of the largest decrease, the middle of the
+order, and the largest increase; of each, the rollout with the largest change.
 """
 
 from collections.abc import Mapping
@@ -28,7 +28,7 @@ VERDICTS = {"Collisions": "collision_rate", "Off-road driving": "offroad_rate", 
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """Rows of both models, and the animations by their rank in the order of scenarios, in words."""
+    """Rows of both models, and the animations by rank in the order of scenarios, in words."""
 
     rows: Mapping[str, Row]
     animations: Mapping[str, PairedAnimation]
@@ -57,7 +57,7 @@ def run(suite: ExperimentSuite) -> Pairs:
 def choose_scenarios(
     ids: list[str], base_rate: Float[np.ndarray, "n"], tuned_rate: Float[np.ndarray, "n"], num_best: int = NUM_BEST
 ) -> dict[str, str]:
-    """Ids of the scenarios to show by their rank in the order, in words; each at most once, the best first.
+    """Ids of the scenarios to show by rank in the order, in words; each at most once, the best first.
 
     Args:
         ids: Ids of all n scenarios.
@@ -74,11 +74,11 @@ def choose_scenarios(
 
 
 def summarize(pairs: Pairs, suite: ExperimentSuite) -> ExperimentResult:
-    """The table, the animations, and the rule by which they were chosen.
+    """The table, the animations, and the rule that chose the scenarios.
 
     Args:
-        pairs: Rows and animations that `run` made; nothing is simulated here.
-        suite: Suite whose budget the notes state.
+        pairs: Rows and animations that `run` made; no rollout is simulated here.
+        suite: Suite with the budget for the notes.
     """
     base, tuned = (pairs.rows[name] for name in SPECS)
     cells = tuple(

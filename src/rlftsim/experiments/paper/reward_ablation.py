@@ -44,7 +44,7 @@ def evaluate_rewards(suite: ExperimentSuite, names: Sequence[str]) -> dict[str, 
     """Rows of the base model and of fine-tunings with some of `REWARDS`, in this order.
 
     Args:
-        suite: Suite that trains and evaluates what is missing, with as many seeds as it has.
+        suite: Suite that trains and evaluates what is missing, with as many seeds as the suite has.
         names: Names of the rewards, keys of `REWARDS`.
     """
     return suite.evaluate({REFERENCE: (BASE,), **{name: over_seeds(REWARDS[name], suite.num_seeds) for name in names}})
@@ -91,8 +91,8 @@ def mean_at_end(suite: ExperimentSuite, specs: Sequence[FineTuned]) -> dict[str,
     """Mean of each of `DISTANCES` over the last updates of runs; empty where there are no runs.
 
     Args:
-        suite: Suite whose folder has the runs; nothing is trained here.
-        specs: Specifications of one fine-tuning, one for each seed; runs without metrics are left out.
+        suite: Suite with the folder of the runs; no model is trained here.
+        specs: Specifications of a fine-tuning, a seed each; runs without metrics are left out.
     """
     runs = [suite.model_folder(spec) for spec in specs]
     metrics = [read_metrics(run) for run in runs if (run / "metrics.jsonl").exists()]

@@ -1,4 +1,4 @@
-"""Figure 3: variance of a rollout's reward against the number N of rollouts it is computed from, and fits to it."""
+"""Figure 3: variance of a rollout's reward against the number N of rollouts behind the reward, with fits."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -52,7 +52,7 @@ def law(sizes: Sequence[int]) -> dict[str, Float[np.ndarray, "sizes"]]:
 
 @dataclass(frozen=True)
 class Scaling:
-    """Fit to the variances of one reward."""
+    """Fit to the variances of a reward."""
 
     middle: Float[np.ndarray, "sizes"]
     """Geometric mean over scenarios."""
@@ -66,7 +66,7 @@ class Scaling:
 
 
 def fit_scaling(variance: Float[np.ndarray, "scenarios sizes"], sizes: Sequence[int]) -> Scaling:
-    """Fit of one reward; scenarios in which a reward never varies are left out.
+    """Fit of a reward; scenarios in which a reward never varies are left out.
 
     Args:
         variance: Variance [scenarios, sizes] of the reward at each number of rollouts.
@@ -85,11 +85,11 @@ def fit_scaling(variance: Float[np.ndarray, "scenarios sizes"], sizes: Sequence[
 
 
 def summarize(measured: Variances, suite: ExperimentSuite) -> ExperimentResult:
-    """Slopes with their intervals, beside the paper's claim and the slopes of independent rollouts.
+    """Slopes with intervals, beside the paper's claim and the slopes of independent rollouts.
 
     Args:
         measured: Variances of both rewards by scenario and number of rollouts.
-        suite: Suite whose metric the notes state; nothing is simulated here.
+        suite: Suite with the metric for the notes; no rollout is simulated here.
     """
     sizes = measured.sizes
     scalings = {name: fit_scaling(values, sizes) for name, values in measured.by_reward.items()}
