@@ -6,8 +6,8 @@ OUT/synthetic-200-SEED/          an exam, named after data and seed
     evaluations/*.parquet        scores of every model
     exam.md, exam.json           tables, margins and verdicts
 
-The seed of a generated exam follows from the commit of the package, so no model can have been tuned on the exam. A ledger counts the
-looks at every exam.
+The seed of a generated exam follows from the commit of the package, so no model can have been tuned on the exam. A
+ledger counts the looks at every exam.
 """
 
 import math
