@@ -41,7 +41,7 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
     closed = {row.name: compute_gap_closed(base.mean, row.mean, rows[CEILING].mean) for row in (*imitations, tuned)}
     return ExperimentResult(
         title="Benchmark: realism of the base model, closed-loop imitation and RLFTSim",
-        tables=(tables.build_table("Ours", rows.values(), SCORES), published.BENCHMARK),
+        tables=(tables.build_table("Ours", rows.values(), SCORES), published.load_table("benchmark")),
         verdicts=(
             *(tuned.against(base), tuned.seeds_against(base)),
             *(v for row in imitations for v in (row.against(base), row.seeds_against(base), tuned.against(row))),

@@ -80,7 +80,7 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
         verdicts += [rows[point(second, length)].against(rows[point(first, length)]) for length in epochs]
     return ExperimentResult(
         title="Realism against epochs of fine-tuning",
-        tables=(tables.build_table("Ours", rows.values(), SCORES[:4]), published.CURVE),
+        tables=(tables.build_table("Ours", rows.values(), SCORES[:4]), published.load_table("finetune-curve")),
         verdicts=tuple(verdicts),
         notes=(
             "At equal epochs all curves had the same number of updates of as many scenarios; RLFTSim simulates "

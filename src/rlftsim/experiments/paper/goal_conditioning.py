@@ -92,7 +92,7 @@ def summarize(rows: GoalRows, suite: ExperimentSuite) -> ExperimentResult:
         tables=(
             tables.build_table("Ours: goals are the logged endpoints", [start, *conditioned], GOAL_COLUMNS),
             tables.build_table("Ours: the same models without goals", [start, *without_goals], GOAL_COLUMNS),
-            published.GOALS,
+            published.load_table("goal-conditioning"),
         ),
         verdicts=(
             *(_format_misses(start, row) for row in conditioned),

@@ -75,7 +75,7 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
             tables.build_table(f"At a KL of {kl:.4f} nats a decision", (base, *equal.values()), COLUMNS),
             replace(matrix.tables[0], title="Row against column, at that KL"),
             tables.build_table("Measured", (base, *measured), COLUMNS),
-            published.REWARDS,
+            published.load_table("rewards"),
         ),
         verdicts=(_format_order(equal, kl), *(row.against(base) for row in equal.values()), *matrix.verdicts),
         notes=(

@@ -84,7 +84,7 @@ def summarize(attained: Attainment, suite: ExperimentSuite) -> ExperimentResult:
                 for rate, heading in (RATES | GOAL_RATES).items()
             ),
             *_tabulate_maneuvers(by_maneuver, rows),
-            published.MANEUVERS,
+            published.load_table("maneuvers"),
         ),
         verdicts=tuple(_format_gain(attained, row, rate) for rate in (*RATES, "passed_once") for row in GUIDED),
         notes=(

@@ -74,7 +74,7 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
     bases = [row for name, row in rows.items() if UNTUNED in name]
     return ExperimentResult(
         title="Model agnosticism: RLFTSim on two architectures",
-        tables=(tables.build_table("Ours", rows.values(), SCORES), published.AGNOSTICISM),
+        tables=(tables.build_table("Ours", rows.values(), SCORES), published.load_table("model-agnosticism")),
         verdicts=(
             *(base.against(rows[FLOOR]) for base in bases),
             *(

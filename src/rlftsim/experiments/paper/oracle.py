@@ -35,7 +35,7 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
         tables=(
             build_feature_table(features, weights, row.mean),
             tables.build_table("Ours, in all", [row], SCORES),
-            published.ORACLE,
+            published.load_table("oracle"),
         ),
         verdicts=(
             f"The log itself scores {row.mean.mean_and_error(RMM).mean:.4f}: the most that a model can gain here is "

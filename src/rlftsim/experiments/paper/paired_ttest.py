@@ -45,7 +45,7 @@ def summarize(measured: Mapping[str, Row], suite: ExperimentSuite) -> Experiment
     pairs = [(i, j) for i in range(len(names)) for j in range(i + 1, len(names))]
     return ExperimentResult(
         title="Paired t-test: every reward against every other",
-        tables=(TextTable("Ours", ("", *names), cells, note), published.T_TEST),
+        tables=(TextTable("Ours", ("", *names), cells, note), published.load_table("paired-ttest")),
         verdicts=tuple(f"{names[i]} against {names[j]}: {gains[i][j].verdict}" for i, j in pairs),
         notes=(
             suite.budget.note,

@@ -60,8 +60,8 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
         tables=(
             tables.build_table("Ours", rows.values(), COLUMNS),
             *((distances,) if distances.rows else ()),
-            published.REWARDS,
-            published.HEURISTICS,
+            published.load_table("rewards"),
+            published.load_table("heuristics"),
         ),
         verdicts=(
             *(row.against(base) for row in tuned),
