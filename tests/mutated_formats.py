@@ -602,7 +602,7 @@ FORMATS: Mapping[str, Format] = {
         {"womd/*": "tfrecord"}, make_scored_records, score("new", "womd"), ("evaluation.scenario_source",)
     ),
     "simulated folder": Format(
-        {"out/rollouts.json": "json", "out/*.npz": "npz"}, make_simulated, simulate, ("cli.rollout_folder",)
+        {"out/rollouts.json": "json", "out/*.npz": "npz"}, make_simulated, simulate, ("evaluation.rollout_folder",)
     ),
     "snapshot": Format({"snapshot": "snapshot"}, make_snapshot, read_snapshot, ("envs.snapshot",)),
     "entry": Format(

@@ -23,17 +23,15 @@ from rlftsim.envs.traffic_scores import blamed_others_rate, realism_of_others
 from rlftsim.errors import ConfigError, DataError, whole_number
 from rlftsim.evaluation.drive_results import DriveResult, DriveSettings
 from rlftsim.evaluation.resumable import (
-    JsonParts,
+    ScenarioValues,
     check_same_work,
+    check_scenarios_stay,
     finish_result,
-    map_scenarios,
-    read_if_readable,
-    refuse_to_leave_out,
+    read_stored,
 )
 from rlftsim.evaluation.scenario_source import hash_manifest
-from rlftsim.jobs.lease import Lease
 from rlftsim.jobs.progress import log
-from rlftsim.jobs.runner import on_this_machine
+from rlftsim.jobs.runner import choose_runner
 from rlftsim.scenario.open import dataset_folder
 from rlftsim.scenario.types import Scenario
 from rlftsim.statistics import mean_interval
@@ -155,13 +153,13 @@ def _read_finished(config: DriveConfig, settings: DriveSettings, ids: Sequence[s
     """The result of an earlier call for the same scenarios in one kind of traffic; None if there is none.
 
     Args:
-        config: of the call.
-        settings: of the result.
-        ids: its scenarios.
-        path: of its file.
+        config: Planner, data and scenarios of the call.
+        settings: Values that the result must agree with.
+        ids: Ids of the scenarios that the result must have, in this order.
+        path: File of the result.
 
     Raises:
-        ConfigError: a result of other scenarios is there, which a limit or a choice would replace.
+        ConfigError: The stored result has other scenarios, which a limit or a choice would replace.
     """
     found = _read_and_refuse(config, settings, ids, path)
     if found is None:
@@ -187,12 +185,12 @@ def _read_and_refuse(
     config: DriveConfig, settings: DriveSettings, ids: Sequence[str], path: Path
 ) -> DriveResult | None:
     """The stored result, unless it is of other work, or a limit or a choice would leave out some of its scenarios."""
-    found = read_if_readable(path, DriveResult.read)
+    found = read_stored(path, DriveResult.read)
     choice = f"limit={config.limit}" if config.limit is not None else "this choice" if config.scenarios else ""
     if found is not None and choice:
         left_out = len({*found.scenario_ids} - {*ids})
         way_out = "name another --out, or drive all scenarios."
-        refuse_to_leave_out(path, len(found.scenario_ids), left_out, choice, way_out)
+        check_scenarios_stay(path, len(found.scenario_ids), left_out, choice, way_out)
     if found is not None:
         # a planner whose code has changed is driven anew, and so is one of an older version of this package
         differing = {*_differences(found.settings, settings)} - {"planner_code", "rlftsim_version"}
@@ -204,23 +202,27 @@ def _drive_traffic(config: DriveConfig, settings: DriveSettings, ids: Sequence[s
     """Drive what is missing in one kind of traffic and write the result, unless it is finished.
 
     Args:
-        config: of the call.
-        settings: of the result.
-        ids: its scenarios.
-        path: of its file; finished scenarios lie beside it until all are there.
+        config: Planner, data, scenarios and processes of the call.
+        settings: Values that the result must agree with.
+        ids: Ids of the scenarios of the result.
+        path: File of the result; finished scenarios lie beside this file until all are there.
     """
     identity = {"settings": settings.what_counts()}
-    files = JsonParts(path.with_suffix(".parts"), ids, dict.fromkeys(ids, identity), {}, _row_and_missing)
-    runner = on_this_machine(config.jobs, len(ids))
+    return finish_result(
+        f"{config.planner} in {settings.traffic}",
+        ids,
+        partial(_drive_scenario, config, settings.traffic, ids),
+        path=path,
+        format=ScenarioValues(path.with_suffix(".parts"), ids, dict.fromkeys(ids, identity), _row_and_missing),
+        find=partial(_read_finished, config, settings, ids, path),
+        combine=partial(_combine, settings),
+        runner=choose_runner(config.jobs, len(ids)),
+    )
 
-    def make(lease: Lease) -> DriveResult:
-        parts = map_scenarios(
-            partial(_drive_scenario, config, settings.traffic, ids), len(ids), files,
-            runner=runner, title=f"{config.planner} in {settings.traffic}", lease=lease,
-        )  # fmt: skip
-        return DriveResult.of(settings, [row for row, _ in parts], {row["scenario_id"]: why for row, why in parts})
 
-    return finish_result(partial(_read_finished, config, settings, ids, path), make, path, files, ids, runner)
+def _combine(settings: DriveSettings, rows: Sequence[tuple[dict[str, Any], dict[str, str]]]) -> DriveResult:
+    """Result of the rows of all scenarios and the scores that each cannot give."""
+    return DriveResult.of(settings, [row for row, _ in rows], {row["scenario_id"]: missing for row, missing in rows})
 
 
 def _row_and_missing(scenario_id: str, values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:

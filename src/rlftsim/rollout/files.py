@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rlftsim.jobs.files import write_whole
+from rlftsim.jobs.files import write_atomically
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import CURRENT_STEP
@@ -42,7 +42,7 @@ def write_rollouts(folder: Path, batch: ScenarioBatch, rollouts: Rollouts) -> li
             z=np.broadcast_to(z[b, : len(chosen), None], own.shape),
             heading=own,
         )
-        write_whole(path, save)
+        write_atomically(path, save)
         files.append(path)
     return files
 

@@ -425,7 +425,7 @@ def _refuse_misshapen(part: Any, place: str) -> None:
         axes = declared.dim_str.split()
         shown = f"[{', '.join(axes)}]"
         if not isinstance(value, np.ndarray):
-            raise DataError(f"{place}.{one.name} is {in_short(value)}, it must be an array {shown}")
+            raise DataError(f"{place}.{one.name} is {type(value).__name__}, it must be an array {shown}")
         wanted = []
         for axis, length in zip(axes, value.shape):
             name, _, more = axis.partition("+")  # such as "F+1"

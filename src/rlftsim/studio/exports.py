@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 from rlftsim.goals.goals_file import parse_goals, write_goals
-from rlftsim.jobs.files import errors_name, write_text, write_whole
+from rlftsim.jobs.files import errors_name, write_atomically, write_text
 from rlftsim.realism.from_rollouts import states_of_rollouts
 from rlftsim.rollout.files import write_rollouts
 from rlftsim.scenario.batch import collate
@@ -83,7 +83,7 @@ def export(session: Session, run: Run, body: ExportBody) -> Path:
         case "submission":
             (states,) = states_of_rollouts(batch, rollouts)
             message = encode_rollouts(scenario.scenario_id, states)
-            write_whole(path, lambda temporary: temporary.write_bytes(message))
+            write_atomically(path, lambda temporary: temporary.write_bytes(message))
         case "scores":
             scored = run.score(body.variant)
             write_text(path, json.dumps(scored.to_payload() | scored.explained(), indent=1) + "\n")

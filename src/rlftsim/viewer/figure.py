@@ -15,7 +15,7 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import NullFormatter, NullLocator
 
 from rlftsim.errors import ConfigError
-from rlftsim.jobs.files import write_whole
+from rlftsim.jobs.files import write_atomically
 
 COLORS = ("#1d63d8", "#e07b00", "#11754b", "#a21caf", "#79828f", "#24292f")
 """Colors of curves; the first four are those of `palette.css`, in the same order."""
@@ -223,7 +223,7 @@ def save_figure(path: Path, figure: Figure, *, dots_per_inch: int = DOTS_PER_INC
     # No dates and a fixed salt for ids: the same figure gives the same bytes.
     metadata = {"png": None, "svg": {"Date": None}, "pdf": {"CreationDate": None}}[picture_format]
     with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "rlftsim"}):
-        write_whole(
+        write_atomically(
             path,
             lambda temporary: figure.savefig(
                 temporary, format=picture_format, dpi=dots_per_inch, facecolor="white", metadata=metadata

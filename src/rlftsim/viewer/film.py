@@ -11,7 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 
 from rlftsim.errors import ConfigError
-from rlftsim.jobs.files import write_whole
+from rlftsim.jobs.files import write_atomically
 from rlftsim.scenario.types import CURRENT_STEP
 from rlftsim.viewer.page import Animation, Panel
 from rlftsim.viewer.picture import agent_shapes, draw_scene, light_dots
@@ -45,7 +45,7 @@ def to_film(
     num_steps = max(panel.trajectories.num_steps for panel in animation.panels)
     frames = [camera.frame(animation.panels, step) for step in range(CURRENT_STEP, num_steps, steps_per_frame)]
     frames += frames[-1:] * round(HOLD_AT_END_S * rate)
-    write_whole(path, lambda temporary: WRITERS[path.suffix](temporary, frames, rate))
+    write_atomically(path, lambda temporary: WRITERS[path.suffix](temporary, frames, rate))
 
 
 class Camera:
