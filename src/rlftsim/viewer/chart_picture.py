@@ -37,6 +37,5 @@ def charts_to_png(path: Path, charts: Sequence[Chart], *, dots_per_inch: int = 1
         # One curve needs no legend: its name is the title of the chart or of its axis.
         if len(axis.get_legend_handles_labels()[1]) > 1:
             axis.legend(frameon=False, fontsize=8)
-        for side in ("top", "right"):
-            axis.spines[side].set_visible(False)
+        axis.spines[["top", "right"]].set_visible(False)
     save_figure(path, figure, dots_per_inch=dots_per_inch)

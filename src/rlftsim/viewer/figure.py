@@ -129,8 +129,7 @@ def draw_subplots(
         axis.set_xticks(range(len(ticks)), list(ticks), fontsize=8)
         axis.set(ylim=(-3, 103))
         axis.grid(color=PALE, lw=0.6, alpha=0.7)
-        for side in ("top", "right"):
-            axis.spines[side].set_visible(False)
+        axis.spines[["top", "right"]].set_visible(False)
     # Inner axes share ticks with the outer ones, so only the last row and the first column are labeled.
     for axis in axes[-columns:]:
         axis.set_xlabel(x_label)
@@ -189,8 +188,7 @@ def draw_verdicts(names: Sequence[str], verdicts: Int[np.ndarray, "n n"], *, tit
     axis.set_xticks(range(len(names)), names, rotation=40, ha="right", rotation_mode="anchor")
     axis.set_yticks(range(len(names)), names)
     axis.tick_params(length=0)
-    for side in axis.spines.values():
-        side.set_visible(False)
+    axis.spines[:].set_visible(False)
     figure.supxlabel(note, fontsize=9, color=INK)
     return figure
 
@@ -236,6 +234,5 @@ def _axis(width: float, height: float, title: str) -> tuple[Figure, Axes]:
     figure = Figure(figsize=(width, height), layout="constrained")
     figure.suptitle(title, fontsize=12, fontweight="bold", color=INK, x=0.01, ha="left")
     axis = figure.subplots()
-    for side in ("top", "right"):
-        axis.spines[side].set_visible(False)
+    axis.spines[["top", "right"]].set_visible(False)
     return figure, axis

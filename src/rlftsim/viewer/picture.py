@@ -84,8 +84,7 @@ def draw_scene(animation: Animation) -> tuple[Figure, Sequence[Axes]]:
         axis.set(xlim=(x - radius, x + radius), ylim=(y - radius, y + radius), xticks=[], yticks=[], aspect="equal")
         axis.set_facecolor(COLORS["ground"])
         axis.set_title(panel.title, fontsize=12, loc="left", fontweight="bold")
-        for side in axis.spines.values():
-            side.set_visible(False)
+        axis.spines[:].set_visible(False)
         draw_map(axis, animation.scene, points_per_m=PANEL_INCHES * POINTS_PER_INCH / (2 * radius))
     names = {"ego": "ego", "evaluated": "evaluated agents", "other": "other agents"}
     handles = [Line2D([], [], color=COLORS[role], lw=5, label=label) for role, label in names.items()]

@@ -1,8 +1,9 @@
 """Basis of the experiments in which only the ego has a goal, given alone: models, rates by scenario, curves."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from rlftsim.evaluation.goal_attainment import Attained, attain_goals
 from rlftsim.evaluation.scenario_source import choose_scenarios
@@ -14,7 +15,7 @@ from rlftsim.goals.goals_file import GoalEntry
 from rlftsim.policies.registry import load_policy
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.statistics import MeanInterval, mean_interval
-from rlftsim.viewer.figure import Band
+from rlftsim.viewer.figure import Band, Subplot, draw_subplots
 
 RATES = {"passed": "passed [%]", "reached": "reached [%]"}
 """Fractions of the rollouts of a goal (attributes of `Attained`), and their headings."""
@@ -22,6 +23,8 @@ SEED_NOTE = "Of every fine-tuned row one model is evaluated, that of seed 0, wha
 ROWS: Mapping[str, ModelSpec] = {"base": BASE, START: GOAL_FREE, **GUIDED}
 Attainment = Mapping[str, tuple[Attained, ...]]
 """Outcome of every goal, in the order of the goals, by row."""
+Curves = Mapping[str, Mapping[str, MeanInterval]]
+"""Mean rates by row and heading."""
 
 
 def open_held_out(suite: ExperimentSuite) -> tuple[ScenarioDataset, tuple[str, ...]]:
@@ -69,21 +72,32 @@ def estimate_mean(values: Iterable[float]) -> MeanInterval:
     return mean_interval(np.array(list(values), float))
 
 
-def build_rate_table(
-    title: str, headings: Sequence[str], curves: Mapping[str, Sequence[MeanInterval]], unit: str = ""
-) -> TextTable:
+def estimate_curves(
+    attained: Attainment, headings: Iterable[str], select_rates: Callable[[Sequence[Attained], str], Iterable[float]]
+) -> Curves:
+    """Mean rate of each row under each heading.
+
+    Args:
+        attained: Outcomes of the goals by row.
+        headings: Names of the conditions that goals are in, such as offsets in time.
+        select_rates: Function of a row's outcomes and a heading that returns the rates of which the mean is taken.
+    """
+    headings = list(headings)
+    return {row: {h: estimate_mean(select_rates(outcomes, h)) for h in headings} for row, outcomes in attained.items()}
+
+
+def build_rate_table(title: str, curves: Curves, unit: str = "") -> TextTable:
     """Table of mean rates in percent with standard errors.
 
     Args:
         title: Title above the table.
-        headings: Headings of the columns of rates.
-        curves: Rates by row, as many as headings; all rows have the same goals.
+        curves: Rates by row and heading; all rows have the same goals.
         unit: Words of the note for the unit of the rates, such as "percentage of rollouts, ".
     """
-    count = max(mean.count for curve in curves.values() for mean in curve)
-    cells = tuple((row, *map(format_rate, curve)) for row, curve in curves.items())
+    count = max(mean.count for curve in curves.values() for mean in curve.values())
+    cells = tuple((row, *map(format_rate, curve.values())) for row, curve in curves.items())
     note = f"Ego of {count} held-out scenarios; {unit}mean ± standard error over scenarios."
-    return TextTable(title, ("", *headings), cells, note)
+    return TextTable(title, ("", *next(iter(curves.values()))), cells, note)
 
 
 def format_rate(rate: MeanInterval) -> str:
@@ -111,13 +125,31 @@ def format_verdict(start_rates: Mapping[str, float], rates: Mapping[str, float])
     )
 
 
-def build_bands(curves: Mapping[str, Sequence[MeanInterval]]) -> tuple[Band, ...]:
-    """Curves of rates in percent for a figure; models without goals are dashed."""
+def draw_rates(
+    panels: Mapping[str, Curves], *, title: str, x_label: str, ticks: Sequence[str], is_joined: bool = True
+) -> Figure:
+    """Figure of rates in percent, two panels in a row; models without goals are dashed.
+
+    Args:
+        panels: Curves of each panel by title, with a rate for each tick.
+        title: Title above all panels.
+        x_label: Quantity and unit of the horizontal axes.
+        ticks: Names of the positions on the horizontal axis.
+        is_joined: True joins the dots of a curve, where the ticks have an order.
+    """
+    subplots = [Subplot(heading, _build_bands(curves)) for heading, curves in panels.items()]
+    y_label = "rollouts [%], 95 % interval"
+    return draw_subplots(
+        subplots, title=title, x_label=x_label, y_label=y_label, ticks=ticks, columns=2, is_joined=is_joined
+    )
+
+
+def _build_bands(curves: Curves) -> tuple[Band, ...]:
     bands = []
     for number, (name, curve) in enumerate(curves.items()):
         # Curves are shifted a little, so that their intervals lie beside each other.
         x = np.arange(len(curve)) + 0.07 * (number - (len(curves) - 1) / 2)
-        mean, low, high = 100 * np.array([(m.mean, *m.interval) for m in curve]).T  # each [ticks]
+        mean, low, high = 100 * np.array([(m.mean, *m.interval) for m in curve.values()]).T  # each [ticks]
         has_goals = name in GUIDED
         color = list(GUIDED).index(name) if has_goals else 4 + (name == START)
         style = "measured" if has_goals else "theory"

@@ -1,9 +1,12 @@
 """Goals of the ego on the logged path, earlier or later than the logged endpoint."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float
 
 from rlftsim.errors import DataError
+from rlftsim.evaluation.goal_attainment import Attained
 from rlftsim.experiments.paper import controllability
 from rlftsim.experiments.paper.controllability import RATES, ROWS, Attainment
 from rlftsim.experiments.paper.goal_conditioning import GUIDED, START
@@ -11,7 +14,6 @@ from rlftsim.experiments.results import Experiment, ExperimentResult
 from rlftsim.experiments.suite import ExperimentSuite
 from rlftsim.goals.goals_file import GoalEntry
 from rlftsim.scenario.types import STEP_S, TOTAL_STEPS, Scenario
-from rlftsim.viewer.figure import Subplot, draw_subplots
 
 NAME = "kinematic-controllability"
 OFFSETS_S = (-3, -2, -1, 0, 1, 2, 3)
@@ -79,29 +81,25 @@ def summarize(attained: Attainment, suite: ExperimentSuite) -> ExperimentResult:
         suite: Suite with the budget for the notes; no model is trained or evaluated here.
     """
 
-    def compute_rates(row: str, rate: str, *offsets_s: int) -> dict[str, float]:
-        compared = {f"{h:+d} s" for h in offsets_s}
-        return controllability.compute_scenario_rates((a for a in attained[row] if a.entry.label in compared), rate)
+    labels = {f"{h:+d} s": h for h in OFFSETS_S}
 
-    curves = {
-        rate: {
-            row: [controllability.estimate_mean(compute_rates(row, rate, h).values()) for h in OFFSETS_S]
-            for row in attained
-        }
-        for rate in RATES
-    }
-    labels, verdicts = [f"{h:+d} s" for h in OFFSETS_S], []
+    def compute_rates(outcomes: Sequence[Attained], rate: str, *compared: str) -> dict[str, float]:
+        return controllability.compute_scenario_rates((a for a in outcomes if a.entry.label in compared), rate)
+
+    curves, verdicts = {}, []
     for rate in RATES:
-        start_rates, *rates = (compute_rates(row, rate, *filter(None, OFFSETS_S)) for row in (START, *GUIDED))
+        curves[rate] = controllability.estimate_curves(
+            attained, labels, lambda outcomes, label, rate=rate: compute_rates(outcomes, rate, label).values()
+        )
+        moved_labels = [label for label, h in labels.items() if h]
+        start_rates, *rates = (compute_rates(attained[row], rate, *moved_labels) for row in (START, *GUIDED))
         for row, row_rates in zip(GUIDED, rates):
             verdict = controllability.format_verdict(start_rates, row_rates)
             verdicts.append(f"{row} against {START}, {rate}, H ≠ 0: {verdict}")
     return ExperimentResult(
         title="Kinematic controllability: goals of the ego that it would pass earlier or later",
         tables=tuple(
-            controllability.build_rate_table(
-                f"Ours: {heading} ↑ against H", labels, curves[rate], "percentage of rollouts, "
-            )
+            controllability.build_rate_table(f"Ours: {heading} ↑ against H", curves[rate], "percentage of rollouts, ")
             for rate, heading in RATES.items()
         ),
         verdicts=tuple(verdicts),
@@ -118,20 +116,18 @@ def summarize(attained: Attainment, suite: ExperimentSuite) -> ExperimentResult:
         numbers={
             rate: {
                 row: [
-                    {"offset_s": h, "mean": m.mean, "interval": m.interval, "scenarios": m.count}
-                    for h, m in zip(OFFSETS_S, curve)
+                    {"offset_s": labels[label], "mean": m.mean, "interval": m.interval, "scenarios": m.count}
+                    for label, m in curve.items()
                 ]
                 for row, curve in by_row.items()
             }
             for rate, by_row in curves.items()
         },
-        figure=draw_subplots(
-            tuple(Subplot(heading, controllability.build_bands(curves[rate])) for rate, heading in RATES.items()),
+        figure=controllability.draw_rates(
+            {heading: curves[rate] for rate, heading in RATES.items()},
             title="Goals of the ego, earlier or later on its path",
             x_label="H [s]",
-            y_label="rollouts [%], 95 % interval",
             ticks=[f"{h:+d}" for h in OFFSETS_S],
-            columns=2,
         ),
     )
 

@@ -1,18 +1,18 @@
 """Maneuvers as goals of the ego: the logged maneuver, an alternative that the lanes allow, or either."""
 
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 from rlftsim.evaluation.goal_attainment import Attained
 from rlftsim.experiments.paper import controllability, published
-from rlftsim.experiments.paper.controllability import RATES, ROWS, Attainment, estimate_mean, format_rate
+from rlftsim.experiments.paper.controllability import RATES, ROWS, Attainment, Curves, estimate_mean, format_rate
 from rlftsim.experiments.paper.goal_conditioning import GUIDED, START
 from rlftsim.experiments.paper.maneuver_goals import NAME, find_goals, is_logged, parse_maneuver
 from rlftsim.experiments.results import Experiment, ExperimentResult
 from rlftsim.experiments.suite import ExperimentSuite
 from rlftsim.experiments.tables import TextTable
-from rlftsim.scenario.maneuver import BENCHMARK_MANEUVERS, Maneuver
+from rlftsim.scenario.maneuver import BENCHMARK_MANEUVERS
 from rlftsim.statistics import MeanInterval
-from rlftsim.viewer.figure import Subplot, draw_subplots
 
 GOAL_RATES = {"passed_once": "goals passed in some rollout [%]", "reached_once": "goals reached in some rollout [%]"}
 """Fractions of the goals (attributes of `Attained`), and their headings. The paper does not say how it counts
@@ -25,8 +25,7 @@ IN_CONDITION: Mapping[str, Callable[[Attained], bool]] = {
 """Tests of a goal being in a condition."""
 CONDITIONS = (LOGGED, MIXED, ALTERNATIVE)
 """Mixed: the mean of a scenario's logged and its alternative goals."""
-ByManeuver = Mapping[tuple[str, str, str], Mapping[Maneuver, MeanInterval]]
-"""Mean rate of each maneuver, by rate, row and condition."""
+MANEUVERS = [maneuver.value for maneuver in BENCHMARK_MANEUVERS]
 
 
 def run(suite: ExperimentSuite) -> Attainment:
@@ -45,45 +44,42 @@ def summarize(attained: Attainment, suite: ExperimentSuite) -> ExperimentResult:
         attained: Outcomes that `run` returned; the labels of the goals have the maneuvers.
         suite: Suite with the budget for the notes; no model is trained or evaluated here.
     """
-    rows = list(attained)
     overall = {
-        rate: {
-            row: [estimate_mean(_compute_rates(attained[row], rate, c).values()) for c in CONDITIONS] for row in rows
-        }
+        rate: controllability.estimate_curves(
+            attained, CONDITIONS, lambda outcomes, c, rate=rate: _compute_rates(outcomes, rate, c).values()
+        )
         for rate in (*RATES, *GOAL_RATES)
     }
-    by_maneuver: ByManeuver = {
-        # Here the goal is the unit, not the scenario: a scenario has one goal of a maneuver or none.
-        (rate, row, condition): {
-            m: estimate_mean(getattr(a, rate) for a in filter(is_in, attained[row]) if parse_maneuver(a.entry) == m)
-            for m in BENCHMARK_MANEUVERS
-        }
+    # Here the goal is the unit, not the scenario: a scenario has one goal of a maneuver or none.
+    by_maneuver = {
+        (rate, condition): controllability.estimate_curves(
+            {row: tuple(filter(is_in, outcomes)) for row, outcomes in attained.items()},
+            MANEUVERS,
+            lambda outcomes, m, rate=rate: [getattr(a, rate) for a in outcomes if parse_maneuver(a.entry).value == m],
+        )
         for rate in RATES
-        for row in rows
         for condition, is_in in IN_CONDITION.items()
     }
     # All rows have the same goals: maneuvers without any are not drawn.
-    drawn_maneuvers = [
-        m for m in BENCHMARK_MANEUVERS if any(by_maneuver["passed", rows[0], c][m].count for c in IN_CONDITION)
-    ]
-    subplots = [
-        Subplot(
-            f"{condition}, {heading.removesuffix(' [%]')}",
-            controllability.build_bands(
-                {row: [by_maneuver[rate, row, condition][m] for m in drawn_maneuvers] for row in rows}
-            ),
-        )
-        for rate, heading in RATES.items()
-        for condition in IN_CONDITION
-    ]
+    counted_rows = [by_maneuver["passed", condition][START] for condition in IN_CONDITION]
+    drawn_maneuvers = [m for m in MANEUVERS if any(means[m].count for means in counted_rows)]
+    panels = {
+        f"{condition}, {RATES[rate].removesuffix(' [%]')}": {
+            row: {m: curve[m] for m in drawn_maneuvers} for row, curve in curves.items()
+        }
+        for (rate, condition), curves in by_maneuver.items()
+    }
     return ExperimentResult(
         title="Maneuver controllability: the ego's goal is its logged maneuver, or an alternative",
         tables=(
             *(
-                controllability.build_rate_table(f"Ours: {heading} ↑", CONDITIONS, overall[rate])
+                controllability.build_rate_table(f"Ours: {heading} ↑", overall[rate])
                 for rate, heading in (RATES | GOAL_RATES).items()
             ),
-            *_tabulate_maneuvers(by_maneuver, rows),
+            *(
+                _tabulate_maneuvers(condition, *(by_maneuver[rate, condition] for rate in RATES))
+                for condition in IN_CONDITION
+            ),
             published.load_table("maneuvers"),
         ),
         verdicts=tuple(_format_gain(attained, row, rate) for rate in (*RATES, "passed_once") for row in GUIDED),
@@ -98,31 +94,20 @@ def summarize(attained: Attainment, suite: ExperimentSuite) -> ExperimentResult:
             "without a violation.",
         ),
         numbers={
-            "conditions": {
-                rate_name: {
-                    row: {c: _to_numbers(rate) for c, rate in zip(CONDITIONS, rates)} for row, rates in by_row.items()
+            "conditions": _to_numbers(overall),
+            "maneuvers": _to_numbers(
+                {
+                    rate: {row: {c: by_maneuver[rate, c][row] for c in IN_CONDITION} for row in attained}
+                    for rate in RATES
                 }
-                for rate_name, by_row in overall.items()
-            },
-            "maneuvers": {
-                rate: {
-                    row: {
-                        c: {m.value: _to_numbers(mean) for m, mean in by_maneuver[rate, row, c].items()}
-                        for c in IN_CONDITION
-                    }
-                    for row in rows
-                }
-                for rate in RATES
-            },
-            "goals": [{"scenario": a.entry.scenario_id, "label": a.entry.label} for a in attained[rows[0]]],
+            ),
+            "goals": [{"scenario": a.entry.scenario_id, "label": a.entry.label} for a in attained[START]],
         },
-        figure=draw_subplots(
-            subplots,
+        figure=controllability.draw_rates(
+            panels,
             title="Maneuvers as goals of the ego",
             x_label="",
-            y_label="rollouts [%], 95 % interval",
-            ticks=[m.value.replace("_", "\n") for m in drawn_maneuvers],
-            columns=len(IN_CONDITION),
+            ticks=[m.replace("_", "\n") for m in drawn_maneuvers],
             is_joined=False,
         ),
     )
@@ -137,21 +122,17 @@ def _compute_rates(outcomes: Sequence[Attained], rate: str, condition: str) -> d
     return controllability.compute_scenario_rates(filter(IN_CONDITION[condition], outcomes), rate)
 
 
-def _tabulate_maneuvers(by_maneuver: ByManeuver, rows: Sequence[str]) -> list[TextTable]:
-    """A table for each condition: rows by maneuvers, with the number of goals of each."""
+def _tabulate_maneuvers(condition: str, passed: Curves, reached: Curves) -> TextTable:
+    """Table of a condition: rows by maneuvers, with the number of goals of each."""
 
-    def format_cell(row: str, condition: str, maneuver: Maneuver) -> str:
-        passed, reached = (by_maneuver[rate, row, condition][maneuver] for rate in RATES)
-        return f"{format_rate(passed)} / {format_rate(reached)}" if passed.count else "–"
+    def format_cell(row: str, maneuver: str) -> str:
+        if not passed[row][maneuver].count:
+            return "–"
+        return f"{format_rate(passed[row][maneuver])} / {format_rate(reached[row][maneuver])}"
 
-    tables = []
-    for condition in IN_CONDITION:
-        counts = by_maneuver["passed", rows[0], condition]
-        headings = (f"{m.value.replace('_', ' ')} ({counts[m].count})" for m in BENCHMARK_MANEUVERS)
-        cells = tuple((row, *(format_cell(row, condition, m) for m in BENCHMARK_MANEUVERS)) for row in rows)
-        title = f"Ours: {condition}, passed / reached [%] ↑ (goals)"
-        tables.append(TextTable(title, ("", *headings), cells))
-    return tables
+    headings = (f"{m.replace('_', ' ')} ({mean.count})" for m, mean in passed[START].items())
+    cells = tuple((row, *(format_cell(row, m) for m in MANEUVERS)) for row in passed)
+    return TextTable(f"Ours: {condition}, passed / reached [%] ↑ (goals)", ("", *headings), cells)
 
 
 def _format_gain(attained: Attainment, row: str, rate: str) -> str:
@@ -163,8 +144,11 @@ def _format_gain(attained: Attainment, row: str, rate: str) -> str:
     return f"{row} against {START}, {rate.replace('_', ' ')}, alternatives only{factor}: {verdict}"
 
 
-def _to_numbers(rate: MeanInterval) -> dict[str, object]:
-    return {name: getattr(rate, name) for name in ("mean", "standard_error", "interval", "count")}
+def _to_numbers(rates: Any) -> dict[str, Any]:
+    """Nested mapping of mean rates with plain numbers as leaves."""
+    if isinstance(rates, MeanInterval):
+        return {name: getattr(rates, name) for name in ("mean", "standard_error", "interval", "count")}
+    return {name: _to_numbers(branch) for name, branch in rates.items()}
 
 
 EXPERIMENT = Experiment(
