@@ -35,7 +35,8 @@ def write_exam(result: ExamResult, config: ExamConfig, ledger: Ledger) -> tuple[
         Tables and verdicts.
     """
     environment = describe_environment()
-    all_tables = (build_means_table(result), build_changes_table(result), build_margins_table(result))
+    means_table = tables.build_table("Means", [result.base, *(row.mean for row in result.rows)], COLUMNS)
+    all_tables = (means_table, build_changes_table(result), build_margins_table(result))
     lines = [row.verdict for row in result.rows] + [format_next_run(row) for row in result.rows if len(row.by_run) > 1]
     lines.append(f"On the split tune the base is most realistic at temperature {result.temperature:g}.")
     entries = [build_ledger_entry(row, result, config, environment["commit"]) for row in result.rows]
@@ -44,11 +45,6 @@ def write_exam(result: ExamResult, config: ExamConfig, ledger: Ledger) -> tuple[
     write_text(result.folder / "exam.md", format_page(result, all_tables, lines, environment))
     ledger.append([to_finite(entry) for entry in entries])
     return all_tables, lines
-
-
-def build_means_table(result: ExamResult) -> TextTable:
-    """Mean of every column, base first."""
-    return tables.build_table("Means", [result.base, *(row.mean for row in result.rows)], COLUMNS)
 
 
 def build_changes_table(result: ExamResult) -> TextTable:

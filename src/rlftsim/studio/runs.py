@@ -154,14 +154,10 @@ class Worker:
         self._wake = threading.Condition()
         self._waiting: Run | None = None
         self._running: Run | None = None
-        self._is_closed = False
+        self.is_closed = False
+        """True once the studio ends."""
         self._thread = threading.Thread(target=self._work, name="studio worker", daemon=True)
         self._thread.start()
-
-    @property
-    def is_closed(self) -> bool:
-        """True once the studio ends."""
-        return self._is_closed
 
     def close(self) -> None:
         """End the thread and what it simulates."""
@@ -171,7 +167,7 @@ class Worker:
     def stop(self) -> None:
         """Stop the running run at the next decision, and take no further run."""
         with self._wake:
-            self._is_closed = True
+            self.is_closed = True
             for run in (self._running, self._waiting):
                 if run is not None:
                     run.stop.set()
@@ -244,8 +240,8 @@ class Worker:
     def _work(self) -> None:
         while True:
             with self._wake:
-                self._wake.wait_for(lambda: self._waiting is not None or self._is_closed)
-                if self._is_closed:
+                self._wake.wait_for(lambda: self._waiting is not None or self.is_closed)
+                if self.is_closed:
                     return
                 run, self._waiting = self._waiting, None
                 assert run is not None
