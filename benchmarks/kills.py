@@ -146,7 +146,9 @@ def start(words, log):
 
 def start_fork_server():
     """Start the server that workers are forked from, for all commands that this process forks."""
-    forkserver.set_forkserver_preload([f"rlftsim.cli.{name}" for name in ("augment", "data", "results", "simulate", "submit")])
+    forkserver.set_forkserver_preload(
+        [f"rlftsim.cli.{name}" for name in ("augment", "data", "results", "simulate", "submit")]
+    )
     forkserver.ensure_running()
     forkserver._forkserver.ensure_running = lambda: None  # a forked command finds it by its address
 
