@@ -273,5 +273,5 @@ def film(config: DriveConfig, out: Path) -> Path:
         result = run_planner(env, load_planner(config.planner), scenario, seed=config.seed)
         records[f"{config.planner} in {traffic}"] = result.record
     path = out / f"{scenario.scenario_id}.webp"
-    to_film(path, build_animation(records), every=2, dots_per_inch=70)
+    to_film(path, build_animation(records), steps_per_frame=2, dots_per_inch=70)
     return path
