@@ -59,7 +59,12 @@ def propose(scenario: Scenario, track: int) -> tuple[Proposal, ...]:
 
 
 def to_goal_entry(scenario: Scenario, proposal: Proposal) -> GoalEntry:
-    """Entry of a goals file for a proposal of an agent of the scenario."""
+    """Entry of a goals file for a proposal, labeled with the maneuver.
+
+    Args:
+        scenario: Scenario of the agent, whose id the entry has.
+        proposal: Proposal for an agent of the scenario; the end of the path becomes the goal.
+    """
     x, y = proposal.position
     return GoalEntry(scenario.scenario_id, proposal.object_id, float(x), float(y), format_label(proposal))
 

@@ -53,6 +53,10 @@ def resolve_path(out: Path, name: str, *, replace: bool) -> Path:
 def save_goals(session: Session, body: SaveGoalsBody) -> Path:
     """Write a goals file, whole, with the goals of scenarios that the session's data set lacks.
 
+    Args:
+        session: Session with the folder of exports.
+        body: Request with the name of the file, without ending, and the text.
+
     Raises:
         DataError: The text is no goals file, in the words of `rlftsim goals check`.
         Refusal: As `resolve_path`.
@@ -64,7 +68,12 @@ def save_goals(session: Session, body: SaveGoalsBody) -> Path:
 
 
 def export(session: Session, run: Run, body: ExportBody) -> Path:
-    """Write rollouts of a complete run in the form that the request names.
+    """Write rollouts of a run in the form that the request names.
+
+    Args:
+        session: Session with the folder of exports and the scenario.
+        run: Run with complete rollouts.
+        body: Request with form, name of the file, variant, and first rollout of films and pages.
 
     Raises:
         Refusal: As `resolve_path`, or the rollouts are not complete.

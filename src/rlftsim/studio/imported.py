@@ -60,6 +60,10 @@ def import_rollouts(sources: tuple[str, ...]) -> dict[str, Imported]:
 def encode_imported(imported: Imported, scenario: Scenario) -> bytes:
     """Bytes of a scenario's rollouts in the map frame, as those of a simulated chunk.
 
+    Args:
+        imported: Rollouts of a file or folder, in the world frame.
+        scenario: Scenario of the rollouts, whose origin becomes that of the poses.
+
     Raises:
         Refusal: As `Imported.read_states`.
         DataError: As `Imported.read_states`.
@@ -73,7 +77,12 @@ def encode_imported(imported: Imported, scenario: Scenario) -> bytes:
 
 
 def score_imported(imported: Imported, scenario: Scenario, metric: str) -> dict[str, Any]:
-    """Score and explanation of a scenario's rollouts, as the page takes them.
+    """Score and explanation of a scenario's rollouts, in the layout of the page.
+
+    Args:
+        imported: Rollouts of a file or folder, in the world frame.
+        scenario: Scenario of the rollouts, with the logged future to compare with.
+        metric: Year of the meta-metric, "2025" or "2024".
 
     Raises:
         Refusal: As `Imported.read_states`.

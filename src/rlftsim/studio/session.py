@@ -84,7 +84,12 @@ class Recent:
         self._values: OrderedDict[Hashable, Any] = OrderedDict()
 
     def get(self, key: Hashable, compute: Callable[[], Any]) -> Any:
-        """Value of a key; `compute`, a function without arguments, makes a missing value."""
+        """Value of a key; a missing value is computed.
+
+        Args:
+            key: Hashable key, such as (split, scenario id).
+            compute: Function without arguments that makes the value; two threads may both compute a missing value.
+        """
         with self._lock:
             if key in self._values:
                 self._values.move_to_end(key)
@@ -152,6 +157,10 @@ class Session:
     def scenario(self, split: str, scenario_id: str) -> Scenario:
         """Scenario of a split by id.
 
+        Args:
+            split: Name of a split of the data set, such as "validation".
+            scenario_id: Id of a scenario in the split.
+
         Raises:
             Refusal: No such scenario (404).
         """
@@ -209,6 +218,10 @@ class Session:
     def scene(self, split: str, scenario_id: str) -> bytes:
         """JSON of the still scene and the logged motion of a scenario.
 
+        Args:
+            split: Name of a split of the data set, such as "validation".
+            scenario_id: Id of a scenario in the split.
+
         Raises:
             Refusal: No such scenario (404).
         """
@@ -216,7 +229,12 @@ class Session:
         return self._scenes.get((split, scenario_id), lambda: _encode_scene(scenario))
 
     def proposals(self, split: str, scenario_id: str, agent: int) -> dict[str, Any]:
-        """Maneuvers that an agent (an object id) can do, with paths and goals.
+        """Maneuvers that an agent can do, with paths and goals.
+
+        Args:
+            split: Name of a split of the data set, such as "validation".
+            scenario_id: Id of a scenario in the split.
+            agent: Object id of a simulated agent.
 
         Raises:
             Refusal: No such scenario (404).
@@ -227,7 +245,12 @@ class Session:
         return self._proposals.get((split, scenario_id, agent), lambda: _describe_proposals(scenario, track))
 
     def doubts(self, scenario: Scenario, goals: tuple[GoalEntry, ...]) -> list[dict[str, Any]]:
-        """Refusal or doubts of each goal of a scenario, in the words of `rlftsim goals check`."""
+        """Refusal or doubts of each goal, in the words of `rlftsim goals check`.
+
+        Args:
+            scenario: Scenario that the goals are placed in.
+            goals: Goals to check, in the order of the answer.
+        """
         answers = []
         for entry in goals:
             refusal, doubts = "", []

@@ -74,11 +74,21 @@ def to_goal_entries(body: RunBody | CheckBody) -> tuple[GoalEntry, ...]:
 
 
 def free_variant(variants: tuple[Variant, ...], index: int) -> int:
-    """Index of the variant of the same model without goals, possibly `index`."""
+    """Index of the variant of the same model without goals, possibly `index`.
+
+    Args:
+        variants: All variants of a run; each model has a variant without goals.
+        index: Index of a variant in the run.
+    """
     model = variants[index].model
     return next(i for i, variant in enumerate(variants) if variant.model == model and not variant.goals)
 
 
 def has_goals(variants: tuple[Variant, ...], index: int) -> bool:
-    """True if the model of the variant at `index` is also simulated with goals."""
+    """True if the variant's model is simulated with goals, too.
+
+    Args:
+        variants: All variants of a run.
+        index: Index of a variant in the run.
+    """
     return any(variant.goals and variant.model == variants[index].model for variant in variants)

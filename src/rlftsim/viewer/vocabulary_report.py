@@ -61,7 +61,13 @@ def write_vocabulary_report(folder: Path, classes: tuple[ClassCoverage, ...], *,
 
 
 def report_numbers(classes: tuple[ClassCoverage, ...], *, vocabulary: str, data: str) -> dict[str, object]:
-    """All numbers of the page as plain JSON values in SI units; arguments as for `write_vocabulary_report`."""
+    """All numbers of the page as plain JSON values in SI units.
+
+    Args:
+        classes: Coverage of each class of agents, the result of `measure_coverage`.
+        vocabulary: Description of the vocabulary, for titles.
+        data: Description of the data that the vocabulary is compared with.
+    """
 
     def summarize(spread: Spread) -> dict[str, object]:
         return {"count": spread.count, "mean": spread.mean, "p95": spread.p95, "max": spread.max}
@@ -117,7 +123,13 @@ worst represented. *Implausible*: a turn of more than 30° or a distance beyond 
 
 
 def report_page(classes: tuple[ClassCoverage, ...], *, vocabulary: str, data: str) -> str:
-    """Report as Markdown; arguments as for `write_vocabulary_report`."""
+    """Report as Markdown.
+
+    Args:
+        classes: Coverage of each class of agents, the result of `measure_coverage`.
+        vocabulary: Description of the vocabulary, for titles.
+        data: Description of the data that the vocabulary is compared with.
+    """
     head = ["| | " + " | ".join(c.class_name for c in classes) + " |", "|---|" + "---:|" * len(classes)]
     body = [f"| {name} | " + " | ".join(format_cell(c) for c in classes) + " |" for name, format_cell in ROWS.items()]
     table = "\n".join(head + body)

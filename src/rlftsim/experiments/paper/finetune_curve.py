@@ -31,7 +31,12 @@ def name_start(curve: FineTuned) -> str:
 
 
 def point(curve: str, epochs: float) -> str:
-    """Name of a point's row: the curve, and its epochs of fine-tuning."""
+    """Name of a point's row.
+
+    Args:
+        curve: Name of the curve, a key of `CURVES`.
+        epochs: Epochs of fine-tuning at the point.
+    """
     return f"{curve}, {epochs:g} epochs"
 
 

@@ -24,7 +24,12 @@ COLUMNS = (*SCORES, DRIFT_COLUMNS[0])
 
 
 def point(reward: str, fraction: float) -> str:
-    """Name of a point's row: the reward, and the fraction of the runs, of `FRACTIONS`."""
+    """Name of a point's row.
+
+    Args:
+        reward: Name of the reward, a key of `REWARDS`.
+        fraction: Fraction of the reward's runs at the point, from `FRACTIONS`.
+    """
     return f"{reward}, {fraction:.0%} of the run"
 
 
