@@ -17,8 +17,8 @@ from rlftsim.jobs.progress import log, progress_bar
 from rlftsim.policies.registry import Device, load_policy, with_guidance
 from rlftsim.rollout.files import write_rollouts
 from rlftsim.rollout.fingerprint import fingerprint_policy
-from rlftsim.rollout.policy import Sampling, device_of, is_goal_conditioned
-from rlftsim.rollout.simulate import refuse_sampling, simulate
+from rlftsim.rollout.policy import Sampling, get_device, is_goal_conditioned
+from rlftsim.rollout.simulate import check_sampling, simulate
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.open import open_dataset, refuse_unknown
 
@@ -96,7 +96,7 @@ class Simulate:
                 warn_of_doubts(entries, scenarios.by_id(scenario_id))
             elif given.goals:
                 log.info(f"  scenario {scenario_id} has no goals: it is simulated without.")
-        refuse_sampling(policy, scenarios, sampling)
+        check_sampling(policy, scenarios, sampling)
         # 2. describe the rollouts; a folder of other rollouts is refused
         about = {
             "model": self.model,
@@ -113,7 +113,7 @@ class Simulate:
         left = left_to_simulate(self.out, ids, self.num_rollouts)
         with progress_bar("simulate", len(ids), len(ids) - len(left)) as advance:
             for scenario_id in left:
-                batch = collate([scenarios.by_id(scenario_id)]).to(device_of(policy))
+                batch = collate([scenarios.by_id(scenario_id)]).to(get_device(policy))
                 entries = given.of_scenario(scenario_id)
                 goals = goals_of_batch(entries, batch) if entries else None
                 rollouts = simulate(

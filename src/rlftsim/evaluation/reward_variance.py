@@ -26,7 +26,7 @@ from rlftsim.jobs.runner import on_this_machine
 from rlftsim.realism import Features, ScenarioLog, compute_features, metric_by_name, scenario_log, score_features
 from rlftsim.rewards.base import leave_one_out
 from rlftsim.rewards.mloo import compute_mloo
-from rlftsim.rollout.policy import Policy, device_of
+from rlftsim.rollout.policy import Policy, get_device
 from rlftsim.scenario.dataset import ScenarioDataset
 
 SIZES = (2, 3, 4, 6, 8, 12, 16, 24, 32)
@@ -76,7 +76,7 @@ def measure_variances(
             "a slope over N = 2, 3, 4, ... needs 4 rollouts at least, "
             f"got {config.num_rollouts}: set --num-rollouts 32."
         )
-    check_jobs(config, device_of(policy))
+    check_jobs(config, get_device(policy))
     ids = [dataset.scenario_ids[i] for i in choose_scenarios(dataset, config)]
     identity = {"sizes": list(sizes), **identity_of(policy, dataset, config)}
     files = JsonParts(Path(out), ids, dict.fromkeys(ids, identity), {}, _stored_variances)
@@ -136,7 +136,7 @@ def _stored_variances(scenario_id: str, values: Mapping[str, Any]) -> Float[np.n
 
 def _measure_scenario(job: _Job, position: int) -> dict[str, object]:
     """Simulate once and score subsets of the rollouts."""
-    scenario, config, device = job.dataset[position], job.config, device_of(job.policy)
+    scenario, config, device = job.dataset[position], job.config, get_device(job.policy)
     try:
         log = scenario_log(scenario, device)
     except DataError as error:

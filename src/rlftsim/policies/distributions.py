@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 
 from rlftsim.policies.token_rows import TokenRows, row_statistics
-from rlftsim.rollout.baselines import refuse_top_k
+from rlftsim.rollout.baselines import check_no_top_k
 from rlftsim.rollout.policy import DecisionStatistics, Sampling
 from rlftsim.rollout.rows import pick_rows, place_rows
 
@@ -98,7 +98,7 @@ class CategoricalDistribution:
 
     def _rows(self, values: Tensor) -> Tensor:
         """Values of the R elements."""
-        return pick_rows(values, self.mask, has_all=self._num_rows == self.mask.numel())
+        return pick_rows(values, self.mask, is_dense=self._num_rows == self.mask.numel())
 
     def _dense(self, values: Tensor) -> Tensor:
         """Values of the R elements at their places, zero elsewhere."""
@@ -182,7 +182,7 @@ class GaussianDistribution:
         Raises:
             ConfigError: `sampling.top_k` is set, and there are no categories.
         """
-        refuse_top_k(sampling)
+        check_no_top_k(sampling)
         drawn = math.sqrt(sampling.temperature) * standard_normal(noise)
         return self._masked(self.mean + self.std * drawn.to(self.mean.dtype))
 
@@ -197,7 +197,7 @@ class GaussianDistribution:
             decision: as drawn.
             sampling: temperature it was drawn with.
         """
-        refuse_top_k(sampling)
+        check_no_top_k(sampling)
         if sampling.temperature == 0:
             return torch.zeros_like(self.mean[..., 0])
         std = self.std * math.sqrt(sampling.temperature)

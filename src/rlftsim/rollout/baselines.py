@@ -30,7 +30,7 @@ class PointMass:
         Raises:
             ConfigError: `sampling.top_k` is set.
         """
-        refuse_top_k(sampling)
+        check_no_top_k(sampling)
         return self.decision
 
     def log_prob(self, decision: Tensor, sampling: Sampling = Sampling()) -> Float[Tensor, "*batch"]:  # noqa: B008
@@ -40,7 +40,7 @@ class PointMass:
             decision: any; its last axis is the event.
             sampling: as in `sample`.
         """
-        refuse_top_k(sampling)
+        check_no_top_k(sampling)
         return torch.zeros_like(decision[..., 0])
 
     def kl(self, other: "PointMass") -> Float[Tensor, "*batch"]:
@@ -52,7 +52,7 @@ class PointMass:
         return torch.zeros_like(self.decision[..., 0])
 
 
-def refuse_top_k(sampling: Sampling) -> None:
+def check_no_top_k(sampling: Sampling) -> None:
     """Raise a ConfigError where top-k is asked of a policy that has no categories."""
     if sampling.top_k is not None:
         raise ConfigError(f"top_k={sampling.top_k} needs a policy with categories, this one has none: leave top_k out.")

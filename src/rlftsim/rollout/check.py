@@ -35,9 +35,9 @@ from rlftsim.rollout.policy import (
     Policy,
     Sampling,
     decision_statistics,
-    device_of,
     encode_like,
-    score_both,
+    get_device,
+    score_with_reference,
 )
 from rlftsim.rollout.simulate import simulate
 from rlftsim.rollout.types import AgentStates, Rollouts
@@ -209,7 +209,7 @@ class _Subject:
         return other
 
     def collate(self, scenarios: Sequence[Scenario], max_agents: int | None = None) -> ScenarioBatch:
-        return collate(scenarios, max_agents=max_agents).to(device_of(self.policy))
+        return collate(scenarios, max_agents=max_agents).to(get_device(self.policy))
 
     def simulate(self, batch: ScenarioBatch, num_rollouts: int | range = NUM_ROLLOUTS, **options) -> Rollouts:
         return simulate(self.policy, batch, num_rollouts=num_rollouts, seed=SEED, **options)
@@ -559,7 +559,7 @@ def shared_passes_change_no_number(subject: _Subject) -> str:
             with torch.no_grad():
                 context = frozen.encode(subject.batch)
                 contexts = [encode_like(policy, subject.batch, context) for policy in (frozen, reference)]
-                dist, ref_dist = score_both(frozen, contexts[0], rollouts, reference, contexts[1], rollouts)
+                dist, ref_dist = score_with_reference(frozen, contexts[0], rollouts, reference, contexts[1], rollouts)
                 found = decision_statistics(dist, decision, ref_dist)
             kl = alone.kl(subject.score(subject.batch, rollouts, reference))
             gaps += [_gap(found.log_prob, alone.log_prob(decision)), _gap(found.kl, kl)]
@@ -582,7 +582,7 @@ def scores_are_invariant_to_rotation_and_translation(subject: _Subject) -> str:
         batch = subject.collate(moved)
         # map frames have their origin on whole meters, so it does not follow a scenario exactly
         origins = [a.origin + np.array(SHIFT_M) - b.origin for a, b in zip(still.scenarios, moved)]
-        offset = torch.from_numpy(np.stack(origins).astype(np.float32)).to(device_of(subject.policy))  # [B, 2]
+        offset = torch.from_numpy(np.stack(origins).astype(np.float32)).to(get_device(subject.policy))  # [B, 2]
         for rollouts in (still.rollouts, still.with_forced, still.with_goals):
             scored = subject.log_prob(batch, _move_rollouts(rollouts, turn, offset))
             gaps[what] = max(gaps.get(what, 0.0), _gap(scored, subject.log_prob(still.batch, rollouts)))

@@ -280,7 +280,7 @@ class LoadablePolicy(Protocol):
 class PartlyTrainedPolicy(Protocol):
     """A policy with parts that fine-tuning leaves alone. Without this, all of its weights are trained."""
 
-    def fine_tuned_parts(self) -> tuple[nn.Module, ...]:
+    def fine_tuned_modules(self) -> tuple[nn.Module, ...]:
         """Submodules to be trained by default; the others are frozen unless `trained="all"`."""
         ...
 
@@ -289,7 +289,7 @@ class PartlyTrainedPolicy(Protocol):
 class PolicyWithHead(Protocol):
     """A policy that can be fine-tuned in its last layers alone, by `trained="head"`: for few rollouts."""
 
-    def head_parts(self) -> tuple[nn.Module, ...]:
+    def head_modules(self) -> tuple[nn.Module, ...]:
         """Submodules to be trained; what they decide by stays as it is."""
         ...
 
@@ -316,7 +316,7 @@ class SharingPolicy(Policy, Protocol):
         """
         ...
 
-    def score_both(
+    def score_with_reference(
         self, context: Any, rollouts: Rollouts, reference: Any, ref_context: Any, ref_rollouts: Rollouts
     ) -> tuple[DecisionDistribution, DecisionDistribution]:
         """`score` of this policy, and without gradient of a reference.
@@ -342,7 +342,7 @@ def encode_like(policy: Policy, scenarios: ScenarioBatch, context: Any) -> Any:
     return policy.encode_like(scenarios, context) if isinstance(policy, SharingPolicy) else policy.encode(scenarios)
 
 
-def score_both(
+def score_with_reference(
     policy: Policy, context: Any, rollouts: Rollouts, reference: Policy, ref_context: Any, ref_rollouts: Rollouts
 ) -> tuple[DecisionDistribution, DecisionDistribution]:
     """Distributions along rollouts under a policy and, without gradient, under a reference.
@@ -356,7 +356,7 @@ def score_both(
         ref_rollouts: the same object, or the same rollouts under other goals.
     """
     if isinstance(policy, SharingPolicy):
-        return policy.score_both(context, rollouts, reference, ref_context, ref_rollouts)
+        return policy.score_with_reference(context, rollouts, reference, ref_context, ref_rollouts)
     dist = policy.score(context, rollouts)
     with torch.no_grad():
         return dist, reference.score(ref_context, ref_rollouts)
@@ -451,7 +451,7 @@ class GoalConditionedPolicy(Policy, Protocol):
     """True if goals have an effect. False lets a class implement this protocol and some of its models not follow
     goals."""
 
-    def goal_parts(self) -> tuple[nn.Module, ...]:
+    def goal_modules(self) -> tuple[nn.Module, ...]:
         """Submodules that only goals use: `trained="goals"` trains these alone, and their learning rate can be scaled.
 
         Empty in a model that is not goal-conditioned.
@@ -488,7 +488,7 @@ class ConditionablePolicy(Protocol):
 # ------------------------------------------------------------------------------------------
 
 
-def device_of(policy: object) -> torch.device:
+def get_device(policy: object) -> torch.device:
     """Device of a policy's weights; the CPU for a policy without any."""
     weights = policy.parameters() if isinstance(policy, nn.Module) else ()
     return next((w.device for w in weights), torch.device("cpu"))

@@ -11,32 +11,32 @@ from jaxtyping import Bool, Int64
 from torch import Tensor
 
 
-def row_places(mask: Bool[Tensor, "*batch"], has_all: bool) -> tuple[Int64[Tensor, "R"], ...]:
+def find_rows(mask: Bool[Tensor, "*batch"], is_dense: bool) -> tuple[Int64[Tensor, "R"], ...]:
     """Index of each row along each axis of a mask, as `nonzero(as_tuple=True)`.
 
     Args:
         mask: True = the element has a row.
-        has_all: all elements have one, and the mask is not read.
+        is_dense: all elements have one, and the mask is not read.
     """
-    return _all_places(mask.shape, mask.device) if has_all else mask.nonzero(as_tuple=True)
+    return _all_rows(mask.shape, mask.device) if is_dense else mask.nonzero(as_tuple=True)
 
 
 @lru_cache(maxsize=4)
-def _all_places(shape: torch.Size, device: torch.device) -> tuple[Int64[Tensor, "R"], ...]:
+def _all_rows(shape: torch.Size, device: torch.device) -> tuple[Int64[Tensor, "R"], ...]:
     """Indices of all elements; kept, because they are the same at every decision of a rollout."""
     places = torch.meshgrid(*(torch.arange(size, device=device) for size in shape), indexing="ij")
     return tuple(place.flatten() for place in places)
 
 
-def pick_rows(values: Tensor, mask: Bool[Tensor, "*batch"], has_all: bool) -> Tensor:
+def pick_rows(values: Tensor, mask: Bool[Tensor, "*batch"], is_dense: bool) -> Tensor:
     """Values [*batch, ...] of the elements whose mask is True, as rows [R, ...].
 
     Args:
         values: of all elements.
         mask: True = the element has a row.
-        has_all: all elements have one, and the mask is not read.
+        is_dense: all elements have one, and the mask is not read.
     """
-    return values.flatten(0, mask.dim() - 1) if has_all else values[mask]
+    return values.flatten(0, mask.dim() - 1) if is_dense else values[mask]
 
 
 def place_rows(rows: Tensor, mask: Bool[Tensor, "*batch"]) -> Tensor:

@@ -11,7 +11,7 @@ from rlftsim.errors import ConfigError, DataError
 from rlftsim.goals.types import Goals
 from rlftsim.jobs.threads import one_thread
 from rlftsim.rollout.noise import draw_noise
-from rlftsim.rollout.policy import DecisionDistribution, Policy, Sampling, device_of
+from rlftsim.rollout.policy import DecisionDistribution, Policy, Sampling, get_device
 from rlftsim.rollout.types import AgentStates, Rollouts
 from rlftsim.scenario.batch import ScenarioBatch, collate
 from rlftsim.scenario.types import FUTURE_STEPS, Scenarios
@@ -136,7 +136,7 @@ def simulate(
     )
 
 
-def refuse_sampling(policy: Policy, scenarios: Scenarios, sampling: Sampling) -> None:
+def check_sampling(policy: Policy, scenarios: Scenarios, sampling: Sampling) -> None:
     """Refuse, before long work, a truncation that the policy's decisions do not have.
 
     Args:
@@ -148,7 +148,7 @@ def refuse_sampling(policy: Policy, scenarios: Scenarios, sampling: Sampling) ->
         ConfigError: `sampling.top_k` is set, and decisions are not categories.
     """
     if sampling.top_k is not None:  # only a draw shows whether there are categories to choose from
-        simulate(policy, collate([scenarios[0]]).to(device_of(policy)), num_rollouts=1, seed=0, sampling=sampling)
+        simulate(policy, collate([scenarios[0]]).to(get_device(policy)), num_rollouts=1, seed=0, sampling=sampling)
 
 
 def _join(forces: list[AgentStates | None], path: Float[Tensor, "B N A T 3"]) -> AgentStates | None:

@@ -66,7 +66,7 @@ class RolloutProvenance:
         """Ids of the scenarios, in the order of the rollouts' axis B."""
         return tuple(scenario.scenario_id for scenario in self.scenarios)
 
-    def refuse_other_agents(self, row: int, scenario: Scenario) -> None:
+    def check_same_agents(self, row: int, scenario: Scenario) -> None:
         """Check that a scenario simulates the agents of the one that was simulated, around the same origin.
 
         Its logged future and its map may differ.
@@ -141,7 +141,7 @@ class Rollouts:
 
     # ---- agents by object id: rollouts that `rlftsim.simulate` returned ------------------------------------------
 
-    def row_of(self, scenario_id: str | None = None) -> int:
+    def find_row(self, scenario_id: str | None = None) -> int:
         """Index of a scenario on axis B.
 
         Args:
@@ -163,9 +163,9 @@ class Rollouts:
         """Object ids of a scenario's simulated agents, in the order of axis A; a scenario's padding has none.
 
         Raises:
-            ConfigError: see `row_of`.
+            ConfigError: see `find_row`.
         """
-        row = self.row_of(scenario_id)
+        row = self.find_row(scenario_id)
         assert self.provenance is not None
         scenario = self.provenance.scenarios[row]
         return scenario.tracks.object_id[scenario.simulated_indices]
@@ -178,9 +178,9 @@ class Rollouts:
             scenario_id: None stands for the only scenario.
 
         Raises:
-            ConfigError: no such agent (the message lists those that are simulated), or see `row_of`.
+            ConfigError: no such agent (the message lists those that are simulated), or see `find_row`.
         """
-        row, ids = self.row_of(scenario_id), self.object_ids(scenario_id)
+        row, ids = self.find_row(scenario_id), self.object_ids(scenario_id)
         assert self.provenance is not None
         scenario = self.provenance.scenarios[row]
         if object_id not in ids:

@@ -33,7 +33,7 @@ from rlftsim.jobs.lease import Lease, remove_locks
 from rlftsim.jobs.progress import log, progress_bar
 from rlftsim.jobs.runner import Runner, on_this_machine, require_finished
 from rlftsim.jobs.threads import one_thread
-from rlftsim.rollout.policy import Policy, device_of
+from rlftsim.rollout.policy import Policy, get_device
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.types import Scenario
 from rlftsim.submission.archive import Piece, count_joined, join_pieces, write_piece
@@ -94,7 +94,7 @@ def build_archive(
         Unfinished: `runner` is a share, which is done, while others are not.
     """
     check_folder(job.folder, "submission")
-    check_jobs(job.config, device_of(job.policy))
+    check_jobs(job.config, get_device(job.policy))
     archive = job.folder / ARCHIVE
     numbers = range(len(job.plan.shards))
     runner = runner or on_this_machine(job.config.jobs, len(numbers))
@@ -176,7 +176,7 @@ def _build_shard(job: Job, number: int, advance: Callable[[int], None], is_stopp
 
 def _simulate_message(job: Job, scenario: Scenario, shard: str) -> bytes:
     """Rollouts of a scenario as they are written, checked."""
-    states = simulate_states(job.policy, scenario, job.config, device_of(job.policy))
+    states = simulate_states(job.policy, scenario, job.config, get_device(job.policy))
     message = encode_rollouts(scenario.scenario_id, round_states(states, job.round_m))
     for finding in check_rollouts(decode_rollouts(message), scenario, shard).findings:
         if finding.severity == "error":

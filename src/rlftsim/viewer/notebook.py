@@ -127,7 +127,7 @@ def show(scenario: AnyScenarios, *rollouts: Rollouts, titles: str | Sequence[str
                     "scenarios they are of."
                 )
             # By id where the rollouts know their scenarios, else by position.
-            place = row if simulated.provenance is None else simulated.row_of(one.scenario_id)
+            place = row if simulated.provenance is None else simulated.find_row(one.scenario_id)
             motion = rollout_trajectories(one, simulated, row=place, max_rollouts=MAX_ROLLOUTS)
             panels.append(Panel(name, motion.with_overlaps(scene.agents)))
         figures.append(animation_html(Animation(f"Scenario {one.scenario_id}", scene, panels)))

@@ -272,7 +272,7 @@ def rollout_trajectories(
     """
     about = rollouts.provenance
     if about is not None:
-        about.refuse_other_agents(row, scenario)
+        about.check_same_agents(row, scenario)
     num_agents = len(scenario.simulated_indices)
     if rollouts.position.shape[2] < num_agents:
         raise DataError(

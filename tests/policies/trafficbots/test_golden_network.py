@@ -50,7 +50,7 @@ def test_parameters_are_the_public_ones_without_the_unused(golden, request, fixt
     assert count(network.actions) + 6 == parts["action_head"]
     if fixture == "default":
         assert count(policy) == 7_912_032
-        assert sum(count(part) for part in policy.fine_tuned_parts()) == 1_707_398
+        assert sum(count(part) for part in policy.fine_tuned_modules()) == 1_707_398
 
 
 def golden_shapes(golden):

@@ -170,7 +170,7 @@ def test_two_passes_have_the_gradient_of_one(scenarios):
     assert float(total.sum().detach()) == pytest.approx(float(found.sums["imitation_loss"]), rel=1e-6)
     one_pass = torch.autograd.grad(total.sum(), weights, allow_unused=True)
     # Weights that only the imitation loss trains: all that decide actions.
-    deciding = {id(weight) for part in policy.fine_tuned_parts() for weight in part.parameters()}
+    deciding = {id(weight) for part in policy.fine_tuned_modules() for weight in part.parameters()}
     compared = [id(weight) in deciding for weight in weights]
     ours, plain = (
         torch.cat([grad.flatten() for grad, is_one in zip(grads, compared) if is_one and grad is not None])

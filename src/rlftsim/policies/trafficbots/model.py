@@ -34,7 +34,7 @@ class TrafficBotsModel(nn.Module):
         self.config = config
         self.network = TrafficBotsNetwork(config)
 
-    def fine_tuned_parts(self) -> tuple[nn.Module, ...]:
+    def fine_tuned_modules(self) -> tuple[nn.Module, ...]:
         """Everything that decides actions.
 
         The destination predictor and the map stay as they are: destinations are drawn from them once per rollout, and
@@ -44,7 +44,7 @@ class TrafficBotsModel(nn.Module):
         destination = (network.destination_map, network.destination_pose, network.add_destination)
         return network.agents, *destination, network.add_personality, network.actions
 
-    def head_parts(self) -> tuple[nn.Module, ...]:
+    def head_modules(self) -> tuple[nn.Module, ...]:
         """The last layer that decides how vehicles accelerate.
 
         Rollouts say next to nothing of yaw rate, whose noise is narrow: training it would be a random walk.

@@ -172,7 +172,7 @@ class TrafficBotsPolicy(TrafficBotsModel):
         record = context.record if self.has_features_of(context.model) else None
         return replace(context, around=around, model=self, record=record)
 
-    def score_both(
+    def score_with_reference(
         self, context: TrafficBotsContext, rollouts: Rollouts, reference: Any, ref_context: Any, ref_rollouts: Rollouts
     ) -> tuple[GaussianDistribution, DecisionDistribution]:
         """Distributions along rollouts of this policy and, without gradient, of a reference.
