@@ -34,7 +34,7 @@ from rlftsim.rollout.policy import (
     DecisionDistribution,
     Policy,
     Sampling,
-    decision_statistics,
+    compute_statistics,
     encode_like,
     get_device,
     score_with_reference,
@@ -560,7 +560,7 @@ def shared_passes_change_no_number(subject: _Subject) -> str:
                 context = frozen.encode(subject.batch)
                 contexts = [encode_like(policy, subject.batch, context) for policy in (frozen, reference)]
                 dist, ref_dist = score_with_reference(frozen, contexts[0], rollouts, reference, contexts[1], rollouts)
-                found = decision_statistics(dist, decision, ref_dist)
+                found = compute_statistics(dist, decision, ref_dist)
             kl = alone.kl(subject.score(subject.batch, rollouts, reference))
             gaps += [_gap(found.log_prob, alone.log_prob(decision)), _gap(found.kl, kl)]
             gaps.append(_gap(found.entropy, alone.entropy()))
