@@ -144,7 +144,7 @@ def test_scoring_with_a_reference_is_scoring_twice(batch, trained):
         for weight in learner.parameters():
             weight.add_(0.02 * torch.randn_like(weight) if weight.requires_grad else 0.0)
     assert isinstance(learner, SharingPolicy)
-    assert learner.has_features_of(reference) == (trained == "head")
+    assert learner.shares_agent_features(reference) == (trained == "head")
     with torch.no_grad():
         rollouts = simulate(learner, batch, num_rollouts=2, seed=0)
         ref_context = reference.encode(batch)
@@ -170,13 +170,13 @@ def test_nothing_is_shared_in_training_mode_or_with_other_settings(batch):
     learner = TrafficBotsPolicy(TINY).requires_grad_(False).eval()
     same, other = copy.deepcopy(learner), TrafficBotsPolicy(replace(TINY, map_neighbors=2)).requires_grad_(False).eval()
     other.load_state_dict(learner.state_dict())
-    assert learner.sees_as(same)
-    assert learner.has_features_of(same)
-    assert not learner.sees_as(other)
+    assert learner.shares_scene_features(same)
+    assert learner.shares_agent_features(same)
+    assert not learner.shares_scene_features(other)
     # Dropout would give each model features of its own.
     same.train()
-    assert not learner.sees_as(same)
-    assert not learner.has_features_of(same)
+    assert not learner.shares_scene_features(same)
+    assert not learner.shares_agent_features(same)
     context = same.eval().encode(batch)
     same.network.map.requires_grad_(True)
     assert learner.encode_like(batch, context).map_features is not context.map_features
