@@ -14,7 +14,7 @@ from rlftsim.evaluation import evaluate as evaluation
 from rlftsim.evaluation.compare import Comparison
 from rlftsim.evaluation.compare import compare as compare_evaluations
 from rlftsim.evaluation.results import EvaluateConfig, Evaluation
-from rlftsim.jobs.buckets import require_folder
+from rlftsim.jobs.buckets import validate_folder
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import Policy, Sampling
 from rlftsim.scenario.any_form import AnyScenarios, Name, scenarios_of
@@ -88,7 +88,7 @@ def evaluate(
             folder, split = temporary / "scenarios", None
             write_dataset((scenarios[position] for position in range(len(scenarios))), folder)
         # Without `out` the results are in memory alone when the folder is gone.
-        out = require_folder(out or temporary / "results")
+        out = validate_folder(out or temporary / "results")
         return evaluation.evaluate(subject, folder, out, replace(config, split=split), name=name)
 
 

@@ -13,7 +13,7 @@ from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.any_form import AnyScenarios, Name, scenarios_of
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.types import Scenario
-from rlftsim.viewer.notebook import require_rollouts
+from rlftsim.viewer.notebook import check_rollouts
 
 
 def score(scenarios: AnyScenarios, rollouts: Rollouts, metric: str | int = "2025") -> RealismResult:
@@ -35,7 +35,7 @@ def score(scenarios: AnyScenarios, rollouts: Rollouts, metric: str | int = "2025
         DataError: a scenario that cannot be scored, e.g. one without its future, a pose that is not finite, or a
             scenario with other agents than the simulated one.
     """
-    require_rollouts("score", scenarios, rollouts)
+    check_rollouts("score", scenarios, rollouts)
     batch = batch_of(scenarios, rollouts.position.device)
     # 1. Refuse rollouts of other scenarios: by the ids of scenarios and agents where they know them, else by numbers.
     about = rollouts.provenance

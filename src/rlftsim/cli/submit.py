@@ -8,13 +8,13 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional
 
-from rlftsim.cli.machines import Work
 from rlftsim.errors import ConfigError, DataError, shorten
 from rlftsim.evaluation.evaluate import EvaluateConfig, evaluation_name, frozen_copy
 from rlftsim.evaluation.scenario_source import choose_scenarios
 from rlftsim.evaluation.score_files import format_scores
 from rlftsim.jobs.folder import check_file
 from rlftsim.jobs.progress import print_wide
+from rlftsim.jobs.runner import Work
 from rlftsim.policies.registry import Device, load_policy
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.simulate import check_sampling

@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from rlftsim.envs.actions import Controls, controls_of
+from rlftsim.envs.actions import Controls, build_controls
 from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.episode import Episode, ScenarioGoals, build_episode
 from rlftsim.envs.world import build_world
@@ -27,10 +27,10 @@ class Source:
     """Scenarios, traffic model and settings of an environment.
 
     Args:
-        config: settings.
-        scenarios: in place of the data set that the settings name; of another name the same split.
-        policy: in place of the model that the settings name.
-        controlled: rules of the planner-driven agents, which come first.
+        config: Settings of the environment; `data` and `model` name what is loaded here.
+        scenarios: Scenarios in place of the data set in `config`; a data set by name is read in the split of `config`.
+        policy: Traffic model in place of the one that `config` names, in evaluation mode.
+        controlled: Rules of the planner-driven agents, which come before the drivers of `config`; None = the ego.
 
     Raises:
         ConfigError: settings that do not fit each other.
@@ -61,7 +61,7 @@ class Source:
             policy if policy is not None else load_policy(config.model, config.device) if needs_policy else None
         )
         self.fingerprint = fingerprint_policy(self.policy) if self.policy is not None else "none"
-        self.controls: Controls = controls_of(
+        self.controls: Controls = build_controls(
             config.action, self.policy, horizon=config.horizon, tracker=config.tracker, reverse=config.reverse,
             hard_braking=config.hard_braking,
         )  # fmt: skip
@@ -76,17 +76,17 @@ class Source:
         try:
             return self.scenarios[self.scenario_ids.index(scenario_id)]
         except ValueError:
-            some = ", ".join(self.scenario_ids[:3])
+            examples = ", ".join(self.scenario_ids[:3])
             raise ConfigError(
-                f"no scenario {scenario_id!r}: this environment has {len(self.scenario_ids)}, such as {some}."
+                f"no scenario {scenario_id!r}: this environment has {len(self.scenario_ids)}, such as {examples}."
             ) from None
 
     def episode(self, scenarios: list[Scenario], goals: ScenarioGoals | None = None) -> Episode:
         """An episode in some scenarios, which step together.
 
         Args:
-            scenarios: at least one.
-            goals: scenario id to object id to (x, y) of agents that follow the policy.
+            scenarios: Scenarios of the episode, at least one, which step together.
+            goals: Scenario id to object id to (x, y) of agents that follow the policy, world frame, m.
 
         Raises:
             ConfigError: drivers that do not fit, or goals for a policy that does not follow any.

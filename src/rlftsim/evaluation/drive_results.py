@@ -16,7 +16,7 @@ from rlftsim.errors import DataError, require_types
 from rlftsim.evaluation.columns import ARROWS, direction_of, format_number
 from rlftsim.evaluation.compare import PairedDifference, compare_paired
 from rlftsim.jobs.documents import parse_json
-from rlftsim.jobs.files import write_whole
+from rlftsim.jobs.files import write_atomically
 from rlftsim.jobs.tables import read_parquet, read_parquet_metadata
 from rlftsim.statistics import mean_interval
 
@@ -97,7 +97,7 @@ class DriveResult:
         """Write as Parquet, whole or not at all."""
         about = {"format": FORMAT, "settings": asdict(self.settings), "missing": self.missing}
         table = self.table.replace_schema_metadata({"rlftsim": json.dumps(about)})
-        write_whole(Path(path), lambda temporary: pq.write_table(table, temporary, compression="zstd"))
+        write_atomically(Path(path), lambda temporary: pq.write_table(table, temporary, compression="zstd"))
 
     @classmethod
     def read(cls, path: str | PathLike[str]) -> "DriveResult":

@@ -19,8 +19,8 @@ import rlftsim
 from rlftsim.errors import ConfigError, DataError, require_types
 from rlftsim.evaluation.columns import SCORES, direction_of
 from rlftsim.evaluation.drift import Drift, measure_drift
-from rlftsim.jobs.documents import describe_kind, parse_json
-from rlftsim.jobs.files import write_whole
+from rlftsim.jobs.documents import describe_type, parse_json
+from rlftsim.jobs.files import write_atomically
 from rlftsim.jobs.tables import check_columns, read_parquet
 from rlftsim.realism import FEATURE_NAMES, RealismResult, SimulatedStates, metric_by_name
 from rlftsim.realism.miss import compute_miss_rates
@@ -269,7 +269,7 @@ class Evaluation:
             "skipped": [asdict(skipped) for skipped in self.skipped],
         }
         table = self.table.replace_schema_metadata({"rlftsim": json.dumps(about)})
-        write_whole(Path(path), lambda temporary: pq.write_table(table, temporary, compression="zstd"))
+        write_atomically(Path(path), lambda temporary: pq.write_table(table, temporary, compression="zstd"))
 
     @classmethod
     def read(cls, path: str | PathLike[str]) -> "Evaluation":
@@ -305,7 +305,7 @@ class Evaluation:
             skipped = tuple(Skipped(**one) for one in skipped)
             for given, kind in ((name, str), (about["provenance"], dict)):
                 if not isinstance(given, kind):
-                    raise DataError(f"its {'name' if kind is str else 'provenance'} is {describe_kind(given)}")
+                    raise DataError(f"its {'name' if kind is str else 'provenance'} is {describe_type(given)}")
         except (TypeError, KeyError, AttributeError, DataError) as error:
             raise DataError(f"{path}: damaged evaluation ({error}): evaluate again.") from None
         try:

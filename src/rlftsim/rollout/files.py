@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rlftsim.jobs.files import write_whole
+from rlftsim.jobs.files import write_atomically
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import CURRENT_STEP
@@ -31,7 +31,7 @@ def write_rollouts(folder: Path, batch: ScenarioBatch, rollouts: Rollouts) -> li
     for b, scenario in enumerate(batch.scenarios):
         indices = scenario.simulated_indices
         heading = headings[b, :, : len(indices)]  # [N, A, 80] without padding
-        write_whole(
+        write_atomically(
             folder / f"{scenario.scenario_id}.npz",
             partial(
                 _write_npz,

@@ -17,7 +17,7 @@ import numpy as np
 import pyarrow as pa
 
 from rlftsim.errors import DataError
-from rlftsim.jobs.files import cannot_write, temporary_beside
+from rlftsim.jobs.files import cannot_write, temporary_path
 from rlftsim.jobs.tables import map_arrow
 from rlftsim.scenario.codec import decode_array, encode_array
 from rlftsim.scenario.index_row import IndexRow, compute_index_row
@@ -95,7 +95,7 @@ class ShardWriter:
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
         self.num_rows = 0
-        self._temporary = temporary_beside(self.path)
+        self._temporary = temporary_path(self.path)
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._file = open(self._temporary, "wb")  # noqa: SIM115 (closed by close and discard)

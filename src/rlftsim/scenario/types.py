@@ -21,6 +21,8 @@ from jaxtyping import Bool, Float, Float32, Float64, Int, Int8, Int32, Int64
 
 from rlftsim.errors import DataError, in_short
 
+MAX_ID_BYTES = 200
+"""Of a scenario id; file systems take names of 255 bytes, and a suffix follows."""
 COARSEST_M = 0.01
 """Coordinates are refused where float32 has larger gaps."""
 STEP_S = 0.1
@@ -228,13 +230,14 @@ class Scenario:
         """Check that the id can be a file name: films and rollouts are named after their scenario.
 
         Raises:
-            DataError: it is no text or empty, or has a slash or a control character.
+            DataError: it is no text or empty, too long, or has a slash or a control character.
         """
         name = self.scenario_id
-        if not isinstance(name, str) or not re.fullmatch(r"[^/\\\x00-\x1f]+", name) or name in (".", ".."):
+        is_text = isinstance(name, str) and len(name.encode(errors="replace")) <= MAX_ID_BYTES
+        if not is_text or not re.fullmatch(r"[^/\\\x00-\x1f]+", name) or name in (".", ".."):
             raise DataError(
-                f"scenario id {in_short(name)} is no file name, and files are named after it: write it as text without "
-                "slashes and control characters"
+                f"scenario id {in_short(name)} is no file name, and files are named after it: write it as text of at "
+                f"most {MAX_ID_BYTES} bytes without slashes and control characters"
             )
 
     def refuse_misshapen(self) -> None:
@@ -425,7 +428,7 @@ def _refuse_misshapen(part: Any, place: str) -> None:
         axes = declared.dim_str.split()
         shown = f"[{', '.join(axes)}]"
         if not isinstance(value, np.ndarray):
-            raise DataError(f"{place}.{one.name} is {in_short(value)}, it must be an array {shown}")
+            raise DataError(f"{place}.{one.name} is {type(value).__name__}, it must be an array {shown}")
         wanted = []
         for axis, length in zip(axes, value.shape):
             name, _, more = axis.partition("+")  # such as "F+1"
