@@ -47,7 +47,7 @@ def score(scenarios: AnyScenarios, rollouts: Rollouts, metric: str | int = "2025
                 f"rollouts of {theirs} do not belong to {', '.join(ids[:3])}: hand over the same scenarios."
             )
         for row, scenario in enumerate(batch.scenarios):
-            about.refuse_other_agents(row, scenario)
+            about.check_same_agents(row, scenario)
         if batch.frame != about.frame:
             batch = collate(batch.scenarios, frame=about.frame).to(batch.device)
     num_scenarios, _, num_agents = rollouts.position.shape[:3]

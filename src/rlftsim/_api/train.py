@@ -15,7 +15,7 @@ from rlftsim.recipes.base import Recipe
 from rlftsim.recipes.calibration import prepare_policy
 from rlftsim.recipes.card import model_card, with_cards_of
 from rlftsim.recipes.registry import RECIPES, recipe_by_name
-from rlftsim.rollout.policy import Policy, device_of
+from rlftsim.rollout.policy import Policy, get_device
 from rlftsim.scenario.any_form import AnyScenarios, Name, scenarios_of
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.types import Scenarios
@@ -167,7 +167,7 @@ def _train_copy(policy: Policy, out: Name | None, train: Callable[[Any, Path], o
     else:
         train(learner, Path(out))
     assert isinstance(learner, nn.Module)
-    return learner.eval().requires_grad_(False).to(device_of(policy))
+    return learner.eval().requires_grad_(False).to(get_device(policy))
 
 
 def _card(what: str, scenarios: Scenarios, start: Policy | Name | None = None) -> str:

@@ -10,7 +10,7 @@ from tyro.conf import Positional
 from rlftsim.evaluation.evaluate import check_jobs
 from rlftsim.jobs.runner import Work, choose_runner
 from rlftsim.policies.registry import Device, load_policy
-from rlftsim.rollout.policy import device_of
+from rlftsim.rollout.policy import get_device
 from rlftsim.scenario.open import open_dataset
 from rlftsim.training.augment import AugmentConfig, augment_goals
 
@@ -44,7 +44,7 @@ class Augment:
         # The data set is opened first: a wrong path is found before weights are loaded.
         scenarios = open_dataset(self.data, self.split)
         policy = load_policy(self.model, self.device)
-        check_jobs(self.jobs, device_of(policy), "jobs")
+        check_jobs(self.jobs, get_device(policy), "jobs")
         runner = self.work.runner(self.jobs, self.work.on_error) or choose_runner(self.jobs, len(scenarios))
         count = augment_goals(policy, scenarios, self.out, self.config, runner=runner)
         print(f"{self.out}: goals for {count} scenarios.")

@@ -17,7 +17,7 @@ from rlftsim.jobs.progress import progress_bar
 from rlftsim.jobs.threads import one_thread
 from rlftsim.policies.registry import load_policy
 from rlftsim.realism import scenario_log, score
-from rlftsim.rollout.policy import device_of
+from rlftsim.rollout.policy import get_device
 from rlftsim.scenario.convert import convert
 from rlftsim.scenario.open import open_dataset
 from rlftsim.submission.messages import encode_rollouts
@@ -68,7 +68,7 @@ def measure_cost(plan: Plan, model: str, data: str, num_measured: int) -> UnitCo
         for position in [chosen[0], *chosen]:
             start = time.process_time()
             scenario = dataset[position]
-            states = simulate_states(policy, scenario, config, device_of(policy))
+            states = simulate_states(policy, scenario, config, get_device(policy))
             if plan == "submit":
                 encode_rollouts(scenario.scenario_id, states)
             else:

@@ -16,8 +16,8 @@ from rlftsim.evaluation.rollout_folder import Simulation, simulate_folder
 from rlftsim.jobs.progress import log
 from rlftsim.jobs.runner import Work, choose_runner
 from rlftsim.policies.registry import Device, load_policy, with_guidance
-from rlftsim.rollout.policy import Sampling, device_of, is_goal_conditioned
-from rlftsim.rollout.simulate import refuse_sampling
+from rlftsim.rollout.policy import Sampling, get_device, is_goal_conditioned
+from rlftsim.rollout.simulate import check_sampling
 from rlftsim.scenario.open import open_dataset, refuse_unknown
 
 
@@ -75,7 +75,7 @@ class Simulate:
         # 1. model, data and goals; anything that does not fit is refused before the folder is touched
         exporters = [exporter_by_name(name) for name in self.export]
         policy = with_guidance(load_policy(self.model, self.device), self.guidance_scale)
-        check_jobs(self.jobs, device_of(policy), "jobs")
+        check_jobs(self.jobs, get_device(policy), "jobs")
         sampling = Sampling(self.temperature, self.top_k)
         scenarios = open_dataset(self.data, self.split)
         goals = given_goals(self.goals, self.goal, self.scenario)
@@ -98,7 +98,7 @@ class Simulate:
                 warn_of_doubts(entries, scenarios.by_id(scenario_id))
             elif goals.goals:
                 log.info(f"  scenario {scenario_id} has no goals: it is simulated without.")
-        refuse_sampling(policy, scenarios, sampling)
+        check_sampling(policy, scenarios, sampling)
         # 2. simulate what is missing; a folder of other rollouts is refused
         simulation = Simulation(policy, scenarios, self.num_rollouts, self.seed, sampling, goals)
         runner = self.work.runner(self.jobs, self.work.on_error) or choose_runner(self.jobs, len(ids))

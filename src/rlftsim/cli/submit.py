@@ -17,7 +17,7 @@ from rlftsim.jobs.progress import print_wide
 from rlftsim.jobs.runner import Work
 from rlftsim.policies.registry import Device, load_policy
 from rlftsim.rollout.fingerprint import fingerprint_policy
-from rlftsim.rollout.simulate import refuse_sampling
+from rlftsim.rollout.simulate import check_sampling
 from rlftsim.scenario.open import open_dataset
 from rlftsim.submission.build import Job, build_archive, delete_parts
 from rlftsim.submission.check import ArchiveCheck, check_archive
@@ -99,7 +99,7 @@ class Build:
         if not self.partial:
             refuse_incomplete(data)
         refuse_open_loop(policy, data[0])
-        refuse_sampling(policy, data, config.sampling)
+        check_sampling(policy, data, config.sampling)
         closed_loop = statement(policy, config.sampling)
         print(closed_loop)
         if not self.i_comply:

@@ -14,7 +14,7 @@ from rlftsim.errors import ConfigError, in_short
 from rlftsim.jobs.threads import one_thread
 from rlftsim.policies.registry import load_policy
 from rlftsim.rollout.fingerprint import fingerprint_policy
-from rlftsim.rollout.policy import Policy, device_of, is_goal_conditioned, is_training
+from rlftsim.rollout.policy import Policy, get_device, is_goal_conditioned, is_training
 from rlftsim.scenario.any_form import AnyScenarios, scenarios_of
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.types import Scenario, Scenarios, scenario_ids_of
@@ -111,7 +111,7 @@ class Source:
         key = scenarios[0].scenario_id
         if key not in self._contexts:
             with one_thread(), torch.no_grad():
-                self._contexts[key] = self.policy.encode(collate(scenarios).to(device_of(self.policy)))
+                self._contexts[key] = self.policy.encode(collate(scenarios).to(get_device(self.policy)))
         self._contexts.move_to_end(key)
         while len(self._contexts) > KEPT_CONTEXTS:
             self._contexts.popitem(last=False)

@@ -29,7 +29,7 @@ from rlftsim.errors import ConfigError, in_short
 from rlftsim.goals.types import Goals, PointById
 from rlftsim.jobs.threads import one_thread
 from rlftsim.rollout.noise import draw_noise
-from rlftsim.rollout.policy import Policy, Sampling, device_of
+from rlftsim.rollout.policy import Policy, Sampling, get_device
 from rlftsim.rollout.types import AgentStates
 from rlftsim.scenario.batch import ScenarioBatch, collate
 from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, STEP_S, TOTAL_STEPS, Scenario
@@ -149,7 +149,7 @@ def build_world(
     followers = bool((drivers == Driver.POLICY).any())
     if followers and policy is None:
         raise ConfigError("some agents follow the policy, but there is no model: name one, or give them other drivers.")
-    batch = batch.to(device_of(policy)) if followers else batch
+    batch = batch.to(get_device(policy)) if followers else batch
     if followers and context is None:
         assert policy is not None
         with one_thread(), torch.no_grad():

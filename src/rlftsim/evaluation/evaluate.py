@@ -34,8 +34,8 @@ from rlftsim.jobs.runner import Runner, choose_runner
 from rlftsim.realism import SimulatedStates, metric_by_name, scenario_log, score
 from rlftsim.realism.from_rollouts import logged_states, states_of_rollouts
 from rlftsim.rollout.fingerprint import fingerprint_policy
-from rlftsim.rollout.policy import Policy, device_of, is_goal_conditioned
-from rlftsim.rollout.simulate import refuse_sampling, simulate
+from rlftsim.rollout.policy import Policy, get_device, is_goal_conditioned
+from rlftsim.rollout.simulate import check_sampling, simulate
 from rlftsim.scenario.batch import ScenarioBatch, collate
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.types import Scenario
@@ -94,10 +94,10 @@ def evaluate(
     # Everything that can be refused is refused before anything is simulated or written.
     dataset, config = open_held_out(data, config)
     positions = choose_scenarios(dataset, config)
-    check_jobs(config.jobs, device_of(policy))
+    check_jobs(config.jobs, get_device(policy))
     frozen: Policy | Oracle = frozen_copy(policy)
     if frozen != "oracle":
-        refuse_sampling(frozen, dataset, config.sampling)
+        check_sampling(frozen, dataset, config.sampling)
     provenance = Provenance(
         config=replace(config, jobs=1),  # the same bytes from any number of processes
         policy=title,
@@ -246,7 +246,7 @@ class _Job:
 
 def _evaluate_scenario(job: _Job, position: int) -> dict[str, object] | Skipped:
     """Row of one scenario, or why there is none."""
-    scenario, config, device = job.dataset[position], job.config, device_of(job.policy)
+    scenario, config, device = job.dataset[position], job.config, get_device(job.policy)
     try:
         scenario.refuse_broken()
         scenario.refuse_not_finite()

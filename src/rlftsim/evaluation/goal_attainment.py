@@ -21,7 +21,7 @@ from rlftsim.evaluation.scenario_source import open_held_out
 from rlftsim.goals.attainment import measure_outcome
 from rlftsim.goals.goals_file import GoalEntry
 from rlftsim.goals.placement import goals_of_batch
-from rlftsim.rollout.policy import Policy, device_of, is_goal_conditioned
+from rlftsim.rollout.policy import Policy, get_device, is_goal_conditioned
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import ScenarioDataset
 
@@ -73,7 +73,7 @@ def attain_goals(
         ConfigError: Several processes for a policy on a GPU.
     """
     dataset, config = open_held_out(data, config)
-    check_jobs(config.jobs, device_of(policy))
+    check_jobs(config.jobs, get_device(policy))
     by_scenario: dict[str, list[GoalEntry]] = {}
     for goal in goals:
         by_scenario.setdefault(goal.scenario_id, []).append(goal)
@@ -123,7 +123,7 @@ def _parse_attained(
 def _simulate_goals(job: _Job, position: int) -> dict[str, object]:
     """Fractions of the rollouts for each goal of a scenario."""
     scenario_id = tuple(job.goals)[position]
-    batch = collate([job.dataset.by_id(scenario_id)]).to(device_of(job.policy))
+    batch = collate([job.dataset.by_id(scenario_id)]).to(get_device(job.policy))
     with torch.no_grad():
         context = job.policy.encode(batch)
     simulated = partial(simulate_encoded, job.policy, batch, context, job.config)

@@ -25,7 +25,7 @@ from rlftsim.evaluation.scenario_source import choose_scenarios, open_held_out
 from rlftsim.realism import Features, ScenarioLog, compute_features, metric_by_name, scenario_log, score_features
 from rlftsim.rewards.base import leave_one_out
 from rlftsim.rewards.mloo import compute_mloo
-from rlftsim.rollout.policy import Policy, device_of
+from rlftsim.rollout.policy import Policy, get_device
 from rlftsim.scenario.dataset import ScenarioDataset
 
 SIZES = (2, 3, 4, 6, 8, 12, 16, 24, 32)
@@ -75,7 +75,7 @@ def measure_variances(
             "a slope over N = 2, 3, 4, ... needs 4 rollouts at least, "
             f"got {config.num_rollouts}: set --num-rollouts 32."
         )
-    check_jobs(config.jobs, device_of(policy))
+    check_jobs(config.jobs, get_device(policy))
     ids = [dataset.scenario_ids[i] for i in choose_scenarios(dataset, config)]
     identity = {"sizes": list(sizes), **describe_measurement(policy, dataset, config)}
     stored = measure_scenarios(
@@ -138,7 +138,7 @@ def _parse_variances(scenario_id: str, values: Mapping[str, Any]) -> Float[np.nd
 
 def _measure_scenario(job: _Job, position: int) -> dict[str, object]:
     """Simulate once and score subsets of the rollouts."""
-    scenario, config, device = job.dataset[position], job.config, device_of(job.policy)
+    scenario, config, device = job.dataset[position], job.config, get_device(job.policy)
     try:
         log = scenario_log(scenario, device)
     except DataError as error:

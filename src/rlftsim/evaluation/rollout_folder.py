@@ -22,7 +22,7 @@ from rlftsim.jobs.progress import log
 from rlftsim.jobs.runner import Runner
 from rlftsim.rollout.files import write_rollouts
 from rlftsim.rollout.fingerprint import fingerprint_policy
-from rlftsim.rollout.policy import Policy, Sampling, device_of
+from rlftsim.rollout.policy import Policy, Sampling, get_device
 from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import ScenarioDataset
@@ -118,7 +118,7 @@ def _simulate_scenario(
     """Write the rollouts of a scenario, unless the work is being stopped."""
     if is_stopped():
         return
-    batch = collate([simulation.scenarios.by_id(scenario_id)]).to(device_of(simulation.policy))
+    batch = collate([simulation.scenarios.by_id(scenario_id)]).to(get_device(simulation.policy))
     entries = simulation.goals.of_scenario(scenario_id)
     rollouts = simulate(
         simulation.policy, batch, num_rollouts=simulation.num_rollouts, seed=simulation.seed,

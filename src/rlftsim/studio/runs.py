@@ -20,7 +20,7 @@ from torch import Tensor
 from rlftsim.errors import RlftsimError
 from rlftsim.jobs.progress import log
 from rlftsim.policies.registry import with_guidance
-from rlftsim.rollout.policy import Sampling, device_of
+from rlftsim.rollout.policy import Sampling, get_device
 from rlftsim.rollout.simulate import simulate
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch, collate
@@ -279,7 +279,7 @@ class Worker:
         for k, (v, ids) in enumerate(run.chunks):
             simulated = run.simulated[v]
             if ids not in simulated.encoded:
-                batch = collate([scenario]).to(device_of(self.session.model(run.variants[v].model).policy))
+                batch = collate([scenario]).to(get_device(self.session.model(run.variants[v].model).policy))
                 rollouts = self._rollouts(run, k, batch)
                 poses = torch.cat([rollouts.position, rollouts.heading[..., None]], -1)
                 simulated.chunks[ids] = rollouts

@@ -33,7 +33,7 @@ from rlftsim.jobs.items import ResultFormat, run_items
 from rlftsim.jobs.processes import Advance
 from rlftsim.jobs.progress import log
 from rlftsim.jobs.runner import Runner, choose_runner
-from rlftsim.rollout.policy import Policy, device_of
+from rlftsim.rollout.policy import Policy, get_device
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.types import Scenario
 from rlftsim.submission.archive import PackedShard, count_joined, join_shards, pack_shard
@@ -118,7 +118,7 @@ def build_archive(
         Unfinished: `runner` is a share, which is done, while others are not.
     """
     check_folder(job.folder, "submission")
-    check_jobs(job.config.jobs, device_of(job.policy))
+    check_jobs(job.config.jobs, get_device(job.policy))
     archive = job.folder / ARCHIVE
     numbers = range(len(job.plan.shards))
     runner = runner or choose_runner(job.config.jobs, len(numbers))
@@ -195,7 +195,7 @@ def _build_shard(job: Job, number: int, advance: Advance, is_stopped: Callable[[
 
 def _simulate_message(job: Job, scenario: Scenario, shard: str) -> bytes:
     """Rollouts of a scenario as the archive holds them, checked."""
-    states = simulate_states(job.policy, scenario, job.config, device_of(job.policy))
+    states = simulate_states(job.policy, scenario, job.config, get_device(job.policy))
     message = encode_rollouts(scenario.scenario_id, round_states(states, job.round_m))
     for finding in check_rollouts(decode_rollouts(message), scenario, shard).findings:
         if finding.severity == "error":

@@ -26,7 +26,7 @@ from rlftsim.jobs.items import GroupFormat, group_positions, group_task, run_ite
 from rlftsim.jobs.runner import Inline, Runner
 from rlftsim.realism import RealismResult, metric_by_name, score_batch
 from rlftsim.realism.from_rollouts import states_of_rollouts
-from rlftsim.rollout.policy import Policy, Sampling, device_of
+from rlftsim.rollout.policy import Policy, Sampling, get_device
 from rlftsim.rollout.simulate import simulate
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.types import Scenarios
@@ -121,7 +121,7 @@ def augment_goals(
     folder, inputs = Path(folder), describe_inputs(policy, scenarios)
     if config.top_k is not None and len(scenarios) and not folder.exists():
         # Tried on one scenario before the folder is claimed for settings that cannot work.
-        batch = batch_with_futures(scenarios, [0]).to(device_of(policy))
+        batch = batch_with_futures(scenarios, [0]).to(get_device(policy))
         try:
             simulate(policy, batch, num_rollouts=1, seed=config.seed, sampling=Sampling(top_k=config.top_k))
         except ConfigError as error:
@@ -140,7 +140,7 @@ def augment_goals(
 
 def _find_ends(policy: Policy, scenarios: Scenarios, config: AugmentConfig, index: int) -> tuple[str, Points]:
     """Id of a scenario, and the object ids and endpoints (world frame) of the agents."""
-    batch = batch_with_futures(scenarios, [index]).to(device_of(policy))
+    batch = batch_with_futures(scenarios, [index]).to(get_device(policy))
     rollouts = simulate(
         policy, batch, num_rollouts=config.num_rollouts, seed=config.seed, goals=logged_goals(batch),
         sampling=Sampling(top_k=config.top_k),

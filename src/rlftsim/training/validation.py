@@ -16,7 +16,7 @@ from rlftsim.errors import ConfigError, given, require_not_negative, require_pos
 from rlftsim.realism import metric_by_name, score_batch
 from rlftsim.realism.from_rollouts import states_of_rollouts
 from rlftsim.rollout.policy import Policy, Sampling
-from rlftsim.rollout.simulate import refuse_sampling, simulate
+from rlftsim.rollout.simulate import check_sampling, simulate
 from rlftsim.scenario.types import Scenarios
 from rlftsim.training.data import batch_with_futures
 from rlftsim.training.map_use import MapUse, measure_map_use, predicts_tokens
@@ -92,7 +92,7 @@ def refuse_to_validate(model: object, scenarios: Scenarios, config: ValidationCo
         raise ConfigError("no scenario to validate on: name another split, or set validation.every=0.")
     if config.top_k is not None:
         frozen: Any = copy.deepcopy(model).eval() if isinstance(model, nn.Module) else model
-        refuse_sampling(frozen, scenarios, Sampling(top_k=config.top_k))
+        check_sampling(frozen, scenarios, Sampling(top_k=config.top_k))
 
 
 @torch.no_grad()

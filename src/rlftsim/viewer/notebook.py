@@ -128,7 +128,7 @@ def show(scenario: AnyScenarios, *rollouts: Rollouts, titles: str | Sequence[str
                     "scenarios they are of."
                 )
             # By id where the rollouts know their scenarios, else by position.
-            batch_row = row if simulated.provenance is None else simulated.row_of(log.scenario_id)
+            batch_row = row if simulated.provenance is None else simulated.find_row(log.scenario_id)
             motion = rollout_trajectories(log, simulated, row=batch_row, max_rollouts=MAX_ROLLOUTS)
             panels.append(Panel(name, motion.with_overlaps(scene.agents)))
         figures.append(animation_html(Animation(f"Scenario {log.scenario_id}", scene, panels)))

@@ -273,7 +273,7 @@ def rollout_trajectories(
     """
     provenance = rollouts.provenance
     if provenance is not None:
-        provenance.refuse_other_agents(row, scenario)
+        provenance.check_same_agents(row, scenario)
     num_agents = len(scenario.simulated_indices)
     if rollouts.position.shape[2] < num_agents:
         raise DataError(

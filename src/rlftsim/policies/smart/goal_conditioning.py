@@ -25,7 +25,7 @@ from rlftsim.policies.distributions import CategoricalDistribution, TokenDistrib
 from rlftsim.policies.smart.config import GoalEncoding
 from rlftsim.policies.smart.embeddings import FourierEmbedding, normalize
 from rlftsim.policies.smart.neighbors import Poses, relative_pose, within
-from rlftsim.rollout.rows import row_places
+from rlftsim.rollout.rows import find_rows
 from rlftsim.scenario.types import FUTURE_STEPS, STEP_S
 from rlftsim.tokens.vocabulary import CLASS_NAMES, STEPS_PER_TOKEN, Vocabulary
 
@@ -220,7 +220,7 @@ class GoalLogitBias(nn.Module):
             class_id: of the agents.
             vocabulary: of the tokens.
         """
-        place = row_places(dist.mask, len(dist.logits) == dist.mask.numel())
+        place = find_rows(dist.mask, len(dist.logits) == dist.mask.numel())
         has_goal = goals.goal_mask[place[:3]]
         conditioned = rows_where(has_goal)  # [g] of the R rows of dist
         rows = tuple(index[conditioned] for index in place)

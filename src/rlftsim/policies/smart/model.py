@@ -27,7 +27,7 @@ from rlftsim.policies.smart.neighbors import most_within
 from rlftsim.policies.smart.network import Scene, SmartNetwork, nowhere_unless
 from rlftsim.policies.smart.token_steps import TokenSteps, logged_steps
 from rlftsim.policies.token_rows import NEVER, TokenRows
-from rlftsim.rollout.rows import row_places
+from rlftsim.rollout.rows import find_rows
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.tokens.agent_tokens import AgentTokens, tokenize_agents
 from rlftsim.tokens.map_tokens import MapTokens, tokenize_map
@@ -63,17 +63,17 @@ class SmartModel(nn.Module):
 
     # ---- training -------------------------------------------------------------------------------------------------
 
-    def fine_tuned_parts(self) -> tuple[nn.Module, ...]:
+    def fine_tuned_modules(self) -> tuple[nn.Module, ...]:
         """The decoder's attention and head, as in the public CAT-K code, and everything for goals."""
         return self.network.decoder.reading_parts()
 
-    def head_parts(self) -> tuple[nn.Module, ...]:
+    def head_modules(self) -> tuple[nn.Module, ...]:
         """The layers that turn an agent's features into logits of tokens, and everything for goals."""
-        return *self.network.decoder.head_parts(), *self.goal_parts()
+        return *self.network.decoder.head_modules(), *self.goal_modules()
 
-    def goal_parts(self) -> tuple[nn.Module, ...]:
+    def goal_modules(self) -> tuple[nn.Module, ...]:
         """Goal encoder and goal logit bias; empty in a goal-free model."""
-        return self.network.decoder.goal_parts()
+        return self.network.decoder.goal_modules()
 
     def sees_as(self, other: nn.Module) -> bool:
         """True if scenes, and the relations of rows to them, are the same for another model, without gradient in both.
@@ -215,7 +215,7 @@ class SmartModel(nn.Module):
         mask: Bool[Tensor, "B N A *L"],
     ) -> CategoricalDistribution:
         """Distributions of the elements of a mask; tokens that a class lacks get the logit `NEVER`."""
-        place = row_places(mask, has_all=len(features) == mask.numel())
+        place = find_rows(mask, is_dense=len(features) == mask.numel())
         class_id = token_class[place[0], place[2]]  # [R]
         head, scores, exists = self.network.decoder.head, self.network.decoder.scores, self.vocabulary.class_tokens
         if isinstance(head, ClassHeads):

@@ -49,7 +49,7 @@ from rlftsim.policies.smart.goal_conditioning import (
 from rlftsim.policies.smart.heads import ClassHeads, ContinuationScores, TokenKeys
 from rlftsim.policies.smart.neighbors import Neighbors, Poses, group_rows, relative_pose, within
 from rlftsim.policies.smart.token_steps import TokenSteps
-from rlftsim.rollout.rows import place_rows, row_places
+from rlftsim.rollout.rows import find_rows, place_rows
 from rlftsim.tokens.map_tokens import NUM_FAMILIES, NUM_LIGHTS, NUM_TYPES, MapTokens
 from rlftsim.tokens.vocabulary import CLASS_NAMES
 
@@ -240,7 +240,7 @@ class AgentDecoder(nn.Module):
         self.goal = goal_encoder(config.goal, dim, frequencies)
         self.aim = GoalLogitBias() if config.goal_logit_bias else None
 
-    def goal_parts(self) -> tuple[GoalEmbedding | GoalEdgeEmbedding | GoalLogitBias, ...]:
+    def goal_modules(self) -> tuple[GoalEmbedding | GoalEdgeEmbedding | GoalLogitBias, ...]:
         """Goal encoder and goal logit bias; empty in a goal-free model."""
         return tuple(part for part in (self.goal, self.aim) if part is not None)
 
@@ -267,13 +267,13 @@ class AgentDecoder(nn.Module):
         """Embedding of every motion token of every class."""
         return torch.stack([embed(table.flatten(1)) for embed, table in zip(self.tokens, end_corners)])
 
-    def head_parts(self) -> tuple[nn.Module, ...]:
+    def head_modules(self) -> tuple[nn.Module, ...]:
         """The parts that turn features into logits."""
         return (self.head,) if self.scores is None else (self.head, self.scores)
 
     def reading_parts(self) -> tuple[nn.Module, ...]:
         """Layers, head and goal parts: all that scenes and views are not made of."""
-        return self.time_layers, self.map_layers, self.agent_layers, *self.head_parts(), *self.goal_parts()
+        return self.time_layers, self.map_layers, self.agent_layers, *self.head_modules(), *self.goal_modules()
 
     def fold(self) -> tuple[AttentionMaps, ...]:
         """Maps of the layers' attention, in the order in which the layers are applied."""
@@ -301,7 +301,7 @@ class AgentDecoder(nn.Module):
             padded: padding has rows, too, which nothing attends to, and lists of neighbors have fixed widths.
         """
         # 1. rows, and the row of each element of the block (-1 = none)
-        rows = row_places(steps.valid, padded)
+        rows = find_rows(steps.valid, padded)
         first_row = 0 if past is None else past.sources[0].shape[0]
         index = torch.arange(len(rows[0]), device=steps.valid.device)
         row_of = torch.where(steps.valid, place_rows(index, steps.valid), -1)  # [B, N, A, K]
@@ -478,7 +478,7 @@ class SmartNetwork(nn.Module):
         self.map_encoder = MapEncoder(config)
         self.decoder = AgentDecoder(config, num_tokens, class_sizes)
         initialize(self, config.frequency_init)
-        for part in self.decoder.goal_parts():
+        for part in self.decoder.goal_modules():
             part.zero_init()
 
     def seeing_weights(self) -> list[Tensor]:

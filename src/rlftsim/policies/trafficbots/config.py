@@ -22,7 +22,7 @@ LATENT_SIZE = 16
 @dataclass(frozen=True)
 class TrafficBotsConfig:
     """Sizes, neighborhoods, exploration noise, training schedule. The defaults are TrafficBots V1.5 (7.9 M parameters
-    without its unused ones)."""
+    without unused ones)."""
 
     fingerprint_name: ClassVar[str] = "rlftsim.policies.trafficbots.config.TrafficBotsConfig"
     free_fields: ClassVar[tuple[str, ...]] = (
@@ -103,7 +103,7 @@ class TrafficBotsConfig:
                 raise ConfigError(f"{name} is in [0, 1), got {getattr(self, name)}.")
         if not 0 <= self.prior_probability <= 1:
             raise ConfigError(f"prior_probability is in [0, 1], got {self.prior_probability}.")
-        if not self.forced_fractions or not all(0 <= one <= 1 for one in self.forced_fractions):
+        if not self.forced_fractions or not all(0 <= fraction <= 1 for fraction in self.forced_fractions):
             raise ConfigError(f"forced_fractions are one or more fractions in [0, 1], got {self.forced_fractions}.")
 
 
