@@ -158,7 +158,10 @@ BAD = [
     (["tokens", "--recipe", "smarttiny", "--data", "d"], "unknown recipe 'smarttiny': did you mean 'smart-tiny'"),
     (["simulate", "demo-base", "--data", "synthetic", "--out", "o", "--export"], "^--export needs at least one value"),
     (["doctor", "--nodes", "4"], "^--nodes has no effect: add --plan evaluate"),
-    (["join"], "^join: write the command of a share behind join, .* are augment, convert, evaluate, score, simulate, submit"),
+    (
+        ["join"],
+        "^join: write the command of a share behind join, .* are augment, convert, evaluate, score, simulate,",
+    ),
     (["join", "foo"], "^join foo: write the command of a share behind join"),
     (["join", "pretrain", "--help"], "^join pretrain --help: write the command of a share behind join"),
     (["join", "submit", "check"], "^join submit check: write the command of a share behind join"),

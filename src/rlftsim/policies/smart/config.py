@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal, get_args
 
-from rlftsim.errors import ConfigError, check_limits, given, require_finite, require_positive, require_types
+from rlftsim.errors import ConfigError, check_finiteness, check_limits, check_positive, check_types, given
 
 GoalEncoding = Literal["concat", "indication"]
 """Encoding of an agent's goal, see `goal_conditioning`."""
@@ -78,7 +78,7 @@ class SmartConfig:
         return 0.0 if self.catk_compat else 1e-3
 
     def __post_init__(self) -> None:
-        require_types(self)
+        check_types(self)
         sizes = (
             "dim",
             "num_heads",
@@ -90,8 +90,8 @@ class SmartConfig:
         )
         radii = ("map_radius_m", "agent_map_radius_m", "agent_radius_m")
         caps = ("max_map_neighbors", "max_agent_map_neighbors", "max_agent_neighbors")
-        require_positive(self, (*sizes, *radii, *given(self, caps)))
-        require_finite(self, radii)
+        check_positive(self, (*sizes, *radii, *given(self, caps)))
+        check_finiteness(self, radii)
         check_limits(self, dict.fromkeys(("num_map_layers", "num_decoder_layers", "history_tokens"), 256))
         check_limits(self, dict.fromkeys(("dim", "num_heads", "head_dim", "num_frequencies"), 65_536))
         check_limits(self, dict.fromkeys(radii, 100_000) | dict.fromkeys(caps, 2**31 - 1))
