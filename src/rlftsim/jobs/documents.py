@@ -23,7 +23,7 @@ LONGEST_INTEGER = 40
 """Digits of a whole number: the seeds of numpy have 39."""
 LONGEST_NAME = 40
 """Characters of a name that a message repeats."""
-_KINDS = {dict: "an object", list: "a list", str: "text", bool: "true or false", type(None): "null"}
+_TYPE_NAMES = {dict: "an object", list: "a list", str: "text", bool: "true or false", type(None): "null"}
 
 
 def read_json(
@@ -104,7 +104,7 @@ def parse_json(
 
     value = _parse(text, parse, source, remedy, error)
     if not isinstance(value, expected):
-        raise error(f"{source}: holds {describe_kind(value)} instead of {_KINDS[expected]}: {remedy}.")
+        raise error(f"{source}: holds {describe_type(value)} instead of {_TYPE_NAMES[expected]}: {remedy}.")
     return value
 
 
@@ -130,9 +130,9 @@ def read_toml(path: str | PathLike[str], remedy: str, *, error: type[RlftsimErro
     return _parse(_read_bytes(path, MAX_TOML_BYTES, remedy, error), parse, str(path), remedy, error)
 
 
-def describe_kind(value: object) -> str:
-    """Kind of a value of JSON or TOML in words, for messages."""
-    return _KINDS.get(type(value), "a number")
+def describe_type(value: object) -> str:
+    """Type of a value of JSON or TOML in words, for messages."""
+    return _TYPE_NAMES.get(type(value), "a number")
 
 
 def first_line(problem: BaseException) -> str:

@@ -20,9 +20,8 @@ from torch import nn
 from torch.optim import Optimizer
 
 from rlftsim.errors import CheckpointError, ConfigError, DataError, NotYetError
-from rlftsim.jobs.folder import check_folder
+from rlftsim.jobs.folder import Lease, check_folder
 from rlftsim.jobs.interruption import ctrl_c_waits
-from rlftsim.jobs.lease import Lease
 from rlftsim.jobs.progress import log, progress_bar
 from rlftsim.jobs.runner import Inline
 from rlftsim.scenario.batch import ScenarioBatch

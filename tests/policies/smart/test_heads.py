@@ -152,7 +152,7 @@ def test_a_saved_model_with_continuation_scores_says_the_same(continuing, batch,
 
 def test_continuation_scores_are_fine_tuned_with_the_head(continuing):
     weight = continuing.network.decoder.scores.query.weight
-    for parts in (continuing.fine_tuned_parts(), continuing.head_parts()):
+    for parts in (continuing.fine_tuned_modules(), continuing.head_modules()):
         assert any(weight is one for part in parts for one in part.parameters())
 
 

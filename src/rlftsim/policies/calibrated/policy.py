@@ -33,7 +33,7 @@ BASE = "base"
 CALIBRATION = "calibration.json"
 """How eta was fitted and what each feature earns."""
 PASSED_ON = (
-    *("fine_tuned_parts", "head_parts", "goal_parts", "is_goal_conditioned", "teacher_forced"),
+    *("fine_tuned_modules", "head_modules", "goal_modules", "is_goal_conditioned", "teacher_forced"),
     *("steps_per_decision", "noise_size", "initial_noise_size", "vocabulary"),
 )
 """Attributes that a calibrated policy has if its base has them, and that are those of the base."""

@@ -9,7 +9,7 @@ import torch
 
 from rlftsim.errors import CheckpointError, DataError
 from rlftsim.jobs.arrays import read_npz
-from rlftsim.jobs.files import write_whole
+from rlftsim.jobs.files import write_atomically
 from rlftsim.tokens.vocabulary import MAX_COORDINATE_M, MAX_TOKENS, STEPS_PER_TOKEN, Vocabulary
 
 MOTION_TABLES = ("veh", "ped", "cyc")
@@ -87,7 +87,7 @@ def write_catk_vocabulary(vocabulary: Vocabulary, path: Path) -> None:
         with temporary.open("wb") as file:
             np.savez(file, **tables)  # type: ignore[arg-type]
 
-    write_whole(path, write)
+    write_atomically(path, write)
 
 
 def _check_tables(tables: dict[str, np.ndarray], source: str) -> None:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
-from rlftsim.errors import ConfigError, check_limits, given, require_finite, require_positive, require_types
+from rlftsim.errors import ConfigError, check_finiteness, check_limits, check_positive, check_types, given
 
 GoalEncoding = Literal["concat", "indication"]
 """Encoding of an agent's goal, see `goal_conditioning`."""
@@ -78,13 +78,13 @@ class SmartConfig:
         return 0.0 if self.catk_compat else 1e-3
 
     def __post_init__(self) -> None:
-        require_types(self)
+        check_types(self)
         depths = ("num_map_layers", "num_decoder_layers", "history_tokens")
         widths = ("dim", "num_heads", "head_dim", "num_frequencies")
         radii = ("map_radius_m", "agent_map_radius_m", "agent_radius_m")
         caps = ("max_map_neighbors", "max_agent_map_neighbors", "max_agent_neighbors")
-        require_positive(self, (*widths, *depths, *radii, *given(self, caps)))
-        require_finite(self, radii)
+        check_positive(self, (*widths, *depths, *radii, *given(self, caps)))
+        check_finiteness(self, radii)
         check_limits(self, dict.fromkeys(depths, 256) | dict.fromkeys(widths, 65_536))
         check_limits(self, dict.fromkeys(radii, 100_000) | dict.fromkeys(caps, 2**31 - 1))
         if self.goal_logit_bias and self.goal is None:

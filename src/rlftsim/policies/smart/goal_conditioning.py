@@ -25,7 +25,7 @@ from rlftsim.policies.distributions import CategoricalDistribution, TokenDistrib
 from rlftsim.policies.smart.config import GoalEncoding
 from rlftsim.policies.smart.embeddings import FourierEmbedding, normalize
 from rlftsim.policies.smart.neighbors import Poses, find_neighbors, relative_pose
-from rlftsim.rollout.rows import row_places
+from rlftsim.rollout.rows import find_rows
 from rlftsim.scenario.types import FUTURE_STEPS, STEP_S
 from rlftsim.tokens.vocabulary import CLASS_NAMES, STEPS_PER_TOKEN, Vocabulary
 
@@ -216,7 +216,7 @@ class GoalLogitBias(nn.Module):
             class_id: Agent class that each agent's token ids refer to.
             vocabulary: Vocabulary of the tokens, whose boxes give the displacements.
         """
-        elements = row_places(dist.mask, len(dist.logits) == dist.mask.numel())
+        elements = find_rows(dist.mask, len(dist.logits) == dist.mask.numel())
         has_goal = goals.goal_mask[elements[:3]]
         conditioned = select_rows(has_goal)  # [g] of the R rows of dist
         rows = tuple(index[conditioned] for index in elements)

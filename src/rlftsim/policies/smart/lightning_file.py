@@ -102,7 +102,8 @@ def _unpickle(path: Path) -> Any:
     except CheckpointError:
         raise
     except Exception as error:  # whatever damage makes of the code that reads it
-        raise CheckpointError(f"{path}: damaged or not a checkpoint ({first_line(error)}): get the file again.") from None
+        reason = first_line(error)
+        raise CheckpointError(f"{path}: damaged or not a checkpoint ({reason}): get the file again.") from None
 
 
 def _plain(value: Any) -> Any:

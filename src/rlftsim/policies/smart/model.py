@@ -27,7 +27,7 @@ from rlftsim.policies.smart.neighbors import bound_neighbors
 from rlftsim.policies.smart.network import Scene, SmartNetwork, mask_positions
 from rlftsim.policies.smart.token_steps import TokenSteps, build_logged_steps
 from rlftsim.policies.token_rows import NEVER, TokenRows
-from rlftsim.rollout.rows import row_places
+from rlftsim.rollout.rows import find_rows
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.tokens.agent_tokens import AgentTokens, tokenize_agents
 from rlftsim.tokens.map_tokens import tokenize_map
@@ -63,15 +63,15 @@ class SmartModel(nn.Module):
 
     # ---- training -------------------------------------------------------------------------------------------------
 
-    def fine_tuned_parts(self) -> tuple[nn.Module, ...]:
+    def fine_tuned_modules(self) -> tuple[nn.Module, ...]:
         """The decoder's attention and head, as in the public CAT-K code, and the goal modules."""
         return self.network.decoder.reader_modules()
 
-    def head_parts(self) -> tuple[nn.Module, ...]:
+    def head_modules(self) -> tuple[nn.Module, ...]:
         """The layers that turn an agent's features into logits of tokens, and the goal modules."""
-        return *self.network.decoder.head_modules(), *self.goal_parts()
+        return *self.network.decoder.head_modules(), *self.goal_modules()
 
-    def goal_parts(self) -> tuple[nn.Module, ...]:
+    def goal_modules(self) -> tuple[nn.Module, ...]:
         """Goal encoder and goal logit bias; empty in a goal-free model."""
         return self.network.decoder.goal_modules()
 
@@ -210,7 +210,7 @@ class SmartModel(nn.Module):
         mask: Bool[Tensor, "B N A *L"],
     ) -> CategoricalDistribution:
         """Distributions of the elements of a mask; tokens that a class lacks get the logit `NEVER`."""
-        scenario, _, agent, *_ = row_places(mask, has_all=len(features) == mask.numel())
+        scenario, _, agent, *_ = find_rows(mask, is_dense=len(features) == mask.numel())
         class_id = token_class[scenario, agent]  # [R]
         head, scores, exists = self.network.decoder.head, self.network.decoder.scores, self.vocabulary.class_tokens
         if isinstance(head, ClassHeads):

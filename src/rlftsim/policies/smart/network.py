@@ -48,7 +48,7 @@ from rlftsim.policies.smart.goal_conditioning import (
 from rlftsim.policies.smart.heads import ClassHeads, ContinuationScores, TokenKeys
 from rlftsim.policies.smart.neighbors import Poses, find_neighbors, group_rows, relative_pose
 from rlftsim.policies.smart.token_steps import TokenSteps
-from rlftsim.rollout.rows import place_rows, row_places
+from rlftsim.rollout.rows import find_rows, place_rows
 from rlftsim.tokens.map_tokens import NUM_FAMILIES, NUM_LIGHTS, NUM_TYPES, MapTokens
 from rlftsim.tokens.vocabulary import CLASS_NAMES
 
@@ -300,7 +300,7 @@ class AgentDecoder(nn.Module):
             padded: Whether padding has rows, too, which no row attends to, and lists have fixed widths.
         """
         # 1. rows, and the row of each element of the block (-1 = none)
-        rows = scenario, rollout, agent, step = row_places(steps.valid, padded)
+        rows = scenario, rollout, agent, step = find_rows(steps.valid, padded)
         num_sources = 0 if past is None else past.sources[0].shape[0]
         index = torch.arange(len(agent), device=agent.device)
         element_row = torch.where(steps.valid, place_rows(index, steps.valid), -1)  # [B, N, A, K]

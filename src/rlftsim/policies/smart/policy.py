@@ -103,7 +103,7 @@ class SmartPolicy(SmartModel):
         num_left = torch.full_like(state.heading, NUM_DECISIONS - state.num_decisions, dtype=torch.int64)
         if context.is_padded:
             mask = torch.ones_like(mask)
-        features = pick_rows(self._compute_features(context, state), mask, has_all=context.is_padded)
+        features = pick_rows(self._compute_features(context, state), mask, is_dense=context.is_padded)
         dist = self._build_distribution(context, state, features, mask, Poses(state.position, state.heading), num_left)
         return TokenDistribution(dist.logits, mask)
 
@@ -203,7 +203,7 @@ class SmartPolicy(SmartModel):
         features = place_rows(rows, context.history.valid)[:, 0, :, -1]
         return replace(context, past=past, features=features, model=self)
 
-    def score_both(
+    def score_with_reference(
         self, context: SmartContext, rollouts: Rollouts, reference: Any, ref_context: Any, ref_rollouts: Rollouts
     ) -> tuple[CategoricalDistribution, DecisionDistribution]:
         """Distributions along rollouts of this policy and, without gradient, of a reference.
