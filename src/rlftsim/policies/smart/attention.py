@@ -280,7 +280,8 @@ def gather_edges(
     # the fused kernel is faster, although relations and sources are copied together for it
     results = []
     for block_query, block in zip(torch.cat(queries, -1).split(neighborhoods.sizes), neighborhoods.blocks):
-        edges = torch.cat(_key_spaces(block.edge_features, block.neighbors, source), -1)[:, None]  # [r, 1, K, 2D]
+        spaces = _key_spaces(block.edge_features, block.neighbors, source)
+        edges = (spaces[0] if source is None else torch.cat(spaces, -1))[:, None]  # [r, 1, K, 2D]
         query = _by_list(block_query, block.num_sharing * block_query.shape[1])[:, None]  # [r, 1, m H, 2D]
         bias = block.bias[:, None]
         result = functional.scaled_dot_product_attention(query, edges, edges, attn_mask=bias, scale=1.0)
