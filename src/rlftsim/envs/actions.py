@@ -327,16 +327,16 @@ def signed_speed(motion: Float[np.ndarray, "*m 5"]) -> Float[np.ndarray, "*m"]:
 
 
 def to_heading_frame(
-    vectors: Float[np.ndarray, "*m 2"], heading: Float[np.ndarray, "*#m"]
+    x: Float[np.ndarray, "*m"], y: Float[np.ndarray, "*m"], heading: Float[np.ndarray, "*#m"]
 ) -> tuple[Float[np.ndarray, "*m"], Float[np.ndarray, "*m"]]:
     """Components of vectors along headings and to the left of them.
 
     Args:
-        vectors: x and y in the map frame.
-        heading: Directions of the new x axes in the map frame, rad; broadcast against the vectors.
+        x: First components in the map frame, in the unit of the result.
+        y: Second components in the map frame, in the same unit.
+        heading: Directions of the new x axes in the map frame, rad; broadcast against the components.
     """
     cos, sin = np.cos(heading), np.sin(heading)
-    x, y = vectors[..., 0], vectors[..., 1]
     return cos * x + sin * y, cos * y - sin * x
 
 

@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int8, Int64
 
-from rlftsim.envs.actions import WHEELBASE_PER_LENGTH, signed_speed
+from rlftsim.envs.actions import WHEELBASE_PER_LENGTH, signed_speed, to_heading_frame
 from rlftsim.envs.drivers import Driver
 from rlftsim.envs.levels import RouteHeights, is_on_level
 from rlftsim.envs.route import Route, compute_headings
@@ -263,7 +263,7 @@ def observe(world: World, atlas: Atlas, state: WorldState, *, frame: Frame = "eg
     ends = np.cumsum([group.size // (2 * count) for group in groups])[:-1] if count else [0] * (len(groups) - 1)
     x, y = points[..., 0] - origin[:, :1], points[..., 1] - origin[:, 1:]
     if is_ego_frame:
-        x, y = _turned(x, y, angle)
+        x, y = to_heading_frame(x, y, angle[:, None])
     local = np.split(np.stack([x, y], -1), ends, axis=1)
     neighbor_points, ego_points, lane_points, edges, crossings, light_points, route_points, end = local
     # 4. Columns.
@@ -271,7 +271,8 @@ def observe(world: World, atlas: Atlas, state: WorldState, *, frame: Frame = "eg
     poses = np.empty((*direction.shape, 4), np.float32)  # [M, 11, K, 4]
     poses[..., :2] = neighbor_points.reshape(*direction.shape, 2)
     poses[..., 2], poses[..., 3] = np.cos(direction), np.sin(direction)
-    velocity = np.stack(_turned(neighbor_motion[:, -1, :, 3], neighbor_motion[:, -1, :, 4], angle), -1)
+    vx, vy = neighbor_motion[:, -1, :, 3], neighbor_motion[:, -1, :, 4]
+    velocity = np.stack(to_heading_frame(vx, vy, angle[:, None]), -1)
     is_replayed = world.drivers[scene[:, None], neighbor] == Driver.REPLAY  # they alone have a log to go by
     age = np.where(is_replayed, STEP_S * (log_step - atlas.last_logged[scene[:, None], neighbor, log_step]), 0.0)
     size, object_type = world.size[scene[:, None], neighbor], world.object_type[scene[:, None], neighbor]
@@ -373,12 +374,6 @@ def _distance(motion: Float[np.ndarray, "M 5"], points: np.ndarray) -> Float[np.
     """Distances from agents to points, of which x and y come first on the last axis."""
     dx, dy = points[..., 0] - motion[:, :1], points[..., 1] - motion[:, 1:2]
     return np.sqrt(dx * dx + dy * dy)
-
-
-def _turned(x: np.ndarray, y: np.ndarray, angle: Float[np.ndarray, "M"]) -> tuple[np.ndarray, np.ndarray]:
-    """Vectors [M, n] in frames that are turned by angles."""
-    cos, sin = np.cos(angle)[:, None], np.sin(angle)[:, None]
-    return cos * x + sin * y, cos * y - sin * x
 
 
 def _nearest(

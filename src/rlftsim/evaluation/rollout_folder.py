@@ -15,7 +15,7 @@ from rlftsim.goals.goals_file import GoalsFile
 from rlftsim.goals.placement import goals_of_batch
 from rlftsim.jobs.documents import read_json
 from rlftsim.jobs.files import remove_temporaries_below
-from rlftsim.jobs.folder import Lease, check_folder, write_identity
+from rlftsim.jobs.folder import Lease, check_folder, find_differences, write_identity
 from rlftsim.jobs.items import WholeFiles, run_items
 from rlftsim.jobs.processes import Advance
 from rlftsim.jobs.progress import log
@@ -146,11 +146,7 @@ def _check_identity(folder: Path, identity: Mapping[str, Any], *, is_alone: bool
     way_out = "name another --out"
     if rollouts and not path.exists():
         raise ConfigError(f"{folder} holds {rollouts[0].name} but no {ABOUT}, so their model is unknown: {way_out}.")
-    stored = read_json(path, way_out) if path.exists() else identity
-    names = [name for name in {**identity, **stored} if name != "model"]
-    differences = [name for name in names if stored.get(name) != identity.get(name)]
+    differences = [name for name in find_differences(path, identity, way_out) if name != "model"]
     if differences and (rollouts or not is_alone):
-        begun = "holds" if rollouts else "was begun by a share for"
-        raise ConfigError(
-            f"{folder} {begun} rollouts of {stored.get('model')} with another {', '.join(differences)}: {way_out}."
-        )
+        begun, model = "holds" if rollouts else "was begun by a share for", read_json(path, way_out).get("model")
+        raise ConfigError(f"{folder} {begun} rollouts of {model} with another {', '.join(differences)}: {way_out}.")

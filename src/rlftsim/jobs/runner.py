@@ -202,9 +202,8 @@ class Work(Machines):
 
     def runner(self, jobs: int, on_death: OnDeath) -> Runner | None:
         """Runner of the flags, see `Machines`."""
-        is_fragile = on_death == "stop" and jobs > 1 and self.share is None and self.ray is None
         runner = super().runner(jobs, on_death)
-        return Processes(jobs, on_death, self.item_log) if is_fragile else runner
+        return Processes(jobs, on_death) if runner is None and on_death == "stop" and jobs > 1 else runner
 
 
 def check_begun(runner: Runner, folder: Path) -> None:

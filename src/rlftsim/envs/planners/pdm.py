@@ -19,6 +19,7 @@ from rlftsim.envs.actions import (
     pursue,
     pursuit_m,
     signed_speed,
+    to_heading_frame,
 )
 from rlftsim.envs.idm import LOOKAHEAD_M, IdmConfig, compute_idm_acceleration, find_leaders
 from rlftsim.envs.planner_scores import ACCELERATION, JERK, LATERAL
@@ -100,9 +101,8 @@ def simulate_proposals(view: View) -> Proposals:
         acceleration = np.maximum(compute_idm_acceleration(speed, free_speed, gap, lead, CONFIG), -ACCELERATION_MPS2)
         # 2. pure pursuit of the line
         target = lines[row, np.minimum(line_index + pursuit_m(speed).astype(int), lines.shape[1] - 1)] - motion[:, :2]
-        cos, sin = np.cos(motion[:, 2]), np.sin(motion[:, 2])
-        x, y = cos * target[:, 0] + sin * target[:, 1], cos * target[:, 1] - sin * target[:, 0]
-        steering = pursue(np.stack([x, y], -1), view.size[:1])
+        target = to_heading_frame(target[:, 0], target[:, 1], motion[:, 2])
+        steering = pursue(np.stack(target, -1), view.size[:1])
         motion = bicycle.drive(motion, acceleration, steering, view.size[:1])
         states.append(motion)
         controls.append(np.stack([acceleration, steering], -1))

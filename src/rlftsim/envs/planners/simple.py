@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from rlftsim.envs.actions import ActionType
+from rlftsim.envs.actions import ActionType, to_heading_frame
 from rlftsim.errors import DataError
 from rlftsim.geometry import wrapped
 
@@ -42,8 +42,7 @@ class Replay:
 def _steps_between(poses: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n-1 3"]:
     """Each pose but the first in the frame of the one before, float32."""
     offset = np.diff(poses[:, :2], axis=0)
-    cos, sin = np.cos(poses[:-1, 2]), np.sin(poses[:-1, 2])
-    x, y = cos * offset[:, 0] + sin * offset[:, 1], cos * offset[:, 1] - sin * offset[:, 0]
+    x, y = to_heading_frame(offset[:, 0], offset[:, 1], poses[:-1, 2])
     return np.stack([x, y, wrapped(np.diff(poses[:, 2]))], -1).astype(np.float32)
 
 
