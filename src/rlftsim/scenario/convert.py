@@ -434,8 +434,8 @@ def _report(
     names = {all_names[entry.file] for entry in entries}
     duplicates = [record for record in manifest.duplicates if record.file in names]
     # a shard of this call that comes first in the index makes duplicates of scenarios that were there before
-    is_old = set(earlier_duplicates).__contains__
-    replaced = [record for record in manifest.duplicates if record.file not in names and not is_old(record)]
+    earlier_records = {*earlier_duplicates}
+    replaced = [r for r in manifest.duplicates if r.file not in names and r not in earlier_records]
     tallies: Counter[str] = Counter()
     for entry in entries:
         tallies.update(entry.tallies)
