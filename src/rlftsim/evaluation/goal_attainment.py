@@ -133,4 +133,4 @@ def _simulate_goals(job: _Job, position: int) -> dict[str, object]:
     for goal in job.goals[scenario_id]:
         states = goal_free or simulated(goals=goals_of_batch([goal], batch))
         outcomes.append(measure_outcome(states.simulated_path(goal.agent_id), (goal.x, goal.y)))
-    return {name: [getattr(outcome, name) for outcome in outcomes] for name in ("reached", "passed")}
+    return {"reached": [outcome.reached for outcome in outcomes], "passed": [outcome.passed for outcome in outcomes]}
