@@ -37,8 +37,8 @@ class RecipeVerb:
     @property
     def settings(self) -> Recipe:
         """The recipe with the values of the command line."""
-        shown = [name for name in sections_of(self.starting_recipe) if name in self.sections]
-        recipe = dataclasses.replace(self.starting_recipe, **{name: getattr(self, name) for name in shown})
+        names = [name for name in sections_of(self.starting_recipe) if hasattr(self, name)]
+        recipe = dataclasses.replace(self.starting_recipe, **{name: getattr(self, name) for name in names})
         return recipe if self.processes is None else recipe.with_processes(self.processes)
 
     @classmethod
@@ -57,9 +57,14 @@ class RecipeVerb:
         return recipe_by_name(name)
 
     @classmethod
+    def sections_for(cls, words: Sequence[str]) -> tuple[str, ...]:
+        """Sections whose fields are flags of a command line, of those that the recipe has."""
+        return cls.sections
+
+    @classmethod
     def sections_in_file(cls, words: Sequence[str]) -> tuple[str, ...]:
         """Sections that are read from the file of settings, of those that the recipe has."""
-        return cls.sections
+        return cls.sections_for(words)
 
     @classmethod
     def run_section(cls, words: Sequence[str]) -> str:
@@ -94,7 +99,8 @@ def with_settings(
     # 2. the recipe gives the sections and their defaults
     name = name or verb.recipe_name_in(words)
     recipe = verb.recipe_for(name, words)
-    shown = {name: section for name, section in sections_of(recipe).items() if name in verb.sections}
+    names = verb.sections_for(words)
+    shown = {name: section for name, section in sections_of(recipe).items() if name in names}
     fields: list[Any] = [(name, type(section), dataclasses.field(default=section)) for name, section in shown.items()]
     complete = dataclasses.make_dataclass(
         verb.__name__,

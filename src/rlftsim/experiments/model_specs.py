@@ -11,7 +11,7 @@ from rlftsim.training.catk import CatkConfig
 from rlftsim.training.finetune_config import FinetuneConfig
 from rlftsim.training.goal_relabeling import GcslConfig
 from rlftsim.training.goals import GoalConfig, with_goals
-from rlftsim.training.methods import FinetuningConfig
+from rlftsim.training.method import TrainingSettings
 
 WEAK_EPOCHS = 1.0
 """Pre-training of the paper's weaker base model."""
@@ -83,7 +83,7 @@ class FineTuned:
         goals = "" if self.goals is None else f"-{self.goals.name}"
         return f"{self.method}{goals}{credit}{base}-seed{self.seed}"
 
-    def training_config(self, recipe: Recipe) -> FinetuningConfig:
+    def training_config(self, recipe: Recipe) -> TrainingSettings:
         """Settings of the training; their type is that of the method.
 
         Raises:

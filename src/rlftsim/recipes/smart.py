@@ -20,7 +20,7 @@ from rlftsim.training.catk import CatkConfig, RoadConfig
 from rlftsim.training.finetune_config import FinetuneConfig
 from rlftsim.training.goal_relabeling import GcslConfig
 from rlftsim.training.goals import GoalConfig
-from rlftsim.training.pretrain import PretrainConfig
+from rlftsim.training.imitation import PretrainConfig
 from rlftsim.training.reference import KlConfig
 
 

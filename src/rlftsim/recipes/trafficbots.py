@@ -15,7 +15,7 @@ from rlftsim.tokens.vocabulary import Vocabulary
 from rlftsim.training.catk import CatkConfig
 from rlftsim.training.finetune_config import FinetuneConfig
 from rlftsim.training.goal_relabeling import GcslConfig
-from rlftsim.training.pretrain import PretrainConfig
+from rlftsim.training.imitation import PretrainConfig
 from rlftsim.training.reference import KlConfig
 
 

@@ -41,7 +41,7 @@ def counts_of(scenarios: Scenarios, columns: Sequence[str]) -> Int64[np.ndarray,
     return np.array([[getattr(row, name) for row in rows] for name in columns], dtype=np.int64)
 
 
-def refuse_unscored(scenarios: Scenarios) -> None:
+def check_scored(scenarios: Scenarios) -> None:
     """Check before a run begins that the metric, and so a reward, is defined for each scenario.
 
     Args:

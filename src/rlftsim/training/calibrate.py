@@ -13,11 +13,9 @@ that of all weights of a network is not after tens of thousands. K features, C c
 """
 
 import math
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -31,24 +29,16 @@ from rlftsim.realism import AgentScores, RealismResult, compute_batch_features, 
 from rlftsim.realism.from_rollouts import states_of_rollouts
 from rlftsim.rewards import compute_rewards, parse_reward, write_reward
 from rlftsim.rollout.noise import derive_seed
-from rlftsim.rollout.policy import Policy, Sampling
+from rlftsim.rollout.policy import Sampling
 from rlftsim.rollout.simulate import simulate
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import Scenarios
 from rlftsim.training.constraints import CONSTRAINTS, against_others
 from rlftsim.training.data import batch_with_futures
+from rlftsim.training.method import Learner, Method, UpdateReport, UpdateScenarios, check_trainable
 from rlftsim.training.natural_step import best_length, natural_direction, t_value
 from rlftsim.training.parallel import DeviceConfig, Fabric, all_reduce_sum, num_sharing_memory
-from rlftsim.training.run import (
-    Learner,
-    TrainingRun,
-    TrainingScenarios,
-    UpdateReport,
-    as_scenarios,
-    require_trainable,
-    train_in_processes,
-)
 
 SUB_SCORES = ("kinematic", "interactive", "map_based")
 MEASURED = ("rmm", *SUB_SCORES, "collision_rate", "offroad_rate")
@@ -162,50 +152,33 @@ class CalibrateConfig:
         return len(self.tasks(num_scenarios))
 
 
-def calibrate(
-    policy: Policy,
-    scenarios: TrainingScenarios,
-    out: str | os.PathLike[str],
-    config: CalibrateConfig,
-    *,
-    card: str = "",
-) -> Path:
-    """Fit the weights of a policy's features in place; resumes where a run in `out` was stopped.
+class CalibrateMethod(Method[CalibrateConfig]):
+    """Fit the weights of a `CalibratablePolicy`'s features, such as `policies.calibrated.policy.CalibratedPolicy`."""
 
-    Args:
-        policy: A `CalibratablePolicy`, such as `policies.calibrated.policy.CalibratedPolicy(base, config.features)`.
-        scenarios: Data set, list or one scenario, with their futures.
-        out: Folder of the run.
-        config: Settings; their features are those of the policy.
-        card: README of the resulting model folder; the policy adds the table of features.
+    settings = CalibrateConfig
+    title = "calibrate"
 
-    Returns:
-        The model folder, `out/model`.
+    def describe(self, settings: CalibrateConfig) -> str:
+        """Number of features, and the reward."""
+        return f"calibration of {len(settings.features)} features, {settings.reward}"
 
-    Raises:
-        ConfigError: The policy has no such features, or there are too few scenarios.
-        DataError: A scenario has no logged future or no evaluated agent.
-        CheckpointError: `out` holds another run.
-        NotYetError: Another run is at work in `out`.
-    """
-    scenarios = as_scenarios(scenarios)
-    model = require_trainable(policy, scenarios, "calibration", needs=("vocabulary", "features", "eta"), rewarded=True)
-    if tuple(model.features) != config.features:
-        raise ConfigError(
-            f"the policy has the features {', '.join(model.features)}, the settings others: make it with "
-            "CalibratedPolicy(base, config.features)."
-        )
-    config.split(len(scenarios))
+    def start(
+        self, policy: Any, scenarios: Scenarios, settings: CalibrateConfig, fabric: Fabric
+    ) -> "CalibrationLearner":
+        """Learner of the features' weights; the features have to be those of the settings."""
+        check_trainable(policy, scenarios, "calibration", needs=("vocabulary", "features", "eta"), is_rewarded=True)
+        if tuple(policy.features) != settings.features:
+            raise ConfigError(
+                f"the policy has the features {', '.join(policy.features)}, the settings others: make it with "
+                "CalibratedPolicy(base, config.features)."
+            )
+        policy.to(fabric.device).eval().requires_grad_(False)
+        optimizer = torch.optim.SGD([policy.eta])
+        return CalibrationLearner(policy=policy, optimizer=optimizer, config=settings, scenarios=scenarios)
 
-    def train(config: CalibrateConfig, fabric: Fabric) -> Path:
-        run = TrainingRun(policy, scenarios, out, config, fabric)
-        model.to(fabric.device).eval().requires_grad_(False)
-        learner = CalibrationLearner(
-            policy=model, optimizer=torch.optim.SGD([model.eta]), config=config, scenarios=scenarios
-        )
-        return run.train(learner, lambda: learner.work(fabric), title="calibrate", card=card)
-
-    return train_in_processes(train, config, len(scenarios), out)
+    def update(self, learner: "CalibrationLearner", scenarios: UpdateScenarios, fabric: Fabric) -> UpdateReport:
+        """Measure the next batch of scenarios, which the learner chooses itself."""
+        return learner.measure(fabric)
 
 
 class Statistics(nn.Module):
@@ -260,7 +233,7 @@ class CalibrationLearner(Learner):
         """The statistics: a checkpoint needs nothing else."""
         return {"statistics": self.statistics}
 
-    def work(self, fabric: Fabric) -> UpdateReport:
+    def measure(self, fabric: Fabric) -> UpdateReport:
         """Measure the next batch of scenarios.
 
         Args:

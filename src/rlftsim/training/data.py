@@ -11,6 +11,7 @@ from torch import Tensor
 from rlftsim.errors import DataError
 from rlftsim.rollout.noise import derive_seed
 from rlftsim.scenario.batch import ScenarioBatch, collate
+from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.derived import cached_on_scenario
 from rlftsim.scenario.mirror import mirrored
 from rlftsim.scenario.types import CURRENT_STEP, Scenario, Scenarios
@@ -143,3 +144,17 @@ def scenarios_of_update(update: int, batch_size: int, num_scenarios: int, seed: 
         for epoch in {p // num_scenarios for p in places}
     }
     return [int(orders[p // num_scenarios][p % num_scenarios]) for p in places]
+
+
+def share_cache(scenarios: Scenarios, num_processes: int) -> Scenarios:
+    """Scenarios of which each process keeps its share in memory, where the process cannot keep all.
+
+    Args:
+        scenarios: Training scenarios; a list, which is in memory already, stays as it is.
+        num_processes: Processes that share a memory.
+    """
+    if not isinstance(scenarios, ScenarioDataset) or num_processes == 1:
+        return scenarios
+    if len(scenarios) * num_processes <= scenarios.cache_size:
+        return scenarios
+    return ScenarioDataset(scenarios.folder, scenarios.split, cache_size=max(scenarios.cache_size // num_processes, 1))

@@ -63,7 +63,7 @@ def freeze_untrained(policy: nn.Module, trained: TrainedParts) -> None:
         part.requires_grad_(True)
 
 
-def refuse_constant_entropy(policy: nn.Module, scenario: Scenario, trained: TrainedParts) -> None:
+def check_entropy(policy: nn.Module, scenario: Scenario, trained: TrainedParts) -> None:
     """Refuse an entropy bonus for a policy whose entropy no trained weight moves, such as one with fixed noise.
 
     Args:

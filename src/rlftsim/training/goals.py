@@ -72,7 +72,7 @@ def with_goals(config: GoalConfig) -> GoalConfig:
     return replace(config, probability=config.probability or 1.0, hindsight=config.hindsight or 1.0)
 
 
-def refuse_goals(policy: Policy, probability: float) -> None:
+def check_goals(policy: Policy, probability: float) -> None:
     """Refuse to train a policy with goals if it is not goal-conditioned.
 
     Args:

@@ -99,7 +99,7 @@ class DeviceConfig:
 
     @property
     def forks(self) -> bool:
-        """True if `processes.in_processes` starts the processes of a run; else lightning-fabric or torchrun does."""
+        """True if `linked_processes` starts the processes of a run; else lightning-fabric or torchrun does."""
         return not self.uses_cuda and self.num_nodes == 1 and not is_torchrun()
 
     def num_processes(
@@ -133,7 +133,7 @@ def can_fork() -> bool:
 
 
 def start_fabric(config: DeviceConfig) -> Fabric:
-    """Device and precision of a run, and its processes on GPUs or under torchrun; for a CPU's see `in_processes`.
+    """Device and precision of a run, and its processes on GPUs or under torchrun; for a CPU's see `linked_processes`.
 
     Raises:
         ConfigError: CUDA is requested, but there is none.

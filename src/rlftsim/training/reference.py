@@ -10,7 +10,7 @@ from torch import nn
 from rlftsim.errors import ConfigError, require_positive, require_types
 from rlftsim.training.alarms import Alarms
 from rlftsim.training.goals import StoredGoals
-from rlftsim.training.run import Learner
+from rlftsim.training.method import Learner
 
 
 @dataclass(frozen=True)
@@ -49,10 +49,14 @@ class RewardLearner(Learner):
     """A policy in fine-tuning with its frozen reference, the KL penalty's strength and the alarms."""
 
     reference: Any
+    config: Any
+    """Settings of the run, a `FinetuneConfig`."""
     beta: float
     augmented_goals: StoredGoals | None = None
     """Goals beside the logged endpoints."""
     alarms: Alarms = field(default_factory=Alarms)
+    warned_terms: set[str] = field(default_factory=set)
+    """Terms of the reward that a message has called not finite."""
 
     @property
     def modules(self) -> dict[str, nn.Module]:

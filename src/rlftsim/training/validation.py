@@ -75,7 +75,7 @@ class ValidationConfig:
         return sorted(order[: self.num_scenarios].tolist())
 
 
-def refuse_to_validate(model: object, scenarios: Scenarios, config: ValidationConfig) -> None:
+def check_validation(model: object, scenarios: Scenarios, config: ValidationConfig) -> None:
     """Refuse before a run what would end it at its first validation.
 
     Args:

@@ -1,6 +1,6 @@
-"""Stages from a data set to trained policies: vocabulary, pre-training, fine-tuning by any method.
+"""The way from a data set to trained policies: vocabulary, pre-training, fine-tuning by any method.
 
-Each does what is missing in its folder, and refuses the folder of another run.
+Each stage does what is missing in its folder, and refuses the folder of another run.
 """
 
 import shutil
@@ -12,16 +12,18 @@ import torch
 from torch import nn
 
 from rlftsim.errors import ConfigError
+from rlftsim.policies.calibrated.policy import CalibratedPolicy
 from rlftsim.policies.registry import load_policy
-from rlftsim.recipes.calibration import prepare_policy
 from rlftsim.recipes.card import model_card
 from rlftsim.rollout.policy import ConditionablePolicy
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.tokens.clustering import TokensConfig, build_vocabulary
 from rlftsim.tokens.vocabulary import Vocabulary
+from rlftsim.training.calibrate import CalibrateConfig
 from rlftsim.training.goals import not_conditioned
-from rlftsim.training.methods import FinetuningConfig, describe_method, finetune_policy
-from rlftsim.training.pretrain import PretrainConfig, pretrain
+from rlftsim.training.imitation import PretrainConfig
+from rlftsim.training.method import TrainingSettings, find_method
+from rlftsim.training.run import train_policy
 
 CACHED_SCENARIOS = 4096
 """About a megabyte each; their tokens are cached with them."""
@@ -88,13 +90,13 @@ def pretrain_policy(
     card = model_card(what, training.folder, len(training), start)
     if isinstance(policy, nn.Module):
         policy.requires_grad_(True)  # weights of a loaded policy are frozen
-    return pretrain(policy, training, out, config, held_out=held_out, card=card)
+    return train_policy(policy, training, out, config, held_out=held_out, card=card)
 
 
 def finetune_model(
     base: str | Path,
     training: ScenarioDataset,
-    config: FinetuningConfig,
+    config: TrainingSettings,
     out: Path,
     *,
     conditioning: GoalConditioning | None = None,
@@ -126,7 +128,30 @@ def finetune_model(
     what = f"fine-tuned ({describe_method(config)}{conditioning or ''}) from {base}"
     card = model_card(what, training.folder, len(training), base)
     policy = prepare_policy(policy, config)
-    return finetune_policy(policy, training, out, config, held_out=held_out, card=card)
+    return train_policy(policy, training, out, config, held_out=held_out, card=card)
+
+
+def describe_method(config: object) -> str:
+    """The method of a fine-tuning in a few words, for the README of its model: by the type of its settings."""
+    method = find_method(config)
+    return "" if method is None else method.describe(config)
+
+
+def prepare_policy(policy: Any, config: object) -> Any:
+    """Policy with the features of a calibration, their weights 0; the policy itself for other methods.
+
+    Args:
+        policy: Base model. One that has been calibrated with the same features goes on from its weights.
+        config: Settings of the method.
+
+    Raises:
+        ConfigError: The policy has no vocabulary or no weights, or a feature is unknown.
+    """
+    if not isinstance(config, CalibrateConfig):
+        return policy
+    if isinstance(policy, CalibratedPolicy) and policy.features == config.features:
+        return policy
+    return CalibratedPolicy(policy, config.features)
 
 
 def start_from_shorter_run(out: Path, epochs: float) -> None:
