@@ -152,7 +152,7 @@ def test_weights_of_the_network_stay_as_they_are(policy, drawn_scenarios, tmp_pa
 
 def test_a_run_that_was_stopped_ends_with_the_same_weights(policy, vocabulary, drawn_scenarios, tmp_path, monkeypatch):
     train_policy(policy, drawn_scenarios, tmp_path / "whole", CONFIG)
-    original, calls = CalibrationLearner.work, []
+    original, calls = CalibrationLearner.measure, []
 
     def interrupted(learner, fabric):
         calls.append(1)
@@ -163,7 +163,7 @@ def test_a_run_that_was_stopped_ends_with_the_same_weights(policy, vocabulary, d
     def fresh():
         return CalibratedPolicy(tiny.tiny_policy(vocabulary, tiny.WITHOUT_CHANCE), CONFIG.features).eval()
 
-    monkeypatch.setattr(CalibrationLearner, "work", interrupted)
+    monkeypatch.setattr(CalibrationLearner, "measure", interrupted)
     with pytest.raises(KeyboardInterrupt, match="behind update 2"):
         train_policy(fresh(), drawn_scenarios, tmp_path / "stopped", CONFIG)
     train_policy(fresh(), drawn_scenarios, tmp_path / "stopped", CONFIG)

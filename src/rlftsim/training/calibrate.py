@@ -213,7 +213,6 @@ class Statistics(nn.Module):
 class CalibrationLearner(Learner):
     """A policy whose features get weights, and the statistics that these follow from."""
 
-    config: CalibrateConfig
     scenarios: Scenarios
 
     def __post_init__(self) -> None:

@@ -101,7 +101,6 @@ class CatkMethod(ImitationMethod[CatkConfig]):
     def predict(self, learner: Imitator, batch: ScenarioBatch, trained: Bool[Tensor, "B A"]) -> Prediction:
         """Predictions along rollouts near the log."""
         model, config, update = learner.policy, learner.config, learner.update
-        assert isinstance(config, CatkConfig)
         context = rollout_context = model.encode(batch)
         behavior = model
         if learner.frozen is not None:

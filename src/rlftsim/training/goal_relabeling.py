@@ -82,7 +82,6 @@ class GcslMethod(ImitationMethod[GcslConfig]):
     def predict(self, learner: Imitator, batch: ScenarioBatch, trained: Bool[Tensor, "B A"]) -> Prediction:
         """Predictions along the policy's rollouts, whose endpoints are the goals."""
         model, config = learner.policy, learner.config
-        assert isinstance(config, GcslConfig)
         model.eval()  # nothing that dropout would act on is trained
         context = model.encode(batch)
         seed = derive_seed(config.seed, "rollouts", learner.update)

@@ -128,7 +128,6 @@ class ImitationConfig:
 class Imitator(Learner):
     """A model in training, with what its updates are made of."""
 
-    config: ImitationConfig
     num_scenarios: int
     """Training scenarios, all of them."""
     average: nn.Module | None = None

@@ -80,6 +80,8 @@ class Learner:
 
     policy: Any
     optimizer: Optimizer
+    config: Any
+    """Settings of the run."""
     update: int = 0
     """Updates done, skipped ones included."""
     skipped_in_a_row: int = 0

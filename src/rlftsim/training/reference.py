@@ -49,8 +49,6 @@ class RewardLearner(Learner):
     """A policy in fine-tuning with its frozen reference, the KL penalty's strength and the alarms."""
 
     reference: Any
-    config: Any
-    """Settings of the run, a `FinetuneConfig`."""
     beta: float
     augmented_goals: StoredGoals | None = None
     """Goals beside the logged endpoints."""
