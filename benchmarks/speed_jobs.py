@@ -369,9 +369,9 @@ def prepare_base(job: Job) -> None:
     """The demo's vocabulary and base model, as `rlftsim demo` makes them."""
     import torch
 
-    from rlftsim.recipes.train import find_vocabulary, open_training
     from rlftsim.policies.smart.policy import SmartPolicy
     from rlftsim.recipes.smart import smart_demo_rlftsim
+    from rlftsim.recipes.train import find_vocabulary, open_training
     from rlftsim.scenario.synthetic import pack_path
     from rlftsim.training.run import train_policy
 
