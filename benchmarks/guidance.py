@@ -15,7 +15,7 @@ from rlftsim.evaluation.compare import compare
 from rlftsim.evaluation.evaluate import evaluate
 from rlftsim.evaluation.goal_attainment import attain_goals
 from rlftsim.evaluation.results import EvaluateConfig
-from rlftsim.experiments.paper.controllability import estimate, rates_by_scenario
+from rlftsim.experiments.paper.controllability import compute_scenario_rates, estimate_mean
 from rlftsim.experiments.paper.maneuver_goals import propose_goals
 from rlftsim.policies.registry import load_policy, with_guidance
 from rlftsim.scenario.dataset import ScenarioDataset
@@ -42,7 +42,7 @@ def main() -> None:
     for scale in arguments.scales:
         policy, name = with_guidance(load_policy(arguments.model), scale), f"guidance-{scale:g}"
         attained = attain_goals(policy, data, arguments.out / name, config, alternatives)
-        passed = estimate(rates_by_scenario(attained, "passed").values())
+        passed = estimate_mean(compute_scenario_rates(attained, "passed").values())
         result = evaluate(policy, data, arguments.out, replace(config, goals="logged"), name=name)
         first = first or result
         gain = compare(first, result)["meta_metric"]

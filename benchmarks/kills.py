@@ -1,5 +1,5 @@
-"""Random kills: conversions, evaluations and submissions that are killed again and again end with the bytes of
-undisturbed ones.
+"""Random kills: conversions, evaluations, simulations, augmented goals and submissions that are killed again and again
+end with the bytes of undisturbed ones.
 
 python benchmarks/kills.py FOLDER [--kills 100] [--backends inline processes shares ray] [--seed 0] [--scenarios 24]
 
@@ -30,7 +30,7 @@ from pathlib import Path
 
 os.environ["OMP_NUM_THREADS"] = "1"
 
-from rlftsim.cli import data, results, submit  # noqa: F401 (so that forked commands need not import them)
+from rlftsim.cli import augment, data, results, simulate, submit  # noqa: F401 (so that forked commands need not import them)
 from rlftsim.cli.main import main as rlftsim
 from rlftsim.scenario import womd_pb2
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
@@ -59,8 +59,8 @@ VICTIMS = {
     "shares": ["command", "all"],
     "ray": ["command", "worker", "all"],
 }
-TIMED = ("submission.report.json", "submission.report.md")
-"""Files that hold the duration of the run."""
+TIMED = ("submission.report.json", "submission.report.md", "environment.json")
+"""Files that hold the duration of the run, or the words of the command."""
 
 
 def write_sources(folder, num_scenarios):
@@ -108,6 +108,14 @@ def commands(sources, out):
             "evaluate", "constant_velocity", "--data", sources / "set", "--out", out, "--num-rollouts", "2",
             "--device", "cpu",
         ],
+        "simulate": [
+            "simulate", "constant_velocity", "--data", sources / "set", "--out", out, "--num-rollouts", "2",
+            "--device", "cpu",
+        ],
+        "augment": [
+            "augment", "constant_velocity", "--data", sources / "set", "--split", "validation", "--out", out,
+            "--num-rollouts", "2", "--top-k", "None", "--scenarios-per-part", "2", "--device", "cpu",
+        ],
         "submit build": [
             "submit", "build", "constant_velocity", "--data", sources / "set", "--split", "validation", "--out", out,
             "--config", sources / "entry.toml", "--num-shards", "6", "--device", "cpu", "--i-comply",
@@ -138,7 +146,9 @@ def start(words, log):
 
 def start_fork_server():
     """Start the server that workers are forked from, for all commands that this process forks."""
-    forkserver.set_forkserver_preload(["rlftsim.cli.data", "rlftsim.cli.results", "rlftsim.cli.submit"])
+    forkserver.set_forkserver_preload(
+        [f"rlftsim.cli.{name}" for name in ("augment", "data", "results", "simulate", "submit")]
+    )
     forkserver.ensure_running()
     forkserver._forkserver.ensure_running = lambda: None  # a forked command finds it by its address
 
@@ -215,6 +225,8 @@ def tree(folder):
 
 def is_done(folder):
     """True if the result is there."""
+    if any((folder / name).exists() for name in ("rollouts.json", "config.json")):
+        return not any(folder.glob(".lock*"))
     return any((folder / name).exists() for name in ("manifest.json", "submission.tar.gz", "constant_velocity.parquet"))
 
 

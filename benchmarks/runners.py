@@ -20,7 +20,8 @@ from collections import Counter
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from rlftsim.jobs.runner import Inline, Processes, Share
+from rlftsim.jobs.processes import Processes
+from rlftsim.jobs.runner import Inline, Share
 
 NUM_ITEMS, ITEM_S = 16, 5.0
 MANY = 20_000
@@ -72,7 +73,7 @@ def row_sleep(options):
 
 def row_share(options):
     """Everything that a run has more as a share: two locks, one of them let go and taken again."""
-    from rlftsim.jobs.lease import Lease
+    from rlftsim.jobs.folder import Lease
 
     start, number = time.process_time(), 1000
     with tempfile.TemporaryDirectory() as folder:
@@ -134,8 +135,8 @@ def row_ray_memory(options):
 
 def row_ray_kills(options):
     """Kill workers of a Ray cluster at random moments, and now and then a raylet, until 100 are dead."""
+    from rlftsim.jobs.processes import SetAside
     from rlftsim.jobs.ray import RayRunner
-    from rlftsim.jobs.runner import SetAside
 
     dice, kills, rounds = random.Random(0), Counter(), 0
 

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from rlftsim.policies.trafficbots.config import TrafficBotsConfig
-from rlftsim.policies.trafficbots.imitation import draw_training, loss_of_scene
+from rlftsim.policies.trafficbots.imitation import compute_scene_loss, draw_training
 from rlftsim.policies.trafficbots.policy import TrafficBotsPolicy
 from rlftsim.policies.trafficbots.scene import Scene
 from rlftsim.policies.trafficbots.state import Memo
@@ -188,7 +188,7 @@ def main() -> None:
         draws = draw_training(scene, policy.config, 0.3, hide=True)
 
         def train() -> None:
-            loss_of_scene(policy.network, policy.config, scene, labels, scene.agent_mask, draws).loss.backward()
+            compute_scene_loss(policy.network, policy.config, scene, labels, scene.agent_mask, draws).loss.backward()
 
         before = peak_gib()
         least(ours, "training step", train)

@@ -105,7 +105,7 @@ def film(
         }
         shown = [Panel(title, motion.with_overlaps(scene.agents)) for title, motion in motions.items()]
         animation = Animation(f"Scenario {scenario_id}", scene, shown)
-        to_film(path, animation, every=2, dots_per_inch=80)
+        to_film(path, animation, steps_per_frame=2, dots_per_inch=80)
         write_page(path.with_suffix(".html"), animation.title, [animation])
 
     return write
@@ -270,7 +270,7 @@ def write_film(path: Path) -> None:
     futures = [rollout_trajectories(scenario, rollouts.select(slice(n, n + 1)), row=0) for n in range(2)]
     panels = [Panel("logged", logged_trajectories(scenario))]
     panels += [Panel(f"simulated, future {n + 1}", motion) for n, motion in enumerate(futures)]
-    to_film(path, Animation(f"Scenario {FILM_SCENARIO}", scene, panels), every=2, dots_per_inch=70)
+    to_film(path, Animation(f"Scenario {FILM_SCENARIO}", scene, panels), steps_per_frame=2, dots_per_inch=70)
 
 
 def write_demo(path: Path) -> None:

@@ -43,7 +43,7 @@ from rlftsim.recipes.settings import recipe_as_json
 from rlftsim.scenario.synthetic import generate
 from rlftsim.scenario.tfrecord import write_records
 from rlftsim.scenario.transfer import pull_dataset
-from rlftsim.studio.serving import token_of
+from rlftsim.studio.serving import load_token
 from rlftsim.submission.entry import describe_entry, read_entry
 from rlftsim.tokens.vocabulary import Vocabulary
 from rlftsim.training.run_folder import read_metrics
@@ -573,7 +573,7 @@ FORMATS: Mapping[str, Format] = {
     "ledger": Format(
         {"exam.jsonl": "json"},
         make_ledger,
-        lambda folder: Ledger(folder / "exam.jsonl").count_looks("e", "r", ["f" * 32], again=True),
+        lambda folder: Ledger(folder / "exam.jsonl").count_looks("e", "r", ["f" * 32], is_repeat=True),
         ("experiments.ledger",),
     ),
     "goals": Format(
@@ -602,7 +602,7 @@ FORMATS: Mapping[str, Format] = {
         {"womd/*": "tfrecord"}, make_scored_records, score("new", "womd"), ("evaluation.scenario_source",)
     ),
     "simulated folder": Format(
-        {"out/rollouts.json": "json", "out/*.npz": "npz"}, make_simulated, simulate, ("cli.rollout_folder",)
+        {"out/rollouts.json": "json", "out/*.npz": "npz"}, make_simulated, simulate, ("evaluation.rollout_folder",)
     ),
     "snapshot": Format({"snapshot": "snapshot"}, make_snapshot, read_snapshot, ("envs.snapshot",)),
     "entry": Format(
@@ -628,8 +628,8 @@ FORMATS: Mapping[str, Format] = {
     ),
     "token": Format(
         {"token": "text"},
-        lambda folder: token_of(folder / "token"),
-        lambda folder: token_of(folder / "token"),
+        lambda folder: load_token(folder / "token"),
+        lambda folder: load_token(folder / "token"),
         ("studio.serving",),
     ),
 }

@@ -643,7 +643,7 @@ def arranged(rollouts, make):
 CV = rs.ConstantVelocity()  # has no state, so tests may share it
 WHOLE = "num_rollouts must be a whole number of at least 1, got"
 GOALS = "goals must be one of none, logged, got"
-CONFIG = "config must be a FinetuneConfig, CatkConfig or GcslConfig, got"
+CONFIG = "config must be a FinetuneConfig, CatkConfig, GcslConfig or CalibrateConfig, got"
 AXES = r"tensors \[B, N, A, T, 2\] and \[B, N, A, T\], got (ndarray )?\(2, .*\): hand over"
 ORDER = r"write rs\.\w+\(scenario, rollouts\), got"
 

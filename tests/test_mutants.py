@@ -21,7 +21,7 @@ READS = {
     "read_bytes", "read_text", "read_table", "read_schema", "read_metadata", "ParquetFile", "memory_map", "open_file",
     "open_stream", "safe_open", "load_file", "is_zipfile", "ZipFile", "FromString", "ParseFromString",
     "read_json", "parse_json", "read_toml", "read_tensors", "read_npz", "read_parquet",
-    "read_parquet_metadata", "map_arrow",
+    "read_parquet_metadata", "map_arrow", "find_differences",
 }  # fmt: skip
 """Calls that open a file or parse its bytes, by their last name."""
 PARSERS = {"json", "tomllib", "np", "numpy", "torch", "pickle", "tarfile"}
@@ -31,16 +31,18 @@ NO_FORMAT = {
     "jobs.ray": "bytes of this program's own processes",
     "jobs.arrays": "for modules that know the format",
     "jobs.documents": "for modules that know the format",
+    "jobs.folder": "for modules that know the format, and the text of a lock, damaged or not",
     "jobs.tables": "for modules that know the format",
-    "jobs.lease": "shows the text of a lock, damaged or not",
     "policies.shipped.__init__": "weights in the box",
     "scenario.synthetic.recording": "what SUMO has just written",
+    "experiments.paper.published": "the paper's tables in the box",
     "jobs.buckets": "copies bytes that it does not look at",
     "studio.server": "the page in the box",
     "submission.transfer": "copies bytes that it does not look at",
     "training.parallel": "bytes of this program's own processes",
     "viewer.page": "the page in the box",
-    "jobs.runner": "the machine's quota, and code that the user runs anyway",
+    "jobs.processes": "code that the user runs anyway, and bytes of this program's own processes",
+    "jobs.runner": "the machine's quota",
 }
 """Modules that open files, and why they are none of the table of formats."""
 

@@ -69,9 +69,9 @@ def test_agents_of_a_parallel_env_leave_one_by_one_and_then_stand():
     assert sorted(name for name, over in terminated.items() if over) == ["100", "101"]
     assert env.agents == ["102", "105"]
     assert infos["100"]["result"].record.collisions[0].at_fault
-    place = env._begun[1].world.now[0, 0].copy()
+    place = env._begun[1].world.motion[0, 0].copy()
     env.step({name: forward for name in env.agents})
-    np.testing.assert_array_equal(env._begun[1].world.now[0, 0, :3], place[:3])
+    np.testing.assert_array_equal(env._begun[1].world.motion[0, 0, :3], place[:3])
 
 
 def test_pedestrians_do_not_act_by_bicycle():

@@ -17,9 +17,9 @@ from rlftsim.envs import EgoEnv
 from rlftsim.envs import drive as drive_module
 from rlftsim.envs.drive import DriveConfig, drive, run_planner
 from rlftsim.envs.episode import OUTSIDE_M
-from rlftsim.envs.idm import IdmConfig, idm_acceleration
+from rlftsim.envs.idm import IdmConfig, compute_idm_acceleration
 from rlftsim.envs.planner_scores import off_road
-from rlftsim.envs.planners.registry import PLANNERS, action_of, hash_code, load_planner
+from rlftsim.envs.planners.registry import PLANNERS, hash_code, load_planner, read_action_settings
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation import resumable
 from rlftsim.evaluation.drive_results import DriveResult, compare_drives, format_drive_comparison
@@ -32,7 +32,12 @@ from scenes import NO_LIGHTS, Mover, bend, build_scenario, junction_map, light, 
 
 def driven(name, scenario, **settings):
     planner = load_planner(name)
-    env = EgoEnv(scenarios=[scenario], action=action_of(planner), stop_on=(), **{"traffic": "replay", **settings})
+    env = EgoEnv(
+        scenarios=[scenario],
+        action=read_action_settings(planner)["action"],
+        stop_on=(),
+        **{"traffic": "replay", **settings},
+    )
     return run_planner(env, planner, scenario, seed=0)
 
 
@@ -41,7 +46,7 @@ def test_planners_keep_their_distance_to_a_slow_car(name):
     slow = build_scenario("slow", (Mover(speed_mps=9.3), Mover(x_m=30.0, speed_mps=3.0)))
     result = driven(name, slow)
     assert result.record.collisions == ()
-    gap = result.record.motion[1, -1, 0] - result.record.own[-1, 0] - 4.6
+    gap = result.record.motion[1, -1, 0] - result.record.agent_motion[-1, 0] - 4.6
     assert 1.0 < gap < 12.0
     assert result.planner.drivable_area == 1.0
     assert driven("constant_velocity", slow).planner.at_fault_collision_rate == 1.0
@@ -58,10 +63,10 @@ def test_planners_stop_at_a_red_light_and_go_at_green(name):
     stays = build_scenario("red", (Mover(speed_mps=8.0),), junction_map(), light(1, 38.0, 0.2, red_until=91))
     result = driven(name, stays)
     assert result.planner.red_light_rate == 0.0
-    assert 30.0 < result.record.own[-1, 0] + 2.3 < 38.5
-    assert np.hypot(*result.record.own[-1, 3:]) < 0.5
+    assert 30.0 < result.record.agent_motion[-1, 0] + 2.3 < 38.5
+    assert np.hypot(*result.record.agent_motion[-1, 3:]) < 0.5
     goes = build_scenario("green", (Mover(speed_mps=8.0),), junction_map(), light(1, 38.0, 0.2, red_until=11))
-    assert driven(name, goes).record.own[-1, 0] > 45.0
+    assert driven(name, goes).record.agent_motion[-1, 0] > 45.0
 
 
 def test_planners_follow_a_bending_lane():
@@ -75,10 +80,10 @@ def test_planners_follow_a_bending_lane():
 def test_the_intelligent_driver_model_has_its_equilibrium():
     # at the wanted gap and equal speeds the acceleration is that of the free road less the whole
     config = IdmConfig()
-    free = idm_acceleration(np.array([10.0]), np.array([10.0]), np.array([np.inf]), np.zeros(1), config)
+    free = compute_idm_acceleration(np.array([10.0]), np.array([10.0]), np.array([np.inf]), np.zeros(1), config)
     assert free == pytest.approx(0.0)
     gap = config.gap_m + 5.0 * config.headway_s
-    held = idm_acceleration(np.array([5.0]), np.array([10.0]), np.array([gap]), np.array([5.0]), config)
+    held = compute_idm_acceleration(np.array([5.0]), np.array([10.0]), np.array([gap]), np.array([5.0]), config)
     assert held == pytest.approx(-(0.5**4), abs=1e-9)  # 1 - (v/v0)^4 - 1
 
 
@@ -158,13 +163,13 @@ def blind(): pass
 def test_planners_of_others_are_found(tmp_path, monkeypatch):
     (tmp_path / "my_planners.py").write_text(PLANNER_FILE)
     monkeypatch.syspath_prepend(tmp_path)
-    assert action_of(load_planner("my_planners:Still")) == "pose"
+    assert read_action_settings(load_planner("my_planners:Still"))["action"] == "pose"
     assert driven("my_planners:Still", straight_road()).planner.route_completion == pytest.approx(0.0, abs=1e-6)
-    assert action_of(load_planner("my_planners:straight")) == "bicycle"
+    assert read_action_settings(load_planner("my_planners:straight"))["action"] == "bicycle"
     code = hash_file(tmp_path / "my_planners.py")
     assert {hash_code(f"my_planners:{name}") for name in ("Still", "straight", "instance", "Calls")} == {code}
     PLANNERS.add("mine", sys.modules["my_planners"].Still)
-    assert action_of(load_planner("mine")) == "pose"
+    assert read_action_settings(load_planner("mine"))["action"] == "pose"
     PLANNERS.remove("mine")
     (far,) = drive(DriveConfig("my_planners:Far", traffic=("replay",), limit=1))
     assert far.values("route_completion")[0] > 0

@@ -7,8 +7,8 @@ import pytest
 
 from rlftsim.envs import EgoEnv, EgoVectorEnv
 from rlftsim.envs.drive import run_planner
-from rlftsim.envs.planners.registry import action_of, load_planner
-from rlftsim.envs.result import animation_of
+from rlftsim.envs.planners.registry import load_planner, read_action_settings
+from rlftsim.envs.result import build_animation
 from rlftsim.envs.scene import build_env_scene
 from rlftsim.envs.world import Dice, begin, build_world, step_world
 from rlftsim.scenario.types import CURRENT_STEP, MapFeatureType
@@ -35,7 +35,7 @@ def ramp(*movers):
 
 def driven(name, scenario):
     planner = load_planner(name)
-    env = EgoEnv(scenarios=[scenario], action=action_of(planner), stop_on=(), traffic="replay")
+    env = EgoEnv(scenarios=[scenario], action=read_action_settings(planner)["action"], stop_on=(), traffic="replay")
     return run_planner(env, planner, scenario, seed=0)
 
 
@@ -63,15 +63,15 @@ def test_films_mark_no_overlap_of_cars_above_each_other():
         (build_scenario("flat", (EGO, BELOW), junction_map()), True),
     ):
         record = driven("replay", scenario).record
-        (panel,) = animation_of({"planner": record}).panels
+        (panel,) = build_animation({"planner": record}).panels
         assert panel.trajectories.collides.any() == is_marked
 
 
 @pytest.mark.parametrize("name", ["idm", "pdm"])
 @pytest.mark.parametrize("lights", [{}, {"lights": light(7, 43.4, 0.3, red_until=91)}])
 def test_planners_drive_over_what_is_below(name, lights):
-    below = driven(name, bridge(EGO, BELOW, **lights)).record.own
-    np.testing.assert_array_equal(below, driven(name, bridge(EGO)).record.own)
+    below = driven(name, bridge(EGO, BELOW, **lights)).record.agent_motion
+    np.testing.assert_array_equal(below, driven(name, bridge(EGO)).record.agent_motion)
 
 
 def test_observations_leave_out_other_levels():
@@ -87,7 +87,7 @@ def test_observations_leave_out_other_levels():
 def test_planners_stop_for_a_car_up_the_ramp(name):
     result = driven(name, ramp(EGO, Mover(x_m=28.0, y_m=0.2, speed_mps=0.0)))
     assert result.record.collisions == ()
-    gap = result.record.motion[1, -1, 0] - result.record.own[-1, 0] - 4.6
+    gap = result.record.motion[1, -1, 0] - result.record.agent_motion[-1, 0] - 4.6
     assert 0.2 < gap < 4.0
 
 
@@ -114,7 +114,7 @@ def test_idm_traffic_stops_for_cars_on_its_own_road_alone(up, passes):
     state = begin(world, [Dice(0)])
     for _ in range(80):
         state = step_world(world, state, world.logged[0, :1, CURRENT_STEP])
-    assert (state.now[0, 1, 0] > state.now[0, 2, 0]) == passes
+    assert (state.motion[0, 1, 0] > state.motion[0, 2, 0]) == passes
 
 
 def test_others_above_each_other_do_not_collide():

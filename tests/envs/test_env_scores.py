@@ -8,7 +8,7 @@ import pytest
 
 from rlftsim.envs import EgoEnv
 from rlftsim.envs.planner_scores import missing_scores
-from rlftsim.envs.traffic_scores import realism_of_others
+from rlftsim.envs.traffic_scores import compute_traffic_realism
 from rlftsim.realism import score
 from rlftsim.realism.from_rollouts import logged_states
 from rlftsim.scenario.types import ObjectType
@@ -57,7 +57,7 @@ def test_a_quiet_drive_has_the_full_score():
 def test_a_collision_has_its_type_and_fault(movers, sideways, kind, at_fault):
     result = drive(movers, sideways_mps=sideways, steps=60)
     first = result.record.collisions[0]
-    assert (first.kind, first.at_fault, first.agent) == (kind, at_fault, 1)
+    assert (first.collision_type, first.at_fault, first.agent) == (kind, at_fault, 1)
     assert len(result.record.collisions) == 1  # every track counts once
     assert result.planner.no_at_fault_collision == float(not at_fault)
     assert (result.planner.nuplan_style == 0) == at_fault
@@ -191,11 +191,11 @@ def test_realism_of_the_others_is_the_metric_without_the_ego():
         difficulty=np.ones(1, np.int8),
     )
     expected = float(score(log, logged_states(log, num_rollouts=1)).meta_metric)
-    assert realism_of_others([result.record]) == pytest.approx(expected, abs=1e-3)
+    assert compute_traffic_realism([result.record]) == pytest.approx(expected, abs=1e-3)
     braking = drive(movers, np.full(80, 1.0), num_predicted=2)
-    assert realism_of_others([braking.record]) < realism_of_others([result.record]) + 1e-6
-    assert math.isnan(realism_of_others([drive(movers, steps=40, num_predicted=2).record]))
+    assert compute_traffic_realism([braking.record]) < compute_traffic_realism([result.record]) + 1e-6
+    assert math.isnan(compute_traffic_realism([drive(movers, steps=40, num_predicted=2).record]))
     others_end = replace(result.record.scene.scenario.tracks, valid=result.record.scene.scenario.tracks.valid.copy())
     others_end.valid[1:, 11:] = False
     scene = replace(result.record.scene, scenario=replace(result.record.scene.scenario, tracks=others_end))
-    assert math.isnan(realism_of_others([replace(result.record, scene=scene)]))
+    assert math.isnan(compute_traffic_realism([replace(result.record, scene=scene)]))

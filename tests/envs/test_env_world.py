@@ -56,9 +56,9 @@ def test_decisions_of_the_model_fed_back_as_poses_are_a_simulation(name, data):
         ego = env.episode.world.scenes[0].ego
         wanted = torch.cat([reference.position, reference.heading[..., None]], -1)[0, 0].numpy()  # [A, 80, 3]
         for step in range(80):
-            env.step(pose_action(env.state.world.now[0, ego], wanted[ego, step].astype(np.float64)))
+            env.step(pose_action(env.state.world.motion[0, ego], wanted[ego, step].astype(np.float64)))
         assert np.array_equal(others(env), np.delete(wanted, ego, axis=0))
-        np.testing.assert_allclose(env.state.world.now[0, ego, :2], wanted[ego, -1, :2], atol=1e-4)
+        np.testing.assert_allclose(env.state.world.motion[0, ego, :2], wanted[ego, -1, :2], atol=1e-4)
 
 
 def test_a_world_that_the_policy_drives_alone_is_a_simulation(model, data):
@@ -193,10 +193,10 @@ def test_replayed_agents_stand_in_a_gap_of_their_log_and_leave_with_its_end():
     env = EgoEnv(scenarios=[with_gaps()], traffic="replay", stop_on=())
     env.reset(seed=0)
     scene = env.episode.world.scenes[0]
-    row = scene.row_of(101)
+    row = int(np.flatnonzero(scene.object_id == 101)[0])
     for _ in range(16):  # step 26 of the log, where agent 101 is not seen
         observation = env.step(np.zeros(2, np.float32))[0]
-    np.testing.assert_array_equal(env.state.world.now[0, row], [*scene.logged[row, 24, :3], 0.0, 0.0])
+    np.testing.assert_array_equal(env.state.world.motion[0, row], [*scene.logged[row, 24, :3], 0.0, 0.0])
     assert observation["neighbors_mask"].sum() == 4
     assert observation["neighbors"][:4, 9].max() == pytest.approx(0.2)
     for _ in range(61):  # step 87, its last state
@@ -230,9 +230,9 @@ def test_idm_traffic_stops_behind_a_planner_that_stands():
     standing = np.append(follower.scenes[0].logged[1, 10, :3], [0.0, 0.0])[None]
     for _ in range(80):
         state = step_world(follower, state, standing)
-    gap = standing[0, 0] - state.now[0, 0, 0] - follower.size[0, :2, 0].sum() / 2
+    gap = standing[0, 0] - state.motion[0, 0, 0] - follower.size[0, :2, 0].sum() / 2
     assert 0.3 < gap < 3.0
-    assert np.hypot(*state.now[0, 0, 3:]) < 0.5
+    assert np.hypot(*state.motion[0, 0, 3:]) < 0.5
 
 
 def test_a_driver_of_all_the_others_comes_before_the_traffic():
@@ -253,7 +253,7 @@ def test_a_bicycle_that_tracks_a_steady_plan_keeps_its_speed():
     for _ in range(80):
         env.step(plan)
     result = env.result()
-    np.testing.assert_allclose(np.hypot(*result.record.own[3:, 3:].T), 10.0, atol=1e-3)
+    np.testing.assert_allclose(np.hypot(*result.record.agent_motion[3:, 3:].T), 10.0, atol=1e-3)
     assert result.planner.comfort == 1.0
 
 
@@ -281,7 +281,7 @@ def test_idm_traffic_backs_up_as_in_its_log(speed):
     state = begin(world, [Dice(0)])
     for _ in range(20):
         state = step_world(world, state, world.logged[0, :1, CURRENT_STEP])
-    now, logged = state.now[0, 1], world.logged[0, 1, CURRENT_STEP + 20]
+    now, logged = state.motion[0, 1], world.logged[0, 1, CURRENT_STEP + 20]
     assert now[2] == pytest.approx(0.5, abs=1e-3)
     np.testing.assert_allclose(now[:2], logged[:2], atol=0.2)
     np.testing.assert_allclose(now[3:], logged[3:], atol=0.3)

@@ -13,7 +13,7 @@ from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation import evaluate as module
 from rlftsim.evaluation.evaluate import EvaluateConfig, Evaluation, evaluate
 from rlftsim.evaluation.results import NUMBERS_VERSION, SCORE_COLUMNS
-from rlftsim.evaluation.resumable import EvaluationParts, resume_evaluation
+from rlftsim.evaluation.resumable import ScenarioRows, resume_evaluation
 from rlftsim.jobs.runner import Inline, Share, Unfinished
 from rlftsim.policies.smart.config import SmartConfig
 from rlftsim.policies.smart.policy import SmartPolicy
@@ -225,7 +225,7 @@ def test_only_the_files_of_an_evaluation_are_removed_with_its_parts(data, tmp_pa
 def test_parts_of_another_policy_are_replaced_with_a_message(data, tmp_path, capsys):
     expected = evaluate(Wobble(strength_mps=2.0), data, tmp_path, CONFIG, name="expected")
     old = evaluate(Wobble(), data, tmp_path, CONFIG, name="w")
-    parts = EvaluationParts("parts", old.provenance, tmp_path)
+    parts = ScenarioRows("parts", old.provenance, tmp_path)
     parts.write(range(0, 4), [dict(row) for row in old.table.slice(0, 4).to_pylist()])
     assert same(evaluate(Wobble(strength_mps=2.0), data, tmp_path, CONFIG, name="parts"), expected)
     assert "another policy_fingerprint: discarded" in capsys.readouterr().err
@@ -334,7 +334,7 @@ def test_work_in_parts_is_joined_in_order_and_skipped_scenarios_are_kept(data, t
 
     ids = [f"s{position}" for position in range(10)]
     result = resume_evaluation(
-        work, ids, "made", provenance, tmp_path, runner=Inline(), title="made", show_progress=False
+        "made", ids, work, name="made", provenance=provenance, out=tmp_path, runner=Inline(), show_progress=False
     )
     assert (done, result.scenario_ids) == (list(range(10)), ["s1", "s2", "s4", "s5", "s7", "s8"])
     assert [skipped.scenario_id for skipped in result.skipped] == ["s0", "s3", "s6", "s9"]

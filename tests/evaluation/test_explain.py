@@ -3,6 +3,8 @@ import pytest
 from rollout_drawing import draw_arrays, write_npz
 
 import scenes
+from rlftsim.cli.main import main
+from rlftsim.evaluation import explain_page
 from rlftsim.evaluation.explain import WHOLE_FUTURE, explain
 from rlftsim.evaluation.explain_page import explain_rollouts, explanation_html
 from rlftsim.evaluation.rollout_files import find_rollouts, read_states
@@ -98,3 +100,49 @@ def test_pages_of_several_sets_of_a_scenario_are_numbered(scenario, tmp_path):
         write_npz(tmp_path / "rollouts" / policy / "s.npz", draw_arrays(scenario, num_rollouts=2))
     pages = explain_rollouts(tmp_path / "rollouts", tmp_path / "data", tmp_path / "out", ScoreConfig(jobs=1))
     assert [page.name for page in pages] == ["junction.html", "junction-2.html", "junction-3.html"]
+
+
+def test_pages_by_shares_and_after_an_interruption_are_the_same(scenario, tmp_path, capsys, monkeypatch):
+    write_dataset([scenario, scenes.lone_agent(), scenes.without_road_edges()], tmp_path / "data")
+    (tmp_path / "rollouts").mkdir()
+    for logged in (scenario, scenes.lone_agent(), scenes.without_road_edges()):
+        write_npz(tmp_path / "rollouts" / f"{logged.scenario_id}.npz", draw_arrays(logged, num_rollouts=2))
+
+    def words(out):
+        folders = ["--out", str(tmp_path / out), "--explain", str(tmp_path / out / "pages")]
+        return [
+            "score",
+            str(tmp_path / "rollouts"),
+            "--scenarios",
+            str(tmp_path / "data"),
+            *folders,
+            "--missing-map",
+            "skip",
+        ]
+
+    def files(out):
+        paths = (path for path in (tmp_path / out / "pages").rglob("*") if path.is_file())
+        return {path.relative_to(tmp_path / out).as_posix(): path.read_bytes() for path in paths}
+
+    assert main([*words("whole"), "--jobs", "1"]) == 0
+    assert sorted(files("whole")) == ["pages/junction.html", "pages/lone.html"]
+    # a share that ends first leaves all to the last one
+    assert main([*words("shared"), "--jobs", "1", "--share", "1/2"]) == 0
+    assert "explain: share 1/2 is done; 1 of 3 pieces are left" in capsys.readouterr().err
+    assert not (tmp_path / "shared" / "pages" / "junction.html").exists()
+    assert main([*words("shared"), "--jobs", "1", "--share", "2/2"]) == 0
+    assert files("shared") == files("whole")
+    # the second page fails; the first is not made again
+    explained, original = [], explain_page.explain
+
+    def failing(logged, states, config):
+        explained.append(logged.scenario_id)
+        if len(explained) == 2:
+            raise KeyboardInterrupt
+        return original(logged, states, config)
+
+    monkeypatch.setattr(explain_page, "explain", failing)
+    assert main([*words("cut"), "--jobs", "1"]) == 130
+    assert main([*words("cut"), "--jobs", "1"]) == 0
+    assert explained == ["junction", "lone", "lone"]
+    assert files("cut") == files("whole")

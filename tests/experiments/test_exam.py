@@ -163,7 +163,7 @@ def test_a_line_that_is_none_of_a_ledger_is_named(tmp_path):
         '{"exam": "a", "looks": 1, "recipe": "r", "date": "d", "fingerprints": []}\n[]\n'
     )
     with pytest.raises(DataError, match="line 2 is none of a ledger"):
-        Ledger(tmp_path / "exam.jsonl").count_looks("a", "r", [], again=True)
+        Ledger(tmp_path / "exam.jsonl").count_looks("a", "r", [], is_repeat=True)
 
 
 @pytest.mark.slow

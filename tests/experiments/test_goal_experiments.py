@@ -12,7 +12,6 @@ from made_up import TINY, row
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.evaluate import EvaluateConfig, evaluate
 from rlftsim.evaluation.goal_attainment import Attained
-from rlftsim.experiments import suite_goals
 from rlftsim.experiments.model_specs import BASE, Baseline, FineTuned, GoalTraining, Guided, finetune_config
 from rlftsim.experiments.paper import (
     controllability,
@@ -22,7 +21,6 @@ from rlftsim.experiments.paper import (
     maneuver_goals,
 )
 from rlftsim.experiments.suite import ExperimentSuite
-from rlftsim.experiments.suite_goals import measure_attainment
 from rlftsim.goals.goals_file import GoalEntry, GoalsFile, read_goals, write_goals
 from rlftsim.policies.smart.policy import SmartPolicy
 from rlftsim.rollout.baselines import ConstantVelocity
@@ -101,7 +99,7 @@ class Seeker(ConstantVelocity):
 
 def test_every_goal_is_given_alone_and_measured_once(suite, monkeypatch):
     policies = {"constant_velocity": ConstantVelocity(), "oracle": Seeker()}
-    monkeypatch.setattr(suite_goals, "load_policy", lambda name, device: policies[name])
+    monkeypatch.setattr(controllability, "load_policy", lambda name, device: policies[name])
     straight_on = 1000.0 + 9.3 * 8
     goals = [
         GoalEntry("straight", 100, straight_on, -200.0),
@@ -110,7 +108,7 @@ def test_every_goal_is_given_alone_and_measured_once(suite, monkeypatch):
         GoalEntry("bend", 100, 1030.0, -190.0),
     ]
     rows = {"straight on": Baseline("constant_velocity"), "seeker": Baseline("oracle")}
-    found = measure_attainment(suite, rows, goals, name="test")
+    found = controllability.measure_attainment(suite, rows, goals, name="test")
     assert [(a.reached, a.passed) for a in found["straight on"]] == [(1, 1), (0, 1), (0, 0), (0, 0)]
     assert [(a.reached, a.passed) for a in found["seeker"]] == [(1, 1)] * 4
     assert [a.entry for a in found["seeker"]] == goals
@@ -118,7 +116,7 @@ def test_every_goal_is_given_alone_and_measured_once(suite, monkeypatch):
     assert len(files) == 4
     # an edited goal is measured anew, the other scenario is not
     edited = [*goals[:3], replace(goals[3], x=1031.0)]
-    measure_attainment(suite, rows, edited, name="test")
+    controllability.measure_attainment(suite, rows, edited, name="test")
     changed = {p.stem for p, stamp in files.items() if p.stat().st_mtime_ns != stamp}
     assert changed == {"bend"}
 
@@ -127,15 +125,15 @@ def test_another_model_of_the_same_name_is_measured_anew(suite, monkeypatch):
     goal = GoalEntry("straight", 100, 1020.0, -200.0)
     rows = {"one": Baseline("constant_velocity")}
     for policy, reached in ((ConstantVelocity(), 0.0), (Seeker(), 1.0), (ConstantVelocity(), 0.0)):
-        monkeypatch.setattr(suite_goals, "load_policy", lambda name, device, policy=policy: policy)
-        assert measure_attainment(suite, rows, [goal], name="again")["one"][0].reached == reached
+        monkeypatch.setattr(controllability, "load_policy", lambda name, device, policy=policy: policy)
+        assert controllability.measure_attainment(suite, rows, [goal], name="again")["one"][0].reached == reached
 
 
 def test_two_processes_measure_what_one_does(data, tmp_path, suite):
     goals = [GoalEntry("straight", 100, 1020.0, -200.0), GoalEntry("bend", 100, 1030.0, -190.0)]
     rows = {"straight on": Baseline("constant_velocity")}
     spread = ExperimentSuite(TINY, data, tmp_path, replace(QUICK, jobs=2))
-    found = [measure_attainment(one, rows, goals, name="spread") for one in (suite, spread)]
+    found = [controllability.measure_attainment(one, rows, goals, name="spread") for one in (suite, spread)]
     assert found[0] == found[1]
     assert len(list(tmp_path.rglob("attainment/spread/**/*.json"))) == 2
 
@@ -146,7 +144,7 @@ def test_two_processes_measure_what_one_does(data, tmp_path, suite):
 def test_goals_lie_on_the_logged_way_and_its_continuation():
     straight = scenes.straight_road()  # 9.3 m/s along x from (1000, -200)
     for offset in (-3, 0, 2):
-        goal = kinematic_controllability.goal_of(straight, offset)
+        goal = kinematic_controllability.find_goal(straight, offset)
         assert goal is not None
         assert (goal.x, goal.y) == pytest.approx((1000 + 9.3 * (8 + offset), -200), abs=0.01)
     # an arc goes on as the same arc: what the mover itself does three seconds later
@@ -154,10 +152,10 @@ def test_goals_lie_on_the_logged_way_and_its_continuation():
     time, rate = 11.0, mover.turn_rate_radps
     radius = mover.speed_mps / rate
     expected = (1000 + radius * np.sin(rate * time), -200 + radius * (1 - np.cos(rate * time)))
-    goal = kinematic_controllability.goal_of(scenes.bend(), 3)
+    goal = kinematic_controllability.find_goal(scenes.bend(), 3)
     assert goal is not None
     assert (goal.x, goal.y) == pytest.approx(expected, abs=0.02)
-    assert kinematic_controllability.goal_of(scenes.without_future(), 0) is None
+    assert kinematic_controllability.find_goal(scenes.without_future(), 0) is None
 
 
 def made_up_rates(labels, rates):
@@ -199,7 +197,7 @@ def test_the_ego_has_a_goal_for_every_offset(suite, monkeypatch):
         ("bend", 100),
         ("standing", 105),
     ]
-    monkeypatch.setattr(kinematic_controllability, "goal_of", lambda scenario, offset_s: None)
+    monkeypatch.setattr(kinematic_controllability, "find_goal", lambda scenario, offset_s: None)
     with pytest.raises(DataError, match="not one of 3 scenarios is logged to the end"):
         kinematic_controllability.run(suite)
 
@@ -330,7 +328,7 @@ def test_the_experiments_run_with_tiny_models(suite):
     assert (suite.out / "evaluations" / f"{suite.evaluation_name(variant, 'logged')}.parquet").exists()
     goals = [GoalEntry("straight", 100, 1080.0, -200.0)]
     rows = {"base": BASE, "soft": variant, "guided": Guided(variant, 1e3)}
-    found = measure_attainment(suite, rows, goals, name="tiny")
+    found = controllability.measure_attainment(suite, rows, goals, name="tiny")
     guided = SmartPolicy.from_pretrained(Path(suite.models([rows["guided"]])[rows["guided"]]))
     plain = SmartPolicy.from_pretrained(Path(suite.models([variant])[variant]))
     assert guided.network.decoder.aim.weight.equal(1e3 * plain.network.decoder.aim.weight)

@@ -27,9 +27,9 @@ from rlftsim.experiments.paper import (
     variance_scaling,
 )
 from rlftsim.experiments.registry import EXPERIMENTS, PAPER
-from rlftsim.experiments.results import ExperimentResult, finite_or_none, run_experiment
+from rlftsim.experiments.results import ExperimentResult, run_experiment, to_finite
 from rlftsim.experiments.rows import mean_of_seeds
-from rlftsim.experiments.stage_progress import StageProgress
+from rlftsim.experiments.stage_progress import Stage, run_stages
 from rlftsim.experiments.suite import ExperimentSuite
 from rlftsim.recipes.base import Recipe
 from rlftsim.rewards.base import leave_one_out
@@ -136,7 +136,7 @@ def test_a_recipe_without_a_counterpart_is_refused(suite):
 
 def test_no_gap_gives_no_fraction():
     same = row("x", [0.5, 0.6]).mean
-    closed = benchmark.gap_closed(same, row("y", [0.6, 0.7]).mean, same)
+    closed = benchmark.compute_gap_closed(same, row("y", [0.6, 0.7]).mean, same)
     assert not math.isfinite(closed.fraction)
 
 
@@ -200,7 +200,7 @@ def frontier(suite, gain_per_nat):
     """Made-up runs that end at a KL of 0.045, but for minADE's, which ends at 0.03, and their evaluations."""
     rows, specs = {"base": row("base", EASE.tolist())}, kl_frontier.specs(suite.num_seeds)
     for number, name in enumerate(kl_frontier.REWARDS):
-        for part in kl_frontier.PARTS:
+        for part in kl_frontier.FRACTIONS:
             reached = min(0.045 * part, 0.03 if name.startswith("minADE") else 0.045)
             for one in specs[kl_frontier.point(name, part)]:
                 run = suite.model_folder(one)
@@ -306,11 +306,11 @@ def test_variance_of_an_additive_metric_is_known():
 def test_slope_of_a_power_law_is_its_power():
     sizes = (2, 4, 8, 16, 32)
     n = np.array(sizes, float)
-    assert variance_scaling.slope_of(5.0 / n**2, sizes) == pytest.approx(-2.0)
-    assert math.isnan(variance_scaling.slope_of(0.0 * n, sizes))
+    assert variance_scaling.fit_slope(5.0 / n**2, sizes) == pytest.approx(-2.0)
+    assert math.isnan(variance_scaling.fit_slope(0.0 * n, sizes))
     # for large N an additive metric's MLOO falls with the square
     large = (128, 256, 512)
-    assert variance_scaling.slope_of(variance_scaling.law(large)["mloo"], large) == pytest.approx(-2.0, abs=0.01)
+    assert variance_scaling.fit_slope(variance_scaling.law(large)["mloo"], large) == pytest.approx(-2.0, abs=0.01)
 
 
 def made_up_variances(sizes, scenarios=50):
@@ -329,7 +329,7 @@ def test_scaling_is_fitted_with_an_interval_and_a_verdict(suite):
     measured = made_up_variances(sizes)
     found = variance_scaling.EXPERIMENT.summarize(measured, suite)
     for slope, first in zip(found.numbers["rewards"]["mloo"]["slopes"], (2, 8)):
-        expected = variance_scaling.slope_of(variance_scaling.law(sizes)["mloo"], sizes, first)
+        expected = variance_scaling.fit_slope(variance_scaling.law(sizes)["mloo"], sizes, first)
         assert (slope["from_size"], slope["scenarios"]) == (first, 49)
         assert slope["of_law"] == pytest.approx(expected)
         assert slope["slope"] == pytest.approx(expected, abs=0.01)
@@ -337,7 +337,7 @@ def test_scaling_is_fitted_with_an_interval_and_a_verdict(suite):
         assert low < slope["slope"] < high
     assert found.verdicts[0].startswith("MLOO, N ≥ 2: no difference from the slope")
     # a pure alpha / N² comes back
-    exact = variance_scaling.scaling_of(np.array([[7.0 / n**2 for n in sizes]] * 3), sizes)
+    exact = variance_scaling.fit_scaling(np.array([[7.0 / n**2 for n in sizes]] * 3), sizes)
     assert exact.alpha == pytest.approx(7.0)
     assert [slope.mean for slope in exact.slopes.values()] == pytest.approx([-2.0, -2.0])
 
@@ -345,8 +345,8 @@ def test_scaling_is_fitted_with_an_interval_and_a_verdict(suite):
 def test_a_slope_can_be_fitted_to_large_numbers_alone():
     # flat up to 8, then with the square
     curve = np.array([1.0, 1.0, 1.0, 0.25, 0.0625])
-    assert variance_scaling.slope_of(curve, (2, 4, 8, 16, 32), 8) == pytest.approx(-2.0)
-    assert variance_scaling.slope_of(curve, (2, 4, 8, 16, 32)) > -1.5
+    assert variance_scaling.fit_slope(curve, (2, 4, 8, 16, 32), 8) == pytest.approx(-2.0)
+    assert variance_scaling.fit_slope(curve, (2, 4, 8, 16, 32)) > -1.5
 
 
 def test_a_reward_that_falls_otherwise_is_a_difference(suite):
@@ -435,21 +435,14 @@ def test_an_unknown_experiment_is_refused_with_the_known_ones():
 
 def test_numbers_for_machines_are_never_nan():
     values = {"a": [1.0, math.nan, (math.inf, 2)], "b": "nan"}
-    assert json.dumps(finite_or_none(values)) == '{"a": [1.0, null, [null, 2]], "b": "nan"}'
+    assert json.dumps(to_finite(values)) == '{"a": [1.0, null, [null, 2]], "b": "nan"}'
 
 
 def test_progress_counts_stages_and_estimates_the_rest(capsys):
-    progress = StageProgress({"fine-tune a": False, "fine-tune b": False, "evaluate a": True})
-    with progress.stage("fine-tune a"):
-        pass
-    with progress.stage("fine-tune b"):
-        pass
-    with progress.stage("fine-tune b"):  # needed twice, counted once
-        pass
+    stages = [Stage(f"fine-tune {name}", False, lambda: None) for name in ("a", "b", "b")]  # b: needed twice
+    run_stages([*stages, Stage("evaluate a", True, lambda: None)])
     err = capsys.readouterr().err
     assert "1/3  fine-tune a\n" in err
     assert "2/3  fine-tune b  (less than a minute to go)" in err
     assert err.count("fine-tune b") == 1
-    with progress.stage("evaluate a"):
-        pass
-    assert "3/3  evaluate a  (finished before)" in capsys.readouterr().err
+    assert "3/3  evaluate a  (finished before)" in err

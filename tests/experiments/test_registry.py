@@ -20,9 +20,9 @@ def run(suite):
 def summarize(rows, suite):
     return ExperimentResult(
         title="Going straight on",
-        tables=(tables.of_rows("Ours", rows.values(), SCORES),),
+        tables=(tables.build_table("Ours", rows.values(), SCORES),),
         verdicts=(rows["straight on"].against(rows["log"]),),
-        numbers={"rows": tables.numbers(rows.values(), SCORES)},
+        numbers={"rows": tables.to_numbers(rows.values(), SCORES)},
         figure=tables.draw_gains(rows["log"], [rows["straight on"]]),
     )
 

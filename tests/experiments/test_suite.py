@@ -193,7 +193,7 @@ def test_an_experiment_of_ones_own_needs_two_functions(done):
         run=lambda suite: suite.evaluate(ROWS),
         summarize=lambda rows, suite: ExperimentResult(
             title="Mine",
-            tables=(tables.of_rows("Ours", rows.values(), SCORES),),
+            tables=(tables.build_table("Ours", rows.values(), SCORES),),
             verdicts=(rows["oracle"].against(rows["base"]),),
             numbers={"nothing": float("nan")},
         ),
@@ -301,12 +301,12 @@ def test_the_demo_runs_the_same_stages(data, tmp_path):
 
 def test_rows_of_methods_that_cannot_train_the_policy_are_left_out_before_anything_runs(done, data, tmp_path, capsys):
     rows = {"base": (BASE,), "CAT-K": over_seeds(FineTuned(CATK), 2), "MLOO": (FineTuned("mloo"),)}
-    assert done.feasible(rows) == rows
+    assert done.select_feasible(rows) == rows
     suite = ExperimentSuite(replace(TINY, catk=None), data, tmp_path, QUICK)
-    assert list(suite.feasible(rows)) == ["base", "MLOO"]
+    assert list(suite.select_feasible(rows)) == ["base", "MLOO"]
     assert "left out: CAT-K (the policy cannot be trained with catk)" in capsys.readouterr().err
     with pytest.raises(ConfigError, match="the recipe has no section catk"):
         FineTuned(CATK).training_config(suite.recipe)
     # A base model without tokens needs no recipe that says so.
     wordless = ExperimentSuite(TINY, data, tmp_path / "wordless", QUICK, base_model="constant_velocity")
-    assert list(wordless.feasible(rows)) == ["base", "MLOO"]
+    assert list(wordless.select_feasible(rows)) == ["base", "MLOO"]

@@ -21,8 +21,8 @@ from rlftsim.jobs.files import (
     remove_folder,
     remove_temporaries,
     save_tensors,
+    write_atomically,
     write_text,
-    write_whole,
 )
 
 
@@ -56,7 +56,7 @@ def test_an_interrupted_write_leaves_nothing(tmp_path):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        write_whole(tmp_path / "page.html", stopped)
+        write_atomically(tmp_path / "page.html", stopped)
     assert names(tmp_path) == []
 
 
@@ -109,9 +109,9 @@ def full_disk():
         lambda path: write_text(path, "x" * 5000),
         lambda path: append_text(path, "x" * 5000),
         lambda path: save_tensors(path, {"x": torch.zeros(5000)}),
-        lambda path: write_whole(path, lambda temporary: temporary.write_bytes(b"x" * 5000)),
+        lambda path: write_atomically(path, lambda temporary: temporary.write_bytes(b"x" * 5000)),
     ],
-    ids=["write_text", "append_text", "save_tensors", "write_whole"],
+    ids=["write_text", "append_text", "save_tensors", "write_atomically"],
 )
 def test_a_write_that_does_not_fit_names_its_path_in_one_line(write, tmp_path, full_disk):
     (tmp_path / "run").mkdir()

@@ -15,6 +15,17 @@ from rlftsim.cli.plugins import Plugins
 from rlftsim.jobs.interruption import SIGNALS, Interruption, ctrl_c_waits, signals_like_ctrl_c
 
 
+@pytest.fixture(autouse=True)
+def _handlers_of_a_new_process():
+    """Ray's driver leaves a handler of SIGTERM that exits, in the process of whatever test comes after it."""
+    before = {number: signal.getsignal(number) for number in SIGNALS}
+    for number in SIGNALS:
+        signal.signal(number, signal.SIG_DFL)
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGUSR1, 138)])
 def test_a_signal_ends_a_command_in_one_line_with_its_status(number, status, monkeypatch, capsys):
     handlers = [signal.getsignal(one) for one in SIGNALS]
@@ -60,7 +71,7 @@ SCRIPT = """
 import os, signal, sys, time
 from multiprocessing import active_children
 from rlftsim.jobs.interruption import signals_like_ctrl_c
-from rlftsim.jobs.runner import Processes
+from rlftsim.jobs.processes import Processes
 
 def work(item, advance, is_stopped):
     if item == 0:

@@ -10,7 +10,7 @@ import pytest
 import rlftsim
 from rlftsim.evaluation.results import Evaluation
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(rlftsim.__file__).parents[1])}
 
 pytestmark = pytest.mark.slow
@@ -44,14 +44,14 @@ def test_the_array_of_the_documents_runs_as_shell_processes(tmp_path):
 
 
 def test_work_that_is_killed_at_random_moments_ends_with_the_same_bytes(tmp_path):
-    command = [sys.executable, ROOT / "benchmarks" / "kills.py", tmp_path, "--kills", "5", "--scenarios", "8"]
+    command = [sys.executable, ROOT / "benchmarks" / "kills.py", tmp_path, "--kills", "10", "--scenarios", "8"]
     done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, timeout=900)
     assert done.returncode == 0, done.stdout + done.stderr
     rows = [line.split("|")[1:-1] for line in done.stdout.splitlines()[2:]]
     assert [(row[0].strip(), row[1].strip()) for row in rows] == [
         (backend, name)
         for backend in ("inline", "processes", "shares")
-        for name in ("convert", "evaluate", "submit build")
+        for name in ("convert", "evaluate", "simulate", "augment", "submit build")
     ]
     for row in rows:
         *kills, num_rounds, different = (int(cell) for cell in row[2:])

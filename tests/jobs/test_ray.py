@@ -17,7 +17,7 @@ import rlftsim
 from rlftsim.cli.main import main
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.evaluate import EvaluateConfig, evaluate
-from rlftsim.jobs.runner import SetAside
+from rlftsim.jobs.processes import SetAside
 from rlftsim.rollout.baselines import ConstantVelocity
 
 pytestmark = pytest.mark.slow
@@ -40,7 +40,7 @@ def cluster():
     ray = pytest.importorskip("ray", reason='Ray is not installed: pip install "rlftsim[ray]"')
     from ray.cluster_utils import Cluster
 
-    folders = [str(PACKAGE.parent), str(Path(__file__).parent)]
+    folders = [str(PACKAGE.parent), str(Path(__file__).parents[1])]
     before = os.environ.get("PYTHONPATH")
     os.environ["PYTHONPATH"] = os.pathsep.join(folders)  # for the processes of the cluster
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
@@ -108,7 +108,7 @@ def test_an_evaluation_has_the_same_bytes_as_inline(cluster, tmp_path):
 
 def test_the_command_of_the_documents_works_on_the_cluster(cluster, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    page = (Path(__file__).parents[1] / "docs" / "machines.md").read_text()
+    page = (Path(__file__).parents[2] / "docs" / "machines.md").read_text()
     line = next(line for line in page.splitlines() if line.startswith("rlftsim evaluate") and " --ray " in line)
     for old, new in {
         "runs/rlft": "constant_velocity", "s3://bucket/womd": "synthetic", "/shared/": "", "10.0.0.1:6379": "auto",
@@ -165,7 +165,7 @@ def test_one_module_imports_ray_and_no_command_does_without_being_asked():
         if (isinstance(node, ast.Import) and any(name.name.split(".")[0] == "ray" for name in node.names))
         or (isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "ray")
     }
-    assert importing == {"cluster/ray.py"}
+    assert importing == {"jobs/ray.py"}
     script = "import sys, rlftsim.cli.results, rlftsim.cli.data, rlftsim.cli.submit; print('ray' in sys.modules)"
     environment = {**os.environ, "PYTHONPATH": str(PACKAGE.parent)}
     done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, timeout=120)
@@ -173,7 +173,7 @@ def test_one_module_imports_ray_and_no_command_does_without_being_asked():
 
 
 def test_without_ray_the_flag_says_how_to_get_it(monkeypatch):
-    from rlftsim.cli.machines import Machines
+    from rlftsim.jobs.runner import Machines
 
     monkeypatch.setitem(sys.modules, "ray", None)
     monkeypatch.delitem(sys.modules, "rlftsim.jobs.ray", raising=False)

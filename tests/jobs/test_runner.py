@@ -14,7 +14,8 @@ import pytest
 
 import rlftsim
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.jobs.runner import Inline, Processes, SetAside, Share, Unfinished, on_this_machine, require_finished
+from rlftsim.jobs.processes import Processes, SetAside, log_item
+from rlftsim.jobs.runner import Inline, Machines, Share, Unfinished, Work, check_finished, choose_runner
 
 SCRIPT = """
 import rlftsim.jobs.runner
@@ -24,7 +25,7 @@ def double(item, advance, is_stopped):
     return 2 * item
 
 def main():
-    runner = rlftsim.jobs.runner.on_this_machine({jobs}, 3)
+    runner = rlftsim.jobs.runner.choose_runner({jobs}, 3)
     print(runner.run(double, [1, 2, 3], advance=lambda count: None))
 
 {call}
@@ -76,7 +77,7 @@ def die_once(path, advance, is_stopped):
 def test_each_finished_item_leaves_a_line_of_json(tmp_path):
     log = tmp_path / "items.jsonl"
     for runner in (Inline(log), Processes(2, item_log=log)):
-        runner.run(double, [3, 1, 2], advance=lambda count: None, name_of=lambda item: f"item {item}")
+        runner.run(double, [3, 1, 2], advance=lambda count: None, describe=lambda item: f"item {item}")
     lines = [json.loads(line) for line in log.read_text().splitlines()]
     assert [line["item"] for line in lines[:3]] == ["item 3", "item 1", "item 2"]
     assert sorted(line["item"] for line in lines[3:]) == ["item 1", "item 2", "item 3"]
@@ -95,19 +96,19 @@ def test_a_container_may_have_fewer_cores_than_the_machine(quota, cores, tmp_pat
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_results_come_in_the_order_of_the_items(jobs):
     done = []
-    assert on_this_machine(jobs, 3).run(double, [3, 1, 2], advance=done.append) == [6, 2, 4]
+    assert choose_runner(jobs, 3).run(double, [3, 1, 2], advance=done.append) == [6, 2, 4]
     assert sum(done) == 3
 
 
 def test_an_error_that_cannot_be_read_back_is_shown_with_its_traceback():
     with pytest.raises(RuntimeError, match="Unreadable: broken beyond reading"):
-        on_this_machine(2, 2).run(fail_unreadably, [1, 2], advance=lambda count: None)
+        choose_runner(2, 2).run(fail_unreadably, [1, 2], advance=lambda count: None)
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_the_error_of_a_task_is_raised(jobs):
     with pytest.raises(DataError, match="is broken"):
-        on_this_machine(jobs, 2).run(fail, [1, 2], advance=lambda count: None)
+        choose_runner(jobs, 2).run(fail, [1, 2], advance=lambda count: None)
 
 
 def test_an_item_that_kills_its_process_is_tried_again_then_set_aside_and_all_others_are_done(tmp_path, caplog):
@@ -115,7 +116,7 @@ def test_an_item_that_kills_its_process_is_tried_again_then_set_aside_and_all_ot
     with pytest.raises(
         SetAside, match=r"^2 pieces .* 3 times and are set aside: (exit|swallow) .* All others are"
     ) as caught:
-        Processes(2).run(write_or_die, items := ["exit", "a", "swallow", "b", "c"], advance=done.append, name_of=str)
+        Processes(2).run(write_or_die, items := ["exit", "a", "swallow", "b", "c"], advance=done.append, describe=str)
     assert "exit (exit status 7)" in str(caught.value)
     assert "swallow (out of memory)" in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -142,9 +143,9 @@ def test_a_task_that_cannot_be_pickled_is_refused():
 def test_shares_have_every_item_once(of):
     items = list(range(14))
     shares = [Share.parse(f"{k}/{of}", Inline()) for k in range(1, of + 1)]
-    assert sorted(item for share in shares for item in share.own(items)) == items
-    assert max(len(share.own(items)) for share in shares) - min(len(share.own(items)) for share in shares) <= 1
-    assert Share.parse("join", Inline()).own(items) == []
+    assert sorted(item for share in shares for item in share.select(items)) == items
+    assert max(len(share.select(items)) for share in shares) - min(len(share.select(items)) for share in shares) <= 1
+    assert Share.parse("join", Inline()).select(items) == []
 
 
 @pytest.mark.parametrize("text", ["3", "0/4", "5/4", "a/4", "1/0", "-1/4", "1.5/4", "/", ""])
@@ -157,11 +158,11 @@ def test_a_share_ends_well_while_others_are_at_work_and_joining_does_not():
     with pytest.raises(
         Unfinished, match=r"convert: share 2/4 is done; 5 of 9 pieces are left .* `rlftsim join`"
     ) as caught:
-        require_finished(Share(2, 4, Inline()), 5, 9, "convert")
+        check_finished(Share(2, 4, Inline()), 5, 9, "convert")
     assert caught.value.exit_status == 0
     with pytest.raises(DataError, match="5 of 9 pieces are missing: run the shares again"):
-        require_finished(Share.parse("join", Inline()), 5, 9, "convert")
-    require_finished(Share(2, 4, Inline()), 0, 9, "convert")
+        check_finished(Share.parse("join", Inline()), 5, 9, "convert")
+    check_finished(Share(2, 4, Inline()), 0, 9, "convert")
 
 
 def test_a_script_with_the_main_guard_may_start_processes(tmp_path):
@@ -172,10 +173,10 @@ def test_a_script_with_the_main_guard_may_start_processes(tmp_path):
 INTERRUPTED = """
 import os, signal, time
 from multiprocessing import active_children
-import rlftsim.jobs.runner
+import rlftsim.jobs.processes
 
 if __name__ == "__main__":
-    start = rlftsim.jobs.runner._Worker.__init__
+    start = rlftsim.jobs.processes._Worker.__init__
 
     def start_then_interrupt(worker):
         start(worker)
@@ -183,9 +184,9 @@ if __name__ == "__main__":
             time.sleep({seconds})
             os.killpg(0, signal.SIGINT)  # as a terminal does, to the processes that are starting, too
 
-    rlftsim.jobs.runner._Worker.__init__ = start_then_interrupt
+    rlftsim.jobs.processes._Worker.__init__ = start_then_interrupt
     try:
-        rlftsim.jobs.runner.Processes(2).run(print, ["an item", "another"], advance=lambda count: None)
+        rlftsim.jobs.processes.Processes(2).run(print, ["an item", "another"], advance=lambda count: None)
     except KeyboardInterrupt:
         print("stopped", active_children())
 """
@@ -230,3 +231,13 @@ def test_a_package_that_is_run_as_a_module_needs_no_guard(tmp_path):
     command = [sys.executable, "-m", "doubling"]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
     assert (done.stdout, done.returncode) == ("[2, 4, 6]\n", 0), done.stderr
+
+
+def test_lines_about_items_are_added_to_no_file_of_other_content(tmp_path):
+    log, manifest = tmp_path / "items.jsonl", tmp_path / "manifest.json"
+    log_item(log, "a", 1.0, "host")
+    manifest.write_text('{"format": "rlftsim scenarios"}')
+    assert Machines(item_log=log).runner(1, "skip") is not None
+    for settings in (Machines(item_log=manifest), Work(item_log=manifest, on_error="stop")):
+        with pytest.raises(ConfigError, match="no log of items: name another file by --item-log"):
+            settings.runner(2, "stop")

@@ -7,7 +7,7 @@ from torch.nn import functional
 
 from rlftsim.policies import token_rows
 from rlftsim.policies.distributions import LazyTokenDistribution, TokenDistribution
-from rlftsim.policies.token_rows import TokenRows, row_statistics
+from rlftsim.policies.token_rows import TokenRows, compute_row_statistics
 
 NUM_ROWS, WIDTH, NUM_TOKENS = 70, 6, 40
 
@@ -61,7 +61,7 @@ def by_autograd(rows, reference, chosen):
 
 
 def test_the_statistics_are_those_of_the_softmax(rows, reference, chosen):
-    found, expected = row_statistics(rows, chosen, reference), by_autograd(rows, reference, chosen)
+    found, expected = compute_row_statistics(rows, chosen, reference), by_autograd(rows, reference, chosen)
     for value, other in zip(found, expected, strict=True):
         torch.testing.assert_close(value, other, atol=1e-12, rtol=0)
     assert expected[1].min() > 0.01
@@ -72,7 +72,7 @@ def test_their_gradients_are_those_of_autograd(rows, reference, chosen, statisti
     weights = torch.linspace(-1, 1, NUM_ROWS, dtype=torch.float64)
     gradients = [
         torch.autograd.grad((weights * statistics[statistic]).sum(), inputs(rows))
-        for statistics in (row_statistics(rows, chosen, reference), by_autograd(rows, reference, chosen))
+        for statistics in (compute_row_statistics(rows, chosen, reference), by_autograd(rows, reference, chosen))
     ]
     for found, expected in zip(*gradients, strict=True):
         assert expected.abs().max() > 0.1
@@ -80,7 +80,7 @@ def test_their_gradients_are_those_of_autograd(rows, reference, chosen, statisti
 
 
 def test_no_gradient_flows_into_the_reference(rows, reference, chosen):
-    sum(value.sum() for value in row_statistics(rows, chosen, reference)).backward()
+    sum(value.sum() for value in compute_row_statistics(rows, chosen, reference)).backward()
     assert rows.hidden.grad is not None
     assert all(value.grad is None for value in inputs(reference))
 
@@ -99,7 +99,7 @@ def test_gradients_of_float32_are_as_exact_as_those_of_autograd(chosen):
         torch.autograd.grad(sum(value.sum() for value in statistics), inputs(rows))
         for rows, statistics in (
             (exact, by_autograd(exact, other, chosen)),
-            (single[0], row_statistics(single[0], chosen, single[1])),
+            (single[0], compute_row_statistics(single[0], chosen, single[1])),
             (single[0], by_autograd(*single, chosen)),
         )
     )
@@ -133,5 +133,5 @@ def test_the_statistics_hold_no_tensor_of_rows_times_vocabulary(rows, reference,
         return value
 
     with torch.autograd.graph.saved_tensors_hooks(remember, lambda value: value):
-        row_statistics(rows, chosen, reference)
+        compute_row_statistics(rows, chosen, reference)
     assert max(held) < NUM_ROWS * NUM_TOKENS / 4

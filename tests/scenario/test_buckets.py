@@ -13,8 +13,8 @@ from rlftsim.cli.main import main
 from rlftsim.errors import ConfigError, DataError, NotYetError
 from rlftsim.evaluation.evaluate import EvaluateConfig, evaluate
 from rlftsim.jobs import buckets
-from rlftsim.jobs.buckets import fetch_shard
-from rlftsim.jobs.lease import Lease, remote_lease
+from rlftsim.jobs.buckets import fetch_shard, remote_lease
+from rlftsim.jobs.folder import Lease
 from rlftsim.jobs.runner import Inline, Share, Unfinished
 from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.scenario.convert import convert

@@ -328,7 +328,7 @@ def test_an_empty_file_is_named(tmp_path, capsys):
     (tmp_path / "empty.tfrecord").touch()
     with pytest.raises(DataError, match=r"not one scenario could be converted; .*empty\.tfrecord.*the file is empty"):
         run(tmp_path / "empty.tfrecord", tmp_path / "data", show_progress=True)
-    assert "converting: 100%" in capsys.readouterr().err
+    assert "convert: 100%" in capsys.readouterr().err
 
 
 def test_only_temporaries_of_killed_conversions_are_removed(source, tmp_path):

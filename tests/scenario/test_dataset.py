@@ -172,6 +172,7 @@ def test_a_valid_state_that_is_no_number_is_refused_by_name(tmp_path, scenarios,
     ("changes", "message"),
     [
         ({"scenario_id": 5}, "scenario id 5 is no file name, .*: write it as text"),
+        ({"scenario_id": "x" * 300}, "scenario id 'x.* is no file name, .*: write it as text of at most 200 bytes"),
         ({"ego_index": -1}, "scenario id1: ego_index names track index -1, but there are 2 tracks"),
         ({"ego_index": 999}, "scenario id1: ego_index names track index 999, but there are 2 tracks"),
         ({"tracks_to_predict": np.array([2], np.int32)}, "tracks_to_predict names track index 2, but there are 2"),

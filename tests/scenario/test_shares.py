@@ -13,16 +13,16 @@ from typing import get_type_hints
 import pytest
 
 from full_disk import limit_files_to
-from rlftsim.cli.machines import Machines, Work
 from rlftsim.cli.main import HAVE_SHARES, VERBS, main
 from rlftsim.cli.submit import Build
 from rlftsim.errors import ConfigError, DataError, NotYetError
 from rlftsim.evaluation.evaluate import EvaluateConfig, evaluate
-from rlftsim.jobs import lease
-from rlftsim.jobs.lease import Lease
-from rlftsim.jobs.runner import Inline, Share, Unfinished
+from rlftsim.jobs import folder as folders
+from rlftsim.jobs.folder import Lease
+from rlftsim.jobs.runner import Inline, Machines, Share, Unfinished, Work
 from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.scenario.convert import convert
+from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
 
 CONFIG = EvaluateConfig(num_rollouts=2, limit=9)
 
@@ -30,7 +30,7 @@ CONFIG = EvaluateConfig(num_rollouts=2, limit=9)
 @pytest.fixture
 def impatient(monkeypatch):
     """A share waits for others no longer than this."""
-    monkeypatch.setattr(lease, "SECONDS_TO_WAIT", 0.3)
+    monkeypatch.setattr(folders, "SECONDS_TO_WAIT", 0.3)
 
 
 @pytest.fixture
@@ -73,6 +73,54 @@ def test_shares_evaluate_to_the_same_bytes(tmp_path):
     assert contents(tmp_path / "shared") == contents(tmp_path / "whole")
     with pytest.raises(ConfigError, match="shares meet in a folder"):
         evaluate(ConstantVelocity(), "synthetic", None, CONFIG, runner=Share(1, 2, Inline()))
+
+
+SIMULATE = ["simulate", "constant_velocity", "--data", "synthetic", "--limit", "5", "--num-rollouts", "2"]
+AUGMENT = ["augment", "constant_velocity", "--num-rollouts", "2", "--top-k", "None", "--scenarios-per-part", "2"]
+
+
+@pytest.fixture
+def augment(tmp_path):
+    """Words of an augmentation of five scenarios."""
+    scenarios = ScenarioDataset("synthetic", "validation")
+    write_dataset([scenarios[position] for position in range(5)], tmp_path / "set", split="training")
+    return [*AUGMENT, "--data", str(tmp_path / "set")]
+
+
+@pytest.mark.parametrize("verb", ["simulate", "augment"])
+def test_simulations_and_augmented_goals_are_the_same_by_processes_and_by_shares(verb, augment, tmp_path, capsys):
+    words = {"simulate": SIMULATE, "augment": augment}[verb]
+
+    def run(out, *flags):
+        return main([*words, "--out", str(tmp_path / out), *flags])
+
+    def files(out):
+        found = contents(tmp_path / out)
+        return {name: found[name] for name in found if name != "environment.json"}  # words of the command
+
+    assert run("whole") == 0
+    assert run("processes", "--jobs", "2", "--item-log", str(tmp_path / "items.jsonl")) == 0
+    assert files("processes") == files("whole")
+    assert len((tmp_path / "items.jsonl").read_text().splitlines()) == {"simulate": 5, "augment": 3}[verb]
+    assert run("shares", "--share", "2/2") == 0
+    assert f"{verb}: share 2/2 is done" in capsys.readouterr().err
+    assert main(["join", *words, "--out", str(tmp_path / "shares")]) == 1
+    assert "pieces are missing: run the shares again" in capsys.readouterr().err
+    assert run("shares", "--share", "1/2") == 0
+    assert files("shares") == files("whole")
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "shares").glob("*[0-9a-f].*")}
+    assert run("shares") == 0  # nothing is done twice
+    assert all(path.stat().st_mtime_ns == stamp for path, stamp in before.items())
+
+
+@pytest.mark.parametrize("verb", ["simulate", "augment"])
+def test_a_second_simulation_or_augmentation_in_the_same_folder_is_refused(verb, augment, tmp_path, capsys):
+    words = [*{"simulate": SIMULATE, "augment": augment}[verb], "--out", str(tmp_path / "out")]
+    with Lease(tmp_path / "out" / ".lock", Inline(), "works in"):
+        assert main(words) == 1
+    assert "another process works in" in capsys.readouterr().err
+    assert [path.name for path in (tmp_path / "out").iterdir()] == [".lock"]
+    assert main([*words, "--jobs", "0"]) == 2
 
 
 def test_a_share_does_its_own_files_only_and_repeats_none(source, tmp_path):
@@ -183,7 +231,7 @@ def test_a_share_takes_over_from_a_driver_that_was_stopped(tmp_path):
     start = time.monotonic()
     with wait_behind(killed, lambda: killed.__exit__(None, None, None)) as mine:
         assert not mine.is_alone
-    assert 0.2 < time.monotonic() - start < lease.SECONDS_TO_WAIT
+    assert 0.2 < time.monotonic() - start < folders.SECONDS_TO_WAIT
 
 
 def test_the_commands_that_join_takes_are_those_with_shares():

@@ -29,7 +29,7 @@ def goal_model(tmp_path_factory):
     policy = demo_base().with_goal_conditioning("indication", logit_bias=True)
     torch.manual_seed(1)
     with torch.no_grad():
-        for part in policy.goal_parts():
+        for part in policy.goal_modules():
             for weight in part.parameters():
                 weight.add_(0.3 * torch.randn_like(weight))
     policy.save_pretrained(folder)

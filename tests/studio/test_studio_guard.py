@@ -15,7 +15,7 @@ import pytest
 from rlftsim.errors import ConfigError
 from rlftsim.studio.guard import Access
 from rlftsim.studio.server import create_app, static_files, static_hash
-from rlftsim.studio.serving import Studio, token_of
+from rlftsim.studio.serving import Studio, load_token
 
 HOST = "127.0.0.1:4711"
 READS = ["/", f"/static/{static_hash()}/main.js", "/api/session", "/api/scenarios?split=validation", "/api/runs/x"]
@@ -160,15 +160,15 @@ def test_the_page_has_no_inline_code_and_never_sets_html(client):
 
 def test_a_token_file_is_made_private_and_read_again(tmp_path):
     path = tmp_path / "token"
-    token = token_of(path)
-    assert (token_of(path), path.stat().st_mode & 0o777) == (token, 0o600)
+    token = load_token(path)
+    assert (load_token(path), path.stat().st_mode & 0o777) == (token, 0o600)
     path.chmod(0o644)
     with pytest.raises(ConfigError, match="only its owner"):
-        token_of(path)
+        load_token(path)
     path.write_bytes(b"\xff" * 60)
     path.chmod(0o600)
     with pytest.raises(ConfigError, match="only its owner"):
-        token_of(path)
+        load_token(path)
 
 
 def test_what_cannot_be_served_or_saved_is_refused_at_the_start(tmp_path, capsys):

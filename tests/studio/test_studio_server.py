@@ -19,7 +19,7 @@ from rlftsim.goals.placement import goal_warnings
 from rlftsim.rollout.files import write_rollouts
 from rlftsim.scenario.batch import collate
 from rlftsim.studio.encoding import MAGIC, encode_poses
-from rlftsim.studio.runs import Worker, chunks_of
+from rlftsim.studio.runs import Worker, split_rollouts
 from rlftsim.studio.server import create_app
 from rlftsim.studio.session import Session
 
@@ -100,8 +100,8 @@ def test_goals_are_doubted_and_refused_in_the_words_of_the_command_line(client, 
 
 
 def test_chunks_are_four_four_eight_sixteen_then_thirty_two():
-    assert [len(ids) for ids in chunks_of(128)] == [4, 4, 8, 16, 32, 32, 32]
-    assert [len(ids) for ids in chunks_of(10)] == [4, 4, 2]
+    assert [len(ids) for ids in split_rollouts(128)] == [4, 4, 8, 16, 32, 32, 32]
+    assert [len(ids) for ids in split_rollouts(10)] == [4, 4, 2]
 
 
 def test_poses_survive_the_encoding_to_half_a_centimeter():

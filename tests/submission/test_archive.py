@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from rlftsim.errors import DataError
 from rlftsim.evaluation.wire_format import read_fields
-from rlftsim.submission.archive import GzipReader, combine_crc32, count_joined, join_pieces, write_piece
+from rlftsim.submission.archive import GzipReader, combine_crc32, count_joined, join_shards, pack_shard
 
 
 @given(st.binary(max_size=300), st.binary(max_size=300))
@@ -31,14 +31,14 @@ def make_pieces(folder, contents):
     pieces = []
     for name, data in contents.items():
         (folder / "raw").write_bytes(data)
-        pieces.append(write_piece(folder / "raw", name, folder / f"{name}.part"))
+        pieces.append(pack_shard(folder / "raw", name, folder / f"{name}.part"))
     (folder / "raw").unlink()
     return pieces
 
 
 def test_every_program_reads_the_whole_archive(contents, tmp_path):
     archive = tmp_path / "a.tar.gz"
-    join_pieces(archive, tmp_path, make_pieces(tmp_path, contents), delete=False)
+    join_shards(archive, tmp_path, make_pieces(tmp_path, contents), delete=False)
     for mode in ("r:gz", "r|gz"):
         with tarfile.open(archive, mode) as tar:
             assert {member.name: tar.extractfile(member).read() for member in tar} == contents
@@ -55,13 +55,13 @@ def test_every_program_reads_the_whole_archive(contents, tmp_path):
 def test_a_stopped_join_goes_on_without_the_pieces_that_are_gone(contents, tmp_path):
     pieces = make_pieces(tmp_path, contents)
     whole, archive = tmp_path / "whole.tar.gz", tmp_path / "a.tar.gz"
-    join_pieces(whole, tmp_path, pieces, delete=False)
+    join_shards(whole, tmp_path, pieces, delete=False)
     # as after a kill in the middle of the third piece: two are deleted, a part of the third is written
     joined = 10 + pieces[0].size + pieces[1].size
     (tmp_path / ".a.tar.gz.partial").write_bytes(whole.read_bytes()[: joined + 777])
     for name in ("a", "b"):
         (tmp_path / f"{name}.part").unlink()
-    join_pieces(archive, tmp_path, pieces, delete=True)
+    join_shards(archive, tmp_path, pieces, delete=True)
     assert archive.read_bytes() == whole.read_bytes()
     assert not list(tmp_path.glob("*.part"))
 
@@ -69,15 +69,15 @@ def test_a_stopped_join_goes_on_without_the_pieces_that_are_gone(contents, tmp_p
 def test_pieces_before_a_damaged_one_stay_joined(contents, tmp_path):
     pieces = make_pieces(tmp_path, contents)
     whole, archive = tmp_path / "whole.tar.gz", tmp_path / "a.tar.gz"
-    join_pieces(whole, tmp_path, pieces, delete=False)
+    join_shards(whole, tmp_path, pieces, delete=False)
     third = (tmp_path / "c.part").read_bytes()
     (tmp_path / "c.part").write_bytes(third[:-1])
     with pytest.raises(DataError, match=r"c\.part was damaged"):
-        join_pieces(archive, tmp_path, pieces, delete=True)
+        join_shards(archive, tmp_path, pieces, delete=True)
     assert not (tmp_path / "a.part").exists()
     assert count_joined(archive, tmp_path, pieces) == 2
     (tmp_path / "c.part").write_bytes(third)  # simulated once more
-    join_pieces(archive, tmp_path, pieces, delete=True)
+    join_shards(archive, tmp_path, pieces, delete=True)
     assert archive.read_bytes() == whole.read_bytes()
 
 
@@ -86,7 +86,7 @@ def test_a_damaged_piece_is_named_and_removed(contents, tmp_path):
     damaged = tmp_path / "c.part"
     damaged.write_bytes(damaged.read_bytes()[:-1] + b"?")
     with pytest.raises(DataError, match=r"c\.part was damaged or missing: run the same command again"):
-        join_pieces(tmp_path / "a.tar.gz", tmp_path, pieces, delete=False)
+        join_shards(tmp_path / "a.tar.gz", tmp_path, pieces, delete=False)
     assert not damaged.exists()
 
 

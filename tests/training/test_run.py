@@ -8,7 +8,7 @@ import torch
 
 import tiny
 from rlftsim.errors import CheckpointError, ConfigError, NotYetError
-from rlftsim.jobs.lease import Lease
+from rlftsim.jobs.folder import Lease
 from rlftsim.jobs.runner import Inline
 from rlftsim.rollout.baselines import ConstantVelocity
 from rlftsim.training import imitation

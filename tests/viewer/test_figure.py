@@ -7,10 +7,10 @@ from matplotlib.patches import Rectangle
 
 from rlftsim.errors import DataError
 from rlftsim.viewer.figure import (  # fmt: skip
-    BETTER,
+    BETTER_COLOR,
     COLORS,
-    NEITHER,
-    WORSE,
+    EQUAL_COLOR,
+    WORSE_COLOR,
     Band,
     Interval,
     draw_bands,
@@ -74,4 +74,4 @@ def test_verdicts_are_signs_and_colors_and_the_diagonal_is_empty():
     axis = draw_verdicts(["a", "b", "c"], verdicts, title="t", note="n").axes[0]
     assert [text.get_text() for text in axis.texts] == ["", "+", "~", "−", "", "+", "~", "−", ""]
     colors = [to_hex(p.get_facecolor()) for p in axis.patches if isinstance(p, Rectangle)]
-    assert [colors[i] for i in (1, 2, 3)] == [BETTER, NEITHER, WORSE]
+    assert [colors[i] for i in (1, 2, 3)] == [BETTER_COLOR, EQUAL_COLOR, WORSE_COLOR]

@@ -38,7 +38,7 @@ def test_an_mp4_plays_the_future_in_real_time_and_everybody_moves(animation, tmp
 
 
 def test_a_webp_plays_where_pictures_are_shown(animation, tmp_path):
-    to_film(tmp_path / "film.webp", animation, every=10, dots_per_inch=50)
+    to_film(tmp_path / "film.webp", animation, steps_per_frame=10, dots_per_inch=50)
     with Image.open(tmp_path / "film.webp") as film:
         assert film.is_animated
         assert film.size == (400, 234)

@@ -30,7 +30,7 @@ def test_agents_are_the_simulated_ones_in_track_order(scenario):
 
 
 def test_map_is_simplified_and_centered_on_the_ego(scenario):
-    lines = {line.kind: line.points for line in build_scene(scenario).lines}
+    lines = {line.style: line.points for line in build_scene(scenario).lines}
     # 61 points on a straight lane become its ends; the corner of the edge stays, its middle point goes
     assert lines["lane"].tolist() == [[-30, 0], [30, 0]]
     assert lines["edge"].tolist() == [[-30, -4], [20, -4], [20, -20]]

@@ -14,10 +14,10 @@ from rlftsim.evaluation import evaluate as evaluation
 from rlftsim.evaluation.compare import Comparison
 from rlftsim.evaluation.compare import compare as compare_evaluations
 from rlftsim.evaluation.results import EvaluateConfig, Evaluation
-from rlftsim.jobs.buckets import require_folder
+from rlftsim.jobs.buckets import validate_folder
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import Policy, Sampling
-from rlftsim.scenario.any_form import AnyScenarios, Name, scenarios_of
+from rlftsim.scenario.any_form import AnyScenarios, Name, to_scenarios
 from rlftsim.scenario.dataset import ScenarioDataset, write_dataset
 
 ORACLE = "oracle"
@@ -78,7 +78,7 @@ def evaluate(
         subject = policy_of(policy)
         name = name or f"{type(policy).__name__}-{fingerprint_policy(policy)[:8]}"
     # 3. Scores.
-    scenarios = scenarios_of(data)
+    scenarios = to_scenarios(data)
     with contextlib.ExitStack() as stack:
         temporary = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="rlftsim-")))
         if isinstance(scenarios, ScenarioDataset):
@@ -88,7 +88,7 @@ def evaluate(
             folder, split = temporary / "scenarios", None
             write_dataset((scenarios[position] for position in range(len(scenarios))), folder)
         # Without `out` the results are in memory alone when the folder is gone.
-        out = require_folder(out or temporary / "results")
+        out = validate_folder(out or temporary / "results")
         return evaluation.evaluate(subject, folder, out, replace(config, split=split), name=name)
 
 

@@ -10,10 +10,10 @@ from rlftsim.rollout.check import CheckReport
 from rlftsim.rollout.check import check_policy as check_contract
 from rlftsim.rollout.policy import Policy
 from rlftsim.rollout.types import Rollouts
-from rlftsim.scenario.any_form import AnyScenarios, Name, scenarios_of
+from rlftsim.scenario.any_form import AnyScenarios, Name, to_scenarios
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.types import Scenario
-from rlftsim.viewer.notebook import require_rollouts
+from rlftsim.viewer.notebook import check_rollouts
 
 
 def score(scenarios: AnyScenarios, rollouts: Rollouts, metric: str | int = "2025") -> RealismResult:
@@ -35,7 +35,7 @@ def score(scenarios: AnyScenarios, rollouts: Rollouts, metric: str | int = "2025
         DataError: a scenario that cannot be scored, e.g. one without its future, a pose that is not finite, or a
             scenario with other agents than the simulated one.
     """
-    require_rollouts("score", scenarios, rollouts)
+    check_rollouts("score", scenarios, rollouts)
     batch = batch_of(scenarios, rollouts.position.device)
     # 1. Refuse rollouts of other scenarios: by the ids of scenarios and agents where they know them, else by numbers.
     about = rollouts.provenance
@@ -47,7 +47,7 @@ def score(scenarios: AnyScenarios, rollouts: Rollouts, metric: str | int = "2025
                 f"rollouts of {theirs} do not belong to {', '.join(ids[:3])}: hand over the same scenarios."
             )
         for row, scenario in enumerate(batch.scenarios):
-            about.refuse_other_agents(row, scenario)
+            about.check_same_agents(row, scenario)
         if batch.frame != about.frame:
             batch = collate(batch.scenarios, frame=about.frame).to(batch.device)
     num_scenarios, _, num_agents = rollouts.position.shape[:3]
@@ -85,6 +85,6 @@ def check_policy(
     Raises:
         ConfigError: no policy, or no scenario.
     """
-    found = scenarios_of(scenarios)
+    found = to_scenarios(scenarios)
     tried = [found[position] for position in range(len(found))]
     return check_contract(policy_of(policy), tried, reference=None if reference is None else policy_of(reference))

@@ -14,7 +14,7 @@ from rlftsim.goals.placement import FASTEST_MPS
 from rlftsim.goals.types import Goals, PointById
 from rlftsim.jobs.progress import progress_bar
 from rlftsim.rollout.fingerprint import fingerprint_policy
-from rlftsim.rollout.policy import Policy, Sampling, device_of, is_goal_conditioned, is_training
+from rlftsim.rollout.policy import Policy, Sampling, get_device, is_goal_conditioned, is_training
 from rlftsim.rollout.simulate import simulate as simulate_batch
 from rlftsim.rollout.types import RolloutProvenance, Rollouts
 from rlftsim.scenario.any_form import AnyScenarios, Name
@@ -59,7 +59,7 @@ def simulate(
     policy = policy_of(policy)
     if is_training(policy):  # with dropout a seed would not say what happens
         policy = frozen_copy(policy)
-    batch = batch_of(scenarios, device_of(policy))
+    batch = batch_of(scenarios, get_device(policy))
     if not isinstance(goals, Goals | Mapping | None):
         raise ConfigError(
             f"goals must be {{object_id: (x, y)}}, {{scenario_id: {{object_id: (x, y)}}}} or Goals, got {goals!r}."

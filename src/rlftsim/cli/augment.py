@@ -7,7 +7,10 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional
 
+from rlftsim.evaluation.evaluate import check_jobs
+from rlftsim.jobs.runner import Work, choose_runner
 from rlftsim.policies.registry import Device, load_policy
+from rlftsim.rollout.policy import get_device
 from rlftsim.scenario.open import open_dataset
 from rlftsim.training.augment import AugmentConfig, augment_goals
 
@@ -30,13 +33,19 @@ class Augment:
     split: str = "training"
     """Split of the data set."""
     device: Device = "auto"
-    """auto: the GPU if torch has one."""
+    """auto: the GPU if torch has one; several processes (--jobs) need cpu."""
+    jobs: int = 1
+    """Processes, each with one thread. Changes no result."""
     config: Annotated[AugmentConfig, tyro.conf.arg(name="")] = field(default_factory=AugmentConfig)
+    work: Annotated[Work, tyro.conf.arg(name="")] = field(default_factory=Work)
 
     def run(self) -> int:
-        """Sample scenario by scenario."""
+        """Sample scenario by scenario, what is missing."""
         # The data set is opened first: a wrong path is found before weights are loaded.
         scenarios = open_dataset(self.data, self.split)
-        count = augment_goals(load_policy(self.model, self.device), scenarios, self.out, self.config)
+        policy = load_policy(self.model, self.device)
+        check_jobs(self.jobs, get_device(policy), "jobs")
+        runner = self.work.runner(self.jobs, self.work.on_error) or choose_runner(self.jobs, len(scenarios))
+        count = augment_goals(policy, scenarios, self.out, self.config, runner=runner)
         print(f"{self.out}: goals for {count} scenarios.")
         return 0

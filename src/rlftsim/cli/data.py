@@ -8,11 +8,10 @@ import tyro
 from rich.table import Table
 from tyro.conf import Positional
 
-from rlftsim.cli.machines import Machines, Work
 from rlftsim.errors import ConfigError
 from rlftsim.jobs.buckets import is_url
 from rlftsim.jobs.progress import print_wide
-from rlftsim.jobs.runner import usable_cores
+from rlftsim.jobs.runner import Machines, Work, usable_cores
 from rlftsim.scenario.convert import convert
 from rlftsim.scenario.inspect import DatasetStats, dataset_stats, verify_dataset
 from rlftsim.scenario.open import dataset_folder

@@ -76,7 +76,7 @@ class Exam:
         )
         of_checkout = CHECKOUT / "benchmarks" / LEDGER
         ledger = Ledger(self.ledger or (of_checkout if of_checkout.exists() else self.out / LEDGER))
-        result = take_exam(config, self.out, ledger, again=self.again)
+        result = take_exam(config, self.out, ledger, is_repeat=self.again)
         tables, verdicts = write_exam(result, config, ledger)
         print_wide(*(table.for_terminal() for table in tables))
         for line in verdicts:

@@ -11,16 +11,16 @@ from rich.table import Table
 from tyro.conf import Positional
 
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.experiments.goal_proposals import entry_of, label_of, propose
+from rlftsim.experiments.goal_proposals import format_label, propose, to_goal_entry
 from rlftsim.goals.goals_file import GoalEntry, GoalsFile, check_single_goals, parse_goal, read_goals, write_goals
 from rlftsim.goals.maneuvers.proposals import Proposal, no_proposal_reason
 from rlftsim.goals.placement import distance_m, goal_warnings
 from rlftsim.jobs.folder import check_file
 from rlftsim.jobs.progress import log, print_wide
 from rlftsim.scenario.dataset import ScenarioDataset
-from rlftsim.scenario.open import dataset_folder, refuse_unknown
+from rlftsim.scenario.open import check_splits, dataset_folder
 from rlftsim.scenario.types import CURRENT_STEP, ObjectType, Scenario
-from rlftsim.viewer.figure import refuse_no_picture
+from rlftsim.viewer.figure import check_picture_path
 from rlftsim.viewer.goal_picture import DrawnGoal, GoalPanel, draw_goals
 
 Choice = Literal[
@@ -58,12 +58,12 @@ class Propose:
         for file in filter(None, (self.out, self.picture)):
             check_file(file)
         if self.picture is not None:
-            refuse_no_picture(self.picture)
+            check_picture_path(self.picture)
         # 2. a table for each scenario, and its goals and pictures for later
         scenarios = ScenarioDataset(dataset_folder(self.data))
         goals, alternatives, panels = [], [], []
         for scenario_id in dict.fromkeys(self.scenario):
-            refuse_unknown(scenarios, scenario_id, self.data, "--scenario")
+            check_splits(scenarios, scenario_id, self.data, "--scenario")
             scenario = scenarios.by_id(scenario_id)
             table = Table(title=f"scenario {scenario.scenario_id}", title_justify="left")
             for heading in ("agent", "kind", "m/s", "maneuver", "goal (x, y)", "away [m]"):
@@ -72,11 +72,12 @@ class Propose:
                 proposals = propose(scenario, track)
                 chosen = next((proposal for proposal in proposals if self._is_chosen(proposal)), None)
                 for proposal in proposals:
-                    (goals if proposal is chosen else alternatives).append(entry_of(scenario, proposal))
+                    (goals if proposal is chosen else alternatives).append(to_goal_entry(scenario, proposal))
                 _add_rows(table, scenario, track, proposals, chosen)
                 agent = int(scenario.tracks.object_id[track])
                 marks = [
-                    DrawnGoal(agent, p.position, label_of(p), p.path[:, :2], is_logged=p.is_logged) for p in proposals
+                    DrawnGoal(agent, p.position, format_label(p), p.path[:, :2], is_logged=p.is_logged)
+                    for p in proposals
                 ]
                 title = f"{scenario.scenario_id}, agent {agent}"
                 panels.append(GoalPanel(title, scenario, tuple(marks) or (DrawnGoal(agent),)))
@@ -147,7 +148,7 @@ class Check:
         scenarios, file = ScenarioDataset(dataset_folder(self.data)), read_goals(self.file)
         lines = []
         for entry in (*file.goals, *file.alternatives):
-            refuse_unknown(scenarios, entry.scenario_id, self.data, entry)
+            check_splits(scenarios, entry.scenario_id, self.data, entry)
             lines += goal_warnings(entry, scenarios.by_id(entry.scenario_id))
         for line in lines:
             print(line)
@@ -224,8 +225,8 @@ def _add_rows(
             *agent, f"nothing: {no_proposal_reason(scenario, track) or 'no maneuver can be completed in time'}", "", ""
         )
     for row, proposal in enumerate(proposals):
-        entry = entry_of(scenario, proposal)
+        entry = to_goal_entry(scenario, proposal)
         mark = " ← goal" if proposal is chosen else ""
         point = f"{entry.x:.2f},{entry.y:.2f}"
         away = f"{distance_m(entry, scenario, track):.0f}"
-        table.add_row(*(agent if row == 0 else ("", "", "")), f"{label_of(proposal)}{mark}", point, away)
+        table.add_row(*(agent if row == 0 else ("", "", "")), f"{format_label(proposal)}{mark}", point, away)

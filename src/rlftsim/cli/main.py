@@ -79,7 +79,7 @@ usage: rlftsim VERB ...      rlftsim VERB --help explains a verb
 STARTS_ANEW = ("doctor", "plugins", "data", "recipe", "tokens", "model", "goals", "studio", "compare")
 """Verbs that keep nothing of an interrupted run."""
 JOIN = "join"
-HAVE_SHARES = ("convert", "evaluate", "score", "submit build", "synthesize")
+HAVE_SHARES = ("augment", "convert", "evaluate", "score", "simulate", "submit build", "synthesize")
 """Commands with --share, whose shares `join` puts together."""
 SIGNALLED = 128
 """Added to the number of the signal that ended the command: 130 = Ctrl-C, 143 = SIGTERM, 138 = SIGUSR1."""

@@ -129,7 +129,7 @@ class Show:
         policy = load_policy(self.model)
         weights = sum(p.numel() for p in policy.parameters()) if isinstance(policy, nn.Module) else 0
         print(f"{self.model}: {type(policy).__name__}, {weights:,} weights\n")
-        print(read_card(self.model, deeper=0) or "No card.")
+        print(read_card(self.model, heading_shift=0) or "No card.")
         return 0
 
 

@@ -12,12 +12,12 @@ from rich.table import Table
 
 from rlftsim.errors import DataError
 from rlftsim.evaluation.evaluate import EvaluateConfig, frozen_copy, simulate_states
-from rlftsim.evaluation.resumable import EvaluationParts
+from rlftsim.evaluation.resumable import ScenarioRows
 from rlftsim.jobs.progress import progress_bar
 from rlftsim.jobs.threads import one_thread
 from rlftsim.policies.registry import load_policy
 from rlftsim.realism import scenario_log, score
-from rlftsim.rollout.policy import device_of
+from rlftsim.rollout.policy import get_device
 from rlftsim.scenario.convert import convert
 from rlftsim.scenario.open import open_dataset
 from rlftsim.submission.messages import encode_rollouts
@@ -25,7 +25,7 @@ from rlftsim.submission.messages import encode_rollouts
 Plan = Literal["convert", "evaluate", "submit"]
 WOMD_SCENARIOS: dict[Plan, int] = {"convert": 576_000, "evaluate": 44_100, "submit": 44_920}
 """All records of the Waymo Open Motion Dataset, its validation split and its test split."""
-WOMD_PIECES: dict[Plan, int] = {"convert": 1_300, "evaluate": 44_100 // EvaluationParts.group_size, "submit": 150}
+WOMD_PIECES: dict[Plan, int] = {"convert": 1_300, "evaluate": 44_100 // ScenarioRows.items_per_file, "submit": 150}
 """Pieces of the work, each done by one core: source files, groups of scenarios, shards."""
 
 
@@ -68,7 +68,7 @@ def measure_cost(plan: Plan, model: str, data: str, num_measured: int) -> UnitCo
         for position in [chosen[0], *chosen]:
             start = time.process_time()
             scenario = dataset[position]
-            states = simulate_states(policy, scenario, config, device_of(policy))
+            states = simulate_states(policy, scenario, config, get_device(policy))
             if plan == "submit":
                 encode_rollouts(scenario.scenario_id, states)
             else:

@@ -3,21 +3,22 @@
 import json
 import sys
 from dataclasses import dataclass, field
+from os import PathLike
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 from tyro.conf import Positional
 
-from rlftsim.cli.machines import Work
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.evaluation.compare import columns_of, compare, format_comparison, format_table
+from rlftsim.evaluation.compare import compare, format_comparison, format_table, select_columns
 from rlftsim.evaluation.drive_results import DriveResult, format_drive_comparison, format_drives, is_drive_result
 from rlftsim.evaluation.evaluate import EvaluateConfig, evaluate, evaluation_name
 from rlftsim.evaluation.explain_page import explain_rollouts
 from rlftsim.evaluation.results import Evaluation
 from rlftsim.evaluation.score_files import ScoreConfig, format_scores, score_rollouts, to_json
 from rlftsim.jobs.progress import print_wide
+from rlftsim.jobs.runner import Runner, Unfinished, Work
 from rlftsim.policies.registry import Device, load_policy_or_oracle, with_guidance
 from rlftsim.scenario.open import dataset_folder
 
@@ -93,11 +94,13 @@ class Score:
         """Score, explain, print."""
         scenarios = dataset_folder(self.scenarios)
         runner = self.work.runner(self.config.num_jobs, self.work.on_error)
-        result = score_rollouts(self.rollouts, scenarios, self.out, self.config, name=self.name, runner=runner)
-        # After the scores: what they refuse, such as a name or a share, is refused before a page is written.
-        if self.explain is not None:
-            pages = explain_rollouts(self.rollouts, scenarios, self.explain, self.config, runner=runner)
-            print(f"{self.explain}: {len(pages)} pages", file=sys.stderr)
+        # Before the pages: what scores refuse, such as a name or a share, is refused before a page is written.
+        try:
+            result = score_rollouts(self.rollouts, scenarios, self.out, self.config, name=self.name, runner=runner)
+        except Unfinished:
+            self._explain(scenarios, runner)
+            raise
+        self._explain(scenarios, runner)
         if self.json:
             print(json.dumps(to_json(result), allow_nan=False))
         else:
@@ -106,6 +109,11 @@ class Score:
         for skipped in result.skipped:
             print(f"  skipped {skipped.scenario_id}: {skipped.reason}", file=sys.stderr)
         return 0
+
+    def _explain(self, scenarios: str | PathLike[str], runner: Runner | None) -> None:
+        if self.explain is not None:
+            pages = explain_rollouts(self.rollouts, scenarios, self.explain, self.config, runner=runner)
+            print(f"{self.explain}: {len(pages)} pages", file=sys.stderr)
 
 
 @dataclass(frozen=True)
@@ -128,5 +136,5 @@ class Compare:
             return 0
         a, b = Evaluation.read(self.first), Evaluation.read(self.second)
         comparison = compare(a, b, alpha=self.alpha)
-        print_wide(format_table(a, b), format_comparison(comparison, columns=columns_of(a, b)))
+        print_wide(format_table(a, b), format_comparison(comparison, columns=select_columns(a, b)))
         return 0

@@ -1,6 +1,6 @@
 """The verb that rolls out scenarios: simulate."""
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
@@ -9,18 +9,16 @@ from tyro.conf import Positional
 
 from rlftsim.cli.goal_outcomes import read_rollouts, report_outcomes
 from rlftsim.cli.goals import given_goals, warn_of_doubts
-from rlftsim.cli.rollout_folder import claim_folder, left_to_simulate
 from rlftsim.errors import ConfigError
+from rlftsim.evaluation.evaluate import check_jobs
 from rlftsim.evaluation.exporters import exporter_by_name
-from rlftsim.goals.placement import goals_of_batch
-from rlftsim.jobs.progress import log, progress_bar
+from rlftsim.evaluation.rollout_folder import Simulation, simulate_folder
+from rlftsim.jobs.progress import log
+from rlftsim.jobs.runner import Work, choose_runner
 from rlftsim.policies.registry import Device, load_policy, with_guidance
-from rlftsim.rollout.files import write_rollouts
-from rlftsim.rollout.fingerprint import fingerprint_policy
-from rlftsim.rollout.policy import Sampling, device_of, is_goal_conditioned
-from rlftsim.rollout.simulate import refuse_sampling, simulate
-from rlftsim.scenario.batch import collate
-from rlftsim.scenario.open import open_dataset, refuse_unknown
+from rlftsim.rollout.policy import Sampling, get_device, is_goal_conditioned
+from rlftsim.rollout.simulate import check_sampling
+from rlftsim.scenario.open import check_splits, open_dataset
 
 
 @dataclass(frozen=True)
@@ -67,64 +65,46 @@ class Simulate:
     """Write further files of each scenario: "page" is OUT/SCENARIO.html, which plays in any browser, "film" is
     OUT/SCENARIO.mp4; other names are those of installed plug-ins."""
     device: Device = "auto"
-    """auto: the GPU if torch has one."""
+    """auto: the GPU if torch has one; several processes (--jobs) need cpu."""
+    jobs: int = 1
+    """Processes, each with one thread. Changes no result."""
+    work: Annotated[Work, tyro.conf.arg(name="")] = field(default_factory=Work)
 
     def run(self) -> int:
         """Simulate the scenarios that have no file yet, and report goals."""
         # 1. model, data and goals; anything that does not fit is refused before the folder is touched
         exporters = [exporter_by_name(name) for name in self.export]
         policy = with_guidance(load_policy(self.model, self.device), self.guidance_scale)
+        check_jobs(self.jobs, get_device(policy), "jobs")
         sampling = Sampling(self.temperature, self.top_k)
         scenarios = open_dataset(self.data, self.split)
-        given = given_goals(self.goals, self.goal, self.scenario)
-        if given.goals and not is_goal_conditioned(policy):
+        goals = given_goals(self.goals, self.goal, self.scenario)
+        if goals.goals and not is_goal_conditioned(policy):
             raise ConfigError(
-                f"{self.model} is not goal-conditioned, {len(given.goals)} goals would have no effect: take a model "
+                f"{self.model} is not goal-conditioned, {len(goals.goals)} goals would have no effect: take a model "
                 "that was fine-tuned with goals (docs/goals.md), or leave --goal and --goals out."
             )
-        if self.guidance_scale != 1.0 and not given.goals:
+        if self.guidance_scale != 1.0 and not goals.goals:
             raise ConfigError(
                 f"--guidance-scale {self.guidance_scale:g} has no effect without goals: add --goal or --goals."
             )
-        ids = list(dict.fromkeys(self.scenario or given.scenario_ids or scenarios.scenario_ids))[: self.limit]
+        ids = list(dict.fromkeys(self.scenario or goals.scenario_ids or scenarios.scenario_ids))[: self.limit]
         for scenario_id in ids:
-            entries = given.of_scenario(scenario_id)
-            refuse_unknown(
-                scenarios, scenario_id, self.data, "--scenario" if self.scenario else next(iter(entries), "")
-            )
+            entries = goals.of_scenario(scenario_id)
+            check_splits(scenarios, scenario_id, self.data, "--scenario" if self.scenario else next(iter(entries), ""))
             if entries:
                 warn_of_doubts(entries, scenarios.by_id(scenario_id))
-            elif given.goals:
+            elif goals.goals:
                 log.info(f"  scenario {scenario_id} has no goals: it is simulated without.")
-        refuse_sampling(policy, scenarios, sampling)
-        # 2. describe the rollouts; a folder of other rollouts is refused
-        about = {
-            "model": self.model,
-            "policy": fingerprint_policy(policy),
-            "data": scenarios.fingerprint,
-            "seed": self.seed,
-            "num_rollouts": self.num_rollouts,
-            "sampling": asdict(sampling),
-        }
-        if given.goals:
-            about["goals"] = [[e.scenario_id, e.agent_id, e.x, e.y] for e in given.goals]
-        claim_folder(self.out, about)
-        # 3. simulate what is missing
-        left = left_to_simulate(self.out, ids, self.num_rollouts)
-        with progress_bar("simulate", len(ids), len(ids) - len(left)) as advance:
-            for scenario_id in left:
-                batch = collate([scenarios.by_id(scenario_id)]).to(device_of(policy))
-                entries = given.of_scenario(scenario_id)
-                goals = goals_of_batch(entries, batch) if entries else None
-                rollouts = simulate(
-                    policy, batch, num_rollouts=self.num_rollouts, seed=self.seed, sampling=sampling, goals=goals
-                )
-                write_rollouts(self.out, batch, rollouts)
-                advance()
-        # 4. outcomes of goals, also of rollouts that an earlier call has written
-        shown = [scenarios.by_id(i) for i in ids if given.of_scenario(i) or self.picture]
-        report_outcomes(self.out, shown, given, picture=self.picture)
-        # 5. further files, likewise
+        check_sampling(policy, scenarios, sampling)
+        # 2. simulate what is missing; a folder of other rollouts is refused
+        simulation = Simulation(policy, scenarios, self.num_rollouts, self.seed, sampling, goals)
+        runner = self.work.runner(self.jobs, self.work.on_error) or choose_runner(self.jobs, len(ids))
+        simulate_folder(simulation, ids, self.out, model=self.model, runner=runner)
+        # 3. outcomes of goals, also of rollouts that an earlier call has written
+        reported = [scenarios.by_id(i) for i in ids if goals.of_scenario(i) or self.picture]
+        report_outcomes(self.out, reported, goals, picture=self.picture)
+        # 4. further files, likewise
         for scenario in map(scenarios.by_id, ids if exporters else ()):
             states = read_rollouts(self.out, scenario)
             for export in exporters:

@@ -8,7 +8,7 @@ import tyro
 
 from rlftsim.errors import ConfigError
 from rlftsim.policies.registry import Device
-from rlftsim.studio import require_extra
+from rlftsim.studio import check_extra
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
@@ -55,8 +55,8 @@ class StudioVerb:
                 f"--host {self.host} makes the studio reachable from other machines: add --allow-remote if that is "
                 "meant, or use ssh -L."
             )
-        require_extra()
-        from rlftsim.studio.serving import Studio, announce, token_of
+        check_extra()
+        from rlftsim.studio.serving import Studio, announce, load_token
         from rlftsim.studio.session import Session
 
         if self.host not in LOOPBACK:
@@ -64,7 +64,7 @@ class StudioVerb:
         session = Session(
             self.data, tuple(self.model) or ("demo-goals",), self.split, self.out, self.device, tuple(self.rollouts)
         )
-        token = None if self.token_file is None else token_of(self.token_file)
+        token = None if self.token_file is None else load_token(self.token_file)
         studio = Studio(session, host=self.host, port=self.port, token=token, trusted_hosts=tuple(self.trust_host))
         announce(studio, as_json=self.json, open_browser=not self.no_browser)
         studio.run()

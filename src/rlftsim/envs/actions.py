@@ -5,9 +5,10 @@ in the center of the box and x ahead.
 """
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -19,20 +20,20 @@ from rlftsim.rollout.policy import Policy, TokenPolicy
 from rlftsim.scenario.types import STEP_S, ObjectType
 from rlftsim.tokens.vocabulary import CLASS_NAMES, STEPS_PER_TOKEN, class_of_type
 
-ActionKind = Literal["bicycle", "bicycle_discrete", "pose", "trajectory", "token"]
+ActionType = Literal["bicycle", "bicycle_discrete", "pose", "trajectory", "token"]
 Tracker = Literal["perfect", "bicycle"]
 
 STEERING_RAD = 0.55
 ACCELERATION_MPS2 = 4.0
-HARDEST_BRAKING_MPS2 = 8.0
+MAX_BRAKING_MPS2 = 8.0
 WHEELBASE_PER_LENGTH = 0.6
 ACCELERATIONS, STEERINGS = 7, 13
 """Levels of the discrete bicycle; actions count steering fastest."""
 POSE_LIMITS = np.array([4.0, 1.5, 0.35])
 """Largest |dx|, |dy| (m) and |dheading| (rad) of a step."""
 TRAJECTORY_LIMITS = np.array([400.0, 400.0, math.pi])
-LEAST_HORIZON, MOST_HORIZON = 5, 80
-PURSUIT_S, LEAST_PURSUIT_M = 0.8, 3.0
+MIN_HORIZON, MAX_HORIZON = 5, 80
+PURSUIT_S, MIN_PURSUIT_M = 0.8, 3.0
 """The bicycle that tracks a trajectory steers for the point so far ahead in time, at least so far away."""
 
 
@@ -40,7 +41,7 @@ PURSUIT_S, LEAST_PURSUIT_M = 0.8, 3.0
 class Actors:
     """Planner-driven agents before an action."""
 
-    name_of: Callable[[int], str]
+    agent_name: Callable[[int], str]
     """Name of an agent in messages: object id and scenario."""
     motion: Float[np.ndarray, "M 5"]
     size: Float[np.ndarray, "M 2"]
@@ -52,142 +53,125 @@ class Moves:
     """Motion that actions lead to."""
 
     motion: Float[np.ndarray, "M h 5"]
-    clipped: Bool[np.ndarray, "M"]
-    """True = the action was out of its bounds and has been cut to them."""
+    is_clipped: Bool[np.ndarray, "M"]
+    """True = the action was out of bounds and has been cut to them."""
 
 
-@runtime_checkable
-class Controls(Protocol):
-    """One way to act."""
+class Controls(ABC):
+    """Meaning of actions: numbers from a planner become motion."""
 
-    @property
-    def steps(self) -> int:
-        """Steps of 0.1 s that an action lasts."""
-        ...
+    steps: int = 1
+    """Steps of 0.1 s that an action lasts."""
+    num_choices: int = 0
+    """Number of discrete actions; 0 where actions are numbers."""
+    limits: np.ndarray = np.zeros(())
+    """Largest absolute values of an action, in the action's shape; of shape () for discrete ones."""
 
-    @property
-    def num_choices(self) -> int:
-        """Number of discrete actions; 0 where actions are numbers."""
-        ...
-
-    @property
-    def limits(self) -> np.ndarray:
-        """Largest absolute values of an action, in its shape; of shape () for discrete ones."""
-        ...
-
+    @abstractmethod
     def move(self, action: np.ndarray, actors: Actors) -> Moves:
-        """Motion that one action of each agent leads to.
+        """Motion that an action of each agent leads to.
 
         Args:
-            action: [M, *shape], or [M] whole numbers.
-            actors: before the action.
+            action: Numbers in shape [M, *limits.shape], or whole numbers [M] below `num_choices`.
+            actors: The M agents before the action, in the same order.
         """
-        ...
 
 
-def controls_of(
-    kind: ActionKind,
+def build_controls(
+    action_type: ActionType,
     policy: Policy | None = None,
     *,
-    horizon: int = LEAST_HORIZON,
+    horizon: int = MIN_HORIZON,
     tracker: Tracker = "perfect",
     reverse: bool = False,
     hard_braking: bool = False,
 ) -> Controls:
-    """Controls of a name.
+    """Controls by the name of an action.
 
     Args:
-        kind: of the action.
-        policy: the traffic model, whose vocabulary "token" chooses from.
-        horizon: number of poses of a "trajectory".
-        tracker: of a trajectory: "perfect" puts the agent there, "bicycle" steers for it.
+        action_type: Name of the action, as the setting `action` has it.
+        policy: Traffic model, whose motion tokens are the choices of a "token"; not used otherwise.
+        horizon: Number of poses of a "trajectory", 5 to 80.
+        tracker: Execution of a trajectory: "perfect" puts the agent there, "bicycle" steers for it.
         reverse: True = a bicycle may drive backwards.
         hard_braking: True = a bicycle's lowest action brakes with 8 m/s² in place of 4.
 
     Raises:
-        ConfigError: no such action, or one that the policy has no tokens for.
+        ConfigError: No such action, or one that the policy has no tokens for.
     """
-    bicycle = Bicycle(reverse=reverse, hardest=HARDEST_BRAKING_MPS2 if hard_braking else ACCELERATION_MPS2)
-    if kind == "bicycle":
+    bicycle = Bicycle(reverse=reverse, max_braking=MAX_BRAKING_MPS2 if hard_braking else ACCELERATION_MPS2)
+    if action_type == "bicycle":
         return bicycle
-    if kind == "bicycle_discrete":
+    if action_type == "bicycle_discrete":
         return DiscreteBicycle(bicycle)
-    if kind == "pose":
+    if action_type == "pose":
         return PoseControls()
-    if kind == "trajectory":
-        if not LEAST_HORIZON <= horizon <= MOST_HORIZON or tracker not in ("perfect", "bicycle"):
+    if action_type == "trajectory":
+        if not MIN_HORIZON <= horizon <= MAX_HORIZON or tracker not in ("perfect", "bicycle"):
             raise ConfigError(
-                f"a trajectory has {LEAST_HORIZON} to {MOST_HORIZON} poses and the tracker perfect or bicycle, got "
+                f"a trajectory has {MIN_HORIZON} to {MAX_HORIZON} poses and the tracker perfect or bicycle, got "
                 f"{horizon} and {tracker!r}."
             )
         return TrajectoryControls(horizon, bicycle if tracker == "bicycle" else None)
-    if kind == "token":
+    if action_type == "token":
         if not isinstance(policy, TokenPolicy):
             raise ConfigError("action 'token' needs a traffic model with motion tokens: take another action or model.")
         return TokenControls(policy)
-    raise ConfigError(f"action {kind!r}: known are bicycle, bicycle_discrete, pose, trajectory, token.")
+    raise ConfigError(f"action {action_type!r}: known are bicycle, bicycle_discrete, pose, trajectory, token.")
 
 
-def checked(action: Any, controls: Controls, name_of: Callable[[int], str], count: int) -> np.ndarray:
-    """Actions of some agents as an array of the right shape and type.
+def validate_actions(action: Any, controls: Controls, agent_name: Callable[[int], str], count: int) -> np.ndarray:
+    """Actions of several agents as an array of the right shape and type.
 
     Args:
-        action: [count, *shape] numbers, or [count] whole numbers.
-        controls: of the action.
-        name_of: name of a row's agent in messages.
-        count: number of agents.
+        action: Numbers in shape [count, *limits.shape], or whole numbers [count] for discrete controls.
+        controls: Controls that the actions are meant for; shape, bounds and number type come from them.
+        agent_name: Name of the agent in a row, for messages.
+        count: Number of agents, the length of the first axis.
 
     Raises:
-        ConfigError: no numbers, another shape, a NaN, or no such discrete action; names agent and entry.
+        ConfigError: No numbers, another shape, a NaN, or no such discrete action; names agent and entry.
     """
     shape = (count, *controls.limits.shape)
     try:
         array = np.asarray(action, np.float64)
     except (TypeError, ValueError):
-        raise ConfigError(f"action of {name_of(0)} must be numbers in shape {shape[1:]}.") from None
+        raise ConfigError(f"action of {agent_name(0)} must be numbers in shape {shape[1:]}.") from None
     if array.shape != shape and array.shape[1:] == shape[1:]:
         raise ConfigError(f"actions have shape {array.shape}, they must have {shape}: one for each of {count}.")
     if array.shape != shape:
-        raise ConfigError(f"action of {name_of(0)} has shape {array.shape[1:]}, it must have {shape[1:]}.")
+        raise ConfigError(f"action of {agent_name(0)} has shape {array.shape[1:]}, it must have {shape[1:]}.")
     if controls.num_choices:
-        wrong = ~((array >= 0) & (array < controls.num_choices) & (array == np.floor(array)))
+        is_valid, dtype = (array >= 0) & (array < controls.num_choices) & (array == np.floor(array)), np.int64
+        requirement = f"a whole number below {controls.num_choices}"
     else:
-        wrong = ~np.isfinite(array)
-    if wrong.any():
-        agent, *entry = np.argwhere(wrong)[0].tolist()
-        where = f" at entry {', '.join(map(str, entry))}" if entry else ""
-        known = f"a whole number below {controls.num_choices}" if controls.num_choices else "finite"
-        raise ConfigError(f"action of {name_of(agent)}{where} is {array[(agent, *entry)]:g}, it must be {known}.")
-    return array.astype(np.int64) if controls.num_choices else array
+        is_valid, dtype, requirement = np.isfinite(array), np.float64, "finite"
+    if not is_valid.all():
+        agent, *entry = np.argwhere(~is_valid)[0].tolist()
+        location = f" at entry {', '.join(map(str, entry))}" if entry else ""
+        number = f"{array[(agent, *entry)]:g}"
+        raise ConfigError(f"action of {agent_name(agent)}{location} is {number}, it must be {requirement}.")
+    return array.astype(dtype)
 
 
 @dataclass(frozen=True)
-class Bicycle:
+class Bicycle(Controls):
     """Kinematic bicycle about the center of the box: acceleration × 4 m/s², steering × 0.55 rad."""
 
     reverse: bool = False
-    hardest: float = ACCELERATION_MPS2
-    steps: int = 1
-    num_choices: int = 0
+    max_braking: float = ACCELERATION_MPS2
+    """Deceleration at the lowest action, m/s²."""
 
-    @property
-    def limits(self) -> np.ndarray:
-        """Two numbers in [-1, 1]."""
-        return np.ones(2)
+    limits = np.ones(2)
 
     def move(self, action: np.ndarray, actors: Actors) -> Moves:
-        """Motion after 0.1 s.
-
-        Args:
-            action: [M, 2].
-            actors: vehicles.
-        """
-        _only_vehicles(actors, "bicycle")
-        kept = np.clip(action, -1.0, 1.0)
-        is_braking = (kept[:, 0] < 0) & (signed_speed(actors.motion) > 0)
-        acceleration = kept[:, 0] * np.where(is_braking, self.hardest, ACCELERATION_MPS2)
-        motion = self.drive(actors.motion, acceleration, kept[:, 1] * STEERING_RAD, actors.size[:, 0])
-        return Moves(motion[:, None], np.any(kept != action, axis=1))
+        """Motion of vehicles after 0.1 s by actions [M, 2]."""
+        _check_vehicles(actors, "bicycle")
+        bounded = np.clip(action, -1.0, 1.0)
+        is_braking = (bounded[:, 0] < 0) & (signed_speed(actors.motion) > 0)
+        acceleration = bounded[:, 0] * np.where(is_braking, self.max_braking, ACCELERATION_MPS2)
+        motion = self.drive(actors.motion, acceleration, bounded[:, 1] * STEERING_RAD, actors.size[:, 0])
+        return Moves(motion[:, None], np.any(bounded != action, axis=1))
 
     def drive(
         self,
@@ -201,10 +185,10 @@ class Bicycle:
         A bicycle that may not drive backwards but does so at first brakes with 4 m/s² until it stands.
 
         Args:
-            motion: before.
-            acceleration: m/s².
-            steering: rad, positive to the left.
-            length: of the vehicles, m.
+            motion: Motion of the vehicles before, map frame.
+            acceleration: Acceleration along the heading, m/s².
+            steering: Angle of the front wheel, rad, positive to the left.
+            length: Length of the vehicles, m; the wheelbase is 0.6 of it.
         """
         x, y, heading = motion[..., 0], motion[..., 1], motion[..., 2]
         speed = signed_speed(motion)
@@ -217,155 +201,113 @@ class Bicycle:
         slip = np.arctan(np.tan(steering) / 2)
         turn = mean_speed * np.cos(slip) * np.tan(steering) / (WHEELBASE_PER_LENGTH * length) * STEP_S
         chord = mean_speed * STEP_S * np.sinc(turn / 2 / math.pi)  # of the arc
-        towards = heading + slip + turn / 2
+        chord_direction = heading + slip + turn / 2
         new_heading = wrapped(heading + turn)
-        along = new_heading + slip
+        direction = new_heading + slip
         return np.stack([
-            x + chord * np.cos(towards), y + chord * np.sin(towards), new_heading,
-            new_speed * np.cos(along), new_speed * np.sin(along),
+            x + chord * np.cos(chord_direction), y + chord * np.sin(chord_direction), new_heading,
+            new_speed * np.cos(direction), new_speed * np.sin(direction),
         ], -1)  # fmt: skip
 
 
 @dataclass(frozen=True)
-class DiscreteBicycle:
+class DiscreteBicycle(Controls):
     """7 accelerations from -4 to 4 m/s² times 13 steering angles."""
 
     bicycle: Bicycle
-    steps: int = 1
-    num_choices: int = ACCELERATIONS * STEERINGS
 
-    @property
-    def limits(self) -> np.ndarray:
-        """A single whole number has no limits of this kind."""
-        return np.zeros(())
+    num_choices = ACCELERATIONS * STEERINGS
 
     def move(self, action: np.ndarray, actors: Actors) -> Moves:
-        """Motion after 0.1 s.
-
-        Args:
-            action: [M] numbers below 91.
-            actors: vehicles.
-        """
+        """Motion of vehicles after 0.1 s by actions [M] below 91."""
         acceleration, steering = np.divmod(action, STEERINGS)
         levels = np.linspace(-1, 1, ACCELERATIONS)[acceleration], np.linspace(-1, 1, STEERINGS)[steering]
         return self.bicycle.move(np.stack(levels, -1), actors)
 
 
-@dataclass(frozen=True)
-class PoseControls:
+class PoseControls(Controls):
     """dx, dy, dheading in the agent's own frame, cut to 4 m, 1.5 m, 0.35 rad."""
 
-    steps: int = 1
-    num_choices: int = 0
-
-    @property
-    def limits(self) -> np.ndarray:
-        """Largest |dx|, |dy| and |dheading|."""
-        return POSE_LIMITS
+    limits = POSE_LIMITS
 
     def move(self, action: np.ndarray, actors: Actors) -> Moves:
-        """Motion after 0.1 s.
-
-        Args:
-            action: [M, 3].
-            actors: of any kind.
-        """
-        kept = np.clip(action, -POSE_LIMITS, POSE_LIMITS)
+        """Motion of agents of any type after 0.1 s by actions [M, 3]."""
+        poses = np.clip(action, -POSE_LIMITS, POSE_LIMITS)[:, None]
         # a float32 action rounds its bounds
-        clipped = np.any(np.abs(action) > POSE_LIMITS + 1e-6, axis=1)
-        return Moves(with_velocity(placed(kept[:, None], actors.motion), actors.motion), clipped)
+        return move_to_poses(poses, actors, np.any(np.abs(action) > POSE_LIMITS + 1e-6, axis=1))
 
 
-@dataclass(frozen=True)
-class TrajectoryControls:
-    """H future poses in the agent's own frame, of which the first is carried out."""
+class TrajectoryControls(Controls):
+    """H future poses in the agent's own frame, of which the first is carried out.
 
-    horizon: int
-    tracker: Bicycle | None
-    """None = the agent is put there."""
-    steps: int = 1
-    num_choices: int = 0
+    Args:
+        horizon: Number H of poses.
+        tracker: Bicycle that steers for the poses; None = the agent is put there.
+    """
 
-    @property
-    def limits(self) -> np.ndarray:
-        """Of H poses."""
-        return np.tile(TRAJECTORY_LIMITS, (self.horizon, 1))
+    def __init__(self, horizon: int, tracker: Bicycle | None):
+        self.tracker = tracker
+        self.limits = np.tile(TRAJECTORY_LIMITS, (horizon, 1))
 
     def move(self, action: np.ndarray, actors: Actors) -> Moves:
-        """Motion after 0.1 s.
-
-        Args:
-            action: [M, H, 3].
-            actors: of any kind; vehicles for the bicycle.
-        """
-        kept = np.clip(action, -TRAJECTORY_LIMITS, TRAJECTORY_LIMITS)
-        clipped = np.any(kept != action, axis=(1, 2))
+        """Motion of agents after 0.1 s by actions [M, H, 3]; the bicycle moves vehicles alone."""
+        poses = np.clip(action, -TRAJECTORY_LIMITS, TRAJECTORY_LIMITS)
+        is_clipped = np.any(poses != action, axis=(1, 2))
         if self.tracker is None:
-            first = np.clip(kept[:, :1], -POSE_LIMITS, POSE_LIMITS)
-            clipped = clipped | np.any(first != kept[:, :1], axis=(1, 2))
-            return Moves(with_velocity(placed(first, actors.motion), actors.motion), clipped)
-        _only_vehicles(actors, "trajectory with the bicycle")
+            first = np.clip(poses[:, :1], -POSE_LIMITS, POSE_LIMITS)
+            return move_to_poses(first, actors, is_clipped | np.any(first != poses[:, :1], axis=(1, 2)))
+        _check_vehicles(actors, "trajectory with the bicycle")
         # Steers for the point ahead; has the speed of the first pose, so that errors along do not remain.
         speed = signed_speed(actors.motion)
-        away = np.linalg.norm(kept[..., :2], axis=-1)  # [M, H]
-        wanted = pursuit_m(speed)[:, None]
-        target = np.where((away >= wanted).any(1), (away >= wanted).argmax(1), self.horizon - 1)
-        steering = pursue(kept[np.arange(len(kept)), target, :2], actors.size[:, 0])
-        needed = (kept[:, 0, 0] / STEP_S - speed) / STEP_S
-        lowest = -np.where(speed > 0, self.tracker.hardest, ACCELERATION_MPS2)
-        acceleration = np.clip(needed, lowest, ACCELERATION_MPS2)
+        is_beyond_pursuit = np.linalg.norm(poses[..., :2], axis=-1) >= pursuit_m(speed)[:, None]  # [M, H]
+        target = np.where(is_beyond_pursuit.any(1), is_beyond_pursuit.argmax(1), poses.shape[1] - 1)
+        steering = pursue(poses[np.arange(len(poses)), target, :2], actors.size[:, 0])
+        acceleration = (poses[:, 0, 0] / STEP_S - speed) / STEP_S
+        lowest = -np.where(speed > 0, self.tracker.max_braking, ACCELERATION_MPS2)
+        acceleration = np.clip(acceleration, lowest, ACCELERATION_MPS2)
         motion = self.tracker.drive(actors.motion, acceleration, steering, actors.size[:, 0])
-        return Moves(motion[:, None], clipped)
+        return Moves(motion[:, None], is_clipped)
 
 
-@dataclass(frozen=True, eq=False)
-class TokenControls:
-    """A motion token of the traffic model, carried out for half a second."""
+class TokenControls(Controls):
+    """A motion token of the traffic model, carried out for half a second.
 
-    policy: TokenPolicy
-    steps: int = STEPS_PER_TOKEN
+    Args:
+        policy: Traffic model, whose vocabulary the actions count through.
+    """
 
-    @property
-    def num_choices(self) -> int:
-        """Size of the vocabulary."""
-        return self.policy.vocabulary.num_tokens
+    steps = STEPS_PER_TOKEN
 
-    @property
-    def limits(self) -> np.ndarray:
-        """A single whole number has no limits of this kind."""
-        return np.zeros(())
+    def __init__(self, policy: TokenPolicy):
+        self.vocabulary = policy.vocabulary
+        self.num_choices = policy.vocabulary.num_tokens
 
     def move(self, action: np.ndarray, actors: Actors) -> Moves:
-        """Motion over half a second.
-
-        Args:
-            action: [M] token ids.
-            actors: of any kind.
+        """Motion of agents of any type over half a second by token ids [M].
 
         Raises:
-            ConfigError: the agent's class has no such token.
+            ConfigError: The agent's class has no such token.
         """
-        vocabulary = self.policy.vocabulary
         classes = class_of_type(torch.from_numpy(actors.object_type))
         ids = torch.from_numpy(action)
-        known = vocabulary.token_mask.cpu()[classes, ids].numpy()
-        if not known.all():
-            agent = int((~known).argmax())
-            name = CLASS_NAMES[int(classes[agent])]
-            count = int(vocabulary.token_mask[classes[agent]].sum())
+        class_tokens = self.vocabulary.token_mask.cpu()[classes]  # [M, V]
+        is_token = class_tokens[torch.arange(len(ids)), ids].numpy()
+        if not is_token.all():
+            agent = int(is_token.argmin())
+            name, count = CLASS_NAMES[int(classes[agent])], int(class_tokens[agent].sum())
             raise ConfigError(
-                f"action of {actors.name_of(agent)}: class {name} has {count} tokens, none is {ids[agent]}."
+                f"action of {actors.agent_name(agent)}: class {name} has {count} tokens, none is {ids[agent]}."
             )
-        poses = vocabulary.poses.cpu()[classes, ids].numpy().astype(np.float64)
-        return Moves(with_velocity(placed(poses, actors.motion), actors.motion), np.zeros(len(action), bool))
+        poses = self.vocabulary.poses.cpu()[classes, ids].numpy().astype(np.float64)
+        return move_to_poses(poses, actors, np.zeros(len(action), bool))
 
 
 def pursue(point: Float[np.ndarray, "*m 2"], length: Float[np.ndarray, "*#m"]) -> Float[np.ndarray, "*m"]:
     """Steering angle of the arc to a point, within the bounds of the bicycle: pure pursuit (Coulter, 1992), rad.
 
     Args:
-        point: in the vehicle's own frame, m.
-        length: of the vehicle, m.
+        point: Point to steer for, in the vehicle's own frame, m.
+        length: Length of the vehicle, m; the wheelbase is 0.6 of it.
     """
     squared = np.maximum((point * point).sum(-1), 0.01)
     steering = np.arctan(2 * WHEELBASE_PER_LENGTH * length * point[..., 1] / squared)
@@ -374,44 +316,49 @@ def pursue(point: Float[np.ndarray, "*m 2"], length: Float[np.ndarray, "*#m"]) -
 
 def pursuit_m(speed: Float[np.ndarray, "*m"]) -> Float[np.ndarray, "*m"]:
     """Distance of the point that is steered for at a speed, m."""
-    return np.maximum(LEAST_PURSUIT_M, PURSUIT_S * np.abs(speed))
+    return np.maximum(MIN_PURSUIT_M, PURSUIT_S * np.abs(speed))
 
 
 def signed_speed(motion: Float[np.ndarray, "*m 5"]) -> Float[np.ndarray, "*m"]:
     """Speed, negative for an agent that moves backwards, m/s."""
     vx, vy = motion[..., 3], motion[..., 4]
-    ahead = vx * np.cos(motion[..., 2]) + vy * np.sin(motion[..., 2])
-    return np.where(ahead < 0, -1.0, 1.0) * np.hypot(vx, vy)
+    forward = vx * np.cos(motion[..., 2]) + vy * np.sin(motion[..., 2])
+    return np.where(forward < 0, -1.0, 1.0) * np.hypot(vx, vy)
 
 
-def placed(poses: Float[np.ndarray, "M h 3"], motion: Float[np.ndarray, "M 5"]) -> Float[np.ndarray, "M h 3"]:
-    """Poses of the agents' own frames in the map frame.
-
-    Args:
-        poses: x, y, heading.
-        motion: of the agents.
-    """
-    cos, sin = np.cos(motion[:, 2])[:, None], np.sin(motion[:, 2])[:, None]
-    x, y = poses[..., 0], poses[..., 1]
-    position = np.stack([cos * x - sin * y, sin * x + cos * y], -1) + motion[:, None, :2]
-    heading = wrapped(motion[:, None, 2] + poses[..., 2])
-    return np.concatenate([position, heading[..., None]], -1)
-
-
-def with_velocity(poses: Float[np.ndarray, "M h 3"], before: Float[np.ndarray, "M 5"]) -> Float[np.ndarray, "M h 5"]:
-    """Motion of poses, with the velocities that lead to them.
+def to_heading_frame(
+    vectors: Float[np.ndarray, "*m 2"], heading: Float[np.ndarray, "*#m"]
+) -> tuple[Float[np.ndarray, "*m"], Float[np.ndarray, "*m"]]:
+    """Components of vectors along headings and to the left of them.
 
     Args:
-        poses: map frame.
-        before: motion one step before the first pose.
+        vectors: x and y in the map frame.
+        heading: Directions of the new x axes in the map frame, rad; broadcast against the vectors.
     """
-    position = np.concatenate([before[:, None, :2], poses[..., :2]], 1)
-    return np.concatenate([poses, np.diff(position, axis=1) / STEP_S], -1)
+    cos, sin = np.cos(heading), np.sin(heading)
+    x, y = vectors[..., 0], vectors[..., 1]
+    return cos * x + sin * y, cos * y - sin * x
 
 
-def _only_vehicles(actors: Actors, what: str) -> None:
-    others = actors.object_type != ObjectType.VEHICLE
-    if others.any():
-        row = int(others.argmax())
-        kind = ObjectType(int(actors.object_type[row])).name.lower()
-        raise ConfigError(f"{actors.name_of(row)} is a {kind}, which does not act by {what}: take pose or trajectory.")
+def move_to_poses(poses: Float[np.ndarray, "M h 3"], actors: Actors, is_clipped: Bool[np.ndarray, "M"]) -> Moves:
+    """Moves of agents that are put at poses, with the velocities that lead there.
+
+    Args:
+        poses: x, y, heading in each agent's own frame before the move.
+        actors: The agents before the move.
+        is_clipped: True = the action was out of bounds.
+    """
+    cos, sin = np.cos(actors.motion[:, 2])[:, None], np.sin(actors.motion[:, 2])[:, None]
+    x, y, origin = poses[..., 0], poses[..., 1], actors.motion[:, None, :2]
+    position = np.stack([cos * x - sin * y, sin * x + cos * y], -1) + origin
+    heading = wrapped(actors.motion[:, None, 2] + poses[..., 2])
+    velocity = np.diff(np.concatenate([origin, position], 1), axis=1) / STEP_S
+    return Moves(np.concatenate([position, heading[..., None], velocity], -1), is_clipped)
+
+
+def _check_vehicles(actors: Actors, action_type: str) -> None:
+    is_vehicle = actors.object_type == ObjectType.VEHICLE
+    if not is_vehicle.all():
+        row = int(is_vehicle.argmin())
+        name, object_type = actors.agent_name(row), ObjectType(int(actors.object_type[row])).name.lower()
+        raise ConfigError(f"{name} is a {object_type}, which does not act by {action_type}: take pose or trajectory.")

@@ -4,18 +4,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
-from rlftsim.envs.actions import ActionKind, Tracker
+from rlftsim.envs.actions import ActionType, Tracker
 from rlftsim.envs.drivers import Rules, Traffic
 from rlftsim.envs.observations import Frame
 from rlftsim.envs.rewards import parse_terms
 from rlftsim.envs.route import RouteChoice
-from rlftsim.errors import ConfigError, in_short, require_types
+from rlftsim.errors import ConfigError, check_types, in_short
 from rlftsim.policies.registry import Device
 from rlftsim.rollout.policy import Sampling
 from rlftsim.scenario.types import FUTURE_STEPS
 
 StopReason = Literal["collision", "offroad", "goal"]
-ObservationKind = Literal["dict", "flat", "arrays"]
+ObservationFormat = Literal["dict", "flat", "arrays"]
 RenderMode = Literal["rgb_array", "html"]
 
 
@@ -32,17 +32,17 @@ class EnvConfig:
     traffic: Traffic = "policy"
     """Driver of all agents but the ego: policy, replay, constant_velocity or idm."""
     drivers: Rules = field(default_factory=dict)
-    """Drivers of some agents, the first match wins; see `drivers_of`. They come before `traffic`."""
-    action: ActionKind = "bicycle"
+    """Drivers of some agents, the first match wins; see `assign_drivers`. They come before `traffic`."""
+    action: ActionType = "bicycle"
     horizon: int = 5
     """Number of poses of a trajectory."""
     tracker: Tracker = "perfect"
-    """Of a trajectory: puts the agent there, or steers a bicycle for it."""
+    """Execution of a trajectory: puts the agent there, or steers a bicycle for it."""
     reverse: bool = False
     """True = a bicycle may drive backwards."""
     hard_braking: bool = False
     """True = a bicycle brakes with up to 8 m/s² in place of 4."""
-    observation: ObservationKind = "dict"
+    observation: ObservationFormat = "dict"
     """Named arrays; all numbers in one row; or the `Observation` itself."""
     frame: Frame = "ego"
     reward: str = "progress - 5*at_fault - 5*offroad"
@@ -56,11 +56,11 @@ class EnvConfig:
     temperature: float = 1.0
     top_k: int | None = None
     device: Device = "cpu"
-    """Of the traffic model."""
+    """Device of the traffic model."""
     render_mode: RenderMode | None = None
 
     def __post_init__(self) -> None:
-        require_types(self)
+        check_types(self)
         if not isinstance(self.drivers, Mapping):
             raise ConfigError(f"drivers must be {{who: driver}}, got {in_short(self.drivers)}.")
         parse_terms(self.reward)

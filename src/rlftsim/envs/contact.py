@@ -11,19 +11,19 @@ from jaxtyping import Bool, Float, Int64
 from scipy.spatial import KDTree
 
 from rlftsim.envs.levels import is_on_level
-from rlftsim.envs.scene import PIECE_POINTS, Scene, build_env_scene
+from rlftsim.envs.scene import SEGMENT_POINTS, Scene, build_env_scene
 from rlftsim.geometry import boxes_overlap, clockwise_corners
 from rlftsim.scenario.derived import cached_on_scenario
 from rlftsim.scenario.types import Scenario
 
-STANDS_MPS = 0.05
+STOPPED_MPS = 0.05
 """At most this fast an agent counts as stopped."""
 BEHIND_RAD = np.radians(150.0)
 """A track at a greater bearing is behind."""
 HALF_LANE_M = 1.85
 """Half of the width that is assumed for every lane, as logs have center lines and few boundaries."""
-DENSE = 3
-"""Points that lanes are searched by, between two points of a piece."""
+SUBDIVISIONS = 3
+"""Points that lanes are searched by, between two points of a segment."""
 
 
 class CollisionType(StrEnum):
@@ -43,17 +43,18 @@ class Collision:
     """The first contact with one track."""
 
     step: int
-    """Of the episode, 1 = after the first action."""
+    """Step of the episode, 1 = after the first action."""
     agent: int
     """Row of the track."""
-    kind: CollisionType
+    collision_type: CollisionType
     at_fault: bool
-    """Of the planner's agent: a stopped track, its own front, or a track beside it while it is not in one lane."""
+    """True = the planner's agent is to blame: a stopped track, a front bumper that meets the track, or a track beside
+    an agent that is not in one lane."""
     speed_change_mps: float
     """Length of the difference of both velocities."""
 
 
-def collision_of(
+def classify_collision(
     scene: Scene,
     step: int,
     agent: int,
@@ -66,32 +67,31 @@ def collision_of(
     """Type and fault of a contact.
 
     Args:
-        scene: the map.
-        step: of the contact.
-        agent: row of the track.
-        ego: motion of the planner's agent.
-        ego_size: its length and width.
-        ego_ground: Height of the ground under it.
-        track: motion of the other one.
-        track_size: its length and width.
+        scene: Scene whose lanes decide whether the ego is in one lane.
+        step: Step of the episode at which the boxes first overlap.
+        agent: Row of the track in the scene's agent axis.
+        ego: Motion of the planner's agent at the step.
+        ego_size: Length and width of the planner's agent, m.
+        ego_ground: Height of the ground under the planner's agent, m; tells levels apart.
+        track: Motion of the track at the step.
+        track_size: Length and width of the track, m.
     """
     bearing = np.arctan2(track[1] - ego[1], track[0] - ego[0]) - ego[2]
-    ahead = np.array([np.cos(ego[2]), np.sin(ego[2])])
-    from_bumper = track[:2] - (ego[:2] + ego_size[0] / 2 * ahead)
-    if np.hypot(*ego[3:]) <= STANDS_MPS:
-        kind = CollisionType.STOPPED_EGO
-    elif np.hypot(*track[3:]) <= STANDS_MPS:
-        kind = CollisionType.STOPPED_TRACK
+    direction = np.array([np.cos(ego[2]), np.sin(ego[2])])
+    from_bumper = track[:2] - (ego[:2] + ego_size[0] / 2 * direction)
+    at_fault = False
+    if np.hypot(*ego[3:]) <= STOPPED_MPS:
+        collision_type = CollisionType.STOPPED_EGO
+    elif np.hypot(*track[3:]) <= STOPPED_MPS:
+        collision_type, at_fault = CollisionType.STOPPED_TRACK, True
     elif np.cos(bearing) < np.cos(BEHIND_RAD):
-        kind = CollisionType.ACTIVE_REAR
+        collision_type = CollisionType.ACTIVE_REAR
     elif boxes_overlap(from_bumper[None], ego[2:3], track[2:3], np.array([0.0, ego_size[1]]), track_size)[0]:
-        kind = CollisionType.ACTIVE_FRONT
+        collision_type, at_fault = CollisionType.ACTIVE_FRONT, True
     else:
-        kind = CollisionType.ACTIVE_LATERAL
-    at_fault = kind in (CollisionType.STOPPED_TRACK, CollisionType.ACTIVE_FRONT) or (
-        kind == CollisionType.ACTIVE_LATERAL and not bool(in_one_lane(scene, ego[None], ego_size, ego_ground)[0])
-    )
-    return Collision(step, agent, kind, at_fault, float(np.hypot(*(ego[3:] - track[3:]))))
+        collision_type = CollisionType.ACTIVE_LATERAL
+        at_fault = not in_one_lane(scene, ego[None], ego_size, ego_ground)[0]
+    return Collision(step, agent, collision_type, bool(at_fault), float(np.hypot(*(ego[3:] - track[3:]))))
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,49 +109,49 @@ class LaneSearch:
     is_junction: Bool[np.ndarray, "n"]
     """True = the lane joins two others inside a junction."""
 
-    def find_near(
+    def find_points(
         self, positions: Float[np.ndarray, "m 2"], distance_m: float, ground: Float[np.ndarray, "m"]
     ) -> list[list[int]]:
-        """For each position the list of points of lanes near it, on its level.
+        """Indices of the lane points near each position and on the same level, a list per position.
 
         Args:
-            positions: Where to search.
-            distance_m: Largest distance in the plane.
-            ground: Heights of the ground there.
+            positions: Centers of the search, map frame, m.
+            distance_m: Largest distance of a lane point in the plane, m.
+            ground: Heights of the ground at the positions, m; lanes of other levels are left out.
         """
-        near = list(self.tree.query_ball_point(positions, distance_m))
+        neighbors = list(self.tree.query_ball_point(positions, distance_m))
         if self.z is None:
-            return near
-        rows = [np.array(points, np.int64) for points in near]
+            return neighbors
+        rows = [np.array(points, np.int64) for points in neighbors]
         return [points[is_on_level(self.z[points] - height)].tolist() for points, height in zip(rows, ground)]
 
 
 @cached_on_scenario
 def lane_search(scenario: Scenario) -> LaneSearch | None:
-    """The lanes of a scenario to be searched by place; None without lanes."""
+    """The lanes of a scenario to be searched by position; None without lanes."""
     scene = build_env_scene(scenario)
-    graph, pieces = scene.graph, scene.lanes
+    graph, segments = scene.graph, scene.lanes
     if not len(graph):
         return None
-    # points between those of the pieces, about every 0.4 m
-    part = np.arange(DENSE * (PIECE_POINTS - 1)) / DENSE
-    low, rest = part.astype(int), (part % 1)[:, None]
-    points = (1 - rest) * pieces.points[:, low] + rest * pieces.points[:, low + 1]
-    along = np.diff(pieces.points, axis=1)[:, low]
+    # points between those of the segments, about every 0.4 m
+    index = np.arange(SUBDIVISIONS * (SEGMENT_POINTS - 1)) / SUBDIVISIONS
+    low, fraction = index.astype(int), (index % 1)[:, None]
+    points = (1 - fraction) * segments.points[:, low] + fraction * segments.points[:, low + 1]
+    step = np.diff(segments.points, axis=1)[:, low]
     joined: list[set[int]] = [{lane, *graph.successors[lane]} for lane in range(len(graph))]
     for lane, successors in enumerate(graph.successors):
         for successor in successors:
             joined[successor].add(lane)
-    topology = scenario.map_features.topology
-    inside = topology.interpolating
-    ids = scenario.map_features.feature_id[inside] if inside is not None else np.zeros(0, np.int64)
+    features = scenario.map_features
+    interpolating = features.topology.interpolating
+    junction_ids = features.feature_id[interpolating] if interpolating is not None else np.zeros(0, np.int64)
     return LaneSearch(
         tree=KDTree(points.reshape(-1, 2)),
-        lane=np.repeat(pieces.lane, len(part)),
-        heading=np.arctan2(along[..., 1], along[..., 0]).ravel(),
-        z=None if scene.levels is None else pieces.z[:, low].ravel(),
+        lane=np.repeat(segments.lane, len(index)),
+        heading=np.arctan2(step[..., 1], step[..., 0]).ravel(),
+        z=None if scene.levels is None else segments.z[:, low].ravel(),
         joined=tuple(frozenset(lanes) for lanes in joined),
-        is_junction=np.isin(graph.lane_id, ids),
+        is_junction=np.isin(graph.lane_id, junction_ids),
     )
 
 
@@ -163,20 +163,20 @@ def in_one_lane(
     Without lanes a box is in none.
 
     Args:
-        scene: the map.
-        motion: x, y, heading of a box over time.
-        size: its length and width.
-        ground: Height of the ground under it.
+        scene: Scene whose lanes are searched.
+        motion: x, y, heading of a box at n steps, map frame; further columns are ignored.
+        size: Length and width of the box, m.
+        ground: Height of the ground under the box at each step, m.
     """
     search = lane_search(scene.scenario)
     if search is None:
         return np.zeros(len(motion), bool)
     corners = clockwise_corners(motion[:, :2], motion[:, 2], size)
-    near = search.find_near(corners.reshape(-1, 2), HALF_LANE_M, np.repeat(ground, 4))
-    lanes = [frozenset(search.lane[rows].tolist()) for rows in near]
-    inside = np.zeros(len(motion), bool)
+    points = search.find_points(corners.reshape(-1, 2), HALF_LANE_M, np.repeat(ground, 4))
+    lanes = [frozenset(search.lane[rows].tolist()) for rows in points]
+    is_inside = np.zeros(len(motion), bool)
     for step in range(len(motion)):
-        of_corners = lanes[4 * step : 4 * step + 4]
-        candidates = frozenset().union(*(search.joined[lane] for lane in of_corners[0]))
-        inside[step] = any(all(search.joined[lane] & own for own in of_corners) for lane in candidates)
-    return inside
+        corner_lanes = lanes[4 * step : 4 * step + 4]
+        candidates = frozenset().union(*(search.joined[lane] for lane in corner_lanes[0]))
+        is_inside[step] = any(all(search.joined[lane] & corner for corner in corner_lanes) for lane in candidates)
+    return is_inside

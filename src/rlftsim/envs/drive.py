@@ -16,24 +16,22 @@ import rlftsim
 from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.drivers import TRAFFIC, Traffic
 from rlftsim.envs.ego_env import EgoEnv
-from rlftsim.envs.planners.registry import Planner, action_of, hash_code, horizon_of, load_planner, may_reverse
-from rlftsim.envs.result import SCORE_NAMES, Result, animation_of
+from rlftsim.envs.planners.registry import Planner, hash_code, load_planner, read_action_settings
+from rlftsim.envs.result import SCORE_NAMES, Result, build_animation
 from rlftsim.envs.source import Source
-from rlftsim.envs.traffic_scores import blamed_others_rate, realism_of_others
+from rlftsim.envs.traffic_scores import blamed_others_rate, compute_traffic_realism
 from rlftsim.errors import ConfigError, DataError, whole_number
 from rlftsim.evaluation.drive_results import DriveResult, DriveSettings
 from rlftsim.evaluation.resumable import (
-    JsonParts,
+    ScenarioValues,
     check_same_work,
+    check_scenarios_stay,
     finish_result,
-    map_scenarios,
-    read_if_readable,
-    refuse_to_leave_out,
+    read_stored,
 )
 from rlftsim.evaluation.scenario_source import hash_manifest
-from rlftsim.jobs.lease import Lease
 from rlftsim.jobs.progress import log
-from rlftsim.jobs.runner import on_this_machine
+from rlftsim.jobs.runner import choose_runner
 from rlftsim.scenario.open import dataset_folder
 from rlftsim.scenario.types import Scenario
 from rlftsim.statistics import mean_interval
@@ -77,11 +75,9 @@ class DriveConfig:
 
     def settings(self, traffic: str) -> EnvConfig:
         """Settings of the environment for one kind of traffic: nothing ends an episode, and nothing is rewarded."""
-        planner = load_planner(self.planner)
         return EnvConfig(
-            data=self.data, split=self.split, model=self.model, traffic=cast(Traffic, traffic),
-            action=action_of(planner), horizon=horizon_of(planner), reverse=may_reverse(planner), stop_on=(),
-            reward="none",
+            data=self.data, split=self.split, model=self.model, traffic=cast(Traffic, traffic), stop_on=(),
+            reward="none", **read_action_settings(load_planner(self.planner)),
         )  # fmt: skip
 
 
@@ -92,8 +88,8 @@ def drive(config: DriveConfig, out: Path | None = None) -> list[DriveResult]:
     file, with a message. A planner whose file has changed is driven anew.
 
     Args:
-        config: what is driven.
-        out: folder for the files; None keeps none.
+        config: Planner, data, kinds of traffic and number of rollouts.
+        out: Folder for the Parquet files; None = results are returned and not written.
 
     Raises:
         ConfigError: an unknown planner, kind of traffic or scenario, or a result of other scenarios that a limit or a
@@ -105,34 +101,34 @@ def drive(config: DriveConfig, out: Path | None = None) -> list[DriveResult]:
     ids = list(config.scenarios or environments[0].source.scenario_ids)[: config.limit]
     for scenario_id in ids:
         environments[0].source.scenario(scenario_id)
-    common = {
+    common_settings = {
         "planner": config.planner, "dataset": config.data, "split": config.split, "num_rollouts": config.num_rollouts,
         "seed": config.seed, "rlftsim_version": rlftsim.__version__,
         "planner_code": hash_code(config.planner),
         "manifest_sha256": hash_manifest(dataset_folder(config.data)),
     }  # fmt: skip
-    kinds = [
-        DriveSettings(traffic=traffic, model=env.source.fingerprint, **common)
+    drive_settings = [
+        DriveSettings(traffic=traffic, model=env.source.fingerprint, **common_settings)
         for traffic, env in zip(config.traffic, environments)
     ]
     # processes hand their rows over in files, so even results that are not kept need a folder
     with tempfile.TemporaryDirectory() as nowhere:
         name = config.planner.replace(":", ".")
         paths = [(out or Path(nowhere)) / f"{name}-{traffic}.parquet" for traffic in config.traffic]
-        for settings, path in zip(kinds, paths):
+        for settings, path in zip(drive_settings, paths):
             _read_and_refuse(config, settings, ids, path)
-        return [_drive_traffic(config, kind, ids, path) for kind, path in zip(kinds, paths)]
+        return [_drive_traffic(config, settings, ids, path) for settings, path in zip(drive_settings, paths)]
 
 
 def run_planner(env: EgoEnv, planner: Planner, scenario: Scenario, *, seed: int, rollout: int = 0) -> Result:
     """Drive one scenario from the current step to the end.
 
     Args:
-        env: whose actions are those of the planner.
-        planner: drives.
-        scenario: one of the environment's.
-        seed: of the traffic.
-        rollout: number of the dice.
+        env: Environment whose type of action is the planner's.
+        planner: Planner that drives, made by `load_planner`.
+        scenario: Scenario of the environment to drive to the end.
+        seed: Seed of the traffic; equal seeds, equal traffic for every planner.
+        rollout: Number of the rollout, 0 or more; each has dice of its own.
 
     Raises:
         DataError: the planner calls exit(). Any other error of the planner passes as it is.
@@ -155,72 +151,76 @@ def _read_finished(config: DriveConfig, settings: DriveSettings, ids: Sequence[s
     """The result of an earlier call for the same scenarios in one kind of traffic; None if there is none.
 
     Args:
-        config: of the call.
-        settings: of the result.
-        ids: its scenarios.
-        path: of its file.
+        config: Planner, data and scenarios of the call.
+        settings: Values that the result must agree with.
+        ids: Ids of the scenarios that the result must have, in this order.
+        path: File of the result.
 
     Raises:
-        ConfigError: a result of other scenarios is there, which a limit or a choice would replace.
+        ConfigError: The stored result has other scenarios, which a limit or a choice would replace.
     """
-    found = _read_and_refuse(config, settings, ids, path)
-    if found is None:
+    result = _read_and_refuse(config, settings, ids, path)
+    if result is None:
         return None
-    differing = _differences(found.settings, settings)
-    if found.scenario_ids != list(ids):
+    differing = _differences(result.settings, settings)
+    if result.scenario_ids != list(ids):
         differing.append("choice of scenarios")
     if differing:
         log.info(f"{path} is of another {', '.join(differing)}: it will be replaced.")
         return None
     # code beside the planner's file, or its weights, may have changed
     log.info(f"{path} is finished and is read: remove it to drive anew.")
-    return found
+    return result
 
 
-def _differences(stored: DriveSettings, wanted: DriveSettings) -> list[str]:
+def _differences(stored: DriveSettings, current: DriveSettings) -> list[str]:
     """Names of the values that count and differ."""
-    before, now = stored.what_counts(), wanted.what_counts()
-    return [name for name in now if before.get(name) != now[name]]
+    stored_values, values = stored.what_counts(), current.what_counts()
+    return [name for name in values if stored_values.get(name) != values[name]]
 
 
 def _read_and_refuse(
     config: DriveConfig, settings: DriveSettings, ids: Sequence[str], path: Path
 ) -> DriveResult | None:
     """The stored result, unless it is of other work, or a limit or a choice would leave out some of its scenarios."""
-    found = read_if_readable(path, DriveResult.read)
+    result = read_stored(path, DriveResult.read)
     choice = f"limit={config.limit}" if config.limit is not None else "this choice" if config.scenarios else ""
-    if found is not None and choice:
-        left_out = len({*found.scenario_ids} - {*ids})
+    if result is not None and choice:
+        left_out = len({*result.scenario_ids} - {*ids})
         way_out = "name another --out, or drive all scenarios."
-        refuse_to_leave_out(path, len(found.scenario_ids), left_out, choice, way_out)
-    if found is not None:
+        check_scenarios_stay(path, len(result.scenario_ids), left_out, choice, way_out)
+    if result is not None:
         # a planner whose code has changed is driven anew, and so is one of an older version of this package
-        differing = {*_differences(found.settings, settings)} - {"planner_code", "rlftsim_version"}
+        differing = {*_differences(result.settings, settings)} - {"planner_code", "rlftsim_version"}
         check_same_work(path, sorted(differing), "choose another --out")
-    return found
+    return result
 
 
 def _drive_traffic(config: DriveConfig, settings: DriveSettings, ids: Sequence[str], path: Path) -> DriveResult:
     """Drive what is missing in one kind of traffic and write the result, unless it is finished.
 
     Args:
-        config: of the call.
-        settings: of the result.
-        ids: its scenarios.
-        path: of its file; finished scenarios lie beside it until all are there.
+        config: Planner, data, scenarios and processes of the call.
+        settings: Values that the result must agree with.
+        ids: Ids of the scenarios of the result.
+        path: File of the result; finished scenarios lie beside this file until all are there.
     """
     identity = {"settings": settings.what_counts()}
-    files = JsonParts(path.with_suffix(".parts"), ids, dict.fromkeys(ids, identity), {}, _row_and_missing)
-    runner = on_this_machine(config.jobs, len(ids))
+    return finish_result(
+        f"{config.planner} in {settings.traffic}",
+        ids,
+        partial(_drive_scenario, config, settings.traffic, ids),
+        path=path,
+        format=ScenarioValues(path.with_suffix(".parts"), ids, dict.fromkeys(ids, identity), _row_and_missing),
+        find=partial(_read_finished, config, settings, ids, path),
+        combine=partial(_combine, settings),
+        runner=choose_runner(config.jobs, len(ids)),
+    )
 
-    def make(lease: Lease) -> DriveResult:
-        parts = map_scenarios(
-            partial(_drive_scenario, config, settings.traffic, ids), len(ids), files,
-            runner=runner, title=f"{config.planner} in {settings.traffic}", lease=lease,
-        )  # fmt: skip
-        return DriveResult.of(settings, [row for row, _ in parts], {row["scenario_id"]: why for row, why in parts})
 
-    return finish_result(partial(_read_finished, config, settings, ids, path), make, path, files, ids, runner)
+def _combine(settings: DriveSettings, rows: Sequence[tuple[dict[str, Any], dict[str, str]]]) -> DriveResult:
+    """Result of the rows of all scenarios and the scores that each cannot give."""
+    return DriveResult.of(settings, [row for row, _ in rows], {row["scenario_id"]: missing for row, missing in rows})
 
 
 def _row_and_missing(scenario_id: str, values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
@@ -230,7 +230,7 @@ def _row_and_missing(scenario_id: str, values: Mapping[str, Any]) -> tuple[dict[
         KeyError, TypeError, ValueError: the file was cut or edited.
     """
     row, missing = values["row"], values["missing"]
-    if row["scenario_id"] != scenario_id or not all(isinstance(why, str) for why in missing.values()):
+    if row["scenario_id"] != scenario_id or not all(isinstance(reason, str) for reason in missing.values()):
         raise ValueError("of another scenario, or without a reason")
     numbers = {name: float(row[name]) for name in (*SCORE_NAMES, "blamed_others_rate", "others_realism")}
     return {"scenario_id": scenario_id, "traffic": values["settings"]["traffic"], **numbers}, missing
@@ -246,8 +246,9 @@ def _drive_scenario(config: DriveConfig, traffic: str, ids: Sequence[str], posit
     rows = [result.scores for result in results]
     # a rollout that cannot give a score leaves it to the others
     means = {name: mean_interval(np.array([row[name] for row in rows])).mean for name in rows[0]}
-    means["blamed_others_rate"] = blamed_others_rate([one for result in results for one in result.record.collisions])
-    realism = realism_of_others([result.record for result in results])
+    collisions = [collision for result in results for collision in result.record.collisions]
+    means["blamed_others_rate"] = blamed_others_rate(collisions)
+    realism = compute_traffic_realism([result.record for result in results])
     row = {"scenario_id": ids[position], "traffic": traffic, **means, "others_realism": realism}
     return {"row": row, "missing": results[0].missing}
 
@@ -262,8 +263,8 @@ def film(config: DriveConfig, out: Path) -> Path:
     """Write a film of the first scenario, the kinds of traffic side by side; returns its path.
 
     Args:
-        config: what is driven.
-        out: folder for the file.
+        config: Planner, data, kinds of traffic and number of rollouts.
+        out: Folder for the film SCENARIO.webp.
     """
     records = {}
     for traffic in config.traffic:
@@ -272,5 +273,5 @@ def film(config: DriveConfig, out: Path) -> Path:
         result = run_planner(env, load_planner(config.planner), scenario, seed=config.seed)
         records[f"{config.planner} in {traffic}"] = result.record
     path = out / f"{scenario.scenario_id}.webp"
-    to_film(path, animation_of(records), every=2, dots_per_inch=70)
+    to_film(path, build_animation(records), steps_per_frame=2, dots_per_inch=70)
     return path

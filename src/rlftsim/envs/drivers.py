@@ -5,7 +5,7 @@ from enum import IntEnum
 from typing import Literal, get_args
 
 import numpy as np
-from jaxtyping import Int64
+from jaxtyping import Bool, Int64
 
 from rlftsim.envs.scene import Scene
 from rlftsim.errors import ConfigError, in_short
@@ -23,56 +23,53 @@ class Driver(IntEnum):
     """Its log: it holds its pose in a gap, and is gone after the last state."""
     CONSTANT_VELOCITY = 3
     IDM = 4
-    """The intelligent driver model along the way of its log, for vehicles alone; all others follow the policy."""
+    """The intelligent driver model along its logged path, for vehicles alone; other agents follow the policy."""
 
 
 Traffic = Literal["policy", "replay", "constant_velocity", "idm"]
 """Drivers that a whole scene may have besides the planner."""
 TRAFFIC = get_args(Traffic)
-GROUPS = {
-    "vehicles": ObjectType.VEHICLE,
-    "pedestrians": ObjectType.PEDESTRIAN,
-    "cyclists": ObjectType.CYCLIST,
-}
+GROUPS = {"vehicles": ObjectType.VEHICLE, "pedestrians": ObjectType.PEDESTRIAN, "cyclists": ObjectType.CYCLIST}
 Rules = Mapping[str | int, str]
 """Agents -> driver, the first match wins: "ego", "vehicles", "pedestrians", "cyclists", "tracks_to_predict", "*", or an
 object id."""
 
 
-def drivers_of(scene: Scene, rules: Rules) -> Int64[np.ndarray, "A"]:
+def assign_drivers(scene: Scene, rules: Rules) -> Int64[np.ndarray, "A"]:
     """Driver of each agent of a scenario, as numbers of `Driver`.
 
     Args:
-        scene: the scenario.
-        rules: agents to driver; an agent that no rule names follows the policy.
+        scene: Scene whose simulated agents get a driver each.
+        rules: Agents to driver, the first match wins; an agent that no rule names follows the policy.
 
     Raises:
-        ConfigError: no such group, agent or driver.
+        ConfigError: No such group, agent or driver.
     """
-    found = np.full(len(scene.object_id), -1)
-    for who, name in rules.items():
+    drivers = np.full(len(scene.object_id), -1)
+    for group, name in rules.items():
         if name not in ("planner", *TRAFFIC):
-            raise ConfigError(f"driver {in_short(name)} of {who!r}: known are planner, {', '.join(TRAFFIC)}.")
-        named = _members(scene, who) & (found < 0)
-        found[named] = Driver[name.upper()]
+            raise ConfigError(f"driver {in_short(name)} of {group!r}: known are planner, {', '.join(TRAFFIC)}.")
+        is_matched = _find_members(scene, group) & (drivers < 0)
+        drivers[is_matched] = Driver[name.upper()]
         if name == "idm":
-            found[named & (scene.object_type != ObjectType.VEHICLE)] = Driver.POLICY
-    return np.where(found < 0, Driver.POLICY, found)
+            drivers[is_matched & (scene.object_type != ObjectType.VEHICLE)] = Driver.POLICY
+    return np.where(drivers < 0, Driver.POLICY, drivers)
 
 
-def _members(scene: Scene, who: str | int) -> np.ndarray:
-    if who == "*":
+def _find_members(scene: Scene, group: str | int) -> Bool[np.ndarray, "A"]:
+    """True for the agents that the left side of a rule names."""
+    if group == "*":
         return np.ones(len(scene.object_id), bool)
-    if who == "ego":
+    if group == "ego":
         return np.arange(len(scene.object_id)) == scene.ego
-    if who == "tracks_to_predict":
+    if group == "tracks_to_predict":
         return np.isin(scene.scenario.simulated_indices, scene.scenario.tracks_to_predict)
-    if who in GROUPS:
-        return scene.object_type == GROUPS[str(who)]
-    if isinstance(who, int) and scene.row_of(who) is not None:
-        return scene.object_id == who
-    listed = ", ".join(map(str, scene.object_id[:12]))
+    if group in GROUPS:
+        return scene.object_type == GROUPS[str(group)]
+    if isinstance(group, int) and group in scene.object_id:
+        return scene.object_id == group
+    ids = ", ".join(map(str, scene.object_id[:12]))
     raise ConfigError(
-        f"drivers of {who!r}: scenario {scene.scenario.scenario_id} has no such agents: name ego, tracks_to_predict, "
-        f"{', '.join(GROUPS)}, '*' or one of {listed}."
+        f"drivers of {group!r}: scenario {scene.scenario.scenario_id} has no such agents: name ego, tracks_to_predict, "
+        f"{', '.join(GROUPS)}, '*' or one of {ids}."
     )

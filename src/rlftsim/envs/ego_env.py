@@ -7,12 +7,12 @@ import gymnasium
 import numpy as np
 
 from rlftsim.envs.episode import Episode, EpisodeState, advance, look, start
-from rlftsim.envs.record import record_of
-from rlftsim.envs.resets import about, chosen, config_of, fresh_seed, note_of
-from rlftsim.envs.result import Result, animation_of, page_of
+from rlftsim.envs.record import build_record
+from rlftsim.envs.resets import build_config, choose_scenario, describe_start, describe_step, draw_seed
+from rlftsim.envs.result import Result, build_animation, build_page
 from rlftsim.envs.snapshot import read_snapshot, write_snapshot
 from rlftsim.envs.source import Source
-from rlftsim.envs.spaces import action_space, observation_space, shown
+from rlftsim.envs.spaces import action_space, format_observation, observation_space
 from rlftsim.envs.world import Noise, fork
 from rlftsim.errors import ConfigError
 from rlftsim.rollout.policy import Policy
@@ -29,10 +29,10 @@ class EgoEnv(gymnasium.Env):
     """One scenario at a time; `gymnasium.make("rlftsim.envs:rlftsim/Ego-v0", ...)` makes it.
 
     Args:
-        scenarios: in place of the data set `data`: one, several or a data set.
-        policy: in place of the traffic model `model`.
-        settings: fields of `EnvConfig` by name.
-        source: scenarios, model and settings that are loaded already, in place of all others.
+        scenarios: Scenario, list of scenarios or data set, in place of the setting `data`.
+        policy: Traffic model in place of the one that the setting `model` names, in evaluation mode.
+        settings: Fields of `EnvConfig` by name; the other fields have their defaults.
+        source: Scenarios, model and settings that are loaded already, in place of the other arguments.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array", "html"], "render_fps": 10}
@@ -45,7 +45,7 @@ class EgoEnv(gymnasium.Env):
         source: Source | None = None,
         **settings: Any,
     ):
-        self.source = source or Source(config_of(settings), scenarios, policy)
+        self.source = source or Source(build_config(settings), scenarios, policy)
         self.config = self.source.config
         self.render_mode = self.config.render_mode
         self.action_space = action_space(self.source.controls)
@@ -78,19 +78,19 @@ class EgoEnv(gymnasium.Env):
         """Begin an episode.
 
         Args:
-            seed: of the choice of scenarios and of the traffic. Same seed, same episode.
-            options: "scenario" (an id; else one is drawn), "rollout" (a number; else 0, 1, ... since the last seed),
-                "goals" ({object id: (x, y)} of agents that follow the policy, world frame).
+            seed: Seed of the order of scenarios and of the traffic; equal seeds, equal episodes.
+            options: Choices by name: "scenario" (an id; else drawn), "rollout" (a number; else 0, 1, ... since the last
+                seed), "goals" ({object id: (x, y)} of agents that follow the policy, world frame).
 
         Raises:
             ConfigError: an unknown option or scenario.
         """
         if seed is None and self._begun is None:
-            seed = fresh_seed()
+            seed = draw_seed()
         super().reset(seed=seed)
         if seed is not None:
             self._seed, self._count = seed, 0
-        scenario_id, dice, goals = chosen(self.np_random, self.source, options or {}, self._seed, self._count)
+        scenario_id, dice, goals = choose_scenario(self.np_random, self.source, options or {}, self._seed, self._count)
         self._count += 1
         scenario = self.source.scenario(scenario_id)
         episode = self.source.episode([scenario], {scenario_id: goals} if goals else None)
@@ -100,13 +100,13 @@ class EgoEnv(gymnasium.Env):
                 "take rlftsim.envs.parallel_env."
             )
         self._begun = episode, start(episode, (dice,))
-        return self._look(), about(episode, self.state, 0, self.source)
+        return self._look(), describe_start(episode, self.state, 0, self.source)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Carry out one action.
 
         Args:
-            action: of the action space.
+            action: Planner action, a member of `action_space`.
 
         Raises:
             ConfigError: before `reset`, after the end, or an action with a NaN or of another shape.
@@ -117,14 +117,14 @@ class EgoEnv(gymnasium.Env):
         state, outcome = advance(episode, state, [action])
         self._begun = episode, state
         terminated, truncated = bool(outcome.terminated[0]), bool(outcome.truncated[0])
-        return self._look(), float(outcome.reward[0]), terminated, truncated, note_of(episode, state, outcome, 0)
+        return self._look(), float(outcome.reward[0]), terminated, truncated, describe_step(episode, state, outcome, 0)
 
     def fork(self, number: int, noise: Noise = "same") -> list["EgoEnv"]:
         """Environments that go on from here, which share all that does not change.
 
         Args:
-            number: of branches.
-            noise: "same" = they meet the same dice; "new" = other ones from the next decision of the traffic on.
+            number: Number of branches to return.
+            noise: "same" = all branches meet equal dice; "new" = new dice from the next decision of the traffic on.
         """
         episode, state = self._running
         branches = []
@@ -136,19 +136,19 @@ class EgoEnv(gymnasium.Env):
 
     def result(self) -> Result:
         """Scores of the episode so far."""
-        return Result(record_of(self.episode, self.state))
+        return Result(build_record(self.episode, self.state))
 
     def render(self) -> Any:
         """Picture of the scene [height, width, 3], or a page that plays the episode so far, by `render_mode`."""
         if self.render_mode is None:
             return None
-        record = record_of(self.episode, self.state)
+        record = build_record(self.episode, self.state)
         if self.render_mode == "html":
-            return page_of({"planner": record})
+            return build_page({"planner": record})
         if self._camera is None or self._camera.animation.scene.scenario_id != record.scene.scenario.scenario_id:
-            self._camera = Camera(animation_of({"planner": record}), RENDER_DOTS_PER_INCH)
+            self._camera = Camera(build_animation({"planner": record}), RENDER_DOTS_PER_INCH)
         present = record.motion[None, :, -1:].astype(np.float32)  # [1, A, 1, 5]
-        motion = SceneMotion(present[..., :2], present[..., 2], record.there[None, :, -1:])
+        motion = SceneMotion(present[..., :2], present[..., 2], record.is_present[None, :, -1:])
         return self._camera.frame([Panel("planner", motion)], 0, len(self.state.world.track) - 1)
 
     def snapshot(self) -> bytes:
@@ -159,14 +159,14 @@ class EgoEnv(gymnasium.Env):
         """Go on from a snapshot: the episode is run again with the planner's stored motion, which gives equal bits.
 
         Args:
-            saved: of `snapshot`.
+            saved: Bytes that `snapshot` returned.
 
         Raises:
             ConfigError: of another model, or of other settings.
             DataError: no snapshot, or a damaged one.
         """
         self._go_on(*read_snapshot(saved, self.source))
-        return self._look(), about(self.episode, self.state, 0, self.source)
+        return self._look(), describe_start(self.episode, self.state, 0, self.source)
 
     def _go_on(self, episode: Episode, state: EpisodeState) -> None:
         """Take over a running episode; the next ones follow from its seed, with the next rollouts."""
@@ -175,4 +175,4 @@ class EgoEnv(gymnasium.Env):
         self._begun, self._seed, self._count = (episode, state), dice.seed, dice.rollout + 1
 
     def _look(self) -> Any:
-        return shown(look(self.episode, self.state), self.config.observation, 0)
+        return format_observation(look(self.episode, self.state), self.config.observation, 0)

@@ -11,13 +11,13 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int64
 
-from rlftsim.envs.actions import Actors, Controls, checked
+from rlftsim.envs.actions import Actors, Controls, validate_actions
 from rlftsim.envs.config import EnvConfig
-from rlftsim.envs.contact import Collision, collision_of
+from rlftsim.envs.contact import Collision, classify_collision
 from rlftsim.envs.observations import Atlas, Observation, build_atlas, observe
 from rlftsim.envs.rewards import WeightedTerm, parse_terms
 from rlftsim.envs.road import MAX_PAIRS, OUTSIDE_M, nearest_edges, road_edges
-from rlftsim.envs.route import SPACING_M, route_of
+from rlftsim.envs.route import SPACING_M, find_route
 from rlftsim.envs.world import Dice, World, WorldState, begin, step_world, with_dice
 from rlftsim.geometry import boxes_overlap, clockwise_corners, heights_overlap, wrapped
 from rlftsim.goals.types import PointById
@@ -49,7 +49,7 @@ class Episode:
         """M."""
         return len(self.world.actors)
 
-    def name_of(self, row: int) -> str:
+    def agent_name(self, row: int) -> str:
         """Scenario and object id of a planner-driven agent."""
         scene, agent = self.world.actors[row]
         view = self.world.scenes[scene]
@@ -85,7 +85,7 @@ class Outcome:
     """Every term of `rewards.TERMS`, unweighted."""
     terminated: Bool[np.ndarray, "M"]
     truncated: Bool[np.ndarray, "M"]
-    clipped: Bool[np.ndarray, "M"]
+    is_clipped: Bool[np.ndarray, "M"]
 
 
 def build_episode(
@@ -97,13 +97,13 @@ def build_episode(
     """Episode in a world.
 
     Args:
-        world: the scenes.
-        controls: of the actions.
-        config: settings.
-        goals: that the world was built with.
+        world: Scenes that step together, with the drivers of all agents.
+        controls: Controls that turn actions into motion.
+        config: Settings of reward, route, ends and observations.
+        goals: Goals that the world was built with, for snapshots.
     """
     routes = tuple(
-        route_of(
+        find_route(
             world.scenes[scene].scenario, int(agent), config.route if agent == world.scenes[scene].ego else "logged"
         )
         for scene, agent in world.actors
@@ -116,8 +116,8 @@ def start(episode: Episode, dice: tuple[Dice, ...]) -> EpisodeState:
     """The first state.
 
     Args:
-        episode: the scenes.
-        dice: of each.
+        episode: Episode whose world, map and settings do not change.
+        dice: Randomness of the traffic, per scene.
     """
     world = begin(episode.world, dice)
     motion = own_motion(episode, world)
@@ -139,25 +139,27 @@ def advance(episode: Episode, state: EpisodeState, action: Any) -> tuple[Episode
     """State and outcome after one action of every planner-driven agent.
 
     Args:
-        episode: the scenes.
-        state: before.
-        action: [M, *shape]; those of agents whose episode is over are ignored.
+        episode: Episode whose world, map and settings do not change.
+        state: State before the action; not changed.
+        action: Planner actions [M, *shape]; those of agents whose episode is over are ignored.
 
     Raises:
         ConfigError: no numbers, a NaN, another shape, or an action that an agent cannot take.
     """
     motion = own_motion(episode, state.world)
     scene, agent = episode.world.actors.T
-    actors = Actors(episode.name_of, motion, episode.world.size[scene, agent], episode.world.object_type[scene, agent])
-    action = checked(action, episode.controls, episode.name_of, episode.num_agents)
+    actors = Actors(
+        episode.agent_name, motion, episode.world.size[scene, agent], episode.world.object_type[scene, agent]
+    )
+    action = validate_actions(action, episode.controls, episode.agent_name, episode.num_agents)
     moves = episode.controls.move(action, actors)
     terms = {}
     for step in range(episode.controls.steps):
         # an agent whose episode is over stands still
         stands = np.concatenate([motion[:, :3], np.zeros((len(motion), 2))], -1)
         moved = np.where(state.ended[:, None], stands, moves.motion[:, step])
-        state, now = _step(episode, state, moved)
-        terms = {name: terms.get(name, 0.0) + value for name, value in now.items()}
+        state, step_terms = _step(episode, state, moved)
+        terms = {name: terms.get(name, 0.0) + value for name, value in step_terms.items()}
     following = _with_ends(episode, state)
     ends = following.ended & ~state.ended
     is_over = state.world.step >= episode.config.max_steps
@@ -168,7 +170,7 @@ def advance(episode: Episode, state: EpisodeState, action: Any) -> tuple[Episode
         terms=terms,
         terminated=terminated,
         truncated=ends & ~terminated & is_over,
-        clipped=moves.clipped,
+        is_clipped=moves.is_clipped,
     )
 
 
@@ -181,10 +183,10 @@ def repeat(
     """The state after steps whose motion is known.
 
     Args:
-        episode: the scenes.
-        state: the first.
-        motion: of the planner-driven agents.
-        dice: of each decision of the traffic, and of those that follow.
+        episode: Episode whose world, map and settings do not change.
+        state: First state of the episode.
+        motion: Motion of the planner-driven agents after each step.
+        dice: Dice of each scene at each decision of the traffic; the last entry is for decisions to come.
     """
     policy = episode.world.policy
     for step, moved in enumerate(motion):
@@ -205,7 +207,7 @@ def _with_dice(episode: Episode, state: EpisodeState, dice: tuple[Dice, ...]) ->
 def _stopped(episode: Episode, state: EpisodeState) -> Bool[np.ndarray, "M"]:
     """True = an event of `stop_on` has happened to the agent."""
     events = {
-        "collision": np.array([bool(found) for found in state.collisions], bool),
+        "collision": np.array([bool(collisions) for collisions in state.collisions], bool),
         "offroad": state.outside,
         "goal": state.at_goal,
     }
@@ -222,25 +224,25 @@ def _step(
     episode: Episode, state: EpisodeState, moved: Float[np.ndarray, "M 5"]
 ) -> tuple[EpisodeState, dict[str, Float[np.ndarray, "M"]]]:
     """State 0.1 s later, and the terms of this step."""
-    before = own_motion(episode, state.world)
+    previous = own_motion(episode, state.world)
     world = step_world(episode.world, state.world, moved)
     # 1. contacts with tracks that have not been touched
     contacts = _contacts(episode, world, moved) & ~state.touched
-    found = [list(known) for known in state.collisions]
+    collisions = [list(earlier) for earlier in state.collisions]
     for row, agent in np.argwhere(contacts & ~state.ended[:, None]):
-        scene, own = episode.world.actors[row]
-        found[row].append(
-            collision_of(
-                episode.world.scenes[scene], world.step, int(agent), moved[row], episode.world.size[scene, own],
-                _ground(episode, world, np.array([row])), world.now[scene, agent], episode.world.size[scene, agent],
+        scene, ego = episode.world.actors[row]
+        collisions[row].append(
+            classify_collision(
+                episode.world.scenes[scene], world.step, int(agent), moved[row], episode.world.size[scene, ego],
+                _ground(episode, world, np.array([row])), world.motion[scene, agent], episode.world.size[scene, agent],
             )
         )  # fmt: skip
-    new = [known[len(earlier) :] for known, earlier in zip(found, state.collisions)]
+    new_collisions = [current[len(earlier) :] for current, earlier in zip(collisions, state.collisions)]
     # 2. road and route
     scene, agent = episode.world.actors.T
     half_diagonal = np.hypot(*episode.world.size[scene, agent].T) / 2
-    turned = np.abs(wrapped(moved[:, 2] - before[:, 2])) * half_diagonal
-    clear = state.clear_m - np.hypot(*(moved[:, :2] - before[:, :2]).T) - turned
+    turned = np.abs(wrapped(moved[:, 2] - previous[:, 2])) * half_diagonal
+    clear = state.clear_m - np.hypot(*(moved[:, :2] - previous[:, :2]).T) - turned
     unclear = np.flatnonzero((clear <= 0) & ~state.outside)
     if len(unclear):
         clear[unclear] = _free_way_m(episode, world, unclear)
@@ -249,20 +251,20 @@ def _step(
     progress = _progress(episode, moved)
     gained = progress - state.progress
     routeless = episode.atlas.route_length == 0
-    step = moved[:, :2] - before[:, :2]
-    ahead = np.cos(moved[:, 2]) * step[:, 0] + np.sin(moved[:, 2]) * step[:, 1]
+    step = moved[:, :2] - previous[:, :2]
+    forward = np.cos(moved[:, 2]) * step[:, 0] + np.sin(moved[:, 2]) * step[:, 1]
     ends = episode.atlas.route_points[np.arange(episode.num_agents), np.maximum(episode.atlas.route_length - 1, 0)]
     near_end = np.linalg.norm(moved[:, :2] - ends, axis=-1) <= AT_GOAL_M
     at_goal = state.at_goal | (near_end & ~routeless)
     terms = {
-        "progress": np.where(routeless, ahead, gained) / 10.0,
-        "collision": np.array([float(len(own)) for own in new]),
-        "at_fault": np.array([float(sum(one.at_fault for one in own)) for own in new]),
+        "progress": np.where(routeless, forward, gained) / 10.0,
+        "collision": np.array([float(len(contacts)) for contacts in new_collisions]),
+        "at_fault": np.array([float(sum(collision.at_fault for collision in contacts)) for contacts in new_collisions]),
         "offroad": (outside & ~state.outside).astype(float),
         "goal": (at_goal & ~state.at_goal).astype(float),
     }
     following = EpisodeState(
-        world, state.touched | contacts, tuple(map(tuple, found)), outside, at_goal, clear, progress, state.ended
+        world, state.touched | contacts, tuple(map(tuple, collisions)), outside, at_goal, clear, progress, state.ended
     )
     return following, terms
 
@@ -271,19 +273,19 @@ def own_motion(episode: Episode, world: WorldState) -> Float[np.ndarray, "M 5"]:
     """Present motion of the planner-driven agents.
 
     Args:
-        episode: the scenes.
-        world: a state of theirs.
+        episode: Episode whose world, map and settings do not change.
+        world: State of the episode's scenes, at any step.
     """
     scene, agent = episode.world.actors.T
-    return world.now[scene, agent]
+    return world.motion[scene, agent]
 
 
 def look(episode: Episode, state: EpisodeState) -> Observation:
     """Observations of all planner-driven agents.
 
     Args:
-        episode: the scenes.
-        state: the present one.
+        episode: Episode whose world, map and settings do not change.
+        state: Present state of the episode.
     """
     config = episode.config
     return observe(episode.world, episode.atlas, state.world, frame=config.frame, steps=config.max_steps)
@@ -299,14 +301,14 @@ def off_road_m(episode: Episode, world: WorldState, rows: Int64[np.ndarray, "m"]
     """Signed distance of the corner farthest off the road, negative on it; that of the official metric.
 
     Args:
-        episode: the scenes.
-        world: a state of theirs.
-        rows: those that are measured.
+        episode: Episode whose world, map and settings do not change.
+        world: State of the episode's scenes, at any step.
+        rows: Rows of the planner-driven agents to measure.
     """
     scene, agent = episode.world.actors[rows].T
     if episode.edges is None or not len(rows):
         return np.full(len(rows), -np.inf)
-    motion = world.now[scene, agent]
+    motion = world.motion[scene, agent]
     corners = clockwise_corners(motion[:, :2], motion[:, 2], episode.world.size[scene, agent])
     origin = np.stack([episode.world.scenes[b].scenario.origin for b in scene])
     z = np.repeat(_ground(episode, world, rows)[:, None, None], 4, 1)
@@ -326,11 +328,11 @@ def _free_way_m(episode: Episode, world: WorldState, rows: Int64[np.ndarray, "m"
     the observations, these decide, unless edges lie above each other.
     """
     scene, agent = episode.world.actors[rows].T
-    motion = world.now[scene, agent]
+    motion = world.motion[scene, agent]
     corners = clockwise_corners(motion[:, :2], motion[:, 2], episode.world.size[scene, agent])  # [m, 4, 2]
-    distance, side, is_beside = nearest_edges(corners, episode.atlas.edges[scene])
+    distance, side, is_alongside = nearest_edges(corners, episode.atlas.edges[scene])
     free = distance.min(1) - SIMPLIFIED_M
-    unclear = np.flatnonzero((free <= 0) | ~((side > 0) & is_beside).all(1) | episode.world.has_levels[scene])
+    unclear = np.flatnonzero((free <= 0) | ~((side > 0) & is_alongside).all(1) | episode.world.has_levels[scene])
     free += OUTSIDE_M
     if len(unclear):
         free[unclear] = OUTSIDE_M - off_road_m(episode, world, rows[unclear])
@@ -341,11 +343,11 @@ def _contacts(episode: Episode, world: WorldState, motion: Float[np.ndarray, "M 
     """Tracks that each planner-driven agent overlaps now."""
     scene, agent = episode.world.actors.T
     size = episode.world.size
-    known = episode.world.known[scene, :, len(world.track) - 1]
-    known[np.arange(len(scene)), agent] = False
-    others = world.now[scene]  # [M, A, 5]
-    gap = others[..., :2] - motion[:, None, :2]
-    meets = known & boxes_overlap(gap, motion[:, None, 2], others[..., 2], size[scene, agent][:, None], size[scene])
+    is_touchable = episode.world.is_observed[scene, :, len(world.track) - 1]
+    is_touchable[np.arange(len(scene)), agent] = False
+    tracks = world.motion[scene]  # [M, A, 5]
+    gap, agent_size = tracks[..., :2] - motion[:, None, :2], size[scene, agent][:, None]
+    meets = is_touchable & boxes_overlap(gap, motion[:, None, 2], tracks[..., 2], agent_size, size[scene])
     if episode.world.has_levels.any():
         z, height = world.z[-1], episode.world.height
         rise = z[scene] - z[scene, agent][:, None]
@@ -361,5 +363,5 @@ def _progress(episode: Episode, motion: Float[np.ndarray, "M 5"]) -> Float[np.nd
     dy = motion[:, 1:2] - atlas.route_points[..., 1]
     nearest = (dx * dx + dy * dy).argmin(1)
     heading = atlas.route_heading[row, nearest]
-    ahead = np.cos(heading) * dx[row, nearest] + np.sin(heading) * dy[row, nearest]
-    return np.where(atlas.route_length > 0, SPACING_M * nearest + ahead, 0.0)
+    forward = np.cos(heading) * dx[row, nearest] + np.sin(heading) * dy[row, nearest]
+    return np.where(atlas.route_length > 0, SPACING_M * nearest + forward, 0.0)

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 
 from rlftsim.envs.actions import signed_speed
 from rlftsim.envs.levels import RouteHeights, is_on_level
-from rlftsim.envs.route import headings_of, points_every
+from rlftsim.envs.route import compute_headings, sample_line
 from rlftsim.envs.scene import RED, YELLOW, Scene
 from rlftsim.geometry import heights_overlap, wrapped
 from rlftsim.scenario.polylines import arc_length
@@ -44,9 +44,9 @@ class IdmConfig:
     hardest_braking_mps2: float = 8.0
 
 
-def idm_acceleration(
+def compute_idm_acceleration(
     speed: Float[np.ndarray, "*m"],
-    wanted: Float[np.ndarray, "*#m"],
+    free_speed: Float[np.ndarray, "*#m"],
     gap: Float[np.ndarray, "*m"],
     lead_speed: Float[np.ndarray, "*m"],
     config: IdmConfig,
@@ -54,15 +54,15 @@ def idm_acceleration(
     """Acceleration, m/s².
 
     Args:
-        speed: of the agent, m/s.
-        wanted: its speed on a free road.
-        gap: from bumper to bumper; infinite without a leader.
-        lead_speed: of the leader.
-        config: parameters.
+        speed: Speed of each agent, m/s.
+        free_speed: Speed of each agent on a free road, m/s.
+        gap: Distance from bumper to bumper, m; infinite without a leader.
+        lead_speed: Speed of the leader along the line, m/s.
+        config: Parameters of the driver model.
     """
     closing = speed * (speed - lead_speed) / (2 * np.sqrt(config.acceleration_mps2 * config.braking_mps2))
     wanted_gap = config.gap_m + np.maximum(0.0, speed * config.headway_s + closing)
-    free = (speed / np.maximum(wanted, 0.1)) ** config.exponent
+    free = (speed / np.maximum(free_speed, 0.1)) ** config.exponent
     acceleration = config.acceleration_mps2 * (1 - free - (wanted_gap / np.maximum(gap, 0.1)) ** 2)
     return np.maximum(acceleration, -config.hardest_braking_mps2)
 
@@ -71,40 +71,40 @@ def find_leaders(
     line: Float[np.ndarray, "M W 2"],
     heading: Float[np.ndarray, "M W"],
     size: Float[np.ndarray, "M 2"],
-    others: Float[np.ndarray, "M K 5"],
-    other_size: Float[np.ndarray, "M K 2"],
+    boxes: Float[np.ndarray, "M K 5"],
+    box_size: Float[np.ndarray, "M K 2"],
     mask: Bool[np.ndarray, "M K"],
 ) -> tuple[Float[np.ndarray, "M"], Float[np.ndarray, "M"]]:
     """Gap to the first box that meets the swept line and its speed along the line; infinite and 0 without one.
 
     Args:
-        line: points ahead of each agent, one every meter.
-        heading: direction of the line there, rad.
-        size: length and width of the agents.
-        others: x, y, heading, vx, vy of the boxes that each agent may meet.
-        other_size: their length and width.
-        mask: True = such a box.
+        line: Points ahead of each agent, a meter apart, map frame.
+        heading: Direction of the line at each point, rad.
+        size: Length and width of the agents, m.
+        boxes: Motion x, y, heading, vx, vy of the boxes that each agent may meet.
+        box_size: Length and width of these boxes, m.
+        mask: True = a box that can be a leader; False = padding.
     """
-    if not others.shape[1]:
+    if not boxes.shape[1]:
         return np.full(len(line), np.inf), np.zeros(len(line))
     # 1. Every point of the line in the frame of every box [M, K, W].
-    offset = line[:, None] - others[:, :, None, :2]  # [M, K, W, 2]
-    cos, sin = np.cos(others[..., 2])[..., None], np.sin(others[..., 2])[..., None]
-    ahead = np.abs(offset[..., 0] * cos + offset[..., 1] * sin)
-    aside = np.abs(offset[..., 1] * cos - offset[..., 0] * sin)
+    offset = line[:, None] - boxes[:, :, None, :2]  # [M, K, W, 2]
+    cos, sin = np.cos(boxes[..., 2])[..., None], np.sin(boxes[..., 2])[..., None]
+    forward = np.abs(offset[..., 0] * cos + offset[..., 1] * sin)
+    lateral = np.abs(offset[..., 1] * cos - offset[..., 0] * sin)
     # 2. It meets the box if the agent's width across the line does.
-    turn = heading[:, None] - others[..., 2:3]
+    turn = heading[:, None] - boxes[..., 2:3]
     half = size[:, None, 1:2] / 2
-    meets = (ahead <= other_size[..., :1] / 2 + half * np.abs(np.sin(turn))) & mask[..., None]
-    meets &= aside <= other_size[..., 1:] / 2 + half * np.abs(np.cos(turn))
+    meets = (forward <= box_size[..., :1] / 2 + half * np.abs(np.sin(turn))) & mask[..., None]
+    meets &= lateral <= box_size[..., 1:] / 2 + half * np.abs(np.cos(turn))
     # 3. The first point and its box.
     any_box = np.any(meets, axis=1)  # [M, W]
-    first, found, row = any_box.argmax(1), np.any(any_box, axis=1), np.arange(len(line))
+    first, has_leader, row = any_box.argmax(1), np.any(any_box, axis=1), np.arange(len(line))
     box = meets[row, :, first].argmax(1)
-    velocity, at = others[row, box, 3:], heading[row, first]
-    speed = np.maximum(velocity[:, 0] * np.cos(at) + velocity[:, 1] * np.sin(at), 0.0)
+    velocity, line_heading = boxes[row, box, 3:], heading[row, first]
+    speed = np.maximum(velocity[:, 0] * np.cos(line_heading) + velocity[:, 1] * np.sin(line_heading), 0.0)
     gap = np.maximum(first - size[:, 0] / 2, 0.0)
-    return np.where(found, gap, np.inf), np.where(found, speed, 0.0)
+    return np.where(has_leader, gap, np.inf), np.where(has_leader, speed, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,30 +127,30 @@ class IdmLines:
     """The fastest logged speed, at least that of `IdmConfig` unless the agent backs up."""
 
 
-def idm_lines(scene: Scene, agents: np.ndarray, config: IdmConfig) -> IdmLines:
+def build_idm_lines(scene: Scene, agents: np.ndarray, config: IdmConfig) -> IdmLines:
     """Lines of those of some agents that drive in their logs; the others stay parked.
 
     Args:
-        scene: the scenario.
-        agents: rows of vehicles.
-        config: parameters.
+        scene: Scene with the log, the lights and the levels of the agents.
+        agents: Rows of the IDM-driven vehicles in the scene's agent axis.
+        config: Parameters of the driver model.
     """
     fastest = np.linalg.norm(scene.logged[agents, CURRENT_STEP:, 3:], axis=-1).max(1, initial=0.0)
     agents, fastest = agents[fastest >= PARKED_MPS], fastest[fastest >= PARKED_MPS]
     logged_paths = [_logged_path(scene, int(agent)) for agent in agents]
-    lines = [points_every(path[:, :2], 1.0) for path in logged_paths]
+    lines = [sample_line(path[:, :2], 1.0) for path in logged_paths]
     longest = max((len(line) for line in lines), default=1)
     points = np.stack([np.pad(line, ((0, longest - len(line)), (0, 0)), mode="edge") for line in lines] or [
         np.zeros((1, 2))
     ])[: len(agents)]  # fmt: skip
-    heading = np.stack([np.pad(headings_of(line), (0, longest - len(line)), mode="edge") for line in lines] or [
+    heading = np.stack([np.pad(compute_headings(line), (0, longest - len(line)), mode="edge") for line in lines] or [
         np.zeros(1)
     ])[: len(agents)]  # fmt: skip
     backs_up = np.zeros(heading.shape, bool)
     for row, path in enumerate(logged_paths):
         at = np.minimum(np.searchsorted(arc_length(path), np.arange(longest), side="right"), len(path) - 1)
         backs_up[row] = np.cos(heading[row] - path[at - 1, 2]) < 0
-    wanted = np.where(backs_up.any(1), fastest, np.maximum(fastest, config.speed_mps))
+    free_speed = np.where(backs_up.any(1), fastest, np.maximum(fastest, config.speed_mps))
     offset = np.linalg.norm(points[:, :, None] - scene.lights.point, axis=-1)  # [M, P, T]
     ground = np.zeros(heading.shape)
     if scene.levels is not None:
@@ -158,7 +158,7 @@ def idm_lines(scene: Scene, agents: np.ndarray, config: IdmConfig) -> IdmLines:
         offset[~is_on_level(scene.lights.z - ground[..., None])] = np.inf
     stop = np.where(offset.min(1) <= ON_LINE_M, offset.argmin(1), np.inf)
     facing = np.where(backs_up, wrapped(heading + np.pi), heading)
-    return IdmLines(agents, points, heading, facing, ground, stop, wanted)
+    return IdmLines(agents, points, heading, facing, ground, stop, free_speed)
 
 
 def _logged_path(scene: Scene, agent: int) -> Float[np.ndarray, "p 3"]:
@@ -178,7 +178,7 @@ def _logged_path(scene: Scene, agent: int) -> Float[np.ndarray, "p 3"]:
 
 def advance_idm(
     lines: IdmLines,
-    place: Float[np.ndarray, "M 2"],
+    idm_state: Float[np.ndarray, "M 2"],
     motion: Float[np.ndarray, "A 5"],
     z: Float[np.ndarray, "A"],
     present: Bool[np.ndarray, "A"],
@@ -189,47 +189,47 @@ def advance_idm(
     """Places and states of the IDM-driven agents of a scenario after 0.1 s.
 
     Args:
-        lines: their ways.
-        place: distance along the line, and speed.
-        motion: x, y, heading, vx, vy of all agents.
-        z: Heights of their centers.
-        present: False = the agent is not there.
-        scene: the scenario.
-        step: of the log, for the lights.
-        config: parameters.
+        lines: Lines of the IDM-driven agents, from their current poses on.
+        idm_state: Distance along the line, m, and speed, m/s.
+        motion: Motion x, y, heading, vx, vy of all agents before the step.
+        z: Heights of the centers of all agents, m.
+        present: False = the agent has left the scene and is no leader.
+        scene: Scene with the log, the lights and the levels of the agents.
+        step: Step of the log, which the states of the lights are read at.
+        config: Parameters of the driver model.
     """
-    way, speed = place.T
+    position_m, speed = idm_state.T
     rows, size = np.arange(len(lines.agents)), scene.size[:, :2]
     # 1. The next 40 m of each line; the agent's own box is no leader.
-    window = np.minimum(way.astype(int)[:, None] + np.arange(LOOKAHEAD_M), lines.points.shape[1] - 1)
-    away = np.linalg.norm(motion[lines.agents, None, :2] - motion[:, :2], axis=-1)
-    away[:, ~present] = np.inf
-    away[rows, lines.agents] = np.inf
-    nearest = np.argsort(away, axis=1)[:, :NEAREST]
-    mask = np.take_along_axis(away, nearest, 1) < LOOKAHEAD_M + BEYOND_BOX_M
+    window = np.minimum(position_m.astype(int)[:, None] + np.arange(LOOKAHEAD_M), lines.points.shape[1] - 1)
+    distance = np.linalg.norm(motion[lines.agents, None, :2] - motion[:, :2], axis=-1)
+    distance[:, ~present] = np.inf
+    distance[rows, lines.agents] = np.inf
+    nearest = np.argsort(distance, axis=1)[:, :NEAREST]
+    mask = np.take_along_axis(distance, nearest, 1) < LOOKAHEAD_M + BEYOND_BOX_M
     line, heading = lines.points[rows[:, None], window], lines.heading[rows[:, None], window]
     if scene.levels is not None:
         height, ground = scene.size[:, 2], lines.ground[rows[:, None], window]
         center = z[nearest] - height[lines.agents, None] / 2
         heights = RouteHeights.measure(motion[nearest, :2], center, line, ground)
-        away = np.take_along_axis(away, nearest, 1)
-        rise = heights.differences(away, ground[:, 0], np.zeros(len(rows)))
+        distance = np.take_along_axis(distance, nearest, 1)
+        rise = heights.differences(distance, ground[:, 0], np.zeros(len(rows)))
         mask &= heights_overlap(rise, height[lines.agents, None], height[nearest])
     gap, lead = find_leaders(line, heading, size[lines.agents], motion[nearest], size[nearest], mask)
     # 2. A red or yellow light ahead is a standing leader.
-    front = way + size[lines.agents, 0] / 2
+    front = position_m + size[lines.agents, 0] / 2
     waits = np.isin(scene.lights.state[min(step, TOTAL_STEPS - 1)], (RED, YELLOW))
     to_stop = np.where(waits & (lines.stop_m >= front[:, None]), lines.stop_m - front[:, None], np.inf)
     to_stop = to_stop.min(1, initial=np.inf)
     lead, gap = np.where(to_stop < gap, 0.0, lead), np.minimum(gap, to_stop)
     # 3. Along the line by the mean speed of the step.
-    acceleration = idm_acceleration(speed, lines.wanted_mps, gap, lead, config)
+    acceleration = compute_idm_acceleration(speed, lines.wanted_mps, gap, lead, config)
     new_speed = np.maximum(speed + acceleration * STEP_S, 0.0)
-    way = np.minimum(way + (speed + new_speed) / 2 * STEP_S, lines.points.shape[1] - 1.001)
-    low = way.astype(int)
-    part = (way - low)[:, None]
-    position = (1 - part) * lines.points[rows, low] + part * lines.points[rows, low + 1]
+    position_m = np.minimum(position_m + (speed + new_speed) / 2 * STEP_S, lines.points.shape[1] - 1.001)
+    low = position_m.astype(int)
+    fraction = (position_m - low)[:, None]
+    position = (1 - fraction) * lines.points[rows, low] + fraction * lines.points[rows, low + 1]
     angle = lines.heading[rows, low]
     velocity = new_speed[:, None] * np.stack([np.cos(angle), np.sin(angle)], -1)
     facing = lines.facing[rows, low]
-    return np.stack([way, new_speed], -1), np.concatenate([position, facing[:, None], velocity], -1)
+    return np.stack([position_m, new_speed], -1), np.concatenate([position, facing[:, None], velocity], -1)

@@ -45,7 +45,7 @@ class Levels:
         """Height of the ground along lines whose points are a few meters apart.
 
         Args:
-            lines: Points.
+            lines: Points of the lines, map frame, m.
             ground: Height of the ground at the start of each line.
         """
         heights = [ground]
@@ -95,7 +95,7 @@ class RouteHeights:
 
         Args:
             points: Positions of the things.
-            z: Their heights.
+            z: Heights of the things, m.
             route: Points of the routes; those beyond the end are far away.
             route_z: Heights of the ground there.
         """
@@ -108,18 +108,18 @@ class RouteHeights:
         return cls(z, above, distance)
 
     def differences(
-        self, away: Float[np.ndarray, "M n"], ground: Float[np.ndarray, "M"], above_route: Float[np.ndarray, "M"]
+        self, distances: Float[np.ndarray, "M n"], ground: Float[np.ndarray, "M"], above_route: Float[np.ndarray, "M"]
     ) -> Float[np.ndarray, "M n"]:
         """Height differences between things and the road that leads there, less what slopes explain.
 
         Args:
-            away: Distance from each agent to each thing.
+            distances: Distance from each agent to each thing.
             ground: Height of the ground under the agents.
             above_route: The same above the nearest point of the route.
         """
-        is_near_route = self.distance < away
+        is_near_route = self.distance < distances
         rise = np.where(is_near_route, self.above_route - above_route[:, None], self.z - ground[:, None])
-        return np.maximum(np.abs(rise) - GRADE * np.where(is_near_route, self.distance, away), 0.0)
+        return np.maximum(np.abs(rise) - GRADE * np.where(is_near_route, self.distance, distances), 0.0)
 
 
 def is_on_level(difference: Float[np.ndarray, "*shape"]) -> Bool[np.ndarray, "*shape"]:

@@ -15,8 +15,8 @@ from jaxtyping import Bool, Float, Float32, Int8, Int64
 from rlftsim.envs.actions import WHEELBASE_PER_LENGTH, signed_speed
 from rlftsim.envs.drivers import Driver
 from rlftsim.envs.levels import RouteHeights, is_on_level
-from rlftsim.envs.route import Route, headings_of
-from rlftsim.envs.scene import GREEN, PIECE_POINTS, RED, YELLOW
+from rlftsim.envs.route import Route, compute_headings
+from rlftsim.envs.scene import GREEN, RED, SEGMENT_POINTS, YELLOW
 from rlftsim.envs.world import World, WorldState, padded
 from rlftsim.geometry import heights_overlap, wrapped
 from rlftsim.scenario.types import STEP_S, TOTAL_STEPS
@@ -76,8 +76,8 @@ class Observation:
 
     def flat(self) -> Float32[np.ndarray, "M D"]:
         """All numbers of each agent in one row, in the order of the fields."""
-        parts = [getattr(self, field.name) for field in fields(self)]
-        return np.concatenate([part.reshape(len(part), -1).astype(np.float32) for part in parts], axis=1)
+        arrays = [getattr(self, field.name) for field in fields(self)]
+        return np.concatenate([array.reshape(len(array), -1).astype(np.float32) for array in arrays], axis=1)
 
 
 SHAPES: dict[str, tuple[int, ...]] = {
@@ -86,7 +86,7 @@ SHAPES: dict[str, tuple[int, ...]] = {
     "neighbors": (NEIGHBORS, 10),
     "neighbors_mask": (NEIGHBORS,),
     "neighbors_history": (NEIGHBORS, 4 * HISTORY),
-    "lanes": (LANES, 2 * PIECE_POINTS + 5),
+    "lanes": (LANES, 2 * SEGMENT_POINTS + 5),
     "lanes_mask": (LANES,),
     "edges": (EDGES, 4),
     "edges_mask": (EDGES,),
@@ -138,8 +138,8 @@ def build_atlas(world: World, routes: tuple[Route, ...]) -> Atlas:
     """Maps and routes of a world.
 
     Args:
-        world: the scenes.
-        routes: of the planner-driven agents.
+        world: Scenes that step together, with the drivers of all agents.
+        routes: Routes of the M planner-driven agents, in the order of `world.actors`.
     """
     scenes = world.scenes
     points = _stack([scene.lanes.points for scene in scenes], _FAR_M)
@@ -152,28 +152,28 @@ def build_atlas(world: World, routes: tuple[Route, ...]) -> Atlas:
         np.pad(s.lights.point, ((0, num_lights + 1 - len(s.lights.lane)), (0, 0)), constant_values=_FAR_M)
         for s in scenes
     ]
-    facts = [np.stack([s.lanes.kind, s.lanes.limit_mps, s.lanes.has_stop_sign], -1) for s in scenes]
+    facts = [np.stack([s.lanes.lane_type, s.lanes.limit_mps, s.lanes.has_stop_sign], -1) for s in scenes]
     edges, crossings = _stack([s.edges for s in scenes], _FAR_M), _stack([s.crossings for s in scenes], _FAR_M)
     on_route = [np.isin(owner[b], route.lanes) for (b, _), route in zip(world.actors, routes)]
-    lane_middle, edge_middle = points[:, :, PIECE_POINTS // 2], (edges[..., :2] + edges[..., 2:]) / 2
+    lane_middle, edge_middle = points[:, :, SEGMENT_POINTS // 2], (edges[..., :2] + edges[..., 2:]) / 2
     crossing_middle = crossings.reshape(*crossings.shape[:2], 4, 2).mean(2)
     route_points = _stack([route.points for route in routes] or [np.zeros((0, 2))], _FAR_M)
     route_ground = _stack([route.ground for route in routes] or [np.zeros(0)], 0.0)
     heights: dict[str, RouteHeights] = {}
     if world.has_levels.any():
-        things = {
-            "lanes": (lane_middle, [s.lanes.z[:, PIECE_POINTS // 2] for s in scenes]),
+        features = {
+            "lanes": (lane_middle, [s.lanes.z[:, SEGMENT_POINTS // 2] for s in scenes]),
             "edges": (edge_middle, [s.edges_z for s in scenes]),
             "crossings": (crossing_middle, [s.crossings_z for s in scenes]),
             "lights": (np.stack(light_point), [s.lights.z for s in scenes]),
         }
-        of_scene = world.actors[:, 0]
-        for name, (middle, z) in things.items():
+        scene_rows = world.actors[:, 0]
+        for name, (middle, z) in features.items():
             padded_z = padded(z, middle.shape[:2])
-            heights[name] = RouteHeights.measure(middle[of_scene], padded_z[of_scene], route_points, route_ground)
+            heights[name] = RouteHeights.measure(middle[scene_rows], padded_z[scene_rows], route_points, route_ground)
     return Atlas(
         lane_points=points,
-        lane_heading=headings_of(points),
+        lane_heading=compute_headings(points),
         lane_middle=lane_middle,
         lane_facts=_stack(facts, 0.0),
         lane_light=lane_light,
@@ -196,86 +196,88 @@ def build_atlas(world: World, routes: tuple[Route, ...]) -> Atlas:
     )
 
 
-def _stack(parts: list[np.ndarray], fill: float | int) -> np.ndarray:
+def _stack(arrays: list[np.ndarray], fill: float | int) -> np.ndarray:
     """Arrays of different lengths, padded to the longest, at least to one row."""
-    longest = max(1, *(len(part) for part in parts))
-    return padded(parts, (len(parts), longest, *parts[0].shape[1:]), fill)
+    longest = max(1, *(len(array) for array in arrays))
+    return padded(arrays, (len(arrays), longest, *arrays[0].shape[1:]), fill)
 
 
 def observe(world: World, atlas: Atlas, state: WorldState, *, frame: Frame = "ego", steps: int) -> Observation:
     """Observations of the planner-driven agents at the present step.
 
     Args:
-        world: the scenes.
-        atlas: their maps and routes.
-        state: the present one.
-        frame: "ego" = each agent's own frame, "world" = the map frame.
-        steps: length of the episode, for the time that is left.
+        world: Scenes that step together, with the drivers of all agents.
+        atlas: Maps and routes of the world, cut once per episode.
+        state: Present state of the world.
+        frame: Frame of all positions: "ego" = each agent's own frame, "world" = the map frame.
+        steps: Length of the episode in steps of 0.1 s, for the time that is left.
     """
     scene, agent = world.actors.T
     row, count = np.arange(len(scene)), len(scene)
-    now = state.now[scene, agent]  # [M, 5]
+    motion = state.motion[scene, agent]  # [M, 5]
     log_step = len(state.track) - 1
-    is_own = frame == "ego"
-    origin, angle = (now[:, :2], now[:, 2]) if is_own else (np.zeros((count, 2)), np.zeros(count))
+    is_ego_frame = frame == "ego"
+    origin, angle = (motion[:, :2], motion[:, 2]) if is_ego_frame else (np.zeros((count, 2)), np.zeros(count))
 
     # 1. Motion over the last 11 steps [M, 11, A, 5], and the other agents that are there, nearest first.
     past = np.stack(state.track[-HISTORY - 1 :], 1)[scene]
-    there = np.moveaxis(world.there[scene, :, log_step - HISTORY : log_step + 1], 2, 1)  # [M, 11, A]
-    away = _distance(now, past[:, -1])
-    away[~there[:, -1]] = np.inf
-    away[row, agent] = np.inf
+    is_present = np.moveaxis(world.is_present[scene, :, log_step - HISTORY : log_step + 1], 2, 1)  # [M, 11, A]
+    neighbor_distance = _distance(motion, past[:, -1])
+    neighbor_distance[~is_present[:, -1]] = np.inf
+    neighbor_distance[row, agent] = np.inf
     distances = {
-        "lanes": _distance(now, atlas.lane_middle[scene]),
-        "edges": _distance(now, atlas.edge_middle[scene]),
-        "crossings": _distance(now, atlas.crossing_middle[scene]),
-        "lights": _distance(now, atlas.light_point[scene]),
-        "neighbors": away,
+        "lanes": _distance(motion, atlas.lane_middle[scene]),
+        "edges": _distance(motion, atlas.edge_middle[scene]),
+        "crossings": _distance(motion, atlas.crossing_middle[scene]),
+        "lights": _distance(motion, atlas.light_point[scene]),
+        "neighbors": neighbor_distance,
     }
-    nearest_on_route = _distance(now, atlas.route_points).argmin(1)
+    nearest_on_route = _distance(motion, atlas.route_points).argmin(1)
     if atlas.heights:
         _leave_out_other_levels(world, atlas, state, nearest_on_route, distances)
-    chosen, near = _nearest(away, NEIGHBORS)
+    neighbor, has_neighbor = _nearest(neighbor_distance, NEIGHBORS)
     steps_back = np.arange(HISTORY + 1)[:, None]
-    seen = past[row[:, None, None], steps_back, chosen[:, None]]  # [M, 11, K, 5]
-    seen_there = there[row[:, None, None], steps_back, chosen[:, None]] & near[:, None]
-    own = past[row, :, agent]  # [M, 11, 5]
+    neighbor_motion = past[row[:, None, None], steps_back, neighbor[:, None]]  # [M, 11, K, 5]
+    is_neighbor_present = is_present[row[:, None, None], steps_back, neighbor[:, None]] & has_neighbor[:, None]
+    ego_motion = past[row, :, agent]  # [M, 11, 5]
     # 2. The nearest rows of the map, lights whose state is known, and the route from the nearest place on.
-    lane, lane_near = _nearest(distances["lanes"], LANES)
-    edge, edge_near = _nearest(distances["edges"], EDGES)
-    area, area_near = _nearest(distances["crossings"], CROSSINGS)
+    lane, has_lane = _nearest(distances["lanes"], LANES)
+    edge, has_edge = _nearest(distances["edges"], EDGES)
+    area, has_area = _nearest(distances["crossings"], CROSSINGS)
     colors = atlas.light_state[scene, log_step]  # [M, T + 1]
-    light_away = distances["lights"]
-    light_away[colors == 0] = np.inf
-    light, light_near = _nearest(light_away, LIGHTS)
+    light_distance = distances["lights"]
+    light_distance[colors == 0] = np.inf
+    light, has_light = _nearest(light_distance, LIGHTS)
     index = nearest_on_route[:, None] + np.arange(ROUTE)
     on_route = index < atlas.route_length[:, None]
     index = np.minimum(index, atlas.route_points.shape[1] - 1)
-    pieces = atlas.lane_points[scene[:, None], lane]  # [M, L, 10, 2]
+    segments = atlas.lane_points[scene[:, None], lane]  # [M, L, 10, 2]
     # 3. All points in the frame of the agents, at once, and split again.
     groups = [
-        seen[..., :2], own[..., :2], pieces, atlas.edges[scene[:, None], edge], atlas.crossings[scene[:, None], area],
+        neighbor_motion[..., :2], ego_motion[..., :2], segments, atlas.edges[scene[:, None], edge],
+        atlas.crossings[scene[:, None], area],
         atlas.light_point[scene[:, None], light], atlas.route_points[row[:, None], index],
         atlas.route_points[row, np.maximum(atlas.route_length - 1, 0)],
     ]  # fmt: skip
     points = np.concatenate([group.reshape(count, -1, 2) for group in groups], 1)
     ends = np.cumsum([group.size // (2 * count) for group in groups])[:-1] if count else [0] * (len(groups) - 1)
     x, y = points[..., 0] - origin[:, :1], points[..., 1] - origin[:, 1:]
-    if is_own:
+    if is_ego_frame:
         x, y = _turned(x, y, angle)
     local = np.split(np.stack([x, y], -1), ends, axis=1)
-    place, own_place, lane_points, edges, crossings, light_points, ahead, end = local
+    neighbor_points, ego_points, lane_points, edges, crossings, light_points, route_points, end = local
     # 4. Columns.
-    direction = seen[..., 2] - angle[:, None, None]
+    direction = neighbor_motion[..., 2] - angle[:, None, None]
     poses = np.empty((*direction.shape, 4), np.float32)  # [M, 11, K, 4]
-    poses[..., :2] = place.reshape(*direction.shape, 2)
+    poses[..., :2] = neighbor_points.reshape(*direction.shape, 2)
     poses[..., 2], poses[..., 3] = np.cos(direction), np.sin(direction)
-    velocity = np.stack(_turned(seen[:, -1, :, 3], seen[:, -1, :, 4], angle), -1)
-    held = world.drivers[scene[:, None], chosen] == Driver.REPLAY  # they alone have a log to go by
-    age = np.where(held, STEP_S * (log_step - atlas.last_logged[scene[:, None], chosen, log_step]), 0.0)
-    size, kind = world.size[scene[:, None], chosen], world.object_type[scene[:, None], chosen]
-    neighbors = np.concatenate([poses[:, -1], velocity, size, kind[..., None], age[..., None]], -1)
-    history = np.where(seen_there[:, :-1, :, None], poses[:, :-1], np.float32(0.0))  # [M, 10, K, 4]
+    velocity = np.stack(_turned(neighbor_motion[:, -1, :, 3], neighbor_motion[:, -1, :, 4], angle), -1)
+    is_replayed = world.drivers[scene[:, None], neighbor] == Driver.REPLAY  # they alone have a log to go by
+    age = np.where(is_replayed, STEP_S * (log_step - atlas.last_logged[scene[:, None], neighbor, log_step]), 0.0)
+    size, object_type = world.size[scene[:, None], neighbor], world.object_type[scene[:, None], neighbor]
+    neighbors = np.concatenate([poses[:, -1], velocity, size, object_type[..., None], age[..., None]], -1)
+    history = np.where(is_neighbor_present[:, :-1, :, None], poses[:, :-1], np.float32(0.0))
+    history = np.moveaxis(history, 1, 2)  # [M, K, 10, 4]
     lane_facts = atlas.lane_facts[scene[:, None], lane]
     lanes = np.concatenate([
         lane_points.reshape(count, lane.shape[1], -1), lane_facts[..., :2],
@@ -285,33 +287,33 @@ def observe(world: World, atlas: Atlas, state: WorldState, *, frame: Frame = "eg
     color = colors[row[:, None], light]
     lamps = [color == RED, color == YELLOW, color == GREEN, atlas.light_age[scene[:, None], log_step, light]]
     lights = np.concatenate([light_points, np.stack(lamps, -1)], -1)
-    route = np.concatenate([ahead, atlas.route_limit[row[:, None], index][..., None]], -1)
+    route = np.concatenate([route_points, atlas.route_limit[row[:, None], index][..., None]], -1)
     goal = np.concatenate([end[:, 0], np.ones((count, 1))], -1)
-    own_direction = own[..., 2] - angle[:, None]
+    ego_direction = ego_motion[..., 2] - angle[:, None]
     ego_history = np.stack(
-        [*np.moveaxis(own_place, -1, 0), np.cos(own_direction), np.sin(own_direction), signed_speed(own)], -1
+        [*np.moveaxis(ego_points, -1, 0), np.cos(ego_direction), np.sin(ego_direction), signed_speed(ego_motion)], -1
     )
-    ego_history = np.where(there[row, :, agent][..., None], ego_history, 0.0)
-    few = slice(OWN_LANES)
-    heading = atlas.lane_heading[scene[:, None], lane[:, few]]
+    ego_history = np.where(is_present[row, :, agent][..., None], ego_history, 0.0)
+    first = slice(OWN_LANES)
+    heading = atlas.lane_heading[scene[:, None], lane[:, first]]
     ego = _about_itself(
-        world, own, pieces[:, few], heading, lane_near[:, few], lane_facts[:, few, 1], steps - state.step
+        world, ego_motion, segments[:, first], heading, has_lane[:, first], lane_facts[:, first, 1], steps - state.step
     )
 
     return Observation(
         ego=ego.astype(np.float32),
         ego_history=ego_history.astype(np.float32),
-        neighbors=_rows(neighbors, near, NEIGHBORS),
-        neighbors_mask=_masks(near, NEIGHBORS),
-        neighbors_history=_rows(np.moveaxis(history, 1, 2).reshape(count, chosen.shape[1], -1), near, NEIGHBORS),
-        lanes=_rows(lanes, lane_near, LANES),
-        lanes_mask=_masks(lane_near, LANES),
-        edges=_rows(edges.reshape(count, -1, 4), edge_near, EDGES),
-        edges_mask=_masks(edge_near, EDGES),
-        crossings=_rows(crossings.reshape(count, -1, 8), area_near, CROSSINGS),
-        crossings_mask=_masks(area_near, CROSSINGS),
-        lights=_rows(lights, light_near, LIGHTS),
-        lights_mask=_masks(light_near, LIGHTS),
+        neighbors=_rows(neighbors, has_neighbor, NEIGHBORS),
+        neighbors_mask=_masks(has_neighbor, NEIGHBORS),
+        neighbors_history=_rows(history.reshape(count, neighbor.shape[1], -1), has_neighbor, NEIGHBORS),
+        lanes=_rows(lanes, has_lane, LANES),
+        lanes_mask=_masks(has_lane, LANES),
+        edges=_rows(edges.reshape(count, -1, 4), has_edge, EDGES),
+        edges_mask=_masks(has_edge, EDGES),
+        crossings=_rows(crossings.reshape(count, -1, 8), has_area, CROSSINGS),
+        crossings_mask=_masks(has_area, CROSSINGS),
+        lights=_rows(lights, has_light, LIGHTS),
+        lights_mask=_masks(has_light, LIGHTS),
         route=_rows(route, on_route, ROUTE),
         route_mask=_masks(on_route, ROUTE),
         goal=np.where((atlas.route_length > 0)[:, None], goal, 0.0).astype(np.float32),
@@ -328,9 +330,9 @@ def _leave_out_other_levels(
     """Put what lies above or below the roads of the observing agents infinitely far away.
 
     Args:
-        world: The scenes.
-        atlas: Their maps and routes.
-        state: The present one.
+        world: Scenes that step together.
+        atlas: Maps and routes of the world.
+        state: Present state of the world.
         nearest_on_route: Index of the route's point nearest to each agent.
         distances: Distances from each agent to rows of the map and to "neighbors", changed in place.
     """
@@ -340,7 +342,9 @@ def _leave_out_other_levels(
     ground = z[scene, agent] - half[:, 0]
     above_route = ground - atlas.route_ground[np.arange(len(scene)), nearest_on_route]
     # a box as high as the agent's whose height difference is 0 stands on the same ground
-    neighbors = RouteHeights.measure(state.now[scene][..., :2], z[scene] - half, atlas.route_points, atlas.route_ground)
+    neighbors = RouteHeights.measure(
+        state.motion[scene][..., :2], z[scene] - half, atlas.route_points, atlas.route_ground
+    )
     for name, heights in {**atlas.heights, "neighbors": neighbors}.items():
         difference = heights.differences(distances[name], ground, above_route)
         if name == "neighbors":
@@ -365,9 +369,9 @@ def _masks(mask: Bool[np.ndarray, "M n"], length: int) -> Int8[np.ndarray, "M le
     return out
 
 
-def _distance(now: Float[np.ndarray, "M 5"], points: np.ndarray) -> Float[np.ndarray, "M n"]:
+def _distance(motion: Float[np.ndarray, "M 5"], points: np.ndarray) -> Float[np.ndarray, "M n"]:
     """Distances from agents to points, of which x and y come first on the last axis."""
-    dx, dy = points[..., 0] - now[:, :1], points[..., 1] - now[:, 1:2]
+    dx, dy = points[..., 0] - motion[:, :1], points[..., 1] - motion[:, 1:2]
     return np.sqrt(dx * dx + dy * dy)
 
 
@@ -393,35 +397,35 @@ def _nearest(
 
 def _about_itself(
     world: World,
-    own: Float[np.ndarray, "M 11 5"],
-    pieces: Float[np.ndarray, "M L 10 2"],
+    motion: Float[np.ndarray, "M 11 5"],
+    segments: Float[np.ndarray, "M L 10 2"],
     heading: Float[np.ndarray, "M L 10"],
-    near: Bool[np.ndarray, "M L"],
+    has_lane: Bool[np.ndarray, "M L"],
     limit: Float[np.ndarray, "M L"],
     steps_left: int,
 ) -> Float[np.ndarray, "M 12"]:
     """The row `Observation.ego`."""
     scene, agent = world.actors.T
-    now, before = own[:, -1], own[:, -2]
-    speed = signed_speed(now)
-    yaw_rate = wrapped(now[:, 2] - before[:, 2]) / STEP_S
+    current, previous = motion[:, -1], motion[:, -2]
+    speed = signed_speed(current)
+    yaw_rate = wrapped(current[:, 2] - previous[:, 2]) / STEP_S
     length = world.size[scene, agent, 0]
     moving = np.abs(speed) > 0.1
     steering = np.where(moving, np.arctan(WHEELBASE_PER_LENGTH * length * yaw_rate / np.where(moving, speed, 1.0)), 0.0)
     # the lane point that is nearest among those of lanes that run the agent's way
-    offset = now[:, None, None, :2] - pieces
-    away = np.hypot(offset[..., 0], offset[..., 1])
-    same_way = np.cos(heading - now[:, 2, None, None]) > 0
-    away = np.where(same_way & near[..., None], away, np.inf).reshape(len(own), -1)
-    best, row = away.argmin(1), np.arange(len(own))
-    on_lane = np.isfinite(away[row, best])
-    direction = heading.reshape(len(own), -1)[row, best]
-    off = offset.reshape(len(own), -1, 2)[row, best]
+    offset = current[:, None, None, :2] - segments
+    distance = np.hypot(offset[..., 0], offset[..., 1])
+    is_same_direction = np.cos(heading - current[:, 2, None, None]) > 0
+    distance = np.where(is_same_direction & has_lane[..., None], distance, np.inf).reshape(len(motion), -1)
+    best, row = distance.argmin(1), np.arange(len(motion))
+    on_lane = np.isfinite(distance[row, best])
+    direction = heading.reshape(len(motion), -1)[row, best]
+    off = offset.reshape(len(motion), -1, 2)[row, best]
     lateral = np.cos(direction) * off[:, 1] - np.sin(direction) * off[:, 0]
-    to_lane = now[:, 2] - direction
+    to_lane = current[:, 2] - direction
     return np.stack([
-        speed, (speed - signed_speed(before)) / STEP_S, yaw_rate, steering, length, world.size[scene, agent, 1],
+        speed, (speed - signed_speed(previous)) / STEP_S, yaw_rate, steering, length, world.size[scene, agent, 1],
         np.where(on_lane, np.cos(to_lane), 0.0), np.where(on_lane, np.sin(to_lane), 0.0),
-        np.where(on_lane, lateral, 0.0), np.where(on_lane, limit[row, best // PIECE_POINTS], 0.0),
-        np.full(len(own), STEP_S * steps_left), world.object_type[scene, agent],
+        np.where(on_lane, lateral, 0.0), np.where(on_lane, limit[row, best // SEGMENT_POINTS], 0.0),
+        np.full(len(motion), STEP_S * steps_left), world.object_type[scene, agent],
     ], -1)  # fmt: skip

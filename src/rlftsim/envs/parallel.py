@@ -9,14 +9,14 @@ from gymnasium.spaces import Space
 from gymnasium.utils import seeding
 from pettingzoo import ParallelEnv
 
-from rlftsim.envs.actions import checked
+from rlftsim.envs.actions import validate_actions
 from rlftsim.envs.config import EnvConfig
-from rlftsim.envs.drivers import Driver, drivers_of
+from rlftsim.envs.drivers import Driver, assign_drivers
 from rlftsim.envs.episode import Episode, EpisodeState, advance, look, start
-from rlftsim.envs.resets import OPTIONS, about, chosen, config_of, fresh_seed, note_of
+from rlftsim.envs.resets import OPTIONS, build_config, choose_scenario, describe_start, describe_step, draw_seed
 from rlftsim.envs.scene import build_env_scene
 from rlftsim.envs.source import Source
-from rlftsim.envs.spaces import action_space, observation_space, shown
+from rlftsim.envs.spaces import action_space, format_observation, observation_space
 from rlftsim.errors import ConfigError, in_short
 from rlftsim.rollout.policy import Policy
 from rlftsim.scenario.any_form import AnyScenarios
@@ -34,10 +34,10 @@ def parallel_env(
     """A PettingZoo parallel environment.
 
     Args:
-        controlled: planner-driven agents: "ego", "tracks_to_predict", "vehicles", or object ids.
-        scenarios: in place of the data set `data`.
-        policy: in place of the traffic model `model`.
-        settings: fields of `EnvConfig` by name.
+        controlled: Planner-driven agents: "ego", "tracks_to_predict", "vehicles", or object ids.
+        scenarios: Scenario, list of scenarios or data set, in place of the setting `data`.
+        policy: Traffic model in place of the one that the setting `model` names, in evaluation mode.
+        settings: Fields of `EnvConfig` by name; the other fields have their defaults.
 
     Raises:
         ConfigError: settings that do not fit each other, or no agents.
@@ -45,21 +45,22 @@ def parallel_env(
     if not isinstance(controlled, str):
         try:
             # names of agents are their ids as text
-            controlled = list(dict.fromkeys(int(one) if isinstance(one, str) else index(one) for one in controlled))
+            ids = (int(name) if isinstance(name, str) else index(name) for name in controlled)
+            controlled = list(dict.fromkeys(ids))
         except (TypeError, ValueError):
             raise ConfigError("controlled must be a group such as 'vehicles', or a list of object ids.") from None
         if not controlled:
             raise ConfigError("controlled is empty: name at least one object id, or a group such as 'vehicles'.")
     rules = dict.fromkeys([controlled] if isinstance(controlled, str) else controlled, "planner")
-    return TrafficParallelEnv(controlled, Source(config_of(settings), scenarios, policy, rules))
+    return TrafficParallelEnv(controlled, Source(build_config(settings), scenarios, policy, rules))
 
 
 class TrafficParallelEnv(ParallelEnv):
     """Planner-driven agents of one scene, named by their object ids.
 
     Args:
-        controlled: planner-driven agents.
-        source: scenarios, model and settings.
+        controlled: Planner-driven agents: a group such as "vehicles", or object ids.
+        source: Scenarios, traffic model and settings, with the rules of the planner-driven agents.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"name": "rlftsim/Traffic-v0", "render_modes": [], "is_parallelizable": True}
@@ -70,7 +71,7 @@ class TrafficParallelEnv(ParallelEnv):
             raise ConfigError("this environment renders nothing and observes 'dict' or 'flat': change these.")
         self.source, self.render_mode = source, None
         self._spaces = observation_space(config.observation), action_space(source.controls)
-        self._seed = fresh_seed()
+        self._seed = draw_seed()
         self._random, _ = seeding.np_random(self._seed)
         self._count = 0
         self._begun: tuple[Episode, EpisodeState] | None = None
@@ -82,12 +83,12 @@ class TrafficParallelEnv(ParallelEnv):
     def _all_agents(self, controlled: Controlled) -> list[str]:
         if not isinstance(controlled, str):
             return [str(object_id) for object_id in controlled]
-        found: dict[str, None] = {}
+        names: dict[str, None] = {}
         for scenario_id in self.source.scenario_ids:
             scene = build_env_scene(self.source.scenario(scenario_id))
-            planned = scene.object_id[drivers_of(scene, self.source.rules) == Driver.PLANNER]
-            found.update(dict.fromkeys(map(str, planned.tolist())))
-        return list(found)
+            planner_ids = scene.object_id[assign_drivers(scene, self.source.rules) == Driver.PLANNER]
+            names.update(dict.fromkeys(map(str, planner_ids.tolist())))
+        return list(names)
 
     def observation_space(self, agent: str) -> Space:
         """Space of an agent's observations, the same for all."""
@@ -101,9 +102,9 @@ class TrafficParallelEnv(ParallelEnv):
         """Begin an episode.
 
         Args:
-            seed: of the choice of scenarios and of the traffic.
-            options: "scenario", "rollout" and "goals", as of `EgoEnv`; PettingZoo allows further ones, which are
-                ignored.
+            seed: Seed of the order of scenarios and of the traffic; equal seeds, equal episodes.
+            options: Choices "scenario", "rollout" and "goals", as of `EgoEnv`; further names are ignored, as
+                PettingZoo allows them.
 
         Raises:
             ConfigError: an unknown scenario, or no planner-driven agent in it.
@@ -111,8 +112,10 @@ class TrafficParallelEnv(ParallelEnv):
         if seed is not None:
             self._random, _ = seeding.np_random(seed)
             self._seed, self._count = seed, 0
-        known = {name: value for name, value in (options or {}).items() if name in OPTIONS}
-        scenario_id, dice, goals = chosen(self._random, self.source, known, self._seed, self._count)
+        environment_options = {name: value for name, value in (options or {}).items() if name in OPTIONS}
+        scenario_id, dice, goals = choose_scenario(
+            self._random, self.source, environment_options, self._seed, self._count
+        )
         self._count += 1
         scenario = self.source.scenario(scenario_id)
         episode = self.source.episode([scenario], {scenario_id: goals} if goals else None)
@@ -121,14 +124,14 @@ class TrafficParallelEnv(ParallelEnv):
         scene = episode.world.scenes[0]
         self._names = [str(scene.object_id[agent]) for _, agent in episode.world.actors]
         self.agents = list(self._names)
-        infos = {name: about(episode, state, row, self.source) for row, name in enumerate(self._names)}
+        infos = {name: describe_start(episode, state, row, self.source) for row, name in enumerate(self._names)}
         return self._observe(self.agents), infos
 
     def step(self, actions: dict[str, Any]) -> tuple[dict, dict, dict, dict, dict]:
         """Carry out one action of every agent that is left; those whose episode is over stand still.
 
         Args:
-            actions: by agent.
+            actions: Agent name to planner action, for every name in `agents`.
 
         Raises:
             ConfigError: before `reset`, after the end, an agent without an action, or one with a NaN or of another
@@ -148,18 +151,20 @@ class TrafficParallelEnv(ParallelEnv):
         array = np.zeros((len(self._names), *controls.limits.shape))
         for row, name in enumerate(self._names):
             if name in acting:
-                array[row] = checked([actions[name]], controls, lambda _, row=row: episode.name_of(row), 1)[0]
+                array[row] = validate_actions([actions[name]], controls, lambda _, row=row: episode.agent_name(row), 1)[
+                    0
+                ]
         state, outcome = advance(episode, state, array)
         self._begun = episode, state
         rows = {name: self._names.index(name) for name in acting}
         terminated = {name: bool(outcome.terminated[row]) for name, row in rows.items()}
         truncated = {name: bool(outcome.truncated[row]) for name, row in rows.items()}
-        infos = {name: note_of(episode, state, outcome, row) for name, row in rows.items()}
+        infos = {name: describe_step(episode, state, outcome, row) for name, row in rows.items()}
         self.agents = [name for name in acting if not (terminated[name] or truncated[name])]
         rewards = {name: float(outcome.reward[row]) for name, row in rows.items()}
         return self._observe(acting), rewards, terminated, truncated, infos
 
     def _observe(self, names: list[str]) -> dict[str, Any]:
         assert self._begun is not None
-        seen, kind = look(*self._begun), self.source.config.observation
-        return {name: shown(seen, kind, self._names.index(name)) for name in names}
+        observation, form = look(*self._begun), self.source.config.observation
+        return {name: format_observation(observation, form, self._names.index(name)) for name in names}

@@ -84,29 +84,30 @@ def score_planner(record: Record) -> PlannerScores:
     """All scores of one episode.
 
     Args:
-        record: of the episode; one that ended early is scored for as long as it lasted.
+        record: Record of the episode; a short episode is scored for as long as it lasted.
     """
-    parts, missing = _parts(record), missing_scores(record)
-    early = _parts(record.first(PDMS_STEPS))
+    components, missing = _score_components(record), missing_scores(record)
+    early_components = _score_components(record.first(PDMS_STEPS))
     multiplied = ("no_at_fault_collision", "drivable_area", "making_progress", "driving_direction")
-    nuplan = math.prod(parts[name] for name in multiplied if math.isfinite(parts[name]))
+    nuplan = math.prod(components[name] for name in multiplied if math.isfinite(components[name]))
     # NAVSIM: a collision with a standing object costs half, and the driving direction has weight 0
-    pdms = early["no_at_fault_collision"] * (1.0 if math.isnan(early["drivable_area"]) else early["drivable_area"])
+    area = early_components["drivable_area"]
+    pdms = early_components["no_at_fault_collision"] * (1.0 if math.isnan(area) else area)
     jerk = _kinematics(record).jerk
-    found, faults = record.collisions, [one.at_fault for one in record.collisions]
-    whole = float(record.route.progress(record.route.points[-1:])[0]) if len(record.route) else math.nan
+    collisions, faults = record.collisions, [collision.at_fault for collision in record.collisions]
+    route_length_m = float(record.route.progress(record.route.points[-1:])[0]) if len(record.route) else math.nan
     return PlannerScores(
-        nuplan_style=nuplan * _weighted(parts, WEIGHTS),
-        pdms_style=pdms * _weighted(early, PDMS_WEIGHTS),
-        **parts,
-        collision_rate=float(bool(found)),
+        nuplan_style=nuplan * _weighted(components, WEIGHTS),
+        pdms_style=pdms * _weighted(early_components, PDMS_WEIGHTS),
+        **components,
+        collision_rate=float(bool(collisions)),
         at_fault_collision_rate=float(any(faults)),
         hit_rate=float(not all(faults)),
         red_light_rate=_red_light(record),
         least_ttc_s=least_time_to_collision(record),
         off_road_m=math.nan if "off_road_m" in missing else max(0.0, float(off_road(record).max())),
-        route_completion=_gained(record.route, record.own) / whole if whole else math.nan,
-        speed_change_mps=max((one.speed_change_mps for one in found), default=0.0),
+        route_completion=_gained(record.route, record.agent_motion) / route_length_m if route_length_m else math.nan,
+        speed_change_mps=max((collision.speed_change_mps for collision in collisions), default=0.0),
         mean_jerk_mps3=float(jerk.mean()) if len(jerk) else math.nan,
         jerk_95_mps3=float(np.quantile(jerk, 0.95)) if len(jerk) else math.nan,
         displacement_error=_displacement(record),
@@ -115,26 +116,26 @@ def score_planner(record: Record) -> PlannerScores:
 
 def missing_scores(record: Record) -> dict[str, str]:
     """Scores that cannot be measured in a record's scenario, and why."""
-    found = {}
+    reasons = {}
     if not record.scene.scenario.has_future:
-        why = "the log's future is withheld, as in a test split"
-        found |= dict.fromkeys(("progress", "making_progress", "displacement_error"), why)
+        reason = "the log's future is withheld, as in a test split"
+        reasons |= dict.fromkeys(("progress", "making_progress", "displacement_error"), reason)
     elif not len(record.logged_route):
-        found |= dict.fromkeys(("progress", "making_progress"), "there is no lane to measure progress along")
+        reasons |= dict.fromkeys(("progress", "making_progress"), "there is no lane to measure progress along")
     if lane_search(record.scene.scenario) is None:
-        found |= dict.fromkeys(("driving_direction", "speed_limit", "others_wrong_way_rate"), "the map has no lanes")
+        reasons |= dict.fromkeys(("driving_direction", "speed_limit", "others_wrong_way_rate"), "the map has no lanes")
     if not len(record.route):
-        found["route_completion"] = "there is no route"
+        reasons["route_completion"] = "there is no route"
     if road_edges(record.scene.scenario) is None:
-        found |= dict.fromkeys(("drivable_area", "off_road_m", "others_offroad_rate"), "the map has no road edges")
-    return found
+        reasons |= dict.fromkeys(("drivable_area", "off_road_m", "others_offroad_rate"), "the map has no road edges")
+    return reasons
 
 
-def _parts(record: Record) -> dict[str, float]:
+def _score_components(record: Record) -> dict[str, float]:
     """The eight parts of the score."""
     missing = missing_scores(record)
     ratio = math.nan if "progress" in missing else _progress_ratio(record)
-    parts = {
+    components = {
         "no_at_fault_collision": _collision_score(record),
         "drivable_area": float((off_road(record) < OUTSIDE_M).all()),
         "making_progress": math.nan if math.isnan(ratio) else float(ratio >= MAKING_PROGRESS),
@@ -144,21 +145,22 @@ def _parts(record: Record) -> dict[str, float]:
         "speed_limit": _speed_score(record),
         "comfort": _comfort(record),
     }
-    return {name: math.nan if name in missing else value for name, value in parts.items()}
+    return {name: math.nan if name in missing else value for name, value in components.items()}
 
 
-def _weighted(parts: dict[str, float], weights: dict[str, float]) -> float:
+def _weighted(components: dict[str, float], weights: dict[str, float]) -> float:
     """Weighted mean of the parts that there are."""
-    known = [name for name in weights if math.isfinite(parts[name])]
-    return sum(weights[name] * parts[name] for name in known) / sum(weights[name] for name in known)
+    measured = [name for name in weights if math.isfinite(components[name])]
+    return sum(weights[name] * components[name] for name in measured) / sum(weights[name] for name in measured)
 
 
 def _collision_score(record: Record) -> float:
     """Product over vulnerable road users, vehicles and objects: 0 after one collision at fault, with objects 0.5."""
-    kinds = [int(record.scene.object_type[one.agent]) for one in record.collisions if one.at_fault]
-    vulnerable = sum(kind in VULNERABLE for kind in kinds)
-    vehicles = sum(kind == ObjectType.VEHICLE for kind in kinds)
-    objects = len(kinds) - vulnerable - vehicles
+    agents = [collision.agent for collision in record.collisions if collision.at_fault]
+    object_types = record.scene.object_type[agents].tolist()
+    vulnerable = sum(object_type in VULNERABLE for object_type in object_types)
+    vehicles = sum(object_type == ObjectType.VEHICLE for object_type in object_types)
+    objects = len(object_types) - vulnerable - vehicles
     return max(0.0, 1.0 - vulnerable) * max(0.0, 1.0 - vehicles) * max(0.0, 1.0 - objects / 2)
 
 
@@ -170,23 +172,23 @@ def off_road(record: Record) -> Float[np.ndarray, "T1"]:
     scene, edges = record.scene, road_edges(record.scene.scenario)
     if edges is None:
         return np.full(record.steps + 1, -np.inf)
-    own = record.own
+    motion = record.agent_motion
     corners = (
-        clockwise_corners(own[:, :2], own[:, 2], scene.size[record.agent]) + scene.scenario.origin
+        clockwise_corners(motion[:, :2], motion[:, 2], scene.size[record.agent]) + scene.scenario.origin
     )  # [T + 1, 4, 2]
     z = np.repeat(record.ground[record.agent][:, None, None], 4, 1)
     groups = torch.from_numpy(np.concatenate([corners, z], -1)).float()
     return compute_point_distance_to_road_edge(groups, edges, max_pairs=MAX_PAIRS).amax(-1).double().numpy()
 
 
-def _gained(route: Route, own: Float[np.ndarray, "T1 5"]) -> float:
+def _gained(route: Route, motion: Float[np.ndarray, "T1 5"]) -> float:
     """Meters along a route between the first and the last step."""
-    first, last = route.progress(own[[0, -1], :2])
+    first, last = route.progress(motion[[0, -1], :2])
     return float(last - first)
 
 
 def _progress_ratio(record: Record) -> float:
-    ego = _gained(record.logged_route, record.own)
+    ego = _gained(record.logged_route, record.agent_motion)
     logged = record.scene.logged[record.agent, CURRENT_STEP : CURRENT_STEP + record.steps + 1]
     if ego < -PROGRESS_M:
         return 0.0
@@ -203,10 +205,10 @@ def _lane_headings(record: Record) -> tuple[Float[np.ndarray, "T1"], Float[np.nd
     junction = np.zeros(record.steps + 1, bool)
     if search is None:
         return angle, limit, junction
-    near = search.find_near(record.own[:, :2], LANE_M, record.ground[record.agent])
-    for step, points in enumerate(near):
+    lane_points = search.find_points(record.agent_motion[:, :2], LANE_M, record.ground[record.agent])
+    for step, points in enumerate(lane_points):
         if points:
-            turn = np.abs(wrapped(search.heading[points] - record.own[step, 2]))
+            turn = np.abs(wrapped(search.heading[points] - record.agent_motion[step, 2]))
             best = points[int(turn.argmin())]
             angle[step] = turn.min()
             limit[step] = record.scene.graph.speed_limit_mps[search.lane[best]]
@@ -216,16 +218,16 @@ def _lane_headings(record: Record) -> tuple[Float[np.ndarray, "T1"], Float[np.nd
 
 def _direction_score(record: Record) -> float:
     angle, _, _ = _lane_headings(record)
-    step = np.linalg.norm(np.diff(record.own[:, :2], axis=0), axis=1)
+    step = np.linalg.norm(np.diff(record.agent_motion[:, :2], axis=0), axis=1)
     against = np.where(np.nan_to_num(angle[1:]) > np.pi / 2, step, 0.0)
     window = min(WRONG_WAY_STEPS, len(against))
-    most = np.convolve(against, np.ones(window), "valid").max() if window else 0.0
-    return 1.0 if most < WRONG_WAY_M[0] else 0.5 if most < WRONG_WAY_M[1] else 0.0
+    max_against = np.convolve(against, np.ones(window), "valid").max() if window else 0.0
+    return 1.0 if max_against < WRONG_WAY_M[0] else 0.5 if max_against < WRONG_WAY_M[1] else 0.0
 
 
 def _speed_score(record: Record) -> float:
     _, limit, _ = _lane_headings(record)
-    speed = np.linalg.norm(record.own[:, 3:], axis=1)
+    speed = np.linalg.norm(record.agent_motion[:, 3:], axis=1)
     over = np.where(limit > 0, np.maximum(speed - limit, 0.0), 0.0)[1:]
     return max(0.0, 1.0 - float(over.mean()) / OVER_SPEED_MPS) if len(over) else 1.0
 
@@ -236,24 +238,25 @@ def least_time_to_collision(record: Record) -> float:
     Tracks ahead and crossing ones count. Those beside the agent do only while it is not in one lane, or in a junction;
     those behind, and those it has touched already, never do.
     """
-    own, others = record.own, record.motion
+    agent_motion, motion = record.agent_motion, record.motion
     size = record.scene.size[:, :2]
-    speed, other_speed = (np.linalg.norm(motion[..., 3:], axis=-1) for motion in (own, others))
-    offset = others[..., :2] - own[:, :2]  # [A, T + 1, 2]
-    bearing = np.abs(wrapped(np.arctan2(offset[..., 1], offset[..., 0]) - own[:, 2]))
-    crossing = np.abs(np.sin(others[..., 2] - own[:, 2])) > np.sin(CROSSING_RAD)
+    speed, other_speed = (np.linalg.norm(motion[..., 3:], axis=-1) for motion in (agent_motion, motion))
+    offset = motion[..., :2] - agent_motion[:, :2]  # [A, T + 1, 2]
+    bearing = np.abs(wrapped(np.arctan2(offset[..., 1], offset[..., 0]) - agent_motion[:, 2]))
+    crossing = np.abs(np.sin(motion[..., 2] - agent_motion[:, 2])) > np.sin(CROSSING_RAD)
     _, _, junction = _lane_headings(record)
-    beside = ~in_one_lane(record.scene, own, size[record.agent], record.ground[record.agent]) | junction
-    counts = record.known & (bearing < BEHIND_RAD) & ((bearing < AHEAD_RAD) | crossing | beside)
+    is_in_lane = in_one_lane(record.scene, agent_motion, size[record.agent], record.ground[record.agent])
+    counts_lateral = ~is_in_lane | junction
+    counts = record.is_observed & (bearing < BEHIND_RAD) & ((bearing < AHEAD_RAD) | crossing | counts_lateral)
     counts[record.agent] = False
     counts &= speed > TTC_MOVING_MPS
-    for one in record.collisions:
-        counts[one.agent, one.step :] = False
+    for collision in record.collisions:
+        counts[collision.agent, collision.step :] = False
     diagonal = np.linalg.norm(size, axis=1)
     reach = TTC_HORIZON_S * (speed + other_speed) + (diagonal[:, None] + diagonal[record.agent]) / 2
     agents, steps = np.nonzero(counts & (np.linalg.norm(offset, axis=-1) <= reach))
     time = STEP_S * np.arange(round(TTC_HORIZON_S / STEP_S) + 1)
-    ego, track = own[steps], others[agents, steps]  # [P, 5] each
+    ego, track = agent_motion[steps], motion[agents, steps]  # [P, 5] each
     gap = track[:, None, :2] - ego[:, None, :2] + time[:, None] * (track[:, None, 3:] - ego[:, None, 3:])  # [P, 31, 2]
     meets = boxes_overlap(gap, ego[:, None, 2], track[:, None, 2], size[record.agent], size[agents, None])
     if record.scene.levels is not None:
@@ -293,15 +296,15 @@ class _Kinematics:
 
 
 def _kinematics(record: Record) -> _Kinematics:
-    own = record.own
-    if len(own) < 5:  # too short for any derivative
+    motion = record.agent_motion
+    if len(motion) < 5:  # too short for any derivative
         return _Kinematics(*[np.zeros(0)] * 6)
     # odd windows that fit a short record
-    short, long = (min(window, len(own) - 1 + len(own) % 2) for window in (SMOOTH_STEPS, SMOOTH_JERK_STEPS))
-    cos, sin = np.cos(own[:, 2]), np.sin(own[:, 2])
-    acceleration = _smooth(own[:, 3:], short, order=2, derivative=1)
+    short, long = (min(window, len(motion) - 1 + len(motion) % 2) for window in (SMOOTH_STEPS, SMOOTH_JERK_STEPS))
+    cos, sin = np.cos(motion[:, 2]), np.sin(motion[:, 2])
+    acceleration = _smooth(motion[:, 3:], short, order=2, derivative=1)
     longitudinal = acceleration[:, 0] * cos + acceleration[:, 1] * sin
-    heading = np.unwrap(own[:, 2])
+    heading = np.unwrap(motion[:, 2])
     jerk = _smooth(acceleration, long, order=2, derivative=1)
     return _Kinematics(
         longitudinal=longitudinal,
@@ -346,7 +349,7 @@ def _red_light(record: Record) -> float:
     signals = _signals(record.scene.scenario)
     if signals is None:
         return 0.0
-    x, y = torch.from_numpy(record.own[:, :2] + record.scene.scenario.origin).float().T[:, None, None]
+    x, y = torch.from_numpy(record.agent_motion[:, :2] + record.scene.scenario.origin).float().T[:, None, None]
     passed = compute_traffic_light_violation(
         x, y, torch.ones(1, 1, record.steps, dtype=torch.bool), signals, first_step=CURRENT_STEP, max_pairs=MAX_PAIRS
     )
@@ -355,8 +358,8 @@ def _red_light(record: Record) -> float:
 
 def _displacement(record: Record) -> float:
     steps = slice(CURRENT_STEP + 1, CURRENT_STEP + 1 + record.steps)
-    known = record.scene.valid[record.agent, steps]
-    if not known.any():
+    is_logged = record.scene.valid[record.agent, steps]
+    if not is_logged.any():
         return math.nan
-    offset = record.own[1:, :2] - record.scene.logged[record.agent, steps, :2]
-    return float(np.linalg.norm(offset[known], axis=1).mean())
+    offset = record.agent_motion[1:, :2] - record.scene.logged[record.agent, steps, :2]
+    return float(np.linalg.norm(offset[is_logged], axis=1).mean())

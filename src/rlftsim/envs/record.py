@@ -1,13 +1,13 @@
 """Records of episodes: motion of all agents of a scene, from the current step of the log to the end."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from rlftsim.envs.contact import Collision
 from rlftsim.envs.episode import Episode, EpisodeState
-from rlftsim.envs.route import Route, route_of
+from rlftsim.envs.route import Route, find_route
 from rlftsim.envs.scene import Scene
 from rlftsim.scenario.types import CURRENT_STEP
 
@@ -23,16 +23,16 @@ class Record:
     """x, y, heading, vx, vy at T + 1 steps."""
     z: Float[np.ndarray, "A T1"]
     """Height of the centers, that of the current step in scenes without levels."""
-    there: Bool[np.ndarray, "A T1"]
+    is_present: Bool[np.ndarray, "A T1"]
     """False = a replayed agent whose log has ended."""
-    known: Bool[np.ndarray, "A T1"]
+    is_observed: Bool[np.ndarray, "A T1"]
     """False also in the gaps of a replayed agent's log: scores leave these states out."""
     collisions: tuple[Collision, ...]
-    """Of the planner's agent."""
+    """Contacts of the planner's agent."""
     route: Route
-    """The one that the planner was given."""
+    """Route that the planner sees."""
     logged_route: Route
-    """The lanes that the logged agent drove, which progress is measured along."""
+    """Lanes that the logged agent drove, along which progress is measured."""
 
     @property
     def steps(self) -> int:
@@ -45,26 +45,30 @@ class Record:
         return self.z - self.scene.size[:, 2:] / 2
 
     @property
-    def own(self) -> Float[np.ndarray, "T1 5"]:
+    def agent_motion(self) -> Float[np.ndarray, "T1 5"]:
         """Motion of the planner's agent."""
         return self.motion[self.agent]
 
-    def first(self, steps: int) -> "Record":
-        """The first steps alone."""
-        return Record(
-            self.scene, self.agent, self.motion[:, : steps + 1], self.z[:, : steps + 1], self.there[:, : steps + 1],
-            self.known[:, : steps + 1], tuple(one for one in self.collisions if one.step <= steps), self.route,
-            self.logged_route,
-        )  # fmt: skip
+    def first(self, num_steps: int) -> "Record":
+        """Record of the first steps alone."""
+        steps = slice(0, num_steps + 1)
+        return replace(
+            self,
+            motion=self.motion[:, steps],
+            z=self.z[:, steps],
+            is_present=self.is_present[:, steps],
+            is_observed=self.is_observed[:, steps],
+            collisions=tuple(collision for collision in self.collisions if collision.step <= num_steps),
+        )
 
 
-def record_of(episode: Episode, state: EpisodeState, row: int = 0) -> Record:
+def build_record(episode: Episode, state: EpisodeState, row: int = 0) -> Record:
     """Record of a planner-driven agent's scene so far.
 
     Args:
-        episode: the scenes.
-        state: the present one.
-        row: of the agent among the planner-driven ones.
+        episode: Episode that is or was running.
+        state: State of the episode at the end of the record.
+        row: Index of the agent among the planner-driven agents [M].
     """
     scene_row, agent = (int(index) for index in episode.world.actors[row])
     scene = episode.world.scenes[scene_row]
@@ -74,9 +78,9 @@ def record_of(episode: Episode, state: EpisodeState, row: int = 0) -> Record:
         agent=agent,
         motion=np.stack([step[scene_row, :count] for step in state.world.track[CURRENT_STEP:]], 1),
         z=np.stack([z[scene_row, :count] for z in state.world.z[CURRENT_STEP:]], 1),
-        there=episode.world.there[scene_row, :count, CURRENT_STEP:last],
-        known=episode.world.known[scene_row, :count, CURRENT_STEP:last],
+        is_present=episode.world.is_present[scene_row, :count, CURRENT_STEP:last],
+        is_observed=episode.world.is_observed[scene_row, :count, CURRENT_STEP:last],
         collisions=state.collisions[row],
         route=episode.atlas.routes[row],
-        logged_route=route_of(scene.scenario, agent, "logged"),
+        logged_route=find_route(scene.scenario, agent, "logged"),
     )

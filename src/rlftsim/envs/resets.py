@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.episode import Episode, EpisodeState, Outcome
-from rlftsim.envs.record import record_of
+from rlftsim.envs.record import build_record
 from rlftsim.envs.result import Result
 from rlftsim.envs.source import Source
 from rlftsim.envs.world import Dice
@@ -18,55 +18,55 @@ OPTIONS = ("scenario", "rollout", "goals")
 """Options of a reset."""
 
 
-def config_of(settings: dict[str, Any]) -> EnvConfig:
+def build_config(settings: dict[str, Any]) -> EnvConfig:
     """Settings by name.
 
     Raises:
         ConfigError: one that there is not.
     """
-    unknown = [name for name in settings if name not in EnvConfig.__dataclass_fields__]
-    if unknown:
-        raise ConfigError(f"no setting {unknown[0]!r}: known are {', '.join(EnvConfig.__dataclass_fields__)}.")
+    unknown_fields = [name for name in settings if name not in EnvConfig.__dataclass_fields__]
+    if unknown_fields:
+        raise ConfigError(f"no setting {unknown_fields[0]!r}: known are {', '.join(EnvConfig.__dataclass_fields__)}.")
     return EnvConfig(**settings)
 
 
-def fresh_seed() -> int:
+def draw_seed() -> int:
     """A seed where none is given: one that fits an array of int64 and gives the same episodes again."""
     return int(np.random.default_rng().integers(2**31))
 
 
-def chosen(
+def choose_scenario(
     random: np.random.Generator, source: Source, options: dict[str, Any], seed: int, count: int
 ) -> tuple[str, Dice, Any]:
     """Scenario, dice and goals of a reset.
 
     Args:
-        random: draws the scenario.
-        source: supplies the scenarios.
-        options: of the reset.
-        seed: of the traffic.
-        count: episodes since the seed, the number of the rollout.
+        random: Generator that draws the scenario, also where the options name one.
+        source: Scenarios to choose from.
+        options: Options of the reset by name; other names than `OPTIONS` are refused.
+        seed: Seed of the traffic, a whole number.
+        count: Number of episodes since the seed, which is the rollout's number.
 
     Raises:
         ConfigError: an option that there is not.
     """
-    unknown = [name for name in options if name not in OPTIONS]
-    if unknown:
-        raise ConfigError(f"reset has no option {unknown[0]!r}: known are {', '.join(OPTIONS)}.")
-    drawn = int(random.integers(len(source.scenario_ids)))
-    scenario_id = options.get("scenario", source.scenario_ids[drawn])
+    unknown_options = [name for name in options if name not in OPTIONS]
+    if unknown_options:
+        raise ConfigError(f"reset has no option {unknown_options[0]!r}: known are {', '.join(OPTIONS)}.")
+    index = int(random.integers(len(source.scenario_ids)))
+    scenario_id = options.get("scenario", source.scenario_ids[index])
     rollout = whole_number("rollout", options.get("rollout", count), 0)
     return scenario_id, Dice(seed, rollout), options.get("goals")
 
 
-def about(episode: Episode, state: EpisodeState, row: int, source: Source) -> dict[str, Any]:
+def describe_start(episode: Episode, state: EpisodeState, row: int, source: Source) -> dict[str, Any]:
     """Information at the beginning of an episode.
 
     Args:
-        episode: of the agent.
-        state: its first.
-        row: of the agent.
-        source: of the environment.
+        episode: Episode that the agent drives in.
+        state: First state of the episode.
+        row: Index of the agent among the planner-driven agents [M].
+        source: Source of the environment, for the fingerprint of its traffic model.
     """
     scene_row, agent = episode.world.actors[row]
     scene, dice = episode.world.scenes[scene_row], state.world.dice[-1][scene_row]
@@ -78,28 +78,28 @@ def about(episode: Episode, state: EpisodeState, row: int, source: Source) -> di
         "step": 0,
         "route": episode.atlas.routes[row].source,
         "model": source.fingerprint,
-        "lights_held": lights_are_held(episode, state, row),
+        "lights_held": has_frozen_lights(episode, state, row),
         "logged": logged_poses(episode, row),
     }
 
 
-def note_of(episode: Episode, state: EpisodeState, outcome: Outcome, row: int) -> dict[str, Any]:
+def describe_step(episode: Episode, state: EpisodeState, outcome: Outcome, row: int) -> dict[str, Any]:
     """Information after an action; at the end of the agent's episode with its `Result`.
 
     Args:
-        episode: of the agent.
-        state: after the action.
-        outcome: of the action.
-        row: of the agent.
+        episode: Episode that the agent drives in.
+        state: State of the episode after the action.
+        outcome: Rewards and ends that the action led to.
+        row: Index of the agent among the planner-driven agents [M].
     """
     note: dict[str, Any] = {
         "step": state.world.step,
         "terms": {name: float(value[row]) for name, value in outcome.terms.items()},
-        "clipped": bool(outcome.clipped[row]),
-        "lights_held": lights_are_held(episode, state, row),
+        "clipped": bool(outcome.is_clipped[row]),
+        "lights_held": has_frozen_lights(episode, state, row),
     }
     if outcome.terminated[row] or outcome.truncated[row]:
-        note["result"] = Result(record_of(episode, state, row))
+        note["result"] = Result(build_record(episode, state, row))
     return note
 
 
@@ -107,8 +107,8 @@ def logged_poses(episode: Episode, row: int) -> Float[np.ndarray, "81 3"]:
     """Logged poses of an agent from the current step on, map frame; NaN where there is no state.
 
     Args:
-        episode: of the agent.
-        row: of the agent.
+        episode: Episode that the agent drives in.
+        row: Index of the agent among the planner-driven agents [M].
     """
     scene, agent = episode.world.actors[row]
     poses = episode.world.logged[scene, agent, CURRENT_STEP:, :3].copy()
@@ -116,13 +116,13 @@ def logged_poses(episode: Episode, row: int) -> Float[np.ndarray, "81 3"]:
     return poses
 
 
-def lights_are_held(episode: Episode, state: EpisodeState, row: int) -> bool:
+def has_frozen_lights(episode: Episode, state: EpisodeState, row: int) -> bool:
     """True where lights keep their last state as the log has no further ones.
 
     Args:
-        episode: of the agent.
-        state: the present one.
-        row: of the agent.
+        episode: Episode that the agent drives in.
+        state: Present state of the episode.
+        row: Index of the agent among the planner-driven agents [M].
     """
     lights = episode.world.scenes[episode.world.actors[row][0]].lights
     return 0 <= lights.last_observed < len(state.world.track) - 1

@@ -15,7 +15,7 @@ from rlftsim.viewer.film import to_film
 from rlftsim.viewer.page import Animation, Panel, animation_html, page_html
 from rlftsim.viewer.scene import AgentBoxes, SceneMotion, build_scene, logged_trajectories
 
-SCORE_NAMES = tuple(one.name for scores in (PlannerScores, TrafficScores) for one in fields(scores))
+SCORE_NAMES = tuple(field.name for scores in (PlannerScores, TrafficScores) for field in fields(scores))
 """Names of all scores of an episode."""
 
 
@@ -49,10 +49,10 @@ class Result:
         """Write a film, .mp4 or .webp.
 
         Args:
-            path: file to write.
-            title: above the picture.
+            path: File to write; its ending .mp4 or .webp decides the format.
+            title: Title above the picture, such as the planner's name.
         """
-        to_film(path, animation_of({title: self.record}))
+        to_film(path, build_animation({title: self.record}))
 
     def __repr__(self) -> str:
         scores = self.planner
@@ -62,17 +62,17 @@ class Result:
         )
 
 
-def motion_of(record: Record, agents: AgentBoxes) -> SceneMotion:
+def to_scene_motion(record: Record, agents: AgentBoxes) -> SceneMotion:
     """Motion of all agents of a record, after the logged history; agents that overlap are marked.
 
     Args:
-        record: Record of an episode.
-        agents: Boxes of its agents.
+        record: Record of an episode, from the current step on.
+        agents: Boxes of the same agents, for marks where they overlap.
     """
     log = logged_trajectories(record.scene.scenario)
     position = np.concatenate([log.position[0, :, :HISTORY_STEPS], record.motion[:, 1:, :2]], 1)
     heading = np.concatenate([log.heading[0, :, :HISTORY_STEPS], record.motion[:, 1:, 2]], 1)
-    valid = np.concatenate([log.valid[0, :, :HISTORY_STEPS], record.there[:, 1:]], 1)
+    valid = np.concatenate([log.valid[0, :, :HISTORY_STEPS], record.is_present[:, 1:]], 1)
     motion = SceneMotion(position[None].astype(np.float32), heading[None].astype(np.float32), valid[None])
     if record.scene.levels is None:
         return motion.with_overlaps(agents)
@@ -80,23 +80,23 @@ def motion_of(record: Record, agents: AgentBoxes) -> SceneMotion:
     return motion.with_overlaps(agents, z[None], record.scene.size[:, 2])
 
 
-def animation_of(records: Mapping[str, Record]) -> Animation:
+def build_animation(records: Mapping[str, Record]) -> Animation:
     """Records of one scenario side by side, by title; agents that overlap are marked.
 
     Args:
-        records: at least one.
+        records: Title to record, at least one, all of the same scenario.
     """
     scenario = next(iter(records.values())).scene.scenario
     scene = build_scene(scenario)
-    panels = [Panel(title, motion_of(record, scene.agents)) for title, record in records.items()]
+    panels = [Panel(title, to_scene_motion(record, scene.agents)) for title, record in records.items()]
     return Animation(f"scenario {scenario.scenario_id}", scene, panels)
 
 
-def page_of(records: Mapping[str, Record]) -> str:
+def build_page(records: Mapping[str, Record]) -> str:
     """A page that plays records of one scenario side by side.
 
     Args:
-        records: by title, at least one.
+        records: Title to record, at least one, all of the same scenario.
     """
-    animation = animation_of(records)
+    animation = build_animation(records)
     return page_html(animation.title, animation_html(animation))

@@ -34,14 +34,14 @@ def parse_terms(text: str) -> tuple[WeightedTerm, ...]:
         return ()
     squeezed = text.replace(" ", "")
     signed = squeezed if squeezed[:1] in ("+", "-") else f"+{squeezed}"
-    found = _TERM.findall(signed)
-    if not found or "".join(f"{sign}{factor}{'*' if factor else ''}{name}" for sign, factor, name in found) != signed:
+    terms = _TERM.findall(signed)
+    if not terms or "".join(f"{sign}{factor}{'*' if factor else ''}{name}" for sign, factor, name in terms) != signed:
         raise ConfigError(
             f"reward {in_short(text)} cannot be read: write a sum of terms, such as 'progress - 5*at_fault'."
         )
-    for _, _, name in found:
+    for _, _, name in terms:
         if name not in TERMS:
             raise ConfigError(
                 f"reward {in_short(text)}: no term {in_short(name)}: known are {', '.join(TERMS)}, or 'none' alone."
             )
-    return tuple(WeightedTerm(float(f"{sign}{factor or 1}"), name) for sign, factor, name in found)
+    return tuple(WeightedTerm(float(f"{sign}{factor or 1}"), name) for sign, factor, name in terms)

@@ -29,8 +29,8 @@ def nearest_edges(
     """Distance of each point to the nearest edge, its side of that edge, and True where it is beside it.
 
     Args:
-        points: m.
-        edges: x0, y0, x1, y1, at least one; the drivable side is on the left.
+        points: Points to measure, map frame, m.
+        edges: Segments x0, y0, x1, y1, at least one, m; the drivable side is on the left.
 
     Returns:
         Distances, m; a positive number for points on the left, a negative one on the right; False for points beyond
@@ -39,11 +39,11 @@ def nearest_edges(
     edges = edges[:, None]  # [n, 1, e, 4]
     dx, dy = edges[..., 2] - edges[..., 0], edges[..., 3] - edges[..., 1]
     to_x, to_y = points[..., :1] - edges[..., 0], points[..., 1:] - edges[..., 1]  # [n, p, e]
-    along = (to_x * dx + to_y * dy) / np.maximum(dx * dx + dy * dy, 1e-9)
-    cut = np.clip(along, 0.0, 1.0)
-    off_x, off_y = to_x - cut * dx, to_y - cut * dy
+    position = (to_x * dx + to_y * dy) / np.maximum(dx * dx + dy * dy, 1e-9)
+    clipped_position = np.clip(position, 0.0, 1.0)
+    off_x, off_y = to_x - clipped_position * dx, to_y - clipped_position * dy
     squared = off_x * off_x + off_y * off_y
     nearest = squared.argmin(-1)[..., None]
     distance = np.sqrt(np.take_along_axis(squared, nearest, -1))[..., 0]
     side = np.take_along_axis(dx * to_y - dy * to_x, nearest, -1)[..., 0]
-    return distance, side, np.take_along_axis(cut == along, nearest, -1)[..., 0]
+    return distance, side, np.take_along_axis(clipped_position == position, nearest, -1)[..., 0]

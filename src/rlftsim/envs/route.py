@@ -67,13 +67,13 @@ NO_ROUTE = Route(np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros(0), np.zer
 
 
 @cached_on_scenario
-def route_of(scenario: Scenario, agent: int, choice: RouteChoice) -> Route:
+def find_route(scenario: Scenario, agent: int, choice: RouteChoice) -> Route:
     """Route of an agent; without lanes there is none.
 
     Args:
-        scenario: the scenario.
-        agent: row of the agent among the simulated ones.
-        choice: "logged" for the lanes that it drove, "none", a maneuver that the lanes allow, or lane ids.
+        scenario: Scenario whose lanes and log give the route.
+        agent: Row of the agent among the simulated agents.
+        choice: Kind of route: "logged" for the lanes of its log, "none", a maneuver that the lanes allow, or lane ids.
 
     Raises:
         ConfigError: no such lane or maneuver.
@@ -89,23 +89,23 @@ def route_of(scenario: Scenario, agent: int, choice: RouteChoice) -> Route:
     for proposal in proposals:
         if proposal.maneuver.value == choice:
             return _of_points(scene, agent, proposal.path[:, :2] - scenario.origin, "maneuver")
-    known = ", ".join(proposal.maneuver.value for proposal in proposals) or "no maneuver"
+    maneuvers = ", ".join(proposal.maneuver.value for proposal in proposals) or "no maneuver"
     raise ConfigError(
         f"route {choice!r}: in scenario {scenario.scenario_id} the lanes of agent {scene.object_id[agent]} allow "
-        f"{known}; routes are also 'logged', 'none' and lane ids."
+        f"{maneuvers}; routes are also 'logged', 'none' and lane ids."
     )
 
 
 def _logged_route(scene: Scene, agent: int) -> Route:
     """The path along the lanes that fits the logged way best."""
-    way = scene.logged[agent, CURRENT_STEP:, :2][scene.valid[agent, CURRENT_STEP:]]
-    travelled = float(arc_length(way)[-1])
+    logged_path = scene.logged[agent, CURRENT_STEP:, :2][scene.valid[agent, CURRENT_STEP:]]
+    travelled = float(arc_length(logged_path)[-1])
     paths = _paths(scene.scenario, agent, max(travelled + BEYOND_M, LEAST_M))
     if not paths:
         heading = scene.logged[agent, CURRENT_STEP:, 2][scene.valid[agent, CURRENT_STEP:]][-1]
         beyond = np.arange(1.0, LEAST_M)[:, None] * [np.cos(heading), np.sin(heading)]
-        return _of_points(scene, agent, np.concatenate([way, way[-1] + beyond]), "logged way")
-    world = way + scene.scenario.origin
+        return _of_points(scene, agent, np.concatenate([logged_path, logged_path[-1] + beyond]), "logged way")
+    world = logged_path + scene.scenario.origin
     misfit = [
         float(np.linalg.norm(world[:, None] - path.points[:, :2], axis=-1).min(1).mean())
         + TURN_PENALTY * abs(float(path.turn[-1]))
@@ -122,32 +122,33 @@ def _paths(scenario: Scenario, agent: int, length_m: float) -> list[LanePath]:
     lanes = lanes_for(scene.graph, driver.object_type)
     if scene.levels is not None:
         lanes.usable[_lanes_of_other_levels(scene.graph, driver.pose.position)] = False
-    own = own_paths(driver, lanes, length_m=length_m)
+    lane_paths = own_paths(driver, lanes, length_m=length_m)
     speed = max(driver.speed_mps, 5.0)
     changing = [
         path
-        for start in own
+        for start in lane_paths
         for side in (1, -1)
         for path, _ in lane_change_paths(lanes, start, side=side, speed_mps=speed, length_m=length_m)
     ]
-    return own + changing
+    return lane_paths + changing
 
 
 def _lanes_of_other_levels(graph: LaneGraph, position: Float[np.ndarray, "3"]) -> Int64[np.ndarray, "l"]:
     """Indices of the lanes that are near an agent in the plane alone."""
     offset = graph.points - position
-    is_near = np.linalg.norm(offset[:, :2], axis=1) <= MAX_LANE_DISTANCE_M
+    is_in_reach = np.linalg.norm(offset[:, :2], axis=1) <= MAX_LANE_DISTANCE_M
     is_same_level = is_on_level(offset[:, 2])
-    return np.setdiff1d(graph.owner[is_near & ~is_same_level], graph.owner[is_near & is_same_level])
+    return np.setdiff1d(graph.owner[is_in_reach & ~is_same_level], graph.owner[is_in_reach & is_same_level])
 
 
 def _along_lanes(scene: Scene, agent: int, lane_ids: tuple[int, ...]) -> Float[np.ndarray, "n 2"]:
     """The middle of lanes one after the other, from the point nearest to an agent on."""
     row_of_id = {int(lane_id): row for row, lane_id in enumerate(scene.graph.lane_id)}
-    unknown = [lane_id for lane_id in lane_ids if lane_id not in row_of_id]
-    if unknown or not lane_ids:
+    unknown_ids = [lane_id for lane_id in lane_ids if lane_id not in row_of_id]
+    if unknown_ids or not lane_ids:
+        missing = unknown_ids[0] if unknown_ids else "here"
         raise ConfigError(
-            f"route {lane_ids}: scenario {scene.scenario.scenario_id} has no lane {unknown[0] if unknown else 'here'}: "
+            f"route {lane_ids}: scenario {scene.scenario.scenario_id} has no lane {missing}: "
             f"its lanes are {', '.join(map(str, list(row_of_id)[:12]))}, ..."
         )
     line = np.concatenate([scene.graph.lines[row_of_id[i]][:, :2] for i in lane_ids]) - scene.scenario.origin
@@ -159,8 +160,8 @@ def _of_points(scene: Scene, agent: int, line: Float[np.ndarray, "n 2"], source:
     """Route along a polyline, with the lanes and limits there."""
     if float(arc_length(line)[-1]) < SPACING_M:
         return NO_ROUTE
-    points = points_every(line, SPACING_M)
-    heading = headings_of(points)
+    points = sample_line(line, SPACING_M)
+    heading = compute_headings(points)
     # lanes and limits: of the nearest lane point that runs the same way
     graph = scene.graph
     offset = np.linalg.norm(points[:, None] - (graph.points[:, :2] - scene.scenario.origin), axis=-1)  # [R, P]
@@ -176,19 +177,19 @@ def _of_points(scene: Scene, agent: int, line: Float[np.ndarray, "n 2"], source:
     return Route(points, heading, ground, limit, np.unique(owner[on_lane]), source)
 
 
-def points_every(line: Float[np.ndarray, "n 2"], spacing_m: float) -> Float[np.ndarray, "m 2"]:
+def sample_line(line: Float[np.ndarray, "n 2"], spacing_m: float) -> Float[np.ndarray, "m 2"]:
     """Points along a polyline from its start on.
 
     Args:
-        line: the polyline.
-        spacing_m: distance from point to point.
+        line: Points of the polyline, at least two, m.
+        spacing_m: Distance from point to point along the line, m.
     """
-    along = arc_length(line)
-    at = np.arange(0.0, along[-1] + 1e-6, spacing_m)
-    return np.stack([np.interp(at, along, line[:, k]) for k in range(2)], axis=1)
+    lengths = arc_length(line)
+    at = np.arange(0.0, lengths[-1] + 1e-6, spacing_m)
+    return np.stack([np.interp(at, lengths, line[:, k]) for k in range(2)], axis=1)
 
 
-def headings_of(lines: Float[np.ndarray, "*lines n 2"]) -> Float[np.ndarray, "*lines n"]:
+def compute_headings(lines: Float[np.ndarray, "*lines n 2"]) -> Float[np.ndarray, "*lines n"]:
     """Direction of polylines from each point to the next, rad; at the last point that of the segment before it."""
-    ahead = np.diff(lines, axis=-2, append=2 * lines[..., -1:, :] - lines[..., -2:-1, :])
-    return np.arctan2(ahead[..., 1], ahead[..., 0])
+    steps = np.diff(lines, axis=-2, append=2 * lines[..., -1:, :] - lines[..., -2:-1, :])
+    return np.arctan2(steps[..., 1], steps[..., 0])

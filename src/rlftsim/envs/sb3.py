@@ -19,8 +19,8 @@ class SB3VecEnv(VecEnv):
     """Ego environments as a `VecEnv`, with one network call for scenes that were reset together.
 
     Args:
-        num_envs: number of environments.
-        settings: of `EgoVectorEnv`.
+        num_envs: Number of environments that step together.
+        settings: Arguments of `EgoVectorEnv` by name.
     """
 
     def __init__(self, num_envs: int = 1, **settings: Any):
@@ -60,8 +60,8 @@ class SB3VecEnv(VecEnv):
         """An attribute of the vector environment, once for each environment.
 
         Args:
-            attr_name: its name.
-            indices: environments; None = all.
+            attr_name: Name of the attribute of `EgoVectorEnv`.
+            indices: Indices of environments, for the length of the result; None = all.
         """
         # the spaces are those of one environment
         name = f"single_{attr_name}" if attr_name in ("action_space", "observation_space") else attr_name
@@ -72,9 +72,9 @@ class SB3VecEnv(VecEnv):
         """Set an attribute of the vector environment.
 
         Args:
-            attr_name: its name.
-            value: of all environments.
-            indices: not used, as they share it.
+            attr_name: Name of the attribute of `EgoVectorEnv`.
+            value: New value, which all environments share.
+            indices: Indices of environments, not used: all share the attribute.
         """
         setattr(self.vector, attr_name, value)
 
@@ -84,10 +84,10 @@ class SB3VecEnv(VecEnv):
         """Call a method of the vector environment, once for each environment.
 
         Args:
-            method_name: its name.
-            method_args: by position.
-            indices: environments; None = all.
-            method_kwargs: by name.
+            method_name: Name of the method of `EgoVectorEnv`.
+            method_args: Arguments of the method by position.
+            indices: Indices of environments, for the length of the result; None = all.
+            method_kwargs: Arguments of the method by name.
         """
         return [getattr(self.vector, method_name)(*method_args, **method_kwargs) for _ in self._get_indices(indices)]
 
@@ -95,7 +95,7 @@ class SB3VecEnv(VecEnv):
         """False: environments are not wrapped one by one.
 
         Args:
-            wrapper_class: not used.
-            indices: environments; None = all.
+            wrapper_class: Class of a wrapper, not used: the answer is False for each.
+            indices: Indices of environments, for the length of the result; None = all.
         """
         return [False for _ in self._get_indices(indices)]

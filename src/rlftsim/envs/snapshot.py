@@ -31,16 +31,16 @@ def write_snapshot(episode: Episode, state: EpisodeState, fingerprint: str) -> b
     """Bytes of an episode.
 
     Args:
-        episode: the scenes.
-        state: the present one.
-        fingerprint: of the traffic model.
+        episode: Episode whose world, map and settings do not change.
+        state: Present state of the episode.
+        fingerprint: Fingerprint of the traffic model, which a reader must have, too.
     """
     scene, agent = episode.world.actors.T
     about = {
         "format": FORMAT,
         "model": fingerprint,
         "scenarios": [view.scenario.scenario_id for view in episode.world.scenes],
-        "dice": [[asdict(one) for one in dice] for dice in state.world.dice],
+        "dice": [[asdict(scene_dice) for scene_dice in dice] for dice in state.world.dice],
         "settings": _settings(episode),
         "goals": episode.goals,
     }
@@ -54,8 +54,8 @@ def read_snapshot(saved: bytes, source: Source) -> tuple[Episode, EpisodeState]:
     """Episode and state of a snapshot.
 
     Args:
-        saved: of `write_snapshot`.
-        source: of the environment that goes on with it.
+        saved: Bytes that `write_snapshot` returned.
+        source: Source of the environment that continues the episode.
 
     Raises:
         DataError: no snapshot, or a damaged one.
@@ -68,11 +68,11 @@ def read_snapshot(saved: bytes, source: Source) -> tuple[Episode, EpisodeState]:
         raise DataError("a snapshot of another version: take a new one with snapshot().")
     if about["model"] != source.fingerprint:
         raise ConfigError("the snapshot is of another traffic model: make the environment with the same one.")
-    goals: Any = {name: {int(i): p for i, p in own.items()} for name, own in (about["goals"] or {}).items()}
+    goals: Any = {name: {int(i): p for i, p in points.items()} for name, points in (about["goals"] or {}).items()}
     episode = source.episode([source.scenario(name) for name in about["scenarios"]], goals or None)
-    different = [name for name, value in _settings(episode).items() if about["settings"].get(name) != value]
-    if different:
-        raise ConfigError(f"the snapshot was taken with another {different[0]}: make the environment alike.")
+    differences = [name for name, value in _settings(episode).items() if about["settings"].get(name) != value]
+    if differences:
+        raise ConfigError(f"the snapshot was taken with another {differences[0]}: make the environment alike.")
     if motion.shape[1:] != (episode.num_agents, 5):
         raise ConfigError("the snapshot was taken with other planner-driven agents: make the environment alike.")
     try:
@@ -92,14 +92,14 @@ def _parse(body: bytes) -> tuple[dict[str, Any], np.ndarray]:
         arrays = load(body)
         about = parse_json(arrays["about"].tobytes(), "take one with snapshot()", source="description of a snapshot")
         motion = arrays["motion"]
-        kinds = {"format": str, "model": str, "scenarios": list, "dice": list, "settings": dict}
-        wrong = [name for name, kind in kinds.items() if not isinstance(about.get(name), kind)]
+        types = {"format": str, "model": str, "scenarios": list, "dice": list, "settings": dict}
+        bad_names = [name for name, value_type in types.items() if not isinstance(about.get(name), value_type)]
         goals = about["goals"] or {}
         if not all(isinstance(value, dict) for value in (goals, *goals.values())):
-            wrong.append("goals")
+            bad_names.append("goals")
         is_motion = motion.ndim == 3 and motion.dtype.kind == "f" and np.isfinite(motion).all()
-        if wrong or not is_motion or not about["dice"]:
-            raise ValueError(f"its {wrong[0] if wrong else 'dice' if is_motion else 'motion'} cannot be used")
+        if bad_names or not is_motion or not about["dice"]:
+            raise ValueError(f"its {bad_names[0] if bad_names else 'dice' if is_motion else 'motion'} cannot be used")
     except (SafetensorError, KeyError, AttributeError, ValueError, TypeError) as error:
         raise DataError(f"a damaged snapshot ({error}): take a new one with snapshot().") from None
     return about, motion
@@ -107,5 +107,5 @@ def _parse(body: bytes) -> tuple[dict[str, Any], np.ndarray]:
 
 def _settings(episode: Episode) -> dict[str, Any]:
     """Settings that an episode depends on, as JSON has them."""
-    known = {name: value for name, value in asdict(episode.config).items() if name not in IGNORED}
-    return parse_json(json.dumps(known), "give plain values", source="settings of the environment")
+    settings = {name: value for name, value in asdict(episode.config).items() if name not in IGNORED}
+    return parse_json(json.dumps(settings), "give plain values", source="settings of the environment")

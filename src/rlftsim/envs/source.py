@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from rlftsim.envs.actions import Controls, controls_of
+from rlftsim.envs.actions import Controls, build_controls
 from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.episode import Episode, ScenarioGoals, build_episode
 from rlftsim.envs.world import build_world
@@ -14,10 +14,10 @@ from rlftsim.errors import ConfigError, in_short
 from rlftsim.jobs.threads import one_thread
 from rlftsim.policies.registry import load_policy
 from rlftsim.rollout.fingerprint import fingerprint_policy
-from rlftsim.rollout.policy import Policy, device_of, is_goal_conditioned, is_training
-from rlftsim.scenario.any_form import AnyScenarios, scenarios_of
+from rlftsim.rollout.policy import Policy, get_device, is_goal_conditioned, is_training
+from rlftsim.scenario.any_form import AnyScenarios, to_scenarios
 from rlftsim.scenario.batch import collate
-from rlftsim.scenario.types import Scenario, Scenarios, scenario_ids_of
+from rlftsim.scenario.types import Scenario, Scenarios, list_scenario_ids
 
 KEPT_CONTEXTS = 16
 """Encoded scenarios that are kept: encoding is most of the cost of a reset."""
@@ -27,10 +27,10 @@ class Source:
     """Scenarios, traffic model and settings of an environment.
 
     Args:
-        config: settings.
-        scenarios: in place of the data set that the settings name; of another name the same split.
-        policy: in place of the model that the settings name.
-        controlled: rules of the planner-driven agents, which come first.
+        config: Settings of the environment; `data` and `model` name what is loaded here.
+        scenarios: Scenarios in place of the data set in `config`; a data set by name is read in the split of `config`.
+        policy: Traffic model in place of the one that `config` names, in evaluation mode.
+        controlled: Rules of the planner-driven agents, which come before the drivers of `config`; None = the ego.
 
     Raises:
         ConfigError: settings that do not fit each other.
@@ -51,8 +51,8 @@ class Source:
                 "policy is in training mode, in which dropout makes traffic of one seed differ: call policy.eval()."
             )
         self.config = config
-        self.scenarios: Scenarios = scenarios_of(scenarios if scenarios is not None else config.data, config.split)
-        self.scenario_ids = list(scenario_ids_of(self.scenarios))
+        self.scenarios: Scenarios = to_scenarios(scenarios if scenarios is not None else config.data, config.split)
+        self.scenario_ids = list(list_scenario_ids(self.scenarios))
         self.rules = {**(controlled or {"ego": "planner"}), **config.drivers}
         self.rules.setdefault("*", config.traffic)
         # IDM leaves pedestrians and cyclists to the policy
@@ -61,7 +61,7 @@ class Source:
             policy if policy is not None else load_policy(config.model, config.device) if needs_policy else None
         )
         self.fingerprint = fingerprint_policy(self.policy) if self.policy is not None else "none"
-        self.controls: Controls = controls_of(
+        self.controls: Controls = build_controls(
             config.action, self.policy, horizon=config.horizon, tracker=config.tracker, reverse=config.reverse,
             hard_braking=config.hard_braking,
         )  # fmt: skip
@@ -76,17 +76,17 @@ class Source:
         try:
             return self.scenarios[self.scenario_ids.index(scenario_id)]
         except ValueError:
-            some = ", ".join(self.scenario_ids[:3])
+            examples = ", ".join(self.scenario_ids[:3])
             raise ConfigError(
-                f"no scenario {scenario_id!r}: this environment has {len(self.scenario_ids)}, such as {some}."
+                f"no scenario {scenario_id!r}: this environment has {len(self.scenario_ids)}, such as {examples}."
             ) from None
 
     def episode(self, scenarios: list[Scenario], goals: ScenarioGoals | None = None) -> Episode:
         """An episode in some scenarios, which step together.
 
         Args:
-            scenarios: at least one.
-            goals: scenario id to object id to (x, y) of agents that follow the policy.
+            scenarios: Scenarios of the episode, at least one, which step together.
+            goals: Scenario id to object id to (x, y) of agents that follow the policy, world frame, m.
 
         Raises:
             ConfigError: drivers that do not fit, or goals for a policy that does not follow any.
@@ -111,7 +111,7 @@ class Source:
         key = scenarios[0].scenario_id
         if key not in self._contexts:
             with one_thread(), torch.no_grad():
-                self._contexts[key] = self.policy.encode(collate(scenarios).to(device_of(self.policy)))
+                self._contexts[key] = self.policy.encode(collate(scenarios).to(get_device(self.policy)))
         self._contexts.move_to_end(key)
         while len(self._contexts) > KEPT_CONTEXTS:
             self._contexts.popitem(last=False)

@@ -6,7 +6,7 @@ import numpy as np
 from gymnasium import spaces
 
 from rlftsim.envs.actions import Controls
-from rlftsim.envs.config import ObservationKind
+from rlftsim.envs.config import ObservationFormat
 from rlftsim.envs.observations import BOUND, SHAPES, Observation
 
 
@@ -18,9 +18,9 @@ def action_space(controls: Controls) -> spaces.Space:
     return spaces.Box(-limits, limits, dtype=np.float32)
 
 
-def observation_space(kind: ObservationKind) -> spaces.Space:
+def observation_space(form: ObservationFormat) -> spaces.Space:
     """Space of one agent's observations; "arrays" has the space of "dict"."""
-    if kind == "flat":
+    if form == "flat":
         return spaces.Box(-BOUND, BOUND, (sum(math.prod(shape) for shape in SHAPES.values()),), np.float32)
     return spaces.Dict({
         name: spaces.Box(0, 1, shape, np.int8)
@@ -30,16 +30,16 @@ def observation_space(kind: ObservationKind) -> spaces.Space:
     })  # fmt: skip
 
 
-def shown(observation: Observation, kind: ObservationKind, row: int | None = None):
+def format_observation(observation: Observation, form: ObservationFormat, row: int | None = None):
     """An observation in the form of its space.
 
     Args:
-        observation: of M agents.
-        kind: of the space.
-        row: one of them; None = all.
+        observation: Observation of M agents.
+        form: Form of the observation, as the setting `observation` has it.
+        row: Row of a single agent; None = all agents, with a leading axis M.
     """
-    if kind == "arrays":
+    if form == "arrays":
         return observation
-    if kind == "flat":
+    if form == "flat":
         return observation.flat() if row is None else observation.flat()[row]
     return observation.by_name() if row is None else observation.of_agent(row)

@@ -52,41 +52,41 @@ class TrafficScores:
 def score_traffic(record: Record) -> TrafficScores:
     """Events of the other agents in one episode."""
     scene, motion = record.scene, record.motion
-    others = np.arange(len(scene.object_id)) != record.agent
-    vehicles = others & (scene.object_type == ObjectType.VEHICLE)
-    has_edges, has_lanes = (found(scene.scenario) is not None for found in (road_edges, lane_search))
+    is_traffic = np.arange(len(scene.object_id)) != record.agent
+    is_vehicle = is_traffic & (scene.object_type == ObjectType.VEHICLE)
+    has_edges, has_lanes = (find(scene.scenario) is not None for find in (road_edges, lane_search))
     # 1. contacts among the others; those that begin with an overlap do not count
     length, width = scene.size[:, 0].astype(np.float32), scene.size[:, 1].astype(np.float32)
     overlaps = compute_overlap(
         motion[None, ..., :2].astype(np.float32), motion[None, ..., 2].astype(np.float32), length, width,
-        (record.known & others[:, None])[None], ignore_from=0,
+        (record.is_observed & is_traffic[:, None])[None], ignore_from=0,
         z=None if scene.levels is None else record.z[None], height=scene.size[:, 2],
     )[0].any(1)  # fmt: skip
     # 2. kinematics over half a second whose states are all known
     speed = np.linalg.norm(np.diff(motion[..., :2], axis=1), axis=-1) / STEP_S  # [A, T]
     speeds = _runs(speed, SPAN_STEPS + 1)
     change = np.abs(speeds[..., -1] - speeds[..., 0]) / (SPAN_STEPS * STEP_S)
-    jolt = (change > INFEASIBLE_ACCELERATION_MPS2) & _runs(record.known, SPAN_STEPS + 2).all(-1)
+    jolt = (change > INFEASIBLE_ACCELERATION_MPS2) & _runs(record.is_observed, SPAN_STEPS + 2).all(-1)
     driven = _runs(speed, SPAN_STEPS).sum(-1) * STEP_S
     headings = _runs(motion[..., 2], SPAN_STEPS + 1)
     turn = np.abs(wrapped(headings[..., -1] - headings[..., 0]))
-    fast = (driven > SLOW_MPS * SPAN_STEPS * STEP_S) & _runs(record.known, SPAN_STEPS + 1).all(-1)
+    fast = (driven > SLOW_MPS * SPAN_STEPS * STEP_S) & _runs(record.is_observed, SPAN_STEPS + 1).all(-1)
     tight = np.where(fast, turn / np.maximum(driven, 1e-3), 0.0) > INFEASIBLE_CURVATURE
     return TrafficScores(
         ego_contacts=float(len(record.collisions)),
         risky_approach_rate=float(least_time_to_collision(record) < RISKY_TTC_S),
-        others_collision_rate=_rate(overlaps, others),
-        others_offroad_rate=_rate(_leaves_road(record), vehicles & has_edges),
-        others_wrong_way_rate=_rate(_drives_against(record, vehicles), vehicles & has_lanes),
-        others_acceleration_rate=_rate(np.any(jolt, axis=1), vehicles),
-        others_steering_rate=_rate(np.any(tight, axis=1), vehicles),
+        others_collision_rate=_rate(overlaps, is_traffic),
+        others_offroad_rate=_rate(_leaves_road(record), is_vehicle & has_edges),
+        others_wrong_way_rate=_rate(_drives_against(record, is_vehicle), is_vehicle & has_lanes),
+        others_acceleration_rate=_rate(np.any(jolt, axis=1), is_vehicle),
+        others_steering_rate=_rate(np.any(tight, axis=1), is_vehicle),
         blamed_others_rate=blamed_others_rate(record.collisions),
     )
 
 
 def blamed_others_rate(collisions: Sequence[Collision]) -> float:
     """Fraction of contacts with the planner's agent, in one episode or several, not its fault; NaN without."""
-    return sum(not one.at_fault for one in collisions) / len(collisions) if collisions else np.nan
+    return sum(not collision.at_fault for collision in collisions) / len(collisions) if collisions else np.nan
 
 
 def _rate(event: Bool[np.ndarray, "A"], among: Bool[np.ndarray, "A"]) -> float:
@@ -110,28 +110,28 @@ def _leaves_road(record: Record) -> Bool[np.ndarray, "A"]:
     states = Trajectories(*(torch.from_numpy(v.copy()).float()[None] for v in motion))
     size = torch.from_numpy(scene.size).float()
     off = compute_distance_to_road_edge(states, size, edges, max_pairs=MAX_PAIRS)[0].numpy()
-    return ((off >= OUTSIDE_M) & record.known).any(1) & (off[:, 0] < OUTSIDE_M)
+    return ((off >= OUTSIDE_M) & record.is_observed).any(1) & (off[:, 0] < OUTSIDE_M)
 
 
 def _drives_against(record: Record, vehicles: Bool[np.ndarray, "A"]) -> Bool[np.ndarray, "A"]:
     """True = drives 2 m or more within a second against every lane that it is in."""
-    search, found = lane_search(record.scene.scenario), np.zeros(len(vehicles), bool)
+    search, is_against = lane_search(record.scene.scenario), np.zeros(len(vehicles), bool)
     if search is None:
-        return found
+        return is_against
     # a replayed agent jumps over the gaps of its log
-    known = record.known[:, 1:] & record.known[:, :-1]
-    step = np.where(known, np.linalg.norm(np.diff(record.motion[..., :2], axis=1), axis=-1), 0.0)
+    is_step_observed = record.is_observed[:, 1:] & record.is_observed[:, :-1]
+    step = np.where(is_step_observed, np.linalg.norm(np.diff(record.motion[..., :2], axis=1), axis=-1), 0.0)
     moving = np.flatnonzero(vehicles & (step.sum(1) >= WRONG_WAY_M[0]))
     for agent in moving:
-        near = search.find_near(record.motion[agent, 1:, :2], LANE_M, record.ground[agent, 1:])
+        lane_points = search.find_points(record.motion[agent, 1:, :2], LANE_M, record.ground[agent, 1:])
         heading = record.motion[agent, 1:, 2]
         against = [
-            bool(points) and bool((np.cos(search.heading[points] - own) < 0).all())
-            for points, own in zip(near, heading)
+            bool(points) and bool((np.cos(search.heading[points] - direction) < 0).all())
+            for points, direction in zip(lane_points, heading)
         ]
         window = np.ones(min(WRONG_WAY_STEPS, len(against)))
-        found[agent] = np.convolve(np.where(against, step[agent], 0.0), window, "valid").max() >= WRONG_WAY_M[0]
-    return found
+        is_against[agent] = np.convolve(np.where(against, step[agent], 0.0), window, "valid").max() >= WRONG_WAY_M[0]
+    return is_against
 
 
 class _WithoutEgo(Scenario):
@@ -140,25 +140,25 @@ class _WithoutEgo(Scenario):
     @cached_property
     def evaluated_indices(self) -> Int64[np.ndarray, "E"]:
         """Tracks to predict, by ascending object id."""
-        chosen = np.unique(self.tracks_to_predict.astype(np.int64))
-        chosen = chosen[self.tracks.valid[chosen, CURRENT_STEP] & (chosen != self.ego_index)]
-        return chosen[np.argsort(self.tracks.object_id[chosen], kind="stable")]
+        rows = np.unique(self.tracks_to_predict.astype(np.int64))
+        rows = rows[self.tracks.valid[rows, CURRENT_STEP] & (rows != self.ego_index)]
+        return rows[np.argsort(self.tracks.object_id[rows], kind="stable")]
 
 
-def realism_of_others(records: Sequence[Record], config: MetricConfig = METRIC_2025) -> float:
+def compute_traffic_realism(records: Sequence[Record], config: MetricConfig = METRIC_2025) -> float:
     """Realism meta-metric of the agents to predict, the ego left out, over rollouts of one scenario.
 
     NaN where it cannot be measured: no future, no road edges, an episode that ended early, or no other agent to
     predict.
 
     Args:
-        records: episodes of one scenario, at least one.
-        config: the metric's year.
+        records: Records of the same scenario, at least one, a rollout each.
+        config: Version of the metric; 2025 by default.
     """
     scene = records[0].scene
-    scenario = _WithoutEgo(**{one.name: getattr(scene.scenario, one.name) for one in fields(Scenario)})
-    is_whole = all(record.steps == FUTURE_STEPS for record in records)
-    if not (scenario.has_evaluated_future and is_whole) or road_edges(scene.scenario) is None:
+    scenario = _WithoutEgo(**{field.name: getattr(scene.scenario, field.name) for field in fields(Scenario)})
+    has_all_steps = all(record.steps == FUTURE_STEPS for record in records)
+    if not (scenario.has_evaluated_future and has_all_steps) or road_edges(scene.scenario) is None:
         return float("nan")
     motion = torch.from_numpy(np.stack([record.motion[:, 1:] for record in records]))  # [N, A, 80, 5]
     world = (motion[..., :2] + torch.from_numpy(scene.scenario.origin)).float()

@@ -10,12 +10,12 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from jaxtyping import Bool, Int64
 
-from rlftsim.envs.actions import checked
+from rlftsim.envs.actions import validate_actions
 from rlftsim.envs.config import EnvConfig
 from rlftsim.envs.episode import Episode, EpisodeState, advance, look, start
-from rlftsim.envs.resets import about, chosen, config_of, fresh_seed, note_of
+from rlftsim.envs.resets import build_config, choose_scenario, describe_start, describe_step, draw_seed
 from rlftsim.envs.source import Source
-from rlftsim.envs.spaces import action_space, observation_space, shown
+from rlftsim.envs.spaces import action_space, format_observation, observation_space
 from rlftsim.errors import ConfigError, in_short, whole_number
 from rlftsim.rollout.policy import Policy
 from rlftsim.scenario.any_form import AnyScenarios
@@ -52,11 +52,12 @@ class EgoVectorEnv(VectorEnv):
     end early are reset on their own and form smaller groups, so `stop_on=()` is fastest.
 
     Args:
-        num_envs: number of slots.
-        autoreset_mode: of Gymnasium: at the next step, in the same step, or by `reset(options={"reset_mask": ...})`.
-        scenarios: in place of the data set `data`.
-        policy: in place of the traffic model `model`.
-        settings: fields of `EnvConfig` by name; pictures and pages are those of `EgoEnv` alone.
+        num_envs: Number of slots, each with an episode of its own.
+        autoreset_mode: Time of Gymnasium's automatic resets: at the next step, in the same step, or by
+            `reset(options={"reset_mask": ...})`.
+        scenarios: Scenario, list of scenarios or data set, in place of the setting `data`.
+        policy: Traffic model in place of the one that the setting `model` names, in evaluation mode.
+        settings: Fields of `EnvConfig` by name; pictures and pages are those of `EgoEnv` alone.
     """
 
     metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
@@ -70,7 +71,7 @@ class EgoVectorEnv(VectorEnv):
         policy: Policy | None = None,
         **settings: Any,
     ):
-        config: EnvConfig = config_of(settings)
+        config: EnvConfig = build_config(settings)
         if config.render_mode is not None or config.observation == "arrays":
             raise ConfigError("a vector of environments renders nothing and observes 'dict' or 'flat': change these.")
         self.source = Source(config, scenarios, policy)
@@ -94,8 +95,8 @@ class EgoVectorEnv(VectorEnv):
         """Begin episodes in all slots, or in those of `options["reset_mask"]`.
 
         Args:
-            seed: s gives slot i the seed s + i; or one seed for each.
-            options: as of `EgoEnv`, the same for all.
+            seed: Number s, which gives slot i the seed s + i; or a list with a seed per slot.
+            options: Options of `EgoEnv.reset`, the same for all slots.
 
         Raises:
             ConfigError: an unknown option or scenario.
@@ -112,8 +113,8 @@ class EgoVectorEnv(VectorEnv):
         """As `reset`, with the infos of each slot by themselves.
 
         Args:
-            seed: s gives slot i the seed s + i; or one seed for each.
-            options: as of `EgoEnv`, the same for all, and "reset_mask".
+            seed: Number s, which gives slot i the seed s + i; or a list with a seed per slot.
+            options: Options of `EgoEnv.reset`, the same for all slots, and "reset_mask" [num_envs].
 
         Raises:
             ConfigError: an unknown option or scenario.
@@ -125,15 +126,15 @@ class EgoVectorEnv(VectorEnv):
         if not self._groups and not mask.all():
             raise ConfigError("the first reset begins an episode in every slot: leave out reset_mask.")
         if isinstance(seed, list | tuple | np.ndarray):
-            seeds = [None if one is None else whole_number("seed", one, 0) for one in seed]
+            seeds = [None if number is None else whole_number("seed", number, 0) for number in seed]
         else:
             seeds = [None if seed is None else whole_number("seed", seed, 0) + i for i in range(self.num_envs)]
         if len(seeds) != self.num_envs:
             raise ConfigError(f"seed has {len(seeds)} numbers, it must be one number or {self.num_envs}.")
-        for i, given in enumerate(seeds):
-            if len(self._slots) <= i or given is not None:
-                used = fresh_seed() if given is None else given
-                self._slots[i : i + 1] = [_Slot(seeding.np_random(used)[0], used)]
+        for i, slot_seed in enumerate(seeds):
+            if len(self._slots) <= i or slot_seed is not None:
+                new_seed = draw_seed() if slot_seed is None else slot_seed
+                self._slots[i : i + 1] = [_Slot(seeding.np_random(new_seed)[0], new_seed)]
         notes: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         self._reset(np.flatnonzero(mask), options, notes)
         return self._observe(), notes
@@ -144,7 +145,7 @@ class EgoVectorEnv(VectorEnv):
         """Carry out one action in every slot.
 
         Args:
-            actions: of the action space.
+            actions: Planner actions [num_envs, ...], in the units of the action space.
 
         Raises:
             ConfigError: as `step_slots`.
@@ -161,7 +162,7 @@ class EgoVectorEnv(VectorEnv):
         """As `step`, with the infos of each slot by themselves.
 
         Args:
-            actions: of the action space.
+            actions: Planner actions [num_envs, ...], in the units of the action space.
 
         Raises:
             ConfigError: before `reset`, or an action with a NaN or of another shape; with autoreset disabled a slot
@@ -171,7 +172,7 @@ class EgoVectorEnv(VectorEnv):
             raise ConfigError("these environments have no episodes yet: call reset() first.")
         controls = self.source.controls
         # all slots before any of them moves
-        actions = checked(actions, controls, self._name_of, self.num_envs)
+        actions = validate_actions(actions, controls, self._name_of, self.num_envs)
         over = np.flatnonzero(self._over)
         if self.autoreset_mode == AutoresetMode.DISABLED and len(over):
             raise ConfigError(f"the episode of slot {over[0]} is over: reset it with options={{'reset_mask': ...}}.")
@@ -194,7 +195,7 @@ class EgoVectorEnv(VectorEnv):
             rewards[slots] = outcome.reward[group.live]
             terminated[slots], truncated[slots] = outcome.terminated[group.live], outcome.truncated[group.live]
             for row, slot in zip(group.live, slots):
-                notes[slot] = note_of(group.episode, group.state, outcome, int(row))
+                notes[slot] = describe_step(group.episode, group.state, outcome, int(row))
         self._over = terminated | truncated
         # 3. the same step resets at once and hands over the last observation beside the first
         ended = np.flatnonzero(self._over)
@@ -202,45 +203,48 @@ class EgoVectorEnv(VectorEnv):
             last, final = self._observe(), {slot: notes[slot] for slot in ended}
             self._reset(ended, {}, notes)
             for slot in ended:
-                seen = {name: values[slot] for name, values in last.items()} if isinstance(last, dict) else last[slot]
-                notes[slot] |= {"final_obs": seen, "final_info": final[slot]}
+                is_dict = isinstance(last, dict)
+                final_observation = {name: values[slot] for name, values in last.items()} if is_dict else last[slot]
+                notes[slot] |= {"final_obs": final_observation, "final_info": final[slot]}
         return self._observe(), rewards, terminated, truncated, notes
 
     def _name_of(self, slot: int) -> str:
         group = next(group for group in self._groups if slot in group.slots)
-        return f"slot {slot}, {group.episode.name_of(int(np.flatnonzero(group.slots == slot)[0]))}"
+        return f"slot {slot}, {group.episode.agent_name(int(np.flatnonzero(group.slots == slot)[0]))}"
 
-    def _reset(self, which: np.ndarray, options: dict[str, Any], notes: list[dict[str, Any]]) -> None:
+    def _reset(self, slots: np.ndarray, options: dict[str, Any], notes: list[dict[str, Any]]) -> None:
         """Begin episodes of some slots, which form a group, and note what there is to say about them."""
         picks = []
-        for i in which:
+        for i in slots:
             slot = self._slots[i]
-            picks.append(chosen(slot.random, self.source, options, slot.seed, slot.count))
+            picks.append(choose_scenario(slot.random, self.source, options, slot.seed, slot.count))
             slot.count += 1
         scenarios = [self.source.scenario(scenario_id) for scenario_id, _, _ in picks]
-        goals = {scenario_id: own for scenario_id, _, own in picks if own}
+        goals = {scenario_id: scenario_goals for scenario_id, _, scenario_goals in picks if scenario_goals}
         episode = self.source.episode(scenarios, goals or None)
         if episode.num_agents != len(picks):
             raise ConfigError("the planner drives more than the egos: take rlftsim.envs.parallel_env.")
         state = start(episode, tuple(dice for _, dice, _ in picks))
         # groups lose the slots that went on, and are dropped when they have none left
-        kept = [replace(group, slots=np.where(np.isin(group.slots, which), -1, group.slots)) for group in self._groups]
-        self._groups = [*(group for group in kept if len(group.live)), _Group(episode, state, np.array(which))]
-        self._over[which] = False
-        for row, i in enumerate(which):
-            notes[i] = about(episode, state, row, self.source)
+        groups = [
+            replace(group, slots=np.where(np.isin(group.slots, slots), -1, group.slots)) for group in self._groups
+        ]
+        self._groups = [*(group for group in groups if len(group.live)), _Group(episode, state, np.array(slots))]
+        self._over[slots] = False
+        for row, i in enumerate(slots):
+            notes[i] = describe_start(episode, state, row, self.source)
 
     def _observe(self) -> Any:
         """Observations of all slots in order."""
-        kind = self.source.config.observation
-        seen: list[Any] = [shown(look(group.episode, group.state), kind) for group in self._groups]
-        if len(seen) == 1 and len(self._groups[0].live) == self.num_envs:
-            return seen[0]  # a group of all slots has them in order
+        form = self.source.config.observation
+        observations: list[Any] = [format_observation(look(group.episode, group.state), form) for group in self._groups]
+        if len(observations) == 1 and len(self._groups[0].live) == self.num_envs:
+            return observations[0]  # a group of all slots has them in order
         order = np.argsort(np.concatenate([group.slots[group.live] for group in self._groups]))
 
         def joined(arrays: list[np.ndarray]) -> np.ndarray:
             return np.concatenate([array[group.live] for array, group in zip(arrays, self._groups)])[order]
 
-        if kind == "flat":
-            return joined(seen)
-        return {name: joined([one[name] for one in seen]) for name in seen[0]}
+        if form == "flat":
+            return joined(observations)
+        return {name: joined([arrays[name] for arrays in observations]) for name in observations[0]}

@@ -22,14 +22,14 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from rlftsim.envs.drivers import Driver, Rules, drivers_of
-from rlftsim.envs.idm import IdmConfig, IdmLines, advance_idm, idm_lines
+from rlftsim.envs.drivers import Driver, Rules, assign_drivers
+from rlftsim.envs.idm import IdmConfig, IdmLines, advance_idm, build_idm_lines
 from rlftsim.envs.scene import Scene, build_env_scene
 from rlftsim.errors import ConfigError, in_short
 from rlftsim.goals.types import Goals, PointById
 from rlftsim.jobs.threads import one_thread
 from rlftsim.rollout.noise import draw_noise
-from rlftsim.rollout.policy import Policy, Sampling, device_of
+from rlftsim.rollout.policy import Policy, Sampling, get_device
 from rlftsim.rollout.types import AgentStates
 from rlftsim.scenario.batch import ScenarioBatch, collate
 from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, STEP_S, TOTAL_STEPS, Scenario
@@ -72,9 +72,9 @@ class World:
     sampling: Sampling
     lines: tuple[IdmLines, ...]
     """Of the IDM-driven agents of each scene."""
-    there: Bool[np.ndarray, "B A 91"]
+    is_present: Bool[np.ndarray, "B A 91"]
     """True = the agent is there at a step of the log's time (10 is the current one); replayed ones until it ends."""
-    known: Bool[np.ndarray, "B A 91"]
+    is_observed: Bool[np.ndarray, "B A 91"]
     """True = it is there, and not held in a gap of its log: contacts and scores count these states alone."""
     has_levels: Bool[np.ndarray, "B"]
     """True = heights count in the scene, see `levels`."""
@@ -84,7 +84,7 @@ class World:
 class Block:
     """Decisions of the policy that are being carried out."""
 
-    before: Any
+    policy_state: Any
     """State of the policy before them."""
     decision: Tensor | None
     """None before the first block."""
@@ -106,7 +106,7 @@ class WorldState:
     """Of all decisions of the episode."""
     dice: tuple[tuple[Dice, ...], ...]
     """Dice of each scene, at each decision taken so far and for all that follow (the last entry)."""
-    places: tuple[Float[np.ndarray, "_ 2"], ...]
+    idm_states: tuple[Float[np.ndarray, "_ 2"], ...]
     """Distance along the line, and speed, of the IDM-driven agents of each scene."""
 
     @property
@@ -115,7 +115,7 @@ class WorldState:
         return len(self.track) - 1 - CURRENT_STEP
 
     @property
-    def now(self) -> Float[np.ndarray, "B A 5"]:
+    def motion(self) -> Float[np.ndarray, "B A 5"]:
         """Present motion."""
         return self.track[-1]
 
@@ -132,12 +132,12 @@ def build_world(
     """The world of some scenarios, which step together.
 
     Args:
-        scenarios: at least one.
-        policy: the traffic model; it is left out where the rules give it no agent.
-        rules: agents to driver, see `drivers_of`.
-        goals: of agents that follow the policy, scenario id to object id to (x, y), world frame.
-        sampling: temperature and truncation of its decisions.
-        context: `policy.encode` of these scenarios, if it is known.
+        scenarios: Scenarios that step together, at least one.
+        policy: Traffic model; left out where the rules give no agent to it.
+        rules: Agents to driver, the first match wins, see `assign_drivers`.
+        goals: Scenario id to object id to (x, y) of agents that follow the policy, world frame, m.
+        sampling: Temperature and truncation of the policy's decisions.
+        context: Result of `policy.encode` for these scenarios; None = computed here.
 
     Raises:
         ConfigError: a rule that does not fit, or agents that follow a policy where there is none.
@@ -145,11 +145,11 @@ def build_world(
     scenes = tuple(build_env_scene(scenario) for scenario in scenarios)
     batch = collate(scenarios)
     shape = tuple(batch.agent_mask.shape)
-    drivers = padded([drivers_of(scene, rules) for scene in scenes], shape, -1)
+    drivers = padded([assign_drivers(scene, rules) for scene in scenes], shape, -1)
     followers = bool((drivers == Driver.POLICY).any())
     if followers and policy is None:
         raise ConfigError("some agents follow the policy, but there is no model: name one, or give them other drivers.")
-    batch = batch.to(device_of(policy)) if followers else batch
+    batch = batch.to(get_device(policy)) if followers else batch
     if followers and context is None:
         assert policy is not None
         with one_thread(), torch.no_grad():
@@ -159,8 +159,8 @@ def build_world(
     # from the current step on all agents exist, but replayed ones are gone after the last state of their log
     goes_on = np.maximum.accumulate(valid[..., ::-1], axis=-1)[..., ::-1]
     simulated = (drivers != Driver.REPLAY)[..., None]
-    there = mask[..., None] & (simulated | goes_on)
-    there[..., : CURRENT_STEP + 1] = valid[..., : CURRENT_STEP + 1]
+    is_present = mask[..., None] & (simulated | goes_on)
+    is_present[..., : CURRENT_STEP + 1] = valid[..., : CURRENT_STEP + 1]
     idm_rows = [np.flatnonzero(row[: len(scene.object_id)] == Driver.IDM) for row, scene in zip(drivers, scenes)]
     return World(
         scenes=scenes,
@@ -174,28 +174,28 @@ def build_world(
         logged=padded([scene.logged for scene in scenes], (*shape, TOTAL_STEPS, 5)),
         logged_z=padded([scene.logged_z for scene in scenes], (*shape, TOTAL_STEPS)),
         valid=valid,
-        there=there,
-        known=there & (simulated | valid),
+        is_present=is_present,
+        is_observed=is_present & (simulated | valid),
         has_levels=np.array([scene.levels is not None for scene in scenes]),
         policy=policy if followers else None,
         context=context if followers else None,
         goals=Goals.from_points(batch, goals) if goals and followers else None,
         sampling=sampling,
-        lines=tuple(idm_lines(scene, rows, IDM) for scene, rows in zip(scenes, idm_rows)),
+        lines=tuple(build_idm_lines(scene, rows, IDM) for scene, rows in zip(scenes, idm_rows)),
     )
 
 
-def padded(parts: list[np.ndarray], shape: tuple[int, ...], fill: float | int | bool = 0.0) -> np.ndarray:
+def padded(arrays: list[np.ndarray], shape: tuple[int, ...], fill: float | int | bool = 0.0) -> np.ndarray:
     """Arrays that differ in the length of their first axis, in one array.
 
     Args:
-        parts: at least one.
-        shape: of the result; its first axis has an entry for each part.
-        fill: value beyond a part's end.
+        arrays: Arrays of the same type, at least one.
+        shape: Shape of the result; its first axis has an entry for each array.
+        fill: Value beyond the end of each array.
     """
-    out = np.full((len(parts), *shape[1:]), fill, parts[0].dtype)
-    for row, part in zip(out, parts):
-        row[: len(part)] = part
+    out = np.full((len(arrays), *shape[1:]), fill, arrays[0].dtype)
+    for row, array in zip(out, arrays):
+        row[: len(array)] = array
     return out
 
 
@@ -203,8 +203,8 @@ def begin(world: World, dice: Sequence[Dice]) -> WorldState:
     """The world at the current step of its logs.
 
     Args:
-        world: the scenes.
-        dice: of each scene.
+        world: Scenes that step together, with the drivers of all agents.
+        dice: Randomness of the traffic, per scene.
     """
     block = noise = None
     if world.policy is not None:
@@ -213,24 +213,24 @@ def begin(world: World, dice: Sequence[Dice]) -> WorldState:
             block = Block(world.policy.begin(world.context, 1, world.goals, initial), None, None)
         noise = _decision_noise(world, dice)
     speed = [np.linalg.norm(scene.logged[lines.agents, CURRENT_STEP, 3:], axis=-1) for scene, lines in _idm(world)]
-    places = tuple(np.stack([np.zeros_like(v), v], -1) for v in speed)
+    idm_states = tuple(np.stack([np.zeros_like(v), v], -1) for v in speed)
     track = tuple(np.moveaxis(world.logged[:, :, : CURRENT_STEP + 1], 2, 0).copy())
     z = (world.logged_z[:, :, CURRENT_STEP],) * len(track)
-    return WorldState(track, z, block, noise, (tuple(dice),), places)
+    return WorldState(track, z, block, noise, (tuple(dice),), idm_states)
 
 
 def step_world(world: World, state: WorldState, moved: Float[np.ndarray, "M 5"]) -> WorldState:
     """The state 0.1 s later.
 
     Args:
-        world: the scenes.
-        state: before the step.
-        moved: motion of the planner-driven agents after the step, in the order of `world.actors`.
+        world: Scenes that step together, with the drivers of all agents.
+        state: State before the step; not changed.
+        moved: Motion of the planner-driven agents after the step, in the order of `world.actors`.
     """
     block, dice = state.block, state.dice
     following = len(state.track)  # step of the log's time that is being computed
     motion = world.logged[:, :, min(following, world.logged.shape[2] - 1)].copy()  # replayed agents
-    before = state.now
+    previous = state.motion
     # 1. agents of the policy, and those that keep their velocity
     if block is not None:
         assert world.policy is not None
@@ -239,34 +239,41 @@ def step_world(world: World, state: WorldState, moved: Float[np.ndarray, "M 5"])
             dice = (*dice, dice[-1])
         assert block.poses is not None
         poses = block.poses[:, :, state.step % world.policy.steps_per_decision]
-        velocity = (poses[..., :2] - before[..., :2]) / STEP_S
+        velocity = (poses[..., :2] - previous[..., :2]) / STEP_S
         follows = world.drivers == Driver.POLICY
         motion[follows] = np.concatenate([poses, velocity], -1)[follows]
     coasts = world.drivers == Driver.CONSTANT_VELOCITY
     if coasts.any():
-        motion[coasts] = before[coasts]
-        motion[coasts, :2] += STEP_S * before[coasts, 3:]
+        motion[coasts] = previous[coasts]
+        motion[coasts, :2] += STEP_S * previous[coasts, 3:]
     # 2. IDM-driven vehicles
-    places = state.places
+    idm_states = state.idm_states
     driven = world.drivers == Driver.IDM
-    motion[driven] = before[driven]
+    motion[driven] = previous[driven]
     motion[driven, 3:] = 0.0  # parked ones stay; those with a line move below
     if any(len(lines.agents) for lines in world.lines):
-        present = world.there[:, :, following - 1]
+        present = world.is_present[:, :, following - 1]
         moves = [
             advance_idm(
-                lines, place, before[b, :count], state.z[-1][b, :count], present[b, :count], scene, following - 1, IDM
+                lines,
+                idm_state,
+                previous[b, :count],
+                state.z[-1][b, :count],
+                present[b, :count],
+                scene,
+                following - 1,
+                IDM,
             )
-            for b, ((scene, lines), place) in enumerate(zip(_idm(world), places))
+            for b, ((scene, lines), idm_state) in enumerate(zip(_idm(world), idm_states))
             for count in [len(scene.object_id)]
         ]
-        places = tuple(place for place, _ in moves)
+        idm_states = tuple(idm_state for idm_state, _ in moves)
         for b, (lines, (_, moving)) in enumerate(zip(world.lines, moves)):
             motion[b, lines.agents] = moving
     # 3. the planner's agents; padding stays at zero
     motion[world.actors[:, 0], world.actors[:, 1]] = moved
     z = _follow_levels(world, state.z[-1], motion, following) if world.has_levels.any() else state.z[-1]
-    return WorldState((*state.track, motion), (*state.z, z), block, state.noise, dice, places)
+    return WorldState((*state.track, motion), (*state.z, z), block, state.noise, dice, idm_states)
 
 
 def _follow_levels(
@@ -275,10 +282,10 @@ def _follow_levels(
     """Heights of the centers after a step: replayed agents have logged ones, the others stay on their level's ground.
 
     Args:
-        world: The scenes.
-        z: Heights before the step.
-        motion: Motion after it.
-        step: Step of the log's time.
+        world: Scenes that step together.
+        z: Heights of the centers before the step, m.
+        motion: Motion of all agents after the step.
+        step: Step of the log's time after the step, 11 to 90.
     """
     z = z.copy()
     for b, scene in enumerate(world.scenes):
@@ -294,11 +301,11 @@ def fork(world: World, state: WorldState, number: int, noise: Noise = "same") ->
     """States that go on from the same one: nothing is copied but the noise of the decisions to come.
 
     Args:
-        world: the scenes.
-        state: where the branches begin.
-        number: of branches.
-        noise: "same" = all meet the dice of `state`; "new" = branch i meets those of rollout + 1 + i, from the next
-            decision on.
+        world: Scenes that step together, with the drivers of all agents.
+        state: State where the branches begin; not changed.
+        number: Number of branches to return.
+        noise: Dice of the branches: "same" = all meet the dice of `state`; "new" = branch i meets those of
+            rollout + 1 + i, from the next decision on.
 
     Raises:
         ConfigError: another word for the noise.
@@ -317,9 +324,9 @@ def with_dice(world: World, state: WorldState, dice: Sequence[Dice]) -> WorldSta
     """The same state with other dice from the next decision on.
 
     Args:
-        world: the scenes.
-        state: of these.
-        dice: of each scene.
+        world: Scenes that step together, with the drivers of all agents.
+        state: State of these scenes; not changed.
+        dice: Randomness of the traffic, per scene.
     """
     noise = None if state.noise is None else _decision_noise(world, dice)
     return replace(state, noise=noise, dice=(*state.dice[:-1], tuple(dice)))
@@ -332,14 +339,14 @@ def _decide(world: World, state: WorldState) -> Block:
     assert block is not None
     assert state.noise is not None
     with one_thread(), torch.no_grad():
-        before = block.before
+        policy_state = block.policy_state
         if block.decision is not None:
-            before = policy.advance(world.context, before, block.decision, _forced(world, state))
-        distribution = policy.decide(world.context, before)
+            policy_state = policy.advance(world.context, policy_state, block.decision, _forced(world, state))
+        distribution = policy.decide(world.context, policy_state)
         index = state.step // policy.steps_per_decision
         decision = distribution.sample(world.sampling, state.noise[..., index, :])
-        poses = policy.advance(world.context, before, decision).poses
-    return Block(before, decision, poses[:, 0].cpu().numpy().astype(np.float64))
+        poses = policy.advance(world.context, policy_state, decision).poses
+    return Block(policy_state, decision, poses[:, 0].cpu().numpy().astype(np.float64))
 
 
 def _forced(world: World, state: WorldState) -> AgentStates | None:
@@ -364,8 +371,11 @@ def _decision_noise(world: World, dice: Sequence[Dice]) -> Tensor:
 def _noise(world: World, dice: Sequence[Dice], purpose: str, per_agent: int) -> Float[Tensor, "B 1 A k"]:
     """Noise of scenes with dice of their own, as `simulate` draws it for each of them."""
     return torch.cat([
-        draw_noise(one, range(d.rollout, d.rollout + 1), seed=d.seed, purpose=purpose, per_agent=per_agent)
-        for one, d in zip(world.batch.split(1), dice)
+        draw_noise(
+            scenario_batch, range(scene_dice.rollout, scene_dice.rollout + 1), seed=scene_dice.seed, purpose=purpose,
+            per_agent=per_agent,
+        )
+        for scenario_batch, scene_dice in zip(world.batch.split(1), dice)
     ])  # fmt: skip
 
 

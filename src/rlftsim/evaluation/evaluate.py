@@ -4,6 +4,7 @@ An interrupted evaluation is resumed by the same call, see `evaluation.resumable
 """
 
 import copy
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -14,7 +15,7 @@ from typing import Any, Literal, TypeVar
 import torch
 from torch import nn
 
-from rlftsim.errors import ConfigError, DataError
+from rlftsim.errors import ConfigError, DataError, whole_number
 from rlftsim.evaluation.results import (
     NUMBERS_VERSION,
     EvaluateConfig,
@@ -24,17 +25,17 @@ from rlftsim.evaluation.results import (
     Skipped,
     row_of_result,
 )
-from rlftsim.evaluation.resumable import EvaluationParts, groups_of, resume_evaluation
+from rlftsim.evaluation.resumable import ScenarioRows, resume_evaluation
 from rlftsim.evaluation.scenario_source import choose_scenarios, hash_manifest, open_held_out
 from rlftsim.goals.logged import logged_goals
 from rlftsim.goals.types import Goals
-from rlftsim.jobs.buckets import require_folder
-from rlftsim.jobs.runner import Runner, on_this_machine
+from rlftsim.jobs.buckets import validate_folder
+from rlftsim.jobs.runner import Runner, choose_runner
 from rlftsim.realism import SimulatedStates, metric_by_name, scenario_log, score
 from rlftsim.realism.from_rollouts import logged_states, states_of_rollouts
 from rlftsim.rollout.fingerprint import fingerprint_policy
-from rlftsim.rollout.policy import Policy, device_of, is_goal_conditioned
-from rlftsim.rollout.simulate import refuse_sampling, simulate
+from rlftsim.rollout.policy import Policy, get_device, is_goal_conditioned
+from rlftsim.rollout.simulate import check_sampling, simulate
 from rlftsim.scenario.batch import ScenarioBatch, collate
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.types import Scenario
@@ -66,40 +67,40 @@ def evaluate(
 ) -> Evaluation:
     """Score a policy on the scenarios of a data set; the result is also written to `out/<name>.parquet`.
 
-    Interrupted in any way, the same call goes on where it was. Once finished, it reads the file.
+    Interrupted in any way, the same call goes on; once finished, it reads the result.
 
     Args:
-        policy: any policy, or "oracle" for the log itself.
-        data: data set's folder, or "synthetic", or an opened data set, whose split then counts.
-        out: folder of the result, made if missing; None keeps nothing.
-        config: rollouts, metric, sampling, scenarios, processes.
-        name: of the row and the file; None = class and fingerprint of the policy. Unfinished work and results of
-            another policy, data set or setting under this name are replaced, with a message on stderr, but never a
-            result of more scenarios by one with a limit.
-        runner: does the work in place of `config.jobs` processes, see `rlftsim.jobs.runner`.
-        show_progress: False = no progress and time left on stderr.
+        policy: Any policy, or "oracle" for the log.
+        data: Folder of a data set, "synthetic", or an opened data set, whose split then counts.
+        out: Folder of the result, made if missing; None keeps only the returned value.
+        config: Rollouts, metric, sampling, scenarios, processes.
+        name: Name of the row and of the file; None = class and fingerprint of the policy. Unfinished work of another
+            policy, data set or setting under this name is replaced, with a message on stderr, but never a finished
+            result.
+        runner: Runner of the work in place of `config.jobs` processes, see `rlftsim.jobs.runner`.
+        show_progress: False prints neither progress nor the time left.
 
     Raises:
-        DataError: no such data set or split, scenarios whose future is withheld (a test split), a scenario with a NaN,
-            or a policy whose poses are not finite.
-        ConfigError: an impossible name, several processes for a policy on a GPU, goals for a policy that is not
-            goal-conditioned, or a limit that would replace a result of more scenarios.
+        DataError: No such data set or split, scenarios without a future (a test split), a scenario with a NaN, or a
+            policy that makes poses that are not finite.
+        ConfigError: An impossible name, a stored result of other work, several processes for a policy on a GPU, goals
+            for a policy that is not goal-conditioned, or a limit that would replace a result of more scenarios.
     """
     is_oracle = isinstance(policy, str)
-    kind, fingerprint = ("oracle", "oracle") if is_oracle else (type(policy).__name__, fingerprint_policy(policy))
-    name = name or (kind if is_oracle else f"{kind}-{fingerprint[:8]}")
+    title, fingerprint = ("oracle", "oracle") if is_oracle else (type(policy).__name__, fingerprint_policy(policy))
+    name = name or (title if is_oracle else f"{title}-{fingerprint[:8]}")
     if config.goals != "none" and not is_goal_conditioned(policy):
         raise ConfigError(f"evaluate.goals={config.goals} has no effect: {name} is not goal-conditioned, leave it out.")
     # Everything that can be refused is refused before anything is simulated or written.
     dataset, config = open_held_out(data, config)
     positions = choose_scenarios(dataset, config)
-    check_jobs(config, device_of(policy))
+    check_jobs(config.jobs, get_device(policy))
     frozen: Policy | Oracle = frozen_copy(policy)
     if frozen != "oracle":
-        refuse_sampling(frozen, dataset, config.sampling)
+        check_sampling(frozen, dataset, config.sampling)
     provenance = Provenance(
         config=replace(config, jobs=1),  # the same bytes from any number of processes
-        policy=kind,
+        policy=title,
         policy_fingerprint=fingerprint,
         dataset=dataset.url or str(dataset.folder.resolve()),
         manifest_sha256=hash_manifest(dataset.folder),
@@ -107,13 +108,13 @@ def evaluate(
         guessed=dataset.guessed,
     )
     return resume_evaluation(
-        partial(_evaluate_scenario, _Job(frozen, dataset, config)),
+        f"evaluate {name}",
         dataset.scenario_ids[: len(positions)],
-        name,
-        provenance,
-        None if out is None else require_folder(out),
-        runner=runner or on_this_machine(config.jobs, len(groups_of(len(positions), EvaluationParts.group_size))),
-        title=f"evaluate {name}",
+        partial(_evaluate_scenario, _Job(frozen, dataset, config)),
+        name=name,
+        provenance=provenance,
+        out=None if out is None else validate_folder(out),
+        runner=runner or choose_runner(config.jobs, math.ceil(len(positions) / ScenarioRows.items_per_file)),
         show_progress=show_progress,
     )
 
@@ -134,13 +135,13 @@ def evaluated_ends(batch: ScenarioBatch) -> Goals:
     return logged_goals(batch, batch.evaluated_mask)
 
 
-def identity_of(policy: Policy, dataset: ScenarioDataset, config: EvaluateConfig) -> dict[str, object]:
-    """Plain values by which a stored measurement is known to be this one, for `JsonParts`.
+def describe_measurement(policy: Policy, dataset: ScenarioDataset, config: EvaluateConfig) -> dict[str, object]:
+    """Plain values that a stored measurement must agree with to be this one, for `ScenarioValues`.
 
     Args:
-        policy: measured.
-        dataset: of the scenarios.
-        config: settings of the rollouts.
+        policy: Policy that is measured; weights and settings count.
+        dataset: Data set of the scenarios; the contents count, not the folder.
+        config: Settings of the rollouts; scenarios and processes do not count.
     """
     return {
         "rlftsim": NUMBERS_VERSION,
@@ -150,19 +151,21 @@ def identity_of(policy: Policy, dataset: ScenarioDataset, config: EvaluateConfig
     }
 
 
-def check_jobs(config: EvaluateConfig, device: torch.device) -> None:
-    """Refuse several processes for a policy on a GPU.
+def check_jobs(jobs: int, device: torch.device, setting: str = "evaluate.jobs") -> None:
+    """Check a number of processes; a policy on a GPU is used by a single one.
 
     Args:
-        config: settings with the number of processes.
-        device: of the policy.
+        jobs: Number of processes, at least 1.
+        device: Device of the policy; several processes need "cpu".
+        setting: Name of the setting, for messages.
 
     Raises:
-        ConfigError: the settings want that.
+        ConfigError: No process, or several and another device.
     """
-    if config.jobs > 1 and device.type != "cpu":
+    whole_number(setting, jobs, 1)
+    if jobs > 1 and device.type != "cpu":
         raise ConfigError(
-            f"evaluate.jobs={config.jobs} works on CPUs only, the policy is on {device}: use --jobs 1 or --device cpu."
+            f"{setting}={jobs} works on CPUs only, the policy is on {device}: use --jobs 1 or --device cpu."
         )
 
 
@@ -177,15 +180,15 @@ def simulate_states(
     """All rollouts of one scenario, simulated a few at a time; a deterministic policy is simulated once.
 
     Args:
-        policy: decides for all agents.
-        scenario: logged; it is simulated from its current step on.
-        config: rollouts, seed, sampling.
-        device: of the policy.
-        goals_of: goals of the agents of a batch, the same in all rollouts; None = goal-free.
+        policy: Policy of all agents.
+        scenario: Logged scenario, simulated from the current step on.
+        config: Number of rollouts, rollouts at a time, seed, sampling.
+        device: Device on which the policy is, and on which all is computed.
+        goals_of: Goals of the agents of a batch, the same in all rollouts; None = goal-free.
 
     Raises:
-        ConfigError: the policy cannot sample as `config` says, e.g. top-k without categories.
-        DataError: a pose of the policy is not finite.
+        ConfigError: The policy cannot sample as `config` says, e.g. top-k without categories.
+        DataError: A pose of the policy is not finite.
     """
     batch = collate([scenario]).to(device)
     with torch.no_grad():
@@ -199,23 +202,29 @@ def simulate_encoded(
     """All rollouts of one scenario that the policy has encoded, see `simulate_states`.
 
     Args:
-        policy: decides for all agents.
-        batch: the scenario alone, on the policy's device.
-        context: `policy.encode(batch)`.
-        config: rollouts, seed, sampling.
-        goals: of a single rollout, the same in all; None = goal-free.
+        policy: Policy of all agents.
+        batch: The scenario alone, on the policy's device.
+        context: Result of `policy.encode(batch)`.
+        config: Number of rollouts, rollouts at a time, seed, sampling.
+        goals: Goals of a single rollout, the same in all; None = goal-free.
 
     Raises:
-        DataError: a pose of the policy is not finite.
+        DataError: A pose of the policy is not finite.
     """
     is_random = policy.initial_noise_size or (policy.noise_size and config.temperature > 0)
     ids = range(config.num_rollouts if is_random else 1)
     passes = []
     for first in range(0, len(ids), config.rollouts_per_pass):
         # Noise belongs to rollout ids, so the passes together draw what a single pass would.
-        some = ids[first : first + config.rollouts_per_pass]
+        rollout_ids = ids[first : first + config.rollouts_per_pass]
         rollouts = simulate(
-            policy, batch, num_rollouts=some, seed=config.seed, context=context, sampling=config.sampling, goals=goals
+            policy,
+            batch,
+            num_rollouts=rollout_ids,
+            seed=config.seed,
+            context=context,
+            sampling=config.sampling,
+            goals=goals,
         )
         passes.append(states_of_rollouts(batch, rollouts)[0])
     x, y, z, heading = (torch.cat([getattr(p, axis) for p in passes]) for axis in ("x", "y", "z", "heading"))
@@ -237,10 +246,10 @@ class _Job:
 
 def _evaluate_scenario(job: _Job, position: int) -> dict[str, object] | Skipped:
     """Row of one scenario, or why there is none."""
-    scenario, config, device = job.dataset[position], job.config, device_of(job.policy)
+    scenario, config, device = job.dataset[position], job.config, get_device(job.policy)
     try:
-        scenario.refuse_broken()
-        scenario.refuse_not_finite()
+        scenario.check_consistency()
+        scenario.check_finite_arrays()
     except DataError as error:
         # An error, not a skipped scenario: NaN would lie in a histogram's last bin and look like a bad score.
         raise DataError(

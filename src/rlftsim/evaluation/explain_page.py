@@ -1,23 +1,26 @@
 """Explanations of scores as self-contained HTML pages: costs by feature, agent and step, and the histograms behind."""
 
+import hashlib
 from collections.abc import Callable
 from functools import partial
 from html import escape
+from operator import itemgetter
 from os import PathLike
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
+from rlftsim import __version__
 from rlftsim.evaluation.explain import WHOLE_FUTURE, Explanation, FeatureHistogram, explain
 from rlftsim.evaluation.rollout_files import RolloutEntry, find_rollouts, read_states
 from rlftsim.evaluation.scenario_source import ScenarioSource, open_scenarios
-from rlftsim.evaluation.score_files import ScoreConfig, check_entries, has_road_edge
-from rlftsim.jobs.files import write_text
-from rlftsim.jobs.folder import check_folder
-from rlftsim.jobs.progress import progress_bar
-from rlftsim.jobs.runner import Runner, on_this_machine
-from rlftsim.jobs.threads import one_thread
+from rlftsim.evaluation.score_files import ScoreConfig, check_entries, has_road_edge, hash_entries
+from rlftsim.jobs.files import remove_folder, write_text
+from rlftsim.jobs.folder import Lease, check_folder
+from rlftsim.jobs.items import WholeFiles, run_items
+from rlftsim.jobs.processes import Advance
+from rlftsim.jobs.runner import Runner, choose_runner
 from rlftsim.realism import metric_by_name
 from rlftsim.realism.config import BERNOULLI_FEATURES, FEATURE_NAMES, HISTOGRAM_FEATURES
 from rlftsim.scenario.types import STEP_S
@@ -69,56 +72,63 @@ def explain_rollouts(
 ) -> list[Path]:
     """Write `out/<scenario id>.html` for every scenario with rollouts, anew. Returns the pages.
 
-    Further sets of rollouts of the same scenario are numbered: `<scenario id>-2.html`.
+    Further sets of rollouts of the same scenario are numbered: `<scenario id>-2.html`. Until all pages are there, the
+    finished ones lie in a folder of their own inside `out`: interrupted in any way, the same call goes on.
 
     Args:
-        rollouts: npz, submission file or a folder of them, see `find_rollouts`.
-        scenarios: converted data set, or tfrecords (file, folder or glob).
-        out: folder of the pages, made if missing.
-        config: metric, handling of missing maps and scenarios, processes.
-        runner: does the work in place of `config.jobs` processes, see `rlftsim.jobs.runner`. A share writes its pages.
-        show_progress: False = no progress bar.
+        rollouts: Npz, submission file or a folder of either, see `find_rollouts`.
+        scenarios: Converted data set, or tfrecords (file, folder or glob).
+        out: Folder of the pages, made if missing.
+        config: Metric, handling of missing maps and scenarios, processes.
+        runner: Runner of the work in place of `config.jobs` processes, see `rlftsim.jobs.runner`.
+        show_progress: False prints neither progress nor the time left.
 
     Raises:
-        DataError: as `score_rollouts`.
+        DataError: Rollouts or scenarios that `score_rollouts` refuses, or another driver at work on these pages.
+        SetAside, Unfinished: See `run_items`.
     """
     check_folder(Path(out), "results")
     entries, source = find_rollouts(rollouts)[: config.limit], open_scenarios(scenarios)
     check_entries(entries, source, config, Path(scenarios))
     # Pages are named before any is written, so that the names do not depend on the order of the processes.
-    pages: dict[Path, RolloutEntry] = {}
+    items: dict[str, RolloutEntry] = {}
     for entry in entries:
         name = entry.scenario_id.replace("/", "_") or "scenario"
         numbered = (name, *(f"{name}-{k}" for k in range(2, len(entries) + 2)))
-        pages[next(path for path in (Path(out) / f"{n}.html" for n in numbered) if path not in pages)] = entry
-    runner = runner or on_this_machine(config.num_jobs, len(pages))
-    own = runner.own(list(pages.items()))
-    with progress_bar("explain", len(own), show=show_progress) as advance, one_thread():
-        written = runner.run(
-            partial(_write_page, source, config), own, advance=advance, name_of=lambda item: item[0].name
-        )
-    return [page for (page, _), is_written in zip(own, written) if is_written]
+        items[next(page for page in (f"{n}.html" for n in numbered) if page not in items)] = entry
+    identity = repr((hash_entries(entries), source.fingerprint, config.metric, config.missing_map, __version__))
+    pages = Path(out) / f"pages-{hashlib.sha256(identity.encode()).hexdigest()[:12]}.parts"
+    runner = runner or choose_runner(config.num_jobs, len(items))
+    with Lease(pages / ".lock", runner, "works in") as lease:
+        finished = run_items(
+            "explain", list(items.items()), partial(_write_page, pages, source, config),
+            format=WholeFiles(pages, itemgetter(0)), lease=lease, runner=runner, show_progress=show_progress,
+        )  # fmt: skip
+        written = [page.replace(Path(out) / page.name) for page in finished if page.stat().st_size]
+        lease.remove()
+        remove_folder(pages, items)
+    return written
 
 
 def _write_page(
+    folder: Path,
     source: ScenarioSource,
     config: ScoreConfig,
-    item: tuple[Path, RolloutEntry],
-    advance: Callable[[int], None],
+    item: tuple[str, RolloutEntry],
+    advance: Advance,
     is_stopped: Callable[[], bool],
-) -> bool:
-    """Write one page; False where there is nothing to explain."""
-    path, entry = item
+) -> None:
+    """Write a page, empty where there is nothing to explain, unless the work is being stopped."""
     if is_stopped():
-        return False
+        return
+    name, entry = item
     scenario = source.by_id(entry.scenario_id) if entry.scenario_id in source else None
+    html = ""
     # Without road edges there is no score to explain; scoring says so.
-    is_scored = scenario is not None and (config.missing_map == "error" or has_road_edge(scenario))
-    if scenario is not None and is_scored:
-        explanation = explain(scenario, read_states(entry), metric_by_name(config.metric))
-        write_text(path, explanation_html(explanation))
+    if scenario is not None and (config.missing_map == "error" or has_road_edge(scenario)):
+        html = explanation_html(explain(scenario, read_states(entry), metric_by_name(config.metric)))
+    write_text(folder / name, html)
     advance(1)
-    return is_scored
 
 
 def explanation_html(explanation: Explanation) -> str:
@@ -138,12 +148,12 @@ def explanation_html(explanation: Explanation) -> str:
         for score in ("meta_metric", "kinematic", "interactive", "map_based")
     )
     # few: the page holds every drawn trajectory
-    shown = explanation.rollouts.first(MAX_SHOWN_ROLLOUTS)
+    first_rollouts = explanation.rollouts.first(MAX_SHOWN_ROLLOUTS)
     panels = [
         Panel("logged", logged_trajectories(explanation.scenario)),
-        Panel(f"first {shown.num_rollouts} rollouts", shown),
+        Panel(f"first {first_rollouts.num_rollouts} rollouts", first_rollouts),
     ]
-    parts = [
+    sections = [
         f"<h1>Scenario {escape(name)}</h1>",
         f'<p class="lead">{lead}</p>',
         f'<div class="tiles">{tiles}</div>',
@@ -162,7 +172,7 @@ def explanation_html(explanation: Explanation) -> str:
         "<h2>What happened</h2>",
         animation_html(Animation(f"Scenario {name}", build_scene(explanation.scenario), panels)),
     ]
-    return page_html(f"Scenario {name}", "\n".join(parts), extra_css=_CSS)
+    return page_html(f"Scenario {name}", "\n".join(sections), extra_css=_CSS)
 
 
 def _features_html(explanation: Explanation) -> str:
@@ -184,12 +194,12 @@ def _agents_html(explanation: Explanation) -> str:
     """Evaluated agents by features."""
     by_agent = explanation.cost.sum(2)  # [F, E]
     # features that this year's metric does not count have no column
-    shown = [i for i in range(len(FEATURE_NAMES)) if explanation.config.weights[i] > 0]
-    head = "".join(f'<th class="narrow">{_words(FEATURE_NAMES[i])}</th>' for i in shown)
+    columns = [i for i in range(len(FEATURE_NAMES)) if explanation.config.weights[i] > 0]
+    head = "".join(f'<th class="narrow">{_words(FEATURE_NAMES[i])}</th>' for i in columns)
     totals = np.nansum(by_agent, axis=0)  # [E]; NaN: a feature without a scored step
     rows = []
     for agent in np.argsort(-totals, kind="stable"):
-        cells = "".join(_heat_cell(by_agent[i, agent], by_agent) for i in shown)
+        cells = "".join(_heat_cell(by_agent[i, agent], by_agent) for i in columns)
         rows.append(
             f"<tr><th>{escape(explanation.agent_names[agent])}</th>{_heat_cell(totals[agent], totals)}{cells}</tr>"
         )
@@ -201,9 +211,9 @@ def _strips_html(explanation: Explanation) -> str:
     steps = np.nan_to_num(explanation.cost[: len(HISTOGRAM_FEATURES), :, :WHOLE_FUTURE])  # [H, E, T]
     totals = steps.sum(-1)  # [H, E]
     order = [divmod(int(i), totals.shape[1]) for i in np.argsort(-totals.ravel(), kind="stable")[:MAX_STRIPS]]
-    seen = np.abs(steps)[steps != 0]  # [steps with a cost]
+    magnitudes = np.abs(steps)[steps != 0]  # [steps with a cost]
     # a quantile, so that a single step does not make all others pale
-    scale = float(np.quantile(seen, 0.95)) if len(seen) else 1.0
+    scale = float(np.quantile(magnitudes, 0.95)) if len(magnitudes) else 1.0
     rows = []
     for feature, agent in order:
         label = f"{_words(HISTOGRAM_FEATURES[feature])}, {escape(explanation.agent_names[agent])}"
@@ -232,9 +242,9 @@ def _charts_html(explanation: Explanation) -> str:
     """Two charts over time: the four costliest histogram features, and frequencies of collisions and violations."""
     steps = np.nan_to_num(explanation.cost[: len(HISTOGRAM_FEATURES), :, :WHOLE_FUTURE]).sum(1)  # [H, T]
     seconds = ((np.arange(steps.shape[1]) + 1) * STEP_S).tolist()
-    chosen = np.argsort(-steps.sum(1), kind="stable")[:4]
+    costliest = np.argsort(-steps.sum(1), kind="stable")[:4]
     # in thousandths: a single step costs little
-    costs = [Curve(_words(HISTOGRAM_FEATURES[i]), seconds, (1000 * steps[i]).tolist()) for i in chosen]
+    costs = [Curve(_words(HISTOGRAM_FEATURES[i]), seconds, (1000 * steps[i]).tolist()) for i in costliest]
     fraction = explanation.event_fraction.mean(1)  # [J, T]
     events = [Curve(_words(name), seconds, fraction[row].tolist()) for row, name in enumerate(BERNOULLI_FEATURES)]
     note = "Evaluated agents, where the log is valid. Their cost belongs to the whole future and is in the tables only."

@@ -14,15 +14,14 @@ from typing import Any
 import torch
 
 from rlftsim import __version__
-from rlftsim.evaluation.evaluate import check_jobs, frozen_copy, identity_of, simulate_encoded
+from rlftsim.evaluation.evaluate import check_jobs, describe_measurement, frozen_copy, simulate_encoded
 from rlftsim.evaluation.results import EvaluateConfig
-from rlftsim.evaluation.resumable import JsonParts, map_scenarios
+from rlftsim.evaluation.resumable import ScenarioValues, measure_scenarios
 from rlftsim.evaluation.scenario_source import open_held_out
 from rlftsim.goals.attainment import measure_outcome
 from rlftsim.goals.goals_file import GoalEntry
 from rlftsim.goals.placement import goals_of_batch
-from rlftsim.jobs.runner import on_this_machine
-from rlftsim.rollout.policy import Policy, device_of, is_goal_conditioned
+from rlftsim.rollout.policy import Policy, get_device, is_goal_conditioned
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.dataset import ScenarioDataset
 
@@ -61,35 +60,42 @@ def attain_goals(
     """Attainment of each goal by a policy, in the order of the goals.
 
     Args:
-        policy: any policy; one that is not goal-conditioned is simulated once for all goals of a scenario.
-        data: data set's folder, or "synthetic", or an opened data set.
-        out: folder of the results, a JSON file per scenario, made if missing.
-        config: rollouts, seed, sampling, split, processes.
-        goals: each is given alone, whatever other goals its scenario has.
-        title: beside the progress bar.
-        show_progress: False = no progress bar.
+        policy: Any policy; one that is not goal-conditioned is simulated once for all goals of a scenario.
+        data: Folder of a data set, "synthetic", or an opened data set.
+        out: Folder of the results, a JSON file per scenario, made if missing.
+        config: Rollouts, seed, sampling, split, processes.
+        goals: Goals, each of which is pursued alone, whatever other goals the scenario has.
+        title: Name of the work, in front of the progress bar.
+        show_progress: False prints neither progress nor the time left.
 
     Raises:
-        DataError: no such data set, scenario or agent.
-        ConfigError: several processes for a policy on a GPU.
+        DataError: No such data set, scenario or agent, or another process at work in the folder.
+        ConfigError: Several processes for a policy on a GPU.
     """
     dataset, config = open_held_out(data, config)
-    check_jobs(config, device_of(policy))
+    check_jobs(config.jobs, get_device(policy))
     by_scenario: dict[str, list[GoalEntry]] = {}
     for goal in goals:
         by_scenario.setdefault(goal.scenario_id, []).append(goal)
     # The goals' labels are not compared: renaming one measures nothing anew.
-    common = identity_of(policy, dataset, config)
-    points = {i: [[goal.agent_id, goal.x, goal.y] for goal in own] for i, own in by_scenario.items()}
-    identity = {scenario_id: common | {"goals": own} for scenario_id, own in points.items()}
-    ids, information = tuple(by_scenario), {"package_version": __version__}
-    files = JsonParts(Path(out), ids, identity, information, partial(_attained, by_scenario))
-    work = partial(_simulate_goals, _Job(frozen_copy(policy), dataset, config, by_scenario))
-    runner = on_this_machine(config.jobs, len(ids))
-    parts = map_scenarios(work, len(ids), files, runner=runner, title=title, show_progress=show_progress)
+    measurement = describe_measurement(policy, dataset, config)
+    identity = {
+        scenario_id: measurement | {"goals": [[goal.agent_id, goal.x, goal.y] for goal in scenario_goals]}
+        for scenario_id, scenario_goals in by_scenario.items()
+    }
+    stored = measure_scenarios(
+        title,
+        partial(_simulate_goals, _Job(frozen_copy(policy), dataset, config, by_scenario)),
+        ScenarioValues(
+            Path(out), tuple(by_scenario), identity, partial(_parse_attained, by_scenario),
+            information={"package_version": __version__},
+        ),
+        jobs=config.jobs,
+        show_progress=show_progress,
+    )  # fmt: skip
     # Files are by scenario, goals may come in any order.
-    found = {_key(one.entry): one for part in parts for one in part}
-    return tuple(found[_key(goal)] for goal in goals)
+    by_goal = {_key(attained.entry): attained for scenario_goals in stored for attained in scenario_goals}
+    return tuple(by_goal[_key(goal)] for goal in goals)
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +113,7 @@ def _key(entry: GoalEntry) -> tuple[str, int, float, float, str]:
     return entry.scenario_id, entry.agent_id, entry.x, entry.y, entry.label
 
 
-def _attained(
+def _parse_attained(
     goals: Mapping[str, Sequence[GoalEntry]], scenario_id: str, values: Mapping[str, Any]
 ) -> tuple[Attained, ...]:
     fractions = zip(goals[scenario_id], values["reached"], values["passed"], strict=True)
@@ -117,7 +123,7 @@ def _attained(
 def _simulate_goals(job: _Job, position: int) -> dict[str, object]:
     """Fractions of the rollouts for each goal of a scenario."""
     scenario_id = tuple(job.goals)[position]
-    batch = collate([job.dataset.by_id(scenario_id)]).to(device_of(job.policy))
+    batch = collate([job.dataset.by_id(scenario_id)]).to(get_device(job.policy))
     with torch.no_grad():
         context = job.policy.encode(batch)
     simulated = partial(simulate_encoded, job.policy, batch, context, job.config)
@@ -127,4 +133,4 @@ def _simulate_goals(job: _Job, position: int) -> dict[str, object]:
     for goal in job.goals[scenario_id]:
         states = goal_free or simulated(goals=goals_of_batch([goal], batch))
         outcomes.append(measure_outcome(states.simulated_path(goal.agent_id), (goal.x, goal.y)))
-    return {"reached": [one.reached for one in outcomes], "passed": [one.passed for one in outcomes]}
+    return {name: [getattr(outcome, name) for outcome in outcomes] for name in ("reached", "passed")}

@@ -16,11 +16,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 import rlftsim
-from rlftsim.errors import ConfigError, DataError, require_types
-from rlftsim.evaluation.columns import SCORES, direction_of
+from rlftsim.errors import ConfigError, DataError, check_types
+from rlftsim.evaluation.columns import SCORES, find_direction
 from rlftsim.evaluation.drift import Drift, measure_drift
-from rlftsim.jobs.documents import describe_kind, parse_json
-from rlftsim.jobs.files import write_whole
+from rlftsim.jobs.documents import describe_type, parse_json
+from rlftsim.jobs.files import write_atomically
 from rlftsim.jobs.tables import check_columns, read_parquet
 from rlftsim.realism import FEATURE_NAMES, RealismResult, SimulatedStates, metric_by_name
 from rlftsim.realism.miss import compute_miss_rates
@@ -104,7 +104,7 @@ class EvaluateConfig:
     """Goals of the evaluated agents: none, or their logged final positions, for a goal-conditioned model."""
 
     def __post_init__(self) -> None:
-        require_types(self)
+        check_types(self)
         for name in ("num_rollouts", "rollouts_per_pass", "jobs", "limit"):
             value = getattr(self, name)
             if value is not None and value < 1:
@@ -269,7 +269,7 @@ class Evaluation:
             "skipped": [asdict(skipped) for skipped in self.skipped],
         }
         table = self.table.replace_schema_metadata({"rlftsim": json.dumps(about)})
-        write_whole(Path(path), lambda temporary: pq.write_table(table, temporary, compression="zstd"))
+        write_atomically(Path(path), lambda temporary: pq.write_table(table, temporary, compression="zstd"))
 
     @classmethod
     def read(cls, path: str | PathLike[str]) -> "Evaluation":
@@ -305,12 +305,12 @@ class Evaluation:
             skipped = tuple(Skipped(**one) for one in skipped)
             for given, kind in ((name, str), (about["provenance"], dict)):
                 if not isinstance(given, kind):
-                    raise DataError(f"its {'name' if kind is str else 'provenance'} is {describe_kind(given)}")
+                    raise DataError(f"its {'name' if kind is str else 'provenance'} is {describe_type(given)}")
         except (TypeError, KeyError, AttributeError, DataError) as error:
             raise DataError(f"{path}: damaged evaluation ({error}): evaluate again.") from None
         try:
             provenance = Provenance.from_plain(about["provenance"])
-            require_types(provenance)
+            check_types(provenance)
         except (TypeError, KeyError, AttributeError, ConfigError) as error:
             error = "a value of another type" if isinstance(error, AttributeError) else error
             raise DataError(f"{path}: made by a later version ({error}): update rlftsim or evaluate again.") from None
@@ -326,7 +326,7 @@ def _check_scores(table: pa.Table) -> None:
     for name in table.schema.names:
         if table[name].type == pa.string():
             continue
-        direction = direction_of(name)
+        direction = find_direction(name)
         # likelihoods and rates are in [0, 1] but for rounding, errors and counts not below 0, drift is any number
         lowest = -LARGEST if direction == "log" and not name.startswith("num_") else 0.0
         is_fraction = name.endswith("_rate") or (direction == "higher" and not name.startswith("num_"))

@@ -1,20 +1,20 @@
 """Interruptible measurements of many scenarios: finished groups are kept in files, a later call does the rest.
 
-`map_scenarios` is the loop, shared by evaluations, scores of rollout files, goal attainment, reward variances and
-planners. They differ in the work on one scenario and in their files: `EvaluationParts` (Parquet) or `JsonParts`.
+Evaluations and scores of rollout files are kept as `ScenarioRows` (Parquet), goal attainment, reward variances and
+planners as `ScenarioValues` (JSON). `finish_result` makes the one file of a result of them.
 """
 
 import json
 import re
 import tempfile
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, Generic, Protocol, TypeVar, runtime_checkable
+from typing import Any, ClassVar, Protocol, TypeVar, runtime_checkable
 
 import pyarrow as pa
 
@@ -22,187 +22,86 @@ from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.results import SCHEMA, Evaluation, Provenance, Skipped, join_evaluations
 from rlftsim.jobs.documents import read_json
 from rlftsim.jobs.files import remove_folder, remove_temporaries, write_text
-from rlftsim.jobs.folder import check_folder, check_name
-from rlftsim.jobs.lease import Lease, remove_locks
-from rlftsim.jobs.progress import log, progress_bar
-from rlftsim.jobs.runner import Inline, Joining, Runner, Share, require_finished
-from rlftsim.jobs.threads import one_thread
+from rlftsim.jobs.folder import Lease, check_folder, check_name, remove_locks
+from rlftsim.jobs.items import GroupFormat, Result, Stored, group_positions, group_task, run_items
+from rlftsim.jobs.progress import log
+from rlftsim.jobs.runner import Inline, Joining, Runner, Share, choose_runner
 
-Result = TypeVar("Result")
-"""Result of one scenario, as the work on it returns it."""
-Part = TypeVar("Part")
-"""Results of a group of scenarios, as they are read back."""
-Stored = TypeVar("Stored")
-"""A finished result."""
 _GROUP_NAME = re.compile(r"\d{6,}-\d{6,}")
-"""Stem of a file of `EvaluationParts`."""
+"""Stem of a file of `ScenarioRows`."""
 
 
-class PartFiles(ABC, Generic[Result, Part]):
-    """Files of finished groups in a folder. They are handed to other processes, so they can be pickled."""
+class ScenarioFormat(GroupFormat[Stored, Result]):
+    """Files of finished groups of scenarios in a folder, which go when the one file of the result is there."""
 
     folder: Path
-    group_size: ClassVar[int]
-    """Scenarios in a file: for each process, what an interruption loses at most."""
-
-    @abstractmethod
-    def write(self, group: range, results: Sequence[Result]) -> None:
-        """Write a finished group, whole or not at all.
-
-        Args:
-            group: positions of its scenarios.
-            results: one per scenario, in this order.
-        """
-
-    @abstractmethod
-    def read(self, group: range) -> Part | None:
-        """A group that an earlier call finished; None if it is missing, damaged or of other work."""
 
     @abstractmethod
     def file_names(self, scenario_ids: Collection[str]) -> list[str]:
         """Names of the files in the folder that groups of the scenarios may have written, damaged ones included."""
 
     @abstractmethod
-    def has_others(self, scenario_ids: Collection[str]) -> bool:
-        """True if the folder holds finished groups of scenarios beside those given, or of other settings."""
-
-
-def map_scenarios(
-    work: Callable[[int], Result],
-    num_scenarios: int,
-    files: PartFiles[Result, Part],
-    *,
-    runner: Runner,
-    title: str,
-    lease: Lease | None = None,
-    show_progress: bool = True,
-) -> list[Part]:
-    """Do the missing groups and return all of them in order.
-
-    Args:
-        work: measures the scenario at a position; can be pickled, if there is more than one job.
-        num_scenarios: positions run from 0 to this.
-        files: of the finished groups.
-        runner: does the work. Changes no result.
-        title: beside the progress bar.
-        lease: on the folder of the files, if several drivers could work in it.
-        show_progress: False = no progress bar.
-
-    Raises:
-        SetAside: groups that killed their process again and again; all others are done.
-        Unfinished: `runner` is a share, which is done, while others are not.
-        DataError: another process removed finished files meanwhile.
-    """
-    groups = groups_of(num_scenarios, files.group_size)
-    own = runner.own(groups)
-    missing = [group for group in own if files.read(group) is None]
-    total, left = (sum(len(group) for group in some) for some in (own, missing))
-    with progress_bar(title, total, total - left, show=show_progress) as advance, one_thread():
-        runner.run(
-            partial(_work_on_group, work, files),
-            missing,
-            advance=advance,
-            name_of=lambda group: f"scenarios {group.start} to {group.stop - 1}",
-        )
-    if lease is not None:
-        lease.finish(title)
-    # Read back even what was just written: a resumed and an uninterrupted call go the same way from here.
-    parts = [part for part in map(files.read, groups) if part is not None]
-    require_finished(runner, len(groups) - len(parts), len(groups), title)
-    return parts
-
-
-def groups_of(num_scenarios: int, size: int) -> list[range]:
-    """Positions of the scenarios in groups, the last of which may be smaller.
-
-    Args:
-        num_scenarios: positions run from 0 to this.
-        size: scenarios in a group.
-    """
-    positions = range(num_scenarios)
-    return [positions[first : first + size] for first in range(0, num_scenarios, size)]
-
-
-def _work_on_group(
-    work: Callable[[int], Any],
-    files: PartFiles[Any, Any],
-    group: range,
-    advance: Callable[[int], None],
-    is_stopped: Callable[[], bool],
-) -> None:
-    results = []
-    for position in group:
-        # another process failed, or Ctrl-C: an unfinished group leaves no file
-        if is_stopped():
-            return
-        results.append(work(position))
-        advance(1)
-    files.write(group, results)
+    def has_other_groups(self, scenario_ids: Collection[str]) -> bool:
+        """True if the folder holds finished groups of scenarios beside those listed, or of other settings."""
 
 
 @dataclass(frozen=True, eq=False)
-class JsonParts(PartFiles[Mapping[str, object], Part]):
-    """A file per scenario, `<folder>/<scenario id>.json`."""
+class ScenarioValues(ScenarioFormat[Stored, Mapping[str, object]]):
+    """A JSON file per scenario, `<folder>/<scenario id>.json`."""
 
     folder: Path
     scenario_ids: Sequence[str]
     """In the order of positions."""
     identity: Mapping[str, Mapping[str, object]]
     """By scenario id: plain values that a file must agree with to belong to this work."""
-    information: Mapping[str, object]
-    """Written into each file and not compared."""
-    parse: Callable[[str, Mapping[str, Any]], Part]
+    parse: Callable[[str, Mapping[str, Any]], Stored]
     """Reads a scenario's values; a KeyError, TypeError or ValueError means that the file is damaged."""
+    information: Mapping[str, object] = field(default_factory=dict)
+    """Written into each file and not compared."""
 
-    group_size: ClassVar[int] = 1
-
-    def write(self, group: range, results: Sequence[Mapping[str, object]]) -> None:
-        """Write the file of a scenario, see `PartFiles`."""
-        scenario_id = self.scenario_ids[group.start]
+    def write(self, item: range, results: Sequence[Mapping[str, object]]) -> None:
+        """Write the file of a scenario, see `GroupFormat`."""
+        scenario_id = self.scenario_ids[item.start]
         values = {**self.identity[scenario_id], **results[0], **self.information}
-        write_text(self._path(scenario_id), json.dumps(values) + "\n")
+        write_text(self.folder / f"{scenario_id}.json", json.dumps(values) + "\n")
 
-    def read(self, group: range) -> Part | None:
-        """The parsed values of a scenario, see `PartFiles`."""
-        scenario_id = self.scenario_ids[group.start]
+    def read(self, item: range) -> Stored | None:
+        """The parsed values of a scenario, see `ResultFormat`."""
+        scenario_id = self.scenario_ids[item.start]
         try:
             values = self._read(scenario_id)
-            return self.parse(scenario_id, values) if self._is_ours(scenario_id, values) else None
+            return self.parse(scenario_id, values) if self._agrees(scenario_id, values) else None
         except (DataError, OSError, ValueError, KeyError, TypeError, AttributeError):
             return None
 
     def file_names(self, scenario_ids: Collection[str]) -> list[str]:
-        """A name per scenario, see `PartFiles`."""
+        """A name per scenario, see `ScenarioFormat`."""
         return [f"{scenario_id}.json" for scenario_id in scenario_ids]
 
-    def has_others(self, scenario_ids: Collection[str]) -> bool:
-        """True if there are files of other scenarios or settings, see `PartFiles`."""
-        for path in self.folder.glob("*.json"):
+    def has_other_groups(self, scenario_ids: Collection[str]) -> bool:
+        """True if there are files of other scenarios or settings, see `ScenarioFormat`."""
+        for name in (path.stem for path in self.folder.glob("*.json")):
             with suppress(DataError, FileNotFoundError):  # a damaged file holds nothing
-                is_ours = path.stem in scenario_ids and self._is_ours(path.stem, self._read(path.stem))
-                if not is_ours:
+                if name not in scenario_ids or not self._agrees(name, self._read(name)):
                     return True
         return False
 
-    def _is_ours(self, scenario_id: str, values: Mapping[str, object]) -> bool:
-        return all(values.get(name) == own for name, own in self.identity[scenario_id].items())
+    def _agrees(self, scenario_id: str, values: Mapping[str, object]) -> bool:
+        return all(values.get(name) == expected for name, expected in self.identity[scenario_id].items())
 
     def _read(self, scenario_id: str) -> dict[str, Any]:
-        return read_json(self._path(scenario_id), "measure it again", allow_nan=True)
-
-    def _path(self, scenario_id: str) -> Path:
-        return self.folder / f"{scenario_id}.json"
+        return read_json(self.folder / f"{scenario_id}.json", "measure it again", allow_nan=True)
 
 
 @dataclass(frozen=True, eq=False)
-class EvaluationParts(PartFiles[Mapping[str, object] | Skipped, Evaluation]):
+class ScenarioRows(ScenarioFormat[Evaluation, Mapping[str, object] | Skipped]):
     """Rows of an evaluation: `<name>.parts/000000-000004.parquet` until all are there, then `<name>.parquet`."""
 
     name: str
     provenance: Provenance
     out: Path
 
-    group_size: ClassVar[int] = 4
+    items_per_file: ClassVar[int] = 4
 
     def __post_init__(self) -> None:
         check_name(self.name, "an evaluation's name")
@@ -221,116 +120,144 @@ class EvaluationParts(PartFiles[Mapping[str, object] | Skipped, Evaluation]):
         """Finished groups of an unfinished evaluation."""
         return self.out / f"{self.name}.parts"
 
-    def part_path(self, group: range) -> Path:
-        """File of one finished group."""
+    def _path(self, group: range) -> Path:
         return self.folder / f"{group.start:06d}-{group.stop:06d}.parquet"
 
-    def write(self, group: range, results: Sequence[Mapping[str, object] | Skipped]) -> None:
-        """Write rows of `SCHEMA` and scenarios without scores, see `PartFiles`."""
+    def write(self, item: range, results: Sequence[Mapping[str, object] | Skipped]) -> None:
+        """Write rows of `SCHEMA` and scenarios without scores, see `GroupFormat`."""
         rows = [dict(result) for result in results if not isinstance(result, Skipped)]
         skipped = tuple(result for result in results if isinstance(result, Skipped))
         table = pa.Table.from_pylist(rows, schema=SCHEMA)
-        Evaluation(self.name, self.provenance, table, skipped).write(self.part_path(group))
+        Evaluation(self.name, self.provenance, table, skipped).write(self._path(item))
 
-    def read(self, group: range) -> Evaluation | None:
-        """The rows of a group, see `PartFiles`."""
-        path = self.part_path(group)
-        rows = read_if_readable(path, Evaluation.read)
+    def read(self, item: range) -> Evaluation | None:
+        """The rows of a group, see `ResultFormat`."""
+        rows = read_stored(self._path(item), Evaluation.read)
         if rows is None:
             return None
         differences = rows.provenance.differences(self.provenance)
-        if _ids_of(rows).total() != len(group):
+        if _count_scenarios(rows).total() != len(item):
             differences.append("number of scenarios")
         if differences:
-            log.info(f"{path} is of another {', '.join(differences)}: discarded.")
+            log.info(f"{self._path(item)} is of another {', '.join(differences)}: discarded.")
         return None if differences else rows
 
     def read_finished(self, scenario_ids: Sequence[str]) -> Evaluation | None:
-        """The result of an earlier call for the same scenarios; None if there is none.
+        """The result of an earlier call for the same scenarios; None where there is none.
 
         Raises:
-            ConfigError: a result is there of other work, or with scenarios that a limit would leave out.
+            ConfigError: A result of other work, or with scenarios that a limit would leave out.
         """
-        found = read_if_readable(self.result_path, Evaluation.read)
-        if found is None:
+        stored = read_stored(self.result_path, Evaluation.read)
+        if stored is None:
             return None
         # Before anything else: also a result of another policy or setting is worth more than a quick look.
-        limit = self.provenance.config.limit
+        counts, limit = _count_scenarios(stored), self.provenance.config.limit
         if limit is not None:
-            num_found = _ids_of(found).total()
             way_out = "name this one apart with --name, or leave the limit out."
-            num_left_out = (_ids_of(found) - Counter(scenario_ids)).total()
-            refuse_to_leave_out(self.result_path, num_found, num_left_out, f"limit={limit}", way_out)
-        other = found.provenance.differences(self.provenance)
-        if other == ["rlftsim_version"]:
+            num_left_out = (counts - Counter(scenario_ids)).total()
+            check_scenarios_stay(self.result_path, counts.total(), num_left_out, f"limit={limit}", way_out)
+        differences = stored.provenance.differences(self.provenance)
+        if differences == ["rlftsim_version"]:
             log.info(f"{self.result_path} is of another version's numbers: it will be replaced.")
             return None
-        check_same_work(self.result_path, other, "choose another --name or --out")
+        check_same_work(self.result_path, differences, "choose another --name or --out")
         # counted: a scenario may have several sets of rollouts in files, and one by a policy
-        return found if _ids_of(found) == Counter(scenario_ids) else None
+        return stored if counts == Counter(scenario_ids) else None
 
     def file_names(self, scenario_ids: Collection[str]) -> list[str]:
-        """Names of groups of any size, see `PartFiles`."""
+        """Names of groups of any size, see `ScenarioFormat`."""
         return [path.name for path in self.folder.glob("*.parquet") if _GROUP_NAME.fullmatch(path.stem)]
 
-    def has_others(self, scenario_ids: Collection[str]) -> bool:
-        """True if a group has other scenarios or settings, see `PartFiles`."""
-        parts = (read_if_readable(path, Evaluation.read) for path in self.folder.glob("*.parquet"))
+    def has_other_groups(self, scenario_ids: Collection[str]) -> bool:
+        """True if a group has other scenarios or settings, see `ScenarioFormat`."""
+        stored = (read_stored(path, Evaluation.read) for path in self.folder.glob("*.parquet"))
         return any(
-            part is not None
-            and bool(part.provenance.differences(self.provenance) or _ids_of(part).keys() - {*scenario_ids})
-            for part in parts
+            rows is not None
+            and bool(rows.provenance.differences(self.provenance) or _count_scenarios(rows).keys() - {*scenario_ids})
+            for rows in stored
         )
 
 
-def _ids_of(evaluation: Evaluation) -> Counter[str]:
-    """Ids of all scenarios of an evaluation, those without scores included, and the number of rows of each."""
+def _count_scenarios(evaluation: Evaluation) -> Counter[str]:
+    """Number of rows of each scenario of an evaluation, those without scores included."""
     return Counter([*evaluation.scenario_ids, *(skipped.scenario_id for skipped in evaluation.skipped)])
 
 
 def resume_evaluation(
-    work: Callable[[int], Mapping[str, object] | Skipped],
+    title: str,
     scenario_ids: Sequence[str],
+    work: Callable[[int], Mapping[str, object] | Skipped],
+    *,
     name: str,
     provenance: Provenance,
     out: Path | None,
-    *,
     runner: Runner,
-    title: str,
     show_progress: bool = True,
 ) -> Evaluation:
     """Do what is missing of an evaluation, write `out/<name>.parquet` and return it; only read it if it is there.
 
     Args:
-        work: from the position of a scenario to its row of `SCHEMA`, or why there is none.
-        scenario_ids: all scenarios of the evaluation.
-        name: of the evaluation and its file.
-        provenance: what a stored result must agree with to be this one.
-        out: folder of the result; None keeps nothing.
-        runner: does the work.
-        title: beside the progress bar.
-        show_progress: False = no progress bar.
+        title: Name of the work, in front of the progress bar.
+        scenario_ids: Ids of all scenarios of the evaluation, in the order of its rows.
+        work: Function from the position of a scenario to a row of `SCHEMA`, or to the reason that there is none.
+        name: Name of the evaluation, also that of the file.
+        provenance: Values that a stored result must agree with to be this one.
+        out: Folder of the result; None keeps nothing.
+        runner: Runner of the groups that are missing; changes no result.
+        show_progress: False prints neither progress nor the time left.
 
     Raises:
-        ConfigError: the name cannot be a file's, the stored result is of other work, a limit would leave out scenarios
+        ConfigError: The name cannot be a file's, the stored result is of other work, a limit would leave out scenarios
             of it, or there is no folder in which shares could meet.
-        DataError: another driver is at work on this evaluation.
-        SetAside, Unfinished: see `map_scenarios`.
+        DataError: Another driver is at work on this evaluation.
+        SetAside, Unfinished: See `run_items`.
     """
     if out is None and isinstance(runner, Share | Joining):
         raise ConfigError("shares meet in a folder: name one with --out.")
     # Processes hand their rows over in files, so even a result that is not kept needs a folder.
-    with tempfile.TemporaryDirectory() as nowhere:
-        files = EvaluationParts(name, provenance, out or Path(nowhere))
+    with tempfile.TemporaryDirectory() as temporary_folder:
+        rows = ScenarioRows(name, provenance, out or Path(temporary_folder))
+        return finish_result(
+            title,
+            scenario_ids,
+            work,
+            path=rows.result_path,
+            format=rows,
+            find=partial(rows.read_finished, scenario_ids),
+            combine=partial(join_evaluations, name, provenance),
+            runner=runner,
+            show_progress=show_progress,
+        )
 
-        def make(lease: Lease) -> Evaluation:
-            parts = map_scenarios(
-                work, len(scenario_ids), files, runner=runner, title=title, lease=lease, show_progress=show_progress
-            )
-            return join_evaluations(name, provenance, parts)
 
-        find = partial(files.read_finished, scenario_ids)
-        return finish_result(find, make, files.result_path, files, scenario_ids, runner)
+def measure_scenarios(
+    title: str,
+    work: Callable[[int], Mapping[str, object]],
+    format: ScenarioValues[Stored],
+    *,
+    jobs: int,
+    show_progress: bool = True,
+) -> list[Stored]:
+    """Values of all scenarios, whose files stay in the folder: measured now, or read from there.
+
+    Args:
+        title: Name of the work, in front of the progress bar.
+        work: Function from the position of a scenario to the values that are stored.
+        format: Files of the scenarios.
+        jobs: Number of processes; changes no result.
+        show_progress: False prints neither progress nor the time left.
+
+    Raises:
+        NotYetError: Another process is at work in the folder.
+        SetAside: See `run_items`.
+    """
+    groups = group_positions(len(format.scenario_ids), format.items_per_file)
+    runner, task = choose_runner(jobs, len(groups)), group_task(work, format)
+    with Lease(format.folder / ".lock", runner, "works in") as lease:
+        stored = run_items(title, groups, task, format=format, lease=lease, runner=runner, show_progress=show_progress)
+        lease.remove()
+    return stored
 
 
 @runtime_checkable
@@ -338,101 +265,112 @@ class Writable(Protocol):
     """A result that is kept in one file."""
 
     def write(self, path: Path) -> None:
-        """Write it whole or not at all."""
+        """Write the file, whole or not at all."""
         ...
 
 
-Kept = TypeVar("Kept", bound=Writable)
+FinishedResult = TypeVar("FinishedResult", bound=Writable)
 
 
 def finish_result(
-    find: Callable[[], Kept | None],
-    make: Callable[[Lease], Kept],
-    path: Path,
-    parts: PartFiles[Any, Any],
+    title: str,
     scenario_ids: Sequence[str],
+    work: Callable[[int], Result],
+    *,
+    path: Path,
+    format: ScenarioFormat[Stored, Result],
+    find: Callable[[], FinishedResult | None],
+    combine: Callable[[list[Stored]], FinishedResult],
     runner: Runner,
-) -> Kept:
-    """The result that an earlier call finished, or the one that is made now and written; its parts are removed.
+    show_progress: bool = True,
+) -> FinishedResult:
+    """The result that an earlier call finished, or the one that is made now and written to its file.
 
     Args:
-        find: reads the finished one; None = there is none.
-        make: makes it of its parts.
-        path: of its file.
-        parts: finished groups of it. All of them stay where the folder holds others, or lock files of shares while
-            `runner` is none: then a longer run is unfinished there.
-        scenario_ids: of the result.
-        runner: does the work.
+        title: Name of the work, in front of the progress bar.
+        scenario_ids: Ids of all scenarios of the result.
+        work: Function from the position of a scenario to the result of the scenario.
+        path: File of the result.
+        format: Files of finished groups, removed in the end. All of them stay where the folder holds others, or lock
+            files of shares while `runner` is none: then a longer run is unfinished there.
+        find: Reader of the finished result; returns None where there is none.
+        combine: Maker of the result from all groups, in the order of the scenarios.
+        runner: Runner of the groups that are missing; changes no result.
+        show_progress: False prints neither progress nor the time left.
 
     Raises:
-        DataError: another driver is at work on it.
+        DataError: Another driver is at work on this result.
     """
     check_folder(path.parent, "results")
-    before, found = _stamp(path), find()
-    if found is None:
-        with Lease(parts.folder / ".lock", runner, "works in") as lease:
+    stamp, result = _stamp(path), find()
+    if result is None:
+        with Lease(format.folder / ".lock", runner, "works in") as lease:
             # another driver may have finished since, so what would be replaced is looked at again
-            found = find() if _stamp(path) != before else None
-            if found is None:
-                found = make(lease)
+            result = find() if _stamp(path) != stamp else None
+            if result is None:
+                groups, task = group_positions(len(scenario_ids), format.items_per_file), group_task(work, format)
+                stored = run_items(
+                    title, groups, task, format=format, lease=lease, runner=runner, show_progress=show_progress
+                )
+                result = combine(stored)
                 remove_temporaries(path)
-                found.write(path)
-            # Only now: an interruption between the two leaves the parts, and the next call finds the result.
-            _remove_parts(parts, scenario_ids, runner)
-    elif parts.folder.exists():
-        with suppress(DataError), Lease(parts.folder / ".lock", Inline(), "works in"):
-            _remove_parts(parts, scenario_ids, runner)
-    return found
+                result.write(path)
+            # Only now: an interruption between the two leaves the groups, and the next call finds the result.
+            _remove_groups(format, scenario_ids, runner)
+    elif format.folder.exists():
+        with suppress(DataError), Lease(format.folder / ".lock", Inline(), "works in"):
+            _remove_groups(format, scenario_ids, runner)
+    return result
 
 
-def _remove_parts(parts: PartFiles[Any, Any], scenario_ids: Sequence[str], runner: Runner) -> None:
-    """Remove the parts of a finished result, but for those of a longer run that is not.
+def _remove_groups(format: ScenarioFormat[Any, Any], scenario_ids: Sequence[str], runner: Runner) -> None:
+    """Remove the groups of a finished result, but for those of a longer run that is not.
 
-    A share that has ended leaves its lock file until all are put together: its parts may be of a longer run, too.
+    A share that has ended leaves its lock file until all are put together: its groups may be of a longer run, too.
     """
     is_share = isinstance(runner, Share | Joining)
-    has_shares = any(parts.folder.glob(".lock.*-of-*")) and not is_share
-    if not has_shares and not parts.has_others({*scenario_ids}):
-        remove_locks(parts.folder / ".lock")
-        remove_folder(parts.folder, parts.file_names({*scenario_ids}))
+    has_shares = any(format.folder.glob(".lock.*-of-*")) and not is_share
+    if not has_shares and not format.has_other_groups({*scenario_ids}):
+        remove_locks(format.folder / ".lock")
+        remove_folder(format.folder, format.file_names({*scenario_ids}))
 
 
 def _stamp(path: Path) -> tuple[int, int] | None:
     """Time and size of a file, which tell whether it was replaced; None where there is none."""
     try:
-        about = path.stat()
+        status = path.stat()
     except OSError:
         return None
-    return about.st_mtime_ns, about.st_size
+    return status.st_mtime_ns, status.st_size
 
 
-def check_same_work(path: Path, differing: Sequence[str], way_out: str) -> None:
+def check_same_work(path: Path, differences: Sequence[str], way_out: str) -> None:
     """Check that a stored result is not of other work, which the new one would replace.
 
     Args:
         path: File of the stored result.
-        differing: Names of the values that count and differ, such as the policy's fingerprint.
+        differences: Names of the values that count and differ, such as the policy's fingerprint.
         way_out: Flags that keep the two apart, for the message.
 
     Raises:
         ConfigError: There is such a value.
     """
-    if differing:
-        raise ConfigError(f"{path} is the result of another {', '.join(differing)}: {way_out}, or remove the file.")
+    if differences:
+        raise ConfigError(f"{path} is the result of another {', '.join(differences)}: {way_out}, or remove the file.")
 
 
-def refuse_to_leave_out(path: Path, num_stored: int, num_left_out: int, choice: str, way_out: str) -> None:
-    """Refuse to replace a result by one without some of its scenarios, of a quick look.
+def check_scenarios_stay(path: Path, num_stored: int, num_left_out: int, choice: str, way_out: str) -> None:
+    """Check that a result is not replaced by one without some of its scenarios, of a quick look.
 
     Args:
-        path: of the stored result.
-        num_stored: scenarios in it.
-        num_left_out: those of them that the new result would not have.
-        choice: setting that leaves them out.
-        way_out: end of the message.
+        path: File of the stored result.
+        num_stored: Number of scenarios in the stored result.
+        num_left_out: Number of those that the new result would not have.
+        choice: Setting that leaves them out, as the message names it.
+        way_out: End of the message.
 
     Raises:
-        ConfigError: there are such scenarios.
+        ConfigError: There are such scenarios.
     """
     if num_left_out > 0:
         raise ConfigError(
@@ -441,12 +379,12 @@ def refuse_to_leave_out(path: Path, num_stored: int, num_left_out: int, choice: 
         )
 
 
-def read_if_readable(path: Path, read: Callable[[Path], Stored]) -> Stored | None:
-    """A stored result; None if there is none, or a damaged one, which a message names.
+def read_stored(path: Path, read: Callable[[Path], Stored]) -> Stored | None:
+    """A stored result; None for a missing file, or a damaged one, which a message names.
 
     Args:
-        path: of the result.
-        read: raises a DataError with the way out, which is to do the work again.
+        path: File of the result.
+        read: Reader of the file; raises a DataError with the way out, which is to do the work again.
     """
     if not path.exists():
         return None

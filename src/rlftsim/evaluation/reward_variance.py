@@ -18,15 +18,14 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.evaluation.evaluate import check_jobs, frozen_copy, identity_of, simulate_states
+from rlftsim.evaluation.evaluate import check_jobs, describe_measurement, frozen_copy, simulate_states
 from rlftsim.evaluation.results import EvaluateConfig
-from rlftsim.evaluation.resumable import JsonParts, map_scenarios
+from rlftsim.evaluation.resumable import ScenarioValues, measure_scenarios
 from rlftsim.evaluation.scenario_source import choose_scenarios, open_held_out
-from rlftsim.jobs.runner import on_this_machine
 from rlftsim.realism import Features, ScenarioLog, compute_features, metric_by_name, scenario_log, score_features
 from rlftsim.rewards.base import leave_one_out
 from rlftsim.rewards.mloo import compute_mloo
-from rlftsim.rollout.policy import Policy, device_of
+from rlftsim.rollout.policy import Policy, get_device
 from rlftsim.scenario.dataset import ScenarioDataset
 
 SIZES = (2, 3, 4, 6, 8, 12, 16, 24, 32)
@@ -35,7 +34,7 @@ MIN_SIZES_FOR_A_SLOPE = 3
 MEMBERS_A_SIZE = 128
 """Rewards averaged over for each N, about; whole subsets of N are drawn until there are as many."""
 
-RewardsOf = Callable[[Int[np.ndarray, "n"]], tuple[Tensor, Tensor]]
+SubsetScorer = Callable[[Int[np.ndarray, "n"]], tuple[Tensor, Tensor]]
 """From the numbers of some rollouts to the `mloo` and `rloo` reward [n] of each among just these."""
 
 
@@ -59,15 +58,15 @@ def measure_variances(
     """Variances of a policy's rewards for each number of rollouts in `SIZES` that there are.
 
     Args:
-        policy: any policy.
-        data: data set's folder, or "synthetic", or an opened data set.
-        out: folder of the results, a JSON file per scenario, made if missing.
-        config: rollouts, seed, sampling, scenarios, processes.
-        show_progress: False = no progress bar.
+        policy: Policy whose rollouts are scored; need not be trainable.
+        data: Folder of a data set, "synthetic", or an opened data set.
+        out: Folder of the results, a JSON file per scenario, made if missing.
+        config: Rollouts, seed, sampling, scenarios, processes.
+        show_progress: False prints neither progress nor the time left.
 
     Raises:
-        ConfigError: too few rollouts for a slope.
-        DataError: not one scenario can be scored.
+        ConfigError: Too few rollouts for a slope.
+        DataError: Not one scenario can be scored, or another process is at work in the folder.
     """
     dataset, config = open_held_out(data, config)
     sizes = tuple(size for size in SIZES if size <= config.num_rollouts)
@@ -76,38 +75,41 @@ def measure_variances(
             "a slope over N = 2, 3, 4, ... needs 4 rollouts at least, "
             f"got {config.num_rollouts}: set --num-rollouts 32."
         )
-    check_jobs(config, device_of(policy))
+    check_jobs(config.jobs, get_device(policy))
     ids = [dataset.scenario_ids[i] for i in choose_scenarios(dataset, config)]
-    identity = {"sizes": list(sizes), **identity_of(policy, dataset, config)}
-    files = JsonParts(Path(out), ids, dict.fromkeys(ids, identity), {}, _stored_variances)
-    work = partial(_measure_scenario, _Job(frozen_copy(policy), dataset, config, sizes))
-    runner = on_this_machine(config.jobs, len(ids))
-    parts = map_scenarios(work, len(ids), files, runner=runner, title="variances", show_progress=show_progress)
+    identity = {"sizes": list(sizes), **describe_measurement(policy, dataset, config)}
+    stored = measure_scenarios(
+        "variances",
+        partial(_measure_scenario, _Job(frozen_copy(policy), dataset, config, sizes)),
+        ScenarioValues(Path(out), ids, dict.fromkeys(ids, identity), _parse_variances),
+        jobs=config.jobs,
+        show_progress=show_progress,
+    )
     # [rewards, sizes] each; a scenario that cannot be scored has an empty array
-    kept = {scenario_id: values for scenario_id, values in zip(ids, parts) if len(values)}
-    if not kept:
+    scored = {scenario_id: values for scenario_id, values in zip(ids, stored) if len(values)}
+    if not scored:
         raise DataError(f"{dataset.folder}: not one of {len(ids)} scenarios can be scored.")
-    stacked = np.stack(list(kept.values()))  # [scenarios, rewards, sizes]
-    return Variances(tuple(kept), sizes, {name: stacked[:, k] for k, name in enumerate(REWARDS)})
+    stacked = np.stack(list(scored.values()))  # [scenarios, rewards, sizes]
+    return Variances(tuple(scored), sizes, {name: stacked[:, k] for k, name in enumerate(REWARDS)})
 
 
 def variance_by_size(
-    rewards_of: RewardsOf, num_rollouts: int, sizes: Sequence[int], rng: np.random.Generator
+    score_subset: SubsetScorer, num_rollouts: int, sizes: Sequence[int], rng: np.random.Generator
 ) -> Float[np.ndarray, "rewards sizes"]:
     """Mean square of the rewards in random subsets of the rollouts.
 
     Args:
-        rewards_of: scores a subset.
-        num_rollouts: to draw from.
-        sizes: numbers of rollouts in a subset.
-        rng: draws.
+        score_subset: Rewards of some rollouts, computed from these alone.
+        num_rollouts: Number of rollouts that subsets are drawn from.
+        sizes: Numbers N of rollouts in a subset, each at most `num_rollouts`.
+        rng: Generator of the subsets.
     """
     variances = np.zeros((len(REWARDS), len(sizes)))  # [rewards, sizes]
     for column, size in enumerate(sizes):
         # all subsets of all rollouts are the same one; else at least two
         num_subsets = 1 if size == num_rollouts else max(MEMBERS_A_SIZE // size, 2)
-        chosen = [np.sort(rng.permutation(num_rollouts)[:size]) for _ in range(num_subsets)]
-        squares = [[float(reward.double().square().mean()) for reward in rewards_of(subset)] for subset in chosen]
+        subsets = [np.sort(rng.permutation(num_rollouts)[:size]) for _ in range(num_subsets)]
+        squares = [[float(reward.double().square().mean()) for reward in score_subset(subset)] for subset in subsets]
         variances[:, column] = np.mean(squares, axis=0)
     return variances
 
@@ -122,7 +124,7 @@ class _Job:
     sizes: tuple[int, ...]
 
 
-def _stored_variances(scenario_id: str, values: Mapping[str, Any]) -> Float[np.ndarray, "..."]:
+def _parse_variances(scenario_id: str, values: Mapping[str, Any]) -> Float[np.ndarray, "..."]:
     """Stored variances of a scenario [rewards, sizes]; empty for one that cannot be scored.
 
     Raises:
@@ -136,25 +138,25 @@ def _stored_variances(scenario_id: str, values: Mapping[str, Any]) -> Float[np.n
 
 def _measure_scenario(job: _Job, position: int) -> dict[str, object]:
     """Simulate once and score subsets of the rollouts."""
-    scenario, config, device = job.dataset[position], job.config, device_of(job.policy)
+    scenario, config, device = job.dataset[position], job.config, get_device(job.policy)
     try:
         log = scenario_log(scenario, device)
     except DataError as error:
         return {"variances": [], "skipped": str(error)}
     # features once for all rollouts: subsets pick rows of them, which is what training would compute
     features = compute_features(log, simulate_states(job.policy, scenario, config, device))
-    rewards_of = partial(_rewards_of, log, features, config.metric)
+    score_subset = partial(_score_subset, log, features, config.metric)
     # by scenario: neither the order of the scenarios nor the number of processes changes the subsets
     rng = np.random.default_rng([config.seed, *scenario.scenario_id.encode()])
-    return {"variances": variance_by_size(rewards_of, config.num_rollouts, job.sizes, rng).tolist()}
+    return {"variances": variance_by_size(score_subset, config.num_rollouts, job.sizes, rng).tolist()}
 
 
-def _rewards_of(
-    log: ScenarioLog, features: Features, metric: str, chosen: Int[np.ndarray, "n"]
+def _score_subset(
+    log: ScenarioLog, features: Features, metric: str, rollout_ids: Int[np.ndarray, "n"]
 ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
     """Both rewards of some rollouts, as training computes them from these rollouts alone."""
     # every tensor of the features has the rollouts first
-    index = torch.from_numpy(chosen).to(features.linear_speed.device)
-    some = {name: values[index] for name, values in vars(features).items() if isinstance(values, Tensor)}
-    realism = score_features(log, replace(features, **some), metric_by_name(metric))  # type: ignore[arg-type]
+    index = torch.from_numpy(rollout_ids).to(features.linear_speed.device)
+    subset = {name: values[index] for name, values in vars(features).items() if isinstance(values, Tensor)}
+    realism = score_features(log, replace(features, **subset), metric_by_name(metric))  # type: ignore[arg-type]
     return compute_mloo(realism.leave_one_out_meta_metric[None])[0], leave_one_out(realism.single_meta_metric[None])[0]

@@ -16,8 +16,8 @@ from typing import Any, Literal
 
 from rich.table import Table
 
-from rlftsim.errors import ConfigError, DataError, require_types
-from rlftsim.evaluation.columns import ARROWS, direction_of
+from rlftsim.errors import ConfigError, DataError, check_types
+from rlftsim.evaluation.columns import ARROWS, find_direction
 from rlftsim.evaluation.results import (
     SCORE_COLUMNS,
     EvaluateConfig,
@@ -26,12 +26,12 @@ from rlftsim.evaluation.results import (
     Skipped,
     row_of_result,
 )
-from rlftsim.evaluation.resumable import EvaluationParts, groups_of, resume_evaluation
+from rlftsim.evaluation.resumable import ScenarioRows, resume_evaluation
 from rlftsim.evaluation.rollout_checks import warn_of_doubts
 from rlftsim.evaluation.rollout_files import RolloutEntry, find_rollouts, read_states
 from rlftsim.evaluation.scenario_source import ScenarioSource, open_scenarios
 from rlftsim.jobs.progress import log
-from rlftsim.jobs.runner import Runner, on_this_machine, usable_cores
+from rlftsim.jobs.runner import Runner, choose_runner, usable_cores
 from rlftsim.realism import MetricConfig, metric_by_name, scenario_log, score
 from rlftsim.realism.map_based import select_polylines
 from rlftsim.realism.official_names import is_reported, official_buckets, official_fields
@@ -57,7 +57,7 @@ class ScoreConfig:
     """Processes, each with one thread; left out, as many as there are cores. Changes no result."""
 
     def __post_init__(self) -> None:
-        require_types(self)
+        check_types(self)
         for name in ("limit", "jobs"):
             value = getattr(self, name)
             if value is not None and value < 1:
@@ -84,38 +84,38 @@ def score_rollouts(
 
     Rollouts that cannot be, such as those of another frame, are scored with a warning that names scenario and agent.
 
-    Interrupted in any way, the same call goes on where it was. Once finished, it reads the file. Scenarios come in the
-    order of the files and of their places in them.
+    Interrupted in any way, the same call goes on; once finished, it reads the result. Scenarios come in the order of
+    the files, and in the order inside each file.
 
     Args:
-        rollouts: npz, submission file or a folder of them, see `find_rollouts`.
-        scenarios: converted data set, or tfrecords (file, folder or glob). Those without rollouts are not read.
-        out: folder of the result, made if missing; None keeps nothing.
-        config: metric, handling of missing maps and scenarios, processes.
-        name: of the row and the file; None = the name of `rollouts`.
-        runner: does the work in place of `config.jobs` processes, see `rlftsim.jobs.runner`.
-        show_progress: False = no progress and time left on stderr.
+        rollouts: Npz, submission file or a folder of either, see `find_rollouts`.
+        scenarios: Converted data set, or tfrecords (file, folder or glob). Scenarios without rollouts are not read.
+        out: Folder of the result, made if missing; None keeps only the returned value.
+        config: Metric, handling of missing maps and scenarios, processes.
+        name: Name of the row and of the file; None = the name of `rollouts`.
+        runner: Runner of the work in place of `config.jobs` processes, see `rlftsim.jobs.runner`.
+        show_progress: False prints neither progress nor the time left.
 
     Raises:
-        DataError: files that cannot be read, agents that are not the scenario's, values that are no numbers or more
+        DataError: Files that cannot be read, agents that are not the scenario's, values that are no numbers or more
             than 1000 km from the origin, sets of different numbers of rollouts; under "error" also scenarios without
             road edges or unknown ones.
-        ConfigError: a limit that would replace a stored result of more scenarios.
+        ConfigError: A limit that would replace a stored result of more scenarios.
     """
     rollouts, scenarios = Path(rollouts), Path(scenarios)
-    found, source = find_rollouts(rollouts), open_scenarios(scenarios)
-    entries = found[: config.limit]
+    all_entries, source = find_rollouts(rollouts), open_scenarios(scenarios)
+    entries = all_entries[: config.limit]
     check_entries(entries, source, config, scenarios)
-    known = next((entry for entry in entries if entry.scenario_id in source), None)
-    if known is None:
+    first_entry = next((entry for entry in entries if entry.scenario_id in source), None)
+    if first_entry is None:
         raise DataError(f"{rollouts}: none of its {len(entries)} scenarios is in {scenarios}: nothing to score.")
     # Read once more by the work on its scenario; all others are compared with this number.
-    num_rollouts = read_states(known).num_rollouts
+    num_rollouts = read_states(first_entry).num_rollouts
     provenance = Provenance(
         config=EvaluateConfig(num_rollouts=num_rollouts, metric=config.metric, split=None, limit=config.limit),
         policy="rollouts from files",
         # of all, also under a limit: a quick look and the whole are of the same rollouts
-        policy_fingerprint=_fingerprint(found),
+        policy_fingerprint=hash_entries(all_entries),
         dataset=str(scenarios.absolute()),
         manifest_sha256=source.fingerprint,
         sources=source.sources,
@@ -123,17 +123,17 @@ def score_rollouts(
     )
     name = name or rollouts.resolve().name.removesuffix(".npz").removesuffix(".binproto").removesuffix(".pb")
     result = resume_evaluation(
-        partial(_score_entry, _Job(tuple(entries), source, config, num_rollouts)),
+        f"score {name}",
         [entry.scenario_id for entry in entries],
-        name,
-        provenance,
-        None if out is None else Path(out),
-        runner=runner or on_this_machine(config.num_jobs, len(groups_of(len(entries), EvaluationParts.group_size))),
-        title=f"score {name}",
+        partial(_score_entry, _Job(tuple(entries), source, config, num_rollouts)),
+        name=name,
+        provenance=provenance,
+        out=None if out is None else Path(out),
+        runner=runner or choose_runner(config.num_jobs, math.ceil(len(entries) / ScenarioRows.items_per_file)),
         show_progress=show_progress,
     )
     # The result may be a stored one, made under missing_map="skip".
-    _refuse_mapless(result.skipped, config)
+    _check_maps(result.skipped, config)
     return result
 
 
@@ -168,11 +168,11 @@ def format_scores(evaluation: Evaluation) -> Table:
     for column in SCORE_COLUMNS:
         if not is_reported(column, metric):
             continue
-        found = evaluation.mean_and_error(column)
+        mean = evaluation.mean_and_error(column)
         label = "meta_metric, traffic light term set to 1" if column == "meta_metric_light_one" else column
-        spread = "" if math.isnan(found.standard_error) else f"± {found.standard_error:.4f}"
+        spread = "" if math.isnan(mean.standard_error) else f"± {mean.standard_error:.4f}"
         table.add_row(
-            f"{label}{ARROWS[direction_of(column)]}", f"{found.mean:.4f}", spread, str(found.count), metric.name
+            f"{label}{ARROWS[find_direction(column)]}", f"{mean.mean:.4f}", spread, str(mean.count), metric.name
         )
     return table
 
@@ -188,23 +188,23 @@ class _Job:
     """Of the first scenario; all others must have as many."""
 
 
-def check_entries(entries: Sequence[RolloutEntry], source: ScenarioSource, config: ScoreConfig, place: Path) -> None:
-    """Refuse or mention rollouts without scenario, and mention scenarios with several sets of rollouts.
+def check_entries(entries: Sequence[RolloutEntry], source: ScenarioSource, config: ScoreConfig, path: Path) -> None:
+    """Check that rollouts have scenarios, and mention scenarios with several sets of rollouts.
 
     Args:
-        entries: the rollouts.
-        source: the scenarios.
-        config: says if rollouts without scenario are an error.
-        place: of the scenarios, for messages.
+        entries: Rollouts in files, in the order of the scores.
+        source: Scenarios that the rollouts may belong to, by id.
+        config: Setting `missing_scenario`: rollouts without scenario are an error, or left out.
+        path: Data set or tfrecords that the scenarios come from, for messages.
 
     Raises:
-        DataError: rollouts without scenario, under `missing_scenario="error"`.
+        DataError: Rollouts without scenario, under `missing_scenario="error"`.
     """
-    unknown = [entry for entry in entries if entry.scenario_id not in source]
-    if unknown and config.missing_scenario == "error":
+    unmatched = [entry for entry in entries if entry.scenario_id not in source]
+    if unmatched and config.missing_scenario == "error":
         raise DataError(
-            f"{unknown[0]}: {len(unknown)} of {len(entries)} scenarios with rollouts, this one first, are not among "
-            f"the {len(source)} of {place}: give all scenarios, or leave them out with missing_scenario=skip "
+            f"{unmatched[0]}: {len(unmatched)} of {len(entries)} scenarios with rollouts, this one first, are not "
+            f"among the {len(source)} of {path}: give all scenarios, or leave them out with missing_scenario=skip "
             "(--missing-scenario skip)."
         )
     counts = Counter(entry.scenario_id for entry in entries)
@@ -216,15 +216,15 @@ def check_entries(entries: Sequence[RolloutEntry], source: ScenarioSource, confi
         )
 
 
-def _fingerprint(entries: Sequence[RolloutEntry]) -> str:
-    """Hash of places, sizes and modification times of the rollouts."""
+def hash_entries(entries: Sequence[RolloutEntry]) -> str:
+    """Hash of names, positions, sizes and modification times of rollouts in files."""
     # not of their bytes: a submission has gigabytes
     digest = hashlib.sha256()
     stats = {path: path.stat() for path in {entry.file for entry in entries}}
     for entry in entries:
         stat = stats[entry.file]
-        place = (entry.scenario_id, entry.file.name, entry.start, entry.stop, stat.st_size, stat.st_mtime_ns)
-        digest.update(repr(place).encode())
+        location = (entry.scenario_id, entry.file.name, entry.start, entry.stop, stat.st_size, stat.st_mtime_ns)
+        digest.update(repr(location).encode())
     return digest.hexdigest()
 
 
@@ -236,7 +236,7 @@ def _score_entry(job: _Job, position: int) -> dict[str, object] | Skipped:
     scenario = job.source.by_id(entry.scenario_id)
     if not has_road_edge(scenario):
         skipped = Skipped(scenario.scenario_id, _NO_ROAD_EDGE)
-        _refuse_mapless([skipped], job.config)
+        _check_maps([skipped], job.config)
         return skipped
     states = read_states(entry)
     if states.num_rollouts != job.num_rollouts:
@@ -257,7 +257,7 @@ def has_road_edge(scenario: Scenario) -> bool:
     return len(select_polylines(scenario.map_features, ROAD_EDGE_TYPES).count) > 0
 
 
-def _refuse_mapless(skipped: Sequence[Skipped], config: ScoreConfig) -> None:
+def _check_maps(skipped: Sequence[Skipped], config: ScoreConfig) -> None:
     """Under "error" nothing may be missing from the means, also where an earlier run left it out."""
     mapless = [scenario for scenario in skipped if scenario.reason == _NO_ROAD_EDGE]
     if mapless and config.missing_map == "error":

@@ -1,13 +1,13 @@
-"""The exam: candidates against the model they started from, on scenarios that no choice was made on, looked at once.
+"""The exam: candidates against the base model, on scenarios that no choice was made on, looked at once.
 
-OUT/tune/                        the base at some temperatures on the split `tune`, which chooses the best one
-OUT/synthetic-200-SEED/          an exam: its name says which
-    scenarios/                   its data set, where the exam is generated
+OUT/tune/                        the base at some temperatures on the split `tune`, which chooses the best
+OUT/synthetic-200-SEED/          an exam, named after data and seed
+    scenarios/                   data set of a generated exam
     evaluations/*.parquet        scores of every model
     exam.md, exam.json           tables, margins and verdicts
 
-The seed of a generated exam follows from the commit of the package, so nobody can have tuned on it. A ledger counts the
-looks at every exam.
+The seed of a generated exam follows from the commit of the package, so no model can have been tuned on the exam. A
+ledger counts the looks at every exam.
 """
 
 import math
@@ -48,21 +48,21 @@ BASE = "base"
 
 @dataclass(frozen=True)
 class Margin:
-    """Change of a column that a candidate may not exceed, however much realism it gains."""
+    """Change of a column that a candidate may not exceed, however much realism the candidate gains."""
 
     column: str
     lowest: float = -math.inf
     highest: float = math.inf
     is_relative: bool = False
-    """The change is a fraction of the base's mean."""
+    """True = the change is a fraction of the base's mean."""
 
     def bounds(self, change: PairedDifference) -> tuple[float, float]:
-        """Ends of a change's interval, as fractions of the base's mean where the margin is one."""
+        """Ends of a change's interval, as fractions of the base's mean where the margin is relative."""
         low, high = change.interval
         return (low / change.mean_a, high / change.mean_a) if self.is_relative else (low, high)
 
     def judge(self, change: PairedDifference) -> str:
-        """A word: holds, missed or undecided, by one-sided 95 % bounds; unknown without an interval.
+        """Word for a change: holds, missed or undecided, by one-sided 95 % bounds; unknown without an interval.
 
         Args:
             change: Difference from the base at alpha = 0.1, whose ends are these bounds.
@@ -92,14 +92,14 @@ class ExamConfig:
     """Models, scenarios and settings of an exam."""
 
     candidates: Mapping[str, Sequence[str]]
-    """Models by the name of their row; several are runs of one recipe with different seeds."""
+    """Models by the name of the row; several are runs of the same recipe with different seeds."""
     bases: Sequence[str] = ("demo-base",)
-    """Model that the candidates started from; of several each has an equal part of every row's models, in their
+    """Model that the candidates started from; of several, each has an equal share of every row's models, in the same
     order."""
     data: str = SYNTHETIC
     """Data set whose split exam is taken; "synthetic" generates an exam."""
     seed: int | None = None
-    """Seed of a generated exam; None = it follows from the commit."""
+    """Seed of a generated exam; None = the seed follows from the commit."""
     num_scenarios: int = 200
     """Scenarios of a generated exam."""
     temperatures: Sequence[float] = (0.7, 0.8, 0.9, 1.0, 1.1)
@@ -144,21 +144,21 @@ class Examinee:
 
     @property
     def has_noise(self) -> bool:
-        """True if it draws its decisions, which a temperature changes."""
+        """True if the policy draws its decisions, which a temperature changes."""
         return bool(self.policy.noise_size or self.policy.initial_noise_size)
 
     @property
     def seed(self) -> int | None:
-        """Seed of the run that trained it; None where it is of no run."""
+        """Seed of the run that trained the model; None for a model of no run."""
         folder = Path(self.name)
         return stored_settings(folder.parent if folder.name == "model" else folder).get("seed")
 
     def evaluate(self, scenarios: ScenarioDataset, out: Path, config: EvaluateConfig) -> Evaluation:
-        """Scores of the scenarios, read from the folder where they are finished.
+        """Scores of the scenarios, read from the folder where finished.
 
         Args:
             scenarios: Split of a data set.
-            out: Folder of the evaluation, whose name tells models and temperatures apart.
+            out: Folder of the evaluation; the name of the file tells models and temperatures apart.
             config: Rollouts, metric and temperature.
         """
         suffix = f"-temperature-{config.temperature:g}" if config.temperature != 1 else ""
@@ -168,7 +168,7 @@ class Examinee:
 
 @dataclass(frozen=True, eq=False)
 class ExamRow:
-    """Evaluations of a row's models, one for each run, beside those of the base model of each."""
+    """Evaluations of a row's models, a run each, beside those of the base model of each run."""
 
     name: str
     models: Sequence[Examinee]
@@ -178,7 +178,7 @@ class ExamRow:
 
     @property
     def mean(self) -> Row:
-        """The same as a row of other experiments."""
+        """The same as a row of experiments."""
         return Row(self.name, tuple(self.by_run))
 
     def change(self, column: str, alpha: float = 0.05) -> PairedDifference:
@@ -188,11 +188,11 @@ class ExamRow:
             column: One of `SCORE_COLUMNS`.
             alpha: Probability that the interval misses the true difference.
         """
-        before, after = (
+        reference_scores, scores = (
             np.stack([evaluation.values(column) for evaluation in evaluations])
             for evaluations in (self.references, self.by_run)
         )  # [runs, scenarios]
-        return compare_paired(column, before, after, alpha=alpha, clusters=self.by_run[0].clusters)
+        return compare_paired(column, reference_scores, scores, alpha=alpha, clusters=self.by_run[0].clusters)
 
     @cached_property
     def changes(self) -> dict[str, PairedDifference]:
@@ -212,23 +212,23 @@ class ExamRow:
 
     @property
     def next_run(self) -> MeanInterval:
-        """Mean gain in RMM, with the interval in which another run of the recipe lies; NaN for a single run."""
+        """Mean gain in RMM, with the interval in which a further run of the recipe lies; NaN for a single run."""
         return prediction_interval(self.gains)
 
     @property
     def verdict(self) -> str:
         """Result of the exam in a line: gain, and the margins that do not hold."""
         gain, words = self.changes[RMM], set(self.margins.values())
-        others = [f"{column} {word}" for column, word in self.margins.items() if word != "holds"]
+        exceptions = [f"{column} {word}" for column, word in self.margins.items() if word != "holds"]
         passed = gain.is_difference and gain.difference > 0 and words == {"holds"}
         failed = (gain.is_difference and gain.difference < 0) or "missed" in words
         result = "passes" if passed else "fails" if failed else "undecided"
-        return f"{self.name} {result}: RMM {gain.verdict} Margins: {', '.join(others) or 'all hold'}."
+        return f"{self.name} {result}: RMM {gain.verdict} Margins: {', '.join(exceptions) or 'all hold'}."
 
 
 @dataclass(frozen=True, eq=False)
 class ExamResult:
-    """Rows of an exam and where it is described."""
+    """Rows of an exam and the folder of the results."""
 
     name: str
     folder: Path
@@ -238,29 +238,30 @@ class ExamResult:
     rows: Sequence[ExamRow]
     """The base at its best temperature, if that is not 1, then the candidates."""
     looks: Mapping[str, int]
-    """Looks at this exam by candidate, this one included."""
+    """Looks at this exam by candidate, the present look included."""
 
 
-def take_exam(config: ExamConfig, out: Path, ledger: Ledger, *, again: bool = False) -> ExamResult:
+def take_exam(config: ExamConfig, out: Path, ledger: Ledger, *, is_repeat: bool = False) -> ExamResult:
     """Evaluate base and candidates on an exam; what an interrupted call finished is not done again.
 
     The result is neither written nor in the ledger: see `experiments.exam_report`.
 
     Args:
         config: Models, scenarios and settings.
-        out: Folder for everything.
+        out: Folder for scenarios, evaluations and results of all exams.
         ledger: Looks at exams so far.
-        again: True allows a further look at a recipe or model that has sat this exam.
+        is_repeat: True allows a further look at a recipe or model that has sat this exam.
 
     Raises:
-        ConfigError: A recipe or model has sat the exam and `again` is not set, no commit and no seed, or no SUMO.
+        ConfigError: A recipe or model has sat the exam and `is_repeat` is not set, no commit and no seed, or no SUMO.
         DataError: The data set has no split exam.
     """
     # 1. Refuse a second look before anything is simulated.
     names = (name for row in (config.bases, *config.candidates.values()) for name in row)
     models = {name: Examinee(name, load_policy(name, config.device)) for name in dict.fromkeys(names)}
     looks = {
-        recipe: 1 + ledger.count_looks(config.exam_name, recipe, [models[n].fingerprint for n in row], again=again)
+        recipe: 1
+        + ledger.count_looks(config.exam_name, recipe, [models[n].fingerprint for n in row], is_repeat=is_repeat)
         for recipe, row in config.candidates.items()
     }
     # 2. Scenarios of the exam.
@@ -287,7 +288,7 @@ def take_exam(config: ExamConfig, out: Path, ledger: Ledger, *, again: bool = Fa
 
 
 def find_temperature(bases: Sequence[Examinee], config: ExamConfig, out: Path) -> float:
-    """Temperature at which the base is most realistic on the split tune; the only one, if there is no other to try.
+    """Temperature at which the base is most realistic on the split tune; a single candidate is not tried.
 
     Args:
         bases: Base models, whose mean counts.
@@ -332,7 +333,7 @@ def generate_exam(config: ExamConfig, folder: Path) -> ScenarioDataset:
 
 
 def find_seed() -> int:
-    """Seed that follows from the commit of the checkout: its first eight hexadecimal digits.
+    """Seed that follows from the commit of the checkout: the first eight hexadecimal digits.
 
     Raises:
         ConfigError: The package does not run from a checkout.
@@ -340,7 +341,7 @@ def find_seed() -> int:
     # an installed package may lie inside of somebody else's repository, whose commit says nothing
     if (CHECKOUT / ".git").exists():
         git = ["git", "-C", str(CHECKOUT), "rev-parse", "HEAD"]
-        found = subprocess.run(git, capture_output=True, text=True, check=False)
-        if found.returncode == 0:
-            return int(found.stdout[:8], 16)
+        process = subprocess.run(git, capture_output=True, text=True, check=False)
+        if process.returncode == 0:
+            return int(process.stdout[:8], 16)
     raise ConfigError("the seed of an exam follows from the commit, and this is no checkout: give one by --seed.")

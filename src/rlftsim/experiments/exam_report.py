@@ -1,4 +1,4 @@
-"""What an exam says: tables, verdicts, a page, JSON, and the lines of the ledger."""
+"""Result of an exam: tables, verdicts, a page, JSON, and the lines of the ledger."""
 
 import json
 import math
@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import Any
 
-from rlftsim.evaluation.columns import DRIFT_COLUMNS, TERMINAL_COLUMNS, Column, direction_of
+from rlftsim.evaluation.columns import DRIFT_COLUMNS, TERMINAL_COLUMNS, Column, find_direction
 from rlftsim.evaluation.compare import FEW_CLUSTERS, PairedDifference
 from rlftsim.experiments import tables
 from rlftsim.experiments.exam import MARGINS, ExamConfig, ExamResult, ExamRow, Margin
 from rlftsim.experiments.ledger import Ledger
-from rlftsim.experiments.results import finite_or_none
+from rlftsim.experiments.results import format_origin, to_finite
 from rlftsim.experiments.tables import TextTable
 from rlftsim.jobs.files import write_text
 from rlftsim.training.run_folder import describe_environment, to_plain
@@ -24,112 +24,106 @@ COLUMNS = (
 
 
 def write_exam(result: ExamResult, config: ExamConfig, ledger: Ledger) -> tuple[Sequence[TextTable], Sequence[str]]:
-    """Write exam.md and exam.json of an exam, then its lines of the ledger.
+    """Write exam.md and exam.json of an exam, then the lines of the ledger.
 
     Args:
-        result: What was measured.
-        config: Settings that it was measured with.
-        ledger: Ledger that the look is added to.
+        result: Rows that `take_exam` measured.
+        config: Models, scenarios and settings of the measurement.
+        ledger: Ledger that the look is added to, a line per row.
 
     Returns:
         Tables and verdicts.
     """
     environment = describe_environment()
-    all_tables = (means_table(result), changes_table(result), margins_table(result))
-    lines = [row.verdict for row in result.rows] + [next_run_line(row) for row in result.rows if len(row.by_run) > 1]
+    means_table = tables.build_table("Means", [result.base, *(row.mean for row in result.rows)], COLUMNS)
+    all_tables = (means_table, build_changes_table(result), build_margins_table(result))
+    lines = [row.verdict for row in result.rows] + [format_next_run(row) for row in result.rows if len(row.by_run) > 1]
     lines.append(f"On the split tune the base is most realistic at temperature {result.temperature:g}.")
-    entries = [ledger_entry(row, result, config, environment["commit"]) for row in result.rows]
+    entries = [build_ledger_entry(row, result, config, environment["commit"]) for row in result.rows]
     values = {"exam": result.name, "verdicts": lines, "rows": entries, "environment": environment}
-    write_text(result.folder / "exam.json", json.dumps(finite_or_none(values), indent=1) + "\n")
-    write_text(result.folder / "exam.md", page(result, all_tables, lines, environment))
-    ledger.append([finite_or_none(entry) for entry in entries])
+    write_text(result.folder / "exam.json", json.dumps(to_finite(values), indent=1) + "\n")
+    write_text(result.folder / "exam.md", format_page(result, all_tables, lines, environment))
+    ledger.append([to_finite(entry) for entry in entries])
     return all_tables, lines
 
 
-def means_table(result: ExamResult) -> TextTable:
-    """Mean of every column, base first."""
-    return tables.of_rows("Means", [result.base, *(row.mean for row in result.rows)], COLUMNS)
-
-
-def changes_table(result: ExamResult) -> TextTable:
-    """Difference of every column from the base, with its interval and a word where it is none by chance."""
+def build_changes_table(result: ExamResult) -> TextTable:
+    """Difference of every column from the base, with interval and word as in `format_change`."""
     rows = [
-        (column.label, *(change_cell(row.changes[column.source], column) for row in result.rows)) for column in COLUMNS
+        (column.label, *(format_change(row.changes[column.source], column) for row in result.rows))
+        for column in COLUMNS
     ]
-    return TextTable(
-        "Against the base",
-        ("", *(row.name for row in result.rows)),
-        tuple(rows),
-        f"95 % intervals by {counted(result)}.",
-    )
+    note = f"95 % intervals by {describe_bootstrap(result)}."
+    return TextTable("Against the base", ("", *(row.name for row in result.rows)), tuple(rows), note)
 
 
-def change_cell(change: PairedDifference, column: Column) -> str:
-    """A difference with its interval in the column's unit; better or worse where it is none by chance."""
+def format_change(change: PairedDifference, column: Column) -> str:
+    """Difference with interval in the column's unit, and a word where chance does not explain the difference."""
     if not math.isfinite(change.difference):
         return "–"
-    direction = direction_of(column.source)
-    is_better = (change.difference > 0) == (direction == "higher")
-    word = " (changed)" if direction == "log" else " (better)" if is_better else " (worse)"
-    numbers = f"{signed(column, change.difference)} {interval_text(column, change.interval)}"
+    direction = find_direction(column.source)
+    is_gain = (change.difference > 0) == (direction == "higher")
+    word = " (changed)" if direction == "log" else " (better)" if is_gain else " (worse)"
+    numbers = f"{format_signed(column, change.difference)} {format_interval(column, change.interval)}"
     return f"{numbers}{word if change.is_difference else ''}"
 
 
-def margins_table(result: ExamResult) -> TextTable:
-    """Word of each margin and the one-sided bounds that it is judged by."""
+def build_margins_table(result: ExamResult) -> TextTable:
+    """Word of each margin and the one-sided bounds that decide the word."""
     columns = {column.source: column for column in COLUMNS}
     rows = []
     for margin in MARGINS:
         column = columns[margin.column]
         if margin.is_relative:
             column = Column(column.source, column.heading, column.meaning, "%")
-        cells = [
-            f"{row.margins[margin.column]} {interval_text(column, margin.bounds(row.change(margin.column, alpha=0.1)))}"
-            for row in result.rows
-        ]
-        rows.append((f"{column.heading} {limit_text(margin, column)}", *cells))
+        bounds = (margin.bounds(row.change(margin.column, alpha=0.1)) for row in result.rows)
+        words = (row.margins[margin.column] for row in result.rows)
+        cells = [f"{word} {format_interval(column, limits)}" for word, limits in zip(words, bounds)]
+        rows.append((f"{column.heading} {format_margin(margin, column)}", *cells))
     note = "A margin holds if both one-sided 95 % bounds (in brackets) are inside, and is missed if both are outside."
     return TextTable("Margins", ("", *(row.name for row in result.rows)), tuple(rows), note)
 
 
-def limit_text(margin: Margin, column: Column) -> str:
+def format_margin(margin: Margin, column: Column) -> str:
     """A margin in the column's unit."""
     unit = f" {column.unit}" if column.unit else ""
     if math.isinf(margin.lowest):
-        return f"≤ {signed(column, margin.highest)}{unit}"
+        return f"≤ {format_signed(column, margin.highest)}{unit}"
     if math.isinf(margin.highest):
-        return f"≥ {signed(column, margin.lowest)}{unit}"
+        return f"≥ {format_signed(column, margin.lowest)}{unit}"
     return f"within {column.text(margin.highest)}{unit}"
 
 
-def signed(column: Column, value: float) -> str:
-    """A difference in the column's unit, with its sign."""
+def format_signed(column: Column, value: float) -> str:
+    """Difference in the column's unit, with a sign."""
     return f"{'+' if value >= 0 else ''}{column.text(value)}"
 
 
-def interval_text(column: Column, interval: Sequence[float]) -> str:
-    """Both ends of an interval in the column's unit; "[unknown]" where there is none."""
-    return f"[{', '.join(signed(column, end) for end in interval)}]" if math.isfinite(interval[0]) else "[unknown]"
+def format_interval(column: Column, interval: Sequence[float]) -> str:
+    """Both ends of an interval in the column's unit; "[unknown]" without an interval."""
+    return (
+        f"[{', '.join(format_signed(column, end) for end in interval)}]" if math.isfinite(interval[0]) else "[unknown]"
+    )
 
 
-def counted(result: ExamResult) -> str:
-    """How intervals count, in words."""
+def describe_bootstrap(result: ExamResult) -> str:
+    """Units of the intervals' bootstrap, in words."""
     row = max(result.rows, key=lambda row: len(row.by_run))
     num_clusters, num_runs = len(set(row.by_run[0].clusters)), len(row.by_run)
     runs = " and runs" if num_runs > 1 else ""
-    few = f"; fewer than {FEW_CLUSTERS} say little about others" if num_clusters < FEW_CLUSTERS else ""
-    return f"bootstrap over {num_clusters} street networks or recordings{runs}{few}"
+    caution = f"; fewer than {FEW_CLUSTERS} say little about others" if num_clusters < FEW_CLUSTERS else ""
+    return f"bootstrap over {num_clusters} street networks or recordings{runs}{caution}"
 
 
-def next_run_line(row: ExamRow) -> str:
-    """Gain of each run, and the interval of the next one."""
+def format_next_run(row: ExamRow) -> str:
+    """Gain of each run, and the interval of the next run."""
     gains, (low, high) = row.gains, row.next_run.interval
     listed = ", ".join(f"{gain:+.4f}" for gain in gains)
     return f"{row.name}: RMM by run {listed}; the next run lies in [{low:+.4f}, {high:+.4f}] with 95 %."
 
 
-def ledger_entry(row: ExamRow, result: ExamResult, config: ExamConfig, commit: str | None) -> dict[str, Any]:
-    """A row for machines, as the ledger has it."""
+def build_ledger_entry(row: ExamRow, result: ExamResult, config: ExamConfig, commit: str | None) -> dict[str, Any]:
+    """Row for machines, an entry of the ledger."""
     return {
         "date": datetime.now(UTC).date().isoformat(),
         "commit": commit,
@@ -160,12 +154,12 @@ def ledger_entry(row: ExamRow, result: ExamResult, config: ExamConfig, commit: s
     }
 
 
-def page(result: ExamResult, all_tables: Sequence[TextTable], lines: Sequence[str], environment: dict[str, Any]) -> str:
+def format_page(
+    result: ExamResult, all_tables: Sequence[TextTable], lines: Sequence[str], environment: dict[str, Any]
+) -> str:
     """The page for people, in Markdown."""
     looks = ", ".join(f"{recipe} {count}" for recipe, count in result.looks.items())
-    parts = [f"# Exam {result.name}", "\n".join(f"* {line}" for line in lines)]
-    for table in all_tables:
-        parts += [f"## {table.title}", table.markdown(), *([table.note] if table.note else [])]
-    commit = environment["commit"] or "of an installed package"
-    parts += ["## Notes", f"* Looks at this exam: {looks}.\n* Made with `{environment['command']}`, commit {commit}."]
-    return "\n\n".join(parts) + "\n"
+    paragraphs = [f"# Exam {result.name}", "\n".join(f"* {line}" for line in lines)]
+    paragraphs += [paragraph for table in all_tables for paragraph in table.paragraphs]
+    paragraphs += ["## Notes", f"* Looks at this exam: {looks}.\n* Made with {format_origin(environment)}."]
+    return "\n\n".join(paragraphs) + "\n"

@@ -32,9 +32,9 @@ def road_test(scenario: Scenario) -> RoadTest | None:
 
 
 def _outside_m(
-    edges: RoadEdges, way: Float[np.ndarray, "S 3"], heading: Float[np.ndarray, "S"], size: Float[np.ndarray, "3"]
+    edges: RoadEdges, path: Float[np.ndarray, "S 3"], heading: Float[np.ndarray, "S"], size: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "S"]:
-    x, y, z = torch.from_numpy(way).float().T  # each [S]
+    x, y, z = torch.from_numpy(path).float().T  # each [S]
     # the metric takes the center of the box, lanes lie on the ground
     z = z + float(size[2]) / 2
     angle = torch.from_numpy(heading).float()
@@ -44,37 +44,36 @@ def _outside_m(
 
 
 def propose(scenario: Scenario, track: int) -> tuple[Proposal, ...]:
-    """Proposals for an agent in the order of the maneuvers: the logged one with its logged end, others along the lanes.
+    """Proposals for an agent in the order of the maneuvers: the logged maneuver, and alternatives along lanes.
 
     Args:
-        scenario: with its logged future, where the logged maneuver is wanted.
-        track: row of the agent in `scenario.tracks`.
+        scenario: Scenario of the agent; without a logged future there is no logged maneuver.
+        track: Row of the agent in `scenario.tracks`.
     """
     logged = logged_maneuver(scenario, track)
-    others = propose_from_lanes(scenario, track, road_test(scenario))
+    from_lanes = propose_from_lanes(scenario, track, road_test(scenario))
     if logged is None:
-        return others
-    order = BENCHMARK_MANEUVERS
-    kept = [proposal for proposal in others if proposal.maneuver != logged.maneuver]
-    return tuple(sorted([*kept, logged], key=lambda proposal: order.index(proposal.maneuver)))
+        return from_lanes
+    proposals = {proposal.maneuver: proposal for proposal in from_lanes} | {logged.maneuver: logged}
+    return tuple(sorted(proposals.values(), key=lambda proposal: BENCHMARK_MANEUVERS.index(proposal.maneuver)))
 
 
-def entry_of(scenario: Scenario, proposal: Proposal) -> GoalEntry:
-    """A proposal as an entry of a goals file.
+def to_goal_entry(scenario: Scenario, proposal: Proposal) -> GoalEntry:
+    """Entry of a goals file for a proposal, labeled with the maneuver.
 
     Args:
-        scenario: of the agent.
-        proposal: for the agent.
+        scenario: Scenario of the agent, whose id the entry has.
+        proposal: Proposal for an agent of the scenario; the end of the path becomes the goal.
     """
     x, y = proposal.position
-    return GoalEntry(scenario.scenario_id, proposal.object_id, float(x), float(y), label_of(proposal))
+    return GoalEntry(scenario.scenario_id, proposal.object_id, float(x), float(y), format_label(proposal))
 
 
-def label_of(proposal: Proposal) -> str:
+def format_label(proposal: Proposal) -> str:
     """Label of a proposal: its maneuver, with an ending for the logged one."""
     return f"{proposal.maneuver.value}{LOGGED if proposal.is_logged else ''}"
 
 
 def split_label(label: str) -> tuple[str, bool]:
-    """The maneuver of a label, and True for the logged one."""
+    """Maneuver that a label names, and True for the logged maneuver."""
     return label.removesuffix(LOGGED), label.endswith(LOGGED)

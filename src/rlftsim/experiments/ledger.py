@@ -1,4 +1,4 @@
-"""A ledger of looks at exams: a line of JSON for each, in a file that only grows."""
+"""Ledger of looks at exams: a line of JSON for each look, in a file that only grows."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -20,10 +20,10 @@ class Ledger:
 
     @cached_property
     def entries(self) -> list[Mapping[str, Any]]:
-        """The lines of the file.
+        """Entries of the file, a mapping for each line.
 
         Raises:
-            DataError: The file cannot be read, or a line of it is none of a ledger.
+            DataError: The file cannot be read, or has a line that is no entry of a ledger.
         """
         try:
             lines = self.path.read_text(encoding="utf-8").splitlines()
@@ -43,17 +43,17 @@ class Ledger:
             entries.append(entry)
         return entries
 
-    def count_looks(self, exam: str, recipe: str, fingerprints: Sequence[str], *, again: bool) -> int:
-        """Earlier looks at an exam by a recipe of this name or one of these models.
+    def count_looks(self, exam: str, recipe: str, fingerprints: Sequence[str], *, is_repeat: bool) -> int:
+        """Number of earlier looks at an exam by a recipe of this name or any of these models.
 
         Args:
             exam: Name of the exam.
             recipe: Name of the recipe.
-            fingerprints: Models of the recipe.
-            again: True = a further look is wanted.
+            fingerprints: Fingerprints of the recipe's models, which may have sat under a former name.
+            is_repeat: True allows a further look, which is counted; False refuses one.
 
         Raises:
-            ConfigError: There was a look, and `again` is not set.
+            ConfigError: There was a look, and `is_repeat` is not set.
         """
         earlier = [
             entry
@@ -62,7 +62,7 @@ class Ledger:
             and entry["exam"] == exam
             and (entry["recipe"] == recipe or set(entry["fingerprints"]) & {*fingerprints})
         ]
-        if earlier and not again:
+        if earlier and not is_repeat:
             raise ConfigError(
                 f"{recipe} sat the exam {exam} on {earlier[-1]['date']} ({self.path}): whoever looks twice chooses on "
                 "the exam. Choose on the split tune, or add --again, which is counted."

@@ -1,5 +1,5 @@
-"""Models that experiments compare: baselines, pre-trained models, and fine-tunings of them. Descriptions only,
-nothing runs here."""
+"""Models that experiments compare: baselines, pre-trained models, and fine-tuned models. Descriptions only,
+no training runs here."""
 
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -7,9 +7,7 @@ from typing import Literal
 from rlftsim.errors import ConfigError
 from rlftsim.recipes.base import Recipe
 from rlftsim.rewards import CreditTo
-from rlftsim.training.catk import CatkConfig
 from rlftsim.training.finetune_config import FinetuneConfig
-from rlftsim.training.goal_relabeling import GcslConfig
 from rlftsim.training.goals import GoalConfig, with_goals
 from rlftsim.training.method import TrainingSettings
 
@@ -19,7 +17,7 @@ WEAK_EPOCHS = 1.0
 
 @dataclass(frozen=True)
 class Baseline:
-    """A policy without weights: the log itself, or constant velocity."""
+    """A policy without weights: the log, or constant velocity."""
 
     name: Literal["oracle", "constant_velocity"]
 
@@ -33,20 +31,20 @@ class Base:
 
     @property
     def name(self) -> str:
-        """Name of its files."""
+        """Name of the model's files."""
         return "base" if self.epochs is None else f"base-{self.epochs:g}-epochs"
 
 
-GoalKind = Literal["soft", "hard"]
+GoalRewardType = Literal["soft", "hard"]
 
 
 @dataclass(frozen=True)
 class GoalTraining:
-    """Goal conditioning that a fine-tuning adds to a model, and the goal reward it is trained with."""
+    """Goal conditioning that a fine-tuning adds to a model, and the goal reward of the training."""
 
     encoding: str
     """Encoding of goals, an argument of the policy's `with_goal_conditioning`: SMART has "concat" and "indication"."""
-    kind: GoalKind | None = None
+    reward_type: GoalRewardType | None = None
     """Reward for passing the goal (soft) or for ending there (hard). None = no reward: rollouts relabelled
     with their own endpoints are imitated."""
     weight: float = 0.1
@@ -54,13 +52,13 @@ class GoalTraining:
 
     @property
     def name(self) -> str:
-        """Part of the name of its files; the weight is not in it."""
-        return self.encoding if self.kind is None else f"{self.encoding}-{self.kind}"
+        """Part of the name of the model's files, without the weight."""
+        return self.encoding if self.reward_type is None else f"{self.encoding}-{self.reward_type}"
 
 
 @dataclass(frozen=True)
 class FineTuned:
-    """A base model after fine-tuning. All other settings are the recipe's, so all of them have the same budget."""
+    """A base model after fine-tuning. All further settings are the recipe's, so the budget is equal."""
 
     method: str = "mloo"
     """Name of a reward, or "catk", "road" or "gcsl"."""
@@ -76,7 +74,7 @@ class FineTuned:
 
     @property
     def name(self) -> str:
-        """Name of its files, without the epochs."""
+        """Name of the model's files, without the epochs."""
         # default values add nothing to a name, which becomes a file's
         credit = "" if self.credit == "rollout" else f"-{self.credit}"
         base = "" if self.base == Base() else f"-from-{self.base.name}"
@@ -84,16 +82,18 @@ class FineTuned:
         return f"{self.method}{goals}{credit}{base}-seed{self.seed}"
 
     def training_config(self, recipe: Recipe) -> TrainingSettings:
-        """Settings of the training; their type is that of the method.
+        """Settings of the training, of the type that the method has.
 
         Raises:
-            ConfigError: there is no such reward, or the recipe has no section for the method.
+            ConfigError: Unknown reward, or the recipe has no section for the method.
         """
         closed_loop = {CATK: recipe.catk, ROAD: recipe.road}.get(self.method)
         if closed_loop is not None:
-            return catk_config(self, closed_loop, recipe.finetune)
+            # As many updates of as many scenarios as a fine-tuning with a reward makes.
+            epochs, batch_size = recipe.finetune.epochs * self.epochs_fraction, recipe.finetune.batch_size
+            return replace(closed_loop, seed=self.seed, epochs=epochs, batch_size=batch_size)
         if self.method == GCSL and recipe.gcsl is not None:
-            return gcsl_config(self, recipe.gcsl)
+            return replace(recipe.gcsl, seed=self.seed, epochs=recipe.gcsl.epochs * self.epochs_fraction)
         if self.method in (CATK, ROAD, GCSL):
             raise ConfigError(f"the recipe has no section {self.method}: its policies cannot be trained so.")
         return finetune_config(self, recipe.finetune)
@@ -101,7 +101,7 @@ class FineTuned:
 
 @dataclass(frozen=True)
 class Guided:
-    """A goal-conditioned model with guidance: its goal logit bias is scaled, nothing is trained. See
+    """A goal-conditioned model with guidance: the goal logit bias is scaled, without training. See
     `SmartPolicy.with_guidance`."""
 
     of: FineTuned
@@ -109,7 +109,7 @@ class Guided:
 
     @property
     def name(self) -> str:
-        """Name of its files."""
+        """Name of the model's files."""
         return f"{self.of.name}-guided-{self.scale:g}"
 
 
@@ -145,11 +145,11 @@ class Budget:
 
 
 def over_seeds(spec: FineTuned, num_seeds: int) -> tuple[FineTuned, ...]:
-    """The same fine-tuning with several seeds: one row of a table.
+    """The same fine-tuning with several seeds: a row of a table.
 
     Args:
-        spec: its own seed is replaced.
-        num_seeds: seeds are 0, 1, ..., num_seeds - 1.
+        spec: Fine-tuning of any seed, which is replaced.
+        num_seeds: Number of seeds, which are 0, 1, ..., num_seeds - 1.
     """
     return tuple(replace(spec, seed=seed) for seed in range(num_seeds))
 
@@ -158,47 +158,19 @@ def finetune_config(spec: FineTuned, recipe: FinetuneConfig) -> FinetuneConfig:
     """Settings of a fine-tuning with a reward.
 
     Args:
-        spec: its method is the reward.
-        recipe: all that the spec leaves open. Without a goal training in the spec, goals are switched off.
+        spec: Fine-tuning with the name of the reward as method.
+        recipe: Settings that the spec leaves open. Without a goal training in the spec, goals are switched off.
 
     Raises:
-        ConfigError: there is no such reward.
+        ConfigError: Unknown reward.
     """
     # Goals of the recipe are for goal-conditioned rows alone.
     reward, goals = spec.method, GoalConfig()
     if spec.goals is not None:
-        reward = f"{spec.method}(goal_weight={spec.goals.weight}, kind='{spec.goals.kind}')"
+        reward = f"{spec.method}(goal_weight={spec.goals.weight}, kind='{spec.goals.reward_type}')"
         goals = with_goals(recipe.goals)
     epochs = recipe.epochs * spec.epochs_fraction
     hold_speed = recipe.hold_speed and spec.goals is None  # goals ask for a speed
     return replace(
-        recipe,
-        reward=reward,
-        seed=spec.seed,
-        epochs=epochs,
-        credit=spec.credit,
-        goals=goals,
-        hold_speed=hold_speed,
+        recipe, reward=reward, seed=spec.seed, epochs=epochs, credit=spec.credit, goals=goals, hold_speed=hold_speed
     )
-
-
-def catk_config(spec: FineTuned, catk: CatkConfig, finetune: FinetuneConfig) -> CatkConfig:
-    """Settings of a fine-tuning with CAT-K that makes as many updates of as many scenarios as one with a reward.
-
-    Args:
-        spec: the seed and the fraction of the epochs.
-        catk: the recipe's settings of CAT-K or RoaD.
-        finetune: the recipe's settings of fine-tuning with a reward, which have the budget.
-    """
-    epochs = finetune.epochs * spec.epochs_fraction
-    return replace(catk, seed=spec.seed, epochs=epochs, batch_size=finetune.batch_size)
-
-
-def gcsl_config(spec: FineTuned, recipe: GcslConfig) -> GcslConfig:
-    """Settings of goal-conditioned supervised learning on the model's own relabelled rollouts.
-
-    Args:
-        spec: the seed and the fraction of the epochs.
-        recipe: all that the spec leaves open.
-    """
-    return replace(recipe, seed=spec.seed, epochs=recipe.epochs * spec.epochs_fraction)

@@ -1,5 +1,5 @@
-"""An animation of one scenario as two policies simulate it, in the rollout in which their collisions and road
-departures differ most."""
+"""Animation of a scenario that two policies simulate, in the rollout in which collisions and road departures differ
+most."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from rlftsim.viewer.scene import build_scene, rollout_trajectories
 
 @dataclass(frozen=True, eq=False)
 class PairedAnimation:
-    """One rollout of a scenario by two policies with the same noise."""
+    """A rollout of a scenario by two policies with the same noise."""
 
     scenario_id: str
     rollout: int
@@ -32,45 +32,44 @@ class PairedAnimation:
 
 
 def animate_pair(
-    place: str, scenario: Scenario, policies: Mapping[str, Policy], suite: ExperimentSuite, *, prefers_increase: bool
+    rank: str, scenario: Scenario, policies: Mapping[str, Policy], suite: ExperimentSuite, *, prefers_increase: bool
 ) -> PairedAnimation:
     """Animation of the first rollout in which the number of events changes most from the first to the second policy.
 
     Args:
-        place: words for the caption.
-        scenario: simulated as in an evaluation, with the suite's seed and sampling.
-        policies: two policies, by their names.
-        suite: settings of the evaluation.
-        prefers_increase: take the rollout of the largest increase, not of the largest decrease.
+        rank: Rank of the scenario in words, such as "1. of 40", for the caption.
+        scenario: Scenario with a logged future; simulated as in an evaluation, with the suite's seed and sampling.
+        policies: Two policies by name, the base model first.
+        suite: Suite with the settings and the device of evaluations.
+        prefers_increase: True takes the rollout of the largest increase, False that of the largest decrease.
     """
     device = find_device(suite.device)
     log = scenario_log(scenario, device)
-    marks = {
+    features = {
         name: compute_features(log, simulate_states(policy, scenario, suite.evaluation, device))
         for name, policy in policies.items()
     }
     # Events: evaluated agents that collide at some step, plus those that leave the road at some step.
-    counts = []
-    for features in marks.values():
-        happens = torch.stack([features.collision.any(-1), features.offroad.any(-1)])  # [2, N, E]
-        counts.append(happens.sum(dim=(0, 2)))  # [N]
-    before, after = counts
-    rollout = int(((after - before) * (1 if prefers_increase else -1)).argmax())
+    base, tuned = (
+        torch.stack([f.collision.any(-1), f.offroad.any(-1)]).sum(dim=(0, 2))  # [2, N, E] -> [N]
+        for f in features.values()
+    )
+    rollout = int(((tuned - base) * (1 if prefers_increase else -1)).argmax())
     # Noise depends on the number of the rollout alone, so that simulating this one alone repeats it.
-    shown, batch = range(rollout, rollout + 1), collate([scenario]).to(device)
+    rollout_ids, batch = range(rollout, rollout + 1), collate([scenario]).to(device)
     seed, sampling = suite.evaluation.seed, suite.evaluation.sampling
     panels = []
     for name, policy in policies.items():
-        rollouts = simulate(policy, batch, num_rollouts=shown, seed=seed, sampling=sampling)
+        rollouts = simulate(policy, batch, num_rollouts=rollout_ids, seed=seed, sampling=sampling)
         # Marks of the rollout that is shown: [1, E, T].
-        flags = {mark: getattr(marks[name], mark)[rollout : rollout + 1].cpu() for mark in ("collision", "offroad")}
+        flags = {mark: getattr(features[name], mark)[rollout : rollout + 1].cpu() for mark in ("collision", "offroad")}
         motion = rollout_trajectories(scenario, rollouts, row=0).with_evaluated_flags(scenario, **flags)
         panels.append(Panel(name, motion))
     num_evaluated = len(scenario.evaluated_indices)
-    rates = (float(before.double().mean()) / num_evaluated, float(after.double().mean()) / num_evaluated)
-    events = (int(before[rollout]), int(after[rollout]))
+    rates = (float(base.double().mean()) / num_evaluated, float(tuned.double().mean()) / num_evaluated)
+    events = (int(base[rollout]), int(tuned[rollout]))
     caption = (
-        f"{place}, rollout {rollout}: {events[0]} collisions and departures from the road before, {events[1]} after; "
+        f"{rank}, rollout {rollout}: {events[0]} collisions and departures from the road before, {events[1]} after; "
         f"over all rollouts {rates[0]:.2f} and {rates[1]:.2f} events an agent."
     )
     animation = Animation(f"Scenario {scenario.scenario_id}", build_scene(scenario), panels, caption=caption)

@@ -1,4 +1,4 @@
-"""Experiments by name. A package of your own adds one, see `rlftsim.plugins`; `rlftsim experiment NAME` then runs it:
+"""Experiments by name. `rlftsim experiment NAME` also runs those of installed packages, see `rlftsim.plugins`:
 
 [project.entry-points."rlftsim.experiments"]
 my-table = "my_package.my_table:EXPERIMENT"
@@ -25,14 +25,15 @@ EXPERIMENTS = ExtensionPoint[Experiment[Any]](
 
 
 def experiment_by_name(name: str) -> Experiment[Any]:
-    """The experiment of a name, this package's or another's.
+    """Experiment of a name, from this package or a plugin.
 
     Raises:
-        ConfigError: unknown, with the nearest known name, or not an experiment.
+        ConfigError: Unknown name (the message has the nearest registered name), or not an experiment.
     """
-    found = EXPERIMENTS.get(name)
-    if not isinstance(found, Experiment):
+    experiment = EXPERIMENTS.get(name)
+    if not isinstance(experiment, Experiment):
+        type_name = type(experiment).__name__
         raise ConfigError(
-            f"experiment {name!r} is of type {type(found).__name__}: make it a rlftsim.experiments.results.Experiment."
+            f"experiment {name!r} is of type {type_name}: make it a rlftsim.experiments.results.Experiment."
         )
-    return found
+    return experiment

@@ -1,8 +1,8 @@
-"""An experiment and its result: tables, verdicts and a figure, written as Markdown, JSON and pictures.
+"""Experiments and results: tables, verdicts and a figure, written as Markdown, JSON and pictures.
 
 A new experiment is two functions: `run` trains and evaluates, `summarize` makes tables and verdicts of that.
 `experiments.tables` makes tables of rows, `Row.against` makes verdicts. `EXPERIMENTS` in
-`experiments.registry` has them by name.
+`experiments.registry` has all experiments by name.
 """
 
 import json
@@ -40,42 +40,42 @@ class ExperimentResult:
     animations: tuple[Animation, ...] = ()
 
 
-Found = TypeVar("Found")
+Measured = TypeVar("Measured")
 FILMS = {".webp": 2, ".mp4": 1}
 """Endings of an animation's films and their steps between frames."""
 
 
 @dataclass(frozen=True)
-class Experiment(Generic[Found]):
+class Experiment(Generic[Measured]):
     """A question, and the two functions that answer it."""
 
     question: str
-    run: Callable[[ExperimentSuite], Found]
-    """Trains and evaluates what is missing, and returns what `summarize` needs: mostly the rows of a table."""
-    summarize: Callable[[Found, ExperimentSuite], ExperimentResult]
+    run: Callable[[ExperimentSuite], Measured]
+    """Trains and evaluates missing models, and returns the input of `summarize`: mostly the rows of a table."""
+    summarize: Callable[[Measured, ExperimentSuite], ExperimentResult]
     """Computes from stored results alone."""
     default_seeds: int = 1
     needs_goals: bool = False
-    """True = it trains goal-conditioned models, so a model that cannot be given goals is refused at once."""
+    """True = goal-conditioned models are trained, so a model that cannot be given goals is refused at once."""
 
 
 def run_experiment(name: str, experiment: Experiment[Any], suite: ExperimentSuite) -> ExperimentResult:
-    """Run what is missing of an experiment and write its result, each file whole or not at all.
+    """Run the missing stages of an experiment and write the result, each file whole or not at all.
 
-    Always NAME.md and NAME.json; with a figure NAME.png and NAME.svg; with animations NAME.html, where they
-    can be played, and films of each: NAME-1.webp, NAME-1.mp4, ...
+    Always NAME.md and NAME.json; with a figure NAME.png and NAME.svg; with animations NAME.html, a page
+    with players, and films of each: NAME-1.webp, NAME-1.mp4, ...
 
     Args:
-        name: of the files.
-        experiment: question and functions.
-        suite: folder of the files; models and evaluations that are in it are not made again.
+        name: Name of the experiment, with which all files begin.
+        experiment: Question and the two functions that answer it.
+        suite: Suite with the folder of the files; models and evaluations in the folder are not made again.
 
     Raises:
-        RlftsimError: a stage failed; the message says which and why.
+        RlftsimError: A stage failed; the message names stage and cause.
     """
     check_folder(suite.out, "results")
     if experiment.needs_goals:
-        suite.require_goals()
+        suite.check_goals()
     # 1. Train and evaluate what is missing, then make tables of stored results alone.
     result = experiment.summarize(experiment.run(suite), suite)
     # 2. Figure and films, before the page that shows them.
@@ -83,11 +83,12 @@ def run_experiment(name: str, experiment: Experiment[Any], suite: ExperimentSuit
         for ending in ("png", "svg"):
             save_figure(suite.out / f"{name}.{ending}", result.figure)
     for number, animation in enumerate(result.animations, 1):
-        for ending, every in FILMS.items():
-            to_film(suite.out / f"{name}-{number}{ending}", animation, every=every)
+        for ending, steps_per_frame in FILMS.items():
+            to_film(suite.out / f"{name}-{number}{ending}", animation, steps_per_frame=steps_per_frame)
     if result.animations:
         write_page(suite.out / f"{name}.html", result.title, result.animations, caption=experiment.question)
     # 3. Everything for machines, with the settings that the numbers depend on.
+    environment = describe_environment()
     for_machines = {
         "experiment": name,
         "question": experiment.question,
@@ -101,42 +102,51 @@ def run_experiment(name: str, experiment: Experiment[Any], suite: ExperimentSuit
         "data": str(suite.data),
         "recipe": to_plain(suite.recipe),
         "evaluation": to_plain(suite.evaluation),
-        "environment": describe_environment(),
+        "environment": environment,
     }
-    write_text(suite.out / f"{name}.json", json.dumps(finite_or_none(for_machines), indent=1) + "\n")
+    write_text(suite.out / f"{name}.json", json.dumps(to_finite(for_machines), indent=1) + "\n")
     # 4. The page for people.
-    write_text(suite.out / f"{name}.md", _markdown(name, experiment, result, suite))
+    write_text(suite.out / f"{name}.md", _format_page(name, experiment, result, suite, environment))
     return result
 
 
-def _markdown(name: str, experiment: Experiment[Any], result: ExperimentResult, suite: ExperimentSuite) -> str:
-    parts = [f"# {result.title}", experiment.question]
+def _format_page(
+    name: str,
+    experiment: Experiment[Any],
+    result: ExperimentResult,
+    suite: ExperimentSuite,
+    environment: dict[str, Any],
+) -> str:
+    paragraphs = [f"# {result.title}", experiment.question]
     for table in result.tables:
-        parts += [f"## {table.title}", table.markdown(), *([table.note] if table.note else [])]
+        paragraphs += table.paragraphs
         # Verdicts and figure belong to the first table: ours. Published tables follow.
         if table is result.tables[0]:
-            parts += ["\n".join(f"* {line}" for line in result.verdicts)] if result.verdicts else []
-            parts += [f"![{result.title}]({name}.png)"] if result.figure is not None else []
+            paragraphs += ["\n".join(f"* {line}" for line in result.verdicts)] if result.verdicts else []
+            paragraphs += [f"![{result.title}]({name}.png)"] if result.figure is not None else []
     for number, animation in enumerate(result.animations, 1):
         film = f"{name}-{number}"
         caption = f"{animation.caption} [Film]({film}.mp4)"
-        parts += [f"## {animation.title}", caption, f"![Film of {animation.title}]({film}.webp)"]
-    environment = describe_environment()
+        paragraphs += [f"## {animation.title}", caption, f"![Film of {animation.title}]({film}.webp)"]
     packages = ", ".join(f"{package} {version}" for package, version in environment["packages"].items())
-    commit = environment["commit"] or "of an installed package"
     facts = (
         f"Data: {suite.data.name}, split {suite.evaluation.split}.",
-        f"Made with `{environment['command']}`, commit {commit}, on {environment['machine']}; {packages}.",
+        f"Made with {format_origin(environment)}, on {environment['machine']}; {packages}.",
     )
-    parts += ["## Notes", "\n".join(f"* {line}" for line in (*result.notes, *facts))]
-    return "\n\n".join(parts) + "\n"
+    paragraphs += ["## Notes", "\n".join(f"* {line}" for line in (*result.notes, *facts))]
+    return "\n\n".join(paragraphs) + "\n"
 
 
-def finite_or_none(value: Any) -> Any:
-    """The same for JSON, with None for numbers that are not finite."""
+def format_origin(environment: Mapping[str, Any]) -> str:
+    """Command and commit of an environment, for the notes of a page."""
+    return f"`{environment['command']}`, commit {environment['commit'] or 'of an installed package'}"
+
+
+def to_finite(value: Any) -> Any:
+    """Value for JSON, with None for numbers that are not finite."""
     if isinstance(value, Mapping):
-        return {str(key): finite_or_none(inner) for key, inner in value.items()}
+        return {str(key): to_finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [finite_or_none(inner) for inner in value]
+        return [to_finite(item) for item in value]
     # JSON has no NaN or infinity.
     return None if isinstance(value, float) and not math.isfinite(value) else value

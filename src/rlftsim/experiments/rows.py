@@ -1,4 +1,4 @@
-"""A row of an experiment: one model specification, evaluated for each seed, and compared with other rows."""
+"""Row of an experiment: a model specification, evaluated for each seed, and compared with further rows."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ RMM = "meta_metric"
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """Evaluations of one model specification on the same scenarios, one for each seed."""
+    """Evaluations of a model specification on the same scenarios, in the order of the seeds."""
 
     name: str
     by_seed: tuple[Evaluation, ...]
@@ -28,36 +28,35 @@ class Row:
         """Each scenario's mean over the seeds."""
         return mean_of_seeds(self.name, self.by_seed)
 
-    def against(self, other: "Row", column: str = RMM, *, alpha: float = 0.05) -> str:
-        """Verdict of a paired t-test in one line, such as "tuned against base, 40 scenarios in both: difference, ...".
+    def against(self, reference: "Row", column: str = RMM, *, alpha: float = 0.05) -> str:
+        """Verdict of a paired t-test in a line, such as "tuned against base, 40 scenarios in both: difference, ...".
 
         Args:
-            other: row to compare with, such as the base model; the difference is this row minus the other.
-            column: score to compare.
-            alpha: level of the test.
+            reference: Row to compare with, such as the base model; the difference is this row minus the reference.
+            column: Name of the score to compare, a column of `Evaluation`.
+            alpha: Level of the test: the chance of a difference where there is none.
         """
-        # Difference is self minus other.
-        comparison = compare(other.mean, self.mean, alpha=alpha)
-        return f"{self.name} against {other.name}, {comparison.pairing}: {comparison[column].verdict}"
+        comparison = compare(reference.mean, self.mean, alpha=alpha)
+        return f"{self.name} against {reference.name}, {comparison.pairing}: {comparison[column].verdict}"
 
-    def gains_over(self, other: "Row", column: str = RMM) -> Float[np.ndarray, "seeds"]:
-        """Difference of the means to another row, one for each seed of this row.
+    def gains_over(self, reference: "Row", column: str = RMM) -> Float[np.ndarray, "seeds"]:
+        """Difference of the means to a reference row, for each seed of this row.
 
         Args:
-            other: row to compare with; its own seeds are averaged.
-            column: score to compare.
+            reference: Row to compare with; the reference's seeds are averaged.
+            column: Name of the score to compare, a column of `Evaluation`.
         """
-        reference = other.mean.mean_and_error(column).mean
-        return np.array([evaluation.mean_and_error(column).mean - reference for evaluation in self.by_seed])
+        level = reference.mean.mean_and_error(column).mean
+        return np.array([evaluation.mean_and_error(column).mean - level for evaluation in self.by_seed])
 
-    def seeds_against(self, other: "Row") -> str:
-        """Gain in RMM of every seed in one line, with a 95 % interval over the seeds where there are several.
+    def seeds_against(self, reference: "Row") -> str:
+        """Gain in RMM of every seed in a line, with a 95 % interval over the seeds where there are several.
 
-        This interval answers another question than a paired t-test over scenarios: the gain that another run
-        would have.
+        The interval does not answer the question of a paired t-test over scenarios, but tells the gain that a
+        further run would have.
         """
-        gains = self.gains_over(other)
-        line = f"{self.name} minus {other.name}, RMM by seed: {', '.join(f'{gain:+.4f}' for gain in gains)}"
+        gains = self.gains_over(reference)
+        line = f"{self.name} minus {reference.name}, RMM by seed: {', '.join(f'{gain:+.4f}' for gain in gains)}"
         if len(gains) == 1:
             return f"{line}; a single seed says nothing about others."
         # Student's t over seeds: with two or three of them the interval is wide, as it should be.
@@ -69,18 +68,18 @@ class Row:
 def mean_of_seeds(
     name: str, evaluations: Sequence[Evaluation], *, weights: Sequence[float] | None = None
 ) -> Evaluation:
-    """An evaluation whose scores are means over evaluations of the same scenarios, scenario by scenario.
+    """Evaluation with mean scores over evaluations of the same scenarios, scenario by scenario.
 
     Args:
-        name: of the mean.
-        evaluations: one for each seed.
-        weights: of each evaluation, their sum is 1. None = all alike.
+        name: Name of the mean in tables and messages.
+        evaluations: Evaluations of the same scenarios, in the order of the seeds.
+        weights: Weight of each evaluation in the mean, with a sum of 1; None = equal weights.
 
     Raises:
-        DataError: they are of different scenarios.
+        DataError: The evaluations are of different scenarios.
     """
     first = evaluations[0]
-    if any(other.scenario_ids != first.scenario_ids for other in evaluations):
+    if any(evaluation.scenario_ids != first.scenario_ids for evaluation in evaluations):
         raise DataError(f"{name}: the evaluations of its seeds are of different scenarios: remove them to start anew.")
     # Ids and numbers of agents are the same for all seeds; only scores are averaged. NaN in one seed stays NaN.
     table = first.table

@@ -1,49 +1,50 @@
-"""Progress over the stages of an experiment: number, title and time left of each."""
+"""Stages of an experiment, run in order with number, title and time left in the log."""
 
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 from rlftsim.jobs.progress import log
 
 
-class StageProgress:
-    """Logs a line for each stage: its number, and about how long the rest takes.
+@dataclass(frozen=True)
+class Stage:
+    """Work that an experiment needs, such as a training or an evaluation."""
+
+    title: str
+    """The first word names the activity ("fine-tune", "evaluate"); stages of an activity should last equally long."""
+    is_finished: bool
+    """True = finished by an earlier call: running the stage takes no time."""
+    run: Callable[[], object]
+
+
+def run_stages(stages: Sequence[Stage]) -> None:
+    """Run stages and log a line for each: number, title, and about how long the remaining stages take.
 
     Args:
-        stages: titles of all stages ahead, in order, and whether each was finished earlier. The first word of a
-            title is the kind of stage ("fine-tune", "evaluate"); stages of one kind are taken to last equally long.
+        stages: Stages in order. A title that comes again is neither counted nor logged again.
     """
-
-    def __init__(self, stages: Mapping[str, bool]):
-        self._open = dict(stages)
-        self._total = len(stages)
-        self._seconds: dict[str, list[float]] = {}
-
-    @contextmanager
-    def stage(self, title: str) -> Iterator[None]:
-        """Count and time a stage. Titles that were not announced, or are done already, are not counted."""
-        if title not in self._open:
-            yield
-            return
-        number, is_done = self._total - len(self._open) + 1, self._open[title]
-        log.info(f"{number}/{self._total}  {title}{'  (finished before)' if is_done else self._time_left()}")
+    remaining = {stage.title: stage.is_finished for stage in stages}
+    total, seconds = len(remaining), {}  # of each activity's stages, without those that were finished before
+    for stage in stages:
+        if stage.title not in remaining:
+            stage.run()
+            continue
+        number = total - len(remaining) + 1
+        status = "  (finished before)" if stage.is_finished else _format_time_left(remaining, seconds)
+        log.info(f"{number}/{total}  {stage.title}{status}")
         start = time.monotonic()
-        yield
-        del self._open[title]
-        # Stages that were finished before take no time, and say nothing about others of their kind.
-        if not is_done:
-            self._seconds.setdefault(_kind(title), []).append(time.monotonic() - start)
-
-    def _time_left(self) -> str:
-        """In words; empty as long as one kind of stage has not been timed."""
-        ahead = [_kind(title) for title, is_done in self._open.items() if not is_done]
-        if not ahead or not all(kind in self._seconds for kind in ahead):
-            return ""
-        # Every open stage lasts as long as the mean of its kind.
-        minutes = sum(sum(self._seconds[kind]) / len(self._seconds[kind]) for kind in ahead) / 60
-        return f"  (about {minutes:.0f} min to go)" if minutes >= 1 else "  (less than a minute to go)"
+        stage.run()
+        del remaining[stage.title]
+        if not stage.is_finished:
+            seconds.setdefault(stage.title.partition(" ")[0], []).append(time.monotonic() - start)
 
 
-def _kind(title: str) -> str:
-    return title.partition(" ")[0]
+def _format_time_left(remaining: dict[str, bool], seconds: dict[str, list[float]]) -> str:
+    """Time left in words; empty as long as an activity has not been timed."""
+    activities = [title.partition(" ")[0] for title, is_finished in remaining.items() if not is_finished]
+    if not all(activity in seconds for activity in activities):
+        return ""
+    # Every stage lasts as long as the mean of its activity.
+    minutes = sum(sum(seconds[activity]) / len(seconds[activity]) for activity in activities) / 60
+    return f"  (about {minutes:.0f} min to go)" if minutes >= 1 else "  (less than a minute to go)"

@@ -1,4 +1,4 @@
-"""Experiment suite: a folder in which models are trained and evaluated once, for all experiments that need them.
+"""Experiment suite: a folder in which models are trained and evaluated once, for all experiments.
 
 config.json, environment.json   settings of the suite; a folder of other settings is refused
 vocabulary.safetensors          motion and map tokens
@@ -9,20 +9,21 @@ variances/                      see `evaluation.reward_variance`
 attainment/                     goals reached and passed, see `evaluation.goal_attainment`
 NAME.md, NAME.json, NAME.png    results of an experiment
 
-Stages are shared: a model that one experiment has trained is found by the next.
+Stages are shared: a model that an experiment has trained is found by the next.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
 from rlftsim.errors import ConfigError
 from rlftsim.evaluation.evaluate import EvaluateConfig, GoalsGiven, evaluate
+from rlftsim.evaluation.results import Evaluation
 from rlftsim.experiments.model_specs import BASE, CATK, GCSL, ROAD, Base, Baseline, Budget, FineTuned, Guided, ModelSpec
 from rlftsim.experiments.rows import Row
-from rlftsim.experiments.stage_progress import StageProgress
+from rlftsim.experiments.stage_progress import Stage, run_stages
 from rlftsim.jobs.progress import log
 from rlftsim.policies.registry import Device, load_policy, load_policy_or_oracle, with_guidance
 from rlftsim.recipes.base import Recipe
@@ -46,12 +47,12 @@ GOALS_SUFFIX: Mapping[GoalsGiven, str] = {"none": "", "logged": "-logged-goals"}
 
 @dataclass(frozen=True)
 class ExperimentSuite:
-    """A folder of stages and the settings they share.
+    """A folder of stages and the shared settings.
 
     Raises:
-        CheckpointError: the folder belongs to other settings, data or base model.
-        DataError: no such data set.
-        ConfigError: no seed, or training on several GPUs.
+        CheckpointError: The folder belongs to other settings, data or base model.
+        DataError: No such data set.
+        ConfigError: No seed, or training on several GPUs.
     """
 
     recipe: Recipe
@@ -72,9 +73,9 @@ class ExperimentSuite:
         if self.num_seeds < 1:
             raise ConfigError(f"an experiment needs at least one seed, got {self.num_seeds}.")
         recipe = self.recipe
-        methods = (recipe.pretrain, recipe.finetune, recipe.catk, recipe.road, recipe.gcsl)
-        devices = [one.device for one in methods if one is not None]
-        if any(one.uses_cuda and one.processes not in ("auto", 1) for one in devices):
+        sections = (recipe.pretrain, recipe.finetune, recipe.catk, recipe.road, recipe.gcsl)
+        devices = [section.device for section in sections if section is not None]
+        if any(device.uses_cuda and device.processes not in ("auto", 1) for device in devices):
             raise ConfigError(
                 "experiments train on one GPU: leave device.processes at auto, or train by `rlftsim finetune` and "
                 "compare by `rlftsim evaluate`."
@@ -86,48 +87,53 @@ class ExperimentSuite:
         self._open_folder(writes=False)
 
     def _open_folder(self, *, writes: bool) -> None:
-        """Refuse a folder of a suite with other settings; with `writes` make it this suite's.
+        """Refuse a folder of a suite with other settings; with `writes` make the folder this suite's.
 
-        It is written when the first stage begins, so that what is refused before has not claimed the folder.
+        Writing waits for the first stage, so that a suite that is refused before has not claimed the folder.
         """
-        RunFolder(self.out, self._what_counts(), writes=writes)
+        RunFolder(self.out, self._identity(), writes=writes)
 
     @cached_property
     def training(self) -> ScenarioDataset:
-        """The training scenarios."""
+        """Training scenarios of the data set."""
         return open_training(self.data)
 
     @property
     def budget(self) -> Budget:
-        """The budget of fine-tuning, from the recipe."""
+        """Budget of fine-tuning, from the recipe."""
         config = self.recipe.finetune
         return Budget(config.num_updates(len(self.training)), config.batch_size, config.num_rollouts)
 
     def evaluate(self, rows: Mapping[str, Sequence[ModelSpec]], *, goals: GoalsGiven = "none") -> dict[str, Row]:
-        """Rows of a table, by their names; models that are missing are trained and evaluated.
+        """Rows of a table by name; missing models are trained and evaluated.
 
         Args:
-            rows: by name, the model of a row: one specification, or the same with several seeds.
-            goals: goals of the evaluated agents: none, or their logged endpoints.
+            rows: Specifications by row: a single model, or the same model with several seeds.
+            goals: Goals of the evaluated agents: "none", or "logged" for the logged endpoints.
         """
-        # A model that is in several rows is trained and evaluated once.
         self._open_folder(writes=True)
-        specs = list(dict.fromkeys(spec for row in rows.values() for spec in row))
-        progress = StageProgress(self._stages(specs, goals=goals))
-        config, folder, found = replace(self.evaluation, goals=goals), self.out / "evaluations", {}
-        for spec in specs:
-            model = self._model(spec, progress)
-            with progress.stage(self._evaluation_title(spec, goals)):
-                policy = load_policy_or_oracle(model, self.device)
-                # An evaluation that is finished is read from its file.
-                found[spec] = evaluate(policy, self.data, folder, config, name=self.evaluation_name(spec, goals))
-        return {name: Row(name, tuple(found[spec] for spec in row)) for name, row in rows.items()}
+        config, folder = replace(self.evaluation, goals=goals), self.out / "evaluations"
+        evaluations: dict[ModelSpec, Evaluation] = {}
 
-    def require_goals(self) -> None:
-        """Refuse a recipe or a base model that cannot be given goals, before anything is trained.
+        def evaluate_spec(spec: ModelSpec) -> None:
+            policy = load_policy_or_oracle(self._find_model(spec), self.device)
+            # An evaluation that is finished is read from its file.
+            evaluations[spec] = evaluate(policy, self.data, folder, config, name=self.evaluation_name(spec, goals))
+
+        # A model that is in several rows is trained and evaluated once.
+        stages = []
+        for spec in dict.fromkeys(spec for row in rows.values() for spec in row):
+            title = f"evaluate {self.title(spec)}{'' if goals == 'none' else f', {goals} goals'}"
+            is_finished = (folder / f"{self.evaluation_name(spec, goals)}.parquet").exists()
+            stages += [*self._training_stages(spec), Stage(title, is_finished, partial(evaluate_spec, spec))]
+        run_stages(stages)
+        return {name: Row(name, tuple(evaluations[spec] for spec in row)) for name, row in rows.items()}
+
+    def check_goals(self) -> None:
+        """Check that the recipe and the base model can be given goals, before any model is trained.
 
         Raises:
-            ConfigError: it cannot.
+            ConfigError: A recipe without goal relabeling, or a base model that cannot be given goals.
         """
         if self.recipe.gcsl is None:
             raise ConfigError(
@@ -142,11 +148,11 @@ class ExperimentSuite:
                 "such as demo-base."
             )
 
-    def feasible(self, rows: Mapping[str, Sequence[ModelSpec]]) -> dict[str, Sequence[ModelSpec]]:
-        """The rows without those of methods that cannot train the suite's policies; a warning names these rows.
+    def select_feasible(self, rows: Mapping[str, Sequence[ModelSpec]]) -> dict[str, Sequence[ModelSpec]]:
+        """Rows of methods that can train the suite's policies; a warning names the rows that are left out.
 
         Args:
-            rows: as in `evaluate`.
+            rows: Specifications by row, as for `evaluate`.
         """
         # CAT-K and goal relabeling learn tokens; a recipe may leave either out.
         if self.base_model is None:
@@ -154,29 +160,29 @@ class ExperimentSuite:
         else:
             has_tokens = isinstance(load_policy(self.base_model), TokenPolicy)
         sections = {CATK: self.recipe.catk, ROAD: self.recipe.road, GCSL: self.recipe.gcsl}
-        refused = {method for method, section in sections.items() if section is None or not has_tokens}
-
-        def is_feasible(spec: ModelSpec) -> bool:
-            return all(not isinstance(one, FineTuned) or one.method not in refused for one in self._lineage(spec))
-
-        left_out = [name for name, specs in rows.items() if not all(is_feasible(spec) for spec in specs)]
-        if left_out:
-            methods = " and ".join(sorted(refused))
-            log.warning(f"left out: {', '.join(left_out)} (the policy cannot be trained with {methods})")
-        return {name: specs for name, specs in rows.items() if name not in left_out}
+        unusable = {method for method, section in sections.items() if section is None or not has_tokens}
+        omitted_rows = [
+            name
+            for name, specs in rows.items()
+            if any(isinstance(s, FineTuned) and s.method in unusable for spec in specs for s in self._lineage(spec))
+        ]
+        if omitted_rows:
+            methods = " and ".join(sorted(unusable))
+            log.warning(f"left out: {', '.join(omitted_rows)} (the policy cannot be trained with {methods})")
+        return {name: specs for name, specs in rows.items() if name not in omitted_rows}
 
     def base(self) -> str:
-        """Name or folder of the base model, which is pre-trained if it is missing."""
+        """Name or folder of the base model; pre-trained where there is none."""
         return self.models([BASE])[BASE]
 
     def models(self, specs: Sequence[ModelSpec]) -> dict[ModelSpec, str]:
         """Names or folders of policies, for `load_policy_or_oracle`; models that are missing are trained."""
         self._open_folder(writes=True)
-        progress = StageProgress(self._stages(specs, evaluated=False))
-        return {spec: self._model(spec, progress) for spec in specs}
+        run_stages([stage for spec in specs for stage in self._training_stages(spec)])
+        return {spec: self._find_model(spec) for spec in specs}
 
     def policy(self, spec: ModelSpec) -> Policy:
-        """A policy on the device of evaluations; trained if it is missing."""
+        """Policy of a specification on the device of evaluations; trained where there is none."""
         return load_policy(self.models([spec])[spec], self.device)
 
     def title(self, spec: ModelSpec) -> str:
@@ -197,8 +203,8 @@ class ExperimentSuite:
         """Name of the files with a model's results.
 
         Args:
-            spec: the model.
-            goals: goals of the evaluated agents.
+            spec: Specification of the model.
+            goals: Goals of the evaluated agents: "none" or "logged", which stands in the name.
         """
         if isinstance(spec, Guided):
             return f"{self.evaluation_name(spec.of, goals)}-guided-{spec.scale:g}"
@@ -207,69 +213,50 @@ class ExperimentSuite:
 
     # ---- stages ---------------------------------------------------------------------------------------------------
 
-    def _stages(
-        self, specs: Sequence[ModelSpec], *, evaluated: bool = True, goals: GoalsGiven = "none"
-    ) -> dict[str, bool]:
-        """Titles of the stages ahead in their order, each with True if it was finished before."""
-        # A title is a key: a base model that several models start from is one stage.
-        stages: dict[str, bool] = {}
-        for spec in specs:
-            for needed in self._lineage(spec):
-                stages[self._training_title(needed)] = (self.model_folder(needed) / "model").exists()
-            if evaluated:
-                path = self.out / "evaluations" / f"{self.evaluation_name(spec, goals)}.parquet"
-                stages[self._evaluation_title(spec, goals)] = path.exists()
+    def _training_stages(self, spec: ModelSpec) -> list[Stage]:
+        """Trainings that a specification needs, those of base models first."""
+        stages = []
+        for model in self._lineage(spec):
+            verb, train = ("pre-train", self._pretrain) if isinstance(model, Base) else ("fine-tune", self._finetune)
+            # A run that is finished returns at once.
+            is_finished = (self.model_folder(model) / "model").exists()
+            stages.append(Stage(f"{verb} {self.title(model)}", is_finished, partial(train, model)))
         return stages
-
-    def _training_title(self, spec: Base | FineTuned) -> str:
-        return f"{'pre-train' if isinstance(spec, Base) else 'fine-tune'} {self.title(spec)}"
-
-    def _evaluation_title(self, spec: ModelSpec, goals: GoalsGiven) -> str:
-        return f"evaluate {self.title(spec)}{'' if goals == 'none' else f', {goals} goals'}"
 
     def _lineage(self, spec: ModelSpec) -> list[Base | FineTuned]:
         """Models to train for a specification, the base model first."""
         if isinstance(spec, Guided):
             return self._lineage(spec.of)
-        # A base model that was given is not trained, but a weaker one beside it is.
+        # The suite's own base model is not trained, but a weaker one beside it is.
         if isinstance(spec, Baseline) or (spec == BASE and self.base_model):
             return []
-        before = self._lineage(spec.base) if isinstance(spec, FineTuned) else []
-        return [*before, spec]
+        return [*(self._lineage(spec.base) if isinstance(spec, FineTuned) else ()), spec]
 
-    def _model(self, spec: ModelSpec, progress: StageProgress) -> str:
-        """Name or folder of a policy, which is trained if it is missing."""
+    def _find_model(self, spec: ModelSpec) -> str:
+        """Name or folder of a policy after all trainings."""
         if isinstance(spec, Baseline):
             return spec.name
-        for needed in self._lineage(spec):
-            # A run that is finished returns at once.
-            with progress.stage(self._training_title(needed)):
-                self._pretrain(needed) if isinstance(needed, Base) else self._finetune(needed)
-        if not isinstance(spec, Guided):
-            return self._trained(spec)
-        # Guidance scales a weight: the folder is written anew each time, nothing is trained.
-        folder = self.model_folder(spec.of) / f"guided-{spec.scale:g}"
-        policy = with_guidance(load_policy(self._trained(spec.of)), spec.scale)
-        policy.save_pretrained(folder, card=f"# {self.title(spec)}\n")
-        return str(folder)
-
-    def _trained(self, spec: Base | FineTuned) -> str:
-        """Model folder of a finished run, or the base model that was given."""
         if spec == BASE and self.base_model:
             return self.base_model
-        return str(self.model_folder(spec) / "model")
+        if not isinstance(spec, Guided):
+            return str(self.model_folder(spec) / "model")
+        # Guidance scales a weight: the folder is written anew each time, nothing is trained.
+        folder = self.model_folder(spec.of) / f"guided-{spec.scale:g}"
+        policy = with_guidance(load_policy(self._find_model(spec.of)), spec.scale)
+        policy.save_pretrained(folder, card=f"# {self.title(spec)}\n")
+        return str(folder)
 
     def _pretrain(self, base: Base) -> None:
         recipe, vocabulary, folder = self.recipe, None, self.model_folder(base)
         if self.base_model:
-            # Another base model for comparison, such as a weaker one: the architecture and tokens of the given one.
-            given = load_policy(self.base_model)
+            # A base model for comparison, such as a weaker one: architecture and tokens are those of the suite's.
+            base_policy = load_policy(self.base_model)
             try:
-                recipe = recipe.like(given)
+                recipe = recipe.like(base_policy)
             except ConfigError as error:
                 message = f"the recipe pre-trains no model like {self.base_model}: leave the base model out"
                 raise ConfigError(f"{message} ({str(error).removesuffix('.')}).") from None
-            vocabulary = getattr(given, "vocabulary", None)
+            vocabulary = getattr(base_policy, "vocabulary", None)
         elif recipe.tokens is not None:
             origin = f"experiments on {self.data.name}, {recipe.tokens}"
             path = self.out / "vocabulary.safetensors"
@@ -278,21 +265,20 @@ class ExperimentSuite:
         pretrain_policy(recipe.new_policy(vocabulary), self.training, config, folder)
 
     def _finetune(self, spec: FineTuned) -> None:
-        out, conditioning = self.model_folder(spec), None
-        if spec.goals is not None:
-            conditioning = GoalConditioning(spec.goals.encoding)
+        out = self.model_folder(spec)
+        conditioning = None if spec.goals is None else GoalConditioning(spec.goals.encoding)
         if spec.method not in (CATK, ROAD, GCSL):
             # Only runs with a reward continue shorter ones. The learning rate of the other methods decays over the
             # whole run, so that a shorter run is no part of a longer one.
             start_from_shorter_run(out, self._epochs(spec))
         config = spec.training_config(self.recipe)
-        finetune_model(self._trained(spec.base), self.training, config, out, conditioning=conditioning)
+        finetune_model(self._find_model(spec.base), self.training, config, out, conditioning=conditioning)
 
     def _epochs(self, spec: FineTuned) -> float:
         section = (self.recipe.gcsl if spec.method == GCSL else None) or self.recipe.finetune
         return section.epochs * spec.epochs_fraction
 
-    def _what_counts(self) -> dict[str, Any]:
+    def _identity(self) -> dict[str, Any]:
         """Settings that all stages of the folder share, without those that change no result."""
         recipe = flatten(to_plain(self.recipe))
         return {

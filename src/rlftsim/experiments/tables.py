@@ -1,21 +1,22 @@
 """Tables and figures of an experiment's rows.
 
-tables.of_rows("Ours", rows.values(), SCORES)     a table, mean ± standard error
-tables.numbers(rows.values(), SCORES)             the same for machines
-tables.draw_gains(base, [tuned, other])           paired differences with their intervals
+tables.build_table("Ours", rows.values(), SCORES)     a table, mean ± standard error
+tables.to_numbers(rows.values(), SCORES)              the same for machines
+tables.draw_gains(base, [tuned, imitated])            paired differences with intervals
 """
 
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+import numpy as np
 from matplotlib.figure import Figure
 from rich.table import Table
 
 from rlftsim.evaluation.columns import Column
 from rlftsim.evaluation.compare import compare
 from rlftsim.experiments.rows import RMM, Row
-from rlftsim.viewer.figure import Interval, draw_intervals
+from rlftsim.viewer.figure import Band, Interval, draw_intervals
 
 
 @dataclass(frozen=True)
@@ -31,8 +32,12 @@ class TextTable:
         """The table in Markdown, without title and note."""
         # Names to the left, numbers to the right.
         dashes = ["---", *["--:"] * (len(self.headings) - 1)]
-        lines = ["| " + " | ".join(cells) + " |" for cells in (self.headings, dashes, *self.rows)]
-        return "\n".join(lines)
+        return "\n".join("| " + " | ".join(cells) + " |" for cells in (self.headings, dashes, *self.rows))
+
+    @property
+    def paragraphs(self) -> list[str]:
+        """Title, table and note as paragraphs of a Markdown page."""
+        return [f"## {self.title}", self.markdown(), *([self.note] if self.note else [])]
 
     def for_terminal(self) -> Table:
         """The table for `print_wide`."""
@@ -44,13 +49,13 @@ class TextTable:
         return table
 
 
-def of_rows(title: str, rows: Iterable[Row], columns: Sequence[Column]) -> TextTable:
+def build_table(title: str, rows: Iterable[Row], columns: Sequence[Column]) -> TextTable:
     """Table of scores: mean ± standard error over scenarios, of each scenario's mean over the seeds.
 
     Args:
-        title: of the table.
-        rows: evaluated on the same scenarios in the same way.
-        columns: scores to show, such as `evaluation.columns.SCORES`.
+        title: Title above the table.
+        rows: Rows that were evaluated on the same scenarios in the same way; the facts of the note are the first row's.
+        columns: Scores to show, such as `evaluation.columns.SCORES`.
     """
     rows = list(rows)
     first, seeds = rows[0].mean, max(len(row.by_seed) for row in rows)
@@ -64,12 +69,12 @@ def of_rows(title: str, rows: Iterable[Row], columns: Sequence[Column]) -> TextT
     return TextTable(title, ("", *(c.label for c in columns)), tuple(cells), note)
 
 
-def numbers(rows: Iterable[Row], columns: Sequence[Column]) -> dict[str, Any]:
+def to_numbers(rows: Iterable[Row], columns: Sequence[Column]) -> dict[str, Any]:
     """Means with standard errors and 95 % intervals, and the mean of every seed, by row and column.
 
     Args:
-        rows: as in `of_rows`.
-        columns: scores; keys are the column names of evaluations ("meta_metric").
+        rows: Rows that were evaluated on the same scenarios.
+        columns: Scores to list; keys are the column names of evaluations ("meta_metric").
     """
     return {
         row.name: {
@@ -83,17 +88,35 @@ def numbers(rows: Iterable[Row], columns: Sequence[Column]) -> dict[str, Any]:
     }
 
 
-def draw_gains(base: Row, others: Iterable[Row]) -> Figure:
-    """Figure of paired differences in RMM with their 95 % intervals.
+def draw_gains(base: Row, rows: Iterable[Row]) -> Figure:
+    """Figure of paired differences in RMM with 95 % intervals.
 
     Args:
-        base: row to compare with.
-        others: rows to draw; the first is highlighted.
+        base: Row to compare with, such as the base model.
+        rows: Rows to draw, from top to bottom; the first is highlighted.
     """
     intervals = []
-    for number, row in enumerate(others):
+    for number, row in enumerate(rows):
         gain = compare(base.mean, row.mean)[RMM]
         # Color 0 is highlighted, 4 is gray.
         intervals.append(Interval(row.name, gain.difference, *gain.interval, color=4 if number else 0))
     label = "gain in RMM over the base model, 95 % interval"
     return draw_intervals(intervals, title="Against the base model", x_label=label, zero=True)
+
+
+def build_gain_band(
+    name: str, start: Row, points: Sequence[tuple[float, Row]], *, level: float = 0.0, color: int = 0
+) -> Band:
+    """Curve of paired gains in RMM with 95 % intervals, from no gain at x = 0 on.
+
+    Args:
+        name: Name of the curve in the legend.
+        start: Row that the gains are measured from. Scenarios being harder or easier in all rows is not in the band.
+        points: Position on the horizontal axis (above 0) and row of each further point, from left to right.
+        level: Height of the start on the vertical axis; 0 draws plain gains.
+        color: Index into `viewer.figure.COLORS`.
+    """
+    gains = [compare(start.mean, row.mean)[RMM] for _, row in points]
+    middle = level + np.array([0.0, *(gain.difference for gain in gains)])  # [1 + points]
+    limits = level + np.array([(0.0, 0.0), *(gain.interval for gain in gains)])  # [1 + points, 2]
+    return Band(name, np.array([0.0, *(x for x, _ in points)]), middle, limits[:, 0], limits[:, 1], color=color)

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from rlftsim.errors import DataError, in_short
-from rlftsim.jobs.documents import describe_kind, parse_json, read_json
+from rlftsim.jobs.documents import describe_type, parse_json, read_json
 from rlftsim.jobs.files import write_text
 
 FORMAT = "rlftsim-goals-1"
@@ -99,7 +99,7 @@ def _parse_goals(content: object, path: str) -> GoalsFile:
     for section in SECTIONS:
         entries, location = content.get(section, []), f"{path}: {section}"
         if not isinstance(entries, list):
-            raise DataError(f"{location}: must be a list of goals, is {describe_kind(entries)}.")
+            raise DataError(f"{location}: must be a list of goals, is {describe_type(entries)}.")
         sections.append(tuple(_parse_entry(entry, f"{location}[{number}]") for number, entry in enumerate(entries)))
     check_single_goals(sections[0])
     return GoalsFile(*sections)
@@ -174,7 +174,7 @@ def _parse_entry(entry: object, location: str) -> GoalEntry:
         raise DataError(f"{location}: {', '.join(missing_fields)} missing: a goal needs scenario, agent, x and y.")
     for name in ("scenario", "label"):
         if not isinstance(entry.get(name, ""), str):
-            raise DataError(f"{location}: {name} must be text in quotes, is {describe_kind(entry[name])}.")
+            raise DataError(f"{location}: {name} must be text in quotes, is {describe_type(entry[name])}.")
         for character in entry.get(name, ""):
             category = UNSHOWABLE.get(unicodedata.category(character))
             if category:
@@ -183,7 +183,7 @@ def _parse_entry(entry: object, location: str) -> GoalEntry:
     # bool is a subclass of int: `true` is refused first.
     agent = entry["agent"]
     if isinstance(agent, bool) or not isinstance(agent, int):
-        value = agent if isinstance(agent, float) else describe_kind(agent)
+        value = agent if isinstance(agent, float) else describe_type(agent)
         raise DataError(f"{location}: agent must be a whole number, an object id of the log, is {value}.")
     if not -(2**63) <= agent < 2**63:
         raise DataError(f"{location}: agent {agent} is no object id, which have 64 bits.")
@@ -193,7 +193,7 @@ def _parse_entry(entry: object, location: str) -> GoalEntry:
 
 def _parse_coordinate(value: object, location: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise DataError(f"{location} must be a number of meters, is {describe_kind(value)}.")
+        raise DataError(f"{location} must be a number of meters, is {describe_type(value)}.")
     if not math.isfinite(value):
         raise DataError(f"{location} is {value}: a goal needs a finite point, meters in the world frame of the log.")
     return float(value)

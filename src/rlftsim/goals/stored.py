@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 
 from rlftsim.errors import DataError
 from rlftsim.goals.types import Goals, Points, goals_at
-from rlftsim.jobs.files import write_whole
+from rlftsim.jobs.files import write_atomically
 from rlftsim.jobs.tables import check_columns, read_parquet
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.shards import hash_file
@@ -39,7 +39,7 @@ def write_goal_file(path: Path, goals: Mapping[str, Points]) -> None:
         "y": np.concatenate([points[:, 1] for _, points in goals.values()]),
     }
     table = pa.table({name: pa.array(values, SCHEMA.field(name).type) for name, values in columns.items()}, SCHEMA)
-    write_whole(path, lambda temporary: pq.write_table(table, temporary))
+    write_atomically(path, lambda temporary: pq.write_table(table, temporary))
 
 
 def _read_goals(file: Path) -> pa.Table:

@@ -7,23 +7,26 @@ import hashlib
 import os
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from datetime import timedelta
 from fnmatch import fnmatchcase
 from glob import has_magic
 from pathlib import Path
 from typing import Any
 
-from rlftsim.errors import ConfigError, DataError, RlftsimError
+from rlftsim.errors import ConfigError, DataError, NotYetError, RlftsimError
 from rlftsim.jobs.files import (
     NO_ROOM,
     errors_name,
     remove_temporaries,
     remove_temporaries_below,
-    temporary_beside,
+    temporary_path,
+    write_atomically,
     write_text,
-    write_whole,
 )
+from rlftsim.jobs.folder import describe_owner, parse_owner
+from rlftsim.jobs.progress import log
 
 ORIGIN = "origin.txt"
 """File in a local copy of a remote data set's index: the address of its shards."""
@@ -34,47 +37,51 @@ READ_ONLY = ("hf", "http", "https")
 """Protocols that only read: what is written to a repository at Hugging Face is a commit of its own."""
 SECONDS_OF_A_TEMPORARY = 24 * 3600.0
 """What a killed process left in the cache is removed after so long."""
+REMOTE_LEASE = ".lease"
+"""File of a remote folder that is being written to."""
+SECONDS_OF_SILENCE = 600.0
+"""A remote lease that was not renewed for so long belongs to a process that is gone."""
 _SHA256 = re.compile("[0-9a-f]{64}")
 """Names of shards in the cache; a file of another name is somebody else's."""
 _EXTRAS = {"s3": "s3", "s3a": "s3", "gs": "gcs", "gcs": "gcs", "hf": "hf"}
 
 
-def is_url(place: object) -> bool:
+def is_url(address: object) -> bool:
     """True for an address such as s3://bucket/folder, in place of a path."""
-    return isinstance(place, str) and "://" in place
+    return isinstance(address, str) and "://" in address
 
 
 def folder_address(url: str) -> str:
-    """The address of a remote folder, without a slash at its end.
+    """The address of a remote folder, without a slash at the end.
 
     Raises:
-        ConfigError: no address, or one without a place in it.
+        ConfigError: No address, or one without a bucket or path.
     """
     if not is_url(url) or not url.partition("://")[2].strip("/"):
         raise ConfigError(f"{url} is no address of a folder: write one such as s3://bucket/folder.")
     return url.rstrip("/")
 
 
-def require_writable(url: str) -> None:
-    """Refuse an address that data is only read from.
+def check_writable(url: str) -> None:
+    """Check that an address is not one that data is only read from.
 
     Raises:
-        ConfigError: it is one.
+        ConfigError: The protocol is one of `READ_ONLY`.
     """
     protocol = url.partition("://")[0]
     if protocol in READ_ONLY:
         raise ConfigError(f"{url}: {protocol}:// is read only here: upload the folder with that site's own tools.")
 
 
-def require_folder(place: str | os.PathLike[str]) -> Path:
+def validate_folder(folder: str | os.PathLike[str]) -> Path:
     """The path of a folder of this machine.
 
     Raises:
-        ConfigError: it is an address.
+        ConfigError: The text is an address.
     """
-    if is_url(place):
-        raise ConfigError(f"{place} is an address: name a folder of this machine here (docs/machines.md, Buckets).")
-    return Path(place)
+    if is_url(folder):
+        raise ConfigError(f"{folder} is an address: name a folder of this machine here (docs/machines.md, Buckets).")
+    return Path(folder)
 
 
 def cache_folder() -> Path:
@@ -82,14 +89,14 @@ def cache_folder() -> Path:
     return Path(os.environ.get("RLFTSIM_CACHE", "~/.cache/rlftsim")).expanduser()
 
 
-def local_copy(url: str, kind: str) -> Path:
+def local_copy(url: str, section: str) -> Path:
     """Local folder that stands for an address.
 
     Args:
-        url: the address.
-        kind: name of the cache's part.
+        url: Address of a remote folder, with or without a slash at the end.
+        section: Folder of the cache in which all such folders lie, such as "data".
     """
-    return cache_folder() / kind / hashlib.sha256(url.rstrip("/").encode()).hexdigest()[:16]
+    return cache_folder() / section / hashlib.sha256(url.rstrip("/").encode()).hexdigest()[:16]
 
 
 @contextmanager
@@ -97,8 +104,8 @@ def remote(url: str) -> Iterator[tuple[Any, str]]:
     """File system of an address and the path in it; errors inside the block become one line that names the address.
 
     Raises:
-        ConfigError: the protocol is unknown or its library is not installed.
-        DataError: nothing is there, or it cannot be reached.
+        ConfigError: The protocol is unknown, or the library for the protocol is not installed.
+        DataError: Nothing has this address, or the network or the permissions fail.
     """
     protocol = url.partition("://")[0]
     try:
@@ -128,22 +135,22 @@ def remote(url: str) -> Iterator[tuple[Any, str]]:
 
 
 def fetch(url: str, path: Path, sha256: str | None = None) -> str:
-    """Copy a remote file, whole or not at all; returns its SHA-256.
+    """Copy a remote file, whole or not at all; returns the SHA-256 of the bytes.
 
     Args:
-        url: of the file.
-        path: of the copy.
-        sha256: that the file must have; None = any.
+        url: Address of the remote file, which is read once, front to back.
+        path: Path of the copy; a missing folder is created.
+        sha256: SHA-256 that the bytes must have, in 64 hexadecimal digits; None takes any.
 
     Raises:
-        DataError: it cannot be fetched, or is another one.
+        DataError: The file cannot be fetched, or has other bytes.
     """
     digest = hashlib.sha256()
 
     def write(temporary: Path) -> None:
         # The copy is opened outside: a disk that is full is no trouble of the remote side.
-        with temporary.open("wb") as copy, remote(url) as (files, place):
-            with files.open(place, "rb", block_size=BLOCK_BYTES, cache_type="readahead") as source:
+        with temporary.open("wb") as copy, remote(url) as (files, remote_path):
+            with files.open(remote_path, "rb", block_size=BLOCK_BYTES, cache_type="readahead") as source:
                 while block := source.read(BLOCK_BYTES):
                     digest.update(block)
                     with errors_name(path):
@@ -151,7 +158,7 @@ def fetch(url: str, path: Path, sha256: str | None = None) -> str:
             if sha256 not in (None, digest.hexdigest()):
                 raise DataError(f"{url}: damaged or replaced: its checksum is not that of the manifest.")
 
-    write_whole(path, write)
+    write_atomically(path, write)
     return digest.hexdigest()
 
 
@@ -159,22 +166,22 @@ def publish(path: Path, url: str) -> None:
     """Copy a file to a bucket. Readers see all of it or nothing: an upload that is cut short leaves no object.
 
     Args:
-        path: of the file.
-        url: of the copy.
+        path: File of this machine that is copied.
+        url: Address of the copy; a file that has this address is replaced.
 
     Raises:
-        DataError: it cannot be written there.
+        DataError: The copy cannot be written.
     """
-    with remote(url) as (files, place):
+    with remote(url) as (files, remote_path):
         if url.partition("://")[0] in OBJECT_STORES:  # no folders: one would make a bucket of a mistyped name
-            files.put_file(str(path), place)
+            files.put_file(str(path), remote_path)
             return
-        folder = files._parent(place)
+        folder = files._parent(remote_path)
         files.makedirs(folder, exist_ok=True)
-        temporary = f"{folder}/{temporary_beside(Path(place)).name}"
+        temporary = f"{folder}/{temporary_path(Path(remote_path)).name}"
         try:
             files.put_file(str(path), temporary)
-            files.mv(temporary, place)
+            files.mv(temporary, remote_path)
         finally:
             if files.exists(temporary):
                 files.rm_file(temporary)
@@ -184,25 +191,25 @@ def put_text(url: str, text: str, *, is_new: bool) -> bool:
     """Write a small remote file; returns False where it should be new and is not. Of several processes one creates it.
 
     Args:
-        url: of the file.
-        text: its content.
-        is_new: leave a file that is there as it is.
+        url: Address of the file.
+        text: Content of the file, stored in UTF-8.
+        is_new: True leaves a file that has this address as it is.
 
     Raises:
-        DataError: it cannot be written there.
+        DataError: The file cannot be written.
     """
-    with remote(url) as (files, place):
+    with remote(url) as (files, remote_path):
         has_folders = url.partition("://")[0] not in OBJECT_STORES
         if has_folders:
-            files.makedirs(files._parent(place), exist_ok=True)
+            files.makedirs(files._parent(remote_path), exist_ok=True)
         try:
-            with files.open(place, "xb" if is_new else "wb") as file:
+            with files.open(remote_path, "xb" if is_new else "wb") as file:
                 file.write(text.encode())
         except FileExistsError:
             return False
         except OSError:
-            if has_folders and files.exists(place):  # an empty file, as on a full disk
-                files.rm_file(place)
+            if has_folders and files.exists(remote_path):  # an empty file, as on a full disk
+                files.rm_file(remote_path)
             raise
     return True
 
@@ -211,20 +218,20 @@ def get_text(url: str) -> str:
     """Content of a small remote file.
 
     Raises:
-        DataError: it is not there or cannot be read.
+        DataError: The file is missing or cannot be read.
     """
-    with remote(url) as (files, place):
-        return files.cat_file(place).decode(errors="replace")
+    with remote(url) as (files, remote_path):
+        return files.cat_file(remote_path).decode(errors="replace")
 
 
 def remove(url: str) -> None:
     """Remove a remote file.
 
     Raises:
-        DataError: it is not there or cannot be removed.
+        DataError: The file is missing or cannot be removed.
     """
-    with remote(url) as (files, place):
-        files.rm_file(place)
+    with remote(url) as (files, remote_path):
+        files.rm_file(remote_path)
 
 
 def fetch_shard(url: str, sha256: str) -> Path:
@@ -233,11 +240,11 @@ def fetch_shard(url: str, sha256: str) -> Path:
     Shards used least recently are removed when the cache has more than RLFTSIM_CACHE_GB (50) gigabytes.
 
     Args:
-        url: of the shard.
-        sha256: of its bytes, which is also its name in the cache.
+        url: Address of the shard, read where the cache lacks these bytes.
+        sha256: SHA-256 of the bytes, also the name of the file in the cache.
 
     Raises:
-        DataError: see `fetch`.
+        DataError: The shard cannot be fetched, or has other bytes.
     """
     path = cache_folder() / "shards" / sha256
     with _locked(path.with_suffix(".lock")):
@@ -252,11 +259,11 @@ def fetch_shard(url: str, sha256: str) -> Path:
 
 def _evict(newest: Path) -> None:
     """Remove the oldest shards of the cache above its limit. Processes that have one open keep it."""
-    given = os.environ.get("RLFTSIM_CACHE_GB", "50")
+    gigabytes = os.environ.get("RLFTSIM_CACHE_GB", "50")
     try:
-        limit = float(given) * 1e9
+        limit = float(gigabytes) * 1e9
     except ValueError:
-        raise ConfigError(f"RLFTSIM_CACHE_GB={given} is no number of gigabytes.") from None
+        raise ConfigError(f"RLFTSIM_CACHE_GB={gigabytes} is no number of gigabytes.") from None
     with _locked(newest.parent / "evict.lock"):  # one process at a time counts and removes
         for path in newest.parent.glob(".*.tmp"):
             with suppress(FileNotFoundError):  # another process has just finished it
@@ -292,11 +299,11 @@ def mirror(url: str, names: tuple[str, ...]) -> Path:
     """Local folder with some files of a remote one, fetched again when the last of them has changed.
 
     Args:
-        url: of the remote folder.
-        names: files in it; the last one changes with the others.
+        url: Address of the remote folder.
+        names: Names of the files, the last of which changes whenever another does, such as a manifest.
 
     Raises:
-        DataError: a file is missing.
+        DataError: A file is missing.
     """
     folder, url = local_copy(url, "data"), url.rstrip("/")
     with _locked(folder / ".lock"):
@@ -314,23 +321,70 @@ def mirror(url: str, names: tuple[str, ...]) -> Path:
 
 
 def find_files(url: str, pattern: str) -> dict[str, int]:
-    """Addresses and sizes of the remote files at a place: a file, a glob, or the matching files of a folder.
+    """Sizes in bytes of remote files by address: a file, those of a glob, or the matching files of a folder.
 
     Args:
-        url: the place.
-        pattern: of file names in a folder, at any depth.
+        url: Address of a file or folder, or a glob of files.
+        pattern: Glob that the names of files in a folder match, at any depth.
 
     Raises:
-        DataError: there are none, or the place cannot be read.
+        DataError: No such files, or the folder cannot be read.
     """
-    with remote(url) as (files, place):
-        found = files.glob(place, detail=True) if has_magic(place) else {}
-        if not found and files.isfile(place):
-            found = {place: files.info(place)}
-        # No glob: the name of a folder may look like a pattern, too.
-        below = {} if found else files.find(place, detail=True)
-        found = found or {name: below[name] for name in below if fnmatchcase(name.rpartition("/")[2], pattern)}
-        sizes = {files.unstrip_protocol(name): info["size"] for name, info in sorted(found.items())}
+    with remote(url) as (files, remote_path):
+        details = files.glob(remote_path, detail=True) if has_magic(remote_path) else {}
+        if not details and files.isfile(remote_path):
+            details = {remote_path: files.info(remote_path)}
+        if not details:  # no glob: the name of a folder may look like a pattern, too
+            below = files.find(remote_path, detail=True)
+            details = {name: below[name] for name in below if fnmatchcase(name.rpartition("/")[2], pattern)}
+        sizes = {files.unstrip_protocol(name): info["size"] for name, info in sorted(details.items())}
     if not sizes:
         raise DataError(f"{url}: no {pattern} there.")
     return sizes
+
+
+@contextmanager
+def remote_lease(url: str, doing: str) -> Iterator[Callable[[], object]]:
+    """Hold a remote folder for the time of a block; yields a function to be called every few minutes meanwhile.
+
+    Buckets have no locks. So the owner and the time are in a file that only one process can create, and that counts
+    until it is removed, or was not renewed for `SECONDS_OF_SILENCE`.
+
+    Args:
+        url: Address of the folder, without a slash at the end.
+        doing: Verb of the work, for messages: "is copying to".
+
+    Raises:
+        NotYetError: Another process holds the folder, or took the folder over after a long silence of this process.
+        DataError: The folder cannot be written to.
+    """
+    lease_url = f"{url}/{REMOTE_LEASE}"
+
+    def renew() -> None:
+        owner = get_text(lease_url).partition(" since ")[0]
+        if owner != describe_owner().partition(" since ")[0]:
+            raise NotYetError(
+                f"{owner or 'another process'} has taken over {url}, after a silence of this process: run the command "
+                "again."
+            )
+        put_text(lease_url, describe_owner(), is_new=False)
+
+    while not put_text(lease_url, describe_owner(), is_new=True):
+        text = get_text(lease_url)
+        try:
+            owner, age = parse_owner(text)
+        except (ValueError, TypeError):  # it is only just beginning, or was damaged
+            owner, age = "unknown", timedelta()
+        if age.total_seconds() < SECONDS_OF_SILENCE:
+            raise NotYetError(
+                f"another process {doing} {url} ({owner}, last heard of {age} ago): wait for it, or remove {lease_url} "
+                "if it is gone."
+            )
+        log.warning(f"{url}: taken over from {owner}, silent for {age}.")
+        remove(lease_url)
+    try:
+        yield renew
+    finally:
+        with suppress(DataError):  # gone, or another's
+            renew()
+            remove(lease_url)

@@ -5,6 +5,7 @@ The only module that parses either: size, depth, repeated names and numbers are 
 
 import json
 import math
+import re
 import tomllib
 from collections import Counter
 from collections.abc import Callable
@@ -19,11 +20,12 @@ MAX_TOML_BYTES = 1 << 20
 """The same of TOML, which is written by hand and parsed slowly."""
 MAX_DEPTH = 64
 """Brackets that may be nested; deeper ones exhaust the stack of whatever walks through the values."""
+_LONG_DOTTED_KEY = re.compile(rf"""(?<![\w"'-])(?:[\w"'-]++\s*+\.\s*+){{{MAX_DEPTH + 1}}}""")
 LONGEST_INTEGER = 40
 """Digits of a whole number: the seeds of numpy have 39."""
 LONGEST_NAME = 40
 """Characters of a name that a message repeats."""
-_KINDS = {dict: "an object", list: "a list", str: "text", bool: "true or false", type(None): "null"}
+_TYPE_NAMES = {dict: "an object", list: "a list", str: "text", bool: "true or false", type(None): "null"}
 
 
 def read_json(
@@ -104,7 +106,7 @@ def parse_json(
 
     value = _parse(text, parse, source, remedy, error)
     if not isinstance(value, expected):
-        raise error(f"{source}: holds {describe_kind(value)} instead of {_KINDS[expected]}: {remedy}.")
+        raise error(f"{source}: holds {describe_type(value)} instead of {_TYPE_NAMES[expected]}: {remedy}.")
     return value
 
 
@@ -122,6 +124,8 @@ def read_toml(path: str | PathLike[str], remedy: str, *, error: type[RlftsimErro
     """
 
     def parse(decoded: str) -> dict[str, Any]:
+        if _LONG_DOTTED_KEY.search(decoded):  # tomllib takes a time that grows with the square of a key's length
+            raise RecursionError
         try:
             return tomllib.loads(decoded)
         except tomllib.TOMLDecodeError as problem:
@@ -130,9 +134,9 @@ def read_toml(path: str | PathLike[str], remedy: str, *, error: type[RlftsimErro
     return _parse(_read_bytes(path, MAX_TOML_BYTES, remedy, error), parse, str(path), remedy, error)
 
 
-def describe_kind(value: object) -> str:
-    """Kind of a value of JSON or TOML in words, for messages."""
-    return _KINDS.get(type(value), "a number")
+def describe_type(value: object) -> str:
+    """Type of a value of JSON or TOML in words, for messages."""
+    return _TYPE_NAMES.get(type(value), "a number")
 
 
 def first_line(problem: BaseException) -> str:

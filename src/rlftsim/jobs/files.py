@@ -21,8 +21,8 @@ from rlftsim.jobs.documents import parse_json
 
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """Errors of the operating system where a file does not fit."""
-_TEMPORARY = re.compile(r"\..+\.\d+\.tmp")
-"""Names that `temporary_beside` gives."""
+_TEMPORARY = re.compile(r"\..+\..+\.\d+\.tmp")
+"""Names that `temporary_path` gives."""
 _ERROR_NUMBER = re.compile(r"\(os error (\d+)\)")
 """Where safetensors writes the number of an error of the operating system."""
 
@@ -44,8 +44,8 @@ def cannot_write(path: Path, error: OSError) -> DataError:
     """Error of a file that cannot be written, with a way out that fits the cause.
 
     Args:
-        path: of the file.
-        error: of the operating system, such as that of a full disk.
+        path: File that was to be written, which begins the message.
+        error: Error of the operating system, such as that of a full disk.
     """
     remedy = "choose another place, then run the same command again."
     # some libraries tell no error number: a full disk is the likeliest cause there
@@ -53,32 +53,32 @@ def cannot_write(path: Path, error: OSError) -> DataError:
         remedy = f"make room or {remedy}"
     elif isinstance(error, FileExistsError | NotADirectoryError):
         # the file stands where the path needs a folder
-        file = next((place for place in (path, *path.parents) if place.is_file()), None)
+        file = next((parent for parent in (path, *path.parents) if parent.is_file()), None)
         remedy = f"{file} is a file, not a folder: choose another place." if file else remedy
     elif isinstance(error, IsADirectoryError):
         remedy = "it is a folder: name a file."
     return DataError(f"cannot write {path} ({error.strerror or error}): {remedy}")
 
 
-def write_whole(path: Path, write: Callable[[Path], object]) -> None:
+def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     """Let `write` fill a temporary file beside `path`, then give it that name. A missing folder is created.
 
     A symbolic link stays, and what it leads to is replaced. Devices and pipes stay, too: they get the finished bytes.
 
     Args:
-        path: of the file.
-        write: called with the path of the temporary file.
+        path: File that appears when the content is whole.
+        write: Writer of the content, called with the path of the temporary file.
 
     Raises:
-        DataError: the file cannot be written, such as on a full disk. Then, and after any other error, nothing is left
-            behind and a file that was there before is untouched.
+        DataError: The file cannot be written, such as on a full disk. Then, and after any other error, nothing is left
+            behind and an older file of this name is untouched.
     """
     target = Path(os.path.realpath(path)) if path.is_symlink() else path
     # Asked of the path: /dev/stdout leads to a pipe, which has no path of its own.
     is_stream = path.exists() and not (path.is_file() or path.is_dir())
     folder = tempfile.TemporaryDirectory() if is_stream else nullcontext(target.parent)
-    with errors_name(path), folder as place:
-        temporary = temporary_beside(Path(place) / target.name)
+    with errors_name(path), folder as temporary_folder:
+        temporary = temporary_path(Path(temporary_folder) / target.name)
         try:
             temporary.parent.mkdir(parents=True, exist_ok=True)
             write(temporary)
@@ -95,7 +95,7 @@ def write_whole(path: Path, write: Callable[[Path], object]) -> None:
                 temporary.unlink()
 
 
-def temporary_beside(path: Path) -> Path:
+def temporary_path(path: Path) -> Path:
     """Name for a file until it is whole: of this process alone, on all machines that see the folder."""
     # Beside the file, as a rename is atomic within a file system only.
     return path.with_name(f".{path.name}.{socket.gethostname()}.{os.getpid()}.tmp")
@@ -132,24 +132,24 @@ def write_text(path: Path, text: str) -> None:
     """Write a text in UTF-8.
 
     Args:
-        path: of the file; its folder is created if missing.
-        text: the whole content.
+        path: File that appears when all of the text is on disk; a missing folder is created.
+        text: Whole content of the file.
 
     Raises:
-        DataError: as `write_whole`.
+        DataError: The file cannot be written, see `write_atomically`.
     """
-    write_whole(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+    write_atomically(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
 
 
 def append_text(path: Path, text: str) -> None:
     """Add a text to the end of a file, in UTF-8. Unlike the others this may leave a part of it.
 
     Args:
-        path: of the file, created if missing.
-        text: whole lines, so that a reader can drop one that was cut short.
+        path: File of lines, created if missing.
+        text: Whole lines, so that a reader can drop one that was cut short.
 
     Raises:
-        DataError: the file cannot be written, such as on a full disk.
+        DataError: The file cannot be written, such as on a full disk.
     """
     with errors_name(path), path.open("a", encoding="utf-8") as file:
         file.write(text)
@@ -159,12 +159,12 @@ def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: dict[str, 
     """Write named tensors as safetensors, the same bytes in each process, readable by all that may read the folder.
 
     Args:
-        path: of the file.
-        tensors: on any device.
-        metadata: stored in the file's header.
+        path: File that appears when all tensors are on disk.
+        tensors: Tensors of any shape by name, on any device.
+        metadata: Texts by name, stored in the header of the file.
 
     Raises:
-        DataError: as `write_whole`.
+        DataError: The file cannot be written, see `write_atomically`.
     """
 
     def write(temporary: Path) -> None:
@@ -180,7 +180,7 @@ def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: dict[str, 
         os.umask(mask)
         temporary.chmod(0o666 & ~mask)
 
-    write_whole(path, write)
+    write_atomically(path, write)
 
 
 def _sort_metadata(path: Path) -> None:

@@ -1,9 +1,27 @@
-"""Result folders: what a folder holds, by the files that it has anyway, and which results may be written into it."""
+"""Result folders: what a folder holds, which results may be written into it, and by whom.
 
+A folder is recognized by the files that it has anyway. Results are made by a single driver, or by the shares of a run:
+a lock refuses all others. A lock belongs to an open file, so it ends with the process that holds it, however that ends.
+Network file systems of today carry such locks between machines. On a file system without locks two drivers at a time
+are not noticed.
+"""
+
+import errno
+import json
+import os
+import socket
+import time
+from collections.abc import Mapping
+from contextlib import suppress
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Literal
+from types import TracebackType
+from typing import Any, Literal, TextIO
 
-from rlftsim.errors import ConfigError, DataError, in_short
+from rlftsim.errors import ConfigError, DataError, NotYetError, in_short
+from rlftsim.jobs.documents import read_json
+from rlftsim.jobs.files import errors_name, write_text
+from rlftsim.jobs.runner import Runner, Share, Unfinished, check_begun
 
 FolderType = Literal["data set", "submission", "set of rollouts", "model", "run", "results"]
 """Type of a result folder. "results" are files that lie beside others, such as evaluations, pages and reports."""
@@ -22,8 +40,12 @@ INNER_FOLDERS: dict[FolderType, tuple[str, ...]] = {
     "run": ("checkpoints", "tensorboard"),
 }
 """Folders inside a result folder that are its own alone."""
-MAY_LIE_BESIDE: dict[FolderType, tuple[FolderType, ...]] = {"results": ("set of rollouts", "run")}
+COMPATIBLE: dict[FolderType, tuple[FolderType, ...]] = {"results": ("set of rollouts", "run")}
 """Types of result that may be written into a folder of another type, which has no use for their names."""
+SECONDS_TO_WAIT = 10.0
+"""A share waits so long for a driver that may only be putting the result together, or for its predecessor to end."""
+WITHOUT_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.ENOLCK)
+"""Errors of file systems that have no locks, such as Lustre mounted without `flock`."""
 
 
 def recognize_folder(folder: Path) -> FolderType | None:
@@ -35,11 +57,11 @@ def recognize_folder(folder: Path) -> FolderType | None:
 
 
 def check_folder(folder: Path, folder_type: FolderType) -> None:
-    """Check that results of a type may be written into a folder. It may be missing, and may hold files of others.
+    """Check that results of a type may be written into a folder.
 
     Args:
-        folder: Place of the results.
-        folder_type: Type of the results.
+        folder: Folder of the results; may be missing, and may hold files of no result.
+        folder_type: Type of the results, which decides beside which others they may lie.
 
     Raises:
         DataError: A file, the folder of another type of result, or a folder inside one.
@@ -48,47 +70,244 @@ def check_folder(folder: Path, folder_type: FolderType) -> None:
         raise DataError(f"{folder} is a file, not a folder: choose another folder.")
     if holder := _find_holder(folder):
         raise DataError(f"{folder} lies inside {holder}: choose another folder.")
-    found = recognize_folder(folder)
-    if found not in (None, folder_type, *MAY_LIE_BESIDE.get(folder_type, ())):
-        raise DataError(f"{folder} is the folder of a {found}: choose another folder.")
+    stored_type = recognize_folder(folder)
+    if stored_type not in (None, folder_type, *COMPATIBLE.get(folder_type, ())):
+        raise DataError(f"{folder} is the folder of a {stored_type}: choose another folder.")
 
 
 def check_file(path: Path) -> None:
     """Check that a file that a command is to write would replace none that a result folder consists of.
 
     Args:
-        path: The file, which need not exist.
+        path: File that the command is to write; need not exist.
 
     Raises:
-        DataError: It is one by which the folder is recognized, or lies in a folder of its own alone.
+        DataError: The folder is recognized by this file, or is an inner one of a result.
     """
-    found = recognize_folder(path.parent)
-    if found and path.exists() and any(path.name in names for names in MARKERS[found]):
-        raise DataError(f"{path} is part of a {found}: choose another file.")
+    stored_type = recognize_folder(path.parent)
+    if stored_type and path.exists() and any(path.name in names for names in MARKERS[stored_type]):
+        raise DataError(f"{path} is part of a {stored_type}: choose another file.")
     if holder := _find_holder(path.parent):
         raise DataError(f"{path} lies inside {holder}: choose another file.")
 
 
-def check_name(name: str, what: str) -> None:
+def check_name(name: str, meaning: str) -> None:
     """Check that a name can be that of a file.
 
     Args:
-        name: Text of a user.
-        what: Meaning of the name in the message, such as "an evaluation's name".
+        name: Text of a user, to be used with a suffix of at most 50 bytes.
+        meaning: Meaning of the name at the beginning of the message, such as "an evaluation's name".
 
     Raises:
-        ConfigError: It is empty, longer than 200 bytes, or has a slash, a line break or another control character.
+        ConfigError: An empty name, more than 200 bytes, or a slash, a line break or another control character.
     """
     is_file_name = name.strip() and name not in (".", "..") and not {*"/\\"} & {*name}
     if not (is_file_name and name.isprintable() and len(name.encode()) <= 200):
-        raise ConfigError(f"{what} becomes a file name, {in_short(name)} cannot: choose another name.")
+        raise ConfigError(f"{meaning} becomes a file name, {in_short(name)} cannot: choose another name.")
 
 
 def _find_holder(folder: Path) -> str | None:
     """The result folder, in words, that a folder is an inner one of."""
-    folder = folder.resolve()
+    try:
+        folder = folder.resolve()
+    except (OSError, RuntimeError):
+        raise DataError(f"{folder}: its links lead nowhere: choose another folder.") from None
     for outer in folder.parents:
-        found = recognize_folder(outer)
-        if found and folder.relative_to(outer).parts[0] in INNER_FOLDERS.get(found, ()):
-            return f"the {found} {outer}"
+        stored_type = recognize_folder(outer)
+        if stored_type and folder.relative_to(outer).parts[0] in INNER_FOLDERS.get(stored_type, ()):
+            return f"the {stored_type} {outer}"
     return None
+
+
+def find_differences(path: Path, identity: Mapping[str, Any], remedy: str) -> list[str]:
+    """Names of the values by which stored results are known not to be of the same work; empty where nothing is stored.
+
+    Args:
+        path: JSON file that `write_identity` has written.
+        identity: Plain values on which the results depend, by name.
+        remedy: Way out at the end of the message about a damaged file.
+
+    Raises:
+        DataError: The file is damaged.
+    """
+    stored = read_json(path, remedy) if path.exists() else identity
+    return [name for name in {**identity, **stored} if stored.get(name) != identity.get(name)]
+
+
+def write_identity(path: Path, identity: Mapping[str, Any]) -> None:
+    """Store the values on which the results in a folder depend.
+
+    Args:
+        path: JSON file in the folder; one that is there is replaced.
+        identity: Plain values by name.
+
+    Raises:
+        DataError: The file cannot be written.
+    """
+    write_text(path, json.dumps(identity, indent=1) + "\n")
+
+
+class Lease:
+    """The right to write into a folder; use it as a context manager.
+
+    A share holds the folder together with other shares, and its own number alone.
+
+    Args:
+        path: Lock file inside the folder, both made if missing.
+        runner: Runner of the work; shares of one count may work side by side.
+        doing: Verb of the work, for messages: "is converting to".
+        note: First line of the lock file, for people who find the file.
+
+    Raises:
+        NotYetError: Another driver holds the folder; says which, and since when.
+        Unfinished: The work ended while a share waited for its turn, so nothing is left to do.
+        DataError: The folder cannot be written to.
+    """
+
+    def __init__(self, path: Path, runner: Runner, doing: str, note: str = "") -> None:
+        self._path, self._doing, self._note = path, doing, note
+        self._share = runner if isinstance(runner, Share) else None
+        self._files: list[TextIO] = []
+        check_begun(runner, path.parent)
+        try:
+            if self._share is None:
+                self._lock(path)
+            else:
+                share_lock = path.with_name(f"{path.name}.{self._share.number}-of-{self._share.count}")
+                deadline = time.monotonic() + SECONDS_TO_WAIT
+                self._lock(share_lock, deadline=deadline)
+                try:
+                    self._lock(path, is_shared=True, deadline=deadline)
+                except Unfinished:
+                    share_lock.unlink(missing_ok=True)
+                    with suppress(OSError):  # a folder of its own that went with the work
+                        path.parent.rmdir()
+                    raise
+        except BaseException:
+            self.__exit__(None, None, None)
+            raise
+
+    @property
+    def is_alone(self) -> bool:
+        """True if no share of the same run may be at work."""
+        return self._share is None
+
+    def __enter__(self) -> "Lease":
+        return self
+
+    def __exit__(
+        self, error_type: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        for file in self._files:
+            with suppress(OSError):  # the owner's line does not fit on a full disk, which has been said
+                file.close()
+
+    def finish(self, title: str) -> None:
+        """Become the only driver, to put the result together.
+
+        Args:
+            title: Name of the work at the beginning of the message.
+
+        Raises:
+            Unfinished: Other shares are at work; the last of them puts the result together.
+        """
+        if self._share is None:
+            return
+        # The lock is let go before it is wanted whole. So of shares that end together the last to let go gets it.
+        self._files.pop().close()
+        try:
+            self._lock(self._path, must_exist=True)
+        except NotYetError:
+            raise Unfinished(
+                f"{title}: {self._share} is done, other shares are at work. The last one puts the result together."
+            ) from None
+        self._share = None
+
+    def remove(self) -> None:
+        """Remove the lock files, at the end of all work. Only after `finish`."""
+        remove_locks(self._path)
+
+    def _lock(self, path: Path, *, is_shared: bool = False, deadline: float = 0.0, must_exist: bool = False) -> None:
+        """Open a file with a lock on it.
+
+        Args:
+            path: Lock file, made if missing.
+            is_shared: True lets other processes have such a lock, too.
+            deadline: Moment at which waiting for another process ends, in seconds of `time.monotonic`.
+            must_exist: True where the file was there: once gone, the work is done.
+
+        Raises:
+            NotYetError: Another process has a lock.
+            Unfinished: Another process had a lock and has removed the file, at the end of all work.
+        """
+        with errors_name(path):
+            if not must_exist:
+                path.parent.mkdir(parents=True, exist_ok=True)
+            while True:
+                try:
+                    # A file that was there and is gone must not come back: its work is done.
+                    file = open(path, "r+" if must_exist else "a+", encoding="utf-8")  # noqa: SIM115 (stays open)
+                except FileNotFoundError:
+                    if not must_exist:
+                        raise
+                    raise Unfinished(
+                        f"{path.parent}: another process has just finished this work: nothing is left to do."
+                    ) from None
+                try:
+                    import fcntl
+
+                    fcntl.flock(file.fileno(), (fcntl.LOCK_SH if is_shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+                except ImportError:  # no such locks on this platform: two drivers at a time are not noticed
+                    pass
+                except BlockingIOError:
+                    with file:
+                        if time.monotonic() >= deadline:
+                            raise NotYetError(self._refusal(file)) from None
+                    must_exist = True
+                    time.sleep(0.1)
+                    continue
+                except OSError as error:
+                    if error.errno not in WITHOUT_LOCKS:
+                        file.close()
+                        raise
+                # The driver before this one may have removed the file in between: then it is no lock for others.
+                if path.exists() and os.fstat(file.fileno()).st_ino == path.stat().st_ino:
+                    break
+                file.close()
+            self._files.append(file)
+            file.truncate(0)
+            file.write(f"{self._note}\n{describe_owner()}")
+            file.flush()
+
+    def _refusal(self, file: TextIO) -> str:
+        """Message with the owner and age of a lock."""
+        file.seek(0)
+        try:
+            owner, age = parse_owner(file.read())
+            whom = f" ({owner}, for {age})"
+        except (ValueError, TypeError):  # it is only just beginning, or the file was damaged
+            whom = ""
+        return f"another process {self._doing} {self._path.parent}{whom}: wait for it or choose another destination."
+
+
+def remove_locks(path: Path) -> None:
+    """Remove a lock file and those of its shares, where the work has ended; missing files are no error."""
+    for lock in (*path.parent.glob(f"{path.name}.*-of-*"), path):
+        lock.unlink(missing_ok=True)
+
+
+def describe_owner() -> str:
+    """A line about this process and the time, for a lock file."""
+    since = datetime.now(UTC).isoformat(timespec="seconds")
+    return f"{socket.gethostname()} process {os.getpid()} since {since}\n"
+
+
+def parse_owner(text: str) -> tuple[str, timedelta]:
+    """Process and age of the last line of a text, as `describe_owner` writes one.
+
+    Raises:
+        ValueError, TypeError: There is no such line.
+    """
+    owner, _, since = (text.splitlines() or [""])[-1].partition(" since ")
+    age = int((datetime.now(UTC) - datetime.fromisoformat(since)).total_seconds())
+    return owner, timedelta(seconds=max(age, 0))  # its clock may be ahead of ours

@@ -59,10 +59,10 @@ def ctrl_c_waits(*, enabled: bool = True) -> Iterator[Callable[[], bool]]:
     of the caller's, all stays as it is.
 
     Args:
-        enabled: False = do nothing.
+        enabled: False leaves all signals as they are.
 
     Raises:
-        KeyboardInterrupt: it was pressed.
+        KeyboardInterrupt: Ctrl-C was pressed.
     """
     ours = (signal.default_int_handler, raise_interruption)
     is_main = threading.current_thread() is threading.main_thread()
@@ -97,8 +97,8 @@ def ctrl_c_blocked() -> Iterator[None]:
     Ctrl-C reaches all processes of a terminal, SLURM's signals all of a job, but only the one that started the others
     is to react, and ends them.
     """
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+    previous_mask = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        signal.pthread_sigmask(signal.SIG_SETMASK, previous_mask)

@@ -58,8 +58,8 @@ class Advance(Protocol):
         """Report progress.
 
         Args:
-            count: units that were finished since the last call.
-            note: text to show next to the bar.
+            count: Number of units that were finished since the last call.
+            note: Text to show next to the bar.
         """
         ...
 
@@ -71,11 +71,11 @@ def progress_bar(
     """Show the progress of a piece of work; yields the function to call after each unit.
 
     Args:
-        title: name of the work.
-        total: units in all.
-        done: units that an earlier run has finished.
-        unit: bytes are shown as kB, MB or GB.
-        show: False = print nothing.
+        title: Name of the work, in front of the bar.
+        total: Number of units in the whole work.
+        done: Number of units that an earlier run has finished; they do not count for the estimate of time.
+        unit: Unit of the numbers; bytes are shown as kB, MB or GB.
+        show: False prints nothing, neither a bar nor lines.
     """
     if not (show and sys.stderr.isatty()):
         yield _lines(title, total, done, show)
@@ -98,21 +98,21 @@ def progress_bar(
 def _lines(title: str, total: int, done: int, show: bool) -> Advance:
     """Progress without a terminal: a line every half minute and at the end."""
     start = last = time.monotonic()
-    so_far = done
+    num_done = done
 
     def advance(count: int = 1, note: str = "") -> None:
-        nonlocal so_far, last
-        so_far += count
-        now = time.monotonic()
-        if show and (now - last >= SECONDS_BETWEEN_LINES or so_far == total):
-            last = now
+        nonlocal num_done, last
+        num_done += count
+        moment = time.monotonic()
+        if show and (moment - last >= SECONDS_BETWEEN_LINES or num_done == total):
+            last = moment
             # Units of earlier runs took no time in this one, so they do not count for the estimate.
             # Before the first unit of this run there is no estimate; work of no units, such as an empty file, is done.
-            eta = f" in {now - start:.0f} s"
-            if so_far < total:
-                left = (now - start) / (so_far - done) * (total - so_far) if so_far > done else math.inf
+            eta = f" in {moment - start:.0f} s"
+            if num_done < total:
+                left = (moment - start) / (num_done - done) * (total - num_done) if num_done > done else math.inf
                 eta = f", about {left:.0f} s to go" if math.isfinite(left) else ""
-            fraction = so_far / total if total else 1.0
+            fraction = num_done / total if total else 1.0
             print(f"{title}: {fraction:.0%}{eta}  {note}".rstrip(), file=sys.stderr, flush=True)
 
     return advance

@@ -19,8 +19,7 @@ from typing import Any
 
 import rlftsim
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.jobs.progress import log
-from rlftsim.jobs.runner import (
+from rlftsim.jobs.processes import (
     OUT_OF_MEMORY,
     Advance,
     Attempts,
@@ -31,6 +30,7 @@ from rlftsim.jobs.runner import (
     pickle_task,
     portable_error,
 )
+from rlftsim.jobs.progress import log
 
 try:
     import ray
@@ -43,7 +43,7 @@ BYTES_OF_A_PROCESS = 6e8
 """Python, torch and a large scenario with a small model."""
 BYTES_PER_BYTE_OF_A_TASK = 20.0
 """More memory for a larger model, whose weights are most of a task: 1.2 GB for those of SMART-tiny, 28 MB."""
-AHEAD = 4
+ITEMS_PER_CORE = 4
 """Items handed to Ray for each core of the cluster; more would make its scheduler and this process grow."""
 SECONDS_BETWEEN_REPORTS = 5.0
 SECONDS_TO_STOP = 5.0
@@ -57,26 +57,26 @@ class RayRunner:
     """Processes of a Ray cluster, one for each of its cores.
 
     Args:
-        address: of the cluster, such as "10.0.0.1:6379"; "auto" = the one that runs on this machine.
-        on_death: see `rlftsim.jobs.runner.OnDeath`.
-        item_log: see `rlftsim.jobs.runner.log_item`.
+        address: Address of the cluster, such as "10.0.0.1:6379"; "auto" = the one that runs on this machine.
+        on_death: "skip" sets an item aside that ended `ATTEMPTS` processes, "stop" raises at the first death.
+        item_log: File that gets a line of JSON for each finished item; None = no such file.
     """
 
     address: str = "auto"
     on_death: OnDeath = "skip"
     item_log: Path | None = None
 
-    def own(self, items: Sequence[Any]) -> Sequence[Any]:
+    def select(self, items: Sequence[Any]) -> Sequence[Any]:
         """All items, see `Runner`."""
         return items
 
     def run(
-        self, task: Task, items: Sequence[Any], *, advance: Advance, name_of: Callable[[Any], str] = str
+        self, task: Task, items: Sequence[Any], *, advance: Advance, describe: Callable[[Any], str] = str
     ) -> list[Any]:
         """Results of all items, see `Runner`.
 
         Raises:
-            ConfigError: there is no such cluster, or another version of this package on it; see also `Runner`.
+            ConfigError: No such cluster, or one with another version of this package; see also `Runner`.
         """
         # Ray's pickle: processes of a cluster do not import the main module, in which a policy may be defined.
         pickled = pickle_task(task, cloudpickle.dumps)
@@ -94,14 +94,14 @@ class RayRunner:
                     f"--ray {self.address}: no Ray cluster there ({cause}): `ray start` makes one."
                 ) from None
         try:
-            return self._run(pickled, items, advance, name_of)
+            return self._run(pickled, items, advance, describe)
         finally:
             if is_own_session:
                 ray.shutdown()
 
-    def _run(self, pickled: bytes, items: Sequence[Any], advance: Advance, name_of: Callable[[Any], str]) -> list[Any]:
+    def _run(self, pickled: bytes, items: Sequence[Any], advance: Advance, describe: Callable[[Any], str]) -> list[Any]:
         results: dict[int, Any] = {}
-        attempts = Attempts(items, name_of)
+        attempts = Attempts(items, describe)
         waiting = attempts.waiting
         at_work: dict[Any, int] = {}
         is_waiting = False
@@ -123,7 +123,7 @@ class RayRunner:
         try:
             while len(results) + len(attempts.set_aside) < len(items):
                 num_cores = int(ray.cluster_resources().get("CPU", 0))
-                while waiting and len(at_work) < AHEAD * max(num_cores, 1):
+                while waiting and len(at_work) < ITEMS_PER_CORE * max(num_cores, 1):
                     number = waiting.popleft()
                     at_work[work.remote([task], key, driver, pickle.dumps(items[number]), number, board)] = number
                 done, _ = ray.wait(list(at_work), timeout=SECONDS_BETWEEN_REPORTS)
@@ -140,21 +140,21 @@ class RayRunner:
                 for ref in done:
                     number = at_work.pop(ref)
                     try:
-                        kind, value, total, seconds, machine = pickle.loads(ray.get(ref))
+                        event, value, total, seconds, machine = pickle.loads(ray.get(ref))
                     except RayError as error:
                         reason = _reason(error)
                         if self.on_death == "stop":
-                            name = name_of(items[number])
+                            name = describe(items[number])
                             raise DataError(
                                 f"the process of {name} died ({reason}): run the same command again, it resumes."
                             ) from None
-                        attempts.again(number, reason, counts=not isinstance(error, NodeDiedError))
+                        attempts.retry(number, reason, is_to_blame=not isinstance(error, NodeDiedError))
                         continue
-                    if kind == "error":
+                    if event == "error":
                         raise value
                     results[number] = value
                     count(number, total)
-                    log_item(self.item_log, name_of(items[number]), seconds, machine)
+                    log_item(self.item_log, describe(items[number]), seconds, machine)
         finally:
             _cancel(list(at_work))
         if attempts.set_aside:
@@ -163,11 +163,7 @@ class RayRunner:
 
 
 def _expected_memory(task_bytes: int) -> int:
-    """Bytes of memory that a process of the cluster is expected to need: no machine gets more of them than fit.
-
-    Args:
-        task_bytes: size of the task.
-    """
+    """Bytes of memory that a process of the cluster is expected to need: no machine gets more of them than fit."""
     needed = BYTES_OF_A_PROCESS + BYTES_PER_BYTE_OF_A_TASK * task_bytes
     # Where even the largest machine has less, the work is tried all the same; Ray would wait for a larger one.
     has = [node["Resources"].get("memory", 0.0) for node in ray.nodes() if node["Resources"].get("CPU")]
@@ -184,8 +180,8 @@ class _Board:
         """Remember the progress of an item.
 
         Args:
-            number: of the item.
-            total: progress since it was begun.
+            number: Index of the item in the list of all items.
+            total: Progress since the item was begun, in units of the work.
         """
         self._totals[number] = total
 

@@ -39,14 +39,14 @@ def read_parquet(path: str | PathLike[str], remedy: str, *, error: type[RlftsimE
     except FileNotFoundError:
         raise
     except _DAMAGE as problem:
-        raise error(f"{path}: cannot be read ({_cause_of(problem)}): {remedy}.") from None
+        raise error(f"{path}: cannot be read ({_describe_cause(problem)}): {remedy}.") from None
 
 
 def map_arrow(path: str | PathLike[str], remedy: str) -> pa.Table:
     """Validated table of an Arrow file, memory-mapped: its values are read when they are needed.
 
     Args:
-        path: Arrow file.
+        path: Arrow file of a shard, which must not change while the table is in use.
         remedy: Way out at the end of every message.
 
     Raises:
@@ -58,7 +58,7 @@ def map_arrow(path: str | PathLike[str], remedy: str) -> pa.Table:
     except FileNotFoundError:
         raise
     except _DAMAGE as problem:
-        raise DataError(f"{path} is damaged ({_cause_of(problem)}): {remedy}.") from None
+        raise DataError(f"{path} is damaged ({_describe_cause(problem)}): {remedy}.") from None
 
 
 def read_parquet_metadata(path: str | PathLike[str]) -> Mapping[bytes, bytes]:
@@ -80,9 +80,9 @@ def check_columns(table: pa.Table, schema: pa.Schema) -> None:
         DataError: A column is missing, unknown, of another type or has an empty cell; the message begins with it.
     """
     missing = [name for name in schema.names if name not in table.schema.names]
-    unknown = [name for name in table.schema.names if name not in schema.names]
-    if missing or unknown:
-        raise DataError(f"no column {missing[0]}" if missing else f"unknown column {unknown[0][:40]!r}")
+    unexpected = [name for name in table.schema.names if name not in schema.names]
+    if missing or unexpected:
+        raise DataError(f"no column {missing[0]}" if missing else f"unknown column {unexpected[0][:40]!r}")
     for field in schema:
         column = table[field.name]
         if column.type != field.type:
@@ -109,5 +109,5 @@ def _check_size(metadata: pq.FileMetaData, num_bytes: int) -> None:
         raise ValueError(f"it announces {announced:.3g} values in {num_bytes} bytes")
 
 
-def _cause_of(problem: BaseException) -> str:
+def _describe_cause(problem: BaseException) -> str:
     return "a name is not text in UTF-8" if isinstance(problem, UnicodeDecodeError) else first_line(problem)

@@ -1,10 +1,10 @@
-"""Averages of policies that were trained from one base.
+"""Averages of policies that were trained from the same base.
 
     runs = [load_policy(f"runs/mloo-{seed}") for seed in range(3)]
     average_policies(runs).save_pretrained("runs/average")
 
-Fine-tuning runs with different seeds share what their reward teaches and differ by the noise of their gradients, which
-the mean of their weights has less of: about what a batch as many times larger would give.
+Fine-tuning runs with different seeds learn the same from the reward and differ by the noise of the gradients. The mean
+of the weights has less of this noise, about as little as with a batch as many times larger.
 """
 
 import copy
@@ -20,16 +20,17 @@ from rlftsim.rollout.fingerprint import fingerprint_policy
 
 
 def average_policies(policies: Sequence[Any], *, base: Any = None, scale: float = 1.0) -> Any:
-    """A new policy with the mean weights of others: base + scale (mean - base).
+    """A new policy with the mean weights of policies: base + scale (mean - base).
 
     Args:
-        policies: of one architecture, with the same settings and vocabulary; they are left as they are.
-        base: policy that they were fine-tuned from; only needed with a scale.
-        scale: above 1 goes further from the base than the policies did, along what they share.
+        policies: Policies of a single architecture, with the same settings and vocabulary; left unchanged.
+        base: Policy that all were fine-tuned from; only needed with a scale.
+        scale: Length of the step from the base to the mean; above 1 goes further than the policies did, in the
+            direction that all share.
 
     Raises:
-        ConfigError: none, or policies that differ in more than their weights; a scale without a base, or with which a
-            weight is not finite.
+        ConfigError: There are no policies, or policies that differ in more than the weights; a scale without a base, or
+            a scale with which a weight is not finite.
 
     Source: model soups, arXiv 2203.05482; with a scale task arithmetic, arXiv 2212.04089.
     """
@@ -40,10 +41,10 @@ def average_policies(policies: Sequence[Any], *, base: Any = None, scale: float 
     if scale != 1.0 and base is None:
         raise ConfigError(f"scale={scale:g} needs the base that the policies were fine-tuned from.")
     first = policies[0]
-    for place, other in enumerate(policies, 1):
-        _require_same_kind(first, other, f"policy {place} of {len(policies)}")
+    for number, policy in enumerate(policies, 1):
+        _check_same_settings(first, policy, f"policy {number} of {len(policies)}")
     if base is not None:
-        _require_same_kind(first, base, "the base")
+        _check_same_settings(first, base, "the base")
     average = copy.deepcopy(first)
     originals = [dict(policy.named_parameters()) for policy in policies]
     start = dict((first if base is None else base).named_parameters())
@@ -58,18 +59,18 @@ def average_policies(policies: Sequence[Any], *, base: Any = None, scale: float 
     return average
 
 
-def _require_same_kind(first: Any, other: Any, name: str) -> None:
-    """Refuse a policy that differs from the first one in more than its weights, under its name in the message."""
-    if not isinstance(other, nn.Module):
-        raise ConfigError(f"{name} is a {type(other).__name__} and has no weights to average.")
-    shapes, found = ({k: v.shape for k, v in policy.state_dict().items()} for policy in (first, other))
-    if shapes == found:
+def _check_same_settings(first: Any, policy: Any, name: str) -> None:
+    """Check that a policy, under a name for the message, differs from the first in no more than the weights."""
+    if not isinstance(policy, nn.Module):
+        raise ConfigError(f"{name} is a {type(policy).__name__} and has no weights to average.")
+    expected_shapes, shapes = ({k: v.shape for k, v in p.state_dict().items()} for p in (first, policy))
+    if shapes == expected_shapes:
         # with the same weights only settings, vocabulary, buffers and class are left to differ
-        twin = copy.deepcopy(other)
+        twin = copy.deepcopy(policy)
         twin.load_state_dict(dict(first.named_parameters()), strict=False)
         if fingerprint_policy(twin) == fingerprint_policy(first):
             return
     raise ConfigError(
-        f"{name}, a {type(other).__name__}, differs from the first in more than its weights: averages are of policies "
+        f"{name}, a {type(policy).__name__}, differs from the first in more than its weights: averages are of policies "
         "with one architecture, the same settings and the same vocabulary."
     )

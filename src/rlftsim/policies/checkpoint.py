@@ -32,19 +32,19 @@ from rlftsim.jobs.folder import check_folder
 CONFIG, WEIGHTS, CARD = "config.json", "model.safetensors", "README.md"
 SHIPPED_MODELS = Path(__file__).parent / "shipped"
 """A folder for each model in the box, by its registered name."""
-_WRITE_AGAIN = "damaged model folder, write it again"
+_REPAIR = "damaged model folder, write it again"
 _WRAPPERS = ("_orig_mod.", "module.")
 """Prefixes that torch.compile and distributed training put before the names of all weights."""
-_FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
+_FLOATS = {torch.float16, torch.bfloat16, torch.float32, torch.float64}
 SHOWN_PROBLEMS = 6
-"""Weights that a message names; a model of other sizes has a hundred that do not fit."""
+"""Number of weights that a message names; in a model of other sizes a hundred do not fit."""
 
 Loaded = TypeVar("Loaded")
 
 
 @dataclass(frozen=True, eq=False)
 class StoredModel:
-    """A model folder's settings; its weights are read on demand."""
+    """A model folder's settings; the weights are read on demand."""
 
     folder: Path
     architecture: str
@@ -56,25 +56,28 @@ class StoredModel:
         """Weights by name, on the CPU.
 
         Raises:
-            CheckpointError: the file is missing or damaged.
+            CheckpointError: The file is missing or damaged.
         """
         try:
-            return read_tensors(self.folder / WEIGHTS, _WRITE_AGAIN, error=CheckpointError)[0]
+            return read_tensors(self.folder / WEIGHTS, _REPAIR, error=CheckpointError)[0]
         except FileNotFoundError:
             raise CheckpointError(f"{self.folder}: not a model folder, {WEIGHTS} is missing.") from None
 
     def build(self, make: Callable[..., Loaded]) -> Loaded:
-        """Call a class with the stored settings as keyword arguments.
+        """Result of a call with the stored settings as keyword arguments.
+
+        Args:
+            make: Class, such as the dataclass of the settings, or function.
 
         Raises:
-            CheckpointError: settings that it does not take, takes in other types, or cannot do without.
+            CheckpointError: Settings are unknown, of wrong types, or missing.
         """
         # JSON has lists where settings have tuples.
         settings = {name: tuple(v) if isinstance(v, list) else v for name, v in self.config.items()}
-        kind: Any = make
         try:
-            if is_dataclass(kind):
-                _require_same_names(settings, kind)
+            settings_type: Any = make
+            if is_dataclass(settings_type):
+                _check_names(settings, {field.name for field in fields(settings_type) if field.init})
             return make(**settings)
         except (ConfigError, TypeError) as error:
             # a wrong call, not a damaged file: the folder may be of a newer version, or was edited
@@ -82,10 +85,13 @@ class StoredModel:
             raise CheckpointError(f"{self.folder / CONFIG}: settings do not fit {make.__name__} ({cause}).") from error
 
     def load(self, make: Callable[..., Loaded]) -> Loaded:
-        """Build a policy from the stored settings and load its weights, if it has any.
+        """Policy built from the stored settings, with the stored weights if there are any.
+
+        Args:
+            make: Class of the policy, called with the settings as keyword arguments.
 
         Raises:
-            CheckpointError: settings or weights that do not fit, or weights that are missing.
+            CheckpointError: Settings or weights do not fit, or weights are missing.
         """
         policy = self.build(make)
         if isinstance(policy, nn.Module):
@@ -93,16 +99,13 @@ class StoredModel:
         return policy
 
 
-def _require_same_names(settings: Mapping[str, Any], kind: Any) -> None:
-    """Refuse settings that a dataclass does not have or that are missing."""
-    names = {one.name for one in fields(kind) if one.init}
-    # A default in place of a value that is not there would make another model of the same weights.
-    missing = sorted(names - settings.keys())
-    unknown = sorted(settings.keys() - names)
-    if missing or unknown:
+def _check_names(settings: Mapping[str, Any], names: set[str]) -> None:
+    """Check that the settings are those of a dataclass: a default for a missing value would make another model."""
+    missing, extra = (", ".join(sorted(s)) or "none" for s in (names - settings.keys(), settings.keys() - names))
+    if settings.keys() != names:
         raise ConfigError(
-            f"missing: {', '.join(missing) or 'none'}; unknown: {', '.join(unknown) or 'none'}; upgrade rlftsim if the "
-            "folder is of a newer version, else write it again"
+            f"missing: {missing}; unknown: {extra}; upgrade rlftsim if the folder is of a newer version, else write it "
+            "again"
         )
 
 
@@ -117,22 +120,22 @@ def save_model(
     """Write a model folder.
 
     Args:
-        folder: created where it is missing.
-        policy: its class attribute `architecture` is the name it is registered under.
-        config: settings it is built with again, values that JSON has.
-        card: text of README.md.
-        weights: by name; None = the policy's state dict, or no weights file if it is not an nn.Module.
+        folder: Folder of the model, created where it is missing.
+        policy: Policy whose class attribute `architecture` is the registered name.
+        config: Settings that the policy is built with when loaded, values that JSON has.
+        card: Text of README.md; empty = a line that says that the origin is unknown.
+        weights: Tensors by name; None = the policy's state dict, or no weights file for a policy that is no nn.Module.
 
     Raises:
-        ConfigError: the policy declares no architecture.
-        DataError: the folder cannot be written.
+        ConfigError: The policy declares no architecture.
+        DataError: The folder cannot be written.
     """
     folder, architecture = Path(folder), getattr(policy, "architecture", None)
     check_folder(folder, "model")
     if not isinstance(architecture, str):
-        kind = type(policy).__name__
+        name = type(policy).__name__
         raise ConfigError(
-            f'{kind} cannot be saved: give the class an attribute such as architecture = "{kind.lower()}".'
+            f'{name} cannot be saved: give the class an attribute such as architecture = "{name.lower()}".'
         )
     if weights is None and isinstance(policy, nn.Module):
         weights = policy.state_dict()
@@ -144,27 +147,27 @@ def save_model(
 
 
 def read_model(folder: str | os.PathLike, *, architecture: str | None = None) -> StoredModel:
-    """Settings of a model folder, or of the one inside a run's folder.
+    """Settings of a model folder, or of the model folder inside a run's folder.
 
     Args:
-        folder: the model's or the run's.
-        architecture: refuse models of another one; None = any.
+        folder: Model folder, or folder of a finished run.
+        architecture: Registered name that the model must have; None = any.
 
     Raises:
-        ConfigError: there is no such folder.
-        CheckpointError: it is not a model folder, is damaged, belongs to a run that has not finished, or holds
+        ConfigError: There is no such folder.
+        CheckpointError: The folder holds no model, is damaged, belongs to a run that has not finished, or holds
             another architecture.
     """
     path = find_model(folder)
     try:
-        values = read_json(path / CONFIG, _WRITE_AGAIN, allow_nan=True, error=CheckpointError)
+        values = read_json(path / CONFIG, _REPAIR, allow_nan=True, error=CheckpointError)
     except FileNotFoundError:
-        inside = list_models(path)
-        hint = f": did you mean {' or '.join(str(path / name) for name in inside)}?" if inside else "."
+        names = list_models(path)
+        hint = f": did you mean {' or '.join(str(path / name) for name in names)}?" if names else "."
         raise CheckpointError(f"{path}: not a model folder, {CONFIG} is missing{hint}") from None
     stored = values.pop("architecture", None)
     if not isinstance(stored, str):
-        # a run's folder has a config.json of its own beside its checkpoints
+        # a run's folder has a config.json, too, beside the checkpoints
         is_run = (path / "environment.json").exists() or (path / "checkpoints").is_dir()
         raise CheckpointError(
             f"{path}: the run has not finished, it has no model folder yet: run its command again to go on."
@@ -177,10 +180,13 @@ def read_model(folder: str | os.PathLike, *, architecture: str | None = None) ->
 
 
 def find_model(name: str | os.PathLike) -> Path:
-    """Model folder of a name: the folder itself, or the one inside a run's folder.
+    """Path of a model folder.
+
+    Args:
+        name: Model folder, or folder of a finished run, which has a model folder inside.
 
     Raises:
-        ConfigError: there is no such folder.
+        ConfigError: There is no such folder.
     """
     folder = Path(name).expanduser()
     if folder.is_file():
@@ -190,27 +196,25 @@ def find_model(name: str | os.PathLike) -> Path:
     if not folder.is_dir():
         if _ships(name):
             raise ConfigError(f"{str(name)!r} is no folder but a model in the box: rs.load_policy({name!r}) loads it.")
-        near = similar_model(folder)
-        raise ConfigError(
-            f"{str(name)!r} is no model folder: there is none of that name"
-            + (f", did you mean {near!r}?" if near else ".")
-        )
+        match = find_similar_model(folder)
+        hint = f", did you mean {match!r}?" if match else "."
+        raise ConfigError(f"{str(name)!r} is no model folder: there is none of that name{hint}")
     return folder
 
 
-def read_card(name: str | os.PathLike, *, deeper: int = 2) -> str | None:
-    """Card of a model; None where there is no such folder, or no card in it.
+def read_card(name: str | os.PathLike, *, heading_shift: int = 2) -> str | None:
+    """Card of a model; None where there is no such folder, or no card.
 
     Args:
-        name: of a shipped model, a model folder or a run's folder.
-        deeper: levels that its headings go down, to stand in another text.
+        name: Name of a shipped model, a model folder or a run's folder.
+        heading_shift: Number of levels that headings go down, for a card inside a longer text.
     """
     try:
         folder = SHIPPED_MODELS / name if _ships(name) else find_model(name)
         text = (folder / CARD).read_text(encoding="utf-8", errors="replace")
     except (ConfigError, OSError):
         return None
-    return re.sub(r"^#+", lambda found: "#" * min(len(found[0]) + deeper, 6), text.strip(), flags=re.MULTILINE)
+    return re.sub(r"^#+", lambda match: "#" * min(len(match[0]) + heading_shift, 6), text.strip(), flags=re.MULTILINE)
 
 
 def _ships(name: str | os.PathLike) -> bool:
@@ -222,47 +226,46 @@ def list_models(folder: Path) -> list[str]:
     """Names of the model folders and finished runs directly in a folder; empty where there is no such folder."""
     if not folder.is_dir():
         return []
-    places = (CONFIG, f"model/{CONFIG}")
-    return sorted(path.name for path in folder.iterdir() if any((path / place).is_file() for place in places))
+    files = (CONFIG, f"model/{CONFIG}")
+    return sorted(path.name for path in folder.iterdir() if any((path / file).is_file() for file in files))
 
 
-def similar_model(folder: Path) -> str | None:
-    """A model folder or run beside a missing one, of a similar name; None if there is none."""
-    near = difflib.get_close_matches(folder.name, list_models(folder.parent), n=1)
-    return str(folder.parent / near[0]) if near else None
+def find_similar_model(folder: Path) -> str | None:
+    """Model folder or run beside a missing folder, of a similar name; None without such a name."""
+    matches = difflib.get_close_matches(folder.name, list_models(folder.parent), n=1)
+    return str(folder.parent / matches[0]) if matches else None
 
 
 def load_strictly(module: nn.Module, weights: Mapping[str, Tensor], *, source: str) -> None:
-    """Load weights; refuse missing or unknown keys, wrong shapes and NaN, and name the first of them.
+    """Load weights; missing or unknown keys, wrong shapes and NaN are refused.
 
     Args:
-        module: receives the weights.
-        weights: by name, as in the module's state dict.
-        source: place they come from, for the message.
+        module: Module that receives the weights.
+        weights: Tensors by name, as in the module's state dict.
+        source: File or folder of the weights, for the message.
 
     Raises:
-        CheckpointError: anything differs, or a weight is not finite.
+        CheckpointError: A name, shape or type differs, or a weight is not finite; the message names the first few.
     """
-    own = module.state_dict()
-    weights = strip_wrappers(weights, own)
-    check_shapes(weights, own, source=source)
+    expected = module.state_dict()
+    weights = strip_wrappers(weights, expected)
+    check_shapes(weights, expected, source=source)
+    parameters = dict(module.named_parameters())
     # Buffers may hold infinities, such as a mask.
-    parameters = {name for name, _ in module.named_parameters()}
-    broken = [
-        name for name in own if not (weights[name].isfinite() if name in parameters else ~weights[name].isnan()).all()
-    ]
+    is_valid = {name: weights[name].isfinite() if name in parameters else ~weights[name].isnan() for name in expected}
+    broken = [name for name, valid in is_valid.items() if not valid.all()]
     if broken:
-        shown = ", ".join(broken[:SHOWN_PROBLEMS]) + (" …" if len(broken) > SHOWN_PROBLEMS else "")
-        raise CheckpointError(f"{source}: weights are not finite ({shown}): take an earlier checkpoint or train again.")
+        names = _join_first(broken, ", ")
+        raise CheckpointError(f"{source}: weights are not finite ({names}): take an earlier checkpoint or train again.")
     module.load_state_dict(weights)
 
 
 def strip_wrappers(weights: Mapping[str, Tensor], names: Collection[str]) -> Mapping[str, Tensor]:
-    """Weights without the prefix that torch.compile or distributed training put before the names of all of them.
+    """Weights without the prefixes that torch.compile and distributed training put before all names.
 
     Args:
-        weights: Tensors by name, as a file has them.
-        names: Names that are wanted; a prefix that begins one of them is a part of the name.
+        weights: Tensors by name, as in a file.
+        names: Expected names; a prefix that begins an expected name stays.
     """
     for prefix in (p for _ in _WRAPPERS for p in _WRAPPERS):
         if all(name.startswith(prefix) for name in weights) and not any(name.startswith(prefix) for name in names):
@@ -270,36 +273,41 @@ def strip_wrappers(weights: Mapping[str, Tensor], names: Collection[str]) -> Map
     return weights
 
 
-def check_shapes(weights: Mapping[str, Tensor], own: Mapping[str, Tensor], *, source: str) -> None:
-    """Check that weights have the names, shapes and kinds of numbers of a model, which may be on no device.
+def check_shapes(weights: Mapping[str, Tensor], expected: Mapping[str, Tensor], *, source: str) -> None:
+    """Check that weights have the names, shapes and number types of a model, which may be on no device.
 
     Args:
-        weights: Tensors by name, as a file has them.
-        own: State dict of the model.
-        source: Place the weights come from, for the message.
+        weights: Tensors by name, as in a file.
+        expected: State dict of the model; only names, shapes and types are read.
+        source: File or folder of the weights, for the message.
 
     Raises:
-        CheckpointError: Anything differs; the message names the first few.
+        CheckpointError: A name, shape or type differs; the message names the first few.
     """
-    problems = [f"missing {k}" for k in sorted(own.keys() - weights.keys())]
-    problems += [f"unknown {k[:100]}" for k in sorted(weights.keys() - own.keys())]
+    problems = [f"missing {k}" for k in sorted(expected.keys() - weights.keys())]
+    problems += [f"unknown {k[:100]}" for k in sorted(weights.keys() - expected.keys())]
+    pairs = [(k, weights[k], expected[k]) for k in sorted(expected.keys() & weights.keys())]
     problems += [
-        f"{k} has shape {tuple(weights[k].shape)} instead of {tuple(own[k].shape)}"
-        for k in sorted(own.keys() & weights.keys())
-        if own[k].shape != weights[k].shape
+        f"{k} has shape {tuple(weight.shape)} instead of {tuple(model.shape)}"
+        for k, weight, model in pairs
+        if weight.shape != model.shape
     ]
     problems += [
-        f"{k} holds {weights[k].dtype} instead of {own[k].dtype}"
-        for k in sorted(own.keys() & weights.keys())
-        if weights[k].dtype != own[k].dtype and not (weights[k].dtype in _FLOATS and own[k].dtype in _FLOATS)
+        f"{k} holds {weight.dtype} instead of {model.dtype}"
+        for k, weight, model in pairs
+        if weight.dtype != model.dtype and not {weight.dtype, model.dtype} <= _FLOATS
     ]
     if problems:
-        shown = "; ".join(problems[:SHOWN_PROBLEMS]) + (" …" if len(problems) > SHOWN_PROBLEMS else "")
-        raise CheckpointError(f"{source}: {len(problems)} weights do not fit this model: {printable(shown)}.")
+        text = printable(_join_first(problems, "; "))
+        raise CheckpointError(f"{source}: {len(problems)} weights do not fit this model: {text}.")
+
+
+def _join_first(problems: list[str], separator: str) -> str:
+    return separator.join(problems[:SHOWN_PROBLEMS]) + (" …" if len(problems) > SHOWN_PROBLEMS else "")
 
 
 class _NoDraws(TorchFunctionMode):
-    """Draws no normal numbers, and keeps sequences in memory: torch needs imports of seconds for either without."""
+    """Mode without normal draws, and with sequences in memory: on the meta device torch would import for seconds."""
 
     def __torch_function__(self, func: Any, types: Any, args: tuple = (), kwargs: dict | None = None) -> Any:
         kwargs = kwargs or {}
@@ -309,25 +317,25 @@ class _NoDraws(TorchFunctionMode):
 
 
 def outline(make: Callable[[], nn.Module]) -> dict[str, Tensor]:
-    """State dict of a network that is built without memory: names, shapes and kinds of numbers.
+    """State dict of a network that is built without memory: names, shapes and number types.
 
     Args:
-        make: Builds the network on torch's default device.
+        make: Function that builds the network on torch's default device.
     """
     with torch.device("meta"), _NoDraws():
         return make().state_dict()
 
 
 def check_fit(make: Callable[[], nn.Module], weights: Mapping[str, Tensor], *, source: str) -> None:
-    """Check that weights fit a network before it is built: its settings may be damaged, and ask for any memory.
+    """Check that weights fit a network before the network is built: damaged settings may ask for any memory.
 
     Args:
-        make: Builds the network on torch's default device, which is one without memory here.
+        make: Function that builds the network on torch's default device, which has no memory here.
         weights: Stored weights by name.
-        source: Place the weights come from, for the message.
+        source: File or folder of the weights, for the message.
 
     Raises:
-        CheckpointError: The weights have other names, shapes or kinds of numbers.
+        CheckpointError: The weights have other names, shapes or number types.
     """
-    own = outline(make)
-    check_shapes(strip_wrappers(weights, own), own, source=source)
+    expected = outline(make)
+    check_shapes(strip_wrappers(weights, expected), expected, source=source)

@@ -8,16 +8,19 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 
-from rlftsim.policies.token_rows import TokenRows, row_statistics
-from rlftsim.rollout.baselines import refuse_top_k
+from rlftsim.policies.token_rows import TokenRows, compute_row_statistics
+from rlftsim.rollout.baselines import check_no_top_k
 from rlftsim.rollout.policy import DecisionStatistics, Sampling
 from rlftsim.rollout.rows import pick_rows, place_rows
+
+FULL = Sampling()
+"""The whole, untempered distribution."""
 
 
 class CategoricalDistribution:
     """Distributions of the R elements whose mask is True, in the order of `mask.nonzero()`.
 
-    All other elements (padding) decide 0 with probability 1. Off the CPU padding may have rows of its own that say so.
+    All other elements (padding) decide 0 with probability 1. Off the CPU padding may have rows that say so.
     """
 
     logits: Float[Tensor, "R V"]
@@ -34,44 +37,40 @@ class CategoricalDistribution:
         """Token ids, by inverting the cumulative distribution at the noise.
 
         Args:
-            sampling: temperature and truncation.
-            noise: uniform in [0, 1).
+            sampling: Temperature and truncation of the draw; temperature 0 takes the mode.
+            noise: Uniform numbers in [0, 1), one per element.
         """
         if sampling.temperature == 0:
             return self._dense(self.logits.argmax(-1))
-        logits, token_id = self._kept(sampling)
+        logits, token_id = self._truncate(sampling)
         cumulative = torch.softmax(logits, -1).cumsum(-1)
         # the sum of float32 probabilities is 1 up to rounding: scaled by it, no noise lies beyond the last token
         level = self._rows(noise) * cumulative[:, -1:]  # [R, 1]
-        chosen = torch.searchsorted(cumulative, level, right=True).clamp(max=logits.shape[-1] - 1)
-        return self._dense((chosen if token_id is None else token_id.gather(-1, chosen))[:, 0])
+        index = torch.searchsorted(cumulative, level, right=True).clamp(max=logits.shape[-1] - 1)
+        return self._dense((index if token_id is None else token_id.gather(-1, index))[:, 0])
 
-    def log_prob(
-        self,
-        decision: Int64[Tensor, "*batch"],
-        sampling: Sampling = Sampling(),  # noqa: B008
-    ) -> Float[Tensor, "*batch"]:
+    def log_prob(self, decision: Int64[Tensor, "*batch"], sampling: Sampling = FULL) -> Float[Tensor, "*batch"]:
         """Log-probability of token ids under the distribution that `sampling` draws from.
 
         Args:
-            decision: token ids.
-            sampling: temperature and truncation they were drawn with. A token that truncation excludes has -inf.
+            decision: Token ids, as `sample` returns.
+            sampling: Temperature and truncation of the draw. A token that truncation excludes has -inf.
         """
         if sampling.temperature == 0:
             return self._dense(torch.zeros_like(self.logits[:, 0]))
-        chosen = self._rows(decision)[:, None]  # [R, 1]
+        token = self._rows(decision)[:, None]  # [R, 1]
         if sampling.is_full:
-            return self._dense(self.log_probs.gather(-1, chosen)[:, 0])
-        logits, token_id = self._kept(sampling)
-        # log p = own logit - logsumexp of the kept ones, at the temperature
-        own = self.logits.gather(-1, chosen) / sampling.temperature
+            return self._dense(self.log_probs.gather(-1, token)[:, 0])
+        logits, token_id = self._truncate(sampling)
+        # log p = logit of the token - logsumexp of the logits after truncation, at the temperature
+        logit = self.logits.gather(-1, token) / sampling.temperature
         if token_id is not None:
-            own = own.masked_fill((token_id != chosen).all(-1, keepdim=True), -torch.inf)
-        return self._dense(own[:, 0] - logits.logsumexp(-1))
+            logit = logit.masked_fill((token_id != token).all(-1, keepdim=True), -torch.inf)
+        return self._dense(logit[:, 0] - logits.logsumexp(-1))
 
-    def kl(self, other: "CategoricalDistribution") -> Float[Tensor, "*batch"]:
-        """KL(self || other), nats."""
-        return self._dense((self.log_probs.exp() * (self.log_probs - other.log_probs)).sum(-1))
+    def kl(self, reference: "CategoricalDistribution") -> Float[Tensor, "*batch"]:
+        """KL(self || reference), nats."""
+        return self._dense((self.log_probs.exp() * (self.log_probs - reference.log_probs)).sum(-1))
 
     def entropy(self) -> Float[Tensor, "*batch"]:
         """Entropy, nats."""
@@ -82,8 +81,11 @@ class CategoricalDistribution:
         """Ids of the K most likely tokens, by K: a memo for repeated calls."""
         return {}
 
-    def _kept(self, sampling: Sampling) -> tuple[Float[Tensor, "R K"], Int64[Tensor, "R K"] | None]:
-        """Logits that `sampling` keeps, at its temperature, and their token ids in increasing order (None = all)."""
+    def _truncate(self, sampling: Sampling) -> tuple[Float[Tensor, "R K"], Int64[Tensor, "R K"] | None]:
+        """Logits of the tokens that may be drawn, at the temperature, and the token ids in increasing order.
+
+        The ids are None if all tokens may be drawn.
+        """
         if sampling.top_k is None or sampling.top_k >= self.logits.shape[-1]:
             return self.logits / sampling.temperature, None
         if sampling.top_k not in self._likeliest:
@@ -98,16 +100,16 @@ class CategoricalDistribution:
 
     def _rows(self, values: Tensor) -> Tensor:
         """Values of the R elements."""
-        return pick_rows(values, self.mask, has_all=self._num_rows == self.mask.numel())
+        return pick_rows(values, self.mask, is_dense=self._num_rows == self.mask.numel())
 
     def _dense(self, values: Tensor) -> Tensor:
-        """Values of the R elements at their places, zero elsewhere."""
+        """Values of the R elements as [*batch], zero elsewhere."""
         return place_rows(values, self.mask)
 
 
 @dataclass(frozen=True, eq=False)
 class TokenDistribution(CategoricalDistribution):
-    """Distributions whose logits are at hand."""
+    """Distributions with logits that have been computed already."""
 
     logits: Float[Tensor, "R V"]
     mask: Bool[Tensor, "*batch"]
@@ -115,7 +117,7 @@ class TokenDistribution(CategoricalDistribution):
 
 @dataclass(frozen=True, eq=False)
 class LazyTokenDistribution(CategoricalDistribution):
-    """Distributions whose logits are computed when they are asked for, and not for the statistics of an update."""
+    """Distributions with logits that are computed on first use, and not for the statistics of an update."""
 
     rows: TokenRows
     mask: Bool[Tensor, "*batch"]
@@ -129,37 +131,33 @@ class LazyTokenDistribution(CategoricalDistribution):
     def _num_rows(self) -> int:
         return len(self.rows.hidden)
 
-    def log_prob(
-        self,
-        decision: Int64[Tensor, "*batch"],
-        sampling: Sampling = Sampling(),  # noqa: B008
-    ) -> Float[Tensor, "*batch"]:
-        """As of any `CategoricalDistribution`; without logits for the full distribution.
+    def log_prob(self, decision: Int64[Tensor, "*batch"], sampling: Sampling = FULL) -> Float[Tensor, "*batch"]:
+        """Log-probability as of any `CategoricalDistribution`; without logits for the full distribution.
 
         Args:
-            decision: token ids.
-            sampling: temperature and truncation they were drawn with.
+            decision: Token ids, as `sample` returns.
+            sampling: Temperature and truncation of the draw.
         """
         if not sampling.is_full:
             return super().log_prob(decision, sampling)
-        return self._dense(row_statistics(self.rows, self._rows(decision))[0])
+        return self._dense(compute_row_statistics(self.rows, self._rows(decision))[0])
 
     def statistics(self, decision: Int64[Tensor, "*batch"], reference: CategoricalDistribution) -> DecisionStatistics:
-        """Log-probability, KL and entropy of all elements, without logits of all of them at once where both are lazy.
+        """Log-probability, KL and entropy of all elements, block by block if both distributions are lazy.
 
         Args:
-            decision: token ids.
-            reference: of the same elements; no gradient flows into it.
+            decision: Token ids, drawn from the full distribution.
+            reference: Distribution of the same elements; receives no gradient.
         """
         if not isinstance(reference, LazyTokenDistribution):
             return DecisionStatistics(self.log_prob(decision), self.kl(reference), self.entropy())
-        found = row_statistics(self.rows, self._rows(decision), reference.rows)
-        return DecisionStatistics(*(self._dense(values) for values in found))
+        statistics = compute_row_statistics(self.rows, self._rows(decision), reference.rows)
+        return DecisionStatistics(*(self._dense(values) for values in statistics))
 
 
 def standard_normal(noise: Float[Tensor, "*shape"]) -> Float64[Tensor, "*shape"]:
-    """Draws of N(0, 1), by the inverse of its cumulative distribution at noise that is uniform in [0, 1)."""
-    # The noise is a multiple of 2^-24: kept from 0, where the inverse is infinite, by half of that.
+    """Draws of N(0, 1), by the inverse of the cumulative distribution at noise that is uniform in [0, 1)."""
+    # The noise is a multiple of 2^-24: half of that stands for 0, where the inverse is infinite.
     return math.sqrt(2) * torch.erfinv(2 * noise.clamp(min=2**-25).double() - 1)
 
 
@@ -176,39 +174,35 @@ class GaussianDistribution:
         """Draws, by the inverse of the cumulative distribution at the noise.
 
         Args:
-            sampling: temperature, which scales the variance: a density to the power 1/T; 0 = the mean.
-            noise: uniform in [0, 1).
+            sampling: Temperature, a factor of the variance: a density to the power 1/T; 0 = the mean.
+            noise: Uniform numbers in [0, 1), one per number of a decision.
 
         Raises:
             ConfigError: `sampling.top_k` is set, and there are no categories.
         """
-        refuse_top_k(sampling)
-        drawn = math.sqrt(sampling.temperature) * standard_normal(noise)
-        return self._masked(self.mean + self.std * drawn.to(self.mean.dtype))
+        check_no_top_k(sampling)
+        deviation = math.sqrt(sampling.temperature) * standard_normal(noise)
+        return self._masked(self.mean + self.std * deviation.to(self.mean.dtype))
 
-    def log_prob(
-        self,
-        decision: Float[Tensor, "*batch D"],
-        sampling: Sampling = Sampling(),  # noqa: B008
-    ) -> Float[Tensor, "*batch"]:
+    def log_prob(self, decision: Float[Tensor, "*batch D"], sampling: Sampling = FULL) -> Float[Tensor, "*batch"]:
         """Log-density under the distribution that `sampling` draws from, summed over the D numbers; 0 at the mode.
 
         Args:
-            decision: as drawn.
-            sampling: temperature it was drawn with.
+            decision: Decisions, as `sample` returns.
+            sampling: Temperature of the draw; `top_k` is refused, as in `sample`.
         """
-        refuse_top_k(sampling)
+        check_no_top_k(sampling)
         if sampling.temperature == 0:
             return torch.zeros_like(self.mean[..., 0])
         std = self.std * math.sqrt(sampling.temperature)
         log_density = -0.5 * ((decision - self.mean) / std).square() - std.log() - 0.5 * math.log(2 * math.pi)
         return self._masked(log_density).sum(-1)
 
-    def kl(self, other: "GaussianDistribution") -> Float[Tensor, "*batch"]:
-        """KL(self || other), nats."""
-        ratio = (self.std / other.std).square()
-        off = ((self.mean - other.mean) / other.std).square()
-        return self._masked(0.5 * (ratio + off - 1 - ratio.log())).sum(-1)
+    def kl(self, reference: "GaussianDistribution") -> Float[Tensor, "*batch"]:
+        """KL(self || reference), nats."""
+        ratio = (self.std / reference.std).square()
+        distance = ((self.mean - reference.mean) / reference.std).square()
+        return self._masked(0.5 * (ratio + distance - 1 - ratio.log())).sum(-1)
 
     def entropy(self) -> Float[Tensor, "*batch"]:
         """Differential entropy, nats."""

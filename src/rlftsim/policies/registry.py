@@ -1,6 +1,6 @@
 """Policies by name: from a registered name, a model folder or a run's folder to a policy.
 
-A package of your own adds an architecture with an entry point, and then every command takes its folders:
+Another package adds an architecture with an entry point, and then all commands take folders of that architecture:
 
     [project.entry-points."rlftsim.policies"]
     cruise = "cruise_package:Cruise"
@@ -18,42 +18,35 @@ from torch import nn
 
 from rlftsim.errors import ConfigError
 from rlftsim.plugins import ExtensionPoint
+from rlftsim.policies import SHIPPED_POLICIES
 from rlftsim.policies.checkpoint import find_model as find_model
-from rlftsim.policies.checkpoint import read_model, similar_model
+from rlftsim.policies.checkpoint import find_similar_model, read_model
 from rlftsim.rollout.policy import LoadablePolicy, Policy
 
 POLICIES: ExtensionPoint[Callable[..., Any]] = ExtensionPoint(
     "policy",
     "rlftsim.policies",
-    {
-        "smart": "rlftsim.policies.smart.policy:SmartPolicy",
-        "trafficbots": "rlftsim.policies.trafficbots.policy:TrafficBotsPolicy",
-        "calibrated": "rlftsim.policies.calibrated.policy:CalibratedPolicy",
-        "constant_velocity": "rlftsim.rollout.baselines:ConstantVelocity",
-        "demo-base": "rlftsim.policies.shipped:demo_base",
-        "demo-tuned": "rlftsim.policies.shipped:demo_tuned",
-        "demo-goals": "rlftsim.policies.shipped:demo_goals",
-        "trafficbots-base": "rlftsim.policies.shipped:trafficbots_base",
-    },
+    SHIPPED_POLICIES,
     use=lambda name: load_policy(name) if _needs_no_arguments(POLICIES.get(name)) else _loadable(name),
 )
 """Architecture name -> policy class. A class that can be called without arguments is a policy by its name alone."""
 
 Device = Literal["auto", "cpu", "cuda"]
-"""auto = the GPU where torch sees one."""
+"""auto = the GPU where torch sees a GPU."""
 
 
 def load_policy(name: str | os.PathLike, device: Device = "cpu") -> Policy:
     """Policy of a name, in evaluation mode and with frozen weights.
 
     Args:
-        name: a registered name ("constant_velocity"), a model folder as `save_pretrained` writes it, or a run's folder.
+        name: Registered name ("constant_velocity"), model folder as `save_pretrained` writes, or a run's folder.
             Where a folder is named like a registered policy, "./name" is the folder.
-        device: of its weights.
+        device: Device of the weights; a policy without weights takes the batch's device.
 
     Raises:
-        ConfigError: neither a known name nor a folder, no such device, or a registered policy that needs its weights.
-        CheckpointError: a folder that is damaged or holds something else.
+        ConfigError: The name is neither registered nor a folder, the policy of the name needs weights, or there is no
+            such device.
+        CheckpointError: The folder is damaged or holds no policy.
     """
     return _load(name, device)
 
@@ -62,19 +55,19 @@ def load_policy_or_oracle(name: str | os.PathLike, device: Device = "cpu") -> Po
     """As `load_policy`; "oracle" stands for the logged futures themselves.
 
     Args:
-        name: "oracle", or as in `load_policy`.
-        device: of the weights.
+        name: "oracle", or a registered name, model folder or run's folder.
+        device: Device of the weights; the log has none.
 
     Raises:
-        ConfigError: as `load_policy`.
-        CheckpointError: as `load_policy`.
+        ConfigError: The name stands for no policy, the policy of the name needs weights, or there is no such device.
+        CheckpointError: The folder is damaged or holds no policy.
     """
     return "oracle" if name == "oracle" else _load(name, device, "oracle")
 
 
-def _load(name: str | os.PathLike, device: Device, *more_names: str) -> Policy:
-    """`load_policy`, offering `more_names` where a name is unknown."""
-    place = find_device(device)  # first, so that a policy without weights refuses a wrong word, too
+def _load(name: str | os.PathLike, device: Device, *extra_names: str) -> Policy:
+    """`load_policy`, offering `extra_names` where a name is unknown."""
+    torch_device = find_device(device)  # first, so that a policy without weights refuses a wrong word, too
     # anything with a separator is a path: no entry point of another package is imported for it
     registered = POLICIES.find(name) if isinstance(name, str) and Path(name).name == name else None
     if registered is not None and _needs_no_arguments(registered):
@@ -88,36 +81,37 @@ def _load(name: str | os.PathLike, device: Device, *more_names: str) -> Policy:
         policy = _loadable(stored.architecture).from_pretrained(stored.folder)
     elif registered is not None:
         raise ConfigError(f"policy {name!r} needs its weights: name a model folder or a run's folder instead.")
-    elif name == "oracle" and not more_names:
+    elif name == "oracle" and not extra_names:
         raise ConfigError("'oracle' stands for the log itself and is no policy: only evaluate takes it.")
     else:
         # names that are policies by themselves: an architecture that needs weights is no answer
         names = [name for name in POLICIES.names() if _needs_no_arguments(POLICIES.get(name))]
-        names += more_names
-        near = next(iter(difflib.get_close_matches(str(name), names, n=1)), similar_model(Path(name).expanduser()))
-        hint = f": did you mean {near!r}?" if near else "."
+        names += extra_names
+        matches = difflib.get_close_matches(str(name), names, n=1)
+        match = matches[0] if matches else find_similar_model(Path(name).expanduser())
+        hint = f": did you mean {match!r}?" if match else "."
         raise ConfigError(f"{str(name)!r} is neither a model folder nor one of {', '.join(names)}{hint}")
     # A class has its instances' attributes, so a function that returns one would pass for a policy.
     if not isinstance(policy, Policy) or isinstance(policy, type):
-        kind = policy if isinstance(policy, type) else type(policy)
+        cls = policy if isinstance(policy, type) else type(policy)
         raise ConfigError(
-            f"policy {str(name)!r} is a {kind.__name__} without what a policy needs: five methods and three numbers, "
+            f"policy {str(name)!r} is a {cls.__name__} without what a policy needs: five methods and three numbers, "
             "see rlftsim.rollout.policy.Policy."
         )
     if isinstance(policy, nn.Module):
-        policy.eval().requires_grad_(False).to(place)
+        policy.eval().requires_grad_(False).to(torch_device)
     return policy
 
 
 def _loadable(architecture: str) -> LoadablePolicy:
     """Class that reads the model folders of an architecture."""
-    kind = POLICIES.get(architecture)
-    if not isinstance(kind, LoadablePolicy):
+    cls = POLICIES.get(architecture)
+    if not isinstance(cls, LoadablePolicy):
         raise ConfigError(
             f"policy {architecture!r} cannot be read from a folder: "
             "give its class an attribute architecture and a classmethod from_pretrained(folder)."
         )
-    return kind
+    return cls
 
 
 def _needs_no_arguments(make: Any) -> bool:
@@ -129,16 +123,14 @@ def _needs_no_arguments(make: Any) -> bool:
 
 
 def with_guidance(policy: Policy | Literal["oracle"], scale: float) -> Any:
-    """Copy of a policy that follows goals more closely than it learned to; itself at 1.
-
-    See `SmartPolicy.with_guidance`.
+    """Copy of a policy that follows goals more closely than was learned; the same policy at 1.
 
     Args:
-        policy: any.
-        scale: factor of what pulls towards goals.
+        policy: Policy of any class, or "oracle"; a scale other than 1 needs a method `with_guidance`.
+        scale: Factor of the pull towards goals, as in `SmartPolicy.with_guidance`.
 
     Raises:
-        ConfigError: it has nothing that could be scaled, or `scale` is no number of 0 or more.
+        ConfigError: The policy has nothing that could be scaled, or `scale` is no number of 0 or more.
     """
     if scale == 1.0:
         return policy
@@ -151,8 +143,11 @@ def with_guidance(policy: Policy | Literal["oracle"], scale: float) -> Any:
 def find_device(device: Device) -> torch.device:
     """Device that a name stands for on this machine.
 
+    Args:
+        device: Name "cpu", "cuda", or "auto" for the GPU where torch sees a GPU.
+
     Raises:
-        ConfigError: no such name, or "cuda" where there is no CUDA device.
+        ConfigError: There is no such name, or "cuda" where there is no CUDA device.
     """
     if device not in get_args(Device):
         raise ConfigError(f"device must be one of {', '.join(get_args(Device))}, got {device!r}.")

@@ -21,7 +21,7 @@ NEVER = -1e9
 """Logit of a token that does not exist."""
 ROWS_PER_BLOCK = {"cpu": 256}
 """Rows whose tokens are processed together: on a processor they fit its cache."""
-ROWS_PER_BLOCK_ELSEWHERE = 1 << 14
+ROWS_PER_DEVICE_BLOCK = 1 << 14
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,37 +31,36 @@ class TokenRows:
     hidden: Float[Tensor, "R D"]
     """Features that the last map of the head reads."""
     weight: Float[Tensor, "V D"]
-    """Of the last map of the head."""
+    """Weights of the last map of the head."""
     bias: Float[Tensor, "V"]
-    """Likewise."""
     class_id: Int64[Tensor, "R"]
     exists: Bool[Tensor, "C V"]
-    """True = a token of that class; the others get the logit `NEVER`."""
+    """True = a token of that class; any other token gets the logit `NEVER`."""
 
     def logits(self) -> Float[Tensor, "R V"]:
         """float32 logits of all tokens of all rows."""
         return _logits(self.hidden, self.weight, self.offset(), self.class_id)
 
     def offset(self) -> Float[Tensor, "C V"]:
-        """The part of the logits that depends on the class alone: the bias of the last map, and `NEVER`."""
+        """Term of the logits that depends on the class alone: the bias of the last map, and `NEVER`."""
         return self.bias.masked_fill(~self.exists, NEVER)
 
 
-def row_statistics(
-    rows: TokenRows, chosen: Int64[Tensor, "R"], reference: TokenRows | None = None
+def compute_row_statistics(
+    rows: TokenRows, token: Int64[Tensor, "R"], reference: TokenRows | None = None
 ) -> tuple[Float[Tensor, "R"], Float[Tensor, "R"], Float[Tensor, "R"]]:
     """Log-probability of a token, KL(rows || reference) and entropy of each row, nats.
 
     Differentiable in `rows`; no gradient flows into the reference.
 
     Args:
-        rows: distributions of the policy.
-        chosen: token of each row.
-        reference: distributions over the same tokens; None = the policy itself, so that the KL is zero.
+        rows: Distributions of the policy, a row per decision.
+        token: Token id of each row, whose log-probability is computed.
+        reference: Distributions over the same tokens; None = those of the policy, so that the KL is zero.
     """
-    others = () if reference is None else (reference.hidden, reference.weight, reference.offset())
-    own, others = (rows.hidden, rows.weight, rows.offset()), [value.detach() for value in others]
-    return _RowStatistics.apply(*own, rows.class_id, chosen, *others)  # type: ignore[return-value]
+    ref = () if reference is None else (reference.hidden, reference.weight, reference.offset())
+    inputs = (rows.hidden, rows.weight, rows.offset(), rows.class_id, token, *(value.detach() for value in ref))
+    return _RowStatistics.apply(*inputs)  # type: ignore[return-value]
 
 
 def _logits(
@@ -78,7 +77,7 @@ def _logits(
 class _RowStatistics(torch.autograd.Function):
     """Statistics block by block, and their gradients by the logits, which are
 
-    * 1[chosen] - p of the log-probability,
+    * 1[token] - p of the log-probability,
     * p (log p - log q - KL) of KL = sum p (log p - log q), where q are the probabilities of the reference,
     * -p (log p + H) of the entropy H = -sum p log p.
     """
@@ -90,16 +89,16 @@ class _RowStatistics(torch.autograd.Function):
         weight: Float[Tensor, "V D"],
         offset: Float[Tensor, "C V"],
         class_id: Int64[Tensor, "R"],
-        chosen: Int64[Tensor, "R"],
+        token: Int64[Tensor, "R"],
         *reference: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        inputs = (hidden, weight, offset, class_id, chosen, *reference)
+        inputs = (hidden, weight, offset, class_id, token, *reference)
         # At least float32, as the logits of `_logits`: hidden features are bfloat16 under autocast.
         dtype = torch.promote_types(hidden.dtype, torch.float32)
         log_prob, kl, entropy = hidden.new_empty(3, len(hidden), dtype=dtype)
         for rows, log_p, log_q in _blocks(*inputs):
             p = log_p.exp()
-            log_prob[rows] = log_p.gather(-1, chosen[rows, None])[:, 0]
+            log_prob[rows] = log_p.gather(-1, token[rows, None])[:, 0]
             kl[rows] = (log_p - log_q).mul_(p).sum(-1)
             entropy[rows] = -log_p.mul_(p).sum(-1)
         ctx.save_for_backward(*inputs, kl, entropy)
@@ -111,7 +110,7 @@ class _RowStatistics(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         *inputs, kl, entropy = ctx.saved_tensors
-        hidden, weight, offset, class_id, chosen, *_ = inputs
+        hidden, weight, offset, class_id, token, *_ = inputs
         by_log_prob, by_kl, by_entropy = (gradient[:, None] for gradient in gradients)  # [R, 1]
         by_hidden, by_weight, by_offset = map(torch.zeros_like, (hidden, weight, offset))
         with torch.autocast(*ctx.autocast):  # logits as they were in the forward pass
@@ -119,7 +118,7 @@ class _RowStatistics(torch.autograd.Function):
                 by_logits = (log_p - log_q).sub_(kl[rows, None]).mul_(by_kl[rows])
                 by_logits -= (log_p + entropy[rows, None]).mul_(by_entropy[rows])
                 by_logits.sub_(by_log_prob[rows]).mul_(log_p.exp_())
-                by_logits.scatter_add_(-1, chosen[rows, None], by_log_prob[rows])
+                by_logits.scatter_add_(-1, token[rows, None], by_log_prob[rows])
                 by_hidden[rows] = by_logits @ weight
                 by_weight += by_logits.mT @ hidden[rows]
                 by_offset.index_add_(0, class_id[rows], by_logits)
@@ -131,11 +130,11 @@ def _blocks(
     weight: Float[Tensor, "V D"],
     offset: Float[Tensor, "C V"],
     class_id: Int64[Tensor, "R"],
-    chosen: Int64[Tensor, "R"],
+    token: Int64[Tensor, "R"],
     *reference: Tensor,
 ) -> Iterator[tuple[slice, Float[Tensor, "r V"], Float[Tensor, "r V"]]]:
     """Log-probabilities of policy and reference, a block of rows at a time."""
-    size = ROWS_PER_BLOCK.get(hidden.device.type, ROWS_PER_BLOCK_ELSEWHERE)
+    size = ROWS_PER_BLOCK.get(hidden.device.type, ROWS_PER_DEVICE_BLOCK)
     for start in range(0, len(hidden), size):
         rows = slice(start, start + size)
         log_p = _logits(hidden[rows], weight, offset, class_id[rows]).log_softmax(-1)

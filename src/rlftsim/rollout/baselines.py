@@ -21,29 +21,29 @@ class PointMass:
     decision: Float[Tensor, "*batch event"]
 
     def sample(self, sampling: Sampling, noise: Tensor) -> Tensor:
-        """The decision itself.
+        """The only possible decision.
 
         Args:
-            sampling: any temperature; `top_k` is refused, as there are no categories.
-            noise: not used.
+            sampling: Sampling of any temperature; `top_k` is refused, as there are no categories.
+            noise: Noise of any size, not used: `Policy.noise_size` may be 0.
 
         Raises:
             ConfigError: `sampling.top_k` is set.
         """
-        refuse_top_k(sampling)
+        check_no_top_k(sampling)
         return self.decision
 
     def log_prob(self, decision: Tensor, sampling: Sampling = Sampling()) -> Float[Tensor, "*batch"]:  # noqa: B008
         """Zeros: the only possible decision has probability 1.
 
         Args:
-            decision: any; its last axis is the event.
-            sampling: as in `sample`.
+            decision: Decisions [*batch, event], not compared with the possible one.
+            sampling: Sampling of any temperature; `top_k` is refused, as in `sample`.
         """
-        refuse_top_k(sampling)
+        check_no_top_k(sampling)
         return torch.zeros_like(decision[..., 0])
 
-    def kl(self, other: "PointMass") -> Float[Tensor, "*batch"]:
+    def kl(self, reference: "PointMass") -> Float[Tensor, "*batch"]:
         """Zeros."""
         return torch.zeros_like(self.decision[..., 0])
 
@@ -52,8 +52,15 @@ class PointMass:
         return torch.zeros_like(self.decision[..., 0])
 
 
-def refuse_top_k(sampling: Sampling) -> None:
-    """Raise a ConfigError where top-k is asked of a policy that has no categories."""
+def check_no_top_k(sampling: Sampling) -> None:
+    """Check that no truncation is set, for decisions that are not categories.
+
+    Args:
+        sampling: Sampling of a draw or of the draw's log-probability; the temperature may be any.
+
+    Raises:
+        ConfigError: `sampling.top_k` is set.
+    """
     if sampling.top_k is not None:
         raise ConfigError(f"top_k={sampling.top_k} needs a policy with categories, this one has none: leave top_k out.")
 
@@ -79,7 +86,7 @@ class ConstantVelocityState:
 
 
 class ConstantVelocity:
-    """Every agent keeps the velocity and heading it has at the current step.
+    """Every agent keeps the velocity and heading of the current step.
 
     A decision is a velocity, kept for 0.1 s.
     """
@@ -95,10 +102,8 @@ class ConstantVelocity:
 
     def encode(self, scenarios: ScenarioBatch) -> ConstantVelocityContext:
         """States at the current step."""
-        now = CURRENT_STEP
-        return ConstantVelocityContext(
-            scenarios.position[:, :, now], scenarios.heading[:, :, now], scenarios.velocity[:, :, now]
-        )
+        states = (scenarios.position, scenarios.heading, scenarios.velocity)
+        return ConstantVelocityContext(*(values[:, :, CURRENT_STEP] for values in states))
 
     def begin(
         self, context: ConstantVelocityContext, num_rollouts: int, goals: Goals | None, noise: Tensor
@@ -106,23 +111,20 @@ class ConstantVelocity:
         """The current state, N times.
 
         Args:
-            context: of `encode`.
-            num_rollouts: N.
-            goals: ignored, this policy cannot follow any.
-            noise: empty.
+            context: Context of the scenarios, from `encode`.
+            num_rollouts: Number N of simulations of each scenario.
+            goals: Goals of agents, ignored: a constant velocity follows none.
+            noise: Noise [B, N, A, 0], empty since nothing is drawn.
         """
-        repeated = (
-            v[:, None].expand(-1, num_rollouts, *v.shape[1:])
-            for v in (context.position, context.heading, context.velocity)
-        )
-        return ConstantVelocityState(*repeated)
+        states = (context.position, context.heading, context.velocity)
+        return ConstantVelocityState(*(v[:, None].expand(-1, num_rollouts, *v.shape[1:]) for v in states))
 
     def decide(self, context: ConstantVelocityContext, state: ConstantVelocityState) -> PointMass:
         """Distributions [B, N, A] with all mass on the present velocity.
 
         Args:
-            context: of `encode`, not used.
-            state: its velocity is the decision.
+            context: Context from `encode`, not used.
+            state: State before the decision; the velocity in it is the decision.
         """
         return PointMass(state.velocity)
 
@@ -136,10 +138,10 @@ class ConstantVelocity:
         """State after 0.1 s at the chosen velocity; the heading stays.
 
         Args:
-            context: of `encode`, not used.
-            state: before the decision.
-            decision: velocities, m/s, map frame.
-            forced: states imposed from outside, of a single step.
+            context: Context from `encode`, not used.
+            state: State before the decision.
+            decision: Velocities in m/s, map frame.
+            forced: States of a single step imposed from outside; None = no agent is forced.
         """
         position, heading = state.position + decision * STEP_S, state.heading
         if forced is not None:
@@ -153,7 +155,7 @@ class ConstantVelocity:
         """Distributions [B, N, A, L]: the same velocity at every decision.
 
         Args:
-            context: of `encode`.
-            rollouts: supply the shape.
+            context: Context of the scenarios, from `encode`.
+            rollouts: Rollouts of the same scenarios; only the shape of the decisions is read.
         """
         return PointMass(context.velocity[:, None, :, None].expand_as(rollouts.decision))

@@ -34,10 +34,10 @@ from rlftsim.rollout.policy import (
     DecisionDistribution,
     Policy,
     Sampling,
-    decision_statistics,
-    device_of,
+    compute_statistics,
     encode_like,
-    score_both,
+    get_device,
+    score_with_reference,
 )
 from rlftsim.rollout.simulate import simulate
 from rlftsim.rollout.types import AgentStates, Rollouts
@@ -50,7 +50,7 @@ SCORE_TOLERANCE = 1e-4
 """Nats, between sampled and scored log-probabilities."""
 PADDING_TOLERANCE = 1e-5
 ROUNDING = 1e-6
-"""Of a continuous decision: what float32 leaves of its mean after some tens of layers."""
+"""Error of a continuous decision: float32 after some tens of layers."""
 POSE_TOLERANCE_M = 1e-3
 MONTE_CARLO_DRAWS = 4096
 MONTE_CARLO_ERRORS = 5.0
@@ -109,47 +109,52 @@ class _Broken(Exception):
 def check_policy(policy: Policy, scenarios: Sequence[Scenario], *, reference: Policy | None = None) -> CheckReport:
     """Try every rule of the policy contract that applies.
 
-    Nothing is changed in the policy: a module is copied and put into evaluation mode. Takes seconds for a small policy.
+    The policy is left as before: a module is copied and put into evaluation mode. Takes seconds for a small policy.
 
     Args:
-        policy: of any architecture, with or without weights.
-        scenarios: at least one, on which everything is tried; best of different sizes and with all kinds of agents.
-        reference: another policy of the same kind for KL divergences; None = a copy with perturbed weights.
+        policy: Policy of any architecture, with or without weights.
+        scenarios: Scenarios that the rules are tried on, at least one; best of different sizes, with agents of all
+            classes.
+        reference: Policy of the same architecture for KL divergences; None = a copy with perturbed weights.
 
     Returns:
-        One result per rule. A rule whose check raised an error counts as failed, the error is its detail.
+        One result per rule. A rule whose check raised an error counts as failed, with the error as detail.
     """
-    subject = _Subject(_evaluation_copy(policy), tuple(scenarios), reference)
+    subject = _Subject(_copy_for_evaluation(policy), tuple(scenarios), reference)
     results = []
     for check in CHECKS:
         outcome: Outcome = "passed"
         try:
             detail = check(subject)
-        except _NotApplicable as reason:
-            outcome, detail = "not applicable", str(reason)
-        except _Broken as measured:
-            outcome, detail = "failed", str(measured)
+        except _NotApplicable as error:
+            outcome, detail = "not applicable", str(error)
+        except _Broken as error:
+            outcome, detail = "failed", str(error)
         except Exception as error:  # whatever a policy raises is an outcome of the test
             outcome, detail = "failed", f"raised {type(error).__name__}: {error} ({place_of(error)})"
         results.append(CheckResult(check.__name__.replace("_", " "), outcome, detail))
     return CheckReport(type(policy).__name__, tuple(results))
 
 
-def _evaluation_copy(policy: Policy) -> Policy:
+def _copy_for_evaluation(policy: Policy) -> Policy:
     return copy.deepcopy(policy).eval() if isinstance(policy, nn.Module) else policy
 
 
 @dataclass(frozen=True, eq=False)
 class _Subject:
-    """A policy, the scenarios it is tested on, and rollouts that several rules share."""
+    """A policy, scenarios to test with, and rollouts that several rules share."""
 
     policy: Policy
     scenarios: tuple[Scenario, ...]
-    given_reference: Policy | None
+    custom_reference: Policy | None
 
     @cached_property
     def batch(self) -> ScenarioBatch:
         return self.collate(self.scenarios)
+
+    @cached_property
+    def smallest_batch(self) -> ScenarioBatch:
+        return self.collate([min(self.scenarios, key=lambda s: len(s.simulated_indices))])
 
     @cached_property
     def rollouts(self) -> Rollouts:
@@ -158,7 +163,7 @@ class _Subject:
     @cached_property
     def with_forced(self) -> Rollouts:
         """Rollouts in which some agents are forced along arcs for a while."""
-        return self.simulate(self.batch, force=_lead_some(self.batch, self.policy.steps_per_decision))
+        return self.simulate(self.batch, force=_lead_agents(self.batch, self.policy.steps_per_decision))
 
     @cached_property
     def with_goals(self) -> Rollouts:
@@ -189,27 +194,32 @@ class _Subject:
             raise _NotApplicable("the policy has no weights")
         return self.policy
 
+    def copy_module(self, is_trained: bool) -> Policy:
+        module = copy.deepcopy(self.module).requires_grad_(is_trained)
+        assert isinstance(module, Policy)
+        return module
+
     @property
     def is_random(self) -> bool:
         return self.policy.noise_size > 0
 
     @cached_property
     def reference(self) -> Policy:
-        """Another policy of the same kind."""
-        if self.given_reference is not None:
-            return _evaluation_copy(self.given_reference)
-        other = copy.deepcopy(self.module)
+        """A different policy of the same architecture."""
+        if self.custom_reference is not None:
+            return _copy_for_evaluation(self.custom_reference)
+        perturbed = copy.deepcopy(self.module)
         generator = torch.Generator().manual_seed(1)
         with torch.no_grad():
-            for weight in other.parameters():
+            for weight in perturbed.parameters():
                 noise = torch.randn(weight.shape, generator=generator).to(weight)
                 # relative to the weights' size, so that a policy of any scale changes visibly but stays finite
                 weight.add_(0.1 * noise * (weight.abs().mean() + 0.01))
-        assert isinstance(other, Policy)
-        return other
+        assert isinstance(perturbed, Policy)
+        return perturbed
 
     def collate(self, scenarios: Sequence[Scenario], max_agents: int | None = None) -> ScenarioBatch:
-        return collate(scenarios, max_agents=max_agents).to(device_of(self.policy))
+        return collate(scenarios, max_agents=max_agents).to(get_device(self.policy))
 
     def simulate(self, batch: ScenarioBatch, num_rollouts: int | range = NUM_ROLLOUTS, **options) -> Rollouts:
         return simulate(self.policy, batch, num_rollouts=num_rollouts, seed=SEED, **options)
@@ -223,9 +233,9 @@ class _Subject:
         """Scored log-probabilities [B, N, A, L], 0 where the policy did not decide.
 
         Args:
-            batch: the scenarios.
-            rollouts: of these.
-            policy: that scores; None = the policy under test.
+            batch: Scenarios of the rollouts, in the same order.
+            rollouts: Rollouts whose decisions are scored.
+            policy: Policy that scores; None = the policy under test.
         """
         scored = self.score(batch, rollouts, policy).log_prob(rollouts.decision)
         return torch.where(rollouts.decision_mask, scored, 0.0)
@@ -235,40 +245,44 @@ Check = Callable[[_Subject], str]
 """A rule: a function that returns its measurement as a text, or raises `_Broken` or `_NotApplicable`."""
 
 
-def _within(measured: float, allowed: float, what: str) -> str:
-    """Text of a measurement, or `_Broken` with it."""
-    text = f"{what} {measured:.2g}, allowed {allowed:g}"
+def _check_limit(measured: float, allowed: float, title: str = "largest gap") -> str:
+    """Text of a measurement, or `_Broken` with the text."""
+    text = f"{title} {measured:.2g}, allowed {allowed:g}"
     if not measured <= allowed:
         raise _Broken(text)
     return text
 
 
-def _gap(a: Tensor, b: Tensor) -> float:
+def _compute_gap(a: Tensor, b: Tensor) -> float:
     """Largest absolute difference; infinite where shapes differ or a value is not finite."""
     if a.shape != b.shape or not (a.isfinite().all() and b.isfinite().all()):
         return math.inf
     return float((a.detach().double() - b.detach().double()).abs().max()) if a.numel() else 0.0
 
 
-def _lead_some(batch: ScenarioBatch, stride: int) -> Callable[[object, int], AgentStates]:
+def _check_gap(a: Tensor, b: Tensor, allowed: float, title: str = "largest gap") -> str:
+    """Text of the largest absolute difference, or `_Broken` with the text."""
+    return _check_limit(_compute_gap(a, b), allowed, title)
+
+
+def _lead_agents(batch: ScenarioBatch, stride: int) -> Callable[[object, int], AgentStates]:
     """A `force` along arcs: of the first agent throughout, of every third from the second on for two seconds."""
-    now = CURRENT_STEP
-    position, velocity, heading = batch.position[:, :, now], batch.velocity[:, :, now], batch.heading[:, :, now]
+    states = (batch.position, batch.velocity, batch.heading)
+    position, velocity, heading = (values[:, :, CURRENT_STEP] for values in states)
     index = torch.arange(batch.agent_mask.shape[1], device=batch.device)
 
     def force(state: object, step: int) -> AgentStates:
         time = torch.arange(step + 1, step + stride + 1, device=batch.device) * STEP_S
         turn = LEAD_TURN_RATE_RADPS * time
         # constant speed along a chord of the arc
-        way = rotate(velocity[:, :, None] * time[:, None], (turn / 2).expand(*heading.shape, stride))
+        offset = rotate(velocity[:, :, None] * time[:, None], (turn / 2).expand(*heading.shape, stride))
         # On the grid of `place_on_grid`, so that these poses can be turned without rounding.
-        path = ((position[:, :, None] + way) / GRID_M).round() * GRID_M
-        towards = wrap_angle(heading[:, :, None] + turn)
+        path = ((position[:, :, None] + offset) / GRID_M).round() * GRID_M
         led = batch.agent_mask & ((index == 0) | ((index % 3 == 1) & (step < 20)))
         shape = (-1, NUM_ROLLOUTS, -1, stride)
         return AgentStates(
             path[:, None].expand(*shape, 2),
-            towards[:, None].expand(shape),
+            wrap_angle(heading[:, :, None] + turn)[:, None].expand(shape),
             led[:, None, :, None].expand(shape),
         )
 
@@ -282,22 +296,22 @@ def _lead_some(batch: ScenarioBatch, stride: int) -> Callable[[object, int], Age
 def scored_log_probs_equal_sampled_ones(subject: _Subject) -> str:
     """Scored log-probabilities equal the sampled ones."""
     scored = subject.log_prob(subject.batch, subject.rollouts)
-    return _within(_gap(scored, subject.rollouts.log_prob), SCORE_TOLERANCE, "largest gap")
+    return _check_gap(scored, subject.rollouts.log_prob, SCORE_TOLERANCE)
 
 
 def scored_log_probs_equal_sampled_ones_with_forced_agents(subject: _Subject) -> str:
     """Scored log-probabilities equal the sampled ones where agents are forced for a while."""
     rollouts = subject.with_forced
     assert rollouts.forced is not None
-    off = (rollouts.position - rollouts.forced.position)[rollouts.forced.valid]
-    _within(float(off.abs().max()), 0.0, "distance of forced agents from their imposed positions (m)")
-    return _within(_gap(subject.log_prob(subject.batch, rollouts), rollouts.log_prob), SCORE_TOLERANCE, "largest gap")
+    offset = (rollouts.position - rollouts.forced.position)[rollouts.forced.valid]
+    _check_limit(float(offset.abs().max()), 0.0, "distance of forced agents from their imposed positions (m)")
+    return _check_gap(subject.log_prob(subject.batch, rollouts), rollouts.log_prob, SCORE_TOLERANCE)
 
 
 def scored_log_probs_equal_sampled_ones_with_goals(subject: _Subject) -> str:
     """Scored log-probabilities equal the sampled ones where agents have goals."""
     scored = subject.log_prob(subject.batch, subject.with_goals)
-    return _within(_gap(scored, subject.with_goals.log_prob), SCORE_TOLERANCE, "largest gap")
+    return _check_gap(scored, subject.with_goals.log_prob, SCORE_TOLERANCE)
 
 
 def empty_goals_equal_no_goals(subject: _Subject) -> str:
@@ -305,18 +319,18 @@ def empty_goals_equal_no_goals(subject: _Subject) -> str:
     position = torch.full_like(subject.batch.position[:, :, CURRENT_STEP], math.nan)
     empty = Goals.of_scenarios(position, torch.zeros_like(subject.batch.agent_mask))
     rollouts = subject.simulate(subject.batch, goals=empty)
-    _within(_gap(rollouts.position, subject.rollouts.position), 0.0, "rollouts apart (m)")
-    return _within(_gap(subject.log_prob(subject.batch, rollouts), rollouts.log_prob), SCORE_TOLERANCE, "largest gap")
+    _check_gap(rollouts.position, subject.rollouts.position, 0.0, "rollouts apart (m)")
+    return _check_gap(subject.log_prob(subject.batch, rollouts), rollouts.log_prob, SCORE_TOLERANCE)
 
 
-def scores_of_some_rollouts_equal_slices_of_all(subject: _Subject) -> str:
+def scores_of_slices_equal_slices_of_scores(subject: _Subject) -> str:
     """Scores do not depend on which rollouts are scored together."""
     gaps = []
     for rollouts in (subject.rollouts, subject.with_forced, subject.with_goals):
-        whole = subject.log_prob(subject.batch, rollouts)
-        for part in (slice(0, 1), slice(1, NUM_ROLLOUTS)):
-            gaps.append(_gap(subject.log_prob(subject.batch, rollouts.select(part)), whole[:, part]))
-    return _within(max(gaps), SCORE_TOLERANCE, "largest gap")
+        scored = subject.log_prob(subject.batch, rollouts)
+        for selected in (slice(0, 1), slice(1, NUM_ROLLOUTS)):
+            gaps.append(_compute_gap(subject.log_prob(subject.batch, rollouts.select(selected)), scored[:, selected]))
+    return _check_limit(max(gaps), SCORE_TOLERANCE)
 
 
 # ---- rules: the distribution
@@ -326,7 +340,7 @@ def scores_of_some_rollouts_equal_slices_of_all(subject: _Subject) -> str:
 def kl_from_itself_is_zero(subject: _Subject) -> str:
     """The KL divergence of a policy from itself is 0."""
     scored = subject.score(subject.batch, subject.rollouts)
-    return _within(float(scored.kl(scored).detach().abs().max()), 1e-6, "largest KL")
+    return _check_limit(float(scored.kl(scored).detach().abs().max()), 1e-6, "largest KL")
 
 
 def kl_from_another_policy_is_positive(subject: _Subject) -> str:
@@ -336,7 +350,7 @@ def kl_from_another_policy_is_positive(subject: _Subject) -> str:
     kl = scored.kl(subject.score(subject.batch, subject.rollouts, reference)).detach()
     if subject.is_random and not float(kl.max()) > 0:
         raise _Broken("the KL from another policy is 0 everywhere")
-    return _within(-float(kl.min()), 1e-6, "most negative KL: minus")
+    return _check_limit(-float(kl.min()), 1e-6, "most negative KL: minus")
 
 
 def padding_has_zero_log_prob_kl_and_entropy(subject: _Subject) -> str:
@@ -348,55 +362,49 @@ def padding_has_zero_log_prob_kl_and_entropy(subject: _Subject) -> str:
     # two more agents than there are: even the largest scenario has padding
     padding = ~batch.agent_mask[:, None, :, None].expand(rollouts.log_prob.shape)
     values = (scored.log_prob(rollouts.decision), scored.kl(scored), scored.entropy())
-    return _within(max(float(v[padding].abs().max()) for v in values), 0.0, "largest value")
+    return _check_limit(max(float(v[padding].abs().max()) for v in values), 0.0, "largest value")
 
 
 def entropy_matches_monte_carlo(subject: _Subject) -> str:
     """The entropy is the mean of minus the log-probability of draws."""
-    drawn = _draw_many(subject)
-    return _agree(-drawn.log_prob, drawn.distribution.entropy()[0], drawn.mask)
+    draws = _draw_decisions(subject)
+    return _check_means(-draws.log_prob, draws.distribution.entropy()[0], draws.mask)
 
 
 def kl_matches_monte_carlo(subject: _Subject) -> str:
     """The KL divergence from another policy is the mean log-ratio of draws."""
-    drawn = _draw_many(subject)
-    other = _first_distribution(subject, subject.reference)
+    draws = _draw_decisions(subject)
+    reference = _decide_first(subject, subject.reference)
     # KL(p || q) is the mean of log p - log q over draws from p
-    ratio = torch.stack([own - other.log_prob(d)[0] for own, d in zip(drawn.log_prob, drawn.decisions)])
-    return _agree(ratio, drawn.distribution.kl(other)[0], drawn.mask)
+    ratio = torch.stack([log_p - reference.log_prob(d)[0] for log_p, d in zip(draws.log_prob, draws.decisions)])
+    return _check_means(ratio, draws.distribution.kl(reference)[0], draws.mask)
 
 
 def probabilities_sum_to_one(subject: _Subject) -> str:
     """Probabilities add up to 1 (as importance weights of draws at temperature 1.5)."""
-    warm = Sampling(temperature=1.5)
-    drawn = _draw_many(subject, warm)
+    draws = _draw_decisions(subject, Sampling(temperature=1.5))
     # the mean of p / p_warm over draws from p_warm is the sum of p over all decisions that p_warm can draw
-    weight = torch.stack(
-        [(drawn.distribution.log_prob(d)[0] - p).exp() for d, p in zip(drawn.decisions, drawn.log_prob)]
-    )
-    return _agree(weight, torch.ones_like(weight[0]), drawn.mask)
+    log_p = torch.stack([draws.distribution.log_prob(d)[0] for d in draws.decisions])
+    weight = (log_p - draws.log_prob).exp()
+    return _check_means(weight, torch.ones_like(weight[0]), draws.mask)
 
 
 @dataclass(frozen=True, eq=False)
-class _Drawn:
+class _Draws:
     """Many draws of the first decision of the smallest scenario."""
 
     distribution: DecisionDistribution
     """[1, N, A]."""
     decisions: list[Tensor]
     log_prob: Tensor
-    """[K, N, A], under the distribution drawn from."""
+    """[K, N, A], under the distribution that was drawn from."""
     mask: Tensor
     """[A], True = a simulated agent."""
 
 
-def _smallest(subject: _Subject) -> ScenarioBatch:
-    return subject.collate([min(subject.scenarios, key=lambda s: len(s.simulated_indices))])
-
-
-def _first_distribution(subject: _Subject, policy: Policy, num_rollouts: int = 64) -> DecisionDistribution:
+def _decide_first(subject: _Subject, policy: Policy, num_rollouts: int = 64) -> DecisionDistribution:
     """Distributions of the first decision in the smallest scenario, for N equal rollouts [1, N, A]."""
-    batch = _smallest(subject)
+    batch = subject.smallest_batch
     shape = (1, num_rollouts, batch.agent_mask.shape[1], policy.initial_noise_size)
     noise = torch.full(shape, 0.5, device=batch.device)
     with torch.no_grad():
@@ -404,28 +412,27 @@ def _first_distribution(subject: _Subject, policy: Policy, num_rollouts: int = 6
         return policy.decide(context, policy.begin(context, num_rollouts, None, noise))
 
 
-def _draw_many(subject: _Subject, sampling: Sampling = Sampling()) -> _Drawn:  # noqa: B008
+def _draw_decisions(subject: _Subject, sampling: Sampling = Sampling()) -> _Draws:  # noqa: B008
     if not subject.is_random:
         raise _NotApplicable("decisions are deterministic (noise_size is 0)")
-    distribution = _first_distribution(subject, subject.policy)
-    mask = _smallest(subject).agent_mask[0]
+    distribution = _decide_first(subject, subject.policy)
+    mask = subject.smallest_batch.agent_mask[0]
     generator = torch.Generator().manual_seed(0)
-    rounds = MONTE_CARLO_DRAWS // 64
     decisions = []
-    for _ in range(rounds):
+    for _ in range(MONTE_CARLO_DRAWS // 64):
         noise = torch.rand(1, 64, len(mask), subject.policy.noise_size, generator=generator).to(mask.device)
         decisions.append(distribution.sample(sampling, noise))
     log_prob = torch.stack([distribution.log_prob(d, sampling)[0] for d in decisions])
-    return _Drawn(distribution, decisions, log_prob, mask)
+    return _Draws(distribution, decisions, log_prob, mask)
 
 
-def _agree(draws: Tensor, expected: Tensor, mask: Tensor) -> str:
-    """Compare Monte Carlo means of draws [K, N, A] with values [N, A]."""
+def _check_means(draws: Tensor, expected: Tensor, mask: Tensor) -> str:
+    """Text of how far Monte Carlo means of draws [K, N, A] lie from values [N, A], or `_Broken` with the text."""
     # agents differ, rollouts are equal: draws and rollouts together are one sample per agent
     flat = draws.double().flatten(0, 1)[:, mask]  # [K N, agents]
     error = flat.std(0) / math.sqrt(len(flat)) + 1e-6
     gap = (flat.mean(0) - expected.double().mean(0)[mask]).abs() / error
-    return _within(float(gap.max()), MONTE_CARLO_ERRORS, f"standard errors off, over {len(flat)} draws:")
+    return _check_limit(float(gap.max()), MONTE_CARLO_ERRORS, f"standard errors off, over {len(flat)} draws:")
 
 
 # ---- rules: sampling and kinematics
@@ -436,20 +443,17 @@ def temperature_zero_is_deterministic(subject: _Subject) -> str:
     """At temperature 0 every rollout is the same, twice, up to what is drawn once per rollout."""
     first, second = (subject.simulate(subject.batch, sampling=Sampling(temperature=0.0)) for _ in range(2))
     if not subject.policy.initial_noise_size:
-        _within(
-            _gap(first.position, first.position[:, :1].expand_as(first.position)),
-            POSE_TOLERANCE_M,
-            "rollouts apart (m)",
-        )
-    return _within(_gap(first.position, second.position), 0.0, "runs apart (m)")
+        repeated = first.position[:, :1].expand_as(first.position)
+        _check_gap(first.position, repeated, POSE_TOLERANCE_M, "rollouts apart (m)")
+    return _check_gap(first.position, second.position, 0.0, "runs apart (m)")
 
 
 def same_seed_gives_same_rollouts(subject: _Subject) -> str:
     """The same seed gives the same rollouts, whole or in slices."""
-    again = subject.simulate(subject.batch)
-    _within(_gap(again.position, subject.rollouts.position), 0.0, "runs apart (m)")
+    repeated = subject.simulate(subject.batch)
+    _check_gap(repeated.position, subject.rollouts.position, 0.0, "runs apart (m)")
     last = subject.simulate(subject.batch, range(1, NUM_ROLLOUTS))
-    return _within(_gap(last.position, subject.rollouts.position[:, 1:]), POSE_TOLERANCE_M, "slices apart (m)")
+    return _check_gap(last.position, subject.rollouts.position[:, 1:], POSE_TOLERANCE_M, "slices apart (m)")
 
 
 def top_k_truncates_or_is_refused(subject: _Subject) -> str:
@@ -463,22 +467,20 @@ def top_k_truncates_or_is_refused(subject: _Subject) -> str:
     # top-1 is the mode; and log-probabilities are those of the truncated, renormalized distribution
     greedy = subject.simulate(subject.batch, sampling=Sampling(temperature=0.0))
     first = subject.simulate(subject.batch, sampling=Sampling(top_k=1))
-    _within(_gap(first.position, greedy.position), POSE_TOLERANCE_M, "top-1 apart from the mode (m)")
-    few = subject.simulate(subject.batch, sampling=Sampling(top_k=3))
-    scored = torch.where(
-        few.decision_mask, subject.score(subject.batch, few).log_prob(few.decision, Sampling(top_k=3)), 0.0
-    )
-    return _within(_gap(scored, few.log_prob), SCORE_TOLERANCE, "largest gap of truncated log-probabilities")
+    _check_gap(first.position, greedy.position, POSE_TOLERANCE_M, "top-1 apart from the mode (m)")
+    truncated = subject.simulate(subject.batch, sampling=Sampling(top_k=3))
+    scored = subject.score(subject.batch, truncated).log_prob(truncated.decision, Sampling(top_k=3))
+    scored = torch.where(truncated.decision_mask, scored, 0.0)
+    return _check_gap(scored, truncated.log_prob, SCORE_TOLERANCE, "largest gap of truncated log-probabilities")
 
 
 def replayed_decisions_give_same_poses(subject: _Subject) -> str:
     """Replaying decisions through `advance` gives the same poses, bit for bit."""
-    return _within(
-        max(_replay_gap(subject, r) for r in (subject.rollouts, subject.with_forced)), 0.0, "largest gap (m, rad)"
-    )
+    gaps = [_measure_replay_gap(subject, rollouts) for rollouts in (subject.rollouts, subject.with_forced)]
+    return _check_limit(max(gaps), 0.0, "largest gap (m, rad)")
 
 
-def _replay_gap(subject: _Subject, rollouts: Rollouts) -> float:
+def _measure_replay_gap(subject: _Subject, rollouts: Rollouts) -> float:
     policy, stride = subject.policy, subject.policy.steps_per_decision
     # The numbers that `simulate` gave to `begin`. Those of the decisions are not needed: the decisions are known.
     ids = range(rollouts.num_rollouts)
@@ -493,7 +495,7 @@ def _replay_gap(subject: _Subject, rollouts: Rollouts) -> float:
             state = policy.advance(context, state, rollouts.decision[:, :, :, index], forced)
             poses.append(state.poses)
     path = torch.cat(poses, 3)
-    return max(_gap(path[..., :2], rollouts.position), _gap(path[..., 2], rollouts.heading))
+    return max(_compute_gap(path[..., :2], rollouts.position), _compute_gap(path[..., 2], rollouts.heading))
 
 
 # ---- rules: gradients
@@ -501,19 +503,19 @@ def _replay_gap(subject: _Subject, rollouts: Rollouts) -> float:
 
 
 def gradients_reach_all_trained_weights(subject: _Subject) -> str:
-    """Gradients of the score reach every weight that is trained and no other, and are finite."""
+    """Gradients of the score reach the trained weights and no frozen ones, and are finite."""
     module = copy.deepcopy(subject.module)
     trained = [p for p in module.parameters() if p.requires_grad]
     if not trained:
         raise _NotApplicable("no weight is trained")
     _back_propagate(module, subject, scale=1.0)
-    # a weight may have a zero gradient (no light in these scenarios), but it must have one
+    # a gradient may be zero (no light in these scenarios), but never absent
     named = dict(module.named_parameters())
-    missed = [name for name, p in named.items() if p.requires_grad and p.grad is None]
+    missing = [name for name, p in named.items() if p.requires_grad and p.grad is None]
     strays = [name for name, p in named.items() if not p.requires_grad and p.grad is not None]
     broken = [name for name, p in named.items() if p.grad is not None and not p.grad.isfinite().all()]
-    if missed or strays or broken:
-        raise _Broken(f"not reached: {missed}; reached though not trained: {strays}; not finite: {broken}")
+    if missing or strays or broken:
+        raise _Broken(f"not reached: {missing}; reached though not trained: {strays}; not finite: {broken}")
     flat = [name for name, p in named.items() if p.grad is not None and not p.grad.any()]
     return f"{len(trained)} weights reached" + (f", zero on these scenarios: {', '.join(flat)}" if flat else "")
 
@@ -524,8 +526,8 @@ def zero_reward_gives_zero_gradient(subject: _Subject) -> str:
     if not any(p.requires_grad for p in module.parameters()):
         raise _NotApplicable("no weight is trained")
     _back_propagate(module, subject, scale=0.0)
-    largest = max(_gap(p.grad, torch.zeros_like(p.grad)) for p in module.parameters() if p.grad is not None)
-    return _within(largest, 0.0, "largest gradient")
+    largest = max(_compute_gap(p.grad, torch.zeros_like(p.grad)) for p in module.parameters() if p.grad is not None)
+    return _check_limit(largest, 0.0, "largest gradient")
 
 
 def _back_propagate(module: nn.Module, subject: _Subject, *, scale: float) -> None:
@@ -540,31 +542,27 @@ def _back_propagate(module: nn.Module, subject: _Subject, *, scale: float) -> No
 
 def freezing_weights_changes_no_score(subject: _Subject) -> str:
     """Freezing the weights changes no score."""
-    frozen = copy.deepcopy(subject.module).requires_grad_(False)
-    assert isinstance(frozen, Policy)
-    free = copy.deepcopy(subject.module).requires_grad_(True)
-    assert isinstance(free, Policy)
-    scores = [subject.log_prob(subject.batch, subject.rollouts, policy) for policy in (frozen, free)]
-    return _within(_gap(*scores), SCORE_TOLERANCE, "largest gap")
+    policies = [subject.copy_module(is_trained) for is_trained in (False, True)]
+    frozen, trained = (subject.log_prob(subject.batch, subject.rollouts, policy) for policy in policies)
+    return _check_gap(frozen, trained, SCORE_TOLERANCE)
 
 
 def shared_passes_change_no_number(subject: _Subject) -> str:
-    """Passes that share what they have in common, and statistics in one pass, give what each gives alone."""
-    frozen = copy.deepcopy(subject.module).requires_grad_(False)
-    assert isinstance(frozen, Policy)
+    """Passes that share features, and statistics in one pass, give the numbers of separate passes."""
+    frozen = subject.copy_module(is_trained=False)
     twin, gaps = copy.deepcopy(frozen), []
     for rollouts in (subject.rollouts, subject.with_goals):
-        alone, decision = subject.score(subject.batch, rollouts, frozen), rollouts.decision
+        expected, decision = subject.score(subject.batch, rollouts, frozen), rollouts.decision
         for reference in (twin, subject.reference):
             with torch.no_grad():
                 context = frozen.encode(subject.batch)
                 contexts = [encode_like(policy, subject.batch, context) for policy in (frozen, reference)]
-                dist, ref_dist = score_both(frozen, contexts[0], rollouts, reference, contexts[1], rollouts)
-                found = decision_statistics(dist, decision, ref_dist)
-            kl = alone.kl(subject.score(subject.batch, rollouts, reference))
-            gaps += [_gap(found.log_prob, alone.log_prob(decision)), _gap(found.kl, kl)]
-            gaps.append(_gap(found.entropy, alone.entropy()))
-    return _within(max(gaps), SCORE_TOLERANCE, "largest gap")
+                dist, ref_dist = score_with_reference(frozen, contexts[0], rollouts, reference, contexts[1], rollouts)
+                statistics = compute_statistics(dist, decision, ref_dist)
+            kl = expected.kl(subject.score(subject.batch, rollouts, reference))
+            gaps += [_compute_gap(statistics.log_prob, expected.log_prob(decision)), _compute_gap(statistics.kl, kl)]
+            gaps.append(_compute_gap(statistics.entropy, expected.entropy()))
+    return _check_limit(max(gaps), SCORE_TOLERANCE)
 
 
 # ---- rules: scenarios
@@ -574,58 +572,58 @@ def shared_passes_change_no_number(subject: _Subject) -> str:
 def scores_are_invariant_to_rotation_and_translation(subject: _Subject) -> str:
     """Scenarios and rollouts turned and shifted together have the same scores."""
     gaps = {}
-    # on a grid that stays exact under the turns below: gaps are then the policy's own rounding
+    # on a grid that stays exact under the turns below: gaps are then the policy's rounding
     still = replace(subject, scenarios=tuple(place_on_grid(s) for s in subject.scenarios))
     turns = (("shifted", 0.0), ("turned by 90 degrees", math.pi / 2), ("turned by 53.13 degrees", EXACT_TURN_RAD))
-    for what, turn in turns:
+    for name, turn in turns:
         moved = [move_scenario(s, turn, SHIFT_M) for s in still.scenarios]
         batch = subject.collate(moved)
-        # map frames have their origin on whole meters, so it does not follow a scenario exactly
+        # origins of map frames lie on whole meters, so no origin follows a scenario exactly
         origins = [a.origin + np.array(SHIFT_M) - b.origin for a, b in zip(still.scenarios, moved)]
-        offset = torch.from_numpy(np.stack(origins).astype(np.float32)).to(device_of(subject.policy))  # [B, 2]
+        offset = torch.from_numpy(np.stack(origins).astype(np.float32)).to(get_device(subject.policy))  # [B, 2]
         for rollouts in (still.rollouts, still.with_forced, still.with_goals):
             scored = subject.log_prob(batch, _move_rollouts(rollouts, turn, offset))
-            gaps[what] = max(gaps.get(what, 0.0), _gap(scored, subject.log_prob(still.batch, rollouts)))
+            gaps[name] = max(gaps.get(name, 0.0), _compute_gap(scored, subject.log_prob(still.batch, rollouts)))
     worst = max(gaps, key=lambda name: gaps[name])
-    return _within(gaps[worst], SCORE_TOLERANCE + subject.rounding, f"largest gap ({worst})")
+    return _check_limit(gaps[worst], SCORE_TOLERANCE + subject.rounding, f"largest gap ({worst})")
 
 
 def rollouts_are_independent_of_batch_composition(subject: _Subject) -> str:
     """A scenario alone has the same scores as in a batch with a larger one, and the same rollouts."""
-    batch, gaps, apart = subject.batch, [], []
+    batch, gaps, distances = subject.batch, [], []
     if len(subject.scenarios) < 2:
         raise _NotApplicable("a single scenario was handed over")
     # a policy that draws once per rollout gets as many agents as in the batch: its draws have that shape
-    whole = subject.log_prob(batch, subject.rollouts)
+    scored = subject.log_prob(batch, subject.rollouts)
     for b, scenario in enumerate(subject.scenarios):
         count = batch.agent_mask.shape[1] if subject.rollouts.draws is not None else len(scenario.simulated_indices)
-        alone = subject.collate([scenario], max_agents=count)
-        own = _of_scenario(subject.rollouts, b, count)
-        gaps.append(_gap(subject.log_prob(alone, own), whole[b : b + 1, :, :count]))
-        apart.append(_gap(subject.simulate(alone).position, own.position))
-    _within(max(apart), POSE_TOLERANCE_M, "rollouts apart (m)")
-    return _within(max(gaps), PADDING_TOLERANCE + subject.rounding, "largest gap")
+        single = subject.collate([scenario], max_agents=count)
+        rollouts = _select_scenario(subject.rollouts, b, count)
+        gaps.append(_compute_gap(subject.log_prob(single, rollouts), scored[b : b + 1, :, :count]))
+        distances.append(_compute_gap(subject.simulate(single).position, rollouts.position))
+    _check_limit(max(distances), POSE_TOLERANCE_M, "rollouts apart (m)")
+    return _check_limit(max(gaps), PADDING_TOLERANCE + subject.rounding)
 
 
 def rollouts_do_not_depend_on_the_logged_future(subject: _Subject) -> str:
     """The rollouts are the same where tracks and lights end at the current step, as in a test split."""
     if not all(scenario.has_future for scenario in subject.scenarios):
         raise _NotApplicable("a scenario has no logged future")
-    hidden = subject.collate([without_future(scenario) for scenario in subject.scenarios])
-    return _within(_gap(subject.simulate(hidden).position, subject.rollouts.position), POSE_TOLERANCE_M, "apart (m)")
+    batch = subject.collate([without_future(scenario) for scenario in subject.scenarios])
+    return _check_gap(subject.simulate(batch).position, subject.rollouts.position, POSE_TOLERANCE_M, "apart (m)")
 
 
 def edge_cases_can_be_simulated_and_scored(subject: _Subject) -> str:
-    """All are simulated and scored: one agent, no map, no lights, 128 agents, agents first seen now or never, NaN."""
+    """Simulations and scores succeed: one agent, no map, no lights, 128 agents, agents first seen now or never, NaN."""
     gaps = {}
     for name, scenario in edge_scenes(subject.scenarios[0]).items():
         batch = subject.collate([scenario])
         rollouts = subject.simulate(batch)
         if not (rollouts.position.isfinite().all() and rollouts.heading.isfinite().all()):
             raise _Broken(f"{name}: poses are not finite")
-        gaps[name] = _gap(subject.log_prob(batch, rollouts), rollouts.log_prob)
+        gaps[name] = _compute_gap(subject.log_prob(batch, rollouts), rollouts.log_prob)
     worst = max(gaps, key=lambda name: gaps[name])
-    return _within(gaps[worst], SCORE_TOLERANCE, f"{len(gaps)} scenes, largest gap ({worst})")
+    return _check_limit(gaps[worst], SCORE_TOLERANCE, f"{len(gaps)} scenes, largest gap ({worst})")
 
 
 def _move_rollouts(rollouts: Rollouts, turn: float, offset: Tensor) -> Rollouts:
@@ -646,11 +644,11 @@ def _move_rollouts(rollouts: Rollouts, turn: float, offset: Tensor) -> Rollouts:
     )
 
 
-def _of_scenario(rollouts: Rollouts, b: int, num_agents: int) -> Rollouts:
+def _select_scenario(rollouts: Rollouts, b: int, num_agents: int) -> Rollouts:
     """Rollouts of one scenario of a batch, without its padding."""
     names = ("position", "heading", "decision", "decision_mask", "log_prob")
-    own = {name: getattr(rollouts, name)[b : b + 1, :, :num_agents] for name in names}
-    return replace(rollouts, **own, draws=None if rollouts.draws is None else rollouts.draws[b : b + 1])
+    values = {name: getattr(rollouts, name)[b : b + 1, :, :num_agents] for name in names}
+    return replace(rollouts, **values, draws=None if rollouts.draws is None else rollouts.draws[b : b + 1])
 
 
 CHECKS: tuple[Check, ...] = (
@@ -658,7 +656,7 @@ CHECKS: tuple[Check, ...] = (
     scored_log_probs_equal_sampled_ones_with_forced_agents,
     scored_log_probs_equal_sampled_ones_with_goals,
     empty_goals_equal_no_goals,
-    scores_of_some_rollouts_equal_slices_of_all,
+    scores_of_slices_equal_slices_of_scores,
     kl_from_itself_is_zero,
     kl_from_another_policy_is_positive,
     padding_has_zero_log_prob_kl_and_entropy,

@@ -22,9 +22,9 @@ def move_scenario(scenario: Scenario, turn_rad: float, shift_m: tuple[float, flo
     """The same scenario turned counter-clockwise about its `origin`, then shifted.
 
     Args:
-        scenario: any.
-        turn_rad: angle.
-        shift_m: x and y, world frame; whole meters keep float32 coordinates as exact as they were.
+        scenario: Scenario to move; the log, the map and the lights move together.
+        turn_rad: Angle of the turn, counter-clockwise.
+        shift_m: Shift in x and y, world frame; whole meters keep float32 coordinates as exact as before.
     """
     # in float64, rounded once at the end
     center = np.append(scenario.origin, 0.0)
@@ -50,12 +50,12 @@ def without_future(scenario: Scenario) -> Scenario:
     """The same scenario as in a test split: tracks and lights end at the current step."""
     tracks, lights, end = scenario.tracks, scenario.lights, CURRENT_STEP + 1
     cut = {name: getattr(tracks, name)[:, :end] for name in ("position", "heading", "velocity", "size", "valid")}
-    seen = {field.name: getattr(lights, field.name)[lights.step < end] for field in fields(lights)}
+    history = {field.name: getattr(lights, field.name)[lights.step < end] for field in fields(lights)}
     return replace(
         scenario,
         timestamps_s=scenario.timestamps_s[:end],
         tracks=replace(tracks, **cut),
-        lights=LightStates(**seen),
+        lights=LightStates(**history),
     )
 
 
@@ -63,7 +63,7 @@ def place_on_grid(scenario: Scenario) -> Scenario:
     """The same scenario at the world's origin, coordinates rounded to 5/4096 m (1.2 mm).
 
     Such coordinates stay exact in float32 when they are turned by 90 degrees or by `EXACT_TURN_RAD` and shifted by some
-    hundreds of whole meters, so that what a policy makes of them differs by the policy's own rounding alone.
+    hundreds of whole meters, so that scores of a policy differ by the policy's rounding alone.
     """
     central = move_scenario(scenario, 0.0, (-float(scenario.origin[0]), -float(scenario.origin[1])))
 
@@ -88,20 +88,20 @@ def edge_scenes(scenario: Scenario) -> dict[str, Scenario]:
         "no map": replace(scenario, map_features=_NO_MAP, lights=_NO_LIGHTS),
         "no lights": replace(scenario, lights=_NO_LIGHTS),
         "128 agents": _crowded(scenario, 128),
-        "agents first seen at the current step": _seen_from(scenario, CURRENT_STEP),
-        "agents first seen at step 7": _seen_from(scenario, 7),
+        "agents first seen at the current step": _with_late_agents(scenario, CURRENT_STEP),
+        "agents first seen at step 7": _with_late_agents(scenario, 7),
         "an agent that is never valid": _with_absent_agent(scenario),
         "NaN wherever a state is not valid": _with_nan(scenario),
     }
 
 
-def _with_tracks(scenario: Scenario, chosen: np.ndarray) -> Scenario:
+def _with_tracks(scenario: Scenario, indices: np.ndarray) -> Scenario:
     """Some of the tracks, in the given order; only the ego is evaluated."""
-    fields = {name: getattr(scenario.tracks, name)[chosen] for name in Tracks.__dataclass_fields__}
+    fields = {name: getattr(scenario.tracks, name)[indices] for name in Tracks.__dataclass_fields__}
     return replace(
         scenario,
         tracks=Tracks(**fields),
-        ego_index=int(np.flatnonzero(chosen == scenario.ego_index)[0]),
+        ego_index=int(np.flatnonzero(indices == scenario.ego_index)[0]),
         tracks_to_predict=scenario.tracks_to_predict[:0],
         difficulty=scenario.difficulty[:0],
         objects_of_interest=scenario.objects_of_interest[:0],
@@ -110,21 +110,19 @@ def _with_tracks(scenario: Scenario, chosen: np.ndarray) -> Scenario:
 
 def _crowded(scenario: Scenario, num_agents: int) -> Scenario:
     """The ego and copies of all agents, shifted on a grid of 3.1 m x 3.3 m, `num_agents` in all."""
-    own = scenario.simulated_indices
-    chosen = np.append(scenario.ego_index, np.resize(own, num_agents - 1))
-    many = _with_tracks(scenario, chosen)
+    indices = np.append(scenario.ego_index, np.resize(scenario.simulated_indices, num_agents - 1))
+    crowd = _with_tracks(scenario, indices)
     # 11 columns; copies of different agents may overlap, which policies have to accept
-    rows = np.arange(len(chosen), dtype=np.float32)
+    rows = np.arange(num_agents, dtype=np.float32)
     shift = np.stack([rows % 11 * 3.1, rows // 11 * 3.3, 0 * rows], -1)[:, None]
-    ids = np.arange(len(chosen), dtype=np.int64) + 1
-    return replace(many, tracks=replace(many.tracks, object_id=ids, position=many.tracks.position + shift))
+    ids = np.arange(1, num_agents + 1, dtype=np.int64)
+    return replace(crowd, tracks=replace(crowd.tracks, object_id=ids, position=crowd.tracks.position + shift))
 
 
-def _seen_from(scenario: Scenario, step: int) -> Scenario:
+def _with_late_agents(scenario: Scenario, step: int) -> Scenario:
     """The scenario with all agents but the ego invalid before a step."""
     valid = scenario.tracks.valid.copy()
-    others = np.arange(len(valid)) != scenario.ego_index
-    valid[others, :step] = False
+    valid[np.arange(len(valid)) != scenario.ego_index, :step] = False
     return replace(scenario, tracks=replace(scenario.tracks, valid=valid))
 
 
@@ -132,7 +130,7 @@ def _with_absent_agent(scenario: Scenario) -> Scenario:
     """The scenario with one more track, without a single valid step."""
     rows = np.append(np.arange(len(scenario.tracks.valid)), scenario.ego_index)
     tracks = _with_tracks(scenario, rows).tracks
-    # a copy of the ego's track, with an id of its own
+    # a copy of the ego's track, with a new id
     valid, ids = tracks.valid.copy(), tracks.object_id.copy()
     valid[-1], ids[-1] = False, ids.max() + 1
     return replace(scenario, tracks=replace(tracks, valid=valid, object_id=ids))
@@ -142,8 +140,7 @@ def _with_nan(scenario: Scenario) -> Scenario:
     """The scenario with every second agent not valid at steps 3 and 4 of the history, and NaN in all such states."""
     tracks = scenario.tracks
     valid = tracks.valid.copy()
-    others = np.flatnonzero(np.arange(len(valid)) != scenario.ego_index)
-    valid[others[::2], 3:5] = False
+    valid[np.delete(np.arange(len(valid)), scenario.ego_index)[::2], 3:5] = False
 
     def emptied(values: np.ndarray) -> np.ndarray:
         return np.where(valid[(..., *[None] * (values.ndim - 2))], values, np.float32(np.nan))

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rlftsim.jobs.files import write_whole
+from rlftsim.jobs.files import write_atomically
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import CURRENT_STEP
@@ -18,32 +18,32 @@ def write_rollouts(folder: Path, batch: ScenarioBatch, rollouts: Rollouts) -> li
     """Write each scenario's rollouts to `folder/<scenario id>.npz`, each file whole or not at all.
 
     Args:
-        folder: created where it is missing.
-        batch: the scenarios.
-        rollouts: of these, map frame. The height of an agent stays that of the current step.
+        folder: Folder of the files, created where it is missing.
+        batch: Scenarios that the rollouts continue, in the same order; they give ids, heights and the world frame.
+        rollouts: Simulated futures in the map frame. The height of an agent stays that of the current step.
 
     Returns:
         The files, in the order of the batch.
     """
     world = batch.to_world(rollouts.position).cpu().numpy()
-    # rollouts are two-dimensional: heights stay those of the current step
-    heading, z = rollouts.heading.float().cpu().numpy(), batch.z[:, :, CURRENT_STEP].cpu().numpy()
+    headings, heights = rollouts.heading.float().cpu().numpy(), batch.z[:, :, CURRENT_STEP].cpu().numpy()
     files = []
     for b, scenario in enumerate(batch.scenarios):
-        chosen = scenario.simulated_indices
-        own = heading[b, :, : len(chosen)]  # [N, A, 80] without padding
-        path = folder / f"{scenario.scenario_id}.npz"
-        save = partial(
-            _write_npz,
-            scenario_id=np.array(scenario.scenario_id),
-            object_ids=scenario.tracks.object_id[chosen],
-            x=world[b, :, : len(chosen), :, 0],
-            y=world[b, :, : len(chosen), :, 1],
-            z=np.broadcast_to(z[b, : len(chosen), None], own.shape),
-            heading=own,
+        indices = scenario.simulated_indices
+        heading = headings[b, :, : len(indices)]  # [N, A, 80] without padding
+        write_atomically(
+            folder / f"{scenario.scenario_id}.npz",
+            partial(
+                _write_npz,
+                scenario_id=np.array(scenario.scenario_id),
+                object_ids=scenario.tracks.object_id[indices],
+                x=world[b, :, : len(indices), :, 0],
+                y=world[b, :, : len(indices), :, 1],
+                z=np.broadcast_to(heights[b, : len(indices), None], heading.shape),
+                heading=heading,
+            ),
         )
-        write_whole(path, save)
-        files.append(path)
+        files.append(folder / f"{scenario.scenario_id}.npz")
     return files
 
 

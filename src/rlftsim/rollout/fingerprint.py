@@ -12,12 +12,15 @@ from torch import Tensor, nn
 def fingerprint_policy(policy: object) -> str:
     """Hash of a policy's architecture, weights and public settings (numbers, texts, tensors, dataclasses of these).
 
-    Moving code must leave the fingerprints of stored models valid. So a class is hashed under the name that it declares
-    itself, `fingerprint_name` or else `architecture`, and only without either under its module and name. Classes of
-    nested settings count too. What a base class declares does not stand for a subclass, which is other code.
+    Moving code must leave the fingerprints of stored models valid. So a class is hashed under a name that it declares,
+    `fingerprint_name` or else `architecture`, and without either under its module and name. Classes of nested settings
+    count too. A base class's name does not stand for a subclass, which is different code.
+
+    Args:
+        policy: Policy of any class; weights count by their bytes, whatever device they lie on.
 
     Returns:
-        32 hexadecimal digits; for a policy without weights and settings they stand for its architecture alone.
+        32 hexadecimal digits; for a policy without weights and settings they stand for the architecture alone.
     """
     digest = hashlib.blake2b(digest_size=16)
     _feed(digest, policy)
@@ -49,26 +52,20 @@ def _feed(digest: "hashlib.blake2b", value: object) -> None:
 
 def _feed_object(digest: "hashlib.blake2b", value: object) -> None:
     """Feed a class's name, weights and public attributes."""
-    kind = type(value)
-    declared = (vars(kind).get(name) for name in ("fingerprint_name", "architecture"))
-    names = [name for name in declared if isinstance(name, str)]
-    name = names[0] if names else f"{kind.__module__}.{kind.__qualname__}"
-    digest.update(f"object {name}".encode())
+    cls = type(value)
+    declared = (vars(cls).get(name) for name in ("fingerprint_name", "architecture"))
+    default = f"{cls.__module__}.{cls.__qualname__}"
+    digest.update(f"object {next((name for name in declared if isinstance(name, str)), default)}".encode())
     if is_dataclass(value) and not isinstance(value, type):
         _feed(digest, {field.name: getattr(value, field.name) for field in fields(value)})
         return
-    own = (
-        {name: item for name, item in vars(value).items() if not name.startswith("_")} if _keeps_settings(value) else {}
-    )
+    is_code = isinstance(value, type) or (callable(value) and not isinstance(value, nn.Module))
+    attributes = {} if is_code else getattr(value, "__dict__", {})
+    settings = {name: item for name, item in attributes.items() if not name.startswith("_")}
     if isinstance(value, nn.Module):
         # mode is no setting; submodules are private attributes, so weights come in through the state dict alone
-        own.pop("training", None)
-        # a submodule with settings of its own is declared by the class
-        own |= {name: getattr(value, name) for name in getattr(kind, "fingerprint_parts", ())}
+        settings.pop("training", None)
+        # a submodule with settings is declared by the class
+        settings |= {name: getattr(value, name) for name in getattr(cls, "fingerprint_parts", ())}
         _feed(digest, value.state_dict())
-    _feed(digest, own)
-
-
-def _keeps_settings(value: object) -> bool:
-    is_code = isinstance(value, type) or (callable(value) and not isinstance(value, nn.Module))
-    return hasattr(value, "__dict__") and not is_code
+    _feed(digest, settings)

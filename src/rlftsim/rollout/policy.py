@@ -1,7 +1,7 @@
 """The interface between a traffic model and everything else. To add a model, read this page and write a class.
 
-`Policy` is all that simulation, the metric and evaluation need: five methods and three numbers. Each protocol below
-it is optional and opens one more door:
+`Policy` is all that simulation, the metric and evaluation need: five methods and three numbers. Each protocol further
+down is optional and opens one more door:
 
 | a policy that implements | can be |
 |---|---|
@@ -9,19 +9,19 @@ it is optional and opens one more door:
 | `TrainablePolicy` (an nn.Module) | fine-tuned with rewards, saved, loaded by folder |
 | `PartlyTrainedPolicy` | fine-tuned in chosen parts, with the rest frozen |
 | `PolicyWithHead` | fine-tuned in its last layers alone |
-| `SharingPolicy` | fine-tuned faster, because passes over the same scenarios share what they have in common |
+| `SharingPolicy` | fine-tuned faster, because passes over the same scenarios share features |
 | `PretrainablePolicy` | pre-trained on logged tracks, token by token |
-| `ImitatedPolicy` | pre-trained on logged tracks with a loss of its own |
+| `ImitatedPolicy` | pre-trained on logged tracks with a special loss |
 | `CalibratablePolicy` | calibrated: a few named features of states and tokens get weights |
 | `TokenPolicy` | fine-tuned in closed loop on tokens (CAT-K, goal relabelling) |
-| `GoalConditionedPolicy` | given goals, and trained on them |
+| `GoalConditionedPolicy` | given goals, and trained on goals |
 | `ConditionablePolicy` | made goal-conditioned, where a run with goals starts from a goal-free model |
 
-`policies.registry` makes it known by name, and `rollout.check.check_policy` tests whether it keeps the contract.
+`policies.registry` gives a policy a name, and `rollout.check.check_policy` tests the contract.
 
 Differences from a classical policy API, each for a reason:
 
-* A policy holds weights only. Its states are values, so policy and reference can run side by side and rollouts can
+* A policy holds weights only. States are values, so policy and reference can run side by side and rollouts can
   interleave.
 * Randomness is handed in as uniform noise, a few values for every (scenario, rollout, agent, decision), drawn from
   the seed and the scenario's id (`rollout.noise`). So the same seed gives the same rollouts however a batch is
@@ -29,10 +29,10 @@ Differences from a classical policy API, each for a reason:
 * A batch holds the logged future, which training learns from. `encode` may not read it: rollouts are those of a test
   split, in which tracks and lights end at the current step.
 
-A policy that is an nn.Module is used in these modes. `policies.registry.load_policy` returns it in evaluation mode with
-`requires_grad` False everywhere. Imitation of the log (pre-training, CAT-K) trains it in `.train()`, so dropout is
-active. Fine-tuning with rewards and goal relabeling train it in `.eval()`: dropout would change the probabilities of
-decisions between the rollout and its score.
+A policy that is an nn.Module is used in these modes. `policies.registry.load_policy` returns evaluation mode with
+`requires_grad` False everywhere. Imitation of the log (pre-training, CAT-K) trains in `.train()`, so dropout is active.
+Fine-tuning with rewards and goal relabeling train in `.eval()`: dropout would change the probabilities of decisions
+between rollout and score.
 
 Shapes: B scenarios, N rollouts, A agents, L decisions, t steps of 0.1 s per decision, V tokens, R selected elements.
 """
@@ -47,7 +47,7 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 
-from rlftsim.errors import ConfigError, require_types
+from rlftsim.errors import ConfigError, check_types
 from rlftsim.goals.types import Goals
 from rlftsim.rollout.types import AgentStates, Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
@@ -56,7 +56,7 @@ from rlftsim.tokens.vocabulary import Vocabulary
 
 @dataclass(frozen=True)
 class Sampling:
-    """Temperature and truncation of the draws. RL samples with the defaults, so that its estimator is unbiased."""
+    """Temperature and truncation of the draws. RL samples with the defaults, so that the estimator is unbiased."""
 
     temperature: float = 1.0
     """The density is raised to 1 / temperature; 0 takes the mode."""
@@ -64,7 +64,7 @@ class Sampling:
     """Keep only this many of the most likely decisions; None keeps all."""
 
     def __post_init__(self) -> None:
-        require_types(self)
+        check_types(self)
         if not 0 <= self.temperature < math.inf:
             raise ConfigError(
                 f"sampling temperature must be >= 0 and finite, got {self.temperature}: 1 samples, 0 takes the mode."
@@ -85,7 +85,7 @@ class DecisionDistribution(Protocol):
     Leading axes are [B, N, A] while simulating and [B, N, A, L] when scored.
     `policies.distributions.TokenDistribution` is one for decisions that are token ids.
 
-    It may have a `mask` of the leading axes. Where that is False the agent decides nothing, such as padding or an agent
+    There may be a `mask` of the leading axes. Where False the agent decides nothing, such as padding or an agent
     that has left the map: log-probability, KL and entropy are 0 there and left out of every mean.
     """
 
@@ -93,8 +93,8 @@ class DecisionDistribution(Protocol):
         """Draw decisions; no gradient flows through them.
 
         Args:
-            sampling: temperature and truncation.
-            noise: uniform in [0, 1), `Policy.noise_size` numbers per element.
+            sampling: Temperature and truncation of the draw.
+            noise: Uniform numbers in [0, 1), `Policy.noise_size` per element.
 
         Returns:
             Decisions [..., *event].
@@ -105,13 +105,13 @@ class DecisionDistribution(Protocol):
         """Log-probability under the distribution that `sampling` draws from.
 
         Args:
-            decision: [..., *event]; the event axes are summed over.
-            sampling: temperature and truncation it was drawn with.
+            decision: Decisions [..., *event]; the event axes are summed over.
+            sampling: Temperature and truncation that the decisions were drawn with.
         """
         ...
 
-    def kl(self, other: Any) -> Float[Tensor, "..."]:
-        """KL(self || other) in closed form, between full distributions of the same kind."""
+    def kl(self, reference: Any) -> Float[Tensor, "..."]:
+        """KL(self || reference) in closed form, between full distributions of the same kind."""
         ...
 
     def entropy(self) -> Float[Tensor, "..."]:
@@ -132,28 +132,28 @@ class DecisionStatistics:
 
 @runtime_checkable
 class StatisticsDistribution(Protocol):
-    """A distribution that finds its statistics in one pass. Optional: it saves memory and time, and changes no number.
+    """A distribution that computes the statistics in one pass. Optional: saves memory and time, changes no number.
 
-    For any other `DecisionDistribution` they come from `log_prob`, `kl` and `entropy`.
+    For any other `DecisionDistribution` the statistics come from `log_prob`, `kl` and `entropy`.
     """
 
     def statistics(self, decision: Tensor, reference: Any) -> DecisionStatistics:
         """Log-probability of a decision, KL(self || reference) and entropy, with gradient.
 
         Args:
-            decision: [..., *event], from the full distribution.
-            reference: distribution of the same kind and elements; no gradient flows into it.
+            decision: Decisions [..., *event], drawn from the full distribution.
+            reference: Distribution of the same kind and elements; receives no gradient.
         """
         ...
 
 
-def decision_statistics(distribution: DecisionDistribution, decision: Tensor, reference: Any) -> DecisionStatistics:
+def compute_statistics(distribution: DecisionDistribution, decision: Tensor, reference: Any) -> DecisionStatistics:
     """Statistics of any distribution, in one pass where it is a `StatisticsDistribution`.
 
     Args:
-        distribution: of the policy.
-        decision: [..., *event], from the full distribution.
-        reference: distribution of the same kind and elements.
+        distribution: Distribution of the policy that is trained.
+        decision: Decisions [..., *event], drawn from the full distribution.
+        reference: Distribution of the same kind and elements that the KL divergence is measured from.
     """
     if isinstance(distribution, StatisticsDistribution):
         return distribution.statistics(decision, reference)
@@ -164,11 +164,11 @@ def decision_statistics(distribution: DecisionDistribution, decision: Tensor, re
 class Policy(Protocol):
     """A model that decides for all agents of a scenario.
 
-    Contexts and states are opaque values of the policy's own classes, except that a state has two attributes:
+    Contexts and states are opaque values of the policy's classes, except that a state has two attributes:
 
     * `poses` [B, N, A, t, 3]: x, y, heading of the steps of the last decision in the map frame; None before the first.
-    * `draws` [B, N, ...]: what `begin` drew from its noise, once per rollout; None for most policies. It is a single
-      tensor that all other code slices along B and N and hands back to `score` as `Rollouts.draws`. Several values
+    * `draws` [B, N, ...]: what `begin` drew from its noise, once per rollout; None for most policies. A single
+      tensor, which all other code slices along B and N and hands back to `score` as `Rollouts.draws`. Several values
       are packed along the last axis: 16 latent numbers and the index of a destination per agent are float32
       [B, N, A, 17], where integers are exact up to 2^24. Log-probabilities are conditional on the draws, and the
       draws themselves are not rewarded: training changes what is decided given a latent, not how latents are drawn.
@@ -182,17 +182,17 @@ class Policy(Protocol):
     """Uniform numbers per agent that `begin` consumes."""
 
     def encode(self, scenarios: ScenarioBatch) -> Any:
-        """Context of a batch: map, lights, history. Computed once per scenario and shared by its rollouts."""
+        """Context of a batch: map, lights, history. Computed once per scenario and shared by all rollouts."""
         ...
 
     def begin(self, context: Any, num_rollouts: int, goals: Goals | None, noise: Float[Tensor, "B N A k"]) -> Any:
         """State of N simulations at the current step.
 
         Args:
-            context: of `encode`.
-            num_rollouts: N.
-            goals: of all agents in each rollout; None = goal-free. A policy that cannot follow goals ignores them.
-            noise: uniform in [0, 1), `initial_noise_size` numbers per agent.
+            context: Context of the scenarios, from `encode`.
+            num_rollouts: Number N of simulations of each scenario.
+            goals: Goals of agents in each rollout; None = goal-free. A policy that cannot follow goals ignores this.
+            noise: Uniform numbers in [0, 1), `initial_noise_size` per agent.
         """
         ...
 
@@ -202,8 +202,8 @@ class Policy(Protocol):
         Log-probability, KL and entropy of padding are exactly 0.
 
         Args:
-            context: of `encode`.
-            state: before the decision.
+            context: Context of the scenarios, from `encode`.
+            state: State before the decision, from `begin` or `advance`.
         """
         ...
 
@@ -211,11 +211,11 @@ class Policy(Protocol):
         """State after a decision: kinematics only, no network.
 
         Args:
-            context: of `encode`.
-            state: before the decision.
-            decision: [B, N, A, *event].
-            forced: states [B, N, A, t] imposed from outside. An agent whose forced states are all valid is put
-                there, whatever was decided for it.
+            context: Context of the scenarios, from `encode`.
+            state: State before the decision, from `begin` or `advance`.
+            decision: Decisions [B, N, A, *event].
+            forced: States [B, N, A, t] imposed from outside; None = none. An agent whose forced states are all valid
+                is put into these states, whatever was decided.
         """
         ...
 
@@ -223,8 +223,8 @@ class Policy(Protocol):
         """Distributions [B, N, A, L] that `decide` gives along rollouts; differentiable, in one parallel pass.
 
         Args:
-            context: of `encode`, for the same scenarios.
-            rollouts: decisions, forced states, goals and draws of the simulation; of this policy or another one.
+            context: Context of the same scenarios, from `encode`.
+            rollouts: Decisions, forced states, goals and draws of a simulation, whichever policy decided in it.
         """
         ...
 
@@ -241,8 +241,8 @@ class SavedPolicy(Protocol):
         """Write the model into a folder.
 
         Args:
-            folder: created where it is missing.
-            card: text of its README.md; training says there what the model was trained with.
+            folder: Folder of the model, created where it is missing.
+            card: Text of the folder's README.md, where training says what the model was trained with.
         """
         ...
 
@@ -259,12 +259,12 @@ class TrainablePolicy(Policy, SavedPolicy, Protocol):
 class LoadablePolicy(Protocol):
     """Class of policies that are found by the architecture name in a model folder's config.json.
 
-    Stored evaluations and runs know a policy by its fingerprint (`rollout.fingerprint`), a hash of its weights, its
-    public settings and the name of its class. That name is `architecture` of the class itself, so the class may be
-    moved or renamed. A class of nested settings, such as a dataclass in `self.config`, declares its name as
-    `fingerprint_name: ClassVar[str]`; without it that class is known by its module and name, and cannot be moved. A
+    Stored evaluations and runs know a policy by the fingerprint (`rollout.fingerprint`), a hash of weights, public
+    settings and the name of the class. That name is `architecture` of the very class, so the class may be moved or
+    renamed. A class of nested settings, such as a dataclass in `self.config`, declares a name as
+    `fingerprint_name: ClassVar[str]`; without that name the class is known by module and name, and cannot be moved. A
     policy that holds another policy declares `fingerprint_parts: ClassVar[tuple[str, ...]]`, names of submodules whose
-    settings count with its own.
+    settings count as well.
     """
 
     architecture: ClassVar[str]
@@ -278,19 +278,19 @@ class LoadablePolicy(Protocol):
 
 @runtime_checkable
 class PartlyTrainedPolicy(Protocol):
-    """A policy with parts that fine-tuning leaves alone. Without this, all of its weights are trained."""
+    """A policy with parts that fine-tuning leaves alone. Without this, all weights are trained."""
 
-    def fine_tuned_parts(self) -> tuple[nn.Module, ...]:
+    def fine_tuned_modules(self) -> tuple[nn.Module, ...]:
         """Submodules to be trained by default; the others are frozen unless `trained="all"`."""
         ...
 
 
 @runtime_checkable
 class PolicyWithHead(Protocol):
-    """A policy that can be fine-tuned in its last layers alone, by `trained="head"`: for few rollouts."""
+    """A policy that can be fine-tuned in the last layers alone, by `trained="head"`: for few rollouts."""
 
-    def head_parts(self) -> tuple[nn.Module, ...]:
-        """Submodules to be trained; what they decide by stays as it is."""
+    def head_modules(self) -> tuple[nn.Module, ...]:
+        """Submodules to be trained; the features that these layers decide by stay as before."""
         ...
 
 
@@ -300,33 +300,33 @@ class PolicyWithHead(Protocol):
 
 @runtime_checkable
 class SharingPolicy(Policy, Protocol):
-    """A policy that does not compute twice what several passes over the same scenarios have in common.
+    """A policy that computes once the features that several passes over the same scenarios have in common.
 
-    An update of fine-tuning encodes its scenarios for the rollout, for the policy and for the reference, and scores the
-    rollouts under two of them. Whether parts are the same is for the policy to find out, by comparing weights.
-    Everything that comes back is what `encode` and `score` return.
+    An update of fine-tuning encodes the scenarios for the rollout, for the policy and for the reference, and scores the
+    rollouts under policy and reference. The policy compares weights to tell which features are equal. The results are
+    those of `encode` and `score`.
     """
 
     def encode_like(self, scenarios: ScenarioBatch, context: Any) -> Any:
-        """`encode(scenarios)`, taking over from another context what this policy would compute alike.
+        """`encode(scenarios)`, taking over from a context the features that this policy would compute alike.
 
         Args:
-            scenarios: of the context.
-            context: of any policy, made by weights that have not been changed since; or None.
+            scenarios: Scenarios that `context` was encoded from, in the same order.
+            context: Context from any policy whose weights have not been changed since; None = nothing to take over.
         """
         ...
 
-    def score_both(
+    def score_with_reference(
         self, context: Any, rollouts: Rollouts, reference: Any, ref_context: Any, ref_rollouts: Rollouts
     ) -> tuple[DecisionDistribution, DecisionDistribution]:
         """`score` of this policy, and without gradient of a reference.
 
         Args:
-            context: of this policy.
-            rollouts: of the same scenarios.
-            reference: any policy.
-            ref_context: of the reference.
-            ref_rollouts: the same object, or the same rollouts under other goals.
+            context: Context of the scenarios under this policy.
+            rollouts: Rollouts of the same scenarios that this policy scores.
+            reference: Policy of any class, scored without gradient.
+            ref_context: Context of the scenarios under the reference.
+            ref_rollouts: The same object as `rollouts`, or the same rollouts under other goals.
         """
         ...
 
@@ -335,28 +335,28 @@ def encode_like(policy: Policy, scenarios: ScenarioBatch, context: Any) -> Any:
     """Context of scenarios that have been encoded before; parts are shared where the policy is a `SharingPolicy`.
 
     Args:
-        policy: any.
-        scenarios: of the context.
-        context: of any policy, made by weights that have not been changed since; or None.
+        policy: Policy of any class that encodes the scenarios.
+        scenarios: Scenarios that `context` was encoded from, in the same order.
+        context: Context from any policy whose weights have not been changed since; None = nothing to take over.
     """
     return policy.encode_like(scenarios, context) if isinstance(policy, SharingPolicy) else policy.encode(scenarios)
 
 
-def score_both(
+def score_with_reference(
     policy: Policy, context: Any, rollouts: Rollouts, reference: Policy, ref_context: Any, ref_rollouts: Rollouts
 ) -> tuple[DecisionDistribution, DecisionDistribution]:
     """Distributions along rollouts under a policy and, without gradient, under a reference.
 
     Args:
-        policy: any; parts are shared where it is a `SharingPolicy`.
-        context: of the policy.
-        rollouts: of the same scenarios.
-        reference: any policy.
-        ref_context: of the reference.
-        ref_rollouts: the same object, or the same rollouts under other goals.
+        policy: Policy of any class; a `SharingPolicy` shares features with the reference.
+        context: Context of the scenarios under the policy.
+        rollouts: Rollouts of the same scenarios that the policy scores.
+        reference: Policy of any class, scored without gradient.
+        ref_context: Context of the scenarios under the reference.
+        ref_rollouts: The same object as `rollouts`, or the same rollouts under other goals.
     """
     if isinstance(policy, SharingPolicy):
-        return policy.score_both(context, rollouts, reference, ref_context, ref_rollouts)
+        return policy.score_with_reference(context, rollouts, reference, ref_context, ref_rollouts)
     dist = policy.score(context, rollouts)
     with torch.no_grad():
         return dist, reference.score(ref_context, ref_rollouts)
@@ -370,7 +370,7 @@ def score_both(
 class TokenPolicy(Policy, Protocol):
     """A policy whose decisions are token ids of a vocabulary.
 
-    Its distributions are dataclasses with `logits` [R, V] of the R elements where their `mask` is True, in the
+    The distributions are dataclasses with `mask` and `logits` [R, V] of the R elements where the mask is True, in the
     mask's order.
     """
 
@@ -381,7 +381,7 @@ class TokenPolicy(Policy, Protocol):
 class CalibratablePolicy(TokenPolicy, SavedPolicy, Protocol):
     """A policy with a weighted sum of named features on its token logits; `policies.calibrated` makes one of any other.
 
-    Its distributions also have `base`, the distribution without the features, and `score_function(decision)`, the
+    The distributions also have `base`, the distribution without the features, and `score_function(decision)`, the
     gradient [..., K] of the log-probability by the K weights.
     """
 
@@ -391,7 +391,7 @@ class CalibratablePolicy(TokenPolicy, SavedPolicy, Protocol):
     """Names of the features."""
 
     def set_calibration(self, eta: Tensor, calibration: Mapping[str, Any]) -> None:
-        """Take fitted weights, and how they were fitted as values that JSON has, to be saved with them.
+        """Take fitted weights, and a record of the fit as values that JSON has, to be saved with the weights.
 
         Args:
             eta: Weights in the order of the features.
@@ -433,7 +433,7 @@ class PretrainablePolicy(SavedPolicy, Protocol):
         """Predictions of the next token of every agent at every step of its logged track.
 
         Args:
-            scenarios: with their futures.
+            scenarios: Scenarios with logged futures.
             trained: True = the agent's predictions count; other agents are context.
         """
         ...
@@ -448,21 +448,23 @@ class GoalConditionedPolicy(Policy, Protocol):
     """A policy that can be given goals. An agent without a goal must decide exactly as in a goal-free policy."""
 
     is_goal_conditioned: bool
-    """True if goals have an effect. False lets a class implement this protocol and some of its models not follow
-    goals."""
+    """True if goals have an effect. False lets a class implement this protocol with models that follow no goals."""
 
-    def goal_parts(self) -> tuple[nn.Module, ...]:
-        """Submodules that only goals use: `trained="goals"` trains these alone, and their learning rate can be scaled.
+    def goal_modules(self) -> tuple[nn.Module, ...]:
+        """Submodules that only goals use: `trained="goals"` trains these alone, with a scaled learning rate.
 
         Empty in a model that is not goal-conditioned.
         """
         ...
 
     def with_guidance(self, scale: float) -> "GoalConditionedPolicy":
-        """Copy that follows goals more closely (scale > 1) or less (< 1) than was learned; itself at 1.
+        """Copy that follows goals more closely (scale > 1) or less (< 1) than was learned; the same policy at 1.
+
+        Args:
+            scale: Factor of the pull towards goals, at least 0.
 
         Raises:
-            ConfigError: this model has nothing that could be scaled.
+            ConfigError: This model has nothing that could be scaled.
         """
         ...
 
@@ -472,14 +474,14 @@ class ConditionablePolicy(Protocol):
     """A policy that goal conditioning can be added to, before it is trained with goals."""
 
     def with_goal_conditioning(self, encoding: Any, *, logit_bias: bool | None = None) -> GoalConditionedPolicy:
-        """Copy with fresh weights for goals that have no effect yet; itself if it is conditioned in this way.
+        """Copy with fresh weights for goals, without effect yet; the same policy if conditioned in this way already.
 
         Args:
-            encoding: name of an encoding of goals, of the policy's own choice; SMART has "concat" and "indication".
-            logit_bias: add a goal-progress bias to the logits of decisions; None = the policy's default.
+            encoding: Name of an encoding of goals that the policy defines; SMART has "concat" and "indication".
+            logit_bias: True adds a goal-progress bias to the logits of decisions; None = the policy's default.
 
         Raises:
-            ConfigError: no such encoding, or it is conditioned in another way.
+            ConfigError: There is no such encoding, or the policy is conditioned in another way.
         """
         ...
 
@@ -488,7 +490,7 @@ class ConditionablePolicy(Protocol):
 # ------------------------------------------------------------------------------------------
 
 
-def device_of(policy: object) -> torch.device:
+def get_device(policy: object) -> torch.device:
     """Device of a policy's weights; the CPU for a policy without any."""
     weights = policy.parameters() if isinstance(policy, nn.Module) else ()
     return next((w.device for w in weights), torch.device("cpu"))
@@ -500,29 +502,29 @@ def is_training(policy: object) -> bool:
 
 
 def is_goal_conditioned(policy: object) -> bool:
-    """True if goals have an effect on a policy: its attribute of this name, False where it has none."""
+    """True if goals have an effect on a policy: the attribute of this name, False where there is none."""
     return bool(getattr(policy, "is_goal_conditioned", False))
 
 
-# ---- optional: an imitation objective of its own
+# ---- optional: a special imitation objective
 # -----------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
 class ImitationLoss:
-    """Loss of imitation and its metrics, summed over predictions: `training.imitation` divides by their number."""
+    """Loss of imitation and metrics, summed over predictions: `training.imitation` divides by their number."""
 
     loss: Float[Tensor, ""]
     """Sum, differentiable."""
     count: Tensor
     """Number of predictions that count, a scalar."""
     sums: Mapping[str, Tensor] = field(default_factory=dict)
-    """Sums of further metrics, scalars, by their names in metrics.jsonl. Always the same names."""
+    """Sums of further metrics, scalars, by name in metrics.jsonl. Always the same names."""
 
 
 @runtime_checkable
-class ImitatedPolicy(Protocol):
-    """A model that is pre-trained with an objective of its own, such as a likelihood of continuous actions.
+class ImitatedPolicy(SavedPolicy, Protocol):
+    """A model that brings the objective of pre-training, such as a likelihood of continuous actions.
 
     Takes the place of `PretrainablePolicy` for a policy without tokens.
     """
@@ -531,18 +533,9 @@ class ImitatedPolicy(Protocol):
         """Loss of the logged futures.
 
         Args:
-            scenarios: with their futures.
+            scenarios: Scenarios with logged futures.
             trained: True = the agent counts; other agents are context.
-            update: counted from 0, for schedules. torch's generator was seeded for this update, so a resumed run
-                draws the same.
-        """
-        ...
-
-    def save_pretrained(self, folder: Path, *, card: str = "") -> None:
-        """Write the model into a folder, as in `TrainablePolicy`.
-
-        Args:
-            folder: created where it is missing.
-            card: text of its README.md.
+            update: Number of the update from 0, for schedules. torch's generator was seeded for this update, so a
+                resumed run draws the same.
         """
         ...

@@ -11,40 +11,40 @@ from jaxtyping import Bool, Int64
 from torch import Tensor
 
 
-def row_places(mask: Bool[Tensor, "*batch"], has_all: bool) -> tuple[Int64[Tensor, "R"], ...]:
+def find_rows(mask: Bool[Tensor, "*batch"], is_dense: bool) -> tuple[Int64[Tensor, "R"], ...]:
     """Index of each row along each axis of a mask, as `nonzero(as_tuple=True)`.
 
     Args:
-        mask: True = the element has a row.
-        has_all: all elements have one, and the mask is not read.
+        mask: Elements with a row, in row-major order; not read if `is_dense`.
+        is_dense: True = all elements have a row, so that the host does not wait for a count.
     """
-    return _all_places(mask.shape, mask.device) if has_all else mask.nonzero(as_tuple=True)
+    return _index_elements(mask.shape, mask.device) if is_dense else mask.nonzero(as_tuple=True)
 
 
 @lru_cache(maxsize=4)
-def _all_places(shape: torch.Size, device: torch.device) -> tuple[Int64[Tensor, "R"], ...]:
-    """Indices of all elements; kept, because they are the same at every decision of a rollout."""
-    places = torch.meshgrid(*(torch.arange(size, device=device) for size in shape), indexing="ij")
-    return tuple(place.flatten() for place in places)
+def _index_elements(shape: torch.Size, device: torch.device) -> tuple[Int64[Tensor, "R"], ...]:
+    """Indices of all elements; cached, because all decisions of a rollout have the same."""
+    axes = torch.meshgrid(*(torch.arange(size, device=device) for size in shape), indexing="ij")
+    return tuple(axis.flatten() for axis in axes)
 
 
-def pick_rows(values: Tensor, mask: Bool[Tensor, "*batch"], has_all: bool) -> Tensor:
-    """Values [*batch, ...] of the elements whose mask is True, as rows [R, ...].
+def pick_rows(values: Tensor, mask: Bool[Tensor, "*batch"], is_dense: bool) -> Tensor:
+    """Values of the elements whose mask is True, as rows [R, ...].
 
     Args:
-        values: of all elements.
-        mask: True = the element has a row.
-        has_all: all elements have one, and the mask is not read.
+        values: Values of all elements, [*batch, ...].
+        mask: Elements with a row, in row-major order; only the number of axes is read if `is_dense`.
+        is_dense: True = all elements have a row, so that the rows are a view of the values.
     """
-    return values.flatten(0, mask.dim() - 1) if has_all else values[mask]
+    return values.flatten(0, mask.dim() - 1) if is_dense else values[mask]
 
 
 def place_rows(rows: Tensor, mask: Bool[Tensor, "*batch"]) -> Tensor:
-    """Rows [R, ...] at the places of a mask, [*batch, ...]; zeros elsewhere.
+    """Rows at the True elements of a mask, [*batch, ...]; zeros elsewhere.
 
     Args:
-        rows: of the elements whose mask is True, or of all elements.
-        mask: not read if all elements have a row.
+        rows: Values [R, ...] of the elements whose mask is True, or of all elements.
+        mask: Elements with a row, in row-major order; only the shape is read if all elements have a row.
     """
     shape = (*mask.shape, *rows.shape[1:])
     if len(rows) == mask.numel():

@@ -11,7 +11,7 @@ from rlftsim.errors import ConfigError, DataError
 from rlftsim.goals.types import Goals
 from rlftsim.jobs.threads import one_thread
 from rlftsim.rollout.noise import draw_noise
-from rlftsim.rollout.policy import DecisionDistribution, Policy, Sampling, device_of
+from rlftsim.rollout.policy import DecisionDistribution, Policy, Sampling, get_device
 from rlftsim.rollout.types import AgentStates, Rollouts
 from rlftsim.scenario.batch import ScenarioBatch, collate
 from rlftsim.scenario.types import FUTURE_STEPS, Scenarios
@@ -27,10 +27,10 @@ def sample_decision(
     """Draw a decision from the policy's distribution: the default of `simulate`.
 
     Args:
-        distribution: of the decisions.
-        state: of the policy, not used here.
-        sampling: temperature and truncation.
-        noise: uniform in [0, 1).
+        distribution: Distributions [B, N, A] of the next decision.
+        state: State before the decision, not used here.
+        sampling: Temperature and truncation of the draw.
+        noise: Uniform numbers in [0, 1), `Policy.noise_size` per agent.
     """
     return distribution.sample(sampling, noise)
 
@@ -54,26 +54,27 @@ def simulate(
     """Simulate N futures of every scenario, all in one batch; on a CPU with one thread.
 
     Args:
-        policy: decides for every agent, the ego included.
-        batch: scenarios; only their history, map and lights are used.
-        num_rollouts: N, or a range of rollout ids: ids 8..15 of a seed are the same rollouts whether drawn alone or
-            among 32.
-        seed: of the noise; see `rollout.noise`.
-        context: `policy.encode(batch)`, if it has been computed already.
-        goals: of agents in each of the N rollouts, or in a single one, which is repeated; None = goal-free.
-        sampling: temperature and truncation.
-        choose: picks decisions from a distribution, such as CAT-K's closest among the top K.
-        force: called before every advance with the state and the step it starts at; may impose states on agents.
-        observe: called after every decision with the poses so far (x, y, heading, map frame); an error that it raises
-            ends the simulation.
+        policy: Policy that decides for every agent, the ego included.
+        batch: Scenarios to continue; only history, map and lights are read.
+        num_rollouts: Number N of futures, or a range of rollout ids: ids 8..15 of a seed are the same rollouts whether
+            drawn alone or among 32.
+        seed: Seed of the noise; the rollouts depend on nothing else that is random.
+        context: Result of `policy.encode(batch)` if it has been computed already; None = encode here.
+        goals: Goals of agents in each of the N rollouts, or in a single one, which is repeated; None = goal-free.
+        sampling: Temperature and truncation of every draw.
+        choose: Function that picks decisions from a distribution, such as CAT-K's closest among the top K.
+        force: Function called before every advance with the state and the step that the decision starts at; may impose
+            states on agents.
+        observe: Function called after every decision with the poses so far (x, y, heading, map frame); an error that
+            it raises ends the simulation.
         may_be_nan: True = log-probabilities that are NaN are handed on, to training, which skips such an update.
 
     Returns:
         Poses, decisions and log-probabilities, under the distribution that was sampled from.
 
     Raises:
-        ConfigError: no rollouts, or a decision length that does not divide the 80 steps.
-        DataError: log-probabilities that are NaN, as of weights that are; the scenario is named.
+        ConfigError: There are no rollouts, or the length of a decision does not divide the 80 steps.
+        DataError: Log-probabilities are NaN, as with weights that are NaN; the scenario is named.
     """
     rollout_ids = range(num_rollouts) if isinstance(num_rollouts, int) else num_rollouts
     stride = policy.steps_per_decision
@@ -94,7 +95,7 @@ def simulate(
     context = policy.encode(batch) if context is None else context
     state = policy.begin(context, len(rollout_ids), goals, initial)
     draws = state.draws
-    poses, decisions, log_probs, forces, masks = [], [], [], [], []
+    poses, decisions, log_probs, forced_states, masks = [], [], [], [], []
     for step, decision_noise in zip(range(0, FUTURE_STEPS, stride), noise.unbind(-2)):
         distribution = policy.decide(context, state)
         decision = choose(distribution, state, sampling, decision_noise)
@@ -104,16 +105,16 @@ def simulate(
         decisions.append(decision)
         log_probs.append(distribution.log_prob(decision, sampling))
         masks.append(getattr(distribution, "mask", None))
-        forces.append(forced)
+        forced_states.append(forced)
         if observe is not None:
             observe(torch.cat(poses, dim=3))
 
     # 3. one value. A decision counts unless the agent is padding, decides nothing any more or was forced through all of
-    #    its steps
+    #    the decision's steps
     path = torch.cat(poses, dim=3)  # [B, N, A, 80, 3]
-    all_forced = _join(forces, path)
+    all_forced = _join_states(forced_states, path)
     present = batch.agent_mask[:, None].expand(path.shape[:3])  # [B, N, A]
-    mask = torch.stack([present if one is None else present & one for one in masks], 3)  # [B, N, A, L]
+    mask = torch.stack([present if decides is None else present & decides for decides in masks], 3)  # [B, N, A, L]
     if all_forced is not None:
         mask = mask & ~all_forced.valid.unflatten(-1, (num_decisions, -1)).all(-1)
     log_prob = torch.where(mask, torch.stack(log_probs, dim=3), 0.0)
@@ -124,44 +125,34 @@ def simulate(
             f"{type(policy).__name__} decides with probabilities that are NaN in scenario {first}: load its weights "
             "again if they diverged, or leave out a scenario with extreme values."
         )
-    return Rollouts(
-        position=path[..., :2],
-        heading=path[..., 2],
-        decision=torch.stack(decisions, dim=3),
-        decision_mask=mask,
-        log_prob=log_prob,
-        draws=draws,
-        goals=goals,
-        forced=all_forced,
-    )
+    decision = torch.stack(decisions, dim=3)
+    return Rollouts(path[..., :2], path[..., 2], decision, mask, log_prob, draws=draws, goals=goals, forced=all_forced)
 
 
-def refuse_sampling(policy: Policy, scenarios: Scenarios, sampling: Sampling) -> None:
-    """Refuse, before long work, a truncation that the policy's decisions do not have.
+def check_sampling(policy: Policy, scenarios: Scenarios, sampling: Sampling) -> None:
+    """Check before long work that the policy's decisions can be truncated as `sampling` says.
 
     Args:
-        policy: in evaluation mode.
-        scenarios: of the work; the first is simulated once if there is a truncation.
-        sampling: of the work.
+        policy: Policy in evaluation mode.
+        scenarios: Scenarios of the work; the first is simulated once if there is a truncation.
+        sampling: Temperature and truncation of the work.
 
     Raises:
         ConfigError: `sampling.top_k` is set, and decisions are not categories.
     """
     if sampling.top_k is not None:  # only a draw shows whether there are categories to choose from
-        simulate(policy, collate([scenarios[0]]).to(device_of(policy)), num_rollouts=1, seed=0, sampling=sampling)
+        simulate(policy, collate([scenarios[0]]).to(get_device(policy)), num_rollouts=1, seed=0, sampling=sampling)
 
 
-def _join(forces: list[AgentStates | None], path: Float[Tensor, "B N A T 3"]) -> AgentStates | None:
+def _join_states(states: list[AgentStates | None], path: Float[Tensor, "B N A T 3"]) -> AgentStates | None:
     """Imposed states of all steps; None where nothing was imposed at all."""
-    if all(f is None for f in forces):
+    if all(forced is None for forced in states):
         return None
-    parts = []
-    for part, f in zip(path.chunk(len(forces), dim=3), forces):
-        if f is None:  # the states that the policy chose, marked as not imposed
-            f = AgentStates(part[..., :2], part[..., 2], torch.zeros_like(part[..., 0], dtype=torch.bool))
-        parts.append(f)
-    return AgentStates(
-        torch.cat([p.position for p in parts], 3),
-        torch.cat([p.heading for p in parts], 3),
-        torch.cat([p.valid for p in parts], 3),
-    )
+    joined = AgentStates(path[..., :2].clone(), path[..., 2].clone(), torch.zeros_like(path[..., 0], dtype=torch.bool))
+    stride = path.shape[3] // len(states)
+    for index, forced in enumerate(states):
+        if forced is not None:
+            steps = slice(index * stride, (index + 1) * stride)
+            joined.position[..., steps, :], joined.heading[..., steps] = forced.position, forced.heading
+            joined.valid[..., steps] = forced.valid
+    return joined

@@ -14,7 +14,7 @@ from torch import Tensor
 import rlftsim
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.goals.types import Goals, shown_id
-from rlftsim.scenario.batch import Frame, origin_of
+from rlftsim.scenario.batch import Frame, compute_origin
 from rlftsim.scenario.types import Scenario, render_html
 
 
@@ -33,8 +33,8 @@ class AgentStates:
         """The states of steps [start, stop).
 
         Args:
-            start: first step of 0.1 s, counted from 0 at the first simulated one.
-            stop: step after the last.
+            start: First step of 0.1 s, counted from 0 at the first simulated step.
+            stop: Step after the last, on the same count.
         """
         return AgentStates(
             self.position[..., start:stop, :], self.heading[..., start:stop], self.valid[..., start:stop]
@@ -47,7 +47,7 @@ class AgentStates:
 
 @dataclass(frozen=True, eq=False)
 class RolloutProvenance:
-    """Origin of rollouts: the scenarios they continue, and what it takes to simulate them again."""
+    """Origin of rollouts: the simulated scenarios, and the settings that give the same rollouts again."""
 
     scenarios: tuple[Scenario, ...]
     frame: Frame
@@ -55,7 +55,7 @@ class RolloutProvenance:
     policy: str
     """Class of the policy."""
     policy_fingerprint: str
-    """Hash of its weights and settings."""
+    """Hash of the policy's weights and settings."""
     seed: int
     temperature: float = 1.0
     top_k: int | None = None
@@ -66,24 +66,24 @@ class RolloutProvenance:
         """Ids of the scenarios, in the order of the rollouts' axis B."""
         return tuple(scenario.scenario_id for scenario in self.scenarios)
 
-    def refuse_other_agents(self, row: int, scenario: Scenario) -> None:
-        """Check that a scenario simulates the agents of the one that was simulated, around the same origin.
+    def check_same_agents(self, row: int, scenario: Scenario) -> None:
+        """Check that a scenario simulates the agents of the scenario that was simulated, around the same origin.
 
-        Its logged future and its map may differ.
+        The logged futures and the maps may differ.
 
         Args:
-            row: index of the simulated scenario on axis B.
-            scenario: to be looked at or scored with the rollouts.
+            row: Index of the simulated scenario on axis B.
+            scenario: Scenario to be looked at or scored with the rollouts.
 
         Raises:
-            DataError: it has other agents or another order of them, or an origin elsewhere.
+            DataError: The scenario has other agents, a different order of agents, or an origin elsewhere.
         """
-        known = self.scenarios[row]
-        ids, known_ids = (one.tracks.object_id[one.simulated_indices] for one in (scenario, known))
-        if not np.array_equal(ids, known_ids):
-            differ = np.setxor1d(ids, known_ids).tolist()
+        simulated = self.scenarios[row]
+        ids, simulated_ids = (s.tracks.object_id[s.simulated_indices] for s in (scenario, simulated))
+        if not np.array_equal(ids, simulated_ids):
+            differ = np.setxor1d(ids, simulated_ids).tolist()
             cause = f"only one of them simulates agent {differ[0]}" if differ else "their agents are in another order"
-        elif self.frame == "map" and not np.array_equal(scenario.origin, known.origin, equal_nan=True):
+        elif self.frame == "map" and not np.array_equal(scenario.origin, simulated.origin, equal_nan=True):
             cause = "the ego is elsewhere at the current step"
         else:
             return
@@ -122,18 +122,15 @@ class Rollouts:
         """Some of the rollouts of every scenario.
 
         Raises:
-            ConfigError: a number, which would drop the axis of rollouts.
+            ConfigError: `selected` is a number, which would drop the axis of rollouts.
         """
         if isinstance(selected, int | np.integer):
-            one = f"slice({selected}, {selected + 1})" if selected != -1 else "slice(-1, None)"
-            raise ConfigError(f"select takes a slice of the rollouts, got {selected}: write {one} for a single one.")
+            single = f"slice({selected}, {selected + 1})" if selected != -1 else "slice(-1, None)"
+            raise ConfigError(f"select takes a slice of the rollouts, got {selected}: write {single} for a single one.")
+        names = ("position", "heading", "decision", "decision_mask", "log_prob")
         return replace(
             self,
-            position=self.position[:, selected],
-            heading=self.heading[:, selected],
-            decision=self.decision[:, selected],
-            decision_mask=self.decision_mask[:, selected],
-            log_prob=self.log_prob[:, selected],
+            **{name: getattr(self, name)[:, selected] for name in names},
             goals=None if self.goals is None else self.goals.rollouts(selected),
             draws=None if self.draws is None else self.draws[:, selected],
             forced=None if self.forced is None else self.forced.rollouts(selected),
@@ -141,48 +138,53 @@ class Rollouts:
 
     # ---- agents by object id: rollouts that `rlftsim.simulate` returned ------------------------------------------
 
-    def row_of(self, scenario_id: str | None = None) -> int:
+    def find_row(self, scenario_id: str | None = None) -> int:
         """Index of a scenario on axis B.
 
         Args:
-            scenario_id: None stands for the only scenario.
+            scenario_id: Id of a simulated scenario; None stands for the only scenario.
 
         Raises:
-            ConfigError: no such scenario, several to choose from, or rollouts without provenance.
+            ConfigError: There is no such scenario, several to choose from, or no provenance.
         """
         if self.provenance is None:
             raise ConfigError("these rollouts do not know their scenarios: simulate them with rlftsim.simulate.")
         ids = self.provenance.scenario_ids
         if scenario_id not in ids and not (scenario_id is None and len(ids) == 1):
             listed = ", ".join(ids[:12]) + (", ..." if len(ids) > 12 else "")
-            wanted = "a scenario_id is needed" if scenario_id is None else f"no scenario {scenario_id!r}"
-            raise ConfigError(f"{wanted}: these are rollouts of {listed}.")
+            cause = "a scenario_id is needed" if scenario_id is None else f"no scenario {scenario_id!r}"
+            raise ConfigError(f"{cause}: these are rollouts of {listed}.")
         return 0 if scenario_id is None else ids.index(scenario_id)
+
+    def _find_scenario(self, scenario_id: str | None) -> Scenario:
+        row = self.find_row(scenario_id)
+        assert self.provenance is not None
+        return self.provenance.scenarios[row]
 
     def object_ids(self, scenario_id: str | None = None) -> Int64[np.ndarray, "A"]:
         """Object ids of a scenario's simulated agents, in the order of axis A; a scenario's padding has none.
 
+        Args:
+            scenario_id: Id of a simulated scenario; None stands for the only scenario.
+
         Raises:
-            ConfigError: see `row_of`.
+            ConfigError: There is no such scenario, several to choose from, or no provenance.
         """
-        row = self.row_of(scenario_id)
-        assert self.provenance is not None
-        scenario = self.provenance.scenarios[row]
+        scenario = self._find_scenario(scenario_id)
         return scenario.tracks.object_id[scenario.simulated_indices]
 
     def trajectory(self, object_id: int, scenario_id: str | None = None) -> Float[Tensor, "N T 3"]:
         """Poses of one agent in all rollouts: x, y in meters and heading in radians, world frame, float32.
 
         Args:
-            object_id: of a simulated agent.
-            scenario_id: None stands for the only scenario.
+            object_id: Object id of a simulated agent, as in `object_ids`.
+            scenario_id: Id of a simulated scenario; None stands for the only scenario.
 
         Raises:
-            ConfigError: no such agent (the message lists those that are simulated), or see `row_of`.
+            ConfigError: There is no such agent (the message lists the simulated ones) or no such scenario.
         """
-        row, ids = self.row_of(scenario_id), self.object_ids(scenario_id)
+        row, ids, scenario = self.find_row(scenario_id), self.object_ids(scenario_id), self._find_scenario(scenario_id)
         assert self.provenance is not None
-        scenario = self.provenance.scenarios[row]
         if object_id not in ids:
             listed = ", ".join(map(str, sorted(ids.tolist())))
             raise ConfigError(
@@ -190,18 +192,16 @@ class Rollouts:
             )
         agent = int(np.flatnonzero(ids == object_id)[0])
         # Added in float64, as `ScenarioBatch.to_world` does, so that only the result is rounded.
-        origin = torch.from_numpy(origin_of(scenario, self.provenance.frame)).to(self.position.device)
+        origin = torch.from_numpy(compute_origin(scenario, self.provenance.frame)).to(self.position.device)
         position = (self.position[row, :, agent].double() + origin).float()  # [N, T, 2]
         return torch.cat([position, self.heading[row, :, agent, :, None].float()], -1)
 
     def __repr__(self) -> str:
-        num_scenarios, num_rollouts, num_agents, num_steps, _ = self.position.shape
-        several = "s" if num_scenarios != 1 else ""
+        num_scenarios, *counts, _ = self.position.shape
+        sizes = [f"{num_scenarios} scenario{'s' if num_scenarios != 1 else ''}"]
+        sizes += [f"{count} {name}" for count, name in zip(counts, ("rollouts", "agents", "steps"))]
         seed = "" if self.provenance is None else f", seed {self.provenance.seed}"
-        counts = (
-            f"{num_scenarios} scenario{several} × {num_rollouts} rollouts × {num_agents} agents × {num_steps} steps"
-        )
-        return f"Rollouts({counts}{seed})"
+        return f"Rollouts({' × '.join(sizes)}{seed})"
 
     def _repr_html_(self) -> str | None:
         return render_html(self)

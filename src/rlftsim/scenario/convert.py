@@ -1,8 +1,8 @@
-"""Files of a data source to a data set: one shard per unit of work, in parallel, resumable.
+"""Files of a data source to a data set: a shard per unit of work, in parallel, resumable.
 
-A finished shard has a receipt beside it, written after it, that holds what it was made from. A later run takes over a
-shard whose receipt, source and checksum agree, and makes the others again. So it does not matter when or how a run was
-interrupted.
+Beside a finished shard lies a receipt, written last, that names the sources of the shard. A later run takes over the
+shards that agree with receipt, sources and checksum, and makes all others again. So the moment of an interruption does
+not matter.
 """
 
 import hashlib
@@ -10,20 +10,19 @@ import json
 import os
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.jobs.buckets import fetch, find_files, is_url, require_folder
+from rlftsim.jobs.buckets import fetch, find_files, is_url, validate_folder
 from rlftsim.jobs.documents import parse_json, read_json
 from rlftsim.jobs.files import remove_temporaries_below
-from rlftsim.jobs.folder import check_folder, check_name
-from rlftsim.jobs.lease import Lease
-from rlftsim.jobs.progress import progress_bar
-from rlftsim.jobs.runner import Runner, on_this_machine, require_finished, usable_cores
+from rlftsim.jobs.folder import Lease, check_folder, check_name
+from rlftsim.jobs.items import ResultFormat, run_items
+from rlftsim.jobs.runner import Runner, check_finished, choose_runner, usable_cores
 from rlftsim.scenario.dataset import (
     INCOMPLETE,
     MANIFEST,
@@ -67,7 +66,7 @@ class ConvertReport:
 
 @dataclass(frozen=True)
 class _Task:
-    """One unit of a source and the shard it becomes."""
+    """A unit of a source and the shard that is made from the unit."""
 
     unit: Unit
     shard: str
@@ -75,30 +74,81 @@ class _Task:
     split: str
     folder: Path
     on_error: OnError
-    known: "_Known | None" = None
+    finished: "_FinishedShard | None" = None
+
+    def agrees(self, entry: ShardEntry) -> bool:
+        """True if a shard has the split of the task, and the size of the sources as they are now."""
+        return (entry.split, entry.source_bytes) == (self.split, self.unit.size)
 
 
 @dataclass(frozen=True)
-class _Known:
+class _FinishedShard:
     """A shard that an earlier run or another share finished."""
 
     entry: ShardEntry
     settings: Mapping[str, object]
-    """Of the data source that it was read by, see `DataSource.describe`; those of other sources may be among them."""
+    """Of the data source that read the sources, see `DataSource.describe`; perhaps also those of other sources."""
 
-    def settings_of(self, source: Mapping[str, object]) -> dict[str, object]:
-        """The settings under the names that a source describes itself by."""
-        return {name: self.settings.get(name) for name in source}
+    def select_settings(self, names: Iterable[str]) -> dict[str, object]:
+        """The settings of some names; None for a name that the shard lacks."""
+        return {name: self.settings.get(name) for name in names}
 
 
 @dataclass(frozen=True)
 class _Outcome:
     entry: ShardEntry
-    reused: bool
+    is_reused: bool | None
+    """None for a shard that another share has taken over or made."""
 
 
 class _Stopped(Exception):
-    """The run is being stopped; this shard is not wanted any more."""
+    """The run is being stopped; the shard is discarded."""
+
+
+class _Shards(ResultFormat[_Task, _Outcome]):
+    """Shards of the data set, as receipts and manifest name them.
+
+    Args:
+        folder: Folder of the data set.
+        source: Data source of the command, whose settings all shards of the same files must share.
+    """
+
+    def __init__(self, folder: Path, source: DataSource) -> None:
+        self._folder, self._settings = folder, _plain(source.describe())
+
+    @cached_property
+    def finished(self) -> dict[str, _FinishedShard]:
+        """Finished shards by path, read once, when they are first asked for."""
+        return _find_finished(self._folder)
+
+    def is_finished(self, item: _Task) -> bool:
+        """False: tasks compare checksums themselves, many at a time."""
+        return False
+
+    def count_units(self, item: _Task) -> int:
+        """Bytes of the sources, see `ResultFormat`."""
+        return item.unit.size
+
+    def describe(self, item: _Task) -> str:
+        """Name of the unit, see `ResultFormat`."""
+        return item.unit.name
+
+    def read(self, item: _Task) -> _Outcome | None:
+        """The shard of another share, by size and split: each share has compared the checksums of its shards.
+
+        Raises:
+            ConfigError: The shard was read with other settings.
+        """
+        shard = self.finished.get(item.shard)
+        if shard is None:
+            return None
+        stored = shard.select_settings(self._settings)
+        if stored != self._settings:
+            raise ConfigError(
+                f"{self._folder / item.shard} was converted with other options "
+                f"({_describe_difference(stored, self._settings)}): give all shares the same, or another destination."
+            )
+        return _Outcome(shard.entry, None) if item.agrees(shard.entry) else None
 
 
 def convert(
@@ -114,39 +164,38 @@ def convert(
     options: Mapping[str, object] | None = None,
     show_progress: bool = True,
 ) -> ConvertReport:
-    """Convert files of a data source to a data set that does not need them any more.
+    """Convert files of a data source to a data set that stands alone.
 
-    Interrupted in any way, the same call goes on where it was. A data set may be added to by converting other files to
-    it; a source that changed is converted again. The same sources give the same bytes.
+    Interrupted in any way, the same call goes on. Other files may be added to a data set by converting them to the same
+    folder; a source that changed is converted again. The same sources give the same bytes.
 
     Args:
-        source: file, folder or glob that the data source finds its files by; also tfrecords in a bucket (s3://...).
-        destination: folder of the data set: new, empty, or a data set or unfinished conversion of ours.
-        reader: name of the data source, such as "womd" (see `sources.SOURCES`); "auto" = the one that recognizes the
-            files.
-        split: name of the split; None = as the data source has it, for WOMD training, validation or testing by the name
+        source: File, folder or glob by which the data source finds its files; also tfrecords in a bucket (s3://...).
+        destination: Folder of the data set: new, empty, or with a data set or an unfinished conversion of ours.
+        reader: Name of the data source, such as "womd" (see `sources.SOURCES`); "auto" = by the contents of the files.
+        split: Name of the split; None = as the data source has it, for WOMD training, validation or testing by the name
             of the file or its folder, else "unknown".
         on_error: "skip" leaves bad files and records out and reports them, "stop" raises at the first.
-        jobs: processes that work at the same time; None = one per usable core.
-        runner: does the work in place of such processes, see `rlftsim.jobs.runner`.
-        license_note: license of the data, for the manifest; None = that of the data source.
-        options: of the data source, such as {"window": "first"} for "av2": arguments of its class.
-        show_progress: False shows no progress bar on stderr.
+        jobs: Number of processes that work at the same time; None = as many as usable cores.
+        runner: Runner of the work in place of such processes, see `rlftsim.jobs.runner`.
+        license_note: License of the data, for the manifest; None = that of the data source.
+        options: Arguments of the data source's class, such as {"window": "first"} for "av2".
+        show_progress: False prints neither progress nor the time left.
 
     Raises:
-        DataError: nothing to read, nothing readable in it, a destination with something else in it, or one that cannot
-            be written to; under "stop" also the first bad file or record.
-        SetAside: units that killed their process again and again; all others are converted.
+        DataError: Nothing to read, nothing readable in it, a destination with other contents, or one that cannot be
+            written to; under "stop" also the first bad file or record.
+        SetAside: Units that killed their process again and again; all others are converted.
         Unfinished: `runner` is a share, which is done, while others are not.
-        ConfigError: an unknown data source or option of it, fewer than one process, a split without a name, or shares
-            with other options.
+        ConfigError: An unknown data source or option, fewer than one process, a split without a name, or shares with
+            other options.
     """
     if jobs is not None and jobs < 1:
         raise ConfigError(f"jobs must be at least 1, got {jobs}: leave it out for one per core.")
     if split is not None:
         check_name(split, "a split's name")
     # 1. Refuse a destination that holds anything but a data set or an unfinished conversion.
-    folder = require_folder(destination)
+    folder = validate_folder(destination)
     check_folder(folder, "data set")
     if folder.exists() and not (folder / INCOMPLETE).exists():
         if (folder / MANIFEST).exists():
@@ -165,91 +214,64 @@ def convert(
     for unit in units:
         label = split or unit.split
         # files of two splits may have the same name: a split's shards have a folder of their own
-        place = unit.name if unit.name.startswith(f"{label}/") else f"{label}/{unit.name}"
-        tasks.append(_Task(unit, f"{SHARDS}/{place}.arrow", label, folder, on_error))
+        name = unit.name if unit.name.startswith(f"{label}/") else f"{label}/{unit.name}"
+        tasks.append(_Task(unit, f"{SHARDS}/{name}.arrow", label, folder, on_error))
     repeated = [shard for shard, count in Counter(task.shard for task in tasks).items() if count > 1]
     if repeated:
         raise DataError(f"{source}: its data source has two units of one name for {repeated[0]}: names must differ.")
 
     # 3. Make the shards that earlier runs have not finished, then index and manifest.
-    runner = runner or on_this_machine(jobs or usable_cores(), len(tasks), on_death=on_error)
-    own = runner.own(tasks)
-    names = {task.shard for task in own}
-    others = [task for task in tasks if task.shard not in names]
-    _refuse_other_settings(others, _known_shards(folder), data_source)
+    runner = runner or choose_runner(jobs or usable_cores(), len(tasks), on_death=on_error)
+    selected = {task.shard for task in runner.select(tasks)}
+    shards = _Shards(folder, data_source)
+    for task in tasks:
+        if task.shard not in selected:
+            shards.read(task)  # refuses those of other shares that were read with other settings
     # The folder is marked as unfinished until the mark is removed.
     with Lease(folder / INCOMPLETE, runner, "is converting to", _INCOMPLETE_TEXT) as lease:
         if lease.is_alone:
             remove_temporaries_below(folder)
-        known = _known_shards(folder)
-        own = [replace(task, known=known.get(task.shard)) for task in own]
-        total = sum(task.unit.size for task in own)
-        with progress_bar("converting", total, unit="bytes", show=show_progress) as advance:
-            convert_one = partial(_convert_unit, source=data_source)
-            outcomes = runner.run(convert_one, own, advance=advance, name_of=lambda task: task.unit.name)
-        lease.finish("convert")
-        # Shards of other shares are taken over by size and split: each share has compared the checksums of its own.
-        known = _known_shards(folder)
-        _refuse_other_settings(others, known, data_source)
-        made = {file: shard.entry for file, shard in known.items()}
-        made |= {outcome.entry.file: outcome.entry for outcome in outcomes}
-        entries = [made[task.shard] for task in tasks if task.shard in made and _is_of(made[task.shard], task)]
-        require_finished(runner, len(tasks) - len(entries), len(tasks), "convert")
+        finished = _find_finished(folder)
+        outcomes = run_items(
+            "convert", [replace(task, finished=finished.get(task.shard)) for task in tasks],
+            partial(_convert_unit, source=data_source),
+            format=_Shards(folder, data_source), lease=lease, runner=runner, unit="bytes", show_progress=show_progress,
+        )  # fmt: skip
+        num_changed = sum(not task.agrees(outcome.entry) for task, outcome in zip(tasks, outcomes))
+        check_finished(runner, num_changed, len(tasks), "convert")  # sources that changed meanwhile
         remove_temporaries_below(folder)  # of processes that were killed
         earlier = _earlier_manifest(folder)
-        manifest = _finish(folder, entries, data_source, license_note, lease)
+        manifest = _finish(folder, [outcome.entry for outcome in outcomes], data_source, license_note, lease)
         lease.remove()
-    return _report(folder, entries, outcomes, manifest, earlier.duplicates if earlier else ())
+    return _report(folder, outcomes, manifest, earlier.duplicates if earlier else ())
 
 
-def _is_of(entry: ShardEntry, task: _Task) -> bool:
-    """True if a shard has the split of a task, and the size of its sources as they are now, if they are there."""
-    return (entry.split, entry.source_bytes) == (task.split, task.unit.size)
-
-
-def _known_shards(folder: Path) -> dict[str, _Known]:
+def _find_finished(folder: Path) -> dict[str, _FinishedShard]:
     """Shards that earlier runs finished, by path: from the manifest and the receipts of runs that got no further."""
     earlier = _earlier_manifest(folder)
-    shards = {entry.file: _Known(entry, earlier.provenance) for entry in earlier.shards} if earlier else {}
+    shards = {entry.file: _FinishedShard(entry, earlier.provenance) for entry in earlier.shards} if earlier else {}
     for path in sorted((folder / SHARDS).rglob(_RECEIPTS)):
         with suppress(DataError, ConfigError, KeyError, TypeError):  # a damaged one counts for nothing
             receipt = read_json(path, "convert again")
             settings = receipt.pop("settings")
             if receipt.pop("schema_version") == SCHEMA_VERSION:
                 entry = shard_entry_from_json(receipt)
-                shards[entry.file] = _Known(entry, settings)
+                shards[entry.file] = _FinishedShard(entry, settings)
     return {file: shard for file, shard in shards.items() if (folder / file).exists()}
 
 
-def _refuse_other_settings(tasks: list[_Task], known: Mapping[str, _Known], source: DataSource) -> None:
-    """Refuse to put shards of other shares together with these if they were read with other settings.
-
-    Raises:
-        ConfigError: there is such a shard.
-    """
-    wanted = _plain(source.describe())
-    for task in tasks:
-        shard = known.get(task.shard)
-        found = wanted if shard is None else shard.settings_of(wanted)
-        if found != wanted:
-            raise ConfigError(
-                f"{task.folder / task.shard} was converted with other options ({_difference(found, wanted)}): give all "
-                "shares the same, or another destination."
-            )
-
-
-def _difference(found: object, wanted: object, name: str = "") -> str:
+def _describe_difference(stored: object, expected: object, name: str = "") -> str:
     """Values that differ between two trees of plain settings, in words.
 
     Args:
-        found: of a shard.
-        wanted: of this command.
-        name: of the setting.
+        stored: Settings of a shard, or the value under a name in them.
+        expected: Settings of this command, or the value under the same name.
+        name: Name of the value, empty for the whole trees.
     """
-    if not (isinstance(found, dict) and isinstance(wanted, dict)):
-        return f"{name} {json.dumps(found)} there, {json.dumps(wanted)} here"
-    names = [key for key in {**wanted, **found} if found.get(key) != wanted.get(key)]
-    return "; ".join(_difference(found.get(key), wanted.get(key), key) for key in names)
+    if not (isinstance(stored, dict) and isinstance(expected, dict)):
+        return f"{name} {json.dumps(stored)} there, {json.dumps(expected)} here"
+    names = [key for key in {**expected, **stored} if stored.get(key) != expected.get(key)]
+    return "; ".join(_describe_difference(stored.get(key), expected.get(key), key) for key in names)
 
 
 def _plain(settings: Mapping[str, object]) -> dict[str, object]:
@@ -258,7 +280,7 @@ def _plain(settings: Mapping[str, object]) -> dict[str, object]:
 
 
 def _earlier_manifest(folder: Path) -> Manifest | None:
-    """Manifest of the data set that is added to, if it is one and can be read."""
+    """Manifest of the data set that is added to; None where there is none that can be read."""
     try:
         return parse_manifest(folder)
     except DataError:
@@ -271,37 +293,38 @@ def _convert_unit(
     """Make the shard of a task, or take over a finished one.
 
     Args:
-        task: unit and shard.
-        advance: called with the number of bytes dealt with.
-        is_stopped: asked after each scenario.
-        source: reader of the unit.
+        task: Unit of the source, the shard to make, and the finished shard of that name.
+        advance: Callback for the number of bytes that were read or need not be.
+        is_stopped: True once the shard is not needed any more; asked after each scenario.
+        source: Reader of the unit, with the options of the command.
 
     Raises:
-        DataError: under "stop", a bad file or record; always: the shard cannot be written.
+        DataError: Under "stop", a bad file or record; always: the shard cannot be written.
         _Stopped: `is_stopped` was true.
     """
     # 1. Take over the shard of an earlier run if it is whole and made from these very files; remote ones are compared
     # by size alone, as their checksums would take as long as fetching them.
     settings = _plain(source.describe())
-    known = task.known.entry if task.known is not None and task.known.settings_of(settings) == settings else None
+    has_settings = task.finished is not None and task.finished.select_settings(settings) == settings
+    stored = task.finished.entry if task.finished is not None and has_settings else None
     if task.unit.url:
-        if known is not None and _is_of(known, task) and hash_file(task.folder / task.shard) == known.sha256:
+        if stored is not None and task.agrees(stored) and hash_file(task.folder / task.shard) == stored.sha256:
             advance(task.unit.size)
-            return _Outcome(known, reused=True)
+            return _Outcome(stored, is_reused=True)
         with tempfile.TemporaryDirectory() as folder:
             local = Path(folder) / Path(task.unit.url).name
             fetch(task.unit.url, local)
             unit = replace(task.unit, files=(local,), url="", url_bytes=0)
-            return _convert_unit(replace(task, unit=unit, known=None), advance, is_stopped, source=source)
+            return _convert_unit(replace(task, unit=unit, finished=None), advance, is_stopped, source=source)
     size, digest = _fingerprint(task.unit.files, settings)
     if (
-        known is not None
-        and (known.source_bytes, known.source_sha256, known.split) == (size, digest, task.split)
-        and not (known.skipped and task.on_error == "stop")
-        and hash_file(task.folder / task.shard) == known.sha256
+        stored is not None
+        and (stored.source_bytes, stored.source_sha256, stored.split) == (size, digest, task.split)
+        and not (stored.skipped and task.on_error == "stop")
+        and hash_file(task.folder / task.shard) == stored.sha256
     ):
         advance(size)
-        return _Outcome(known, reused=True)
+        return _Outcome(stored, is_reused=True)
 
     # 2. Read and write record by record, so that memory does not grow with the file.
     skipped: list[SkippedRecord] = []
@@ -350,11 +373,11 @@ def _convert_unit(
     )
     receipt = {**asdict(entry), "settings": settings, "schema_version": SCHEMA_VERSION}
     write_json(task.folder / f"{task.shard}.json", receipt)
-    return _Outcome(entry, reused=False)
+    return _Outcome(entry, is_reused=False)
 
 
 def _fingerprint(files: tuple[Path, ...], settings: Mapping[str, object]) -> tuple[int, str]:
-    """Bytes of some files and their SHA-256; of several files or with settings, that of all checksums and these."""
+    """Bytes of some files and the SHA-256; of several files or with settings, that of all checksums and settings."""
     try:
         size = sum(file.stat().st_size for file in files)
         digests = [hash_file(file) for file in files]
@@ -370,7 +393,7 @@ def _finish(
 ) -> Manifest:
     """Write index and manifest of the new shards and those that were there, and remove the receipts."""
     # shards of earlier runs that this call does not touch stay in the data set
-    earlier_shards = {file: shard.entry for file, shard in _known_shards(folder).items()}
+    earlier_shards = {file: shard.entry for file, shard in _find_finished(folder).items()}
     entries = earlier_shards | {entry.file: entry for entry in new}
     if not any(entry.num_rows for entry in entries.values()):
         # leave nothing behind, as if the command had not been given
@@ -403,29 +426,26 @@ def _finish(
 
 
 def _report(
-    folder: Path,
-    entries: list[ShardEntry],
-    outcomes: list[_Outcome],
-    manifest: Manifest,
-    earlier_duplicates: Sequence[SkippedRecord],
+    folder: Path, outcomes: list[_Outcome], manifest: Manifest, earlier_duplicates: Sequence[SkippedRecord]
 ) -> ConvertReport:
-    """Report on the units of this call; a data set may hold more, and of a share's call other shares made the rest."""
+    """Report on the units of this call; a data set may hold more, and other shares may have made most of them."""
+    entries = [outcome.entry for outcome in outcomes]
     all_names = names_of_shards(manifest.shards)
     names = {all_names[entry.file] for entry in entries}
-    own = [record for record in manifest.duplicates if record.file in names]
+    duplicates = [record for record in manifest.duplicates if record.file in names]
     # a shard of this call that comes first in the index makes duplicates of scenarios that were there before
-    known = set(earlier_duplicates)
-    replaced = [record for record in manifest.duplicates if record.file not in names and record not in known]
+    is_old = set(earlier_duplicates).__contains__
+    replaced = [record for record in manifest.duplicates if record.file not in names and not is_old(record)]
     tallies: Counter[str] = Counter()
     for entry in entries:
         tallies.update(entry.tallies)
     return ConvertReport(
         destination=folder,
-        converted=sum(entry.num_rows for entry in entries) - len(own),
+        converted=sum(entry.num_rows for entry in entries) - len(duplicates),
         skipped=tuple(record for entry in entries for record in entry.skipped),
-        duplicates=(*own, *replaced),
-        shards_written=sum(not outcome.reused for outcome in outcomes),
-        shards_reused=sum(outcome.reused for outcome in outcomes),
+        duplicates=(*duplicates, *replaced),
+        shards_written=sum(outcome.is_reused is False for outcome in outcomes),
+        shards_reused=sum(outcome.is_reused is True for outcome in outcomes),
         counts=manifest.counts,
         tallies=dict(sorted(tallies.items())),
     )

@@ -30,10 +30,10 @@ import pyarrow.parquet as pq
 from jaxtyping import Int64, Shaped
 
 import rlftsim
-from rlftsim.errors import ConfigError, DataError, require_types, whole_number
-from rlftsim.jobs.buckets import ORIGIN, fetch_shard, is_url, mirror, require_folder
+from rlftsim.errors import ConfigError, DataError, check_types, whole_number
+from rlftsim.jobs.buckets import ORIGIN, fetch_shard, is_url, mirror, validate_folder
 from rlftsim.jobs.documents import read_json
-from rlftsim.jobs.files import cannot_write, write_text, write_whole
+from rlftsim.jobs.files import cannot_write, write_atomically, write_text
 from rlftsim.jobs.folder import check_folder
 from rlftsim.jobs.tables import check_columns, read_parquet
 from rlftsim.scenario.index_row import AGENT_COLUMNS
@@ -279,7 +279,7 @@ class DatasetWriter:
         license_note: str = DEFAULT_LICENSE_NOTE,
         provenance: Mapping[str, object] | None = None,
     ) -> None:
-        self.folder = require_folder(folder)
+        self.folder = validate_folder(folder)
         check_folder(self.folder, "data set")
         if self.folder.exists() and (not self.folder.is_dir() or any(self.folder.iterdir())):
             raise DataError(f"{self.folder} is not an empty folder: choose another one or delete it")
@@ -438,7 +438,7 @@ def write_index_and_manifest(
     # sorted: the index must not depend on the order in which processes finished
     entries = sorted(entries, key=lambda entry: entry.file)
     table, duplicates = build_index(folder, entries)
-    write_whole(folder / INDEX, lambda path: pq.write_table(table, path, compression="zstd"))
+    write_atomically(folder / INDEX, lambda path: pq.write_table(table, path, compression="zstd"))
     manifest = Manifest(
         shards=tuple(entries),
         num_scenarios=table.num_rows,
@@ -481,7 +481,7 @@ def parse_manifest(folder: Path) -> Manifest:
         shards = tuple(shard_entry_from_json(shard) for shard in values.pop("shards"))
         duplicates = tuple(_skipped_from_json(duplicate) for duplicate in values.pop("duplicates"))
         manifest = Manifest(shards=shards, duplicates=duplicates, **values)
-        require_types(manifest)
+        check_types(manifest)
         _check_numbers("counts", manifest.counts)
         if not isinstance(manifest.provenance, Mapping):
             raise TypeError("provenance is no object")
@@ -511,7 +511,7 @@ def shard_entry_from_json(values: Mapping[str, Any]) -> ShardEntry:
     """
     skipped = tuple(_skipped_from_json(record) for record in values["skipped"])
     entry = ShardEntry(**{**values, "skipped": skipped})
-    require_types(entry)
+    check_types(entry)
     _check_numbers("tallies", entry.tallies)
     path = PurePosixPath(entry.file)
     if path.is_absolute() or ".." in path.parts or not entry.file.isprintable():
@@ -521,7 +521,7 @@ def shard_entry_from_json(values: Mapping[str, Any]) -> ShardEntry:
 
 def _skipped_from_json(values: Mapping[str, Any]) -> SkippedRecord:
     record = SkippedRecord(**values)
-    require_types(record)
+    check_types(record)
     return record
 
 

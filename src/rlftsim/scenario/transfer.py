@@ -5,10 +5,9 @@ import shutil
 from pathlib import Path
 
 from rlftsim.errors import DataError
-from rlftsim.jobs.buckets import fetch, folder_address, mirror, publish, remove, require_writable
+from rlftsim.jobs.buckets import check_writable, fetch, folder_address, mirror, publish, remote_lease, remove
 from rlftsim.jobs.files import remove_temporaries_below
-from rlftsim.jobs.folder import check_folder
-from rlftsim.jobs.lease import Lease, remote_lease
+from rlftsim.jobs.folder import Lease, check_folder
 from rlftsim.jobs.progress import progress_bar
 from rlftsim.jobs.runner import Inline
 from rlftsim.scenario.dataset import INCOMPLETE, INDEX, MANIFEST, Manifest, parse_manifest, read_manifest
@@ -22,28 +21,28 @@ def push_dataset(folder: str | os.PathLike[str], url: str, *, show_progress: boo
     is removed first: until the end there is no data set, and after an interruption the same call copies all.
 
     Args:
-        folder: the data set.
-        url: of its copy, such as s3://bucket/womd.
-        show_progress: False = no progress bar.
+        folder: Folder of the data set, which must be finished.
+        url: Address of the copy, such as s3://bucket/womd.
+        show_progress: False prints neither progress nor the time left.
 
     Raises:
-        ConfigError: no address of a folder, or one that is only read from.
-        DataError: no finished data set in the folder, or the bucket cannot be written to.
-        NotYetError: another process copies a data set there.
+        ConfigError: No address of a folder, or one that is only read from.
+        DataError: No finished data set in the folder, or the bucket cannot be written to.
+        NotYetError: Another process copies a data set to this address.
     """
     folder, url = Path(folder), folder_address(url)
-    require_writable(url)
+    check_writable(url)
     manifest = read_manifest(folder)
     with remote_lease(url, "is copying to") as renew:
         try:
-            there = {(entry.file, entry.sha256) for entry in parse_manifest(mirror(url, (INDEX, MANIFEST))).shards}
+            published = {(entry.file, entry.sha256) for entry in parse_manifest(mirror(url, (INDEX, MANIFEST))).shards}
         except DataError:  # no data set there yet
-            there = set()
-        if there and any((entry.file, entry.sha256) not in there for entry in manifest.shards):
+            published = set()
+        if published and any((entry.file, entry.sha256) not in published for entry in manifest.shards):
             remove(f"{url}/{MANIFEST}")
         with progress_bar("push", len(manifest.shards), show=show_progress) as advance:
             for entry in manifest.shards:
-                if (entry.file, entry.sha256) not in there:
+                if (entry.file, entry.sha256) not in published:
                     publish(folder / entry.file, f"{url}/{entry.file}")
                     renew()
                 advance(1)
@@ -57,14 +56,14 @@ def pull_dataset(url: str, folder: str | os.PathLike[str], *, show_progress: boo
     """Copy a data set from a bucket to a folder. Interrupted in any way, the same call goes on.
 
     Args:
-        url: of the data set.
-        folder: new, empty, or one with a part of this data set.
-        show_progress: False = no progress bar.
+        url: Address of the data set, such as s3://bucket/womd.
+        folder: Folder of the copy: new, empty, or with a begun copy of this data set.
+        show_progress: False prints neither progress nor the time left.
 
     Raises:
-        ConfigError: no address of a folder.
-        DataError: no data set there, something else in the folder or at work in it, or a shard that is not the
-            manifest's.
+        ConfigError: No address of a folder.
+        DataError: No data set at the address, a folder with other contents or another process at work, or a shard that
+            is not the manifest's.
     """
     folder, url = Path(folder), folder_address(url)
     check_folder(folder, "data set")

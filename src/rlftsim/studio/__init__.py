@@ -1,19 +1,19 @@
-"""Goal studio: a page on this machine that asks agents for things and shows what happens.
+"""Goal studio: a page on this machine that gives agents goals and shows the rollouts.
 
-`serving.Studio` starts a server and stops it; `server.create_app` has the routes, `guard.Guard` stands before all of
-them, `session.Session` holds data and models, `runs.Worker` simulates in one thread. The page is in `static/`, plain
-ES modules; they share `viewer/drawing.js` with the pages that stand alone. Needs the extra: `pip install
+`serving.Studio` starts and stops a server; `server.create_app` has the routes, `guard.Guard` stands before all
+routes, `session.Session` holds data and models, `runs.Worker` simulates in one thread. The page is in `static/`, plain
+ES modules, which share `viewer/drawing.js` with the pages that stand alone. Needs the extra: `pip install
 'rlftsim[studio]'`.
 """
 
 from rlftsim.errors import ConfigError
 
 
-def require_extra() -> None:
+def check_extra() -> None:
     """Check that the server's libraries are installed.
 
     Raises:
-        ConfigError: one is missing; names the command that installs it.
+        ConfigError: A library is missing; the message has the command that installs the extra.
     """
     try:
         import fastapi  # noqa: F401

@@ -1,4 +1,4 @@
-"""Bodies of the requests. pydantic checks types and bounds before any of them is made."""
+"""Bodies of the requests. pydantic checks types and bounds before a body is made."""
 
 from dataclasses import dataclass, field
 from typing import Annotated, ClassVar, Literal
@@ -6,19 +6,24 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import ConfigDict, Field
 
 MAX_ROLLOUTS, MAX_GOALS, MAX_MODELS = 128, 128, 4
-STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
 Text = Annotated[str, Field(min_length=1, max_length=200)]
 Stem = Annotated[str, Field(pattern=r"^[A-Za-z0-9._-]{1,80}$")]
-"""Name of a file below `--out`, without its ending."""
+"""Name of a file below `--out`, without the ending."""
 Metric = Literal["2025", "2024"]
-ExportKind = Literal["rollouts", "submission", "film-mp4", "film-webp", "page", "scores"]
+ExportForm = Literal["rollouts", "submission", "film-mp4", "film-webp", "page", "scores"]
 
 
 @dataclass(frozen=True)
-class GoalBody:
+class Body:
+    """Body of a request; unknown fields and infinite numbers are refused."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+
+@dataclass(frozen=True)
+class GoalBody(Body):
     """A point for an agent, world frame, m."""
 
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
     agent: int
     x: float
     y: float
@@ -26,20 +31,18 @@ class GoalBody:
 
 
 @dataclass(frozen=True)
-class CheckBody:
-    """Goals to be checked against their scenario."""
+class CheckBody(Body):
+    """Goals to be checked against the scenario."""
 
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
     split: Text
     scenario: Text
     goals: Annotated[tuple[GoalBody, ...], Field(max_length=MAX_GOALS)]
 
 
 @dataclass(frozen=True)
-class RunBody:
-    """Rollouts of a scenario by one or several models."""
+class RunBody(Body):
+    """Rollouts of a scenario by several models."""
 
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
     split: Text
     scenario: Text
     models: Annotated[tuple[Text, ...], Field(min_length=1, max_length=MAX_MODELS)]
@@ -53,30 +56,27 @@ class RunBody:
 
 
 @dataclass(frozen=True)
-class OpenGoalsBody:
+class OpenGoalsBody(Body):
     """Text of a goals file that the page has read."""
 
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
     text: str
     name: Annotated[str, Field(max_length=200)] = "goals file"
 
 
 @dataclass(frozen=True)
-class SaveGoalsBody:
+class SaveGoalsBody(Body):
     """A goals file to be written below `--out`."""
 
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
     name: Stem
     text: str
     replace: bool = False
 
 
 @dataclass(frozen=True)
-class ExportBody:
+class ExportBody(Body):
     """Rollouts of a run to be written below `--out`."""
 
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
-    kind: ExportKind
+    kind: ExportForm
     name: Stem
     run: Text
     variant: Annotated[int, Field(ge=0)] = 0
@@ -87,8 +87,7 @@ class ExportBody:
 
 
 @dataclass(frozen=True)
-class EmptyBody:
-    """Body of a request that says everything in its address."""
+class EmptyBody(Body):
+    """Body of a request with all arguments in the address."""
 
-    __pydantic_config__: ClassVar[ConfigDict] = STRICT
     nothing: None = field(default=None)

@@ -22,11 +22,11 @@ def encode_poses(poses: Float[np.ndarray, "N A t 3"], current: Float[np.ndarray,
     """Bytes of simulated poses.
 
     Args:
-        poses: x, y (m) and heading (rad) of the simulated steps, map frame.
-        current: the agents' logged poses at the current step, same frame.
+        poses: Simulated poses [N, A, t, 3] in the map frame: x and y in meters, heading in radians.
+        current: Logged poses [A, 3] of the agents at the current step, same frame and units.
 
     Raises:
-        DataError: a pose is not finite.
+        DataError: A pose is not finite.
     """
     if not np.isfinite(poses).all():
         raise DataError("the model's rollouts have poses that are not finite numbers: it is not trained soundly.")
@@ -37,21 +37,21 @@ def encode_poses(poses: Float[np.ndarray, "N A t 3"], current: Float[np.ndarray,
     steps = np.diff(np.rint(path * HUNDREDTHS).astype(np.int64), axis=2)  # [N, A, t, 3]
     second = np.diff(steps, axis=2, prepend=0).swapaxes(2, 3)  # [N, A, 3, t]
     # Two bytes hold 327 m in a tenth of a second; an untrained model may do more.
-    kind = "<i2" if abs(second).max(initial=0) < 1 << 15 else "<i4"
-    header = np.array([MAGIC, *poses.shape[:3], np.dtype(kind).itemsize], "<u4")
-    return header.tobytes() + np.ascontiguousarray(second, dtype=kind).tobytes()
+    dtype = np.dtype("<i2" if abs(second).max(initial=0) < 1 << 15 else "<i4")
+    header = np.array([MAGIC, *poses.shape[:3], dtype.itemsize], "<u4")
+    return header.tobytes() + np.ascontiguousarray(second, dtype=dtype).tobytes()
 
 
 def encode_batch(poses: Float[Tensor, "B N A t 3"], batch: ScenarioBatch) -> bytes:
     """Bytes of the poses of a batch's only scenario, without padding.
 
     Args:
-        poses: x, y (m) and heading (rad) of the simulated steps, map frame.
-        batch: of one scenario.
+        poses: Simulated poses [1, N, A, t, 3] in the map frame: x and y in meters, heading in radians.
+        batch: Batch of a single scenario, with the current poses and the mask of agents.
 
     Raises:
-        DataError: a pose is not finite.
+        DataError: A pose is not finite.
     """
-    now = torch.cat([batch.position[0, :, CURRENT_STEP], batch.heading[0, :, CURRENT_STEP, None]], -1)
-    kept = batch.agent_mask[0]
-    return encode_poses(poses[0][:, kept].float().cpu().numpy(), now[kept].float().cpu().numpy())
+    current = torch.cat([batch.position[0, :, CURRENT_STEP], batch.heading[0, :, CURRENT_STEP, None]], -1)
+    is_agent = batch.agent_mask[0]
+    return encode_poses(poses[0][:, is_agent].float().cpu().numpy(), current[is_agent].float().cpu().numpy())

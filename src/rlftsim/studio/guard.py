@@ -26,7 +26,7 @@ def new_token() -> str:
 
 @dataclass(frozen=True)
 class Access:
-    """Names and secrets of one start of the studio."""
+    """Names and secrets of a start of the studio."""
 
     port: int
     token: str = field(repr=False)
@@ -70,8 +70,8 @@ class Guard:
     """ASGI middleware that lets a request through or answers it with 401, 403, 413 or 415.
 
     Args:
-        app: everything behind the gate.
-        access: hosts and token.
+        app: Application behind the gate, which gets only requests that pass.
+        access: Hosts, token and headers of this start of the studio.
     """
 
     def __init__(self, app: ASGIApp, access: Access) -> None:
@@ -79,15 +79,15 @@ class Guard:
         self.access = access
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Check a request, then hand it on."""
+        """Check a request, then call the application."""
         if scope["type"] == "lifespan":
             return await self.app(scope, receive, send)
         if scope["type"] != "http":  # no route is a WebSocket
             return await send({"type": "websocket.close", "code": 1008})
         headers = Headers(scope=scope)
-        refused = self._refusal(scope, headers)
-        if refused is not None:
-            return await self._answer(send, *refused)
+        refusal = self._find_refusal(scope, headers)
+        if refusal is not None:
+            return await self._answer(send, *refusal)
         offered = parse_qs(scope["query_string"].decode("latin-1")).get("token", [])
         if scope["path"] == "/" and offered:
             # The address bar, the history and logs of proxies must not keep the token.
@@ -103,7 +103,7 @@ class Guard:
                 break
         await self.app(scope, _replay(body, receive), self._with_headers(send))
 
-    def _refusal(self, scope: Scope, headers: Headers) -> tuple[int, str] | None:
+    def _find_refusal(self, scope: Scope, headers: Headers) -> tuple[int, str] | None:
         """Status and sentence for a request that is not let through."""
         hosts, is_change = headers.getlist("host"), scope["method"] not in SAFE_METHODS
         if len(hosts) != 1 or hosts[0].lower() not in self.access.hosts:
@@ -117,17 +117,19 @@ class Guard:
         if is_change:
             # "null", or a scheme and a host; a script that knows the token has none.
             origin = headers.get("origin")
-            is_own = self.access.is_token(bearer) if origin is None else origin.partition("://")[2] == hosts[0]
-            if not is_own:
+            is_same_origin = self.access.is_token(bearer) if origin is None else origin.partition("://")[2] == hosts[0]
+            if not is_same_origin:
                 return 403, "the request comes from another page: only the studio's own page may change something."
             if headers.get("content-type", "").partition(";")[0].strip().lower() != "application/json":
                 return 415, "the body must be application/json."
         return None
 
-    async def _answer(self, send: Send, status: int, sentence: str, more: dict[str, str] | None = None) -> None:
+    async def _answer(
+        self, send: Send, status: int, sentence: str, extra_headers: dict[str, str] | None = None
+    ) -> None:
         body = json.dumps({"error": sentence, "hint": ""}).encode() if sentence else b""
         headers = {"content-type": "application/json", "content-length": str(len(body)), "cache-control": "no-store"}
-        pairs = [(name.encode(), value.encode()) for name, value in (headers | (more or {})).items()]
+        pairs = [(name.encode(), value.encode()) for name, value in (headers | (extra_headers or {})).items()]
         await send({"type": "http.response.start", "status": status, "headers": [*pairs, *self.access.headers]})
         await send({"type": "http.response.body", "body": body})
 
@@ -143,10 +145,10 @@ class Guard:
 
 
 def _replay(body: bytes, receive: Receive) -> Receive:
-    """The body that has been read already, then whatever comes, such as the end of the connection."""
-    left = [{"type": "http.request", "body": body, "more_body": False}]
+    """Messages with the body that has been read already, then new messages, such as the end of the connection."""
+    messages = [{"type": "http.request", "body": body, "more_body": False}]
 
-    async def receive_again() -> Message:
-        return left.pop() if left else await receive()
+    async def receive_message() -> Message:
+        return messages.pop() if messages else await receive()
 
-    return receive_again
+    return receive_message

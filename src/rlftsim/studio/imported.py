@@ -1,4 +1,4 @@
-"""Rollouts of files in panels of their own, beside those that the studio simulates."""
+"""Rollouts of files in separate panels, beside those that the studio simulates."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,22 +23,22 @@ class Imported:
     entries: dict[str, RolloutEntry]
     """By scenario id."""
 
-    def states_of(self, scenario: Scenario) -> SimulatedStates:
-        """A scenario's rollouts, all simulated agents in the order of the log.
+    def read_states(self, scenario: Scenario) -> SimulatedStates:
+        """Rollouts of a scenario, all simulated agents in the order of the log.
 
         Raises:
-            Refusal: there are none (404).
-            DataError: a damaged file, or agents that the scenario has are missing.
+            Refusal: No rollouts of the scenario (404), or of an agent (422).
+            DataError: A damaged file.
         """
         if scenario.scenario_id not in self.entries:
             raise Refusal(f"{self.name} has no rollouts of scenario {scenario.scenario_id}.", status=404)
         states = read_states(self.entries[scenario.scenario_id])
-        places = {int(one): place for place, one in enumerate(states.object_id)}
+        rows = {int(object_id): row for row, object_id in enumerate(states.object_id)}
         ids = scenario.tracks.object_id[scenario.simulated_indices].tolist()
-        missing = [one for one in ids if one not in places]
+        missing = [object_id for object_id in ids if object_id not in rows]
         if missing:
             raise Refusal(f"{self.entries[scenario.scenario_id]}: no rollouts of agent {missing[0]}.")
-        order = torch.tensor([places[one] for one in ids])
+        order = torch.tensor([rows[object_id] for object_id in ids])
         axes = (getattr(states, axis)[:, order] for axis in ("x", "y", "z", "heading"))
         return SimulatedStates(np.array(ids), *axes)
 
@@ -47,46 +47,46 @@ def import_rollouts(sources: tuple[str, ...]) -> dict[str, Imported]:
     """Rollouts of files and folders by name; files are only listed, not read.
 
     Raises:
-        DataError: nothing there, or no rollouts.
+        DataError: No file or folder of this name, or no rollouts inside.
     """
-    found: dict[str, Imported] = {}
+    imported: dict[str, Imported] = {}
     for source in sources:
         stem = Path(source).resolve().name
-        name = next(n for k in range(1, len(sources) + 1) if (n := stem if k == 1 else f"{stem}-{k}") not in found)
-        found[name] = Imported(name, {entry.scenario_id: entry for entry in find_rollouts(source)})
-    return found
+        name = next(n for k in range(1, len(sources) + 1) if (n := stem if k == 1 else f"{stem}-{k}") not in imported)
+        imported[name] = Imported(name, {entry.scenario_id: entry for entry in find_rollouts(source)})
+    return imported
 
 
 def encode_imported(imported: Imported, scenario: Scenario) -> bytes:
-    """Bytes of a scenario's rollouts, as those of a simulated chunk.
+    """Bytes of a scenario's rollouts in the map frame, as those of a simulated chunk.
 
     Args:
-        imported: has the rollouts.
-        scenario: its origin becomes that of the poses.
+        imported: Rollouts of a file or folder, in the world frame.
+        scenario: Scenario of the rollouts, whose origin becomes that of the poses.
 
     Raises:
-        Refusal: as `Imported.states_of`.
-        DataError: as `Imported.states_of`.
+        Refusal: As `Imported.read_states`.
+        DataError: As `Imported.read_states`.
     """
-    states, chosen = imported.states_of(scenario), scenario.simulated_indices
+    states, indices = imported.read_states(scenario), scenario.simulated_indices
     x, y = states.x.numpy() - scenario.origin[0], states.y.numpy() - scenario.origin[1]  # [N, A, 80]
     poses = np.stack([x, y, states.heading.numpy()], axis=-1)
-    position = scenario.tracks.position[chosen, CURRENT_STEP, :2] - scenario.origin[:2]
-    current = np.concatenate([position, scenario.tracks.heading[chosen, CURRENT_STEP, None]], axis=-1)  # [A, 3]
+    position = scenario.tracks.position[indices, CURRENT_STEP, :2] - scenario.origin[:2]
+    current = np.concatenate([position, scenario.tracks.heading[indices, CURRENT_STEP, None]], axis=-1)  # [A, 3]
     return encode_poses(poses, current)
 
 
 def score_imported(imported: Imported, scenario: Scenario, metric: str) -> dict[str, Any]:
-    """Score and explanation of a scenario's rollouts, as the page takes them.
+    """Score and explanation of a scenario's rollouts, in the layout of the page.
 
     Args:
-        imported: has the rollouts.
-        scenario: that they are of.
-        metric: year.
+        imported: Rollouts of a file or folder, in the world frame.
+        scenario: Scenario of the rollouts, with the logged future to compare with.
+        metric: Year of the meta-metric, "2025" or "2024".
 
     Raises:
-        Refusal: as `Imported.states_of`.
-        DataError: as `Imported.states_of`.
+        Refusal: As `Imported.read_states`.
+        DataError: As `Imported.read_states`.
     """
-    scored = score_states(scenario, imported.states_of(scenario), (), metric)
+    scored = score_states(scenario, imported.read_states(scenario), (), metric)
     return {**scored.to_payload(), "explained": scored.explained()}

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from rlftsim.errors import ConfigError, in_short
 from rlftsim.scenario.any_form import Name
-from rlftsim.studio import require_extra
+from rlftsim.studio import check_extra
 
 if TYPE_CHECKING:
     from rlftsim.studio.serving import Studio
@@ -24,7 +24,7 @@ class StudioCell:
     """A running studio that a notebook shows in a frame.
 
     Args:
-        studio: started.
+        studio: Server that answers already; `stop()` ends it.
     """
 
     def __init__(self, studio: "Studio") -> None:
@@ -32,7 +32,7 @@ class StudioCell:
 
     @property
     def url(self) -> str:
-        """Address with the token, for a tab of its own."""
+        """Address with the token, for a separate tab."""
         return self.studio.url
 
     def stop(self) -> None:
@@ -68,26 +68,26 @@ def open_studio(
     """Start the goal studio for a notebook cell.
 
     Args:
-        data: folder of a data set, or "synthetic".
-        models: runs, model folders or registered names, one or several.
-        rollouts: files or folders of rollouts, for panels of their own, one or several.
-        split: shown first; None = validation, where there is one.
-        out: folder of everything that the page saves.
-        trusted_hosts: Host headers of a proxy, such as "hub.example"; its origin may show the page, too.
+        data: Folder of a data set, or "synthetic" for the embedded data set.
+        models: Run, model folder or registered name, or several of these.
+        rollouts: File or folder of rollouts, or several; each gets a separate panel.
+        split: Split that the page shows first; None = validation, if the data set has that split.
+        out: Folder of all files that the page saves.
+        trusted_hosts: Host headers of a proxy, such as "hub.example", whose origin may show the page, too.
 
     Returns:
         A value that a notebook displays; `stop()` ends the server.
 
     Raises:
-        RlftsimError: no such data set, split or model, a policy in place of a name, or the extra is not installed.
+        RlftsimError: No such data set, split or model, a policy in place of a name, or the extra is not installed.
     """
-    require_extra()
+    check_extra()
     # Not at the top: `import rlftsim` works without the extra.
     from rlftsim.studio.serving import Studio
     from rlftsim.studio.session import Session
 
-    names, files = _several("models", models), _several("rollouts", rollouts)
-    hosts = _several("trusted_hosts", trusted_hosts)
+    names, files = _to_names("models", models), _to_names("rollouts", rollouts)
+    hosts = _to_names("trusted_hosts", trusted_hosts)
     session = Session(os.fspath(data), names, split, Path(out), rollouts=files)
     origins = (*NOTEBOOK_ORIGINS, *(f"https://{host}" for host in hosts))
     studio = Studio(session, trusted_hosts=hosts, frame_ancestors=origins)
@@ -95,15 +95,15 @@ def open_studio(
     return StudioCell(studio)
 
 
-def _several(argument: str, names: object) -> tuple[str, ...]:
-    """Names as text; a single one counts as a list of one.
+def _to_names(argument: str, names: object) -> tuple[str, ...]:
+    """Names as text; a single name counts as a list.
 
     Raises:
-        ConfigError: something else, such as a policy.
+        ConfigError: A value that is no name, such as a policy.
     """
     listed = [names] if isinstance(names, str | os.PathLike) else names
-    if not isinstance(listed, Sequence) or not all(isinstance(one, str | os.PathLike) for one in listed):
+    if not isinstance(listed, Sequence) or not all(isinstance(name, str | os.PathLike) for name in listed):
         raise ConfigError(
             f"{argument} must be names or folders, got {in_short(names)}: write what is in memory to a folder first."
         )
-    return tuple(os.fspath(one) for one in listed)
+    return tuple(os.fspath(name) for name in listed)

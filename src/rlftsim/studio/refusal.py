@@ -1,4 +1,4 @@
-"""The one error of the studio's server: a sentence, a hint and a status."""
+"""Error of the studio's server: a sentence, a hint and a status."""
 
 from rlftsim.errors import RlftsimError
 
@@ -7,9 +7,9 @@ class Refusal(RlftsimError):
     """A request that is not carried out.
 
     Args:
-        message: the value, the cause and the way out.
-        status: of the HTTP answer.
-        hint: what to do, where the page has room for it.
+        message: Sentence with the value, the cause and the way out.
+        status: Status of the HTTP answer, 4xx.
+        hint: Further advice, which the page shows below the message.
     """
 
     def __init__(self, message: str, *, status: int = 422, hint: str = "") -> None:

@@ -1,9 +1,9 @@
-"""Runs: rollouts of one scenario by some models, simulated in small chunks by one thread.
+"""Runs: rollouts of a scenario by several models, simulated in small chunks by a single thread.
 
-A run has variants: every model with the goals, and the goal-conditioned ones also without, on the same seeds, for
+A run has variants: every model with the goals, and the goal-conditioned models also without, on the same seeds, for
 the change of realism. The first four rollouts of each variant come first. A rollout depends on the seed, the scenario
-and its number alone, so chunks are bit for bit the rows of one large simulation, and pressing simulate twice or
-changing a goal computes only what is new.
+and the rollout's number alone, so chunks are bit for bit the rows of a large simulation, and pressing simulate twice
+or changing a goal computes only new rollouts.
 """
 
 import hashlib
@@ -20,7 +20,7 @@ from torch import Tensor
 from rlftsim.errors import RlftsimError
 from rlftsim.jobs.progress import log
 from rlftsim.policies.registry import with_guidance
-from rlftsim.rollout.policy import Sampling, device_of
+from rlftsim.rollout.policy import Sampling, get_device
 from rlftsim.rollout.simulate import simulate
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch, collate
@@ -30,9 +30,9 @@ from rlftsim.studio.encoding import encode_batch
 from rlftsim.studio.refusal import Refusal
 from rlftsim.studio.scoring import Scored, score_variant
 from rlftsim.studio.session import Session
-from rlftsim.studio.variants import Variant, free_variant, has_goals, variants_of
+from rlftsim.studio.variants import Variant, build_variants, free_variant, has_goals
 
-CHUNKS = (4, 4, 8, 16)
+FIRST_CHUNKS = (4, 4, 8, 16)
 LARGEST_CHUNK = 32
 KEPT_BYTES = 512 << 20
 KEPT_RUNS = 64
@@ -46,7 +46,7 @@ class Cancelled(Exception):
 class Simulated:
     """Rollouts of a variant so far; grows by chunks, which runs of different sizes share."""
 
-    parts: dict[range, Rollouts] = field(default_factory=dict)
+    chunks: dict[range, Rollouts] = field(default_factory=dict)
     """By numbers of the rollouts."""
     encoded: dict[range, bytes] = field(default_factory=dict)
     scored: dict[tuple[int, str], Scored] = field(default_factory=dict)
@@ -56,14 +56,14 @@ class Simulated:
     def num_bytes(self) -> int:
         """Memory of tensors and chunks, about."""
         tensors = (
-            p.position.nbytes + p.heading.nbytes + p.decision.nbytes + p.log_prob.nbytes for p in self.parts.values()
+            p.position.nbytes + p.heading.nbytes + p.decision.nbytes + p.log_prob.nbytes for p in self.chunks.values()
         )
         return sum(tensors) + sum(map(len, self.encoded.values()))
 
 
 @dataclass(eq=False)
 class Run:
-    """One press of simulate."""
+    """A press of simulate."""
 
     name: str
     body: RunBody
@@ -83,37 +83,37 @@ class Run:
         self.events.append((event, data))
 
     def chunk(self, k: int) -> bytes:
-        """Poses of a chunk, also of one that is being simulated.
+        """Poses of chunk `k`, also while the chunk is being simulated.
 
         Raises:
-            Refusal: there is none yet (404).
+            Refusal: No such chunk, or no poses yet (404).
         """
         if not 0 <= k < len(self.chunks):
             raise Refusal(f"run {self.name} has no chunk {k}.", status=404)
         variant, ids = self.chunks[k]
-        found = self.simulated[variant].encoded.get(ids, self.growing.get(k))
-        if found is None:
+        content = self.simulated[variant].encoded.get(ids, self.growing.get(k))
+        if content is None:
             raise Refusal(f"chunk {k} of run {self.name} is not simulated yet.", status=404)
-        return found
+        return content
 
     def rollouts(self, variant: int) -> Rollouts:
         """All rollouts of a variant.
 
         Raises:
-            Refusal: no such variant, or it is not complete (409).
+            Refusal: No such variant (404), or the variant is not complete (409).
         """
         if not 0 <= variant < len(self.variants):
             raise Refusal(f"run {self.name} has no variant {variant}.", status=404)
-        parts, wanted = self.simulated[variant].parts, chunks_of(self.body.num_rollouts)
-        if any(ids not in parts for ids in wanted):
+        chunks, expected = self.simulated[variant].chunks, split_rollouts(self.body.num_rollouts)
+        if any(ids not in chunks for ids in expected):
             raise Refusal("these rollouts are not complete yet: wait until the run is done.", status=409)
-        return join([parts[ids] for ids in wanted])
+        return join_chunks([chunks[ids] for ids in expected])
 
     def score(self, variant: int) -> Scored:
         """Score of a variant.
 
         Raises:
-            Refusal: no such variant, or it is not scored yet (409).
+            Refusal: No such variant (404), or the variant is not scored yet (409).
         """
         self.rollouts(variant)
         scored = self.simulated[variant].scored.get((self.body.num_rollouts, self.body.metric))
@@ -122,48 +122,42 @@ class Run:
         return scored
 
 
-def chunks_of(num_rollouts: int) -> list[range]:
+def split_rollouts(num_rollouts: int) -> list[range]:
     """Rollouts that are simulated at once: 4, 4, 8, 16, then 32 each."""
-    found: list[range] = []
-    while (first := found[-1].stop if found else 0) < num_rollouts:
-        size = CHUNKS[len(found)] if len(found) < len(CHUNKS) else LARGEST_CHUNK
-        found.append(range(first, min(first + size, num_rollouts)))
-    return found
+    chunks: list[range] = []
+    while (first := chunks[-1].stop if chunks else 0) < num_rollouts:
+        size = FIRST_CHUNKS[len(chunks)] if len(chunks) < len(FIRST_CHUNKS) else LARGEST_CHUNK
+        chunks.append(range(first, min(first + size, num_rollouts)))
+    return chunks
 
 
-def join(parts: list[Rollouts]) -> Rollouts:
-    """Chunks of one variant as one value on the CPU; goals and draws are left out."""
-    return Rollouts(
-        position=torch.cat([part.position for part in parts], 1).cpu(),
-        heading=torch.cat([part.heading for part in parts], 1).cpu(),
-        decision=torch.cat([part.decision for part in parts], 1).cpu(),
-        decision_mask=torch.cat([part.decision_mask for part in parts], 1).cpu(),
-        log_prob=torch.cat([part.log_prob for part in parts], 1).cpu(),
-    )
+def join_chunks(chunks: list[Rollouts]) -> Rollouts:
+    """Rollouts of all chunks of a variant on the CPU; goals and draws are left out."""
+
+    def join(name: str) -> Tensor:
+        return torch.cat([getattr(chunk, name) for chunk in chunks], 1).cpu()
+
+    return Rollouts(join("position"), join("heading"), join("decision"), join("decision_mask"), join("log_prob"))
 
 
 class Worker:
-    """One thread that simulates; a new run takes the place of the waiting one and cancels the running one.
+    """A thread that simulates; a new run replaces the waiting run and cancels the running one.
 
     Args:
-        session: data and models.
+        session: Session with the scenarios and models of the runs.
     """
 
     def __init__(self, session: Session) -> None:
         self.session = session
         self.runs: OrderedDict[str, Run] = OrderedDict()
-        self._known: OrderedDict[Variant, Simulated] = OrderedDict()
+        self._simulated: OrderedDict[Variant, Simulated] = OrderedDict()
         self._wake = threading.Condition()
         self._waiting: Run | None = None
         self._running: Run | None = None
-        self._is_closed = False
+        self.is_closed = False
+        """True once the studio ends."""
         self._thread = threading.Thread(target=self._work, name="studio worker", daemon=True)
         self._thread.start()
-
-    @property
-    def is_closed(self) -> bool:
-        """True once the studio ends."""
-        return self._is_closed
 
     def close(self) -> None:
         """End the thread and what it simulates."""
@@ -171,34 +165,34 @@ class Worker:
         self._thread.join(timeout=1.5)
 
     def stop(self) -> None:
-        """Stop the running run at its next decision, and take no other one."""
+        """Stop the running run at the next decision, and take no further run."""
         with self._wake:
-            self._is_closed = True
+            self.is_closed = True
             for run in (self._running, self._waiting):
                 if run is not None:
                     run.stop.set()
             self._wake.notify()
 
     def submit(self, body: RunBody) -> Run:
-        """Queue a run; one with the same inputs that is complete or under way is returned as it is.
+        """Queue a run; a run with the same inputs that is complete or under way is returned unchanged.
 
         Raises:
-            Refusal: an unknown scenario or model, or goals that none of the models takes.
-            DataError: an impossible goal, or two for one agent.
+            Refusal: An unknown scenario or model, or goals that no model takes.
+            DataError: An impossible goal, or two for the same agent.
         """
-        variants = tuple(variants_of(self.session, body))
+        variants = tuple(build_variants(self.session, body))
         name = hashlib.blake2b(repr((variants, body)).encode(), digest_size=8).hexdigest()
         with self._wake:
-            known = self.runs.get(name)
-            if known is not None and not known.stop.is_set() and not any(e == "failed" for e, _ in known.events):
+            earlier = self.runs.get(name)
+            if earlier is not None and not earlier.stop.is_set() and not any(e == "failed" for e, _ in earlier.events):
                 self.runs.move_to_end(name)
-                return known
+                return earlier
             run = self._new_run(name, body, variants)
             self.runs[name] = run
-            for other in (self._running, self._waiting):
-                if other is not None and not other.stop.is_set():
-                    other.stop_reason = "replaced by a newer run."
-                    other.stop.set()
+            for replaced in (self._running, self._waiting):
+                if replaced is not None and not replaced.stop.is_set():
+                    replaced.stop_reason = "replaced by a newer run."
+                    replaced.stop.set()
             if self._waiting is not None:
                 self._end(self._waiting, "failed", message=self._waiting.stop_reason, cancelled=True)
             self._waiting = run
@@ -208,10 +202,10 @@ class Worker:
         return run
 
     def run(self, name: str) -> Run:
-        """A run by its name.
+        """Run by name.
 
         Raises:
-            Refusal: it is not in memory any more (404).
+            Refusal: The run is not in memory any more (404).
         """
         if name not in self.runs:
             raise Refusal(
@@ -220,7 +214,7 @@ class Worker:
         return self.runs[name]
 
     def cancel(self, name: str) -> None:
-        """Stop a run at its next decision."""
+        """Stop a run at the next decision."""
         run = self.run(name)
         with self._wake:
             run.stop.set()
@@ -229,25 +223,25 @@ class Worker:
                 self._end(run, "failed", message=run.stop_reason, cancelled=True)
 
     def drop(self, name: str) -> None:
-        """Cancel a run and forget it."""
+        """Cancel and forget a run."""
         self.cancel(name)
         self.runs.pop(name, None)
 
     def _new_run(self, name: str, body: RunBody, variants: tuple[Variant, ...]) -> Run:
         simulated = []
         for variant in variants:
-            simulated.append(self._known.setdefault(variant, Simulated()))
-            self._known.move_to_end(variant)
+            simulated.append(self._simulated.setdefault(variant, Simulated()))
+            self._simulated.move_to_end(variant)
         # The first chunk of every variant, then the rest; goal-free rollouts only matter for the score, so they end.
-        chunks = [(v, ids) for ids in chunks_of(body.num_rollouts) for v in range(len(variants))]
+        chunks = [(v, ids) for ids in split_rollouts(body.num_rollouts) for v in range(len(variants))]
         chunks.sort(key=lambda chunk: free_variant(variants, chunk[0]) == chunk[0] and has_goals(variants, chunk[0]))
         return Run(name, body, variants, tuple(simulated), chunks)
 
     def _work(self) -> None:
         while True:
             with self._wake:
-                self._wake.wait_for(lambda: self._waiting is not None or self._is_closed)
-                if self._is_closed:
+                self._wake.wait_for(lambda: self._waiting is not None or self.is_closed)
+                if self.is_closed:
                     return
                 run, self._waiting = self._waiting, None
                 assert run is not None
@@ -274,21 +268,21 @@ class Worker:
         run.is_over = True
 
     def _forget_oldest(self) -> None:
-        while sum(s.num_bytes for s in self._known.values()) > KEPT_BYTES and len(self._known) > 1:
-            _, dropped = self._known.popitem(last=False)
+        while sum(s.num_bytes for s in self._simulated.values()) > KEPT_BYTES and len(self._simulated) > 1:
+            _, dropped = self._simulated.popitem(last=False)
             for name in [name for name, run in self.runs.items() if dropped in run.simulated]:
                 del self.runs[name]
 
     def _simulate(self, run: Run) -> None:
-        """Simulate what is missing, chunk by chunk, and score each variant when it is complete."""
+        """Simulate missing chunks in order, and score each variant when complete."""
         scenario = self.session.scenario(run.body.split, run.body.scenario)
         for k, (v, ids) in enumerate(run.chunks):
             simulated = run.simulated[v]
             if ids not in simulated.encoded:
-                batch = collate([scenario]).to(device_of(self.session.model(run.variants[v].model).policy))
+                batch = collate([scenario]).to(get_device(self.session.model(run.variants[v].model).policy))
                 rollouts = self._rollouts(run, k, batch)
                 poses = torch.cat([rollouts.position, rollouts.heading[..., None]], -1)
-                simulated.parts[ids] = rollouts
+                simulated.chunks[ids] = rollouts
                 simulated.encoded[ids] = encode_batch(poses, batch)
                 run.growing.pop(k, None)
             run.tell("chunk", k=k, variant=v, first=ids.start, count=len(ids), steps=FUTURE_STEPS)
@@ -336,10 +330,12 @@ class Worker:
             simulated.scored[key] = score_variant(scenario, run.rollouts(v), run.variants[v].goals, body.metric)
         # The change of realism is known once the model's rollouts without goals are there, too; they come last.
         free = free_variant(run.variants, v)
-        again = [i for i in range(len(run.variants)) if free == v and i != v and free_variant(run.variants, i) == v]
-        for one in (v, *again):
-            base = run.simulated[free].scored.get(key) if one != free else None
-            run.tell("score", variant=one, **run.simulated[one].scored[key].to_payload(base))
+        with_goals = [
+            i for i in range(len(run.variants)) if free == v and i != v and free_variant(run.variants, i) == v
+        ]
+        for variant in (v, *with_goals):
+            base = run.simulated[free].scored.get(key) if variant != free else None
+            run.tell("score", variant=variant, **run.simulated[variant].scored[key].to_payload(base))
 
 
 @torch.no_grad()
@@ -348,5 +344,5 @@ def _encode(policy: Any, batch: ScenarioBatch) -> Any:
 
 
 def as_json(event: tuple[str, dict[str, Any]]) -> str:
-    """Data of an event as one line."""
+    """Data of an event as a line of JSON."""
     return json.dumps(event[1], separators=(",", ":"), allow_nan=False)

@@ -1,4 +1,4 @@
-"""Score, outcome of goals and events of one variant's rollouts, as the page shows them."""
+"""Score, outcome of goals and events of a variant's rollouts, in the layout of the page."""
 
 import math
 from dataclasses import dataclass
@@ -18,26 +18,26 @@ from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.types import Scenario
 
-EVENT_KINDS = ("collision", "offroad", "light")
+EVENT_NAMES = ("collision", "offroad", "light")
 """Names of `BERNOULLI_FEATURES` on the page."""
-assert len(EVENT_KINDS) == len(BERNOULLI_FEATURES)
+assert len(EVENT_NAMES) == len(BERNOULLI_FEATURES)
 
 
 @dataclass(frozen=True, eq=False)
 class Scored:
-    """Everything that is known of a variant once its rollouts are complete."""
+    """Score, outcomes and explanation of a variant with complete rollouts."""
 
     num_rollouts: int
     outcomes: tuple[tuple[GoalEntry, Outcome], ...]
     explanation: Explanation | None
     reason: str = ""
-    """Why there is no score; empty where there is one."""
+    """Reason for a missing score; empty with a score."""
 
     def to_payload(self, free: "Scored | None" = None) -> dict[str, Any]:
         """Plain numbers for the page.
 
         Args:
-            free: the same model on the same seeds without goals, for the change of realism.
+            free: Scores of the same model on the same seeds without goals, for the change of realism.
         """
         return {
             "num_rollouts": self.num_rollouts,
@@ -55,25 +55,30 @@ class Scored:
             "reason": self.reason,
             "score": None if self.explanation is None else self._score,
             "events": [] if self.explanation is None else self._events,
-            "change": None if free is None else change_of(self, free),
+            "change": None if free is None else compute_change(self, free),
         }
 
     @cached_property
     def _score(self) -> dict[str, Any]:
-        found = self.explanation
-        assert found is not None
-        (official,), (ceiling,) = found.result.to_official_fields(), found.ceiling.to_official_fields()
-        lost = found.cost.sum((1, 2))  # [F]
+        explanation = self.explanation
+        assert explanation is not None
+        result, top_result = explanation.result, explanation.ceiling
+        (official,), (ceiling,) = result.to_official_fields(), top_result.to_official_fields()
+        features = zip(
+            FEATURE_NAMES,
+            explanation.config.weights,
+            result.likelihoods,
+            top_result.likelihoods,
+            explanation.cost.sum((1, 2)),
+        )
         return {
-            "metric": found.config.name,
+            "metric": explanation.config.name,
             "official": _plain(official),
             "ceiling": _plain(ceiling),
-            "lost": found.lost,
+            "lost": explanation.lost,
             "features": [
-                {"name": name, "weight": weight, "value": _number(value), "ceiling": _number(top), "lost": float(part)}
-                for name, weight, value, top, part in zip(
-                    FEATURE_NAMES, found.config.weights, found.result.likelihoods, found.ceiling.likelihoods, lost
-                )
+                {"name": name, "weight": weight, "value": _number(value), "ceiling": _number(top), "lost": float(cost)}
+                for name, weight, value, top, cost in features
             ],
         }
 
@@ -86,19 +91,19 @@ class Scored:
         edges = np.diff(self.explanation.events.astype(np.int8), axis=-1, prepend=0, append=0)  # [J, N, E, T + 1]
         # Rows of both are in the same order, so that starts and stops of one event stand side by side.
         starts, stops = np.argwhere(edges == 1).tolist(), np.argwhere(edges == -1).tolist()
-        return [[EVENT_KINDS[j], n, ids[e], start, stop[3]] for (j, n, e, start), stop in zip(starts, stops)]
+        return [[EVENT_NAMES[j], n, ids[e], start, stop[3]] for (j, n, e, start), stop in zip(starts, stops)]
 
     def explained(self) -> dict[str, Any]:
         """Costs by feature, agent and step for the page."""
         if self.explanation is None:
             return {"reason": self.reason}
-        found, tracks = self.explanation, self.explanation.scenario.tracks
+        scenario = self.explanation.scenario
         return {
             "reason": "",
             "features": list(FEATURE_NAMES),
-            "agents": tracks.object_id[found.scenario.evaluated_indices].tolist(),
-            "names": found.agent_names,
-            "cost": np.round(found.cost, 6).tolist(),
+            "agents": scenario.tracks.object_id[scenario.evaluated_indices].tolist(),
+            "names": self.explanation.agent_names,
+            "cost": np.round(self.explanation.cost, 6).tolist(),
         }
 
 
@@ -106,10 +111,10 @@ def score_variant(scenario: Scenario, rollouts: Rollouts, goals: tuple[GoalEntry
     """Score and outcomes of all rollouts of a scenario, from the numbers that `rlftsim simulate` writes.
 
     Args:
-        scenario: that was simulated.
-        rollouts: of this scenario alone, on the CPU.
-        goals: of its agents.
-        metric: year.
+        scenario: Scenario that was simulated, with its logged future where there is one.
+        rollouts: Rollouts of this scenario alone (B = 1), on the CPU.
+        goals: Goals of the scenario's agents, to be measured.
+        metric: Year of the meta-metric, "2025" or "2024".
     """
     (states,) = states_of_rollouts(collate([scenario]), rollouts)
     return score_states(scenario, states, goals, metric)
@@ -119,10 +124,10 @@ def score_states(scenario: Scenario, states: SimulatedStates, goals: tuple[GoalE
     """Score and outcomes of simulated states.
 
     Args:
-        scenario: that was simulated.
-        states: world frame.
-        goals: of its agents.
-        metric: year.
+        scenario: Scenario that was simulated; without a logged future there is a reason in place of a score.
+        states: Simulated states [N, A, 80] of the scenario in the world frame.
+        goals: Goals of the scenario's agents, to be measured.
+        metric: Year of the meta-metric, "2025" or "2024".
     """
     outcomes = tuple((goal, measure_outcome(states.simulated_path(goal.agent_id), (goal.x, goal.y))) for goal in goals)
     explanation, reason = None, ""
@@ -136,12 +141,12 @@ def score_states(scenario: Scenario, states: SimulatedStates, goals: tuple[GoalE
     return Scored(states.num_rollouts, outcomes, explanation, reason)
 
 
-def change_of(scored: Scored, free: Scored) -> dict[str, float] | None:
+def compute_change(scored: Scored, free: Scored) -> dict[str, float] | None:
     """Change of the meta-metric by goals with its standard error, by the jackknife over pairs of rollouts.
 
     Args:
-        scored: with goals.
-        free: without, on the same seeds, so that rollouts are pairs.
+        scored: Scores of a variant with goals.
+        free: Scores of the same model without goals, on the same seeds, so that rollouts are pairs.
 
     Returns:
         None without a score.
@@ -151,19 +156,19 @@ def change_of(scored: Scored, free: Scored) -> dict[str, float] | None:
 
     if scored.explanation is None or free.explanation is None:
         return None
-    own, other = scored.explanation.result, free.explanation.result
-    mean = float(own.meta_metric - other.meta_metric)
+    result, free_result = scored.explanation.result, free.explanation.result
+    mean = float(result.meta_metric - free_result.meta_metric)
     count = scored.num_rollouts
     if count < 2:
         return {"mean": mean, "margin": 0.0}
-    without_each = (own.leave_one_out_meta_metric - other.leave_one_out_meta_metric).double()  # [N]
-    variance = (count - 1) / count * (without_each - without_each.mean()).square().sum()
+    changes = (result.leave_one_out_meta_metric - free_result.leave_one_out_meta_metric).double()  # [N]
+    variance = (count - 1) / count * (changes - changes.mean()).square().sum()
     low, high = interval_around(mean, math.sqrt(float(variance)), count).interval
     return {"mean": mean, "margin": (high - low) / 2}
 
 
 def _plain(fields: dict[str, Any]) -> dict[str, Any]:
-    """Official fields with None for what is not a number."""
+    """Official fields with None for values that are not finite."""
     return {
         name: _plain(value) if isinstance(value, dict) else value if isinstance(value, str) else _number(value)
         for name, value in fields.items()

@@ -1,4 +1,4 @@
-"""Routes of the studio. Everything goes through `guard.Guard` first."""
+"""Routes of the studio, behind `guard.Guard`."""
 
 import asyncio
 import hashlib
@@ -22,7 +22,7 @@ from rlftsim.studio.imported import encode_imported, score_imported
 from rlftsim.studio.refusal import Refusal
 from rlftsim.studio.runs import Run, Worker, as_json
 from rlftsim.studio.session import Session
-from rlftsim.studio.variants import entries_of
+from rlftsim.studio.variants import to_goal_entries
 
 POLL_S = 0.05
 IDLE_S = 60.0
@@ -37,14 +37,15 @@ SHARED = ("drawing.js", "palette.css")
 @cache
 def static_files() -> dict[str, bytes]:
     """Files of the page by name."""
-    own = resources.files("rlftsim.studio") / "static"
-    found = {one.name: one.read_bytes() for one in own.iterdir() if one.is_file()}
-    return found | {name: (resources.files("rlftsim.viewer") / name).read_bytes() for name in SHARED}
+    folder = resources.files("rlftsim.studio") / "static"
+    files = [file for file in folder.iterdir() if file.is_file()]
+    files += [resources.files("rlftsim.viewer") / name for name in SHARED]
+    return {file.name: file.read_bytes() for file in files}
 
 
 @cache
 def static_hash() -> str:
-    """Hash of the page's files: part of their addresses, so that a browser may keep them for ever."""
+    """Hash of the page's files: part of all addresses, so that a browser may keep the files for ever."""
     digest = hashlib.sha256()
     for name, content in sorted(static_files().items()):
         digest.update(name.encode() + content)
@@ -55,9 +56,9 @@ def create_app(session: Session, worker: Worker, access: Access) -> ASGIApp:
     """The server as an ASGI application.
 
     Args:
-        session: data and models.
-        worker: simulates.
-        access: hosts and token.
+        session: Session with data, models and folder of exports.
+        worker: Thread that simulates the runs; the caller closes the worker.
+        access: Hosts and token that requests have to show.
     """
     app = FastAPI(title="rlftsim studio", docs_url=None, redoc_url=None, openapi_url=None)
     app.add_exception_handler(RlftsimError, _answer_error)
@@ -80,7 +81,7 @@ def _add_page(app: FastAPI) -> None:
 
     @app.get("/static/{version}/{name}")
     def _static(version: str, name: str) -> Response:
-        """A module or style sheet; names are looked up, so none can lead out of the folder."""
+        """A module or style sheet; names are looked up, so no name can lead out of the folder."""
         ending = name.rpartition(".")[2]
         if version != static_hash() or name not in static_files() or ending not in MEDIA_TYPES:
             raise Refusal(f"no file {name!r} on this page.", status=404, hint="Reload the page.")
@@ -130,13 +131,13 @@ def _add_scenarios(app: FastAPI, session: Session) -> None:
     @app.post("/api/goals/check")
     def _check(body: CheckBody) -> dict[str, Any]:
         """Refusals and doubts of goals."""
-        return {"goals": session.doubts(session.scenario(body.split, body.scenario), entries_of(body))}
+        return {"goals": session.doubts(session.scenario(body.split, body.scenario), to_goal_entries(body))}
 
     @app.post("/api/goals/open")
     def _open_goals(body: OpenGoalsBody) -> dict[str, Any]:
         """Entries of a goals file."""
         file = parse_goals(body.text, body.name)
-        return {"goals": _plain(file.goals), "alternatives": _plain(file.alternatives)}
+        return {"goals": _to_payload(file.goals), "alternatives": _to_payload(file.alternatives)}
 
 
 def _add_runs(app: FastAPI, worker: Worker) -> None:
@@ -145,18 +146,18 @@ def _add_runs(app: FastAPI, worker: Worker) -> None:
     @app.post("/api/runs")
     def _submit(body: RunBody) -> dict[str, Any]:
         """Queue a run."""
-        return _described(worker.submit(body))
+        return _describe_run(worker.submit(body))
 
     @app.get("/api/runs/{name}")
     def _state(name: str, after: Annotated[int, Query(ge=-1)] = -1) -> dict[str, Any]:
         """Events of a run after a number, for pages behind a proxy that holds streams back."""
         run = worker.run(name)
         events = [{"id": i, "event": e, "data": d} for i, (e, d) in enumerate(run.events) if i > after]
-        return {**_described(run), "events": events}
+        return {**_describe_run(run), "events": events}
 
     @app.get("/api/runs/{name}/events")
     async def _events(name: str, request: Request) -> Response:
-        """Events of a run as they come."""
+        """Events of a run as a stream."""
         nonlocal streams
         run = worker.run(name)
         last = request.headers.get("last-event-id", "")
@@ -185,8 +186,8 @@ def _add_runs(app: FastAPI, worker: Worker) -> None:
     @app.get("/api/runs/{name}/score")
     def _score(name: str) -> dict[str, Any]:
         """Scores of the variants that are complete."""
-        found = {data["variant"]: data for event, data in list(worker.run(name).events) if event == "score"}
-        return {"variants": [found[v] for v in sorted(found)]}
+        scores = {data["variant"]: data for event, data in list(worker.run(name).events) if event == "score"}
+        return {"variants": [scores[v] for v in sorted(scores)]}
 
     @app.get("/api/runs/{name}/explain")
     def _explain(name: str, variant: Annotated[int, Query(ge=0)] = 0) -> dict[str, Any]:
@@ -195,13 +196,13 @@ def _add_runs(app: FastAPI, worker: Worker) -> None:
 
     @app.post("/api/runs/{name}/cancel")
     def _cancel(name: str, body: EmptyBody) -> dict[str, Any]:
-        """Stop a run at its next decision."""
+        """Stop a run at the next decision."""
         worker.cancel(name)
         return {"run": name}
 
     @app.delete("/api/runs/{name}")
     def _drop(name: str) -> dict[str, Any]:
-        """Stop a run and forget it."""
+        """Stop and forget a run."""
         worker.drop(name)
         return {"run": name}
 
@@ -219,7 +220,7 @@ def _add_files(app: FastAPI, session: Session, worker: Worker) -> None:
 
 
 async def _stream(run: Run, first: int, worker: Worker) -> AsyncIterator[str]:
-    """Events of a run from number `first` on; ends with the run, with the studio, or after a minute without any."""
+    """Events of a run from number `first` on; ends with the run, with the studio, or after a minute without events."""
     sent, idle_s = first, 0.0
     while idle_s < IDLE_S and not worker.is_closed:
         events = run.events[sent:]
@@ -231,12 +232,12 @@ async def _stream(run: Run, first: int, worker: Worker) -> AsyncIterator[str]:
         await asyncio.sleep(POLL_S)
 
 
-def _described(run: Run) -> dict[str, Any]:
+def _describe_run(run: Run) -> dict[str, Any]:
     variants = [{"model": v.model, "goals": len(v.goals), "guidance": v.guidance} for v in run.variants]
     return {"run": run.name, "variants": variants, "num_rollouts": run.body.num_rollouts, "is_over": run.is_over}
 
 
-def _plain(entries: tuple[GoalEntry, ...]) -> list[dict[str, Any]]:
+def _to_payload(entries: tuple[GoalEntry, ...]) -> list[dict[str, Any]]:
     return [{"scenario": e.scenario_id, "agent": e.agent_id, "x": e.x, "y": e.y, "label": e.label} for e in entries]
 
 
@@ -248,8 +249,8 @@ async def _answer_error(_: Request, error: Exception) -> Response:
 async def _answer_invalid(_: Request, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError)
     first = error.errors()[0]
-    place = ".".join(str(part) for part in first["loc"] if part not in ("body", "query"))
-    return JSONResponse({"error": f"{place or 'body'}: {first['msg']}", "hint": ""}, 422)
+    location = ".".join(str(step) for step in first["loc"] if step not in ("body", "query"))
+    return JSONResponse({"error": f"{location or 'body'}: {first['msg']}", "hint": ""}, 422)
 
 
 async def _answer_http(_: Request, error: Exception) -> Response:

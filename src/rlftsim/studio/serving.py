@@ -37,8 +37,8 @@ class _Server(uvicorn.Server):
         """Take a signal.
 
         Args:
-            sig: its number.
-            frame: where it came.
+            sig: Number of the signal; 2 is Ctrl-C.
+            frame: Frame that the signal interrupted; not read.
         """
         self._worker.stop()
         # Requests that are cut off by the end are no errors.
@@ -50,15 +50,15 @@ class Studio:
     """A server on this machine, from `start` or `run` until `stop`.
 
     Args:
-        session: data and models.
-        host: address to listen on.
-        port: 0 = a free one.
-        token: of an earlier start, so that an open page goes on; None = a new one.
-        trusted_hosts: further values of the Host header.
-        frame_ancestors: origins that may show the page in a frame.
+        session: Session with data, models and folder of exports.
+        host: Address to listen on; "0.0.0.0" listens on all interfaces.
+        port: Port to listen on; 0 takes a free port.
+        token: Token of an earlier start, so that an open page goes on; None makes a new token.
+        trusted_hosts: Further values of the Host header that are answered, such as a proxy's.
+        frame_ancestors: Origins that may show the page in a frame, such as notebooks.
 
     Raises:
-        ConfigError: the port cannot be had.
+        ConfigError: The port is taken, forbidden or out of range.
     """
 
     def __init__(
@@ -75,9 +75,12 @@ class Studio:
         self.port = int(self._socket.getsockname()[1])
         # Another interface is reached under the name that was given for it; in addresses IPv6 stands in brackets.
         self._name = LOOPBACK if host in ALL_INTERFACES else f"[{host}]" if ":" in host else host
-        own = () if self._name in LOCAL_NAMES else (f"{self._name}:{self.port}",)
+        extra_hosts = () if self._name in LOCAL_NAMES else (f"{self._name}:{self.port}",)
         self.access = Access(
-            self.port, token or new_token(), trusted_hosts=(*trusted_hosts, *own), frame_ancestors=frame_ancestors
+            self.port,
+            token or new_token(),
+            trusted_hosts=(*trusted_hosts, *extra_hosts),
+            frame_ancestors=frame_ancestors,
         )
         self._worker = Worker(session)
         app = create_app(session, self._worker, self.access)
@@ -99,7 +102,7 @@ class Studio:
             self._worker.close()
 
     def start(self) -> None:
-        """Serve in a thread of its own; returns when the server answers."""
+        """Serve in a separate thread; returns when the server answers."""
         self._thread = threading.Thread(
             target=self._server.run, kwargs={"sockets": [self._socket]}, name="studio server", daemon=True
         )
@@ -119,16 +122,16 @@ class Studio:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+        self, error_type: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         self.stop()
 
 
-def token_of(path: Path) -> str:
-    """Token of a file, which is made where it is missing, readable by its owner only.
+def load_token(path: Path) -> str:
+    """Token of a file; a missing file is made, readable by the owner only.
 
     Raises:
-        ConfigError: the file holds something else, or others may read it.
+        ConfigError: The file has no token, or is readable by further users.
     """
     if not path.exists():
         with errors_name(path):
@@ -142,12 +145,12 @@ def token_of(path: Path) -> str:
 
 
 def announce(studio: Studio, *, as_json: bool, open_browser: bool) -> None:
-    """Print the address on one line, and open it.
+    """Print the address on a line, and open the page.
 
     Args:
-        studio: that is about to serve: its port listens already.
-        as_json: True = a line of JSON.
-        open_browser: True = in the user's browser.
+        studio: Studio that is about to serve; the port listens already.
+        as_json: True prints a line of JSON with address and port.
+        open_browser: True opens the page in the user's browser.
     """
     line = json.dumps({"url": studio.url, "port": studio.port}) if as_json else studio.url
     print(line, flush=True)
@@ -169,8 +172,6 @@ def _bind(host: str, port: int) -> socket.socket:
     except OSError as error:
         bound.close()
         # A taken or forbidden port; everything else is the host's fault, as a name that stands for no address.
-        way_out = (
-            "choose another --port, or 0 for a free one" if error.errno in PORT_ERRORS else "choose another --host"
-        )
-        raise ConfigError(f"cannot listen on {host}:{port} ({error.strerror or error}): {way_out}.") from None
+        advice = "choose another --port, or 0 for a free one" if error.errno in PORT_ERRORS else "choose another --host"
+        raise ConfigError(f"cannot listen on {host}:{port} ({error.strerror or error}): {advice}.") from None
     return bound

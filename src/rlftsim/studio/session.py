@@ -1,4 +1,4 @@
-"""Data and models of one start of the studio, and everything about a scenario that no rollout is needed for."""
+"""Data and models of a start of the studio, and all facts about a scenario that need no rollout."""
 
 import json
 import re
@@ -13,7 +13,7 @@ import numpy as np
 
 import rlftsim
 from rlftsim.errors import ConfigError, DataError
-from rlftsim.experiments.goal_proposals import entry_of, label_of, propose
+from rlftsim.experiments.goal_proposals import format_label, propose, to_goal_entry
 from rlftsim.goals.goals_file import GoalEntry
 from rlftsim.goals.maneuvers.proposals import no_proposal_reason
 from rlftsim.goals.placement import goal_warnings
@@ -22,7 +22,7 @@ from rlftsim.jobs.folder import check_folder
 from rlftsim.policies.registry import Device, load_policy, with_guidance
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.rollout.policy import Policy, is_goal_conditioned
-from rlftsim.scenario.open import open_dataset, splits_of
+from rlftsim.scenario.open import list_splits, open_dataset
 from rlftsim.scenario.types import CURRENT_STEP, Scenario
 from rlftsim.studio.imported import Imported, import_rollouts
 from rlftsim.studio.refusal import Refusal
@@ -43,6 +43,8 @@ FIELDS = {
     "source": "source",
 }
 """Words of a query -> columns of the index; `num_agents` is a sum of three of them."""
+MODEL_FIELDS = ("name", "source", "fingerprint", "takes_goals", "can_guide", "note")
+"""Fields of `Model` that the page gets."""
 _TERM = re.compile(r"^(\w+)(<=|>=|!=|=|<|>)(.+)$")
 _COMPARE: dict[str, Callable[[Any, Any], bool]] = {
     "=": lambda a, b: a == b,
@@ -65,15 +67,15 @@ class Model:
     fingerprint: str
     takes_goals: bool
     note: str
-    """Reason for controls that are switched off; empty where none is."""
+    """Reason for controls that are switched off; empty where all work."""
     can_guide: bool
 
 
 class Recent:
-    """Values by key, the most recently used ones; safe in threads.
+    """The most recently used values by key; safe in threads.
 
     Args:
-        size: number of values kept.
+        size: Number of values to keep; the least recently used values go first.
     """
 
     def __init__(self, size: int) -> None:
@@ -82,11 +84,11 @@ class Recent:
         self._values: OrderedDict[Hashable, Any] = OrderedDict()
 
     def get(self, key: Hashable, compute: Callable[[], Any]) -> Any:
-        """Value of a key, computed where it is not there yet.
+        """Value of a key; a missing value is computed.
 
         Args:
-            key: of the value.
-            compute: called without arguments.
+            key: Hashable key, such as (split, scenario id).
+            compute: Function without arguments that makes the value; two threads may both compute a missing value.
         """
         with self._lock:
             if key in self._values:
@@ -101,18 +103,18 @@ class Recent:
 
 
 class Session:
-    """One data set and some models.
+    """Data set, models and imported rollouts of the studio.
 
     Args:
-        data: folder of a data set, or "synthetic".
-        models: names for `load_policy`; folders are read only here, no request can name another one.
-        split: shown first; None = "validation" where there is one.
-        out: folder of everything that is saved.
-        device: of the models.
-        rollouts: files and folders of rollouts, for panels of their own.
+        data: Folder of a data set, or "synthetic" for the embedded data set.
+        models: Names for `load_policy`; folders are read only here, no request can name a further folder.
+        split: Split that the page shows first; None = "validation", if the data set has that split.
+        out: Folder of all files that the page saves.
+        device: Device that the models simulate on.
+        rollouts: Files and folders of rollouts; each gets a separate panel.
 
     Raises:
-        RlftsimError: no such data set, split or model, or no rollouts.
+        RlftsimError: No such data set, split or model, or no rollouts.
     """
 
     def __init__(
@@ -125,7 +127,7 @@ class Session:
         rollouts: tuple[str, ...] = (),
     ) -> None:
         self.data = data
-        self.splits = splits_of(data)
+        self.splits = list_splits(data)
         self.split = split or ("validation" if "validation" in self.splits else self.splits[0])
         self._datasets = {name: open_dataset(data, name) for name in dict.fromkeys((self.split, *self.splits))}
         check_folder(out, "results")
@@ -138,7 +140,7 @@ class Session:
         """Encoded scenarios by (model, split, scenario)."""
 
     def describe(self) -> dict[str, Any]:
-        """Everything that the page has to know before it shows a scenario."""
+        """Versions, models and data: facts for the page before a scenario is shown."""
         counts = {name: len(dataset) for name, dataset in self._datasets.items()}
         return {
             "version": rlftsim.__version__,
@@ -148,29 +150,19 @@ class Session:
             "license": next(iter(self._datasets.values())).manifest.license_note,
             "out": str(self.out),
             "fields": list(FIELDS),
-            "models": [
-                {
-                    "name": model.name,
-                    "source": model.source,
-                    "fingerprint": model.fingerprint,
-                    "takes_goals": model.takes_goals,
-                    "can_guide": model.can_guide,
-                    "note": model.note,
-                }
-                for model in self.models.values()
-            ],
-            "imported": [{"name": one.name, "scenarios": len(one.entries)} for one in self._imported.values()],
+            "models": [{name: getattr(model, name) for name in MODEL_FIELDS} for model in self.models.values()],
+            "imported": [{"name": name, "scenarios": len(i.entries)} for name, i in self._imported.items()],
         }
 
     def scenario(self, split: str, scenario_id: str) -> Scenario:
-        """A scenario.
+        """Scenario of a split by id.
 
         Args:
-            split: its split.
-            scenario_id: its id.
+            split: Name of a split of the data set, such as "validation".
+            scenario_id: Id of a scenario in the split.
 
         Raises:
-            Refusal: there is no such scenario (404).
+            Refusal: No such scenario (404).
         """
         if split not in self._datasets or scenario_id not in self._datasets[split]:
             raise Refusal(
@@ -181,21 +173,20 @@ class Session:
         return self._datasets[split].by_id(scenario_id)
 
     def model(self, name: str) -> Model:
-        """A model by its name.
+        """Model by name.
 
         Raises:
-            Refusal: it was not given on the command line (404).
+            Refusal: The studio was started without this model (404).
         """
         if name not in self.models:
-            known = ", ".join(self.models)
-            raise Refusal(f"no model {name!r}: this studio was started with {known}.", status=404)
+            raise Refusal(f"no model {name!r}: this studio was started with {', '.join(self.models)}.", status=404)
         return self.models[name]
 
     def imported(self, name: str) -> Imported:
-        """Rollouts of files by their name.
+        """Rollouts of files by name.
 
         Raises:
-            Refusal: they were not given on the command line (404).
+            Refusal: The studio was started without these rollouts (404).
         """
         if name not in self._imported:
             raise Refusal(f"no rollouts {name!r}: this studio was started without them.", status=404)
@@ -205,12 +196,12 @@ class Session:
         """A page of the index.
 
         Args:
-            split: of the data set.
-            query: words with spaces between them, all of which must hold: "ego_turn=left n_ped>3", or a part of an id.
-            offset: first row of the page, counted among those that the query leaves.
+            split: Split of the data set, such as "validation".
+            query: Words with spaces between, all of which must hold: "ego_turn=left n_ped>3", or a piece of an id.
+            offset: First row of the page, counted among the rows that match the query.
 
         Raises:
-            Refusal: no such split, or a word that names no column.
+            Refusal: No such split, or a word that names no column.
         """
         if split not in self._datasets:
             raise Refusal(f"no split {split!r} in {self.data}, only {', '.join(self.splits)}.", status=404)
@@ -220,69 +211,70 @@ class Session:
             index = dataset.index.select(columns).append_column("num_agents", [dataset.num_agents])
             rows = index.to_pylist()
             self._rows[split] = rows  # complete: another request may read them at once
-        tests = [_test_of(term) for term in query.split()]
-        found = [row for row in self._rows[split] if all(test(row) for test in tests)]
-        page = found[offset : offset + ROWS_PER_PAGE]
-        return {"total": len(found), "offset": offset, "rows": page}
+        tests = [_parse_term(term) for term in query.split()]
+        matches = [row for row in self._rows[split] if all(test(row) for test in tests)]
+        return {"total": len(matches), "offset": offset, "rows": matches[offset : offset + ROWS_PER_PAGE]}
 
     def scene(self, split: str, scenario_id: str) -> bytes:
-        """JSON of the still scene and the logged motion.
+        """JSON of the still scene and the logged motion of a scenario.
 
         Args:
-            split: of the scenario.
-            scenario_id: its id.
+            split: Name of a split of the data set, such as "validation".
+            scenario_id: Id of a scenario in the split.
 
         Raises:
-            Refusal: there is no such scenario.
+            Refusal: No such scenario (404).
         """
         scenario = self.scenario(split, scenario_id)
-        return self._scenes.get((split, scenario_id), lambda: _scene_json(scenario))
+        return self._scenes.get((split, scenario_id), lambda: _encode_scene(scenario))
 
     def proposals(self, split: str, scenario_id: str, agent: int) -> dict[str, Any]:
-        """Maneuvers that an agent can do, with their ways and goals.
+        """Maneuvers that an agent can do, with paths and goals.
 
         Args:
-            split: of the scenario.
-            scenario_id: its id.
-            agent: object id.
+            split: Name of a split of the data set, such as "validation".
+            scenario_id: Id of a scenario in the split.
+            agent: Object id of a simulated agent.
 
         Raises:
-            Refusal: there is no such scenario.
-            DataError: no such agent.
+            Refusal: No such scenario (404).
+            DataError: No such agent.
         """
         scenario = self.scenario(split, scenario_id)
         track = simulated_track(scenario, agent, "proposals")
-        return self._proposals.get((split, scenario_id, agent), lambda: _proposals_of(scenario, track))
+        return self._proposals.get((split, scenario_id, agent), lambda: _describe_proposals(scenario, track))
 
     def doubts(self, scenario: Scenario, goals: tuple[GoalEntry, ...]) -> list[dict[str, Any]]:
         """Refusal or doubts of each goal, in the words of `rlftsim goals check`.
 
         Args:
-            scenario: of the goals.
-            goals: to be checked.
+            scenario: Scenario that the goals are placed in.
+            goals: Goals to check, in the order of the answer.
         """
-        found = []
+        answers = []
         for entry in goals:
+            refusal, doubts = "", []
             try:
-                found.append({"agent": entry.agent_id, "refused": "", "doubts": list(goal_warnings(entry, scenario))})
+                doubts = list(goal_warnings(entry, scenario))
             except DataError as error:
-                found.append({"agent": entry.agent_id, "refused": str(error), "doubts": []})
-        return found
+                refusal = str(error)
+            answers.append({"agent": entry.agent_id, "refused": refusal, "doubts": doubts})
+        return answers
 
 
 def _load(names: tuple[str, ...], device: Device) -> list[Model]:
-    found: list[Model] = []
+    models: list[Model] = []
     for source in names:
         policy = load_policy(source, device)
         path = Path(source)
         # A run's model lies in run/model: the run's name says more.
         name = path.resolve().parent.name if path.name == "model" else path.name or path.resolve().name
-        if any(model.name == name for model in found):
-            name = next(n for k in range(2, len(names) + 2) if all(m.name != (n := f"{name}-{k}") for m in found))
+        if any(model.name == name for model in models):
+            name = next(n for k in range(2, len(names) + 2) if all(m.name != (n := f"{name}-{k}") for m in models))
         takes_goals = is_goal_conditioned(policy)
         note = "" if takes_goals else f"{name} is not goal-conditioned: it was not trained to follow goals."
-        found.append(Model(name, source, policy, fingerprint_policy(policy), takes_goals, note, _can_guide(policy)))
-    return found
+        models.append(Model(name, source, policy, fingerprint_policy(policy), takes_goals, note, _can_guide(policy)))
+    return models
 
 
 def _can_guide(policy: Policy) -> bool:
@@ -293,12 +285,12 @@ def _can_guide(policy: Policy) -> bool:
     return True
 
 
-def _test_of(term: str) -> Callable[[dict[str, Any]], bool]:
+def _parse_term(term: str) -> Callable[[dict[str, Any]], bool]:
     """Test of a row for one word of a query."""
-    parts = _TERM.match(term)
-    if parts is None:
+    match = _TERM.match(term)
+    if match is None:
         return lambda row: term in row["scenario_id"] or term == row["ego_maneuver"]
-    word, sign, text = parts.groups()
+    word, sign, text = match.groups()
     if word not in FIELDS:
         raise Refusal(f"{term}: no column {word!r}.", hint=f"Columns are {', '.join(FIELDS)}.")
     column, compare = FIELDS[word], _COMPARE[sign]
@@ -311,10 +303,9 @@ def _test_of(term: str) -> Callable[[dict[str, Any]], bool]:
     return lambda row: compare(row[column], number)
 
 
-def _scene_json(scenario: Scenario) -> bytes:
+def _encode_scene(scenario: Scenario) -> bytes:
     scene, log = build_scene(scenario), logged_trajectories(scenario)
-    tracks, chosen = scenario.tracks, scenario.simulated_indices
-    speed = np.linalg.norm(tracks.velocity[chosen, CURRENT_STEP], axis=-1)
+    speed = np.linalg.norm(scenario.tracks.velocity[scenario.simulated_indices, CURRENT_STEP], axis=-1)
     payload = {
         "scene": scene.to_payload(),
         "log": log.with_overlaps(scene.agents).to_payload(),
@@ -326,23 +317,22 @@ def _scene_json(scenario: Scenario) -> bytes:
     return json.dumps(payload, separators=(",", ":"), allow_nan=False).encode()
 
 
-def _proposals_of(scenario: Scenario, track: int) -> dict[str, Any]:
+def _describe_proposals(scenario: Scenario, track: int) -> dict[str, Any]:
     proposals = propose(scenario, track)
     reason = "" if proposals else no_proposal_reason(scenario, track) or "no maneuver can be completed in time"
-    found = []
+    descriptions = []
     for proposal in proposals:
-        entry = entry_of(scenario, proposal)
-        way = np.round(proposal.path[:, :2] - scenario.origin, 2)
-        found.append(
+        entry = to_goal_entry(scenario, proposal)
+        descriptions.append(
             {
                 "maneuver": proposal.maneuver.value,
-                "label": label_of(proposal),
+                "label": format_label(proposal),
                 "logged": proposal.is_logged,
                 # As a goals file stores it, so that saved and simulated goals are the same.
                 "x": round(entry.x, 3),
                 "y": round(entry.y, 3),
-                "way": way.tolist(),
+                "way": np.round(proposal.path[:, :2] - scenario.origin, 2).tolist(),
                 "doubts": list(goal_warnings(entry, scenario)),
             }
         )
-    return {"agent": int(scenario.tracks.object_id[track]), "reason": reason, "proposals": found}
+    return {"agent": int(scenario.tracks.object_id[track]), "reason": reason, "proposals": descriptions}

@@ -1,4 +1,4 @@
-"""Variants of a run: each model with the goals, and goal-conditioned ones also without, on the same seeds."""
+"""Variants of a run: each model with the goals, and goal-conditioned models also without, on the same seeds."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from rlftsim.studio.session import Session
 
 @dataclass(frozen=True)
 class Variant:
-    """One model, with or without goals, under the settings of a run."""
+    """A model, with or without goals, under the settings of a run."""
 
     model: str
     fingerprint: str
@@ -27,24 +27,24 @@ class Variant:
     goals: tuple[GoalEntry, ...] = ()
 
     def goals_in(self, batch: ScenarioBatch) -> Goals | None:
-        """The goals in the frame of a batch of its scenario; None where it has none."""
+        """Goals in the frame of a batch of the scenario; None without goals."""
         return goals_of_batch(self.goals, batch) if self.goals else None
 
 
-def variants_of(session: Session, body: RunBody) -> Iterator[Variant]:
-    """Variants of a run: models with goals where they take any, and goal-conditioned ones also without.
+def build_variants(session: Session, body: RunBody) -> Iterator[Variant]:
+    """Variants of a run: goal-conditioned models with the goals and without, the remaining models without.
 
     Args:
-        session: data and models.
-        body: the request.
+        session: Session with the scenarios and models that the request names.
+        body: Request for a run: scenario, models, goals and sampling.
 
     Raises:
-        Refusal: an unknown scenario or model, or goals or guidance that would have no effect.
-        DataError: an impossible goal, or two goals of one agent.
+        Refusal: An unknown scenario or model, or goals or guidance that would have no effect.
+        DataError: An impossible goal, or two goals of the same agent.
     """
     scenario = session.scenario(body.split, body.scenario)
     models = [session.model(name) for name in dict.fromkeys(body.models)]
-    goals = entries_of(body)
+    goals = to_goal_entries(body)
     goals_of_batch(goals, collate([scenario]))  # refuses impossible ones
     if goals and not any(model.takes_goals for model in models):
         raise Refusal(
@@ -59,14 +59,11 @@ def variants_of(session: Session, body: RunBody) -> Iterator[Variant]:
         yield Variant(model.name, model.fingerprint, *settings)
 
 
-def entries_of(body: RunBody | CheckBody) -> tuple[GoalEntry, ...]:
-    """Goals of a request as entries of a goals file.
-
-    Args:
-        body: with a scenario and goals.
+def to_goal_entries(body: RunBody | CheckBody) -> tuple[GoalEntry, ...]:
+    """Goals of a request as entries of a goals file, in millimeters.
 
     Raises:
-        Refusal: an agent has two goals.
+        Refusal: An agent has two goals.
     """
     entries = tuple(GoalEntry(body.scenario, g.agent, round(g.x, 3), round(g.y, 3), g.label) for g in body.goals)
     agents = [entry.agent_id for entry in entries]
@@ -77,20 +74,21 @@ def entries_of(body: RunBody | CheckBody) -> tuple[GoalEntry, ...]:
 
 
 def free_variant(variants: tuple[Variant, ...], index: int) -> int:
-    """Index of the variant of the same model without goals; the variant's own where it has none.
+    """Index of the variant of the same model without goals, possibly `index`.
 
     Args:
-        variants: of a run.
-        index: of one of them.
+        variants: All variants of a run; each model has a variant without goals.
+        index: Index of a variant in the run.
     """
-    return next(i for i, other in enumerate(variants) if other.model == variants[index].model and not other.goals)
+    model = variants[index].model
+    return next(i for i, variant in enumerate(variants) if variant.model == model and not variant.goals)
 
 
 def has_goals(variants: tuple[Variant, ...], index: int) -> bool:
-    """True if the variant's model is also simulated with goals.
+    """True if the variant's model is simulated with goals, too.
 
     Args:
-        variants: of a run.
-        index: of one of them.
+        variants: All variants of a run.
+        index: Index of a variant in the run.
     """
-    return any(other.goals and other.model == variants[index].model for other in variants)
+    return any(variant.goals and variant.model == variants[index].model for variant in variants)

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from rlftsim.errors import DataError
-from rlftsim.jobs.files import errors_name, temporary_beside
+from rlftsim.jobs.files import errors_name, temporary_path
 
 LEVEL = 1
 """Of deflate. On rollouts 6 and 9 save less than 1 % and take twice as long."""
@@ -31,7 +31,7 @@ _CRC_POLYNOMIAL = 0xEDB88320
 
 
 @dataclass(frozen=True)
-class Piece:
+class PackedShard:
     """A deflated tar entry in a file of its own."""
 
     file: str
@@ -46,7 +46,7 @@ class Piece:
     """CRC-32 of the tar entry."""
 
 
-def write_piece(source: Path, name: str, destination: Path) -> Piece:
+def pack_shard(source: Path, name: str, destination: Path) -> PackedShard:
     """Deflate a file as a tar entry. The same contents and name give the same bytes.
 
     Args:
@@ -62,7 +62,7 @@ def write_piece(source: Path, name: str, destination: Path) -> Piece:
     header = entry.tobuf(tarfile.USTAR_FORMAT)
     padding = bytes(-entry.size % tarfile.BLOCKSIZE)
     deflate = zlib.compressobj(LEVEL, zlib.DEFLATED, -zlib.MAX_WBITS)
-    temporary = temporary_beside(destination)
+    temporary = temporary_path(destination)
     raw_size = raw_crc = size = piece_crc = 0
     try:
         with errors_name(destination), source.open("rb") as contents, temporary.open("wb") as out:
@@ -77,10 +77,10 @@ def write_piece(source: Path, name: str, destination: Path) -> Piece:
             temporary.replace(destination)
     finally:
         temporary.unlink(missing_ok=True)
-    return Piece(destination.name, size, piece_crc, raw_size, raw_crc)
+    return PackedShard(destination.name, size, piece_crc, raw_size, raw_crc)
 
 
-def join_pieces(archive: Path, folder: Path, pieces: Sequence[Piece], *, delete: bool) -> None:
+def join_shards(archive: Path, folder: Path, pieces: Sequence[PackedShard], *, delete: bool) -> None:
     """Write the archive of some pieces. Interrupted in any way, the same call goes on.
 
     Args:
@@ -102,7 +102,7 @@ def join_pieces(archive: Path, folder: Path, pieces: Sequence[Piece], *, delete:
         else:
             out.write(_GZIP_HEADER)
         for piece in pieces[num_joined:]:
-            _refuse_damaged(folder / piece.file, piece)
+            _check_archive(folder / piece.file, piece)
             with (folder / piece.file).open("rb") as file:
                 shutil.copyfileobj(file, out, _CHUNK)
             if delete:
@@ -123,7 +123,7 @@ def join_pieces(archive: Path, folder: Path, pieces: Sequence[Piece], *, delete:
         partial.replace(archive)
 
 
-def count_joined(archive: Path, folder: Path, pieces: Sequence[Piece | None]) -> int:
+def count_joined(archive: Path, folder: Path, pieces: Sequence[PackedShard | None]) -> int:
     """Leading pieces that are in the unfinished archive and were deleted; later ones may have been begun there.
 
     Args:
@@ -145,7 +145,7 @@ def _partial(archive: Path) -> Path:
     return archive.with_name(f".{archive.name}.partial")
 
 
-def _refuse_damaged(path: Path, piece: Piece) -> None:
+def _check_archive(path: Path, piece: PackedShard) -> None:
     """Compare a piece with its receipt before any of it is in the archive; a damaged one is removed."""
     crc = size = 0
     if path.exists():

@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 
-from rlftsim.errors import ConfigError, DataError, require_types
+from rlftsim.errors import ConfigError, DataError, check_types
 from rlftsim.evaluation.evaluate import check_jobs, simulate_states
 from rlftsim.evaluation.results import EvaluateConfig
 from rlftsim.jobs.documents import read_json
@@ -25,18 +25,18 @@ from rlftsim.jobs.files import (
     remove_folder,
     remove_temporaries,
     remove_temporaries_below,
-    temporary_beside,
+    temporary_path,
     write_text,
 )
-from rlftsim.jobs.folder import check_folder
-from rlftsim.jobs.lease import Lease, remove_locks
-from rlftsim.jobs.progress import log, progress_bar
-from rlftsim.jobs.runner import Runner, on_this_machine, require_finished
-from rlftsim.jobs.threads import one_thread
-from rlftsim.rollout.policy import Policy, device_of
+from rlftsim.jobs.folder import Lease, check_folder, remove_locks
+from rlftsim.jobs.items import ResultFormat, run_items
+from rlftsim.jobs.processes import Advance
+from rlftsim.jobs.progress import log
+from rlftsim.jobs.runner import Runner, choose_runner
+from rlftsim.rollout.policy import Policy, get_device
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.types import Scenario
-from rlftsim.submission.archive import Piece, count_joined, join_pieces, write_piece
+from rlftsim.submission.archive import PackedShard, count_joined, join_shards, pack_shard
 from rlftsim.submission.messages import decode_rollouts, encode_rollouts, encode_varint, round_states
 from rlftsim.submission.plan import GZIP_RATIO, PLAN, Plan
 from rlftsim.submission.scenario_checks import check_rollouts
@@ -58,7 +58,7 @@ class Job:
     round_m: float | None
     folder: Path
 
-    def piece_path(self, number: int) -> Path:
+    def shard_path(self, number: int) -> Path:
         """File of a finished shard."""
         return self.folder / _SHARDS / f"{number:05d}.part"
 
@@ -66,38 +66,62 @@ class Job:
         """Receipt of a finished shard."""
         return self.folder / _SHARDS / f"{number:05d}.json"
 
-    def receipt(self, number: int) -> Piece | None:
+    def receipt(self, number: int) -> PackedShard | None:
         """A finished shard; None if there is none. Its file may be in the archive already."""
         try:
-            piece = Piece(**read_json(self.receipt_path(number), "build again"))
-            require_types(piece)
+            shard = PackedShard(**read_json(self.receipt_path(number), "build again"))
+            check_types(shard)
         except (DataError, ConfigError, FileNotFoundError, TypeError):
             return None
-        return piece if piece.file == self.piece_path(number).name else None
+        return shard if shard.file == self.shard_path(number).name else None
+
+
+@dataclass(frozen=True)
+class _Receipts(ResultFormat[int, PackedShard]):
+    """Finished shards by number, as their receipts tell; the first ones may be in the unfinished archive alone."""
+
+    job: Job
+    num_joined: int
+
+    def read(self, item: int) -> PackedShard | None:
+        """The receipt of a shard, see `ResultFormat`."""
+        return self.job.receipt(item)
+
+    def is_finished(self, item: int) -> bool:
+        """True for a shard with receipt and file, or in the archive, see `ResultFormat`."""
+        return item < self.num_joined or (self.read(item) is not None and self.job.shard_path(item).exists())
+
+    def count_units(self, item: int) -> int:
+        """Number of scenarios, see `ResultFormat`."""
+        return len(self.job.plan.shards[item])
+
+    def describe(self, item: int) -> str:
+        """Name of the shard in the archive, see `ResultFormat`."""
+        return self.job.plan.shard_name(item)
 
 
 def build_archive(
     job: Job, *, runner: Runner | None = None, delete_parts: bool = False, show_progress: bool = True
 ) -> Path:
-    """Simulate what is missing and write the archive; returns its path. Interrupted in any way, the same call goes on.
+    """Simulate what is missing, write the archive and return its path. Interrupted in any way, the same call goes on.
 
     Args:
-        job: policy, data, plan and settings.
-        runner: does the work in place of the settings' processes, see `rlftsim.jobs.runner`.
-        delete_parts: remove each compressed shard as soon as it is in the archive. Halves the disk space.
-        show_progress: False = no progress bar.
+        job: Policy, data, plan and settings of the submission.
+        runner: Runner of the work in place of the settings' processes, see `rlftsim.jobs.runner`.
+        delete_parts: True removes each compressed shard as soon as it is in the archive, which halves the disk space.
+        show_progress: False prints neither progress nor the time left.
 
     Raises:
-        ConfigError: several processes for a policy on a GPU, or a folder with work on another plan.
-        DataError: rollouts that the server would refuse, a disk that is full, or another driver at work here.
-        SetAside: shards that killed their process again and again; all others are done.
+        ConfigError: Several processes for a policy on a GPU, or a folder with work on another plan.
+        DataError: Rollouts that the server would refuse, a disk that is full, or another driver at work here.
+        SetAside: Shards that killed their process again and again; all others are done.
         Unfinished: `runner` is a share, which is done, while others are not.
     """
     check_folder(job.folder, "submission")
-    check_jobs(job.config, device_of(job.policy))
+    check_jobs(job.config.jobs, get_device(job.policy))
     archive = job.folder / ARCHIVE
     numbers = range(len(job.plan.shards))
-    runner = runner or on_this_machine(job.config.jobs, len(numbers))
+    runner = runner or choose_runner(job.config.jobs, len(numbers))
     if archive.exists():
         if not (job.folder / PLAN).exists():
             raise DataError(f"{archive} is there without its {PLAN}: name another --out, or remove it.")
@@ -110,32 +134,27 @@ def build_archive(
         shards.mkdir(exist_ok=True)
         if lease.is_alone:
             remove_temporaries_below(shards)
-        receipts = [job.receipt(n) for n in numbers]
-        num_joined = count_joined(archive, shards, receipts)
-        own = runner.own(numbers)
-        missing = [n for n in own if n >= num_joined and (receipts[n] is None or not job.piece_path(n).exists())]
-        total, left = (sum(len(job.plan.shards[n]) for n in some) for some in (own, missing))
-        _forecast(job, len(missing))
-        with progress_bar("submit", total, total - left, show=show_progress) as advance, one_thread():
-            runner.run(partial(_build_shard, job), missing, advance=advance, name_of=job.plan.shard_name)
-        lease.finish("submit")
+        receipts = _Receipts(job, count_joined(archive, shards, [job.receipt(n) for n in numbers]))
+        _forecast(job, sum(not receipts.is_finished(n) for n in runner.select(numbers)))
+        packed_shards = run_items(
+            "submit", numbers, partial(_build_shard, job),
+            format=receipts, lease=lease, runner=runner, show_progress=show_progress,
+        )  # fmt: skip
         remove_temporaries_below(shards)
         remove_temporaries(job.folder / PLAN)
-        pieces = [piece for piece in map(job.receipt, numbers) if piece is not None]
-        require_finished(runner, len(numbers) - len(pieces), len(numbers), "submit")
-        join_pieces(archive, shards, pieces, delete=delete_parts)
+        join_shards(archive, shards, packed_shards, delete=delete_parts)
         lease.remove()
     return archive
 
 
 def delete_parts(job: Job) -> None:
-    """Remove the compressed shards of a finished archive and their receipts."""
-    paths = [path for n in range(len(job.plan.shards)) for path in (job.piece_path(n), job.receipt_path(n))]
+    """Remove the compressed shards of a finished archive, and the receipts."""
+    paths = [path for n in range(len(job.plan.shards)) for path in (job.shard_path(n), job.receipt_path(n))]
     remove_folder(job.folder / _SHARDS, [path.name for path in paths])
 
 
 def _forecast(job: Job, num_missing: int) -> None:
-    """Say how large the archive will be, and if the disk has too little room."""
+    """Log how large the archive will be, and whether the disk has too little room."""
     low, high = (ratio * job.plan.message_bytes / 1e9 for ratio in GZIP_RATIO)
     free = shutil.disk_usage(job.folder).free / 1e9
     log.info(
@@ -148,10 +167,10 @@ def _forecast(job: Job, num_missing: int) -> None:
         log.warning(f"  parts and archive need up to {needed:.3g} GB: make room, or halve that with --delete-parts.")
 
 
-def _build_shard(job: Job, number: int, advance: Callable[[int], None], is_stopped: Callable[[], bool]) -> None:
-    """Simulate the scenarios of a shard, write it, compress it, sign for it."""
+def _build_shard(job: Job, number: int, advance: Advance, is_stopped: Callable[[], bool]) -> None:
+    """Simulate the scenarios of a shard; write, compress and sign for the shard."""
     name = job.plan.shard_name(number)
-    raw = temporary_beside(job.folder / _SHARDS / name)
+    raw = temporary_path(job.folder / _SHARDS / name)
     try:
         with errors_name(raw), raw.open("wb") as file:
             file.write(job.metadata)
@@ -161,22 +180,22 @@ def _build_shard(job: Job, number: int, advance: Callable[[int], None], is_stopp
                 message = _simulate_message(job, job.data[position], name)
                 file.write(b"\x0a" + encode_varint(len(message)) + message)
                 advance(1)
-        piece = write_piece(raw, name, job.piece_path(number))
+        shard = pack_shard(raw, name, job.shard_path(number))
     finally:
         raw.unlink(missing_ok=True)
     is_first = not any(job.receipt_path(n).exists() for n in range(len(job.plan.shards)))
-    write_text(job.receipt_path(number), json.dumps(asdict(piece)) + "\n")
+    write_text(job.receipt_path(number), json.dumps(asdict(shard)) + "\n")
     if is_first:
-        size = forecast_size(job.plan, number, piece)
+        size = forecast_size(job.plan, number, shard)
         log.info(
-            f"  first shard: compressed to {piece.size / piece.raw_size:.3f}, so the archive will have "
+            f"  first shard: compressed to {shard.size / shard.raw_size:.3f}, so the archive will have "
             f"about {size / 1e9:.3g} GB."
         )
 
 
 def _simulate_message(job: Job, scenario: Scenario, shard: str) -> bytes:
-    """Rollouts of a scenario as they are written, checked."""
-    states = simulate_states(job.policy, scenario, job.config, device_of(job.policy))
+    """Rollouts of a scenario as the archive holds them, checked."""
+    states = simulate_states(job.policy, scenario, job.config, get_device(job.policy))
     message = encode_rollouts(scenario.scenario_id, round_states(states, job.round_m))
     for finding in check_rollouts(decode_rollouts(message), scenario, shard).findings:
         if finding.severity == "error":
@@ -184,12 +203,12 @@ def _simulate_message(job: Job, scenario: Scenario, shard: str) -> bytes:
     return message
 
 
-def forecast_size(plan: Plan, number: int, piece: Piece) -> float:
+def forecast_size(plan: Plan, number: int, shard: PackedShard) -> float:
     """Bytes that the archive will have, from one finished shard.
 
     Args:
-        plan: of the archive.
-        number: of the shard.
-        piece: the shard.
+        plan: Plan of the archive, with the number of agents in each shard.
+        number: Number of the finished shard in the plan.
+        shard: The finished shard, whose size stands for those of the others.
     """
-    return piece.size / plan.num_agents[number] * sum(plan.num_agents)
+    return shard.size / plan.num_agents[number] * sum(plan.num_agents)

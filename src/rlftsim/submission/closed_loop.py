@@ -7,7 +7,7 @@ from rlftsim.errors import ConfigError
 from rlftsim.rollout.check import POSE_TOLERANCE_M
 from rlftsim.rollout.edge_scenes import without_future
 from rlftsim.rollout.noise import draw_noise
-from rlftsim.rollout.policy import Policy, Sampling, device_of
+from rlftsim.rollout.policy import Policy, Sampling, get_device
 from rlftsim.rollout.simulate import simulate
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.types import FUTURE_STEPS, STEP_S, Scenario
@@ -37,7 +37,7 @@ The code makes sure of the first and the last three points. That the policy itse
 for you to know."""
 
 
-def refuse_open_loop(policy: Policy, scenario: Scenario) -> None:
+def check_closed_loop(policy: Policy, scenario: Scenario) -> None:
     """Refuse a policy that cannot make the statement.
 
     Args:
@@ -56,7 +56,7 @@ def refuse_open_loop(policy: Policy, scenario: Scenario) -> None:
         )
     if scenario.has_future:  # in a test split there is none that could be read
         with_it, without_it = (
-            simulate(policy, collate([one]).to(device_of(policy)), num_rollouts=1, seed=0).position
+            simulate(policy, collate([one]).to(get_device(policy)), num_rollouts=1, seed=0).position
             for one in (scenario, without_future(scenario))
         )
         if not torch.allclose(with_it, without_it, rtol=0.0, atol=POSE_TOLERANCE_M):
@@ -66,7 +66,7 @@ def refuse_open_loop(policy: Policy, scenario: Scenario) -> None:
             )
     if not policy.initial_noise_size:
         return
-    batch = collate([scenario]).to(device_of(policy))
+    batch = collate([scenario]).to(get_device(policy))
     noise = draw_noise(batch, range(1), seed=0, purpose="begin", per_agent=policy.initial_noise_size)
     is_ego = torch.from_numpy(scenario.simulated_indices == scenario.ego_index).to(batch.device)  # [A]
     with torch.no_grad():

@@ -1,7 +1,6 @@
 """Plan of a submission: which scenarios go into which shard, and what all of it depends on."""
 
 import hashlib
-import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,8 +11,7 @@ import numpy as np
 
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.evaluation.results import NUMBERS_VERSION, EvaluateConfig
-from rlftsim.jobs.documents import read_json
-from rlftsim.jobs.files import write_text
+from rlftsim.jobs.folder import find_differences, write_identity
 from rlftsim.scenario.dataset import ScenarioDataset
 from rlftsim.scenario.tfrecord import count_lost
 from rlftsim.submission.messages import NUM_SCENES, TRAJECTORY_BYTES
@@ -45,21 +43,19 @@ class Plan:
         return sum(self.num_agents) * NUM_SCENES * TRAJECTORY_BYTES
 
     def claim(self, folder: Path) -> None:
-        """Write the plan into a folder, or compare it with the one that is there.
+        """Write the plan into a folder, or compare the plan with a stored one.
 
         Raises:
-            ConfigError: the folder holds work on another plan.
+            ConfigError: The folder holds work on another plan.
         """
         path = folder / PLAN
         values = {**self.identity, "shards": [[shard.start, shard.stop] for shard in self.shards]}
-        old = read_json(path, "name another --out, or remove the folder") if path.exists() else values
-        differing = [name for name in {**values, **old} if old.get(name) != values.get(name)]
-        if differing:
+        if differences := find_differences(path, values, "name another --out, or remove the folder"):
             raise ConfigError(
-                f"{folder} holds a submission of another {', '.join(differing)}: name another --out, or remove it."
+                f"{folder} holds a submission of another {', '.join(differences)}: name another --out, or remove it."
             )
         if not path.exists():
-            write_text(path, json.dumps(values, indent=1) + "\n")
+            write_identity(path, values)
 
 
 def make_plan(
@@ -115,7 +111,7 @@ def make_plan(
     return Plan(shards, tuple(int(agents[shard.start : shard.stop].sum()) for shard in shards), identity)
 
 
-def refuse_other_sources(data: ScenarioDataset) -> None:
+def check_sources(data: ScenarioDataset) -> None:
     """Refuse recordings that are not Waymo's, the only ones the leaderboard knows; synthetic scenarios are practice.
 
     Raises:
@@ -129,7 +125,7 @@ def refuse_other_sources(data: ScenarioDataset) -> None:
         )
 
 
-def refuse_incomplete(data: ScenarioDataset) -> None:
+def check_complete(data: ScenarioDataset) -> None:
     """Refuse a split that lacks files, before anything is simulated: the server wants every scenario of it.
 
     Raises:

@@ -6,7 +6,7 @@ from glob import escape
 from pathlib import Path
 
 from rlftsim.errors import ConfigError
-from rlftsim.jobs.files import errors_name, remove_temporaries, temporary_beside
+from rlftsim.jobs.files import errors_name, remove_temporaries, temporary_path
 
 _CHUNK = 1 << 22
 
@@ -17,22 +17,22 @@ def split_file(path: Path, part_gb: float) -> list[Path]:
     Parts of an earlier cut are removed when all new ones are written.
 
     Args:
-        path: of the file, which is kept.
-        part_gb: size of a part.
+        path: File that is copied, and stays.
+        part_gb: Size of a part in gigabytes of 10^9 bytes.
 
     Raises:
-        ConfigError: more than 1000 parts.
-        DataError: a part cannot be written; those of an earlier cut are left as they are.
+        ConfigError: More than 1000 parts.
+        DataError: A part cannot be written; those of an earlier cut are left as they are.
     """
     part_bytes = int(part_gb * 1e9) if 0 < part_gb < math.inf else 0
     count = -(-path.stat().st_size // part_bytes) if part_bytes else 0
     if not 0 < count <= 1000:
         raise ConfigError(f"{path} cannot be cut into parts of {part_gb:g} GB: choose 1 to 1000 parts.")
-    parts = [path.with_name(f"{path.name}.{number:03d}") for number in range(count)]
+    paths = [path.with_name(f"{path.name}.{number:03d}") for number in range(count)]
     try:
         with path.open("rb") as source:
-            for part in parts:
-                with errors_name(part), temporary_beside(part).open("wb") as out:
+            for target in paths:
+                with errors_name(target), temporary_path(target).open("wb") as out:
                     left = part_bytes
                     while left and (chunk := source.read(min(left, _CHUNK))):
                         out.write(chunk)
@@ -41,9 +41,9 @@ def split_file(path: Path, part_gb: float) -> list[Path]:
                     os.fsync(out.fileno())
         for old in path.parent.glob(f"{escape(path.name)}.[0-9][0-9][0-9]"):
             old.unlink()  # `cat` would join those of an earlier, finer cut, too
-        for part in parts:
-            temporary_beside(part).replace(part)
+        for target in paths:
+            temporary_path(target).replace(target)
     finally:
-        for part in parts:
-            remove_temporaries(part)
-    return parts
+        for target in paths:
+            remove_temporaries(target)
+    return paths

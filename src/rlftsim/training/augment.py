@@ -1,26 +1,32 @@
 """Stochastic target augmentation (RLFTSim, algorithm 1): goals that rollouts have met, stored beside a data set.
 
-The logged endpoint is one place an agent could go. For every scenario rollouts are sampled, and the endpoints of
-the most realistic one become further goals, which the policy is known to be able to reach.
+The logged endpoint is a single place an agent could go. For every scenario rollouts are sampled, and the endpoints of
+the most realistic rollout become further goals, which the policy is known to be able to reach.
 """
 
 import math
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from rlftsim.errors import ConfigError, given, require_positive, require_types
+from rlftsim.errors import ConfigError, check_positive, check_types, given
 from rlftsim.goals.logged import logged_goals
 from rlftsim.goals.stored import write_goal_file
 from rlftsim.goals.types import Points
-from rlftsim.jobs.progress import progress_bar
+from rlftsim.jobs.files import remove_temporaries_below
+from rlftsim.jobs.folder import Lease
+from rlftsim.jobs.items import GroupFormat, group_positions, group_task, run_items
+from rlftsim.jobs.runner import Inline, Runner
 from rlftsim.realism import RealismResult, metric_by_name, score_batch
 from rlftsim.realism.from_rollouts import states_of_rollouts
-from rlftsim.rollout.policy import Policy, Sampling, device_of
+from rlftsim.rollout.policy import Policy, Sampling, get_device
 from rlftsim.rollout.simulate import simulate
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.types import Scenarios
@@ -29,19 +35,19 @@ from rlftsim.training.run_folder import RunFolder, describe_inputs
 
 
 def most_realistic(realism: RealismResult) -> Int64[Tensor, "B"]:
-    """Index of the rollout of each scenario with the highest meta-metric of its own."""
+    """Index of the rollout of each scenario with the highest single meta-metric."""
     # A rollout without a finite score (nothing valid to compare with) is never chosen before one that has a score.
     return torch.nan_to_num(realism.single_meta_metric, nan=-math.inf).argmax(-1)
 
 
-def ends_of(rollouts: Rollouts, chosen: Int64[Tensor, "B"]) -> Float[Tensor, "B A 2"]:
-    """Final positions of the agents in one rollout of each scenario, map frame.
+def select_ends(rollouts: Rollouts, index: Int64[Tensor, "B"]) -> Float[Tensor, "B A 2"]:
+    """Final positions of the agents in a selected rollout of each scenario, map frame.
 
     Args:
-        rollouts: N of each scenario.
-        chosen: index of the one.
+        rollouts: Rollouts of B scenarios, N of each.
+        index: Number of the selected rollout of each scenario, in [0, N).
     """
-    return rollouts.position[torch.arange(len(chosen), device=chosen.device), chosen, :, -1]
+    return rollouts.position[torch.arange(len(index), device=index.device), index, :, -1]
 
 
 @dataclass(frozen=True)
@@ -60,54 +66,81 @@ class AugmentConfig:
     """Of the rollouts."""
 
     def __post_init__(self) -> None:
-        require_types(self)
-        require_positive(self, ("num_rollouts", "scenarios_per_part", *given(self, ("top_k",))))
+        check_types(self)
+        check_positive(self, ("num_rollouts", "scenarios_per_part", *given(self, ("top_k",))))
         metric_by_name(self.metric)
 
 
-def augment_goals(policy: Policy, scenarios: Scenarios, folder: str | os.PathLike[str], config: AugmentConfig) -> int:
+@dataclass(frozen=True)
+class _GoalFiles(GroupFormat[Path, tuple[str, Any]]):
+    """Ids and `Points` of some scenarios, see `goals.stored`. A file that exists is finished: it is written whole."""
+
+    folder: Path
+    size: int
+
+    def _path(self, group: range) -> Path:
+        return self.folder / f"part-{group.start // self.size:06d}.parquet"
+
+    def write(self, item: range, results: Sequence[tuple[str, Any]]) -> None:
+        """Write the file of a group, see `GroupFormat`."""
+        write_goal_file(self._path(item), dict(results))
+
+    def read(self, item: range) -> Path | None:
+        """The file of a group, see `ResultFormat`."""
+        return self._path(item) if self._path(item).exists() else None
+
+
+def augment_goals(
+    policy: Policy,
+    scenarios: Scenarios,
+    folder: str | os.PathLike[str],
+    config: AugmentConfig,
+    *,
+    runner: Runner = Inline(),  # noqa: B008
+) -> int:
     """Write the endpoints of the most realistic rollout of each scenario (RLFTSim, algorithm 1); resumes.
 
-    A goal-conditioned policy has the logged endpoints as its goals.
+    A goal-conditioned policy pursues the logged endpoints.
 
     Args:
-        policy: samples the rollouts.
-        scenarios: with their futures.
-        folder: for the files, see `goals.stored`.
-        config: see its fields.
+        policy: Policy that the rollouts are sampled from.
+        scenarios: Scenarios with logged futures, by which realism is measured.
+        folder: Folder of the files, made if missing, see `goals.stored`.
+        config: Number of rollouts, sampling, metric, seed; a stored folder is continued only with equal settings.
+        runner: Runner of the work; changes no result.
 
     Returns:
         Number of scenarios that have goals now.
 
     Raises:
-        DataError: a scenario withholds its future.
-        CheckpointError: the folder holds goals of another policy, other scenarios or other settings.
+        DataError: A scenario withholds the future, or another driver is at work in the folder.
+        CheckpointError: The folder holds goals of another policy, other scenarios or other settings.
         ConfigError: `top_k` is set and the policy's decisions are not categories.
+        SetAside, Unfinished: See `run_items`.
     """
-    folder, size = Path(folder), config.scenarios_per_part
+    folder, inputs = Path(folder), describe_inputs(policy, scenarios)
     if config.top_k is not None and len(scenarios) and not folder.exists():
         # Tried on one scenario before the folder is claimed for settings that cannot work.
-        batch = batch_with_futures(scenarios, [0]).to(device_of(policy))
+        batch = batch_with_futures(scenarios, [0]).to(get_device(policy))
         try:
             simulate(policy, batch, num_rollouts=1, seed=config.seed, sampling=Sampling(top_k=config.top_k))
         except ConfigError as error:
             name = type(policy).__name__
             raise ConfigError(f"top_k={config.top_k} and {name}: {str(error).rstrip('.')} (--top-k None).") from None
-    RunFolder(folder, config, describe_inputs(policy, scenarios))
-    with progress_bar("augment", len(scenarios), 0) as advance:
-        for start in range(0, len(scenarios), size):
-            path = folder / f"part-{start // size:06d}.parquet"
-            indices = range(start, min(start + size, len(scenarios)))
-            # Files are written whole, so one that exists is finished.
-            if not path.exists():
-                write_goal_file(path, dict(_endpoints(policy, scenarios, i, config) for i in indices))
-            advance(len(indices))
+    RunFolder(folder, config, inputs, writes=False)  # refuses before the folder gets a lock file
+    with Lease(folder / ".lock", runner, "works in") as lease:
+        RunFolder(folder, config, inputs)
+        goals = _GoalFiles(folder, config.scenarios_per_part)
+        groups, work = group_positions(len(scenarios), goals.size), partial(_find_ends, policy, scenarios, config)
+        run_items("augment", groups, group_task(work, goals), format=goals, lease=lease, runner=runner)
+        remove_temporaries_below(folder)  # of processes that were killed
+        lease.remove()
     return len(scenarios)
 
 
-def _endpoints(policy: Policy, scenarios: Scenarios, index: int, config: AugmentConfig) -> tuple[str, Points]:
-    """Id of a scenario, and the object ids and endpoints (world frame) of its agents."""
-    batch = batch_with_futures(scenarios, [index]).to(device_of(policy))
+def _find_ends(policy: Policy, scenarios: Scenarios, config: AugmentConfig, index: int) -> tuple[str, Points]:
+    """Id of a scenario, and the object ids and endpoints (world frame) of the agents."""
+    batch = batch_with_futures(scenarios, [index]).to(get_device(policy))
     rollouts = simulate(
         policy, batch, num_rollouts=config.num_rollouts, seed=config.seed, goals=logged_goals(batch),
         sampling=Sampling(top_k=config.top_k),
@@ -115,6 +148,6 @@ def _endpoints(policy: Policy, scenarios: Scenarios, index: int, config: Augment
     states = states_of_rollouts(batch, rollouts)
     # A scenario without a map still has endpoints: it counts as on the road.
     realism = score_batch(batch.scenarios, states, metric_by_name(config.metric), missing_map="neutral")
-    ends = ends_of(rollouts, most_realistic(realism))  # [1, A, 2]
+    ends = select_ends(rollouts, most_realistic(realism))  # [1, A, 2]
     ends = batch.to_world(ends[:, None, :, None])[0, 0, :, 0]  # to_world takes [B, N, A, T, 2]
     return batch.scenarios[0].scenario_id, (batch.object_id[0].cpu().numpy(), ends.double().cpu().numpy())

@@ -151,7 +151,7 @@ class _Target:
             ids: K candidate tokens of each agent.
             mask: True = one of the R agents.
         """
-        pick = partial(pick_rows, mask=mask, has_all=len(ids) == mask.numel())
+        pick = partial(pick_rows, mask=mask, is_dense=len(ids) == mask.numel())
         class_id = pick(self.class_id)  # [R]
         ends = self.vocabulary.end_corners()[class_id[:, None], ids]  # [R, K, 4, 2], in the agents' frames
         logged, pose = ((pick(position), pick(heading)) for position, heading in (self.logged, self.pose))
@@ -190,7 +190,7 @@ def _take_closest(distribution: TokenLogits, target: _Target, count: int, noise:
     likely = logits.topk(min(count, logits.shape[-1]), dim=-1).indices  # [R, K]
     nearest = target.distances(likely, mask).argmin(-1, keepdim=True)
     # topk sorts, so the first candidate is the most likely token.
-    is_logged = pick_rows(target.logged_valid, mask, has_all=len(logits) == mask.numel())
+    is_logged = pick_rows(target.logged_valid, mask, is_dense=len(logits) == mask.numel())
     return place_rows(torch.where(is_logged, likely.gather(-1, nearest)[:, 0], likely[:, 0]), mask)
 
 
@@ -202,7 +202,7 @@ def _draw_near(distribution: Any, target: _Target, count: int, noise: Tensor) ->
     logits, mask = distribution.logits, distribution.mask  # [R, V], [B, N, A]
     ids = torch.arange(logits.shape[-1], device=logits.device).expand_as(logits)
     # a class may have fewer tokens than the table has rows
-    exists = target.vocabulary.token_mask[pick_rows(target.class_id, mask, has_all=len(logits) == mask.numel())]
+    exists = target.vocabulary.token_mask[pick_rows(target.class_id, mask, is_dense=len(logits) == mask.numel())]
     near = target.distances(ids, mask).masked_fill(~exists, torch.inf)
     near = near.topk(min(count, logits.shape[-1]), dim=-1, largest=False).indices  # [R, K]
     kept = torch.zeros_like(logits, dtype=torch.bool).scatter(-1, near, True)

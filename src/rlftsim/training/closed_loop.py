@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from rlftsim.rollout.policy import TokenPolicy
-from rlftsim.rollout.rows import row_places
+from rlftsim.rollout.rows import find_rows
 from rlftsim.rollout.types import Rollouts
 
 
@@ -58,5 +58,5 @@ def predict_along(
     counts = targeted.target_mask & targeted.rollouts.decision_mask & trained[:, None, :, None]  # [B, N, A, L]
     class_id = targeted.class_id[:, None, :, None].expand(counts.shape)
     # The distribution has a row for each element of its mask only: pick the same ones, in the same order.
-    place = row_places(dist.mask, has_all=len(dist.logits) == dist.mask.numel())
+    place = find_rows(dist.mask, is_dense=len(dist.logits) == dist.mask.numel())
     return ClosedLoopPrediction(dist.logits, *(values[place] for values in (targeted.target, counts, class_id)))

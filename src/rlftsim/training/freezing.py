@@ -8,7 +8,7 @@ from torch.optim import Optimizer
 
 from rlftsim.errors import ConfigError
 from rlftsim.rollout.noise import draw_noise
-from rlftsim.rollout.policy import PolicyWithHead, device_of, is_goal_conditioned
+from rlftsim.rollout.policy import PolicyWithHead, get_device, is_goal_conditioned
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.types import Scenario
 from rlftsim.training.goals import not_conditioned
@@ -21,15 +21,15 @@ def trained_parts(policy: nn.Module, trained: TrainedParts) -> tuple[nn.Module, 
 
     Args:
         policy: any.
-        trained: "decoder" = the parts that the policy names in `fine_tuned_parts`, all of it where it names none.
-            "head" = what it names in `head_parts`, its last layers. "goals" = the goal encoder only, so that agents
+        trained: "decoder" = the parts that the policy names in `fine_tuned_modules`, all of it where it names none.
+            "head" = what it names in `head_modules`, its last layers. "goals" = the goal encoder only, so that agents
             without a goal go on deciding as before. "all" = everything.
 
     Raises:
         ConfigError: the policy is not goal-conditioned, has no part that only goals use, or names no head.
     """
     if trained == "goals":
-        parts = _goal_parts(policy)
+        parts = _goal_modules(policy)
         if not parts and is_goal_conditioned(policy):
             raise ConfigError(
                 f"trained=goals, but {type(policy).__name__} has no part that only goals use: set trained=all."
@@ -38,10 +38,10 @@ def trained_parts(policy: nn.Module, trained: TrainedParts) -> tuple[nn.Module, 
             raise ConfigError(f"trained=goals, but {not_conditioned(policy)}")
     elif trained == "head":
         if not isinstance(policy, PolicyWithHead):
-            raise ConfigError(f"trained=head, but {type(policy).__name__} names no head_parts: set trained=decoder.")
-        parts = policy.head_parts()
+            raise ConfigError(f"trained=head, but {type(policy).__name__} names no head_modules: set trained=decoder.")
+        parts = policy.head_modules()
     else:
-        named = getattr(policy, "fine_tuned_parts", None)
+        named = getattr(policy, "fine_tuned_modules", None)
         parts = (policy,) if trained == "all" or named is None else named()
     return parts
 
@@ -76,7 +76,7 @@ def check_entropy(policy: nn.Module, scenario: Scenario, trained: TrainedParts) 
     """
     tried: Any = copy.deepcopy(policy).eval()
     freeze_untrained(tried, trained)
-    batch = collate([scenario]).to(device_of(tried))
+    batch = collate([scenario]).to(get_device(tried))
     context = tried.encode(batch)
     noise = draw_noise(batch, range(1), seed=0, purpose="begin", per_agent=tried.initial_noise_size)
     if not tried.decide(context, tried.begin(context, 1, None, noise)).entropy().requires_grad:
@@ -93,7 +93,7 @@ def parameter_groups(model: nn.Module, goal_scale: float) -> list[dict[str, Any]
         model: after `freeze_untrained`.
         goal_scale: learning rate of the goal encoder over that of the others.
     """
-    goal_weights = [p for part in _goal_parts(model) for p in part.parameters() if p.requires_grad]
+    goal_weights = [p for part in _goal_modules(model) for p in part.parameters() if p.requires_grad]
     # By identity: comparing tensors would compare their values.
     ids = {id(p) for p in goal_weights}
     others = [p for p in model.parameters() if p.requires_grad and id(p) not in ids]
@@ -102,8 +102,8 @@ def parameter_groups(model: nn.Module, goal_scale: float) -> list[dict[str, Any]
     return [group for group in groups if group["params"]]
 
 
-def _goal_parts(model: nn.Module) -> tuple[nn.Module, ...]:
-    return model.goal_parts() if hasattr(model, "goal_parts") else ()  # type: ignore[operator]
+def _goal_modules(model: nn.Module) -> tuple[nn.Module, ...]:
+    return model.goal_modules() if hasattr(model, "goal_modules") else ()  # type: ignore[operator]
 
 
 def set_learning_rate(optimizer: Optimizer, value: float) -> None:

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from rlftsim.rollout.policy import decision_statistics, encode_like, score_both
+from rlftsim.rollout.policy import compute_statistics, encode_like, score_with_reference
 from rlftsim.training.experience import Experience
 from rlftsim.training.finetune_config import FinetuneConfig, Reduction
 from rlftsim.training.imitation import accumulate_imitation
@@ -140,8 +140,8 @@ def accumulate_gradients(
             with fabric.autocast():
                 # Encoded anew for every slice: each slice's graph is freed by its own backward pass.
                 context = encode_like(policy, experience.batch, experience.context)
-                dist, ref_dist = score_both(policy, context, rollouts, reference, ref_context, ref_rollouts)
-            found = decision_statistics(dist, rollouts.decision, ref_dist)  # [B, n, A, L] each
+                dist, ref_dist = score_with_reference(policy, context, rollouts, reference, ref_context, ref_rollouts)
+            found = compute_statistics(dist, rollouts.decision, ref_dist)  # [B, n, A, L] each
             kl, entropy = masked_sum(found.kl, mask), masked_sum(found.entropy, mask)
             by_agent = agent_log_prob(found.log_prob, mask, terms.config.log_prob_reduction)  # [B, n, A]
             loss = policy_gradient_loss(reward, by_agent, terms.num_scenarios)

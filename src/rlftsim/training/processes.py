@@ -21,7 +21,7 @@ from torch import Tensor
 
 from rlftsim.errors import ConfigError, DataError, RlftsimError
 from rlftsim.jobs.interruption import ctrl_c_blocked
-from rlftsim.jobs.runner import exit_with_parent, portable_error
+from rlftsim.jobs.processes import exit_with_parent, portable_error
 from rlftsim.training.parallel import DeviceConfig, Fabric, can_fork, start_fabric
 
 

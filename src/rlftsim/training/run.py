@@ -16,9 +16,8 @@ from typing import Any
 import torch
 
 from rlftsim.errors import CheckpointError, ConfigError, DataError, NotYetError
-from rlftsim.jobs.folder import check_folder
+from rlftsim.jobs.folder import Lease, check_folder
 from rlftsim.jobs.interruption import ctrl_c_waits
-from rlftsim.jobs.lease import Lease
 from rlftsim.jobs.progress import log, progress_bar
 from rlftsim.jobs.runner import Inline
 from rlftsim.scenario.types import Scenario, Scenarios

@@ -13,12 +13,12 @@ from rlftsim.viewer.page import embed_json
 
 WIDTH, HEIGHT = 460, 270
 LEFT, RIGHT, TOP, BOTTOM = 72, 14, 12, 44
-"""Room around the plotted area, in the SVG's own units."""
+"""Room around the plotted area, in units of the SVG."""
 MAX_DRAWN_POINTS = 600
 MIN_POINTS_TO_SMOOTH = 12
 NUM_SERIES_COLORS = 4
 DRAWN_MAGNITUDE = 1e30
-"""Values farther from zero count as not finite; on a logarithmic axis also those closer to it than 1 over this."""
+"""Values farther from zero count as not finite; on a logarithmic axis also values closer to zero than 1 over this."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Chart:
 
 @dataclass(frozen=True)
 class Axes:
-    """Limits of both axes, and the place of a value between them. Vertical limits are logarithms where `log_y`."""
+    """Limits of both axes, and positions of values in between. Vertical limits are logarithms where `log_y`."""
 
     x_low: float
     x_high: float
@@ -75,42 +75,42 @@ class Axes:
 
 def chart_html(chart: Chart) -> str:
     """A `<figure>` with title, legend (for more than one curve), SVG and note."""
-    drawn = [(curve.name, *_drawable(curve, chart.log_y)) for curve in chart.curves]  # name, x [n], y [n]
+    curves = [(curve.name, *_select_points(curve, chart.log_y)) for curve in chart.curves]  # name, x [n], y [n]
     title = f'<figcaption class="chart-title">{escape(chart.title)}</figcaption>'
     note = f'<p class="note">{escape(chart.note)}</p>' if chart.note else ""
-    if not any(len(x) for _, x, _ in drawn):
+    if not any(len(x) for _, x, _ in curves):
         return f'<figure class="chart">{title}<p class="note">No data.</p>{note}</figure>'
-    axes = _axes(drawn, chart)
-    parts = [_frame_svg(axes, chart)]
-    parts += [_curve_svg(axes, x, y, color_of(index)) for index, (_, x, y) in enumerate(drawn)]
+    axes = _compute_axes(curves, chart)
+    shapes = [_frame_svg(axes, chart)]
+    shapes += [_curve_svg(axes, x, y, css_color(index)) for index, (_, x, y) in enumerate(curves)]
     if chart.reference and not (chart.log_y and chart.reference[1] <= 0):
         name, height = chart.reference
         y = float(axes.vertical(np.array(height)))
-        parts.append(f'<path class="reference" d="M{LEFT} {y:.1f}H{WIDTH - RIGHT}"/>')
+        shapes.append(f'<path class="reference" d="M{LEFT} {y:.1f}H{WIDTH - RIGHT}"/>')
         label = f'<text class="halo" x="{WIDTH - RIGHT - 4}" y="{y - 5:.1f}" text-anchor="end">{escape(name)}</text>'
-        parts.append(label)
+        shapes.append(label)
     legend = ""
     if len(chart.curves) > 1:
         line = '<svg viewBox="0 0 24 16" aria-hidden="true"><path d="M2 8H22" stroke="{}" stroke-width="3"/></svg>'
-        items = "".join(f"<li>{line.format(color_of(i))}{escape(c.name)}</li>" for i, c in enumerate(chart.curves))
+        items = "".join(f"<li>{line.format(css_color(i))}{escape(c.name)}</li>" for i, c in enumerate(chart.curves))
         legend = f'<ul class="legend chart-legend">{items}</ul>'
-    # chart.js shows under the pointer: places in the SVG, and the values as text.
+    # chart.js shows under the pointer: positions in the SVG, and the values as text.
     hover = embed_json(
         [
             {
                 "name": name,
-                "color": color_of(index),
+                "color": css_color(index),
                 "x": [round(float(v), 1) for v in axes.horizontal(x)],
                 "y": [round(float(v), 1) for v in axes.vertical(y)],
                 "at": [f"{v:g}" for v in np.round(x, 2)],
                 "value": [f"{v:.4g}" for v in y],
             }
-            for index, (name, x, y) in enumerate(drawn)
+            for index, (name, x, y) in enumerate(curves)
         ]
     )
     return (
         f'<figure class="chart">{title}{legend}'
-        f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(chart.title)}">{"".join(parts)}</svg>'
+        f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(chart.title)}">{"".join(shapes)}</svg>'
         f'<script type="application/json">{hover}</script>{note}</figure>'
     )
 
@@ -118,25 +118,25 @@ def chart_html(chart: Chart) -> str:
 def smooth(values: Float[np.ndarray, "n"], window: int) -> Float[np.ndarray, "n"]:
     """Value at each point of the straight line fitted to its neighbors.
 
-    In the interior that is a running mean; at the ends it has neither the bias nor the jumps of one.
+    In the interior that is a running mean; at the ends the line has neither the bias nor the jumps of a mean.
 
     Args:
-        values: at equal distances.
-        window: number of points that are fitted; near the ends they lie mostly on one side.
+        values: Values [n] at equal distances.
+        window: Number of fitted points around each point; near the ends, points of mostly one side.
     """
     smoothed = np.array(values, float)  # [n]
     window = min(window, len(smoothed))
     for i in range(len(smoothed)):
         start = min(max(i - window // 2, 0), len(smoothed) - window)
-        near = np.arange(start, start + window)
-        offset = near - near.mean()
+        neighbors = np.arange(start, start + window)
+        offset = neighbors - neighbors.mean()
         # The maximum avoids 0 / 0 for a window of one point, whose slope does not matter.
-        slope = offset @ values[near] / max(float(offset @ offset), 1.0)
-        smoothed[i] = values[near].mean() + slope * (i - near.mean())
+        slope = offset @ values[neighbors] / max(float(offset @ offset), 1.0)
+        smoothed[i] = values[neighbors].mean() + slope * (i - neighbors.mean())
     return smoothed
 
 
-def color_of(index: int) -> str:
+def css_color(index: int) -> str:
     """CSS color of the curve with this number."""
     return f"var(--series-{index % NUM_SERIES_COLORS + 1})"
 
@@ -145,9 +145,9 @@ def nice_ticks(low: float, high: float, count: int) -> list[float]:
     """Round numbers in [low, high].
 
     Args:
-        low: lower limit.
-        high: upper limit, above the lower one.
-        count: approximate number of them.
+        low: Lower limit of the axis.
+        high: Upper limit, above the lower limit.
+        count: Number of ticks to aim at; the result may have a few more or fewer.
     """
     raw = (high - low) / max(count, 1)
     magnitude = 10.0 ** math.floor(math.log10(raw))
@@ -161,8 +161,8 @@ def format_tick(value: float, step: float) -> str:
     """Number with as many digits as the distance between ticks needs, in powers of ten where there would be too many.
 
     Args:
-        value: the number.
-        step: distance between ticks.
+        value: Number to write at the tick.
+        step: Distance between ticks, which sets the number of digits.
     """
     largest = max(abs(value), step)
     if largest >= 1e5 or step < 1e-5:
@@ -171,12 +171,12 @@ def format_tick(value: float, step: float) -> str:
     return f"{value:,.{digits}f}".replace("-", "−").replace(",", "\u202f")
 
 
-def _drawable(curve: Curve, log_y: bool) -> tuple[np.ndarray, np.ndarray]:
+def _select_points(curve: Curve, log_y: bool) -> tuple[np.ndarray, np.ndarray]:
     """Points that can be drawn, x and y [n], averaged over neighbors where there are very many."""
     x, y = np.asarray(curve.x, float), np.asarray(curve.y, float)
-    # Comparisons with NaN are False, so y needs no isfinite of its own.
-    kept = np.isfinite(x) & (np.abs(y) < DRAWN_MAGNITUDE) & ((y > 1 / DRAWN_MAGNITUDE) if log_y else True)
-    x, y = x[kept], y[kept]
+    # Comparisons with NaN are False, so y needs no separate isfinite.
+    is_drawable = np.isfinite(x) & (np.abs(y) < DRAWN_MAGNITUDE) & ((y > 1 / DRAWN_MAGNITUDE) if log_y else True)
+    x, y = x[is_drawable], y[is_drawable]
     if len(x) <= MAX_DRAWN_POINTS:
         return x, y
     groups = np.array_split(np.arange(len(x)), MAX_DRAWN_POINTS)
@@ -184,7 +184,7 @@ def _drawable(curve: Curve, log_y: bool) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _smoothed(y: np.ndarray, log_y: bool) -> np.ndarray:
-    """Values smoothed on the scale on which they are drawn, never beyond the raw ones: a rate stays above zero."""
+    """Values smoothed on the scale of the drawing, never beyond the raw values: a rate stays above zero."""
     height = np.log10(y) if log_y else y
     smoothed = np.clip(smooth(height, _window(len(y))), height.min(), height.max())
     return 10**smoothed if log_y else smoothed
@@ -195,11 +195,11 @@ def _window(num_points: int) -> int:
     return 1 if num_points < MIN_POINTS_TO_SMOOTH else 2 * (num_points // 24) + 3
 
 
-def _axes(drawn: list[tuple[str, np.ndarray, np.ndarray]], chart: Chart) -> Axes:
+def _compute_axes(curves: list[tuple[str, np.ndarray, np.ndarray]], chart: Chart) -> Axes:
     """Limits around the smoothed lines and all but the most extreme raw points."""
-    x = np.concatenate([x for _, x, _ in drawn])
+    x = np.concatenate([x for _, x, _ in curves])
     heights = []
-    for _, _, y in drawn:
+    for _, _, y in curves:
         if len(y):
             heights += [np.quantile(y, 0.02), np.quantile(y, 0.98), *_smoothed(y, chart.log_y)]
     if chart.reference:
@@ -219,32 +219,32 @@ def _axes(drawn: list[tuple[str, np.ndarray, np.ndarray]], chart: Chart) -> Axes
 def _frame_svg(axes: Axes, chart: Chart) -> str:
     """Grid, tick labels, axis labels."""
     bottom, right = HEIGHT - BOTTOM, WIDTH - RIGHT
-    parts = []
+    shapes = []
     # 1. Horizontal grid lines with their values.
     for value, label in _vertical_ticks(axes):
         y = float(axes.vertical(np.array(value)))
-        parts.append(f'<path class="grid" d="M{LEFT} {y:.1f}H{right}"/>')
-        parts.append(f'<text x="{LEFT - 8}" y="{y + 4:.1f}" text-anchor="end">{label}</text>')
+        shapes.append(f'<path class="grid" d="M{LEFT} {y:.1f}H{right}"/>')
+        shapes.append(f'<text x="{LEFT - 8}" y="{y + 4:.1f}" text-anchor="end">{label}</text>')
     # 2. Ticks below the horizontal axis.
     ticks = nice_ticks(axes.x_low, axes.x_high, 5)
     for value in ticks:
         x = float(axes.horizontal(np.array(value)))
         label = format_tick(value, ticks[1] - ticks[0] if len(ticks) > 1 else 1.0)
-        parts.append(f'<path class="tick" d="M{x:.1f} {bottom}v5"/>')
-        parts.append(f'<text x="{x:.1f}" y="{bottom + 18}" text-anchor="middle">{label}</text>')
-    parts.append(f'<path class="axis" d="M{LEFT} {bottom}H{right}"/>')
+        shapes.append(f'<path class="tick" d="M{x:.1f} {bottom}v5"/>')
+        shapes.append(f'<text x="{x:.1f}" y="{bottom + 18}" text-anchor="middle">{label}</text>')
+    shapes.append(f'<path class="axis" d="M{LEFT} {bottom}H{right}"/>')
     # 3. Names of both axes, the vertical one turned.
     middle = (LEFT + right) / 2
-    parts.append(
+    shapes.append(
         f'<text class="label" x="{middle}" y="{HEIGHT - 6}" text-anchor="middle">{escape(chart.x_label)}</text>'
     )
     turn = f"translate(13 {(TOP + bottom) / 2}) rotate(-90)"
-    parts.append(f'<text class="label" transform="{turn}" text-anchor="middle">{escape(chart.y_label)}</text>')
-    return "".join(parts)
+    shapes.append(f'<text class="label" transform="{turn}" text-anchor="middle">{escape(chart.y_label)}</text>')
+    return "".join(shapes)
 
 
 def _vertical_ticks(axes: Axes) -> list[tuple[float, str]]:
-    """Values to mark on the vertical axis, with their labels."""
+    """Values to mark on the vertical axis, with labels."""
     if not axes.log_y:
         ticks = nice_ticks(axes.y_low, axes.y_high, 5)
         step = ticks[1] - ticks[0] if len(ticks) > 1 else 1.0
@@ -258,7 +258,7 @@ def _vertical_ticks(axes: Axes) -> list[tuple[float, str]]:
 
 
 def _curve_svg(axes: Axes, x: np.ndarray, y: np.ndarray, color: str) -> str:
-    """The raw line, pale, and the smoothed one; dots where there are too few points to smooth."""
+    """Raw line, pale, and smoothed line; dots where points are too few to smooth."""
     if not len(x):
         return ""
     window = _window(len(x))
@@ -270,9 +270,9 @@ def _curve_svg(axes: Axes, x: np.ndarray, y: np.ndarray, color: str) -> str:
     smoothed = _path(across, axes.vertical(_smoothed(y, axes.log_y)))
     # A nested svg clips what lies outside its box: the most extreme raw points.
     box = f"{LEFT} {TOP} {WIDTH - LEFT - RIGHT} {HEIGHT - TOP - BOTTOM}"
-    place = 'x="{}" y="{}" width="{}" height="{}"'.format(*box.split())
+    frame = 'x="{}" y="{}" width="{}" height="{}"'.format(*box.split())
     return (
-        f'<svg {place} viewBox="{box}"><path class="raw" d="{raw}" stroke="{color}"/></svg>'
+        f'<svg {frame} viewBox="{box}"><path class="raw" d="{raw}" stroke="{color}"/></svg>'
         f'<path class="smooth" d="{smoothed}" stroke="{color}"/>'
     )
 

@@ -16,9 +16,9 @@ def charts_to_png(path: Path, charts: Sequence[Chart], *, dots_per_inch: int = 1
     """Draw charts side by side.
 
     Args:
-        path: file to write; nothing half-written is left there.
-        charts: at least one.
-        dots_per_inch: of the picture.
+        path: File to write (.png, .svg or .pdf); no half-written file is left.
+        charts: Charts from left to right, at least one.
+        dots_per_inch: Resolution of a PNG; 120 makes a chart 552 pixels wide.
     """
     width, height = CHART_INCHES
     figure = Figure(figsize=(width * len(charts), height), layout="constrained")
@@ -30,14 +30,12 @@ def charts_to_png(path: Path, charts: Sequence[Chart], *, dots_per_inch: int = 1
             # A short curve may be a single point, which a line alone would not show.
             marker = "o" if len(curve.x) < 20 else ""
             color = COLORS[index % len(COLORS)]
-            axis.plot(
-                np.asarray(curve.x), np.asarray(curve.y), color=color, lw=1.2, marker=marker, ms=3, label=curve.name
-            )
+            x, y = np.asarray(curve.x), np.asarray(curve.y)
+            axis.plot(x, y, color=color, lw=1.2, marker=marker, ms=3, label=curve.name)
         if chart.reference:
             axis.axhline(chart.reference[1], color=INK, ls="--", lw=1, label=chart.reference[0])
         # One curve needs no legend: its name is the title of the chart or of its axis.
         if len(axis.get_legend_handles_labels()[1]) > 1:
             axis.legend(frameon=False, fontsize=8)
-        for side in ("top", "right"):
-            axis.spines[side].set_visible(False)
+        axis.spines[["top", "right"]].set_visible(False)
     save_figure(path, figure, dots_per_inch=dots_per_inch)

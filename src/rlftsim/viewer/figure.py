@@ -15,12 +15,12 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import NullFormatter, NullLocator
 
 from rlftsim.errors import ConfigError
-from rlftsim.jobs.files import write_whole
+from rlftsim.jobs.files import write_atomically
 
 COLORS = ("#1d63d8", "#e07b00", "#11754b", "#a21caf", "#79828f", "#24292f")
 """Colors of curves; the first four are those of `palette.css`, in the same order."""
 INK, PALE = "#24292f", "#c9cfd6"
-BETTER, WORSE, NEITHER, OWN = "#bfe3cf", "#f3c4bf", "#eef0ec", "#d7dbe0"
+BETTER_COLOR, WORSE_COLOR, EQUAL_COLOR, DIAGONAL_COLOR = "#bfe3cf", "#f3c4bf", "#eef0ec", "#d7dbe0"
 DOTS_PER_INCH = 160
 PICTURES = (".png", ".svg", ".pdf")
 
@@ -42,7 +42,7 @@ class Band:
 
 @dataclass(frozen=True)
 class Interval:
-    """A named number with its interval."""
+    """A named number with an interval."""
 
     name: str
     mean: float
@@ -57,12 +57,12 @@ def draw_bands(
     """Figure of curves that share both axes.
 
     Args:
-        bands: the curves.
-        title: above them.
-        x_label: of the horizontal axis.
-        y_label: of the vertical axis.
-        log: both axes logarithmic.
-        ticks: values marked on the horizontal axis; empty = matplotlib chooses.
+        bands: Curves in the order of the legend, in data units of the axes.
+        title: Title above the curves.
+        x_label: Quantity and unit of the horizontal axis.
+        y_label: Quantity and unit of the vertical axis.
+        log: True makes both axes logarithmic.
+        ticks: Values marked on the horizontal axis; empty = matplotlib chooses.
     """
     figure, axis = _axis(6.4, 4.4, title)
     for band in bands:
@@ -86,7 +86,7 @@ def draw_bands(
 
 @dataclass(frozen=True)
 class Subplot:
-    """Curves that share an axis with others beside it."""
+    """Curves in a panel that shares both axes with neighboring panels."""
 
     title: str
     bands: tuple[Band, ...]
@@ -102,16 +102,16 @@ def draw_subplots(
     columns: int,
     is_joined: bool = True,
 ) -> Figure:
-    """Figure of panels with percentages that share both axes and one legend.
+    """Figure of panels with percentages that share both axes and a legend.
 
     Args:
-        panels: the same names in each; the horizontal axis counts ticks from 0.
-        title: above them.
-        x_label: of the horizontal axes.
-        y_label: of the vertical axes.
-        ticks: names of the places 0, 1, ... of the horizontal axis.
-        columns: panels in a row.
-        is_joined: True = the places along the horizontal axis have an order, so their dots are joined.
+        panels: Curves with the same names in each panel; the horizontal axis counts ticks from 0.
+        title: Title above all panels.
+        x_label: Quantity and unit of the horizontal axes.
+        y_label: Quantity and unit of the vertical axes, 0 to 100 %.
+        ticks: Names of the positions 0, 1, ... on the horizontal axis.
+        columns: Number of panels in a row.
+        is_joined: True joins the dots of a curve, where the ticks have an order.
     """
     rows = -(-len(panels) // columns)  # rounded up
     figure = Figure(figsize=(4.4 * columns, 3.4 * rows + 0.8), layout="constrained")
@@ -129,8 +129,7 @@ def draw_subplots(
         axis.set_xticks(range(len(ticks)), list(ticks), fontsize=8)
         axis.set(ylim=(-3, 103))
         axis.grid(color=PALE, lw=0.6, alpha=0.7)
-        for side in ("top", "right"):
-            axis.spines[side].set_visible(False)
+        axis.spines[["top", "right"]].set_visible(False)
     # Inner axes share ticks with the outer ones, so only the last row and the first column are labeled.
     for axis in axes[-columns:]:
         axis.set_xlabel(x_label)
@@ -142,13 +141,13 @@ def draw_subplots(
 
 
 def draw_intervals(intervals: Sequence[Interval], *, title: str, x_label: str, zero: bool) -> Figure:
-    """Figure with a row for each number and its interval, the first on top.
+    """Figure with a row for each number and interval, the first on top.
 
     Args:
-        intervals: the numbers.
-        title: above them.
-        x_label: quantity and unit of the numbers.
-        zero: True = zero is marked, for differences.
+        intervals: Numbers with intervals, from top to bottom.
+        title: Title above the numbers.
+        x_label: Quantity and unit of the numbers.
+        zero: True marks zero by a line, for differences.
     """
     figure, axis = _axis(6.4, 1.3 + 0.42 * len(intervals), title)
     for row, item in enumerate(intervals):
@@ -170,72 +169,70 @@ def draw_verdicts(names: Sequence[str], verdicts: Int[np.ndarray, "n n"], *, tit
     """Matrix of all pairwise comparisons.
 
     Args:
-        names: of rows and columns.
-        verdicts: 1 the row is better than the column, -1 worse, 0 no difference; the diagonal is ignored.
-        title: above the matrix.
-        note: below it.
+        names: Names of rows and columns, n of them.
+        verdicts: Matrix [n, n]: 1 the row is better than the column, -1 worse, 0 equal; the diagonal is not read.
+        title: Title above the matrix.
+        note: Small print below the matrix, such as the level of the test.
     """
     size = 0.62 * len(names)
     figure, axis = _axis(size + 3.4, size + 2.6, title)
     # Signs beside the colors, for readers that cannot tell red from green.
     for row, column in np.ndindex(*verdicts.shape):
         verdict = int(verdicts[row, column])
-        color, sign = {1: (BETTER, "+"), -1: (WORSE, "−"), 0: (NEITHER, "~")}[verdict]
+        color, sign = {1: (BETTER_COLOR, "+"), -1: (WORSE_COLOR, "−"), 0: (EQUAL_COLOR, "~")}[verdict]
         if row == column:
-            color, sign = OWN, ""
+            color, sign = DIAGONAL_COLOR, ""
         axis.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, fc=color, ec="white", lw=2))
         axis.text(column, row, sign, ha="center", va="center", fontsize=13, fontweight="bold", color=INK)
     axis.set(xlim=(-0.5, len(names) - 0.5), ylim=(len(names) - 0.5, -0.5), aspect="equal")
     axis.set_xticks(range(len(names)), names, rotation=40, ha="right", rotation_mode="anchor")
     axis.set_yticks(range(len(names)), names)
     axis.tick_params(length=0)
-    for side in axis.spines.values():
-        side.set_visible(False)
+    axis.spines[:].set_visible(False)
     figure.supxlabel(note, fontsize=9, color=INK)
     return figure
 
 
-def refuse_no_picture(path: Path) -> None:
+def check_picture_path(path: Path) -> None:
     """Check that a file name has the ending of a picture.
 
     Raises:
-        ConfigError: it has another one.
+        ConfigError: The ending is no picture's.
     """
     if path.suffix not in PICTURES:
         raise ConfigError(f"{path}: pictures are written as {', '.join(PICTURES)}: name the file so.")
 
 
 def save_figure(path: Path, figure: Figure, *, dots_per_inch: int = DOTS_PER_INCH) -> None:
-    """Write a figure as PNG, SVG or PDF; nothing half-written is left behind.
+    """Write a figure as PNG, SVG or PDF; no half-written file is left behind.
 
     Args:
-        path: file to write; its ending chooses the format.
-        figure: what to write.
-        dots_per_inch: resolution of a PNG.
+        path: File to write; the ending .png, .svg or .pdf chooses the format.
+        figure: Figure to write; equal figures give equal bytes.
+        dots_per_inch: Resolution of a PNG; 160 makes an inch 160 pixels.
 
     Raises:
-        ConfigError: another ending.
-        DataError: the file cannot be written.
+        ConfigError: An ending that is no picture's.
+        DataError: The file cannot be written.
     """
-    refuse_no_picture(path)
-    kind = path.suffix.removeprefix(".")
+    check_picture_path(path)
+    picture_format = path.suffix.removeprefix(".")
     FigureCanvasAgg(figure)
     # No dates and a fixed salt for ids: the same figure gives the same bytes.
-    metadata = {"png": None, "svg": {"Date": None}, "pdf": {"CreationDate": None}}[kind]
+    metadata = {"png": None, "svg": {"Date": None}, "pdf": {"CreationDate": None}}[picture_format]
     with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "rlftsim"}):
-        write_whole(
+        write_atomically(
             path,
             lambda temporary: figure.savefig(
-                temporary, format=kind, dpi=dots_per_inch, facecolor="white", metadata=metadata
+                temporary, format=picture_format, dpi=dots_per_inch, facecolor="white", metadata=metadata
             ),
         )
 
 
 def _axis(width: float, height: float, title: str) -> tuple[Figure, Axes]:
-    """Figure of a size in inches with one empty axis."""
+    """Figure of a size in inches with an empty axis."""
     figure = Figure(figsize=(width, height), layout="constrained")
     figure.suptitle(title, fontsize=12, fontweight="bold", color=INK, x=0.01, ha="left")
     axis = figure.subplots()
-    for side in ("top", "right"):
-        axis.spines[side].set_visible(False)
+    axis.spines[["top", "right"]].set_visible(False)
     return figure, axis

@@ -1,7 +1,7 @@
 """Films of scenes: the panels of an animation side by side, step by step, in a file that plays anywhere."""
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import imageio_ffmpeg
@@ -11,7 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 
 from rlftsim.errors import ConfigError
-from rlftsim.jobs.files import write_whole
+from rlftsim.jobs.files import write_atomically
 from rlftsim.scenario.types import CURRENT_STEP
 from rlftsim.viewer.page import Animation, Panel
 from rlftsim.viewer.picture import agent_shapes, draw_scene, light_dots
@@ -22,35 +22,38 @@ HOLD_AT_END_S = 1.0
 Frame = UInt8[np.ndarray, "height width 3"]
 
 
-def to_film(path: str | os.PathLike[str], animation: Animation, *, every: int = 1, dots_per_inch: int = 110) -> None:
+def to_film(
+    path: str | os.PathLike[str], animation: Animation, *, steps_per_frame: int = 1, dots_per_inch: int = 110
+) -> None:
     """Write a film of an animation's first rollouts, from the current step on, in real time.
 
     Args:
-        path: file to write, .mp4 (H.264) or .webp (plays wherever pictures are shown); nothing half-written is left
-            there.
-        animation: scene and panels.
-        every: steps of 0.1 s between frames.
-        dots_per_inch: 110 makes a panel 440 pixels wide.
+        path: File to write, .mp4 (H.264) or .webp (plays wherever pictures are shown); no half-written file is left.
+        animation: Scene and panels, each with the motion of the agents.
+        steps_per_frame: Number of steps of 0.1 s between frames; 2 halves the size of the file.
+        dots_per_inch: Resolution; 110 makes a panel 440 pixels wide.
 
     Raises:
-        ConfigError: another ending.
-        DataError: the file cannot be written.
+        ConfigError: An ending that is no film's.
+        DataError: The file cannot be written.
     """
     path = Path(path)
     if path.suffix not in WRITERS:
         raise ConfigError(f"{path}: a film is {' or '.join(WRITERS)}, choose one of these endings.")
     # The last frame stays for a while, or the end could not be seen before a player starts again.
-    films = list(_frames(animation, every, dots_per_inch))
-    films += films[-1:] * round(HOLD_AT_END_S * STEPS_PER_SECOND / every)
-    write_whole(path, lambda temporary: WRITERS[path.suffix](temporary, films, STEPS_PER_SECOND / every))
+    camera, rate = Camera(animation, dots_per_inch), STEPS_PER_SECOND / steps_per_frame
+    num_steps = max(panel.trajectories.num_steps for panel in animation.panels)
+    frames = [camera.frame(animation.panels, step) for step in range(CURRENT_STEP, num_steps, steps_per_frame)]
+    frames += frames[-1:] * round(HOLD_AT_END_S * rate)
+    write_atomically(path, lambda temporary: WRITERS[path.suffix](temporary, frames, rate))
 
 
 class Camera:
     """Draws single frames of a scene.
 
     Args:
-        animation: scene and panels.
-        dots_per_inch: 110 makes a panel 440 pixels wide.
+        animation: Scene, and a panel for each picture side by side.
+        dots_per_inch: Resolution; 110 makes a panel 440 pixels wide.
     """
 
     def __init__(self, animation: Animation, dots_per_inch: int):
@@ -63,12 +66,12 @@ class Camera:
         self._ground = self._canvas.copy_from_bbox(self._figure.bbox)
 
     def frame(self, panels: Sequence[Panel], step: int, light_step: int | None = None) -> Frame:
-        """Picture of the agents at one step.
+        """Picture of the agents at a step.
 
         Args:
-            panels: motion, one for each panel of the animation.
-            step: of the motion.
-            light_step: of the log, for traffic lights; None = `step`.
+            panels: Motion of the agents, for each panel of the animation.
+            step: Step of the motion, 0 the first.
+            light_step: Step of the log whose traffic lights are drawn; None = `step`.
         """
         scene, lights_at = self.animation.scene, step if light_step is None else light_step
         self._canvas.restore_region(self._ground)
@@ -79,17 +82,9 @@ class Camera:
             for shape in (*shapes, light_dots(axis, scene, lights_at)):
                 axis.draw_artist(shape)
                 shape.remove()
-        drawn = np.asarray(self._canvas.buffer_rgba())[..., :3]
+        pixels = np.asarray(self._canvas.buffer_rgba())[..., :3]
         # H.264 wants even sizes. The copy is needed because the canvas reuses its buffer.
-        return drawn[: len(drawn) // 2 * 2, : drawn.shape[1] // 2 * 2].copy()
-
-
-def _frames(animation: Animation, every: int, dots_per_inch: int) -> Iterator[Frame]:
-    """Frames of a film, one every so many steps."""
-    camera = Camera(animation, dots_per_inch)
-    num_steps = max(panel.trajectories.num_steps for panel in animation.panels)
-    for step in range(CURRENT_STEP, num_steps, every):
-        yield camera.frame(animation.panels, step)
+        return pixels[: len(pixels) // 2 * 2, : pixels.shape[1] // 2 * 2].copy()
 
 
 def _write_mp4(path: Path, frames: list[Frame], frames_per_second: float) -> None:
@@ -105,9 +100,9 @@ def _write_mp4(path: Path, frames: list[Frame], frames_per_second: float) -> Non
 
 
 def _write_webp(path: Path, frames: list[Frame], frames_per_second: float) -> None:
-    first, *rest = (Image.fromarray(frame) for frame in frames)
+    first, *later = (Image.fromarray(frame) for frame in frames)
     first.save(
-        path, format="WEBP", save_all=True, append_images=rest, duration=round(1000 / frames_per_second), loop=0,
+        path, format="WEBP", save_all=True, append_images=later, duration=round(1000 / frames_per_second), loop=0,
         quality=60, method=4,
     )  # fmt: skip
 

@@ -1,6 +1,6 @@
 """Goals on a map: the goals of agents, the paths there, and the trajectories of simulations.
 
-Everything is handed over in the world frame and drawn in the map frame.
+Arguments are in the world frame; pictures are in the map frame.
 """
 
 from collections.abc import Sequence
@@ -36,9 +36,9 @@ class DrawnGoal:
 
     object_id: int
     position: Float[np.ndarray, "2"] | None = None
-    """None = the agent has no goal and only its paths are drawn."""
+    """None = the agent has no goal; only the paths are drawn."""
     label: str = ""
-    way: Float[np.ndarray, "S 2"] | None = None
+    path: Float[np.ndarray, "S 2"] | None = None
     """Path to the goal."""
     driven: Float[np.ndarray, "N T 2"] | None = None
     """Simulated paths of the agent."""
@@ -47,7 +47,7 @@ class DrawnGoal:
 
     @property
     def name(self) -> str:
-        """Text beside the goal: object id and label, a long one shortened."""
+        """Text beside the goal: object id and label, shortened if long."""
         label = self.label.replace("_", " ")
         cut = label if len(label) <= LONGEST_LABEL else f"{label[: LONGEST_LABEL - 1]}…"
         return f"{self.object_id}: {cut}" if label else str(self.object_id)
@@ -73,15 +73,15 @@ def draw_goals(
     """Write a picture with a panel for each scenario.
 
     Args:
-        path: .png, .svg or .pdf.
-        panels: at least one.
-        columns: panels in a row.
-        panel_inches: width of a panel.
-        dots_per_inch: of a PNG.
+        path: File to write, .png, .svg or .pdf.
+        panels: Scenarios with goals, row by row, at least one.
+        columns: Number of panels in a row.
+        panel_inches: Width of a panel in inches; the height is 0.3 inches more, for the title.
+        dots_per_inch: Resolution of a PNG.
 
     Raises:
-        ConfigError: another ending.
-        DataError: the file cannot be written.
+        ConfigError: An ending that is no picture's.
+        DataError: The file cannot be written.
     """
     rows = -(-len(panels) // columns)  # rounded up
     figure = Figure(figsize=(panel_inches * columns, (panel_inches + 0.3) * rows), layout="constrained")
@@ -118,8 +118,8 @@ def _draw_mark(axis: Axes, mark: DrawnGoal, origin: Float[np.ndarray, "2"], colo
         driven = mark.driven - origin  # [N, T, 2], map frame
         axis.add_collection(LineCollection(list(driven), colors=color, lw=1, alpha=alpha), autolim=False)
         axis.plot(*driven[:, -1].T, ".", color=color, ms=3, mec="none", alpha=max(alpha, 0.5), zorder=4)
-    if mark.way is not None:
-        axis.plot(*(mark.way - origin).T, color=color, lw=1.4, zorder=4)
+    if mark.path is not None:
+        axis.plot(*(mark.path - origin).T, color=color, lw=1.4, zorder=4)
     if mark.position is None:
         return
     point = mark.position - origin  # [2], map frame
@@ -130,26 +130,25 @@ def _draw_mark(axis: Axes, mark: DrawnGoal, origin: Float[np.ndarray, "2"], colo
     _write(axis, mark.name, point, color, size=7.0)
 
 
-def _write(axis: Axes, text: str, place: Float[np.ndarray, "2"], color: str, *, size: float) -> None:
-    """Write a text beside a place, on the side with more room; a dollar sign begins no formula."""
-    is_right = place[0] > sum(axis.get_xlim()) / 2
+def _write(axis: Axes, text: str, point: Float[np.ndarray, "2"], color: str, *, size: float) -> None:
+    """Write a text beside a point, on the side with more room; a dollar sign begins no formula."""
+    is_right = point[0] > sum(axis.get_xlim()) / 2
     outline = [patheffects.withStroke(linewidth=2, foreground="white")]
     axis.annotate(
-        text, tuple(place), (-4 if is_right else 4, 4), ha="right" if is_right else "left", textcoords="offset points",
+        text, tuple(point), (-4 if is_right else 4, 4), ha="right" if is_right else "left", textcoords="offset points",
         fontsize=size, color=color, zorder=6, path_effects=outline, annotation_clip=True, parse_math=False,
     ).set_in_layout(False)  # fmt: skip
 
 
 def _focus(panel: GoalPanel, scene: SceneView) -> tuple[float, float, float]:
-    """Square around the goals and their agents, as center x, y and half width; the scenario's own without goals."""
-    ids = [mark.object_id for mark in panel.marks]
+    """Square around goals and agents, as center x, y and half width; without goals the focus of the scene."""
     tracks = panel.scenario.tracks
-    # Everything that is to be seen, map frame: current positions, goals, paths and simulated paths, each [n, 2].
-    places = [tracks.position[np.isin(tracks.object_id, ids), CURRENT_STEP, :2] - panel.scenario.origin]
+    is_marked = np.isin(tracks.object_id, [mark.object_id for mark in panel.marks])
+    # Current positions, goals, paths and simulated paths, each [n, 2].
+    point_sets = [tracks.position[is_marked, CURRENT_STEP, :2]]
     for mark in panel.marks:
-        ways = (None if mark.position is None else mark.position[None], mark.way, mark.driven)
-        places += [way.reshape(-1, 2) - panel.scenario.origin for way in ways if way is not None]
-    points = np.concatenate(places)
+        point_sets += [p.reshape(-1, 2) for p in (mark.position, mark.path, mark.driven) if p is not None]
+    points = np.concatenate(point_sets) - panel.scenario.origin  # map frame
     if not len(points):
         return scene.focus
     low, high = points.min(0), points.max(0)

@@ -14,7 +14,7 @@ from torch import Tensor
 from rlftsim.errors import ConfigError, DataError
 from rlftsim.jobs.files import write_text
 from rlftsim.rollout.types import Rollouts
-from rlftsim.scenario.any_form import AnyScenarios, scenarios_of
+from rlftsim.scenario.any_form import AnyScenarios, to_scenarios
 from rlftsim.scenario.types import Scenario, register_html
 from rlftsim.viewer.page import Animation, Panel, animation_html, page_html
 from rlftsim.viewer.scene import build_scene, logged_trajectories, rollout_trajectories
@@ -22,7 +22,7 @@ from rlftsim.viewer.scene import build_scene, logged_trajectories, rollout_traje
 MAX_ROLLOUTS = 4
 """Rollouts that play in one panel: a notebook stores the page in its file, and every rollout adds about 50 kB."""
 MAX_SCENARIOS = 3
-"""Scenarios of one cell."""
+"""Scenarios of a cell."""
 FRAME_HEIGHT = 660
 """Pixels that one scenario takes."""
 FRAME_CSS = (
@@ -37,7 +37,7 @@ class Cell:
 
     Args:
         page: HTML of a whole self-contained page.
-        height: of the frame, pixels.
+        height: Height of the frame in pixels; a higher page scrolls.
     """
 
     def __init__(self, page: str, height: int = FRAME_HEIGHT) -> None:
@@ -57,33 +57,33 @@ class Cell:
         return f'<iframe style="{style}" sandbox="allow-scripts" srcdoc="{escape(self.page)}"></iframe>'
 
 
-def require_rollouts(function: str, scenarios: object, *rollouts: object) -> None:
-    """Refuse something else in place of rollouts, mostly arguments in the other order.
+def check_rollouts(function: str, scenarios: object, *rollouts: object) -> None:
+    """Check the arguments of a function of scenarios and rollouts, which are easily confused.
 
     Args:
-        function: public name, for the message.
-        scenarios: as handed over, in whatever form.
-        rollouts: as handed over.
+        function: Public name of the function, for the message.
+        scenarios: First argument as handed over: scenarios in any form.
+        rollouts: Further arguments as handed over.
 
     Raises:
-        ConfigError: there is something else.
-        DataError: rollouts whose positions and headings are no tensors of the axes that they have.
+        ConfigError: A value that is no `Rollouts`, mostly arguments in the wrong order.
+        DataError: Rollouts with positions and headings that are no tensors with the axes of rollouts.
     """
-    for one in rollouts:
-        if not isinstance(one, Rollouts) or isinstance(scenarios, Rollouts):
-            kinds = ", ".join(type(value).__name__ for value in (scenarios, *rollouts))
-            raise ConfigError(f"write rs.{function}(scenario, rollouts), got ({kinds}).")
-        poses = (one.position, one.heading)
-        is_sound = all(isinstance(values, Tensor) for values in poses) and one.heading.dim() == 4
-        if not is_sound or one.position.shape != (*one.heading.shape, 2):
-            found = " and ".join(_shape_of(values) for values in poses)
+    for argument in rollouts:
+        if not isinstance(argument, Rollouts) or isinstance(scenarios, Rollouts):
+            types = ", ".join(type(value).__name__ for value in (scenarios, *rollouts))
+            raise ConfigError(f"write rs.{function}(scenario, rollouts), got ({types}).")
+        poses = (argument.position, argument.heading)
+        are_tensors = all(isinstance(values, Tensor) for values in poses) and argument.heading.dim() == 4
+        if not are_tensors or argument.position.shape != (*argument.heading.shape, 2):
+            shapes = " and ".join(_describe_shape(values) for values in poses)
             raise DataError(
-                f"position and heading of rollouts must be tensors [B, N, A, T, 2] and [B, N, A, T], got {found}: hand "
-                "over those of rs.simulate, or put such tensors in their place."
+                f"position and heading of rollouts must be tensors [B, N, A, T, 2] and [B, N, A, T], got {shapes}: "
+                "hand over those of rs.simulate, or put such tensors in their place."
             )
 
 
-def _shape_of(values: Any) -> str:
+def _describe_shape(values: Any) -> str:
     shape = tuple(getattr(values, "shape", ()))
     return str(shape) if isinstance(values, Tensor) else f"{type(values).__name__} {shape}"
 
@@ -91,52 +91,53 @@ def _shape_of(values: Any) -> str:
 def show(scenario: AnyScenarios, *rollouts: Rollouts, titles: str | Sequence[str] = ()) -> Cell:
     """Player of the logged scenario beside its rollouts, for a notebook cell.
 
-    Boxes that overlap are marked; the first rollouts of each kind can be played.
+    Boxes that overlap are marked; the first rollouts of each argument can be played.
 
     Args:
-        scenario: one scenario; of several, a batch or a data set the first few are shown. A name of a data set stands
-            for its split validation.
-        rollouts: of the same scenarios, such as those of a base model and of a tuned one.
-        titles: of the panels with rollouts, in their order; left out, "rollouts" or "rollouts 1", "rollouts 2", ...
+        scenario: A scenario; of several, a batch or a data set the first 3 are shown. A name of a data set stands for
+            the split validation.
+        rollouts: Rollouts of the same scenarios, a panel each, such as those of a base model and of a tuned model.
+        titles: Titles of the panels with rollouts, in the same order; left out, "rollouts" or "rollouts 1",
+            "rollouts 2", ...
 
     Returns:
-        A value that a notebook displays; `save(path)` writes it as a page.
+        A value that a notebook displays; `save(path)` writes the page.
 
     Raises:
-        ConfigError: rollouts of other scenarios, more titles than rollouts, or no scenario.
-        DataError: no data set of this name, or without this split, or a scenario with other agents than the simulated
-            one.
+        ConfigError: Rollouts of other scenarios, more titles than rollouts, or no scenario.
+        DataError: No data set of this name, or without this split, or a scenario with other agents than the simulated
+            scenario.
     """
-    require_rollouts("show", scenario, *rollouts)
+    check_rollouts("show", scenario, *rollouts)
     titles = (titles,) if isinstance(titles, str) else titles
     if len(titles) > len(rollouts):
         raise ConfigError(f"{len(titles)} titles for {len(rollouts)} rollouts: give one each, or none.")
     numbered = [f"rollouts {i + 1}" for i in range(len(rollouts))] if len(rollouts) > 1 else ["rollouts"]
     names = [*titles, *numbered[len(titles) :]]
-    found = scenarios_of(scenario)
-    shown = [found[row] for row in range(min(len(found), MAX_SCENARIOS))]
-    # One figure a scenario: the log, then one panel for each kind of rollouts.
+    scenarios = to_scenarios(scenario)
+    # One figure a scenario: the log, then one panel for each argument of rollouts.
     figures = []
-    for row, one in enumerate(shown):
-        scene = build_scene(one)
-        panels = [Panel("logged", logged_trajectories(one).with_overlaps(scene.agents))]
+    for row in range(min(len(scenarios), MAX_SCENARIOS)):
+        log = scenarios[row]
+        scene = build_scene(log)
+        panels = [Panel("logged", logged_trajectories(log).with_overlaps(scene.agents))]
         for name, simulated in zip(names, rollouts):
-            if simulated.provenance is None and len(simulated.position) != len(found):
+            if simulated.provenance is None and len(simulated.position) != len(scenarios):
                 raise ConfigError(
-                    f"rollouts of {len(simulated.position)} scenarios do not belong to {len(found)}: hand over the "
+                    f"rollouts of {len(simulated.position)} scenarios do not belong to {len(scenarios)}: hand over the "
                     "scenarios they are of."
                 )
             # By id where the rollouts know their scenarios, else by position.
-            place = row if simulated.provenance is None else simulated.row_of(one.scenario_id)
-            motion = rollout_trajectories(one, simulated, row=place, max_rollouts=MAX_ROLLOUTS)
+            batch_row = row if simulated.provenance is None else simulated.find_row(log.scenario_id)
+            motion = rollout_trajectories(log, simulated, row=batch_row, max_rollouts=MAX_ROLLOUTS)
             panels.append(Panel(name, motion.with_overlaps(scene.agents)))
-        figures.append(animation_html(Animation(f"Scenario {one.scenario_id}", scene, panels)))
-    page = page_html(f"Scenario {shown[0].scenario_id}", "\n".join(figures), extra_css=FRAME_CSS)
-    return Cell(page, FRAME_HEIGHT * len(shown))
+        figures.append(animation_html(Animation(f"Scenario {log.scenario_id}", scene, panels)))
+    page = page_html(f"Scenario {scenarios[0].scenario_id}", "\n".join(figures), extra_css=FRAME_CSS)
+    return Cell(page, FRAME_HEIGHT * len(figures))
 
 
 def _show_rollouts(rollouts: Rollouts) -> str | None:
-    """Frame that plays rollouts beside the log; None where they do not know their scenarios."""
+    """Frame that plays rollouts beside the log; None for rollouts without scenarios."""
     return None if rollouts.provenance is None else show(rollouts.provenance.scenarios, rollouts)._repr_html_()
 
 

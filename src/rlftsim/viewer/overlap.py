@@ -17,17 +17,17 @@ def compute_overlap(
     z: Float[np.ndarray, "N A S"] | None = None,
     height: Float[np.ndarray, "A"] | None = None,
 ) -> Bool[np.ndarray, "N A S"]:
-    """True where an agent's box has an inner point in common with another one.
+    """True where an agent's box has an inner point in common with a second box.
 
     Args:
-        position: centers, meters.
-        heading: radians.
-        length: along the heading, meters.
-        width: meters.
-        valid: an agent that is not valid overlaps no other.
-        ignore_from: a step; two agents that overlap there are never marked for overlapping each other.
-        z: Heights of the centers, meters; without them agents above each other overlap.
-        height: Heights of the boxes, meters; needed with `z`.
+        position: Centers [N, A, S, 2] of the boxes, meters.
+        heading: Headings [N, A, S], radians.
+        length: Lengths [A] along the heading, meters.
+        width: Widths [A] across the heading, meters.
+        valid: Mask [N, A, S]; an agent that is not valid overlaps no agent.
+        ignore_from: Step at which overlapping pairs are noted, never to be marked; None marks all pairs.
+        z: Heights [N, A, S] of the centers, meters; without heights, agents above each other overlap.
+        height: Heights [A] of the boxes, meters; needed with `z`.
     """
     overlap = np.zeros(valid.shape, bool)  # [N, A, S]
     size = np.stack([length, width], axis=-1).astype(np.float64)
@@ -49,16 +49,16 @@ def _mark_rollout(
     """Mark one rollout's overlaps in `overlap`."""
     radius = np.linalg.norm(size, axis=-1) / 2  # [A], of the circle around a box
     for agent in range(len(valid) - 1):
-        others = slice(agent + 1, None)
-        gap = position[others] - position[agent]  # [A - agent - 1, S, 2]
+        later_agents = slice(agent + 1, None)
+        gap = position[later_agents] - position[agent]  # [A - agent - 1, S, 2]
         # Few pairs are so close that their circles touch; only these need the exact test.
-        near = (gap**2).sum(-1) < (radius[others, None] + radius[agent]) ** 2
-        # k pairs of another agent and a step
-        other, step = np.nonzero(near & valid[others] & valid[agent])
-        if not len(other):
+        is_close = (gap**2).sum(-1) < (radius[later_agents, None] + radius[agent]) ** 2
+        # k pairs of a later agent and a step
+        gap_row, step = np.nonzero(is_close & valid[later_agents] & valid[agent])
+        if not len(gap_row):
             continue
-        row = other + agent + 1
-        hit = boxes_overlap(gap[other, step], heading[agent, step], heading[row, step], size[agent], size[row])
+        row = gap_row + agent + 1
+        hit = boxes_overlap(gap[gap_row, step], heading[agent, step], heading[row, step], size[agent], size[row])
         if heights is not None:
             z, height = heights
             hit &= heights_overlap(z[row, step] - z[agent, step], height[agent, None], height[row])

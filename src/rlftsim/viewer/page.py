@@ -1,4 +1,4 @@
-"""Scenarios that play in a browser: a page, or pieces of one, that need no network."""
+"""Scenarios that play in a browser: a page, or figures of a page, that need no network."""
 
 import json
 import os
@@ -20,7 +20,7 @@ SPEEDS = (0.25, 0.5, 1, 2, 4)
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """One picture of a scene: a title and the motion of its agents."""
+    """Picture of a scene: a title and the motion of the agents."""
 
     title: str
     trajectories: SceneMotion
@@ -40,11 +40,11 @@ class Animation:
             raise DataError(f"{self.title}: an animation needs at least one panel.")
         # Agents have no ids in the panels: the same number means the same agent in all of them.
         for panel in self.panels:
-            shown, expected = panel.trajectories.position.shape[1], len(self.scene.agents)
-            if shown != expected:
+            num_agents, expected = panel.trajectories.position.shape[1], len(self.scene.agents)
+            if num_agents != expected:
                 raise DataError(
-                    f"{self.title}, {panel.title}: {shown} agents, but scene {self.scene.scenario_id} has {expected}: "
-                    "build both from the same scenario."
+                    f"{self.title}, {panel.title}: {num_agents} agents, but scene {self.scene.scenario_id} has "
+                    f"{expected}: build both from the same scenario."
                 )
 
     def to_payload(self) -> dict[str, Any]:
@@ -88,10 +88,10 @@ def page_html(title: str, body: str, *, extra_css: str = "", extra_js: str = "")
     """A whole self-contained page.
 
     Args:
-        title: plain text.
-        body: HTML with texts that are already escaped.
-        extra_css: style rules after those of the player.
-        extra_js: script after that of the player.
+        title: Title of the page, plain text.
+        body: HTML inside of `<main>`, with texts that are already escaped.
+        extra_css: Style rules after those of the player.
+        extra_js: Script after the player's, in the same page.
     """
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
@@ -105,13 +105,13 @@ def write_page(path: str | os.PathLike[str], title: str, animations: Sequence[An
     """Write a page of animations.
 
     Args:
-        path: file to write; nothing half-written is left there.
-        title: plain text, above the animations.
-        animations: scenes, one below the other.
-        caption: plain text below the title.
+        path: File to write; no half-written file is left.
+        title: Heading above the animations, plain text.
+        animations: Scenes from top to bottom, a figure each.
+        caption: Paragraph below the heading, plain text; empty = none.
 
     Raises:
-        DataError: the file cannot be written.
+        DataError: The file cannot be written.
     """
     intro = f'<p class="lead">{escape(caption)}</p>' if caption else ""
     figures = "\n".join(animation_html(animation) for animation in animations)
@@ -137,7 +137,7 @@ def _player_script() -> str:
 
 
 def _controls_html() -> str:
-    """Controls below the panels. `player.js` finds them by `data-part` and hides `several` for a single rollout."""
+    """Controls below the panels. `player.js` reads `data-part` and hides the class `several` for a single rollout."""
     speeds = "".join(f'<option value="{s}"{" selected" if s == 1 else ""}>{s}×</option>' for s in SPEEDS)
     return (
         '<div class="controls"><button class="play" data-part="play" aria-label="Play"></button>'
@@ -154,7 +154,7 @@ def _controls_html() -> str:
 
 
 def _legend_html(animation: Animation) -> str:
-    """Legend of what can be seen; marks that no panel has are left out."""
+    """Legend of shapes and colors; marks that no panel has are left out."""
     trajectories = [panel.trajectories for panel in animation.panels]
     # Pairs of SVG shapes and names.
     entries = [
@@ -173,7 +173,7 @@ def _legend_html(animation: Animation) -> str:
         entries.append(
             ("".join(f'<circle cx="{x}" cy="8" r="3.5" fill="var(--{c})"/>' for x, c in dots), "traffic light")
         )
-    if any(line.kind == "stop_sign" for line in animation.scene.lines):
+    if any(line.style == "stop_sign" for line in animation.scene.lines):
         octagon = '<path d="M18 5.5v5L14.5 14h-5L6 10.5v-5L9.5 2h5z" fill="var(--stop)"/>'
         octagon += '<path d="M8.5 7h7v2h-7z" fill="var(--surface)"/>'
         entries.append((octagon, "stop sign"))
@@ -187,8 +187,8 @@ def _legend_html(animation: Animation) -> str:
 
 def _box_svg(color: str, half: float = 10.0) -> str:
     """A vehicle from above, heading right."""
-    place = f'x="{12 - half}" y="{8 - half * 0.42}" width="{2 * half}" height="{half * 0.84}"'
-    shape = f'<rect {place} rx="1.5" fill="var(--{color})"/>'
+    box = f'x="{12 - half}" y="{8 - half * 0.42}" width="{2 * half}" height="{half * 0.84}"'
+    shape = f'<rect {box} rx="1.5" fill="var(--{color})"/>'
     tip, root = 12 + half * 0.85, 12 + half * 0.3
     return f'{shape}<path d="M{tip} 8L{root} {8 - half * 0.28}V{8 + half * 0.28}z" fill="var(--heading-mark)"/>'
 

@@ -1,9 +1,10 @@
-"""One still picture of a scene: panels side by side, with the paths of all rollouts as thin lines."""
+"""Still picture of a scene: panels side by side, with the paths of all rollouts as thin lines."""
 
 import os
 from collections.abc import Sequence
 from pathlib import Path
 from textwrap import wrap
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -55,14 +56,14 @@ def to_png(
     """Draw the panels of an animation side by side, boxes at `step`, paths of evaluated agents from there on.
 
     Args:
-        path: file to write; nothing half-written is left there.
-        animation: scene and panels; its caption is left out.
-        step: 0..90; the boxes are those of each panel's first rollout.
-        dots_per_inch: 160 makes a panel 640 pixels wide.
+        path: File to write, .png, .svg or .pdf; no half-written file is left.
+        animation: Scene and panels; the caption is left out.
+        step: Step 0..90 of the boxes, which are those of each panel's first rollout.
+        dots_per_inch: Resolution of a PNG; 160 makes a panel 640 pixels wide.
 
     Raises:
-        ConfigError: another ending than pictures have.
-        DataError: the file cannot be written.
+        ConfigError: An ending that is no picture's.
+        DataError: The file cannot be written.
     """
     figure, axes = draw_scene(animation)
     for axis, panel in zip(axes, animation.panels):
@@ -74,7 +75,7 @@ def to_png(
 
 
 def draw_scene(animation: Animation) -> tuple[Figure, Sequence[Axes]]:
-    """Figure with the still part of an animation: a map for each of its panels, and a legend."""
+    """Figure with the still part of an animation: a map for each panel, and a legend."""
     panels = animation.panels
     figure = Figure(figsize=(PANEL_INCHES * len(panels), PANEL_INCHES + 0.7), layout="constrained")
     axes = figure.subplots(1, len(panels), squeeze=False)[0]
@@ -83,8 +84,7 @@ def draw_scene(animation: Animation) -> tuple[Figure, Sequence[Axes]]:
         axis.set(xlim=(x - radius, x + radius), ylim=(y - radius, y + radius), xticks=[], yticks=[], aspect="equal")
         axis.set_facecolor(COLORS["ground"])
         axis.set_title(panel.title, fontsize=12, loc="left", fontweight="bold")
-        for side in axis.spines.values():
-            side.set_visible(False)
+        axis.spines[:].set_visible(False)
         draw_map(axis, animation.scene, points_per_m=PANEL_INCHES * POINTS_PER_INCH / (2 * radius))
     names = {"ego": "ego", "evaluated": "evaluated agents", "other": "other agents"}
     handles = [Line2D([], [], color=COLORS[role], lw=5, label=label) for role, label in names.items()]
@@ -106,9 +106,9 @@ def write_notes(figure: Figure, scenes: Sequence[SceneView], *, panels_across: i
     """Write the notes of the scenes in small print on top of a figure, each once.
 
     Args:
-        figure: with a constrained layout, which makes room.
-        scenes: those that the figure shows.
-        panels_across: number of panels side by side.
+        figure: Figure with a constrained layout, which makes room for the notes.
+        scenes: Scenes in the figure; equal notes are written once.
+        panels_across: Number of panels side by side, for the length of a line.
     """
     notes = " ".join(dict.fromkeys(scene.note for scene in scenes if scene.note))
     if notes:
@@ -120,56 +120,47 @@ def draw_map(axis: Axes, scene: SceneView, *, points_per_m: float) -> None:
     """Draw a scene's map: road, on it crosswalks, lines, and edges on top.
 
     Args:
-        axis: axes in the map frame, m.
-        scene: the still part of a scenario.
-        points_per_m: points (1/72 inch) on paper for a meter, so that lanes are as wide as they are in the world.
+        axis: Axes in the map frame, meters.
+        scene: Still part of a scenario, with the map features as styled lines.
+        points_per_m: Points (1/72 inch) on paper for a meter, so that lanes have the width of the real road.
     """
     # Autoscaling is off for every collection: the limits show the focus of the scene, not the whole map.
-    by_kind: dict[str, list[np.ndarray]] = {}
+    by_style: dict[str, list[np.ndarray]] = {}
     for line in scene.lines:
-        by_kind.setdefault(line.kind, []).append(line.points)
-    axis.add_collection(PolyCollection(by_kind.get("driveway", []), facecolor=COLORS["road"], zorder=1), autolim=False)
+        by_style.setdefault(line.style, []).append(line.points)
+
+    def add(collection: type[PolyCollection] | type[LineCollection], style: str, **properties: Any) -> None:
+        axis.add_collection(collection(by_style.get(style, []), **properties), autolim=False)
+
+    add(PolyCollection, "driveway", facecolor=COLORS["road"], zorder=1)
     # Lanes are logged as center lines; wide strokes with round ends make them a road surface without gaps.
-    for kind, width in LANE_WIDTH_M.items():
-        lanes = LineCollection(
-            by_kind.get(kind, []), colors=COLORS["road"], lw=width * points_per_m, capstyle="round", zorder=1
-        )
-        axis.add_collection(lanes, autolim=False)
-    for kind in ("crosswalk", "speed_bump"):
-        areas = PolyCollection(
-            by_kind.get(kind, []), facecolor=COLORS["crosswalk"], edgecolor=COLORS["edge"], lw=0.4, zorder=1
-        )
-        axis.add_collection(areas, autolim=False)
-    for kind, dashes in (
-        ("white", "-"),
-        ("white_broken", (0, (4, 6))),
-        ("yellow", "-"),
-        ("yellow_broken", (0, (4, 6))),
-    ):
-        color = COLORS[kind.removesuffix("_broken")]
-        axis.add_collection(
-            LineCollection(by_kind.get(kind, []), colors=color, lw=0.9, linestyles=[dashes]), autolim=False
-        )
-    axis.add_collection(LineCollection(by_kind.get("edge", []), colors=COLORS["edge"], lw=1.1), autolim=False)
+    for style, width in LANE_WIDTH_M.items():
+        add(LineCollection, style, colors=COLORS["road"], lw=width * points_per_m, capstyle="round", zorder=1)
+    for style in ("crosswalk", "speed_bump"):
+        add(PolyCollection, style, facecolor=COLORS["crosswalk"], edgecolor=COLORS["edge"], lw=0.4, zorder=1)
+    for color in ("white", "yellow"):
+        add(LineCollection, color, colors=COLORS[color], lw=0.9, linestyles=["-"])
+        add(LineCollection, f"{color}_broken", colors=COLORS[color], lw=0.9, linestyles=[(0, (4, 6))])
+    add(LineCollection, "edge", colors=COLORS["edge"], lw=1.1)
 
 
 def draw_paths(axis: Axes, agents: AgentBoxes, panel: Panel, step: int) -> None:
     """Draw the paths of the evaluated agents as thin lines, paler the more rollouts there are.
 
     Args:
-        axis: axes in the map frame, m.
-        agents: boxes of the scene.
-        panel: motion of the agents.
-        step: first step that is drawn.
+        axis: Axes in the map frame, meters.
+        agents: Boxes of the scene, which say which agents are evaluated.
+        panel: Motion of the agents in all rollouts.
+        step: First step of the paths, 0..90.
     """
     trajectories = panel.trajectories
     alpha = max(0.12, 0.9 / np.sqrt(trajectories.num_rollouts))
     for agent in np.flatnonzero(agents.evaluated_mask):
         # [N, steps, 2]; NaN interrupts a line where the agent is not valid.
-        where = np.where(trajectories.valid[:, agent, step:, None], trajectories.position[:, agent, step:], np.nan)
+        points = np.where(trajectories.valid[:, agent, step:, None], trajectories.position[:, agent, step:], np.nan)
         color = COLORS[ROLES[2 if agents.is_ego[agent] else 1]]
         width = 2.0 if trajectories.num_rollouts == 1 else 1.0
-        axis.add_collection(LineCollection(list(where), colors=color, lw=width, alpha=alpha), autolim=False)
+        axis.add_collection(LineCollection(list(points), colors=color, lw=width, alpha=alpha), autolim=False)
 
 
 def agent_shapes(agents: AgentBoxes, panel: Panel, step: int) -> list[PolyCollection]:
@@ -178,22 +169,22 @@ def agent_shapes(agents: AgentBoxes, panel: Panel, step: int) -> list[PolyCollec
     Boxes have a wedge that points ahead, pedestrians are discs; agents that collide or are off the road get a frame.
 
     Args:
-        agents: boxes of the scene.
-        panel: motion of the agents.
-        step: 0..90; beyond the end of the motion there are no shapes.
+        agents: Boxes of the scene, sizes in meters.
+        panel: Motion of the agents; the first rollout counts.
+        step: Step 0..90; beyond the end of the motion there are no shapes.
     """
     trajectories = panel.trajectories
     if step >= trajectories.num_steps:
         return []
-    chosen = np.flatnonzero(trajectories.valid[0, :, step])  # [k], agents that are there
+    present_agents = np.flatnonzero(trajectories.valid[0, :, step])  # [k]
     roles = np.where(agents.is_ego, 2, agents.evaluated_mask.astype(int))
-    colors = [COLORS[ROLES[roles[agent]]] for agent in chosen]
+    colors = [COLORS[ROLES[roles[agent]]] for agent in present_agents]
     outlines, wedges = [], []
-    for agent in chosen:
+    for agent in present_agents:
         cos, sin = np.cos(trajectories.heading[0, agent, step]), np.sin(trajectories.heading[0, agent, step])
         # Rows are points, so they are multiplied from the left with the transposed rotation.
-        turn, place = np.array([[cos, sin], [-sin, cos]]), trajectories.position[0, agent, step]
-        outline, wedge = (shape @ turn + place for shape in _outline(agents, int(agent)))
+        rotation, center = np.array([[cos, sin], [-sin, cos]]), trajectories.position[0, agent, step]
+        outline, wedge = (shape @ rotation + center for shape in _outline(agents, int(agent)))
         outlines.append(outline)
         wedges.append(wedge)
     shapes = [
@@ -203,7 +194,7 @@ def agent_shapes(agents: AgentBoxes, panel: Panel, step: int) -> list[PolyCollec
     # Frames are enlarged outlines, so that both kinds can be seen around one agent.
     for mark, style in MARK_STYLES.items():
         flags = getattr(trajectories, mark)
-        marked = [] if flags is None else [outlines[row] for row in np.flatnonzero(flags[0, chosen, step])]
+        marked = [] if flags is None else [outlines[row] for row in np.flatnonzero(flags[0, present_agents, step])]
         frames = [shape.mean(0) + FRAME_SCALE[mark] * (shape - shape.mean(0)) for shape in marked]
         shapes.append(
             PolyCollection(frames, facecolor="none", edgecolor=COLORS[mark], lw=MARK_WIDTH, ls=style, zorder=4)
@@ -215,23 +206,29 @@ def light_dots(axis: Axes, scene: SceneView, step: int) -> PathCollection:
     """Add the traffic lights to axes in the map frame; lights that were not observed at the step are left out.
 
     Args:
-        axis: the axes.
-        scene: the still part of a scenario.
-        step: 0..90.
+        axis: Axes in the map frame, meters.
+        scene: Still part of a scenario, with the states of all lights.
+        step: Step 0..90 of the states.
 
     Returns:
-        The dots, which a film removes again.
+        Dots, which a film removes again.
     """
     colors = [(light.stop_point, LIGHT_COLORS.get(light.states[step : step + 1])) for light in scene.lights]
-    seen = [(point, color) for point, color in colors if color]
-    points = np.array([point for point, _ in seen]).reshape(-1, 2)
+    observed = [(point, color) for point, color in colors if color]
+    points = np.array([point for point, _ in observed]).reshape(-1, 2)
     return axis.scatter(
-        points[:, 0], points[:, 1], s=26, c=[color for _, color in seen], edgecolors="white", linewidths=0.6, zorder=5
+        points[:, 0],
+        points[:, 1],
+        s=26,
+        c=[color for _, color in observed],
+        edgecolors="white",
+        linewidths=0.6,
+        zorder=5,
     )
 
 
 def _outline(agents: AgentBoxes, agent: int) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "3 2"]]:
-    """Outline and wedge in the agent's own frame, meters."""
+    """Outline and wedge in the agent's frame, meters."""
     half = np.array([agents.length[agent], agents.width[agent]]) / 2
     wedge = np.array([[0.9, 0], [0.3, 0.65], [0.3, -0.65]])
     if agents.object_type[agent] != ObjectType.PEDESTRIAN:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from rlftsim.errors import DataError
 from rlftsim.rollout.types import Rollouts
-from rlftsim.scenario.sources import attribution_of
+from rlftsim.scenario.sources import find_attribution
 from rlftsim.scenario.types import (
     CURRENT_STEP,
     HISTORY_STEPS,
@@ -30,7 +30,7 @@ SIMPLIFY_TOLERANCE_M = 0.1
 MIN_FOCUS_RADIUS_M, MAX_FOCUS_RADIUS_M = 30.0, 80.0
 UNSEEN_LIGHT = "-"
 
-MAP_KINDS = {
+MAP_STYLES = {
     MapFeatureType.LANE_UNDEFINED: "lane",
     MapFeatureType.LANE_FREEWAY: "lane",
     MapFeatureType.LANE_SURFACE_STREET: "lane",
@@ -57,17 +57,17 @@ MAP_KINDS = {
 
 @dataclass(frozen=True, eq=False)
 class MapLine:
-    """One map feature: a polyline, a polygon (crosswalk, speed bump, driveway) or a point (stop sign)."""
+    """Map feature: a polyline, a polygon (crosswalk, speed bump, driveway) or a point (stop sign)."""
 
-    kind: str
-    """A value of `MAP_KINDS`."""
+    style: str
+    """A value of `MAP_STYLES`."""
     points: Float[np.ndarray, "n 2"]
     """Map frame, meters."""
 
 
 @dataclass(frozen=True, eq=False)
 class Light:
-    """One traffic light at its stop point."""
+    """Traffic light at a stop point."""
 
     stop_point: Float[np.ndarray, "2"]
     """Map frame, meters."""
@@ -85,7 +85,7 @@ class AgentBoxes:
     width: Float[np.ndarray, "A"]
     is_ego: Bool[np.ndarray, "A"]
     evaluated_mask: Bool[np.ndarray, "A"]
-    """True = the agent is evaluated by the metric; the ego is one of them."""
+    """True = the agent is evaluated by the metric, as is the ego."""
 
     def __len__(self) -> int:
         return len(self.object_id)
@@ -102,15 +102,15 @@ class SceneView:
     focus: tuple[float, float, float]
     """View at the beginning: x and y of the center and half of the shown width, meters."""
     note: str = ""
-    """Stands below every picture: origin and license of the log, and what is guessed in it."""
+    """Small print below every picture: origin and license of the log, and guessed facts."""
 
     def to_payload(self) -> dict[str, Any]:
-        """Lists, numbers and text only, in the layout that `player.js` reads; centimeters, points as differences."""
-        kinds: dict[str, list[list[int]]] = {}
+        """Lists, numbers and text in the layout that `player.js` reads; centimeters, points as differences."""
+        by_style: dict[str, list[list[int]]] = {}
         for line in self.lines:
             # x0, y0, then differences from point to point
             steps = np.diff(_centi(line.points), axis=0, prepend=np.zeros((1, 2), np.int64))
-            kinds.setdefault(line.kind, []).append(steps.ravel().tolist())
+            by_style.setdefault(line.style, []).append(steps.ravel().tolist())
         agents = self.agents
         roles = np.where(agents.is_ego, 2, agents.evaluated_mask.astype(int))
         columns = (agents.object_id, agents.object_type, _centi(agents.length), _centi(agents.width), roles)
@@ -118,7 +118,7 @@ class SceneView:
             "id": self.scenario_id,
             "now": CURRENT_STEP,
             "focus": [round(v, 1) for v in self.focus],
-            "map": kinds,
+            "map": by_style,
             "lights": [[*_centi(light.stop_point).tolist(), light.states] for light in self.lights],
             "agents": [list(row) for row in zip(*(c.tolist() for c in columns))],
         }
@@ -132,9 +132,9 @@ class SceneMotion:
     heading: Float[np.ndarray, "N A S"]
     valid: Bool[np.ndarray, "N A S"]
     collides: Bool[np.ndarray, "N A S"] | None = None
-    """True = the agent overlaps another one; None = unknown, nothing is marked."""
+    """True = the agent overlaps an agent; None = unknown, no agent is marked."""
     offroad: Bool[np.ndarray, "N A S"] | None = None
-    """True = a corner of the agent is off the road; None = unknown, nothing is marked."""
+    """True = a corner of the agent is off the road; None = unknown, no agent is marked."""
 
     @property
     def num_rollouts(self) -> int:
@@ -147,9 +147,9 @@ class SceneMotion:
         return self.position.shape[2]
 
     def first(self, num_rollouts: int) -> "SceneMotion":
-        """The first rollouts only."""
-        kept = {name: None if values is None else values[:num_rollouts] for name, values in vars(self).items()}
-        return replace(self, **kept)
+        """Motion of the first rollouts only."""
+        fields = {name: None if values is None else values[:num_rollouts] for name, values in vars(self).items()}
+        return replace(self, **fields)
 
     def with_overlaps(
         self,
@@ -157,15 +157,16 @@ class SceneMotion:
         z: Float[np.ndarray, "N A S"] | None = None,
         height: Float[np.ndarray, "A"] | None = None,
     ) -> "SceneMotion":
-        """The same with `collides` = the boxes overlap, and did not at the current step.
+        """Motion with `collides` = the boxes overlap, and did not at the current step.
 
-        A logged stroller and its pusher overlap from the beginning, which is no collision. Boxes have sharp corners
-        here and rounded ones in the metric, so these are not exactly the metric's collisions.
+        A logged stroller and pusher overlap from the beginning, which is no collision. Boxes have sharp corners
+        here and rounded corners in the metric, so these are not exactly the metric's collisions.
 
         Args:
-            agents: Boxes of the agents.
-            z: Heights of their centers, meters; without them agents above each other overlap, as in the metric.
-            height: Heights of the boxes, meters; needed with `z`.
+            agents: Boxes of the agents, in the same order.
+            z: Heights [N, A, S] of the centers, meters; without heights, agents above each other overlap, as in the
+                metric.
+            height: Heights [A] of the boxes, meters; needed with `z`.
         """
         collides = compute_overlap(
             self.position, self.heading, agents.length, agents.width, self.valid, ignore_from=CURRENT_STEP,
@@ -180,12 +181,12 @@ class SceneMotion:
         collision: Bool[Tensor | np.ndarray, "N E T"] | None = None,
         offroad: Bool[Tensor | np.ndarray, "N E T"] | None = None,
     ) -> "SceneMotion":
-        """The same with the metric's own marks, which it has for evaluated agents and future steps.
+        """Motion with the metric's marks, which exist for evaluated agents and future steps.
 
         Args:
-            scenario: the scenario of this motion.
+            scenario: Scenario of this motion, which says which agents are evaluated.
             collision: True = the agent collides; rows in the order of `scenario.evaluated_indices`.
-            offroad: True = the agent is off the road; rows likewise.
+            offroad: True = the agent is off the road; rows in the same order.
         """
         rows = np.searchsorted(scenario.simulated_indices, scenario.evaluated_indices)  # [E]
         spread = {}
@@ -193,8 +194,8 @@ class SceneMotion:
             if values is not None:
                 spread[name] = np.zeros(self.valid.shape, bool)  # [N, A, S]
                 # Fewer rollouts or steps may be shown than the metric has marks for.
-                shown = np.asarray(values, bool)[: self.num_rollouts, :, : self.num_steps - HISTORY_STEPS]
-                spread[name][:, rows, HISTORY_STEPS:] = shown
+                flags = np.asarray(values, bool)[: self.num_rollouts, :, : self.num_steps - HISTORY_STEPS]
+                spread[name][:, rows, HISTORY_STEPS:] = flags
         return replace(self, **spread)
 
     def to_payload(self) -> dict[str, Any]:
@@ -202,7 +203,7 @@ class SceneMotion:
         return {"steps": self.num_steps, "rollouts": [self._encode_rollout(n) for n in range(self.num_rollouts)]}
 
     def _encode_rollout(self, n: int) -> list[list[list[int]]]:
-        """Second differences of x, y (cm) and heading (0.01 rad) of each agent, and its valid, colliding and off-road
+        """Second differences of x, y (cm) and heading (0.01 rad) of each agent, and valid, colliding and off-road
         steps as intervals."""
         position, heading = _hold(self.position[n], self.valid[n]), _hold(self.heading[n], self.valid[n])
         # Held and unwrapped first: a gap or a jump by a full turn would cost two large differences each.
@@ -222,25 +223,25 @@ class SceneMotion:
 
 def build_scene(scenario: Scenario) -> SceneView:
     """Still part of a scenario: map (simplified to 10 cm), lights, boxes of the agents."""
-    tracks, chosen, features = scenario.tracks, scenario.simulated_indices, scenario.map_features
+    tracks, indices, features = scenario.tracks, scenario.simulated_indices, scenario.map_features
     lines = []
     for index in range(len(features)):
         # Subtracted in float64: world coordinates are kilometers, where float32 rounds to half a millimeter.
         points = features.polyline(index)[:, :2].astype(np.float64) - scenario.origin  # [n, 2]
         points = points[np.isfinite(points).all(-1)]
         if len(points):
-            lines.append(MapLine(MAP_KINDS[MapFeatureType(int(features.feature_type[index]))], simplify(points)))
+            lines.append(MapLine(MAP_STYLES[MapFeatureType(int(features.feature_type[index]))], simplify(points)))
     return SceneView(
         scenario_id=scenario.scenario_id,
         lines=tuple(lines),
-        lights=_lights(scenario.lights, scenario.origin, scenario.num_steps),
+        lights=_build_lights(scenario.lights, scenario.origin, scenario.num_steps),
         agents=AgentBoxes(
-            object_id=tracks.object_id[chosen],
-            object_type=tracks.object_type[chosen].astype(np.int64),
-            length=tracks.size[chosen, CURRENT_STEP, 0],
-            width=tracks.size[chosen, CURRENT_STEP, 1],
-            is_ego=chosen == scenario.ego_index,
-            evaluated_mask=np.isin(chosen, scenario.evaluated_indices),
+            object_id=tracks.object_id[indices],
+            object_type=tracks.object_type[indices].astype(np.int64),
+            length=tracks.size[indices, CURRENT_STEP, 0],
+            width=tracks.size[indices, CURRENT_STEP, 1],
+            is_ego=indices == scenario.ego_index,
+            evaluated_mask=np.isin(indices, scenario.evaluated_indices),
         ),
         focus=_focus(scenario),
         note=_note(scenario),
@@ -249,30 +250,30 @@ def build_scene(scenario: Scenario) -> SceneView:
 
 def logged_trajectories(scenario: Scenario) -> SceneMotion:
     """Logged motion of the simulated agents: 91 steps, or 11 where the future is withheld."""
-    tracks, chosen = scenario.tracks, scenario.simulated_indices
-    position = (tracks.position[chosen][..., :2] - scenario.origin).astype(np.float32)  # [A, S, 2]
-    heading = tracks.heading[chosen]
-    finite = np.isfinite(position).all(-1) & np.isfinite(heading)
-    return SceneMotion(position[None], heading[None], (tracks.valid[chosen] & finite)[None])
+    tracks, indices = scenario.tracks, scenario.simulated_indices
+    position = (tracks.position[indices][..., :2] - scenario.origin).astype(np.float32)  # [A, S, 2]
+    heading = tracks.heading[indices]
+    is_finite = np.isfinite(position).all(-1) & np.isfinite(heading)
+    return SceneMotion(position[None], heading[None], (tracks.valid[indices] & is_finite)[None])
 
 
 def rollout_trajectories(
     scenario: Scenario, rollouts: Rollouts, *, row: int, max_rollouts: int | None = None
 ) -> SceneMotion:
-    """Simulated futures of one scenario of a batch, after its logged history.
+    """Simulated futures of a scenario of a batch, after the logged history.
 
     Args:
-        scenario: scenario number `row` of the batch.
-        rollouts: rollouts of the whole batch.
-        row: index b of the scenario in the batch.
-        max_rollouts: number of rollouts that are kept, the first ones; None = all.
+        scenario: Scenario number `row` of the batch.
+        rollouts: Rollouts of the whole batch, in the map frame or the world frame.
+        row: Index b of the scenario in the batch.
+        max_rollouts: Number of rollouts to take, from the first on; None = all.
 
     Raises:
-        DataError: the rollouts have other agents than the scenario, or fewer, so they belong to another one.
+        DataError: The rollouts have other agents than the scenario, or fewer: they are of a different scenario.
     """
-    about = rollouts.provenance
-    if about is not None:
-        about.refuse_other_agents(row, scenario)
+    provenance = rollouts.provenance
+    if provenance is not None:
+        provenance.check_same_agents(row, scenario)
     num_agents = len(scenario.simulated_indices)
     if rollouts.position.shape[2] < num_agents:
         raise DataError(
@@ -284,7 +285,7 @@ def rollout_trajectories(
         values[row, :max_rollouts, :num_agents].detach().to("cpu", torch.float32).numpy()
         for values in (rollouts.position, rollouts.heading)
     )
-    if about is not None and about.frame != "map":
+    if provenance is not None and provenance.frame != "map":
         future_position = (future_position - scenario.origin).astype(np.float32)
     log = logged_trajectories(scenario)
 
@@ -301,11 +302,11 @@ def rollout_trajectories(
 
 
 def simplify(points: Float[np.ndarray, "n 2"], tolerance_m: float = SIMPLIFY_TOLERANCE_M) -> Float[np.ndarray, "m 2"]:
-    """Polyline with fewer points that stays close to the given one (Douglas and Peucker, 1973).
+    """Polyline with fewer points, close to the original (Douglas and Peucker, 1973).
 
     Args:
-        points: the polyline.
-        tolerance_m: largest distance of a removed point from the result.
+        points: Polyline [n, 2], meters; the end points stay.
+        tolerance_m: Largest distance of a removed point from the result, meters.
     """
     if len(points) < 3:
         return points
@@ -317,10 +318,10 @@ def simplify(points: Float[np.ndarray, "n 2"], tolerance_m: float = SIMPLIFY_TOL
         start, stop = spans.pop()
         if stop - start < 2:
             continue
-        inner, along = points[start + 1 : stop], points[stop] - points[start]
-        # Place of the nearest point of the segment, 0 at its start and 1 at its end; a segment may have no length.
-        fraction = np.clip((inner - points[start]) @ along / max(float(along @ along), 1e-12), 0, 1)
-        distance = np.linalg.norm(inner - points[start] - fraction[:, None] * along, axis=-1)
+        inner, segment = points[start + 1 : stop], points[stop] - points[start]
+        # Position of the nearest point of the segment, 0 at its start and 1 at its end; a segment may have no length.
+        fraction = np.clip((inner - points[start]) @ segment / max(float(segment @ segment), 1e-12), 0, 1)
+        distance = np.linalg.norm(inner - points[start] - fraction[:, None] * segment, axis=-1)
         farthest = int(distance.argmax())
         if distance[farthest] > tolerance_m:
             middle = start + 1 + farthest
@@ -329,9 +330,9 @@ def simplify(points: Float[np.ndarray, "n 2"], tolerance_m: float = SIMPLIFY_TOL
     return points[keep]
 
 
-def _lights(lights: LightStates, origin: np.ndarray, num_steps: int) -> tuple[Light, ...]:
-    """One light per controlled lane; of two entries for a lane and a step the later one counts."""
-    found = []
+def _build_lights(lights: LightStates, origin: np.ndarray, num_steps: int) -> tuple[Light, ...]:
+    """A light per controlled lane; of two entries for a lane and a step the later counts."""
+    built = []
     for lane_id in np.unique(lights.lane_id):
         rows = np.flatnonzero(lights.lane_id == lane_id)
         states = [UNSEEN_LIGHT] * num_steps
@@ -341,25 +342,25 @@ def _lights(lights: LightStates, origin: np.ndarray, num_steps: int) -> tuple[Li
                 states[int(step)] = str(int(state))
         stop_point = lights.stop_point[rows[0], :2].astype(np.float64) - origin
         if np.isfinite(stop_point).all():
-            found.append(Light(stop_point, "".join(states)))
-    return tuple(found)
+            built.append(Light(stop_point, "".join(states)))
+    return tuple(built)
 
 
 def _note(scenario: Scenario) -> str:
-    """Attribution of the source, and the parts of the scenario that are guessed."""
+    """Attribution of the source, and the facts of the scenario that are guessed."""
     guessed = f"Guessed, not logged: {', '.join(sorted(scenario.guessed))}." if scenario.guessed else ""
-    return f"{attribution_of(scenario.source)} {guessed}".strip()
+    return f"{find_attribution(scenario.source)} {guessed}".strip()
 
 
 def _focus(scenario: Scenario) -> tuple[float, float, float]:
     """Square around the logged paths of the evaluated agents, neither tiny nor so large that boxes become dots."""
-    chosen = scenario.evaluated_indices
-    visited = (scenario.tracks.position[chosen][scenario.tracks.valid[chosen]][:, :2] - scenario.origin).astype(float)
+    tracks, indices = scenario.tracks, scenario.evaluated_indices
+    visited = (tracks.position[indices][tracks.valid[indices]][:, :2] - scenario.origin).astype(float)
     if not len(visited):
         return 0.0, 0.0, MIN_FOCUS_RADIUS_M
     low, high = visited.min(0), visited.max(0)
     radius = float(np.clip((high - low).max() / 2 + 8, MIN_FOCUS_RADIUS_M, MAX_FOCUS_RADIUS_M))
-    ego = scenario.tracks.position[scenario.ego_index, CURRENT_STEP, :2] - scenario.origin
+    ego = tracks.position[scenario.ego_index, CURRENT_STEP, :2] - scenario.origin
     # If not everything fits, the ego at the current step stays in the picture.
     center = np.clip((low + high) / 2, ego - 0.8 * radius, ego + 0.8 * radius)
     return float(center[0]), float(center[1]), radius
@@ -379,11 +380,11 @@ def _second_differences(values: Int[np.ndarray, "S"]) -> list[int]:
 
 
 def _hold(values: np.ndarray, valid: Bool[np.ndarray, "A S"]) -> np.ndarray:
-    """Values with gaps filled by the last valid one, or before it by the first: second differences there are zero."""
+    """Values with gaps filled by the last valid value, at the start by the first: second differences there are zero."""
     steps = np.arange(valid.shape[1])
     last = np.maximum.accumulate(np.where(valid, steps, -1), axis=1)  # [A, S], step of the last valid value or -1
     first = np.where(valid.any(1), valid.argmax(1), 0)
     source = np.where(last < 0, first[:, None], last)
     filled = np.take_along_axis(values, source if values.ndim == 2 else source[..., None], axis=1)
-    known = valid.any(1).reshape(-1, *[1] * (values.ndim - 1))
-    return np.where(known, filled, 0)
+    has_valid_step = valid.any(1).reshape(-1, *[1] * (values.ndim - 1))
+    return np.where(has_valid_step, filled, 0)

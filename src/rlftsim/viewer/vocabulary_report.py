@@ -1,4 +1,4 @@
-"""The report on a vocabulary: a folder with a page, its numbers, and a picture.
+"""Report on a vocabulary: a folder with a page, numbers, and a picture.
 
 For each class the picture shows the endpoints of the tokens, the size of the errors, and the speeds of tokens and
 motions.
@@ -26,22 +26,22 @@ DEAD, SPARE, BARS = "#e5735c", "#8b94a1", "#c3ccd8"
 SINGLE, ROLLING = COLORS[:2]
 TICK_INCHES = 0.085
 SHOWN_FRACTION = 0.998
-"""Fraction of the tokens inside the picture, in x and in y; a single one far away would squeeze all others."""
+"""Fraction of the tokens inside the picture, in x and in y; a single token far out would squeeze all tokens."""
 MANY_TOKENS = 3000
-"""Above this, heading ticks are shorter, so that they do not hide each other."""
+"""Above this, heading ticks are shorter, so that no tick hides a neighbor."""
 
 
 def write_vocabulary_report(folder: Path, classes: tuple[ClassCoverage, ...], *, vocabulary: str, data: str) -> None:
     """Write `report.md`, `report.json` and `picture.png` into a folder, all or none; an earlier report is replaced.
 
     Args:
-        folder: folder of the report.
-        classes: result of `measure_coverage`.
-        vocabulary: description of the vocabulary.
-        data: description of the data it is compared with.
+        folder: Folder of the report; only an earlier report may be in the folder.
+        classes: Coverage of each class of agents, the result of `measure_coverage`.
+        vocabulary: Description of the vocabulary, for titles.
+        data: Description of the data that the vocabulary is compared with.
 
     Raises:
-        DataError: the folder holds something else, or cannot be written.
+        DataError: The folder has files of no report, or cannot be written.
     """
     if folder.exists() and not (folder.is_dir() and {p.name for p in folder.iterdir()} <= {PAGE, NUMBERS, PICTURE}):
         raise DataError(f"{folder} is not a report on a vocabulary: name another place with --report.")
@@ -64,12 +64,12 @@ def report_numbers(classes: tuple[ClassCoverage, ...], *, vocabulary: str, data:
     """All numbers of the page as plain JSON values in SI units.
 
     Args:
-        classes: result of `measure_coverage`.
-        vocabulary: description of the vocabulary.
-        data: description of the data it is compared with.
+        classes: Coverage of each class of agents, the result of `measure_coverage`.
+        vocabulary: Description of the vocabulary, for titles.
+        data: Description of the data that the vocabulary is compared with.
     """
 
-    def of(spread: Spread) -> dict[str, object]:
+    def summarize(spread: Spread) -> dict[str, object]:
         return {"count": spread.count, "mean": spread.mean, "p95": spread.p95, "max": spread.max}
 
     numbers = {
@@ -78,9 +78,9 @@ def report_numbers(classes: tuple[ClassCoverage, ...], *, vocabulary: str, data:
             "num_glitches": coverage.num_glitches,
             "num_tokens": coverage.num_tokens,
             "disk_radius_m": coverage.radius_m,
-            "single_error_m": of(coverage.single_m),
-            "rolling_error_m": of(coverage.rolling_m),
-            "rolling_heading_error_rad": of(coverage.heading_rad),
+            "single_error_m": summarize(coverage.single_m),
+            "rolling_error_m": summarize(coverage.rolling_m),
+            "rolling_heading_error_rad": summarize(coverage.heading_rad),
             "fastest_token_mps": float(coverage.token_speed_mps.max()),
             "fastest_motion_mps": coverage.speed_mps.max,
             "asymmetry_m": coverage.asymmetry_m,
@@ -123,15 +123,15 @@ worst represented. *Implausible*: a turn of more than 30° or a distance beyond 
 
 
 def report_page(classes: tuple[ClassCoverage, ...], *, vocabulary: str, data: str) -> str:
-    """The report as Markdown.
+    """Report as Markdown.
 
     Args:
-        classes: result of `measure_coverage`.
-        vocabulary: description of the vocabulary.
-        data: description of the data it is compared with.
+        classes: Coverage of each class of agents, the result of `measure_coverage`.
+        vocabulary: Description of the vocabulary, for titles.
+        data: Description of the data that the vocabulary is compared with.
     """
     head = ["| | " + " | ".join(c.class_name for c in classes) + " |", "|---|" + "---:|" * len(classes)]
-    body = [f"| {name} | " + " | ".join(say(c) for c in classes) + " |" for name, say in ROWS.items()]
+    body = [f"| {name} | " + " | ".join(format_cell(c) for c in classes) + " |" for name, format_cell in ROWS.items()]
     table = "\n".join(head + body)
     return f"# A vocabulary\n\n{vocabulary}, compared with {data}.\n\n{table}\n\n{NOTES}\n![picture]({PICTURE})\n"
 
@@ -144,10 +144,10 @@ def coverage_picture(path: Path, classes: tuple[ClassCoverage, ...], *, title: s
     """Draw a row of three panels for each class.
 
     Args:
-        path: PNG to write; nothing half-written is left there.
-        classes: result of `measure_coverage`.
-        title: description of vocabulary and data.
-        dots_per_inch: resolution of the PNG, which is 17 inches wide.
+        path: PNG to write; no half-written file is left.
+        classes: Coverage of each class of agents, the result of `measure_coverage`.
+        title: Description of vocabulary and data above all panels.
+        dots_per_inch: Resolution of the PNG, which is 17 inches wide.
     """
     figure = Figure(figsize=(17, 4.3 * len(classes) + 0.6), layout="constrained")
     figure.suptitle(title, fontsize=13, fontweight="bold", x=0.01, ha="left", color=INK)
@@ -163,7 +163,7 @@ def coverage_picture(path: Path, classes: tuple[ClassCoverage, ...], *, title: s
 
 
 def _draw_tokens(figure: Figure, axis: Axes, coverage: ClassCoverage) -> None:
-    """Draw endpoints of tokens with a tick along the heading on the screen, the most used ones on top."""
+    """Draw endpoints of tokens with a tick along the heading on the screen, the most used tokens on top."""
     end, use = coverage.poses[:, -1], coverage.use  # [tokens, 3] and [tokens]
     # Unused tokens first, so that the used ones are drawn over them.
     size = TICK_INCHES * (1.0 if len(end) <= MANY_TOKENS else 0.6)
@@ -172,9 +172,9 @@ def _draw_tokens(figure: Figure, axis: Axes, coverage: ClassCoverage) -> None:
         (coverage.is_spare, SPARE, f"{coverage.is_spare.sum()} for speeds the data lack"),
         (coverage.is_dead, DEAD, f"{coverage.is_dead.sum()} that no motion falls on"),
     )
-    for where, color, label in groups:
-        if where.any():
-            _draw_ticks(axis, end[where], size, color=color)
+    for is_member, color, label in groups:
+        if is_member.any():
+            _draw_ticks(axis, end[is_member], size, color=color)
             axis.plot([], [], color=color, lw=2, label=label)
     used = np.flatnonzero(~coverage.is_unused)
     used = used[np.argsort(use[used])]  # drawn in this order, the most used ones last
@@ -223,9 +223,9 @@ def _draw_errors(axis: Axes, coverage: ClassCoverage) -> None:
             continue
         values, fraction = spread.curve()
         # Below the first tick of the logarithmic axis there is nothing to see.
-        shown = (values * 100 >= 0.05) & (values * 100 <= 1000)
+        is_visible = (values * 100 >= 0.05) & (values * 100 <= 1000)
         label = f"{name}: {100 * spread.mean:.1f} · {100 * spread.p95:.1f} · {100 * spread.max:.0f} cm"
-        axis.plot(values[shown] * 100, fraction[shown] * 100, color=color, lw=1.8, label=label)
+        axis.plot(values[is_visible] * 100, fraction[is_visible] * 100, color=color, lw=1.8, label=label)
         axis.plot(spread.p95 * 100, 95, "o", color=color, ms=5)
         axis.plot(spread.mean * 100, np.interp(spread.mean, values, fraction) * 100, "D", color=color, ms=5)
     axis.set_xticks([0.1, 1, 10, 100, 1000], ["0.1", "1", "10", "100", "1000"])
@@ -248,9 +248,9 @@ def _draw_speeds(axis: Axes, coverage: ClassCoverage) -> None:
         (coverage.is_spare, SPARE, "tokens for speeds the data lack"),
         (~coverage.is_unused, SINGLE, "used tokens"),
     )
-    for where, color, label in groups:
-        if where.any():
-            axis.vlines(speeds[where], 0.12, 0.55, color=color, lw=0.7, label=label)
+    for is_member, color, label in groups:
+        if is_member.any():
+            axis.vlines(speeds[is_member], 0.12, 0.55, color=color, lw=0.7, label=label)
     fastest = max(float(np.quantile(speeds, SHOWN_FRACTION)), coverage.speed_mps.max)
     axis.set(yscale="log", ylim=(0.1, top), xlim=(-0.01 * fastest, min(fastest * 1.05 + 1, MAX_SPEED_BIN_MPS + 2)))
     axis.set_title("speed", loc="left", fontsize=11, color=INK)

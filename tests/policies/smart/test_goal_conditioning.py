@@ -58,7 +58,7 @@ def learned(policy, encoding, size=0.5, *, bias=False):
     """A goal-conditioned copy with random goal weights; with `bias` only those of the logit bias are random."""
     policy = policy.with_goal_conditioning(encoding, logit_bias=bias)
     generator = torch.Generator().manual_seed(11)
-    encoder, *biases = policy.goal_parts()
+    encoder, *biases = policy.goal_modules()
     with torch.no_grad():
         for weight in (biases[0] if bias else encoder).parameters():
             weight.add_(size * torch.randn(weight.shape, generator=generator))
@@ -168,7 +168,7 @@ def test_goals_are_seen_in_half_precision_too(encoding, trained, base, batch):
     policy, goals = learned(base, encoding), far_goals(batch)
     if trained == "parts":
         policy.requires_grad_(False)
-        for part in policy.fine_tuned_parts():
+        for part in policy.fine_tuned_modules():
             part.requires_grad_(True)
     with torch.autocast("cpu", torch.bfloat16):
         rollouts = simulate(policy, batch, num_rollouts=2, seed=5, goals=goals)
@@ -204,7 +204,7 @@ def test_sight_is_given_once(base):
 def test_without_aim_a_model_is_the_papers(encoding, base, batch):
     plain = base.with_goal_conditioning(encoding, logit_bias=False)
     assert plain.with_goal_conditioning(encoding) is plain  # a goal-conditioned model keeps its encoding
-    assert [type(part).__name__ for part in plain.goal_parts()] == [
+    assert [type(part).__name__ for part in plain.goal_modules()] == [
         {"concat": "GoalEmbedding", "indication": "GoalEdgeEmbedding"}[encoding]
     ]
     biased = base.with_goal_conditioning(encoding)

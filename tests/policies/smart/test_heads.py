@@ -110,7 +110,7 @@ def scores():
 
 def scored(scores, hidden, last, class_id, ends):
     """Scores [R, V] of tokens with these ends; the last one led to `last`."""
-    before = scores.keys(last.expand(3, -1, -1)).phase_before[class_id.clamp(max=2), torch.arange(len(last))]
+    before = scores.keys(last.expand(3, -1, -1)).last_phase[class_id.clamp(max=2), torch.arange(len(last))]
     return scores.queries(hidden, before, class_id) @ scores.keys(ends).keys.mT
 
 
@@ -152,7 +152,7 @@ def test_a_saved_model_with_continuation_scores_says_the_same(continuing, batch,
 
 def test_continuation_scores_are_fine_tuned_with_the_head(continuing):
     weight = continuing.network.decoder.scores.query.weight
-    for parts in (continuing.fine_tuned_parts(), continuing.head_parts()):
+    for parts in (continuing.fine_tuned_modules(), continuing.head_modules()):
         assert any(weight is one for part in parts for one in part.parameters())
 
 

@@ -39,7 +39,7 @@ def policy(vocabulary):  # noqa: F811
 def reference(policy):
     """Other layers and another head, the same frozen weights."""
     reference = copy.deepcopy(policy).requires_grad_(False)
-    for part in policy.fine_tuned_parts():
+    for part in policy.fine_tuned_modules():
         move(part)
     return reference
 
@@ -69,7 +69,7 @@ def scored(policy, reference, batch, rollouts):
         context = policy.encode(batch)
         ref_context = reference.encode_like(batch, context)
     own = policy.encode_like(batch, context)
-    return (context, own, ref_context), policy.score_both(own, rollouts, reference, ref_context, rollouts)
+    return (context, own, ref_context), policy.score_with_reference(own, rollouts, reference, ref_context, rollouts)
 
 
 def test_what_frozen_and_equal_weights_see_is_computed_once(policy, reference, batch, monkeypatch):
@@ -119,7 +119,7 @@ def test_goals_have_their_own_part(policy, batch, encoding):
     policy = policy.with_goal_conditioning(encoding, logit_bias=False).eval()
     freeze_untrained(policy, "decoder")
     reference = copy.deepcopy(policy).requires_grad_(False)
-    for part in policy.goal_parts():
+    for part in policy.goal_modules():
         move(part)
     goals = Goals.of_scenarios(batch.position[:, :, 10] + 15.0, batch.agent_mask).repeat(2)
     rollouts = simulate(policy, batch, num_rollouts=2, seed=1, goals=goals)
@@ -128,7 +128,7 @@ def test_goals_have_their_own_part(policy, batch, encoding):
         with torch.no_grad():
             context = policy.encode(batch)
             ref_context = reference.encode_like(batch, context)
-            both = policy.score_both(context, rollouts, reference, ref_context, ref_rollouts)
+            both = policy.score_with_reference(context, rollouts, reference, ref_context, ref_rollouts)
             alone = policy.score(context, rollouts), reference.score(reference.encode(batch), ref_rollouts)
         for dist, expected in zip(both, alone):
             torch.testing.assert_close(dist.logits, expected.logits, atol=ROUNDING, rtol=0)
@@ -144,7 +144,7 @@ class Plain(nn.Module):
         super().__init__()
         self.policy = policy
         self.encode, self.begin, self.advance = policy.encode, policy.begin, policy.advance
-        self.decide, self.fine_tuned_parts = policy.decide, policy.fine_tuned_parts
+        self.decide, self.fine_tuned_modules = policy.decide, policy.fine_tuned_modules
 
     def __deepcopy__(self, memo):
         return Plain(copy.deepcopy(self.policy, memo))
@@ -162,7 +162,7 @@ def test_an_update_is_that_of_a_policy_that_shares_nothing(vocabulary, batch, tr
         policy = wrap(tiny.tiny_policy(vocabulary))
         assert isinstance(policy, SharingPolicy) == (wrap is not Plain)
         learner = prepare(policy, config, fabric.device)
-        for part in learner.reference.fine_tuned_parts():
+        for part in learner.reference.fine_tuned_modules():
             move(part)
         values = update_policy(learner, batch, config, fabric)
         found.append(({n.removeprefix("policy."): g for n, g in tiny.gradients_of(policy).items()}, values))

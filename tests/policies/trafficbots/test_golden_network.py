@@ -50,7 +50,7 @@ def test_parameters_are_the_public_ones_without_the_unused(golden, request, fixt
     assert count(network.actions) + 6 == parts["action_head"]
     if fixture == "default":
         assert count(policy) == 7_912_032
-        assert sum(count(part) for part in policy.fine_tuned_parts()) == 1_707_398
+        assert sum(count(part) for part in policy.fine_tuned_modules()) == 1_707_398
 
 
 def golden_shapes(golden):
@@ -141,7 +141,7 @@ def test_the_default_size(golden, default, scene):
     context = default.encode_scene(scene)
     assert gap(context.map_features[0, ::8], theirs["map_feature_every8"]) <= 2e-5
     windows = Windows(scene.valid[:, None, None], scene.pose[:, None, None], scene.motion[:, None, None])
-    agents = network.agents(windows, scene, context.around.steps(0, 1))
+    agents = network.agents(windows, scene, context.agent_context.select_steps(slice(0, 1)))
     assert gap(agents[0, 0, 0], theirs["agent_feature"]) <= 2e-5
     history = Windows(scene.valid, scene.pose, scene.motion)
     destinations = network.destination_predictor(history, scene, context.map_features)

@@ -97,7 +97,7 @@ def test_along_its_own_rollouts_a_policy_with_a_trained_head_computes_no_feature
     monkeypatch.setattr(learner.network, "features", lambda *inputs: counted.append(1) or features(*inputs))
     for number, one in enumerate((rollouts, others, rollouts.select(slice(0, 1)))):
         own = learner.encode_like(batch, context)
-        dist, ref_dist = learner.score_both(own, one, reference, reference.encode_like(batch, context), one)
+        dist, ref_dist = learner.score_with_reference(own, one, reference, reference.encode_like(batch, context), one)
         assert bool(counted) == (number > 0)  # others than those of the record, or a part of them
         assert torch.allclose(dist.log_prob(one.decision), one.log_prob, atol=1e-4)
         assert torch.allclose(ref_dist.mean, dist.mean, atol=1e-6)
@@ -144,14 +144,14 @@ def test_scoring_with_a_reference_is_scoring_twice(batch, trained):
         for weight in learner.parameters():
             weight.add_(0.02 * torch.randn_like(weight) if weight.requires_grad else 0.0)
     assert isinstance(learner, SharingPolicy)
-    assert learner.has_features_of(reference) == (trained == "head")
+    assert learner.shares_agent_features(reference) == (trained == "head")
     with torch.no_grad():
         rollouts = simulate(learner, batch, num_rollouts=2, seed=0)
         ref_context = reference.encode(batch)
         ref_alone = reference.score(ref_context, rollouts)
     context = learner.encode_like(batch, ref_context)
     assert context.map_features is ref_context.map_features
-    dist, ref_dist = learner.score_both(context, rollouts, reference, ref_context, rollouts)
+    dist, ref_dist = learner.score_with_reference(context, rollouts, reference, ref_context, rollouts)
     gradients = []
     for one in (dist, learner.score(learner.encode(batch), rollouts)):
         learner.zero_grad()
@@ -170,13 +170,13 @@ def test_nothing_is_shared_in_training_mode_or_with_other_settings(batch):
     learner = TrafficBotsPolicy(TINY).requires_grad_(False).eval()
     same, other = copy.deepcopy(learner), TrafficBotsPolicy(replace(TINY, map_neighbors=2)).requires_grad_(False).eval()
     other.load_state_dict(learner.state_dict())
-    assert learner.sees_as(same)
-    assert learner.has_features_of(same)
-    assert not learner.sees_as(other)
+    assert learner.shares_scene_features(same)
+    assert learner.shares_agent_features(same)
+    assert not learner.shares_scene_features(other)
     # Dropout would give each model features of its own.
     same.train()
-    assert not learner.sees_as(same)
-    assert not learner.has_features_of(same)
+    assert not learner.shares_scene_features(same)
+    assert not learner.shares_agent_features(same)
     context = same.eval().encode(batch)
     same.network.map.requires_grad_(True)
     assert learner.encode_like(batch, context).map_features is not context.map_features
@@ -192,7 +192,7 @@ def test_fine_tuning_the_head_leaves_pedestrians_as_they_are(batch):
         for weight in learner.parameters():
             weight.add_(0.1 if weight.requires_grad else 0.0)
         context = learner.encode(batch)
-        dist, ref_dist = learner.score_both(context, rollouts, reference, context, rollouts)
+        dist, ref_dist = learner.score_with_reference(context, rollouts, reference, context, rollouts)
     is_vehicle = (context.scene.agent_class == 0)[:, None, :, None].expand(dist.mask.shape)
     differs = (dist.mean != ref_dist.mean).any(-1)
     assert differs[is_vehicle & dist.mask].all()

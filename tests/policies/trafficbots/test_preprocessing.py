@@ -14,7 +14,7 @@ from rlftsim.policies.trafficbots.destinations import (
     _successors,
     destination_labels,
 )
-from rlftsim.policies.trafficbots.map_tokens import cut_line, light_tokens, map_pieces, sides_of_polygon
+from rlftsim.policies.trafficbots.map_tokens import cut_line, sides_of_polygon, tokenize_lights, tokenize_map
 from rlftsim.policies.trafficbots.scene import build_scene
 from rlftsim.policies.trafficbots.tracks import agent_motions
 from rlftsim.scenario.batch import collate
@@ -31,7 +31,7 @@ def packed(golden, name):
 @pytest.mark.official
 @both
 def test_map_tokens_are_the_packed_ones(golden, records, name):
-    ours, theirs = map_pieces(records(name)), packed(golden, name)
+    ours, theirs = tokenize_map(records(name)), packed(golden, name)
     assert np.array_equal(ours.node_mask, theirs["map_valid"])
     assert np.array_equal(ours.type, theirs["map_type"])
     assert np.array_equal(ours.feature_id, theirs["map_id"])
@@ -42,7 +42,7 @@ def test_map_tokens_are_the_packed_ones(golden, records, name):
 @pytest.mark.official
 @both
 def test_lights_are_the_packed_ones(golden, records, name):
-    ours, theirs = light_tokens(records(name), of_history=False), packed(golden, name)
+    ours, theirs = tokenize_lights(records(name), of_history=False), packed(golden, name)
     assert np.array_equal(ours.token, theirs["tl_token"])
     assert np.array_equal(ours.observed, theirs["tl_valid"])
     assert np.array_equal(ours.state, np.maximum(theirs["tl_state"], 0))
@@ -81,7 +81,7 @@ def test_destination_labels_are_the_packed_ones(golden, records, name):
 @both
 def test_all_destinations_at_forks_are_those_of_the_public_walk(golden, records, name):
     scenario, theirs = records(name), golden.arrays(f"scenario_{name}/goals")
-    places = DestinationMap(map_pieces(scenario), _successors(scenario))
+    places = DestinationMap(tokenize_map(scenario), _successors(scenario))
     starts = theirs["dest_possible_ptr"]
     for k, (goal, kind) in enumerate(zip(theirs["goal"].astype(float), theirs["type"])):
         found = places.destinations(goal, int(kind))
@@ -119,14 +119,14 @@ def test_polygons_become_their_longer_sides(golden, k):
 
 def test_a_log_without_map_has_no_tokens_lights_or_destinations():
     scenario = scenes.without_map()
-    assert len(map_pieces(scenario)) == 0
-    assert light_tokens(scenario).state.shape == (0, TOTAL_STEPS)
+    assert len(tokenize_map(scenario)) == 0
+    assert tokenize_lights(scenario).state.shape == (0, TOTAL_STEPS)
     assert (destination_labels(scenario, None) == NO_DESTINATION).all()
 
 
 def test_tokens_far_from_the_agents_go_first_where_there_are_too_many():
     scenario = scenes.junction_with_light()
-    everything, few = map_pieces(scenario, None), map_pieces(scenario, 20)
+    everything, few = tokenize_map(scenario, None), tokenize_map(scenario, 20)
     assert len(few) == 20 < len(everything)
 
     def nearest(pieces):
@@ -137,11 +137,11 @@ def test_tokens_far_from_the_agents_go_first_where_there_are_too_many():
 
 def test_lights_first_seen_after_the_current_step_are_left_out():
     scenario = scenes.junction_with_light()
-    assert light_tokens(scenario).observed.all()
+    assert tokenize_lights(scenario).observed.all()
     later = scenario.lights.step >= HISTORY_STEPS
     lights = LightStates(**{k: v[later] for k, v in vars(scenario.lights).items()})
     late = replace(scenario, lights=lights)
-    assert len(light_tokens(late).token) == 0 < len(light_tokens(late, of_history=False).token)
+    assert len(tokenize_lights(late).token) == 0 < len(tokenize_lights(late, of_history=False).token)
 
 
 def test_gaps_are_filled_and_the_future_is_not_looked_at():
@@ -163,10 +163,10 @@ def test_speed_is_negative_where_an_agent_drives_backwards():
 
 def test_a_vehicle_off_the_road_and_a_cyclist_without_a_lane_go_to_the_nearest_edge():
     scenario = scenes.straight_road()
-    places = DestinationMap(map_pieces(scenario), {})
+    places = DestinationMap(tokenize_map(scenario), {})
     last = np.array([0.0, -2.0, 1.5, 0.0])
     (token,) = places.destinations(last, CYCLIST)
-    assert places.pieces.type[token] == 4
-    assert np.abs(places.pieces.position[token, 0, :2] - last[:2]).max() < 40
+    assert places.map_tokens.type[token] == 4
+    assert np.abs(places.map_tokens.position[token, 0, :2] - last[:2]).max() < 40
     (token,) = places.destinations(np.array([0.0, 60.0, 0.0, 0.0]), VEHICLE)
-    assert places.pieces.type[token] == 4
+    assert places.map_tokens.type[token] == 4

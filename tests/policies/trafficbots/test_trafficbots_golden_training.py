@@ -6,7 +6,7 @@ import torch
 from public_names import UNUSED, our_names
 
 from rlftsim.policies.trafficbots.dynamics import max_action, move
-from rlftsim.policies.trafficbots.imitation import TrainingDraws, imitation_terms, loss_of_scene, personality_kl
+from rlftsim.policies.trafficbots.imitation import TrainingDraws, compute_scene_loss, imitation_terms, personality_kl
 
 pytestmark = [pytest.mark.official, pytest.mark.usefixtures("without_gradients")]
 TERMS = ("imitation", "personality", "destination", "light")
@@ -26,7 +26,7 @@ def test_loss_and_every_gradient(golden, small, scene, name, case):
     )
     small.zero_grad()
     with torch.enable_grad():
-        found = loss_of_scene(network, small.config, scene, labels, scene.agent_mask, draws)
+        found = compute_scene_loss(network, small.config, scene, labels, scene.agent_mask, draws)
         found.loss.backward()
     # 1. The loss, all of it and its terms.
     assert float(found.loss.detach()) == pytest.approx(numbers["loss"], rel=1e-6)

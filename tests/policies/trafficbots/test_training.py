@@ -12,11 +12,11 @@ from rlftsim.errors import ConfigError
 from rlftsim.evaluation.evaluate import EvaluateConfig, evaluate
 from rlftsim.policies.trafficbots.destinations import NO_DESTINATION, destination_labels
 from rlftsim.policies.trafficbots.dynamics import max_action, move
-from rlftsim.policies.trafficbots.imitation import draw_training, imitation_terms, loss_of_scene
+from rlftsim.policies.trafficbots.imitation import compute_scene_loss, draw_training, imitation_terms
 from rlftsim.policies.trafficbots.network import Windows
 from rlftsim.policies.trafficbots.policy import TrafficBotsPolicy
 from rlftsim.policies.trafficbots.scene import build_scene
-from rlftsim.policies.trafficbots.state import Imposed, traffic_at_start
+from rlftsim.policies.trafficbots.state import ImposedStates, start_traffic
 from rlftsim.recipes.registry import recipe_by_name
 from rlftsim.scenario.batch import collate
 from rlftsim.scenario.types import TOTAL_STEPS
@@ -130,7 +130,7 @@ def test_two_passes_have_the_gradient_of_one(scenarios):
         own = torch.from_numpy(destination_labels(scenario, None))
         row[: len(own)] = own
     draws = replace(draw_training(scene, SETTINGS, 0.3, hide=False), from_prior=False)
-    found = loss_of_scene(network, SETTINGS, scene, labels, scene.agent_mask, draws)
+    found = compute_scene_loss(network, SETTINGS, scene, labels, scene.agent_mask, draws)
     two_passes = torch.autograd.grad(found.loss, weights, allow_unused=True)
 
     # The imitation loss alone, step by step with gradient; the other terms are the same in both.
@@ -145,12 +145,12 @@ def test_two_passes_have_the_gradient_of_one(scenarios):
     personality = mean + network.posterior.log_std.exp() * draws.noise
     given = network.conditioning(scene, map_features, personality[:, None], labels[:, None])
     around = network.agents.context(map_features, lights[:, 10:])
-    traffic, limit = traffic_at_start(scene, labels[:, None]), max_action(scene.agent_class)[:, None]
+    traffic, limit = start_traffic(scene, labels[:, None]), max_action(scene.agent_class)[:, None]
     pose, speed = traffic.windows.pose[..., -1, :], traffic.windows.motion[..., -1, 0]
     losses, counted = [], []
     for step in range(11, 91):
-        now = around.steps(step - 11, step - 10)
-        features = network.features(traffic.windows.as_one_decision(), scene, now, given, traffic.active[:, None])
+        now = around.select_steps(slice(step - 11, step - 10))
+        features = network.features(traffic.windows.add_decision_axis(), scene, now, given, traffic.active[:, None])
         action = network.mean_actions(features, scene)[:, 0]
         pose, motion = move(pose, speed, torch.where(traffic.alive[..., None], action, 0.0), limit)
         own_pose, own_motion = scene.pose[:, None, :, step], scene.motion[:, None, :, step]
@@ -163,13 +163,15 @@ def test_two_passes_have_the_gradient_of_one(scenarios):
             torch.where(is_put, own_motion[..., 0], motion[..., 0]),
         )
         with torch.no_grad():
-            traffic = traffic.after(action.detach(), scene, Imposed(is_put, own_pose, own_motion), staying=is_logged)
+            traffic = traffic.advance(
+                action.detach(), scene, ImposedStates(is_put, own_pose, own_motion), staying=is_logged
+            )
     mask = torch.stack(counted, -1)
     total = (torch.stack(losses, -1) * mask).flatten(1).sum(1) / mask.flatten(1).sum(1).clamp(min=1)
     assert float(total.sum().detach()) == pytest.approx(float(found.sums["imitation_loss"]), rel=1e-6)
     one_pass = torch.autograd.grad(total.sum(), weights, allow_unused=True)
     # Weights that only the imitation loss trains: all that decide actions.
-    deciding = {id(weight) for part in policy.fine_tuned_parts() for weight in part.parameters()}
+    deciding = {id(weight) for part in policy.fine_tuned_modules() for weight in part.parameters()}
     compared = [id(weight) in deciding for weight in weights]
     ours, plain = (
         torch.cat([grad.flatten() for grad, is_one in zip(grads, compared) if is_one and grad is not None])

@@ -61,15 +61,15 @@ def test_an_interrupted_generation_goes_on(tmp_path, monkeypatch):
     arguments = {"num_scenarios": 4, "seed": 3, "splits": {"training": 1.0}, "scenarios_per_network": 2}
     write, calls = module._write_shard, []
 
-    def write_once(task, *worker, folder):
+    def write_once(shards, task, *worker):
         calls.append(task.index)
         if len(calls) == 2:
             raise KeyboardInterrupt
-        write(task, *worker, folder=folder)
+        write(shards, task, *worker)
 
-    def write_again(task, *worker, folder):
+    def write_again(shards, task, *worker):
         calls.append(task.index)
-        write(task, *worker, folder=folder)
+        write(shards, task, *worker)
 
     monkeypatch.setattr(module, "_write_shard", write_once)
     with pytest.raises(KeyboardInterrupt):

@@ -14,13 +14,13 @@ from jaxtyping import Bool, Float
 from rlftsim.envs.actions import (
     ACCELERATION_MPS2,
     STEERING_RAD,
-    ActionKind,
+    ActionType,
     Bicycle,
     pursue,
     pursuit_m,
     signed_speed,
 )
-from rlftsim.envs.idm import LOOKAHEAD_M, IdmConfig, find_leaders, idm_acceleration
+from rlftsim.envs.idm import LOOKAHEAD_M, IdmConfig, compute_idm_acceleration, find_leaders
 from rlftsim.envs.planner_scores import ACCELERATION, JERK, LATERAL
 from rlftsim.envs.planners.view import View, read_view
 from rlftsim.envs.road import OUTSIDE_M, nearest_edges
@@ -51,7 +51,7 @@ class Proposals:
 class PdmPlanner:
     """The best of 15 proposals: 5 fractions of the wanted speed times 3 offsets from the route."""
 
-    action: ActionKind = "bicycle"
+    action: ActionType = "bicycle"
 
     def __init__(self) -> None:
         self._plan = np.zeros((0, 2), np.float32)
@@ -79,27 +79,27 @@ class PdmPlanner:
 def simulate_proposals(view: View) -> Proposals:
     """Drive along the route at several speeds and offsets for 4 s; the others keep their velocity."""
     fraction, offset = (v.ravel() for v in np.meshgrid(SPEED_FRACTIONS, OFFSETS_M))
-    wanted = fraction * (view.limit_mps or CONFIG.speed_mps)
-    n, bicycle = len(wanted), Bicycle()
+    free_speed = fraction * (view.limit_mps or CONFIG.speed_mps)
+    n, bicycle = len(free_speed), Bicycle()
     normal = np.stack([-np.sin(view.heading), np.cos(view.heading)], -1)
     lines = view.line + offset[:, None, None] * normal  # [n, P, 2]
     motion = np.tile([0.0, 0.0, 0.0, view.speed, 0.0], (n, 1))
     row, size = np.arange(n), np.tile(view.size, (n, 1))
-    mask, other_size = np.ones((n, len(view.others)), bool), np.tile(view.other_size, (n, 1, 1))
+    mask, other_size = np.ones((n, len(view.boxes)), bool), np.tile(view.box_size, (n, 1, 1))
     states, controls = [motion], []
     for step in range(STEPS):
-        others = np.tile(_coasted(view.others, step * STEP_S), (n, 1, 1))
+        boxes = np.tile(_coasted(view.boxes, step * STEP_S), (n, 1, 1))
         # 1. place on the line, and the leader from there on
-        place = np.linalg.norm(lines - motion[:, None, :2], axis=-1).argmin(1)
-        window = np.minimum(place[:, None] + np.arange(LOOKAHEAD_M), lines.shape[1] - 1)
-        gap, lead = find_leaders(lines[row[:, None], window], view.heading[window], size, others, other_size, mask)
-        to_stop = view.stop_m - place - view.size[0] / 2
+        line_index = np.linalg.norm(lines - motion[:, None, :2], axis=-1).argmin(1)
+        window = np.minimum(line_index[:, None] + np.arange(LOOKAHEAD_M), lines.shape[1] - 1)
+        gap, lead = find_leaders(lines[row[:, None], window], view.heading[window], size, boxes, other_size, mask)
+        to_stop = view.stop_m - line_index - view.size[0] / 2
         to_stop = np.where(to_stop > -1.0, np.maximum(to_stop, 0.0), np.inf)
         gap, lead = np.minimum(gap, to_stop), np.where(to_stop < gap, 0.0, lead)
         speed = np.maximum(signed_speed(motion), 0.0)
-        acceleration = np.maximum(idm_acceleration(speed, wanted, gap, lead, CONFIG), -ACCELERATION_MPS2)
+        acceleration = np.maximum(compute_idm_acceleration(speed, free_speed, gap, lead, CONFIG), -ACCELERATION_MPS2)
         # 2. pure pursuit of the line
-        target = lines[row, np.minimum(place + pursuit_m(speed).astype(int), lines.shape[1] - 1)] - motion[:, :2]
+        target = lines[row, np.minimum(line_index + pursuit_m(speed).astype(int), lines.shape[1] - 1)] - motion[:, :2]
         cos, sin = np.cos(motion[:, 2]), np.sin(motion[:, 2])
         x, y = cos * target[:, 0] + sin * target[:, 1], cos * target[:, 1] - sin * target[:, 0]
         steering = pursue(np.stack([x, y], -1), view.size[:1])
@@ -113,11 +113,11 @@ def collisions(view: View, motion: Float[np.ndarray, "n T1 5"]) -> Bool[np.ndarr
     """True from the step on at which a proposal meets a box that is not behind it; overlaps at the start are left out.
 
     Args:
-        view: of the agent.
-        motion: of the proposals.
+        view: What the planner sees, in the ego frame: x ahead, meters.
+        motion: Motion of the proposals, ego frame at the time of planning.
     """
     time = STEP_S * np.arange(motion.shape[1])
-    meets = _meets(view, motion, np.stack([_coasted(view.others, t) for t in time]))  # [n, T + 1, K]
+    meets = _meets(view, motion, np.stack([_coasted(view.boxes, t) for t in time]))  # [n, T + 1, K]
     meets &= ~meets[:, :1]
     return np.logical_or.accumulate(meets.any(-1), axis=1)
 
@@ -128,28 +128,28 @@ def score_proposals(
     """NC · DDC · DAC · (5 progress + 5 TTC + 2 comfort) / 12 of each proposal.
 
     Args:
-        view: of the agent.
-        motion: of the proposals.
-        collides: as `collisions` returns it.
+        view: What the planner sees, in the ego frame: x ahead, meters.
+        motion: Motion of the proposals, ego frame at the time of planning.
+        collides: True from the step of a collision on, as `collisions` returns it.
     """
     n = len(motion)
     # 1. what must not happen: collisions, driving against the route, leaving the road
     end = motion[:, -1]
-    place = np.linalg.norm(view.line - end[:, None, :2], axis=-1).argmin(1)
-    direction = np.cos(end[:, 2] - view.heading[place]) > 0
+    line_index = np.linalg.norm(view.line - end[:, None, :2], axis=-1).argmin(1)
+    direction = np.cos(end[:, 2] - view.heading[line_index]) > 0
     sparse = motion[:, ::SPARSE]
     allowed = ~collides[:, -1] & direction & ~_leaves_road(view, sparse)
     # 2. progress along the route, as a fraction of the best proposal's
-    progress = np.where(allowed, place, 0.0)
+    progress = np.where(allowed, line_index, 0.0)
     best = progress.max()
     progress = progress / best if best > LEAST_PROGRESS_M else np.ones(n)
     # 3. time to collision and comfort
     risky = np.zeros(n, bool)
     time = STEP_S * SPARSE * np.arange(sparse.shape[1])
-    for ahead in TTC_S:
+    for delay_s in TTC_S:
         coasted = sparse.copy()
-        coasted[..., :2] += ahead * sparse[..., 3:]
-        meets = _meets(view, coasted, np.stack([_coasted(view.others, t + ahead) for t in time]))
+        coasted[..., :2] += delay_s * sparse[..., 3:]
+        meets = _meets(view, coasted, np.stack([_coasted(view.boxes, t + delay_s) for t in time]))
         risky |= (meets & (signed_speed(sparse) > 0.1)[..., None]).any((1, 2))
     speed = signed_speed(motion)
     acceleration = np.diff(speed, axis=1) / STEP_S
@@ -162,13 +162,13 @@ def score_proposals(
 
 
 def _meets(
-    view: View, motion: Float[np.ndarray, "n t 5"], others: Float[np.ndarray, "t K 5"]
+    view: View, motion: Float[np.ndarray, "n t 5"], boxes: Float[np.ndarray, "t K 5"]
 ) -> Bool[np.ndarray, "n t K"]:
     """True where a proposal overlaps a box that is not behind it."""
-    offset = others[..., :2] - motion[..., None, :2]  # [n, t, K, 2]
-    meets = boxes_overlap(offset, motion[..., None, 2], others[..., 2], view.size, view.other_size)
-    ahead = offset[..., 0] * np.cos(motion[..., None, 2]) + offset[..., 1] * np.sin(motion[..., None, 2])
-    return meets & (ahead > -view.size[0] / 2)
+    offset = boxes[..., :2] - motion[..., None, :2]  # [n, t, K, 2]
+    meets = boxes_overlap(offset, motion[..., None, 2], boxes[..., 2], view.size, view.box_size)
+    forward = offset[..., 0] * np.cos(motion[..., None, 2]) + offset[..., 1] * np.sin(motion[..., None, 2])
+    return meets & (forward > -view.size[0] / 2)
 
 
 def _leaves_road(view: View, motion: Float[np.ndarray, "n t 5"]) -> Bool[np.ndarray, "n"]:
@@ -180,8 +180,8 @@ def _leaves_road(view: View, motion: Float[np.ndarray, "n t 5"]) -> Bool[np.ndar
     return np.any((side < 0) & (distance >= OUTSIDE_M), axis=1)
 
 
-def _coasted(others: Float[np.ndarray, "K 5"], time_s: float) -> Float[np.ndarray, "K 5"]:
+def _coasted(boxes: Float[np.ndarray, "K 5"], time_s: float) -> Float[np.ndarray, "K 5"]:
     """Boxes at constant velocity after some time."""
-    moved = others.copy()
-    moved[:, :2] += time_s * others[:, 3:]
+    moved = boxes.copy()
+    moved[:, :2] += time_s * boxes[:, 3:]
     return moved

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any, Protocol, get_args, runtime_checkable
 
-from rlftsim.envs.actions import LEAST_HORIZON, ActionKind
+from rlftsim.envs.actions import MIN_HORIZON, ActionType
 from rlftsim.errors import ConfigError
 from rlftsim.plugins import ExtensionPoint
 from rlftsim.scenario.shards import hash_file
@@ -33,9 +33,9 @@ PLANNERS: ExtensionPoint[Callable[..., Any]] = ExtensionPoint(
 
 @runtime_checkable
 class Planner(Protocol):
-    """Drives one agent. Attribute `action` names its kind of action; without it that is "bicycle".
+    """Drives an agent. Attribute `action` names the type of action; the default is "bicycle".
 
-    Attribute `horizon` is the number of poses of a "trajectory"; without it that is 5. A bicycle drives backwards where
+    Attribute `horizon` is the number of poses of a "trajectory"; the default is 5. A bicycle drives backwards where
     attribute `reverse` is True.
     """
 
@@ -43,7 +43,7 @@ class Planner(Protocol):
         """Begin an episode.
 
         Args:
-            info: of the environment's reset; "logged" holds the agent's logged poses.
+            info: Information of the environment's reset; "logged" has the agent's logged poses [81, 3].
         """
         ...
 
@@ -56,17 +56,16 @@ class CallablePlanner:
     """A plain function from observation to action, as a planner.
 
     Args:
-        function: called with an observation.
+        function: Function that is called with an observation and returns an action.
     """
 
     def __init__(self, function: Callable[[dict[str, Any]], Any]):
         self.function = function
-        self.action = action_of(function)
-        self.horizon = horizon_of(function)
-        self.reverse = may_reverse(function)
+        for name, value in read_action_settings(function).items():
+            setattr(self, name, value)
 
     def reset(self, info: dict[str, Any]) -> None:
-        """Nothing: a function has no memory."""
+        """Do nothing: a function has no memory."""
 
     def act(self, observation: dict[str, Any]) -> Any:
         """Result of the function."""
@@ -77,26 +76,26 @@ def load_planner(name: str) -> Planner:
     """Planner of a name.
 
     Args:
-        name: a registered name, or "package.module:Class" (or ":function").
+        name: Registered name, or "package.module:Class" (or ":function") of code that can be imported.
 
     Raises:
-        ConfigError: unknown, not importable, neither an object with `reset` and `act` nor a function, with other
-            arguments than these, or with an unknown kind of action.
+        ConfigError: Unknown, not importable, neither an object with `reset` and `act` nor a function, with other
+            arguments than these, or with an unknown type of action.
     """
     if ":" in name:
         module, _, attribute = name.partition(":")
         if not module or module.startswith("."):
             raise ConfigError(f"planner {name!r} names no module: write package.module:Class.")
         try:
-            found = getattr(importlib.import_module(module), attribute)
+            loaded = getattr(importlib.import_module(module), attribute)
         except (Exception, SystemExit) as error:  # a file of others may fail in any way
             raise ConfigError(
                 f"planner {name!r} cannot be imported ({type(error).__name__}: {error}): name package.module:Class."
             ) from error
     else:
-        found = PLANNERS.get(name)
+        loaded = PLANNERS.get(name)
     try:
-        planner = found() if isinstance(found, type) else found
+        planner = loaded() if isinstance(loaded, type) else loaded
     except TypeError as error:
         raise ConfigError(f"planner {name!r} cannot be made without arguments ({error}).") from None
     except SystemExit as stop:
@@ -105,18 +104,18 @@ def load_planner(name: str) -> Planner:
         ) from stop
     if not isinstance(planner, Planner):
         if not callable(planner):
-            kind = type(planner).__name__
-            raise ConfigError(f"planner {name!r} is of type {kind}: give it reset(info) and act(observation).")
-        _require_one_argument(f"planner {name!r}", planner, "observation")
+            class_name = type(planner).__name__
+            raise ConfigError(f"planner {name!r} is of type {class_name}: give it reset(info) and act(observation).")
+        _check_argument(f"planner {name!r}", planner, "observation")
         planner = CallablePlanner(planner)
-    _require_one_argument(f"reset of planner {name!r}", planner.reset, "info")
-    _require_one_argument(f"act of planner {name!r}", planner.act, "observation")
-    action_of(planner)  # refuses an unknown kind now, not in the first episode
+    _check_argument(f"reset of planner {name!r}", planner.reset, "info")
+    _check_argument(f"act of planner {name!r}", planner.act, "observation")
+    read_action_settings(planner)  # an unknown action ends here, not in the first episode
     return planner
 
 
-def _require_one_argument(what: str, function: Callable[..., Any], argument: str) -> None:
-    """Refuse a function that cannot be called with one value; one without a readable signature passes."""
+def _check_argument(name: str, function: Callable[..., Any], argument: str) -> None:
+    """Raise ConfigError for a function that cannot be called with a single value; unreadable signatures pass."""
     try:
         signature = inspect.signature(function)
     except (TypeError, ValueError):
@@ -124,56 +123,47 @@ def _require_one_argument(what: str, function: Callable[..., Any], argument: str
     try:
         signature.bind(argument)
     except TypeError as error:
-        raise ConfigError(f"{what} cannot be called with {argument} alone ({error}): let it take that.") from None
+        raise ConfigError(f"{name} cannot be called with {argument} alone ({error}): let it take that.") from None
 
 
 def hash_code(name: str) -> str:
-    """SHA-256 of the file that defines a planner, and of the module in its name if that is another one.
+    """SHA-256 of the file that defines a planner, and of the module in the planner's name where that is a second file.
 
-    Of a planner without a file, as in a notebook, it is another value each time.
+    A planner without a file, as in a notebook, has a new value each time.
 
     Args:
-        name: as for `load_planner`.
+        name: Name of the planner, as `load_planner` takes it.
     """
     planner = load_planner(name)
-    made = planner.function if isinstance(planner, CallablePlanner) else planner
-    places: list[Any] = [made if inspect.isroutine(made) else type(made)]
+    code: Any = planner.function if isinstance(planner, CallablePlanner) else planner
+    sources: list[Any] = [code if inspect.isroutine(code) else type(code)]
     if ":" in name:
-        places.append(sys.modules[name.partition(":")[0]])
-    hashes = dict.fromkeys(found for found in map(_hash_source, places) if found)
+        sources.append(sys.modules[name.partition(":")[0]])
+    hashes = dict.fromkeys(filter(None, map(_hash_source, sources)))
     # without a file it may be other code than the last time
     return "-".join(hashes) or secrets.token_hex(32)
 
 
 @cache
 def _hash_source(code: Any) -> str | None:
-    """Hash of the file of a module, class or function, as it is when this process first sees it: one that is edited
-    afterwards is not the one that drives. None = there is no file."""
+    """Hash of the file of a module, class or function when this process first sees the code: a later edit does not
+    drive. None = there is no file."""
     try:
         return hash_file(inspect.getfile(code))
     except (TypeError, OSError):
         return None
 
 
-def action_of(planner: Planner | Callable[..., Any]) -> ActionKind:
-    """Kind of action that a planner takes.
+def read_action_settings(planner: Planner | Callable[..., Any]) -> dict[str, Any]:
+    """Settings `action`, `horizon` and `reverse` of the environment that a planner drives in, by its attributes.
 
     Raises:
-        ConfigError: there is no such kind.
+        ConfigError: The attribute `action` names no type of action.
     """
     action: Any = getattr(planner, "action", "bicycle")
-    if action not in get_args(ActionKind):
-        known = ", ".join(get_args(ActionKind))
+    if action not in get_args(ActionType):
+        choices = ", ".join(get_args(ActionType))
         name = getattr(planner, "__name__", type(planner).__name__)
-        raise ConfigError(f"planner {name} has action = {action!r}: known are {known}.")
-    return action
-
-
-def horizon_of(planner: Planner | Callable[..., Any]) -> int:
-    """Number of poses of a planner's trajectories."""
-    return getattr(planner, "horizon", LEAST_HORIZON)
-
-
-def may_reverse(planner: Planner | Callable[..., Any]) -> bool:
-    """True = the planner's bicycle may drive backwards."""
-    return getattr(planner, "reverse", False)
+        raise ConfigError(f"planner {name} has action = {action!r}: known are {choices}.")
+    horizon, reverse = getattr(planner, "horizon", MIN_HORIZON), getattr(planner, "reverse", False)
+    return {"action": action, "horizon": horizon, "reverse": reverse}

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from rlftsim.envs.actions import ActionKind
+from rlftsim.envs.actions import ActionType
 from rlftsim.errors import DataError
 from rlftsim.geometry import wrapped
 
@@ -13,11 +13,11 @@ from rlftsim.geometry import wrapped
 class Replay:
     """Drives as logged. With replayed traffic it gives the log back, so it tests the whole loop."""
 
-    action: ActionKind = "pose"
+    action: ActionType = "pose"
 
     def __init__(self) -> None:
         self._steps = np.zeros((0, 3), np.float32)
-        self._taken = 0
+        self._num_steps = 0
 
     def reset(self, info: dict[str, Any]) -> None:
         """Take the logged poses.
@@ -28,15 +28,15 @@ class Replay:
         logged = info["logged"]
         if np.isnan(logged[1:]).all():
             raise DataError(f"scenario {info['scenario']} has no logged future: the replay planner needs one.")
-        known = np.isfinite(logged).all(1)
+        has_state = np.isfinite(logged).all(1)
         # where the log has a gap, the agent waits at the last pose
-        held = logged[np.maximum.accumulate(np.where(known, np.arange(len(logged)), 0))]
-        self._steps, self._taken = _steps_between(held), 0
+        poses = logged[np.maximum.accumulate(np.where(has_state, np.arange(len(logged)), 0))]
+        self._steps, self._num_steps = _steps_between(poses), 0
 
     def act(self, observation: dict[str, Any]) -> Float[np.ndarray, "3"]:
         """The next logged pose in the frame of the present one."""
-        self._taken += 1
-        return self._steps[self._taken - 1]
+        self._num_steps += 1
+        return self._steps[self._num_steps - 1]
 
 
 def _steps_between(poses: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n-1 3"]:
@@ -50,7 +50,7 @@ def _steps_between(poses: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n-1 3"
 class ConstantVelocityPlanner:
     """Keeps speed and heading, backwards too: the floor."""
 
-    action: ActionKind = "bicycle"
+    action: ActionType = "bicycle"
     reverse = True
 
     def reset(self, info: dict[str, Any]) -> None:

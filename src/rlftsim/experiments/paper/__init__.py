@@ -1,1 +1,1 @@
-"""The paper's tables and figures, an experiment in a file each. `experiments.registry` lists them."""
+"""The paper's tables and figures, an experiment in a file each, listed in `experiments.registry`."""

@@ -1,4 +1,4 @@
-"""Table 1, extended: base model, CAT-K, RoaD and RLFTSim, between constant velocity and the log itself (the oracle)."""
+"""Table 1, extended: base model, CAT-K, RoaD and RLFTSim, between constant velocity and the log (the oracle)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ RESAMPLES_AT_ONCE = 100
 
 
 def run(suite: ExperimentSuite) -> dict[str, Row]:
-    """Rows of the table, without closed-loop imitation for a policy that it cannot train."""
+    """Rows of the table; closed-loop imitation is left out for a policy without tokens."""
     rows = {
         REFERENCE: (BASE,),
         **{name: over_seeds(FineTuned(method), suite.num_seeds) for name, method in IMITATIONS.items()},
@@ -31,24 +31,20 @@ def run(suite: ExperimentSuite) -> dict[str, Row]:
         CEILING: (ORACLE,),
         FLOOR: (CONSTANT_VELOCITY,),
     }
-    return suite.evaluate(suite.feasible(rows))
+    return suite.evaluate(suite.select_feasible(rows))
 
 
 def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResult:
     """The table, the differences, and the part of the gap to the oracle that fine-tuning closes."""
     base, tuned = rows[REFERENCE], rows[TUNED]
     imitations = [rows[name] for name in IMITATIONS if name in rows]
-    closed = {row.name: gap_closed(base.mean, row.mean, rows[CEILING].mean) for row in (*imitations, tuned)}
+    closed = {row.name: compute_gap_closed(base.mean, row.mean, rows[CEILING].mean) for row in (*imitations, tuned)}
     return ExperimentResult(
         title="Benchmark: realism of the base model, closed-loop imitation and RLFTSim",
-        tables=(tables.of_rows("Ours", rows.values(), SCORES), published.BENCHMARK),
+        tables=(tables.build_table("Ours", rows.values(), SCORES), published.load_table("benchmark")),
         verdicts=(
             *(tuned.against(base), tuned.seeds_against(base)),
-            *(
-                verdict
-                for row in imitations
-                for verdict in (row.against(base), row.seeds_against(base), tuned.against(row))
-            ),
+            *(v for row in imitations for v in (row.against(base), row.seeds_against(base), tuned.against(row))),
             *(f"{name}: {gap}" for name, gap in closed.items()),
         ),
         notes=(
@@ -62,7 +58,7 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
             "would give.",
         ),
         numbers={
-            "rows": tables.numbers(rows.values(), SCORES),
+            "rows": tables.to_numbers(rows.values(), SCORES),
             "gain_by_seed": {row.name: row.gains_over(base).tolist() for row in (*imitations, tuned)},
             "gap_closed": {name: {"fraction": g.fraction, "interval": g.interval} for name, g in closed.items()},
         },
@@ -85,30 +81,30 @@ class GapClosed:
         return f"{self.fraction:.1%} of the gap from base to oracle closed, {interval}."
 
 
-def gap_closed(base: Evaluation, tuned: Evaluation, ceiling: Evaluation) -> GapClosed:
+def compute_gap_closed(base: Evaluation, tuned: Evaluation, ceiling: Evaluation) -> GapClosed:
     """Mean gain over mean gap of the meta-metric, scenarios paired.
 
     Args:
-        base: start of the gap.
-        tuned: model whose gain is measured.
-        ceiling: end of the gap, such as the oracle.
+        base: Evaluation of the base model, the start of the gap.
+        tuned: Evaluation of the fine-tuned model, for the gain.
+        ceiling: Evaluation of the oracle, the end of the gap.
 
     Raises:
-        DataError: no scenario in common.
+        DataError: No scenario in common.
     """
-    ids, before, after = paired_values(base, tuned, RMM)
-    above = dict(zip(ceiling.scenario_ids, ceiling.values(RMM)))
-    best = np.array([above.get(i, np.nan) for i in ids])
+    ids, base_scores, tuned_scores = paired_values(base, tuned, RMM)
+    by_id = dict(zip(ceiling.scenario_ids, ceiling.values(RMM)))
+    gain, gap = tuned_scores - base_scores, np.array([by_id.get(i, np.nan) for i in ids]) - base_scores
     # A scenario counts where all three have a score.
-    known = np.isfinite(before) & np.isfinite(after) & np.isfinite(best)
-    gain, gap = (after - before)[known], (best - before)[known]  # [scenarios]
+    is_scored = np.isfinite(gain) & np.isfinite(gap)
+    gain, gap = gain[is_scored], gap[is_scored]  # [scenarios]
     if not len(gain):
         return GapClosed(np.nan, (np.nan, np.nan))
     # Bootstrap: scenarios are drawn again and again with replacement, a few resamples at a time for memory.
     rng, means = np.random.default_rng(0), []
     for _ in range(NUM_RESAMPLES // RESAMPLES_AT_ONCE):
-        drawn = rng.integers(len(gain), size=(RESAMPLES_AT_ONCE, len(gain)))  # [resamples, scenarios]
-        means.append((gain[drawn].mean(1), gap[drawn].mean(1)))
+        resamples = rng.integers(len(gain), size=(RESAMPLES_AT_ONCE, len(gain)))  # [resamples, scenarios]
+        means.append((gain[resamples].mean(1), gap[resamples].mean(1)))
     mean_gain, mean_gap = np.concatenate(means, axis=1)  # [NUM_RESAMPLES] each
     # Ratio of means, not mean of ratios: scenarios in which the base model is as good as the oracle have no ratio.
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -1,11 +1,10 @@
-"""Credit assignment: the leave-one-out reward given to whole rollouts, beside one that is split over agents."""
+"""Credit assignment: the leave-one-out reward given to whole rollouts, or split over agents."""
 
 from collections.abc import Mapping
 
 from rlftsim.evaluation.columns import COLUMNS
 from rlftsim.experiments import tables
-from rlftsim.experiments.model_specs import BASE, over_seeds
-from rlftsim.experiments.paper.reward_ablation import REFERENCE, REWARDS
+from rlftsim.experiments.paper import reward_ablation
 from rlftsim.experiments.results import Experiment, ExperimentResult
 from rlftsim.experiments.rows import Row
 from rlftsim.experiments.suite import ExperimentSuite
@@ -15,17 +14,15 @@ COMPARED = ("MLOO", "MLOO, credit by agent")
 
 def run(suite: ExperimentSuite) -> dict[str, Row]:
     """Rows of the base model, and of MLOO with either credit assignment."""
-    tuned = {name: over_seeds(REWARDS[name], suite.num_seeds) for name in COMPARED}
-    return suite.evaluate({REFERENCE: (BASE,), **tuned})
+    return reward_ablation.evaluate_rewards(suite, COMPARED)
 
 
 def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResult:
     """The table, and a verdict on the split."""
-    # In the order of `run`.
-    base, plain, split = rows.values()
+    base, plain, split = rows.values()  # in the order of `run`
     return ExperimentResult(
         title="Credit assignment: MLOO for whole rollouts, and for each agent",
-        tables=(tables.of_rows("Ours", rows.values(), COLUMNS),),
+        tables=(tables.build_table("Ours", rows.values(), COLUMNS),),
         verdicts=(
             *(split.against(plain), plain.against(base), split.against(base)),
             *(plain.seeds_against(base), split.seeds_against(base)),
@@ -34,7 +31,7 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
             suite.budget.note,
             "The paper gives every decision of a rollout the same reward; it has no number for the other.",
         ),
-        numbers={"rows": tables.numbers(rows.values(), COLUMNS)},
+        numbers={"rows": tables.to_numbers(rows.values(), COLUMNS)},
         figure=tables.draw_gains(base, [plain, split]),
     )
 

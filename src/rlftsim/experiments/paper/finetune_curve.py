@@ -3,17 +3,14 @@
 from collections.abc import Mapping
 from dataclasses import replace
 
-import numpy as np
-
 from rlftsim.evaluation.columns import SCORES
-from rlftsim.evaluation.compare import compare
 from rlftsim.experiments import tables
 from rlftsim.experiments.model_specs import BASE, CATK, WEAK_EPOCHS, Base, FineTuned, ModelSpec, over_seeds
 from rlftsim.experiments.paper import published
 from rlftsim.experiments.results import Experiment, ExperimentResult
 from rlftsim.experiments.rows import RMM, Row
 from rlftsim.experiments.suite import ExperimentSuite
-from rlftsim.viewer.figure import Band, draw_bands
+from rlftsim.viewer.figure import draw_bands
 
 EPOCHS_FRACTIONS = (0.25, 0.5, 1.0, 1.5)
 """Of the recipe's fine-tuning epochs."""
@@ -28,17 +25,17 @@ PAIRS = (("CAT-K", "RLFTSim"), ("CAT-K, weak base", "RLFTSim, weak base"))
 """Compared at equal length."""
 
 
-def start_of(curve: FineTuned) -> str:
+def name_start(curve: FineTuned) -> str:
     """Row of the model that a curve starts from."""
     return "base" if curve.base == BASE else f"weak base ({WEAK_EPOCHS:g} epoch)"
 
 
 def point(curve: str, epochs: float) -> str:
-    """Row of a point of a curve.
+    """Name of a point's row.
 
     Args:
-        curve: its name.
-        epochs: of fine-tuning.
+        curve: Name of the curve, a key of `CURVES`.
+        epochs: Epochs of fine-tuning at the point.
     """
     return f"{curve}, {epochs:g} epochs"
 
@@ -47,52 +44,48 @@ def specs(num_seeds: int, epochs: float) -> dict[str, tuple[ModelSpec, ...]]:
     """Specifications of the starts and points of all curves.
 
     Args:
-        num_seeds: of every point.
-        epochs: of the recipe's fine-tuning.
+        num_seeds: Number of fine-tunings behind every point, with the seeds 0, 1, ....
+        epochs: Epochs of the recipe's fine-tuning; points lie at the fractions `EPOCHS_FRACTIONS` of these.
     """
-    starts = {start_of(curve): (curve.base,) for curve in CURVES.values()}
+    starts = {name_start(curve): (curve.base,) for curve in CURVES.values()}
     # Shorter runs first: longer ones with a reward continue them.
     points = {
-        point(name, part * epochs): over_seeds(replace(curve, epochs_fraction=part), num_seeds)
+        point(name, fraction * epochs): over_seeds(replace(curve, epochs_fraction=fraction), num_seeds)
         for name, curve in CURVES.items()
-        for part in EPOCHS_FRACTIONS
+        for fraction in EPOCHS_FRACTIONS
     }
     return {**starts, **points}
 
 
 def run(suite: ExperimentSuite) -> dict[str, Row]:
-    """Rows of all points, without CAT-K for a policy that it cannot train."""
-    return suite.evaluate(suite.feasible(specs(suite.num_seeds, suite.recipe.finetune.epochs)))
+    """Rows of all points; CAT-K is left out for a policy without tokens."""
+    return suite.evaluate(suite.select_feasible(specs(suite.num_seeds, suite.recipe.finetune.epochs)))
 
 
 def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResult:
     """The table, the curves, and the differences at equal length.
 
     Args:
-        rows: of `run`, by the names that `start_of` and `point` give.
-        suite: for the epochs of its recipe.
+        rows: Rows that `run` returned, by the names that `name_start` and `point` give.
+        suite: Suite with the recipe's epochs; no model is trained or evaluated here.
     """
-    epochs = [part * suite.recipe.finetune.epochs for part in EPOCHS_FRACTIONS]
+    epochs = [fraction * suite.recipe.finetune.epochs for fraction in EPOCHS_FRACTIONS]
     verdicts, bands = [], []
     # A curve of a method that cannot train the policy has no rows.
-    drawn = [name for name in CURVES if point(name, epochs[0]) in rows]
+    measured_curves = [name for name in CURVES if point(name, epochs[0]) in rows]
     for number, (name, curve) in enumerate(CURVES.items()):
-        if name not in drawn:
+        if name not in measured_curves:
             continue
-        start, points = rows[start_of(curve)], [rows[point(name, length)] for length in epochs]
+        start, points = rows[name_start(curve)], [rows[point(name, length)] for length in epochs]
         best = max(points, key=lambda row: row.mean.mean_and_error(RMM).mean)
         verdicts.append(f"best of its curve: {best.against(start)}")
-        # Bands are the intervals of the paired gains: scenarios being harder or easier in all models is not in them.
-        low = start.mean.mean_and_error(RMM).mean
-        gains = [compare(start.mean, row.mean)[RMM] for row in points]
-        middle = low + np.array([0.0, *(gain.difference for gain in gains)])  # [points]
-        limits = low + np.array([(0.0, 0.0), *(gain.interval for gain in gains)])  # [points, 2]
-        bands.append(Band(name, np.array([0.0, *epochs]), middle, limits[:, 0], limits[:, 1], color=number))
-    for first, second in (pair for pair in PAIRS if set(pair) <= set(drawn)):
+        level = start.mean.mean_and_error(RMM).mean
+        bands.append(tables.build_gain_band(name, start, list(zip(epochs, points)), level=level, color=number))
+    for first, second in (pair for pair in PAIRS if set(pair) <= set(measured_curves)):
         verdicts += [rows[point(second, length)].against(rows[point(first, length)]) for length in epochs]
     return ExperimentResult(
         title="Realism against epochs of fine-tuning",
-        tables=(tables.of_rows("Ours", rows.values(), SCORES[:4]), published.CURVE),
+        tables=(tables.build_table("Ours", rows.values(), SCORES[:4]), published.load_table("finetune-curve")),
         verdicts=tuple(verdicts),
         notes=(
             "At equal epochs all curves had the same number of updates of as many scenarios; RLFTSim simulates "
@@ -101,7 +94,7 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
             "CAT-K are runs of their own, because its learning rate falls towards the end.",
             "The best point of a curve is chosen with the scenarios it is evaluated on, which flatters it a little.",
         ),
-        numbers={"rows": tables.numbers(rows.values(), SCORES[:4]), "epochs": epochs},
+        numbers={"rows": tables.to_numbers(rows.values(), SCORES[:4]), "epochs": epochs},
         figure=draw_bands(
             bands,
             title="Realism against fine-tuning",

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from rlftsim.evaluation.columns import GOAL_COLUMNS
 from rlftsim.experiments import tables
-from rlftsim.experiments.model_specs import GCFT, GCSL, FineTuned, GoalKind, GoalTraining, Guided, over_seeds
+from rlftsim.experiments.model_specs import GCFT, GCSL, FineTuned, GoalRewardType, GoalTraining, Guided, over_seeds
 from rlftsim.experiments.paper import published
 from rlftsim.experiments.results import Experiment, ExperimentResult
 from rlftsim.experiments.rows import RMM, Row
@@ -17,7 +17,7 @@ START = "goal-free"
 GOAL_FREE = FineTuned("mloo")
 """The realism-aligned model that goal conditioning starts from."""
 ENCODINGS = {"concatenation": "concat", "indication": "indication"}
-KINDS: tuple[GoalKind, ...] = ("soft", "hard")
+REWARD_TYPES: tuple[GoalRewardType, ...] = ("soft", "hard")
 GOAL_WEIGHT = 0.02
 """Lambda. The paper's is 0.1, for agents that learn from the reward what a goal is. These have learned it
 before, and at 0.1 small models pay for passing more goals in collisions (docs/log.md)."""
@@ -27,21 +27,24 @@ RELABELLED = {
 }
 """The goal-free model after imitating its own rollouts, relabelled with their endpoints as goals. Not rewarded yet."""
 VARIANTS = {
-    f"{name}, {kind}": FineTuned(
-        GCFT, credit="agent", base=RELABELLED[f"{name}, relabelled"], goals=GoalTraining(encoding, kind, GOAL_WEIGHT)
+    f"{name}, {reward_type}": FineTuned(
+        GCFT,
+        credit="agent",
+        base=RELABELLED[f"{name}, relabelled"],
+        goals=GoalTraining(encoding, reward_type, GOAL_WEIGHT),
     )
     for name, encoding in ENCODINGS.items()
-    for kind in KINDS
+    for reward_type in REWARD_TYPES
 }
 GUIDANCE_SCALE = 2.0
 """Of the goal logit bias. Small models have not learned a bias as strong as it might be (docs/log.md)."""
-GUIDED = {f"{name}, guided": Guided(one, GUIDANCE_SCALE) for name, one in VARIANTS.items()}
+GUIDED = {f"{name}, guided": Guided(spec, GUIDANCE_SCALE) for name, spec in VARIANTS.items()}
 """The same models, not trained any further."""
 
 
 @dataclass(frozen=True)
 class GoalRows:
-    """Rows of the goal-free model, and by name of the goal-conditioned ones."""
+    """Rows of the goal-free model, and by name of the goal-conditioned models."""
 
     start: Row
     relabelled: Mapping[str, Row]
@@ -53,17 +56,16 @@ class GoalRows:
 
 
 def run(suite: ExperimentSuite) -> GoalRows:
-    """Rows of all models. Of the goal-free and the relabelled models only seed 0 is trained: the others start
-    from it."""
-    seeds = suite.num_seeds
-    variants = {name: over_seeds(spec, seeds) for name, spec in VARIANTS.items()}
+    """Rows of all models. Of the goal-free and the relabelled models only seed 0 is trained, where the
+    further trainings start."""
+    variants = {name: over_seeds(spec, suite.num_seeds) for name, spec in VARIANTS.items()}
     # The guided models of all seeds, not only those of seed 0 that `GUIDED` has.
     guided = {
-        name: tuple(Guided(one, spec.scale) for one in over_seeds(spec.of, seeds)) for name, spec in GUIDED.items()
+        f"{name}, guided": tuple(Guided(spec, GUIDANCE_SCALE) for spec in specs) for name, specs in variants.items()
     }
     return GoalRows(
         start=suite.evaluate({START: (GOAL_FREE,)})[START],
-        relabelled=suite.evaluate({name: (one,) for name, one in RELABELLED.items()}, goals="logged"),
+        relabelled=suite.evaluate({name: (spec,) for name, spec in RELABELLED.items()}, goals="logged"),
         variants=suite.evaluate(variants, goals="logged"),
         guided=suite.evaluate(guided, goals="logged"),
         without_goals=suite.evaluate(variants),
@@ -74,8 +76,8 @@ def summarize(rows: GoalRows, suite: ExperimentSuite) -> ExperimentResult:
     """The table, the cost of following goals, and the realism that is left without goals.
 
     Args:
-        rows: of `run`; everything is compared with the goal-free model.
-        suite: for the notes.
+        rows: Rows that `run` returned; all are compared with the goal-free model.
+        suite: Suite with the budget for the notes; no model is trained or evaluated here.
     """
     start = rows.start
     conditioned = [*rows.relabelled.values(), *rows.variants.values(), *rows.guided.values()]
@@ -88,12 +90,12 @@ def summarize(rows: GoalRows, suite: ExperimentSuite) -> ExperimentResult:
     return ExperimentResult(
         title="Goal conditioning: goals that agents miss, and the cost in realism",
         tables=(
-            tables.of_rows("Ours: goals are the logged endpoints", [start, *conditioned], GOAL_COLUMNS),
-            tables.of_rows("Ours: the same models without goals", [start, *without_goals], GOAL_COLUMNS),
-            published.GOALS,
+            tables.build_table("Ours: goals are the logged endpoints", [start, *conditioned], GOAL_COLUMNS),
+            tables.build_table("Ours: the same models without goals", [start, *without_goals], GOAL_COLUMNS),
+            published.load_table("goal-conditioning"),
         ),
         verdicts=(
-            *(_misses_line(start, row) for row in conditioned),
+            *(_format_misses(start, row) for row in conditioned),
             *(f"passing misses: {row.against(start, MISS)}" for row in conditioned),
             *(f"RMM: {row.against(start)}" for row in (*conditioned, *without_goals)),
         ),
@@ -108,7 +110,7 @@ def summarize(rows: GoalRows, suite: ExperimentSuite) -> ExperimentResult:
             "endpoint; percentage of agents and rollouts. In all rollouts: percentage of agents that miss in every "
             "one of them.",
         ),
-        numbers={"rows": tables.numbers([start, *conditioned, *without_goals], GOAL_COLUMNS)},
+        numbers={"rows": tables.to_numbers([start, *conditioned, *without_goals], GOAL_COLUMNS)},
         figure=draw_intervals(
             intervals,
             title="Agents that never pass their goal",
@@ -118,12 +120,12 @@ def summarize(rows: GoalRows, suite: ExperimentSuite) -> ExperimentResult:
     )
 
 
-def _misses_line(start: Row, row: Row) -> str:
-    before, after = (one.mean.mean_and_error(MISS).mean for one in (start, row))
+def _format_misses(start: Row, row: Row) -> str:
+    start_rate, rate = (evaluation.mean_and_error(MISS).mean for evaluation in (start.mean, row.mean))
     # Rates of 0 have no relative change.
-    relative = f"{after / before - 1:+.0%} relative" if before > 0 else "no misses before"
+    relative = f"{rate / start_rate - 1:+.0%} relative" if start_rate > 0 else "no misses before"
     gain = row.mean.mean_and_error(RMM).mean - start.mean.mean_and_error(RMM).mean
-    return f"{row.name}: passing misses {before:.2%} → {after:.2%}, {relative}, at {gain:+.4f} RMM."
+    return f"{row.name}: passing misses {start_rate:.2%} → {rate:.2%}, {relative}, at {gain:+.4f} RMM."
 
 
 EXPERIMENT = Experiment(

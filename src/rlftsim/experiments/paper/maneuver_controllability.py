@@ -1,75 +1,88 @@
-"""Maneuvers as goals of the ego: the logged one, an alternative that the lanes allow, or either."""
+"""Maneuvers as goals of the ego: the logged maneuver, an alternative that the lanes allow, or either."""
 
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 from rlftsim.evaluation.goal_attainment import Attained
 from rlftsim.experiments.paper import controllability, published
-from rlftsim.experiments.paper.controllability import RATES, Attainment, cell, estimate
+from rlftsim.experiments.paper.controllability import RATES, ROWS, Attainment, Curves, estimate_mean, format_rate
 from rlftsim.experiments.paper.goal_conditioning import GUIDED, START
-from rlftsim.experiments.paper.maneuver_goals import NAME, find_goals, is_logged, maneuver_of
+from rlftsim.experiments.paper.maneuver_goals import NAME, find_goals, is_logged, parse_maneuver
 from rlftsim.experiments.results import Experiment, ExperimentResult
 from rlftsim.experiments.suite import ExperimentSuite
 from rlftsim.experiments.tables import TextTable
-from rlftsim.scenario.maneuver import BENCHMARK_MANEUVERS, Maneuver
+from rlftsim.scenario.maneuver import BENCHMARK_MANEUVERS
 from rlftsim.statistics import MeanInterval
-from rlftsim.viewer.figure import Subplot, draw_subplots
 
-ONCE = {"passed_once": "goals passed in some rollout [%]", "reached_once": "goals reached in some rollout [%]"}
+GOAL_RATES = {"passed_once": "goals passed in some rollout [%]", "reached_once": "goals reached in some rollout [%]"}
 """Fractions of the goals (attributes of `Attained`), and their headings. The paper does not say how it counts
 several rollouts of a goal; its percentages are those of whole goals."""
-MIXED, ALTERNATIVE = "mixed", "alternative only"
-CONTAINS: dict[str, Callable[[Attained], bool]] = {
-    "ground truth": lambda one: is_logged(one.entry),
-    ALTERNATIVE: lambda one: not is_logged(one.entry),
+LOGGED, MIXED, ALTERNATIVE = "ground truth", "mixed", "alternative only"
+IN_CONDITION: Mapping[str, Callable[[Attained], bool]] = {
+    LOGGED: lambda outcome: is_logged(outcome.entry),
+    ALTERNATIVE: lambda outcome: not is_logged(outcome.entry),
 }
 """Tests of a goal being in a condition."""
-CONDITIONS = ("ground truth", MIXED, ALTERNATIVE)
+CONDITIONS = (LOGGED, MIXED, ALTERNATIVE)
 """Mixed: the mean of a scenario's logged and its alternative goals."""
-ByManeuver = Mapping[tuple[str, str, str], Mapping[Maneuver, MeanInterval]]
-"""Mean rate of each maneuver, by rate, row and condition."""
+MANEUVERS = [maneuver.value for maneuver in BENCHMARK_MANEUVERS]
 
 
-def run(suite: ExperimentSuite) -> dict[str, tuple[Attained, ...]]:
+def run(suite: ExperimentSuite) -> Attainment:
     """Outcome of every goal, by row. The goals are proposed and written first, unless there is a goals file.
 
     Raises:
-        DataError: there is no ego with two maneuvers, or the goals file was edited and makes no sense.
+        DataError: No ego has two maneuvers, or the goals file was edited and makes no sense.
     """
-    return controllability.attain(suite, find_goals(suite), NAME)
+    return controllability.measure_attainment(suite, ROWS, find_goals(suite), name=NAME)
 
 
 def summarize(attained: Attainment, suite: ExperimentSuite) -> ExperimentResult:
     """Rates by condition and by maneuver, beside the paper's.
 
     Args:
-        attained: of `run`; the labels of the goals have the maneuvers.
-        suite: for the notes.
+        attained: Outcomes that `run` returned; the labels of the goals have the maneuvers.
+        suite: Suite with the budget for the notes; no model is trained or evaluated here.
     """
-    rows = list(attained)
     overall = {
-        rate: {row: [estimate(_rates(attained, row, rate, c).values()) for c in CONDITIONS] for row in rows}
-        for rate in (*RATES, *ONCE)
+        rate: controllability.estimate_curves(
+            attained, CONDITIONS, lambda outcomes, c, rate=rate: _compute_rates(outcomes, rate, c).values()
+        )
+        for rate in (*RATES, *GOAL_RATES)
     }
-    by_maneuver: ByManeuver = {
-        (rate, row, condition): _by_maneuver(attained, row, rate, condition)
+    # Here the goal is the unit, not the scenario: a scenario has one goal of a maneuver or none.
+    by_maneuver = {
+        (rate, condition): controllability.estimate_curves(
+            {row: tuple(filter(is_in, outcomes)) for row, outcomes in attained.items()},
+            MANEUVERS,
+            lambda outcomes, m, rate=rate: [getattr(a, rate) for a in outcomes if parse_maneuver(a.entry).value == m],
+        )
         for rate in RATES
-        for row in rows
-        for condition in CONTAINS
+        for condition, is_in in IN_CONDITION.items()
     }
     # All rows have the same goals: maneuvers without any are not drawn.
-    shown = [m for m in BENCHMARK_MANEUVERS if any(by_maneuver["passed", rows[0], c][m].count for c in CONTAINS)]
-    subplots = [
-        Subplot(
-            f"{condition}, {heading.removesuffix(' [%]')}",
-            controllability.bands_of({row: [by_maneuver[rate, row, condition][m] for m in shown] for row in rows}),
-        )
-        for rate, heading in RATES.items()
-        for condition in CONTAINS
-    ]
+    counted_rows = [by_maneuver["passed", condition][START] for condition in IN_CONDITION]
+    drawn_maneuvers = [m for m in MANEUVERS if any(means[m].count for means in counted_rows)]
+    panels = {
+        f"{condition}, {RATES[rate].removesuffix(' [%]')}": {
+            row: {m: curve[m] for m in drawn_maneuvers} for row, curve in curves.items()
+        }
+        for (rate, condition), curves in by_maneuver.items()
+    }
     return ExperimentResult(
         title="Maneuver controllability: the ego's goal is its logged maneuver, or an alternative",
-        tables=(*_condition_tables(overall), *_maneuver_tables(by_maneuver, rows), published.MANEUVERS),
-        verdicts=tuple(_verdict(attained, row, rate) for rate in (*RATES, "passed_once") for row in GUIDED),
+        tables=(
+            *(
+                controllability.build_rate_table(f"Ours: {heading} ↑", overall[rate])
+                for rate, heading in (RATES | GOAL_RATES).items()
+            ),
+            *(
+                _tabulate_maneuvers(condition, *(by_maneuver[rate, condition] for rate in RATES))
+                for condition in IN_CONDITION
+            ),
+            published.load_table("maneuvers"),
+        ),
+        verdicts=tuple(_format_gain(attained, row, rate) for rate in (*RATES, "passed_once") for row in GUIDED),
         notes=(
             suite.budget.note,
             controllability.SEED_NOTE,
@@ -81,88 +94,61 @@ def summarize(attained: Attainment, suite: ExperimentSuite) -> ExperimentResult:
             "without a violation.",
         ),
         numbers={
-            "conditions": {
-                rate: {row: {c: _plain(one) for c, one in zip(CONDITIONS, ones)} for row, ones in by_row.items()}
-                for rate, by_row in overall.items()
-            },
-            "maneuvers": {
-                rate: {
-                    row: {c: {m.value: _plain(e) for m, e in by_maneuver[rate, row, c].items()} for c in CONTAINS}
-                    for row in rows
+            "conditions": _to_numbers(overall),
+            "maneuvers": _to_numbers(
+                {
+                    rate: {row: {c: by_maneuver[rate, c][row] for c in IN_CONDITION} for row in attained}
+                    for rate in RATES
                 }
-                for rate in RATES
-            },
-            "goals": [{"scenario": one.entry.scenario_id, "label": one.entry.label} for one in attained[rows[0]]],
+            ),
+            "goals": [{"scenario": a.entry.scenario_id, "label": a.entry.label} for a in attained[START]],
         },
-        figure=draw_subplots(
-            subplots,
+        figure=controllability.draw_rates(
+            panels,
             title="Maneuvers as goals of the ego",
             x_label="",
-            y_label="rollouts [%], 95 % interval",
-            ticks=[m.value.replace("_", "\n") for m in shown],
-            columns=len(CONTAINS),
+            ticks=[m.replace("_", "\n") for m in drawn_maneuvers],
             is_joined=False,
         ),
     )
 
 
-def _rates(attained: Attainment, row: str, rate: str, condition: str) -> dict[str, float]:
+def _compute_rates(outcomes: Sequence[Attained], rate: str, condition: str) -> dict[str, float]:
     """Mean rate over the goals of a condition, by scenario."""
     if condition == MIXED:
         # Scenarios with goals in both conditions; half and half, however many goals each has.
-        one, other = (_rates(attained, row, rate, name) for name in CONTAINS)
-        return {scenario_id: (one[scenario_id] + other[scenario_id]) / 2 for scenario_id in one if scenario_id in other}
-    return controllability.rates_by_scenario(filter(CONTAINS[condition], attained[row]), rate)
+        logged, alternative = (_compute_rates(outcomes, rate, name) for name in IN_CONDITION)
+        return {i: (logged[i] + alternative[i]) / 2 for i in logged if i in alternative}
+    return controllability.compute_scenario_rates(filter(IN_CONDITION[condition], outcomes), rate)
 
 
-def _by_maneuver(attained: Attainment, row: str, rate: str, condition: str) -> dict[Maneuver, MeanInterval]:
-    """Mean rate over the goals of a condition, by maneuver."""
-    # Here the goal is the unit, not the scenario: a scenario has one goal of a maneuver or none.
-    values: dict[Maneuver, list[float]] = {m: [] for m in BENCHMARK_MANEUVERS}
-    for one in filter(CONTAINS[condition], attained[row]):
-        values[maneuver_of(one.entry)].append(getattr(one, rate))
-    return {m: estimate(own) for m, own in values.items()}
+def _tabulate_maneuvers(condition: str, passed: Curves, reached: Curves) -> TextTable:
+    """Table of a condition: rows by maneuvers, with the number of goals of each."""
+
+    def format_cell(row: str, maneuver: str) -> str:
+        if not passed[row][maneuver].count:
+            return "–"
+        return f"{format_rate(passed[row][maneuver])} / {format_rate(reached[row][maneuver])}"
+
+    headings = (f"{m.replace('_', ' ')} ({mean.count})" for m, mean in passed[START].items())
+    cells = tuple((row, *(format_cell(row, m) for m in MANEUVERS)) for row in passed)
+    return TextTable(f"Ours: {condition}, passed / reached [%] ↑ (goals)", ("", *headings), cells)
 
 
-def _condition_tables(overall: Mapping[str, Mapping[str, Sequence[MeanInterval]]]) -> list[TextTable]:
-    """A table for each rate: rows by conditions."""
-    tables = []
-    for rate, heading in (RATES | ONCE).items():
-        cells = tuple((row, *map(cell, rates)) for row, rates in overall[rate].items())
-        count = max(one.count for one in next(iter(overall[rate].values())))
-        note = f"Ego of {count} held-out scenarios; mean ± standard error over scenarios."
-        tables.append(TextTable(f"Ours: {heading} ↑", ("", *CONDITIONS), cells, note))
-    return tables
+def _format_gain(attained: Attainment, row: str, rate: str) -> str:
+    """Verdict on a variant against the goal-free model, alternatives only."""
+    start_rates, rates = (_compute_rates(attained[name], rate, ALTERNATIVE) for name in (START, row))
+    start_mean, mean = (estimate_mean(values[i] for i in rates).mean for values in (start_rates, rates))
+    factor = f" ({mean / start_mean:.2f} times)" if start_mean > 0 else ""
+    verdict = controllability.format_verdict(start_rates, rates)
+    return f"{row} against {START}, {rate.replace('_', ' ')}, alternatives only{factor}: {verdict}"
 
 
-def _maneuver_tables(by_maneuver: ByManeuver, rows: Sequence[str]) -> list[TextTable]:
-    """A table for each condition: rows by maneuvers, with the number of goals of each."""
-    tables = []
-    for condition in CONTAINS:
-        counts = by_maneuver["passed", rows[0], condition]
-        headings = (f"{m.value.replace('_', ' ')} ({counts[m].count})" for m in BENCHMARK_MANEUVERS)
-        cells = []
-        for row in rows:
-            passed, reached = (by_maneuver[rate, row, condition] for rate in RATES)
-            both = {m: f"{cell(passed[m])} / {cell(reached[m])}" for m in BENCHMARK_MANEUVERS if passed[m].count}
-            cells.append((row, *(both.get(m, "–") for m in BENCHMARK_MANEUVERS)))
-        title = f"Ours: {condition}, passed / reached [%] ↑ (goals)"
-        tables.append(TextTable(title, ("", *headings), tuple(cells)))
-    return tables
-
-
-def _verdict(attained: Attainment, row: str, rate: str) -> str:
-    """A variant against the goal-free model, alternatives only."""
-    before, after = (_rates(attained, name, rate, ALTERNATIVE) for name in (START, row))
-    gain, mean = controllability.paired_gain(before, after), estimate(before.values()).mean
-    times = f" ({(mean + gain.mean) / mean:.2f} times)" if mean > 0 else ""
-    rate = rate.replace("_", " ")
-    return f"{row} against {START}, {rate}, alternatives only{times}: {controllability.gain_verdict(gain)}"
-
-
-def _plain(rate: MeanInterval) -> dict[str, object]:
-    names = ("mean", "standard_error", "interval", "count")
-    return {name: getattr(rate, name) for name in names}
+def _to_numbers(rates: Any) -> dict[str, Any]:
+    """Nested mapping of mean rates with plain numbers as leaves."""
+    if isinstance(rates, MeanInterval):
+        return {name: getattr(rates, name) for name in ("mean", "standard_error", "interval", "count")}
+    return {name: _to_numbers(branch) for name, branch in rates.items()}
 
 
 EXPERIMENT = Experiment(

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rlftsim.errors import DataError
-from rlftsim.experiments.goal_proposals import LOGGED, entry_of, propose, split_label
+from rlftsim.experiments.goal_proposals import LOGGED, propose, split_label, to_goal_entry
+from rlftsim.experiments.paper.controllability import open_held_out
 from rlftsim.experiments.suite import ExperimentSuite
-from rlftsim.experiments.suite_goals import held_out
 from rlftsim.goals.goals_file import GoalEntry, GoalsFile, read_goals, write_goals
 from rlftsim.goals.placement import find_track
 from rlftsim.scenario.dataset import ScenarioDataset
@@ -16,36 +16,35 @@ NAME = "maneuver-controllability"
 
 
 def goals_path(suite: ExperimentSuite) -> Path:
-    """The goals file of a suite, which may be edited by hand."""
+    """Path of a suite's goals file, which may be edited by hand."""
     return suite.out / f"{NAME}.goals.json"
 
 
 def propose_goals(dataset: ScenarioDataset, scenario_ids: Sequence[str]) -> GoalsFile:
-    """Logged and alternative maneuvers of every ego that has both. The logged ones are the file's goals.
+    """Logged and alternative maneuvers of every ego that has both. The logged maneuvers are the file's goals.
 
     Args:
-        dataset: scenarios with their futures.
-        scenario_ids: scenarios to propose goals for.
+        dataset: Scenarios with logged futures.
+        scenario_ids: Ids of the scenarios to propose goals for, in the order of the file.
     """
     logged, alternatives = [], []
     for scenario_id in scenario_ids:
         scenario = dataset.by_id(scenario_id)
         proposals = propose(scenario, scenario.ego_index)
-        kinds = {proposal.is_logged for proposal in proposals}
         # An ego without an alternative, or whose logged maneuver has no name, cannot be compared with itself.
-        if kinds == {True, False}:
+        if {proposal.is_logged for proposal in proposals} == {True, False}:
             for proposal in proposals:
-                (logged if proposal.is_logged else alternatives).append(entry_of(scenario, proposal))
+                (logged if proposal.is_logged else alternatives).append(to_goal_entry(scenario, proposal))
     return GoalsFile(tuple(logged), tuple(alternatives))
 
 
 def find_goals(suite: ExperimentSuite) -> list[GoalEntry]:
-    """Goals of the suite's held-out scenarios from its goals file, which is written first if there is none.
+    """Goals of the suite's held-out scenarios from the suite's goals file, which is written first if there is none.
 
     Raises:
-        DataError: there is no ego with two maneuvers, or the file was edited and makes no sense.
+        DataError: No ego has two maneuvers, or the file was edited and makes no sense.
     """
-    dataset, ids = held_out(suite)
+    dataset, ids = open_held_out(suite)
     path = goals_path(suite)
     # 1. Goals are proposed once: the file may have been edited since.
     if not path.exists():
@@ -54,7 +53,7 @@ def find_goals(suite: ExperimentSuite) -> list[GoalEntry]:
     goals = [goal for goal in (*file.goals, *file.alternatives) if goal.scenario_id in ids]
     # 2. All of them are checked, before anything is trained.
     for goal in goals:
-        maneuver_of(goal)
+        parse_maneuver(goal)
         scenario = dataset.by_id(goal.scenario_id)
         if find_track(goal, scenario) != scenario.ego_index:
             raise DataError(
@@ -70,21 +69,21 @@ def find_goals(suite: ExperimentSuite) -> list[GoalEntry]:
 
 
 def is_logged(goal: GoalEntry) -> bool:
-    """True if the goal's maneuver is the logged one."""
+    """True if the goal's maneuver is the logged maneuver."""
     return split_label(goal.label)[1]
 
 
-def maneuver_of(goal: GoalEntry) -> Maneuver:
-    """The maneuver that a goal's label names.
+def parse_maneuver(goal: GoalEntry) -> Maneuver:
+    """Maneuver that a goal's label names.
 
     Raises:
-        DataError: it names none.
+        DataError: The label names no maneuver.
     """
     try:
         return Maneuver(split_label(goal.label)[0])
     except ValueError:
-        known = ", ".join(m.value for m in BENCHMARK_MANEUVERS)
+        maneuvers = ", ".join(m.value for m in BENCHMARK_MANEUVERS)
         raise DataError(
-            f"{goal}: label {goal.label!r} names no maneuver: known are {known}, each with {LOGGED!r} if it is the "
+            f"{goal}: label {goal.label!r} names no maneuver: known are {maneuvers}, each with {LOGGED!r} if it is the "
             "logged one."
         ) from None

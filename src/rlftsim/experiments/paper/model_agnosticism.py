@@ -1,4 +1,4 @@
-"""Another architecture: base model and RLFTSim for SMART and for TrafficBots, in one table."""
+"""A second architecture: base model and RLFTSim for SMART and for TrafficBots, in a single table."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -15,93 +15,93 @@ from rlftsim.experiments.rows import Row
 from rlftsim.experiments.suite import ExperimentSuite
 from rlftsim.policies.registry import load_policy
 from rlftsim.recipes.registry import recipe_by_name
-from rlftsim.training.finetune_config import FinetuneConfig
 
 FLOOR = "constant velocity"
-BEFORE, AFTER, MEAN_ACTIONS = "base", "RLFTSim (MLOO)", ", mean actions"
+UNTUNED, TUNED, MEAN_ACTIONS = "base", "RLFTSim (MLOO)", ", mean actions"
 ALPHA = 1e-3
 """Level of the tests of a gain."""
 
 
 def run(suite: ExperimentSuite) -> dict[str, Row]:
-    """Rows of both architectures; twice for models without tokens: with their exploration noise, and without."""
-    both = suites(suite)  # first, which refuses models of the wrong kind
+    """Rows of both architectures; twice for models without tokens: with exploration noise, and without."""
+    pair = suites(suite)  # first, which refuses models of the wrong architecture
     rows = suite.evaluate({FLOOR: (CONSTANT_VELOCITY,)})
-    for one in both:
-        specs: dict[str, Sequence[ModelSpec]] = {
-            BEFORE: (BASE,),
-            AFTER: over_seeds(FineTuned("mloo", credit=one.recipe.finetune.credit), suite.num_seeds),
-        }
-        model = one.recipe.model_name
-        rows |= one.evaluate({f"{model}, {name}": row for name, row in specs.items()})
+    for architecture in pair:
+        recipe = architecture.recipe
+        tuned = over_seeds(FineTuned("mloo", credit=recipe.finetune.credit), suite.num_seeds)
+        specs = {f"{recipe.model_name}, {UNTUNED}": (BASE,), f"{recipe.model_name}, {TUNED}": tuned}
+        rows |= architecture.evaluate(specs)
         # A model of tokens at temperature 0 always drives the same, which no metric of distributions is made for.
-        if one.recipe.tokens is None:
-            rows |= {f"{model}, {name}{MEAN_ACTIONS}": _without_noise(one, name, row) for name, row in specs.items()}
+        if recipe.tokens is None:
+            rows |= {
+                f"{name}{MEAN_ACTIONS}": _evaluate_mean_actions(architecture, f"{name}{MEAN_ACTIONS}", row)
+                for name, row in specs.items()
+            }
     return rows
 
 
 def suites(suite: ExperimentSuite) -> tuple[ExperimentSuite, ExperimentSuite]:
-    """The suite, and one for its recipe's counterpart in a folder inside of it.
+    """The suite, and a suite for the recipe's counterpart in an inner folder.
 
     Raises:
-        ConfigError: the recipe names no counterpart, or a base model is not of its recipe's architecture.
+        ConfigError: The recipe names no counterpart, or a base model is not of the recipe's architecture.
     """
     name = suite.recipe.counterpart
     if name is None:
         raise ConfigError(f"{type(suite.recipe).__name__} names no recipe of another architecture to compare with.")
     out, base = Path(suite.out) / name, suite.counterpart_model
     recipe = recipe_by_name(name)
-    # Rows are named after recipes, so a model of the other kind would stand under a wrong name.
-    for own, model in ((suite.recipe, suite.base_model), (recipe, base)):
+    # Rows are named after recipes, so a model of the other architecture would stand under a wrong name.
+    for model_recipe, model in ((suite.recipe, suite.base_model), (recipe, base)):
         if model is not None:
-            own.like(load_policy(model))
+            model_recipe.like(load_policy(model))
     return suite, replace(suite, recipe=recipe, out=out, base_model=base, counterpart_model=None)
 
 
-def _without_noise(suite: ExperimentSuite, name: str, specs: Sequence[ModelSpec]) -> Row:
-    """The same models at temperature 0: rollouts differ by what is drawn once."""
+def _evaluate_mean_actions(suite: ExperimentSuite, name: str, specs: Sequence[ModelSpec]) -> Row:
+    """Row of the same models at temperature 0: rollouts differ by the draws at the start."""
     config, folder = replace(suite.evaluation, temperature=0.0), suite.out / "evaluations"
-    found = []
+    evaluations = []
     for spec, model in suite.models(specs).items():
         title = f"{suite.evaluation_name(spec)}-mean-actions"
-        found.append(evaluate(load_policy(model, suite.device), suite.data, folder, config, name=title))
-    return Row(f"{suite.recipe.model_name}, {name}{MEAN_ACTIONS}", tuple(found))
+        evaluations.append(evaluate(load_policy(model, suite.device), suite.data, folder, config, name=title))
+    return Row(name, tuple(evaluations))
 
 
 def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResult:
     """The table, and the gain of each model."""
-    pairs = [(rows[name.replace(AFTER, BEFORE)], row) for name, row in rows.items() if AFTER in name]
-    bases = [row for name, row in rows.items() if BEFORE in name]
+    pairs = [(rows[name.replace(TUNED, UNTUNED)], row) for name, row in rows.items() if TUNED in name]
+    bases = [row for name, row in rows.items() if UNTUNED in name]
     return ExperimentResult(
         title="Model agnosticism: RLFTSim on two architectures",
-        tables=(tables.of_rows("Ours", rows.values(), SCORES), published.AGNOSTICISM),
+        tables=(tables.build_table("Ours", rows.values(), SCORES), published.load_table("model-agnosticism")),
         verdicts=(
             *(base.against(rows[FLOOR]) for base in bases),
-            *(verdict for before, after in pairs for verdict in _gain(before, after)),
+            *(
+                verdict
+                for base, tuned in pairs
+                for verdict in (
+                    tuned.against(base, alpha=ALPHA),
+                    tuned.against(base, "kinematic", alpha=ALPHA),
+                    tuned.seeds_against(base),
+                )
+            ),
         ),
         notes=(
-            *(f"{one.recipe.model_name}: {one.budget}; {_objective(one.recipe.finetune)}." for one in suites(suite)),
+            # The settings that each recipe chooses for itself.
+            *(
+                f"{s.recipe.model_name}: {s.budget}; credit by {s.recipe.finetune.credit}, "
+                f"speed {'held' if s.recipe.finetune.hold_speed else 'not held'}."
+                for s in suites(suite)
+            ),
             f"Gains are tested at level {ALPHA:g}, scenarios paired.",
             "Mean actions: rollouts at temperature 0, without exploration noise.",
         ),
         numbers={
-            "rows": tables.numbers(rows.values(), SCORES),
-            "gain_by_seed": {after.name: after.gains_over(before).tolist() for before, after in pairs},
+            "rows": tables.to_numbers(rows.values(), SCORES),
+            "gain_by_seed": {tuned.name: tuned.gains_over(base).tolist() for base, tuned in pairs},
         },
         figure=tables.draw_gains(rows[FLOOR], [row for name, row in rows.items() if name != FLOOR]),
-    )
-
-
-def _objective(config: FinetuneConfig) -> str:
-    """The settings in words that each recipe chooses for itself."""
-    return f"credit by {config.credit}, speed {'held' if config.hold_speed else 'not held'}"
-
-
-def _gain(before: Row, after: Row) -> tuple[str, ...]:
-    return (
-        after.against(before, alpha=ALPHA),
-        after.against(before, "kinematic", alpha=ALPHA),
-        after.seeds_against(before),
     )
 
 

@@ -1,7 +1,7 @@
-"""The oracle: the log itself as rollouts, scored feature by feature. It is the ceiling of the metric.
+"""The oracle: the log as rollouts, scored feature by feature, the ceiling of the metric.
 
-It scores below 1, because the histogram of a single logged future, which is smoothed, never gives one bin all
-the probability.
+The oracle scores below 1, because the histogram of a single logged future, which is smoothed, never gives a single
+bin all the probability.
 """
 
 import math
@@ -26,16 +26,16 @@ def run(suite: ExperimentSuite) -> dict[str, Row]:
 
 
 def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResult:
-    """Likelihood of the log under its own histograms, and the features that keep it below 1."""
+    """Likelihood of the log under the log's own histograms, and the features that keep the score below 1."""
     row = rows["oracle"]
     weights: dict[str, float] = dict(zip(FEATURE_NAMES, metric_by_name(row.mean.config.metric).weights))
     features = {name: row.mean.mean_and_error(f"{name}_likelihood") for name in FEATURE_NAMES}
     return ExperimentResult(
         title="Oracle: the log against itself",
         tables=(
-            feature_table(features, weights, row.mean),
-            tables.of_rows("Ours, in all", [row], SCORES),
-            published.ORACLE,
+            build_feature_table(features, weights, row.mean),
+            tables.build_table("Ours, in all", [row], SCORES),
+            published.load_table("oracle"),
         ),
         verdicts=(
             f"The log itself scores {row.mean.mean_and_error(RMM).mean:.4f}: the most that a model can gain here is "
@@ -43,14 +43,14 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
         ),
         notes=("A likelihood is missing (–) where no scenario has a step at which the feature counts.",),
         numbers={
-            "rows": tables.numbers([row], SCORES),
+            "rows": tables.to_numbers([row], SCORES),
             "features": {
                 name: {"weight": weights[name], "likelihood": e.mean, "standard_error": e.standard_error}
                 for name, e in features.items()
             },
         },
         figure=draw_intervals(
-            [Interval(_words(name), e.mean, *e.interval) for name, e in features.items()],
+            [Interval(name.replace("_", " "), e.mean, *e.interval) for name, e in features.items()],
             title="Likelihood of the log under itself",
             x_label="mean over scenarios, 95 % interval",
             zero=False,
@@ -58,31 +58,28 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
     )
 
 
-def feature_table(
+def build_feature_table(
     features: Mapping[str, MeanInterval], weights: Mapping[str, float], evaluation: Evaluation
 ) -> tables.TextTable:
     """Table of the features' weights, likelihoods and costs.
 
     Args:
-        features: likelihoods by name of the feature.
-        weights: weights in the meta-metric. The cost of a feature is weight × (1 − likelihood).
-        evaluation: the oracle's.
+        features: Mean likelihood of each feature over scenarios, by the feature's name.
+        weights: Weights in the meta-metric by the same names. The cost of a feature is weight × (1 − likelihood).
+        evaluation: Evaluation of the oracle, for the facts of the note.
     """
     rows = []
     for name, estimate in features.items():
-        error = f" ± {estimate.standard_error:.4f}" if math.isfinite(estimate.standard_error) else ""
-        known = math.isfinite(estimate.mean)
-        likelihood = f"{format_number(estimate.mean, 4)}{error}" if known else "–"
-        # Weights add up to 1, so the costs add up to what the meta-metric lacks to 1, if no feature is missing.
-        cost = format_number(weights[name] * (1 - estimate.mean), 4) if known else "–"
-        rows.append((_words(name), f"{weights[name]:g}", likelihood, cost))
+        likelihood, cost = "–", "–"
+        if math.isfinite(estimate.mean):
+            error = f" ± {estimate.standard_error:.4f}" if math.isfinite(estimate.standard_error) else ""
+            likelihood = f"{format_number(estimate.mean, 4)}{error}"
+            # Weights add up to 1, so the costs add up to what the meta-metric lacks to 1, if no feature is missing.
+            cost = format_number(weights[name] * (1 - estimate.mean), 4)
+        rows.append((name.replace("_", " "), f"{weights[name]:g}", likelihood, cost))
     note = f"{len(evaluation)} scenarios, metric {evaluation.config.metric}; mean ± standard error."
     headings = ("feature", "weight", "likelihood ↑", "missing to 1, weighted ↓")
     return tables.TextTable("Ours, by feature", headings, tuple(rows), note)
-
-
-def _words(name: str) -> str:
-    return name.replace("_", " ")
 
 
 EXPERIMENT = Experiment(

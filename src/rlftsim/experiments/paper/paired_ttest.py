@@ -1,11 +1,11 @@
 """The appendix's paired t-test: every reward against every other, scenario by scenario."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from jaxtyping import Int
 
-from rlftsim.evaluation.compare import PairedDifference, compare
+from rlftsim.evaluation.compare import compare
 from rlftsim.experiments.paper import published, reward_ablation
 from rlftsim.experiments.results import Experiment, ExperimentResult
 from rlftsim.experiments.rows import RMM, Row
@@ -15,31 +15,28 @@ from rlftsim.viewer.figure import draw_verdicts
 
 ALPHA = 1e-3
 SIGNS = {1: "+", -1: "−", 0: "~"}
-
-
-def differences(rows: Sequence[Row]) -> list[list[PairedDifference]]:
-    """Row minus column of the per-scenario RMM; the diagonal compares a row with itself."""
-    return [[compare(column.mean, row.mean, alpha=ALPHA)[RMM] for column in rows] for row in rows]
-
-
-def verdict_of(difference: PairedDifference) -> int:
-    """1 = significantly better, -1 = worse, 0 = no difference."""
-    return int(np.sign(difference.difference)) if difference.is_difference else 0
+"""Signs of the row being significantly better than the column, worse, or not different."""
 
 
 def summarize(measured: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResult:
     """The matrix of verdicts, as a table and as a figure; the best reward first.
 
     Args:
-        measured: rows of the reward ablation, in any order.
-        suite: for the notes.
+        measured: Rows of the reward ablation by name, in any order.
+        suite: Suite with budget and seeds for the notes; no model is trained or evaluated here.
     """
-    rows = sorted(measured.values(), key=lambda row: -row.mean.mean_and_error(RMM).mean)
     # Best first, so that a perfect order has + above the diagonal and − below it.
-    names, compared, count = [row.name for row in rows], differences(rows), len(rows[0].mean)
-    verdicts: Int[np.ndarray, "n n"] = np.array([[verdict_of(d) for d in line] for line in compared])
-    signs = [["" if i == j else SIGNS[int(v)] for j, v in enumerate(line)] for i, line in enumerate(verdicts)]
-    cells = tuple((name, *line) for name, line in zip(names, signs))
+    rows = sorted(measured.values(), key=lambda row: -row.mean.mean_and_error(RMM).mean)
+    names, count = [row.name for row in rows], len(rows[0].mean)
+    # Row minus column; the diagonal compares a row with itself.
+    gains = [[compare(column.mean, row.mean, alpha=ALPHA)[RMM] for column in rows] for row in rows]
+    verdicts: Int[np.ndarray, "n n"] = np.array(
+        [[int(np.sign(gain.difference)) if gain.is_difference else 0 for gain in line] for line in gains]
+    )
+    cells = tuple(
+        (name, *("" if i == j else SIGNS[int(verdict)] for j, verdict in enumerate(verdicts[i])))
+        for i, name in enumerate(names)
+    )
     note = (
         f"Per-scenario RMM of {count} scenarios, two-sided paired t-test at {ALPHA:g}; + the row is better than the "
         "column, − worse, ~ no difference."
@@ -48,8 +45,8 @@ def summarize(measured: Mapping[str, Row], suite: ExperimentSuite) -> Experiment
     pairs = [(i, j) for i in range(len(names)) for j in range(i + 1, len(names))]
     return ExperimentResult(
         title="Paired t-test: every reward against every other",
-        tables=(TextTable("Ours", ("", *names), cells, note), published.T_TEST),
-        verdicts=tuple(f"{names[i]} against {names[j]}: {compared[i][j].verdict}" for i, j in pairs),
+        tables=(TextTable("Ours", ("", *names), cells, note), published.load_table("paired-ttest")),
+        verdicts=tuple(f"{names[i]} against {names[j]}: {gains[i][j].verdict}" for i, j in pairs),
         notes=(
             suite.budget.note,
             "The test takes the trained models as given: it says which is better on scenarios like these, not which "
@@ -60,8 +57,8 @@ def summarize(measured: Mapping[str, Row], suite: ExperimentSuite) -> Experiment
             "alpha": ALPHA,
             "names": names,
             "verdicts": verdicts.tolist(),
-            "p_values": [[d.p_value for d in line] for line in compared],
-            "differences": [[d.difference for d in line] for line in compared],
+            "p_values": [[gain.p_value for gain in line] for line in gains],
+            "differences": [[gain.difference for gain in line] for line in gains],
         },
         figure=draw_verdicts(
             names,

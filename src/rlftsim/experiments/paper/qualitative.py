@@ -1,8 +1,8 @@
 """The same scenario with the same noise before and after fine-tuning.
 
-Nothing is picked by eye. Scenarios are sorted by the decrease in the rate of evaluated agents that collide or
-leave the road. Shown are those of the largest decrease, the one in the middle, and the one of the largest
-increase; of each, the rollout with the largest change.
+No scenario is picked by eye. Scenarios are sorted by the decrease in the rate of evaluated agents that collide or
+leave the road. Shown are those of the largest decrease, the middle of the
+order, and the largest increase; of each, the rollout with the largest change.
 """
 
 from collections.abc import Mapping
@@ -21,18 +21,17 @@ from rlftsim.experiments.rows import RMM, Row
 from rlftsim.experiments.suite import ExperimentSuite
 from rlftsim.scenario.dataset import ScenarioDataset
 
-BEFORE, AFTER = "base", "RLFTSim (MLOO)"
-SPECS: dict[str, Base | FineTuned] = {BEFORE: BASE, AFTER: FineTuned("mloo")}
+SPECS: dict[str, Base | FineTuned] = {"base": BASE, "RLFTSim (MLOO)": FineTuned("mloo")}
 NUM_BEST = 3
 VERDICTS = {"Collisions": "collision_rate", "Off-road driving": "offroad_rate", "RMM": RMM}
 
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """Rows of both models, and the animations that are shown, by their place in the order of scenarios."""
+    """Rows of both models, and the animations by rank in the order of scenarios, in words."""
 
     rows: Mapping[str, Row]
-    shown: Mapping[str, PairedAnimation]
+    animations: Mapping[str, PairedAnimation]
 
 
 def run(suite: ExperimentSuite) -> Pairs:
@@ -40,48 +39,51 @@ def run(suite: ExperimentSuite) -> Pairs:
     rows = suite.evaluate({name: (spec,) for name, spec in SPECS.items()})
     policies = {name: suite.policy(spec) for name, spec in SPECS.items()}
     # Rate of events of a scenario: collision rate plus off-road rate.
-    before, after = (rows[name].mean for name in SPECS)
+    base, tuned = (rows[name].mean for name in SPECS)
     # A rate may be missing, such as off-road driving on a map without road edges: it counts as 0.
-    ids, *collisions = paired_values(before, after, "collision_rate")
-    _, *offroad = paired_values(before, after, "offroad_rate")
-    rates = [np.nan_to_num(a) + np.nan_to_num(b) for a, b in zip(collisions, offroad)]  # [scenarios], before and after
-    scenarios, shown = ScenarioDataset(suite.data, suite.evaluation.split), {}
-    for place, scenario_id in choose_scenarios(list(ids), rates[0], rates[1]).items():
-        scenario, is_worst = scenarios.by_id(scenario_id), place.startswith("last")
-        shown[place] = animate_pair(place, scenario, policies, suite, prefers_increase=is_worst)
-    return Pairs(rows, shown)
+    ids, *collisions = paired_values(base, tuned, "collision_rate")
+    _, *offroad = paired_values(base, tuned, "offroad_rate")
+    rates = [np.nan_to_num(a) + np.nan_to_num(b) for a, b in zip(collisions, offroad)]  # [scenarios], base and tuned
+    scenarios = ScenarioDataset(suite.data, suite.evaluation.split)
+    animations = {
+        rank: animate_pair(
+            rank, scenarios.by_id(scenario_id), policies, suite, prefers_increase=rank.startswith("last")
+        )
+        for rank, scenario_id in choose_scenarios(list(ids), rates[0], rates[1]).items()
+    }
+    return Pairs(rows, animations)
 
 
 def choose_scenarios(
-    ids: list[str], before: Float[np.ndarray, "n"], after: Float[np.ndarray, "n"], num_best: int = NUM_BEST
+    ids: list[str], base_rate: Float[np.ndarray, "n"], tuned_rate: Float[np.ndarray, "n"], num_best: int = NUM_BEST
 ) -> dict[str, str]:
-    """Ids of the scenarios to show by their place in the order, in words; each at most once, the best first.
+    """Ids of the scenarios to show by rank in the order, in words; each at most once, the best first.
 
     Args:
-        ids: of the scenarios.
-        before: rate of events of each scenario before fine-tuning.
-        after: and after it.
-        num_best: of those with the largest decrease.
+        ids: Ids of all n scenarios.
+        base_rate: Rate of events [n] in each scenario before fine-tuning.
+        tuned_rate: Rate of events [n] after fine-tuning.
+        num_best: Number of scenarios with the largest decrease to show.
     """
-    order = [ids[i] for i in np.argsort(after - before, kind="stable")]
-    places = {f"{n + 1}. of {len(ids)}": order[n] for n in range(min(num_best, len(order)))}
-    places |= {"in the middle": order[len(order) // 2], f"last of {len(ids)}": order[-1]}
-    # With few scenarios one may have several places: it keeps the first.
-    first_place = {scenario_id: place for place, scenario_id in reversed(places.items())}
-    return {place: i for place, i in places.items() if first_place[i] == place}
+    order = [ids[i] for i in np.argsort(tuned_rate - base_rate, kind="stable")]
+    by_rank = {f"{n + 1}. of {len(ids)}": scenario_id for n, scenario_id in enumerate(order[:num_best])}
+    by_rank |= {"in the middle": order[len(order) // 2], f"last of {len(ids)}": order[-1]}
+    # With few scenarios one may have several ranks: it keeps the first.
+    first_rank = {scenario_id: rank for rank, scenario_id in reversed(by_rank.items())}
+    return {rank: scenario_id for rank, scenario_id in by_rank.items() if first_rank[scenario_id] == rank}
 
 
 def summarize(pairs: Pairs, suite: ExperimentSuite) -> ExperimentResult:
-    """The table, the animations, and the rule by which they were chosen.
+    """The table, the animations, and the rule that chose the scenarios.
 
     Args:
-        pairs: of `run`; the animations are made already, nothing is simulated here.
-        suite: for the notes.
+        pairs: Rows and animations that `run` made; no rollout is simulated here.
+        suite: Suite with the budget for the notes.
     """
-    before, after = (pairs.rows[name] for name in SPECS)
+    base, tuned = (pairs.rows[name] for name in SPECS)
     cells = tuple(
-        (place, one.scenario_id, str(one.rollout), *(f"{r:.2f}" for r in one.rates), *map(str, one.events))
-        for place, one in pairs.shown.items()
+        (rank, pair.scenario_id, str(pair.rollout), *(f"{r:.2f}" for r in pair.rates), *map(str, pair.events))
+        for rank, pair in pairs.animations.items()
     )
     headings = ("place", "scenario", "rollout", "rate before", "rate after", "events before", "events after")
     note = (
@@ -91,10 +93,10 @@ def summarize(pairs: Pairs, suite: ExperimentSuite) -> ExperimentResult:
     return ExperimentResult(
         title="The same scenario with the same noise, before and after fine-tuning",
         tables=(
-            tables.of_rows("All held-out scenarios", [before, after], SCORES),
+            tables.build_table("All held-out scenarios", [base, tuned], SCORES),
             tables.TextTable("Shown", headings, cells, note),
         ),
-        verdicts=tuple(f"{heading}, {after.against(before, column)}" for heading, column in VERDICTS.items()),
+        verdicts=tuple(f"{heading}, {tuned.against(base, column)}" for heading, column in VERDICTS.items()),
         notes=(
             f"Scenarios are sorted by the decrease in the rate. Shown are the {NUM_BEST} of the largest decrease, "
             "the one in the middle, and the one of the largest increase or smallest decrease; of each, the first "
@@ -103,13 +105,13 @@ def summarize(pairs: Pairs, suite: ExperimentSuite) -> ExperimentResult:
             suite.budget.note,
         ),
         numbers={
-            "rows": tables.numbers([before, after], SCORES),
+            "rows": tables.to_numbers([base, tuned], SCORES),
             "pairs": [
-                {"scenario_id": p.scenario_id, "rollout": p.rollout, "rates": p.rates, "events": p.events}
-                for p in pairs.shown.values()
+                {name: getattr(pair, name) for name in ("scenario_id", "rollout", "rates", "events")}
+                for pair in pairs.animations.values()
             ],
         },
-        animations=tuple(one.animation for one in pairs.shown.values()),
+        animations=tuple(pair.animation for pair in pairs.animations.values()),
     )
 
 

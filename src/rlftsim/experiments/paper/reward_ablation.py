@@ -31,33 +31,41 @@ DISTANCES = {
     "reward_std": "std of the reward",
 }
 """Headings, by metric of a run."""
-LAST_PART = 5
-"""Metrics are averaged over the last 1 / 5 of a run."""
+FINAL_PERCENT = 20
+"""Percentage of a run's updates, the last ones, that metrics are averaged over."""
 
 
 def run(suite: ExperimentSuite) -> dict[str, Row]:
     """Rows of the base model and of a fine-tuning with each reward."""
-    tuned = {name: over_seeds(spec, suite.num_seeds) for name, spec in REWARDS.items()}
-    return suite.evaluate({REFERENCE: (BASE,), **tuned})
+    return evaluate_rewards(suite, tuple(REWARDS))
+
+
+def evaluate_rewards(suite: ExperimentSuite, names: Sequence[str]) -> dict[str, Row]:
+    """Rows of the base model and of fine-tunings with some of `REWARDS`, in this order.
+
+    Args:
+        suite: Suite that trains and evaluates what is missing, with as many seeds as the suite has.
+        names: Names of the rewards, keys of `REWARDS`.
+    """
+    return suite.evaluate({REFERENCE: (BASE,), **{name: over_seeds(REWARDS[name], suite.num_seeds) for name in names}})
 
 
 def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResult:
     """The table, every reward against the base model, and MLOO against every other."""
-    # In the order of `run`.
-    base, mloo, *others = rows.values()
-    tuned = [mloo, *others]
-    distances = _distances(suite)
+    base, *tuned = rows.values()  # in the order of `run`
+    mloo, *alternatives = tuned
+    distances = _tabulate_distances(suite)
     return ExperimentResult(
         title="Rewards: the same budget of fine-tuning with each of them",
         tables=(
-            tables.of_rows("Ours", rows.values(), COLUMNS),
+            tables.build_table("Ours", rows.values(), COLUMNS),
             *((distances,) if distances.rows else ()),
-            published.REWARDS,
-            published.HEURISTICS,
+            published.load_table("rewards"),
+            published.load_table("heuristics"),
         ),
         verdicts=(
             *(row.against(base) for row in tuned),
-            *(mloo.against(row) for row in others),
+            *(mloo.against(row) for row in alternatives),
             *(row.seeds_against(base) for row in tuned if len(row.by_seed) > 1),
         ),
         notes=(
@@ -66,31 +74,31 @@ def summarize(rows: Mapping[str, Row], suite: ExperimentSuite) -> ExperimentResu
             "Equal budgets are not equal distances: rewards differ in size, so they pull with different force "
             "against the same KL penalty, and in a short run its controller does not catch up.",
         ),
-        numbers={"rows": tables.numbers(rows.values(), COLUMNS)},
+        numbers={"rows": tables.to_numbers(rows.values(), COLUMNS)},
         figure=tables.draw_gains(base, tuned),
     )
 
 
-def _distances(suite: ExperimentSuite) -> tables.TextTable:
+def _tabulate_distances(suite: ExperimentSuite) -> tables.TextTable:
     """Distance of each fine-tuned model from the base model at the end of its runs; no rows where there are no runs."""
-    ends = {name: mean_at_end(suite, over_seeds(spec, suite.num_seeds)) for name, spec in REWARDS.items()}
-    rows = [(name, *(f"{end[metric]:.3g}" for metric in DISTANCES)) for name, end in ends.items() if end]
-    note = f"Means over the last {100 // LAST_PART} % of the updates; training rollouts."
+    means = {name: mean_at_end(suite, over_seeds(spec, suite.num_seeds)) for name, spec in REWARDS.items()}
+    rows = [(name, *(f"{mean[metric]:.3g}" for metric in DISTANCES)) for name, mean in means.items() if mean]
+    note = f"Means over the last {FINAL_PERCENT} % of the updates; training rollouts."
     return tables.TextTable("Distance from the base model", ("", *DISTANCES.values()), tuple(rows), note)
 
 
 def mean_at_end(suite: ExperimentSuite, specs: Sequence[FineTuned]) -> dict[str, float]:
-    """Mean of each of `DISTANCES` over the last part of runs; empty where there are no runs.
+    """Mean of each of `DISTANCES` over the last updates of runs; empty where there are no runs.
 
     Args:
-        suite: where the runs are.
-        specs: one for each seed.
+        suite: Suite with the folder of the runs; no model is trained here.
+        specs: Specifications of a fine-tuning, a seed each; runs without metrics are left out.
     """
     runs = [suite.model_folder(spec) for spec in specs]
     metrics = [read_metrics(run) for run in runs if (run / "metrics.jsonl").exists()]
-    # The last part of every run, at least its last update.
-    ends = [line for lines in metrics for line in lines[-max(len(lines) // LAST_PART, 1) :]]
-    return {metric: float(np.mean([line[metric] for line in ends])) for metric in DISTANCES} if ends else {}
+    # At least the last update of every run.
+    updates = [line for lines in metrics for line in lines[-max(len(lines) * FINAL_PERCENT // 100, 1) :]]
+    return {metric: float(np.mean([line[metric] for line in updates])) for metric in DISTANCES} if updates else {}
 
 
 EXPERIMENT = Experiment(

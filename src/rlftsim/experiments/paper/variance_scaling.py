@@ -1,6 +1,6 @@
-"""Figure 3: variance of a rollout's reward against the number N of rollouts it is computed from, and fits to it."""
+"""Figure 3: variance of a rollout's reward against the number N of rollouts behind the reward, with fits."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,19 +26,19 @@ def run(suite: ExperimentSuite) -> Variances:
     return measure_variances(policy, suite.data, suite.out / "variances", suite.evaluation)
 
 
-def slope_of(variance: Float[np.ndarray, "sizes"], sizes: Sequence[int], first: int = 0) -> float:
+def fit_slope(variance: Float[np.ndarray, "sizes"], sizes: Sequence[int], first: int = 0) -> float:
     """Slope of the straight line fitted to logarithms; NaN where a variance is zero.
 
     Args:
-        variance: by number of rollouts.
-        sizes: numbers of rollouts.
-        first: smallest number that the line is fitted to.
+        variance: Variance [sizes] of the reward at each number of rollouts.
+        sizes: Numbers of rollouts N, as many as there are variances.
+        first: Smallest N that the line is fitted to.
     """
-    used = np.array(sizes) >= first
     # a reward that never varies at some N has no logarithm there
     if not (variance > 0).all():
         return float("nan")
-    return float(np.polyfit(np.log(np.array(sizes)[used]), np.log(variance[used]), 1)[0])
+    is_fitted = np.array(sizes) >= first
+    return float(np.polyfit(np.log(np.array(sizes)[is_fitted]), np.log(variance[is_fitted]), 1)[0])
 
 
 def law(sizes: Sequence[int]) -> dict[str, Float[np.ndarray, "sizes"]]:
@@ -52,7 +52,7 @@ def law(sizes: Sequence[int]) -> dict[str, Float[np.ndarray, "sizes"]]:
 
 @dataclass(frozen=True)
 class Scaling:
-    """Fit to the variances of one reward."""
+    """Fit to the variances of a reward."""
 
     middle: Float[np.ndarray, "sizes"]
     """Geometric mean over scenarios."""
@@ -65,17 +65,17 @@ class Scaling:
     """Over the scenarios' own slopes, by the smallest size they are fitted to."""
 
 
-def scaling_of(variance: Float[np.ndarray, "scenarios sizes"], sizes: Sequence[int]) -> Scaling:
-    """Fit of one reward; scenarios in which a reward never varies are left out.
+def fit_scaling(variance: Float[np.ndarray, "scenarios sizes"], sizes: Sequence[int]) -> Scaling:
+    """Fit of a reward; scenarios in which a reward never varies are left out.
 
     Args:
-        variance: of the reward.
-        sizes: numbers of rollouts.
+        variance: Variance [scenarios, sizes] of the reward at each number of rollouts.
+        sizes: Numbers of rollouts N, as many as there are columns.
     """
     varied = np.log(variance[(variance > 0).all(1)])  # [varied scenarios, sizes]
     middle, spread = varied.mean(0), varied.std(0)
     slopes = {
-        first: mean_interval(np.array([slope_of(line, sizes, first) for line in np.exp(varied)]))
+        first: mean_interval(np.array([fit_slope(line, sizes, first) for line in np.exp(varied)]))
         for first in FROM_SIZES
         if sum(size >= first for size in sizes) >= MIN_SIZES_FOR_A_SLOPE
     }
@@ -85,28 +85,38 @@ def scaling_of(variance: Float[np.ndarray, "scenarios sizes"], sizes: Sequence[i
 
 
 def summarize(measured: Variances, suite: ExperimentSuite) -> ExperimentResult:
-    """Slopes with their intervals, beside the paper's claim and the slopes of independent rollouts.
+    """Slopes with intervals, beside the paper's claim and the slopes of independent rollouts.
 
     Args:
-        measured: variances.
-        suite: for the notes.
+        measured: Variances of both rewards by scenario and number of rollouts.
+        suite: Suite with the metric for the notes; no rollout is simulated here.
     """
     sizes = measured.sizes
-    scalings = {name: scaling_of(values, sizes) for name, values in measured.by_reward.items()}
-    # slopes of the laws over the same N, so that both have the same curvature at small N
-    expected = {
-        (name, first): slope_of(curve, sizes, first)
-        for name, curve in law(sizes).items()
-        for first in scalings[name].slopes
-    }
+    scalings = {name: fit_scaling(values, sizes) for name, values in measured.by_reward.items()}
     rows = tuple((str(size), *(f"{scalings[name].middle[k]:.3g}" for name in REWARDS)) for k, size in enumerate(sizes))
     note = f"Geometric mean over the scenarios; base model, metric {suite.evaluation.metric}."
-    slopes = []
-    for (name, first), law_slope in expected.items():
-        slope = scalings[name].slopes[first]
-        low, high = slope.interval
-        numbers = (f"{slope.mean:.3f}", f"[{low:.3f}, {high:.3f}]", f"{law_slope:.3f}", f"{CLAIMED_SLOPE[name]:g}")
-        slopes.append((f"{name.upper()}, N ≥ {first}", *numbers))
+    slopes, verdicts, plain_slopes = [], [], {}
+    for name, curve in law(sizes).items():
+        plain_slopes[name] = []
+        for first, slope in scalings[name].slopes.items():
+            # slope of the law over the same N, so that both have the same curvature at small N
+            law_slope, (low, high) = fit_slope(curve, sizes, first), slope.interval
+            title, interval = f"{name.upper()}, N ≥ {first}", f"[{low:.3f}, {high:.3f}]"
+            slopes.append((title, f"{slope.mean:.3f}", interval, f"{law_slope:.3f}", f"{CLAIMED_SLOPE[name]:g}"))
+            plain_slopes[name].append(
+                {
+                    "from_size": first, "slope": slope.mean, "interval": slope.interval, "of_law": law_slope,
+                    "scenarios": slope.count,
+                }
+            )  # fmt: skip
+            if slope.count < 2:
+                verdicts.append(f"{title}: no verdict: fewer than two scenarios in which the reward varies.")
+                continue
+            verdict = "no difference from" if low <= law_slope <= high else "difference from"
+            verdicts.append(
+                f"{title}: {verdict} the slope {law_slope:.3f} of independent rollouts: slope {slope.mean:.3f}, 95% "
+                f"interval over {slope.count} scenarios {interval}."
+            )
     headings = ("", "slope", "95 % interval", "of independent rollouts", "the paper, large N")
     slope_note = "Mean and interval over the scenarios' own slopes (Student's t)."
     return ExperimentResult(
@@ -115,7 +125,7 @@ def summarize(measured: Variances, suite: ExperimentSuite) -> ExperimentResult:
             TextTable("Variance of a rollout's reward", ("N", "MLOO", "RLOO"), rows, note),
             TextTable("Slope in logarithms", headings, tuple(slopes), slope_note),
         ),
-        verdicts=tuple(_verdict(name, first, scalings[name], expected[name, first]) for name, first in expected),
+        verdicts=tuple(verdicts),
         notes=(
             "The paper fits alpha / N² to its MLOO curve (Fig. 3) and gives no slope; it finds RLOO to flatten out.",
             "Its proof has 1 / (N (N − 1)) for MLOO, which is steeper than 1 / N² at small N, and N / (N − 1) for "
@@ -127,54 +137,31 @@ def summarize(measured: Variances, suite: ExperimentSuite) -> ExperimentResult:
         ),
         numbers={
             "sizes": sizes,
-            "rewards": {name: _plain(name, scaling, expected) for name, scaling in scalings.items()},
+            "rewards": {
+                name: {"variance": scaling.middle.tolist(), "alpha": scaling.alpha, "slopes": plain_slopes[name]}
+                for name, scaling in scalings.items()
+            },
             "scenario_ids": measured.scenario_ids,
             "by_scenario": {name: values.tolist() for name, values in measured.by_reward.items()},
         },
-        figure=_figure(scalings, sizes),
+        figure=_draw_figure(scalings["mloo"], scalings["rloo"], np.array(sizes, float)),
     )
 
 
-def _plain(name: str, scaling: Scaling, expected: Mapping[tuple[str, int], float]) -> dict[str, object]:
-    """Numbers of one reward for machines."""
-    slopes = [
-        {
-            "from_size": first, "slope": slope.mean, "interval": slope.interval, "of_law": expected[name, first],
-            "scenarios": slope.count,
-        }
-        for first, slope in scaling.slopes.items()
-    ]  # fmt: skip
-    return {"variance": scaling.middle.tolist(), "alpha": scaling.alpha, "slopes": slopes}
-
-
-def _verdict(name: str, first: int, scaling: Scaling, expected: float) -> str:
-    slope = scaling.slopes[first]
-    low, high = slope.interval
-    if slope.count < 2:
-        return f"{name.upper()}, N ≥ {first}: no verdict: fewer than two scenarios in which the reward varies."
-    verdict = "no difference from" if low <= expected <= high else "difference from"
-    return (
-        f"{name.upper()}, N ≥ {first}: {verdict} the slope {expected:.3f} of independent rollouts: slope "
-        f"{slope.mean:.3f}, 95% interval over {slope.count} scenarios [{low:.3f}, {high:.3f}]."
-    )
-
-
-def _figure(scalings: dict[str, Scaling], sizes: Sequence[int]) -> Figure:
-    across = np.array(sizes, float)
-    mloo, rloo = scalings["mloo"], scalings["rloo"]
+def _draw_figure(mloo: Scaling, rloo: Scaling, sizes: Float[np.ndarray, "sizes"]) -> Figure:
     bands = [
-        Band("MLOO", across, mloo.middle, mloo.low, mloo.high),
-        Band(f"{mloo.alpha:.2g} / N²", across, mloo.alpha / across**2, style="theory"),
-        Band("RLOO", across, rloo.middle, rloo.low, rloo.high, color=1),
+        Band("MLOO", sizes, mloo.middle, mloo.low, mloo.high),
+        Band(f"{mloo.alpha:.2g} / N²", sizes, mloo.alpha / sizes**2, style="theory"),
+        Band("RLOO", sizes, rloo.middle, rloo.low, rloo.high, color=1),
     ]
     return draw_bands(
-        bands, title="Variance of a rollout's reward", x_label="rollouts N", log=True, ticks=sizes,
+        bands, title="Variance of a rollout's reward", x_label="rollouts N", log=True, ticks=sizes.astype(int).tolist(),
         y_label="variance, geometric mean ± 1 std",
     )  # fmt: skip
 
 
 EXPERIMENT = Experiment(
-    question="Does the variance of the leave-one-out reward fall with the square of the number of rollouts?",
-    run=run,
-    summarize=summarize,
+    "Does the variance of the leave-one-out reward fall with the square of the number of rollouts?",
+    run,
+    summarize,
 )

@@ -15,7 +15,7 @@ from rlftsim.policies.calibrated.candidates import SUPPORT_NATS, Candidates
 from rlftsim.policies.calibrated.features import Feature
 from rlftsim.policies.calibrated.traffic import Scene, Traffic
 from rlftsim.policies.distributions import CategoricalDistribution
-from rlftsim.rollout.rows import row_places
+from rlftsim.rollout.rows import find_rows
 from rlftsim.tokens.vocabulary import Vocabulary
 
 
@@ -88,7 +88,7 @@ class TiltedDistribution(CategoricalDistribution):
     def _candidates(self) -> Candidates:
         row, token, place = self._pairs
         has_choice, index = row.unique_consecutive(return_inverse=True)
-        agent = tuple(axis[has_choice] for axis in row_places(self.mask, has_all=self._num_rows == self.mask.numel()))
+        agent = tuple(axis[has_choice] for axis in find_rows(self.mask, is_dense=self._num_rows == self.mask.numel()))
         agent = (*agent, torch.zeros_like(has_choice))[:4]  # while simulating there is a single moment
         class_id = self.scene.class_id[agent[0], agent[2]].index_select(0, index)
         ends = self.vocabulary.poses[:, :, -1]  # [C, V, 3]

@@ -1,7 +1,7 @@
 """Models that ship with the package, CC0, loaded by name: `load_policy("demo-base")`.
 
-Their weights are stored in float16 and computed with in float32. A README in each folder says what a model was trained
-on and how it scores.
+The weights are stored in float16 and computed with in float32. A README in each folder has the training data and the
+scores of a model.
 """
 
 from rlftsim.jobs.arrays import read_tensors
@@ -11,7 +11,7 @@ from rlftsim.policies.trafficbots.policy import TrafficBotsPolicy
 
 
 def demo_base() -> SmartPolicy:
-    """SMART of the demo's size, pre-trained on synthetic scenarios: it reads the map, and is not fine-tuned."""
+    """SMART of the demo's size, pre-trained on synthetic scenarios and not fine-tuned."""
     return SmartPolicy.from_pretrained(SHIPPED_MODELS / "demo-base")
 
 
@@ -22,8 +22,7 @@ def demo_tuned() -> SmartPolicy:
 
 def demo_goals() -> SmartPolicy:
     """`demo_base` with a trained goal encoder: 192 weights more, and without goals the same to the last bit."""
-    policy = demo_base().with_goal_conditioning("indication", logit_bias=True)
-    return _with_changes(policy, "demo-goals")
+    return _with_changes(demo_base().with_goal_conditioning("indication", logit_bias=True), "demo-goals")
 
 
 def trafficbots_base() -> TrafficBotsPolicy:

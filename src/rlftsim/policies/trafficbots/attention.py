@@ -24,14 +24,14 @@ from rlftsim.policies.trafficbots.poses import Neighbors
 
 @dataclass(frozen=True, eq=False)
 class KeyValues:
-    """Projected targets, computed once for all queries that look at them."""
+    """Projected targets, computed once for all queries."""
 
     keys: Float[Tensor, "*h H M d"]
     values: Float[Tensor, "*h H M d"]
 
-    def steps(self, start: int, stop: int) -> "KeyValues":
-        """Those of some steps, where the second axis is time."""
-        return KeyValues(self.keys[:, start:stop], self.values[:, start:stop])
+    def select_steps(self, steps: slice) -> "KeyValues":
+        """Keys and values of a range of steps, where the second axis is time."""
+        return KeyValues(self.keys[:, steps], self.values[:, steps])
 
 
 class PoseAttention(nn.Module):
@@ -45,13 +45,13 @@ class PoseAttention(nn.Module):
         self.relation = nn.Linear(dim, 2 * dim)
         self.out = nn.Linear(dim, dim)
         self.dropout = nn.Dropout(dropout)
-        # One matrix of 3 D rows would be drawn from a narrower range than its parts.
+        # A single matrix of 3 D rows would be drawn from a narrower range.
         bound = math.sqrt(6 / (4 * dim))
-        for part in (self.query, self.key_value):
-            nn.init.uniform_(part.weight, -bound, bound)
+        for layer in (self.query, self.key_value):
+            nn.init.uniform_(layer.weight, -bound, bound)
         nn.init.xavier_uniform_(self.out.weight)
-        for part in (self.query, self.key_value, self.out):
-            nn.init.zeros_(part.bias)
+        for layer in (self.query, self.key_value, self.out):
+            nn.init.zeros_(layer.bias)
 
     def project(self, targets: Float[Tensor, "*h M D"]) -> KeyValues:
         """Keys and values of targets."""
@@ -60,13 +60,13 @@ class PoseAttention(nn.Module):
         return KeyValues(keys.transpose(-2, -3), values.transpose(-2, -3))
 
     def forward(
-        self, queries: Float[Tensor, "*g S D"], kinds: Sequence[tuple[KeyValues, Neighbors]]
+        self, queries: Float[Tensor, "*g S D"], sources: Sequence[tuple[KeyValues, Neighbors]]
     ) -> Float[Tensor, "*g S D"]:
-        """Attention to neighbors of one or several kinds, in one softmax; 0 for a query without neighbors.
+        """Attention to neighbors from one or several sources, in a single softmax; 0 for a query without neighbors.
 
         Args:
-            queries: normalized features.
-            kinds: targets of each kind, and the queries' neighbors among them.
+            queries: Normalized features of the tokens that attend.
+            sources: Targets of each source, and the queries' neighbors among these targets.
         """
         heads, rows = self.num_heads, queries.shape[:-1]  # rows = [*g, S]
         query = self.query(queries).unflatten(-1, (heads, -1)) / math.sqrt(queries.shape[-1] // heads)
@@ -74,24 +74,24 @@ class PoseAttention(nn.Module):
         # Embeddings are never projected: q (W e) = (W^T q) e. The bias of W_k drops out of the softmax.
         pose_query = torch.einsum("...hd,hde->...he", query, key_relation)  # [*g, S, H, E]
         logits = []
-        for targets, neighbors in kinds:
+        for targets, neighbors in sources:
             # All pairs by one matrix product are cheaper than copies of each neighbor's key.
             dense = _merge_rows(query, targets.keys) @ targets.keys.transpose(-1, -2)  # [*h, H, R, M]
-            chosen = dense.gather(-1, _merged_index(neighbors.index, dense))  # [*h, H, R, K]
-            content = chosen.transpose(-2, -3).reshape(*rows, heads, chosen.shape[-1])  # [*g, S, H, K]
+            picked = dense.gather(-1, _merge_index(neighbors.index, dense))  # [*h, H, R, K]
+            content = picked.transpose(-2, -3).reshape(*rows, heads, picked.shape[-1])  # [*g, S, H, K]
             pose = pose_query @ neighbors.embedding.transpose(-1, -2)
             logits.append((content + pose).masked_fill(~neighbors.valid[..., None, :], -torch.inf))
         joined = torch.cat(logits, -1)  # [*g, S, H, all K]
         is_alone = joined.isneginf().all(-1, keepdim=True)
         weights = self.dropout(torch.softmax(joined.masked_fill(is_alone, 0.0), -1))
-        parts = weights.split([part.shape[-1] for part in logits], -1)
+        weights_by_source = weights.split([block.shape[-1] for block in logits], -1)
         out = weights.sum(-1, keepdim=True) * self.relation.bias.unflatten(0, (2, heads, -1))[1]  # [*g, S, H, d]
-        for part, (targets, neighbors) in zip(parts, kinds):
-            pose_value = part @ neighbors.embedding.to(part.dtype)  # [*g, S, H, E]
+        for weight, (targets, neighbors) in zip(weights_by_source, sources):
+            pose_value = weight @ neighbors.embedding.to(weight.dtype)  # [*g, S, H, E]
             out = out + torch.einsum("...he,hde->...hd", pose_value, value_relation)
-            merged = part.flatten(targets.keys.dim() - 3, -3).transpose(-2, -3)  # [*h, H, R, K]
+            merged = weight.flatten(targets.keys.dim() - 3, -3).transpose(-2, -3)  # [*h, H, R, K]
             dense = merged.new_zeros(*merged.shape[:-1], targets.keys.shape[-2])
-            dense = dense.scatter(-1, _merged_index(neighbors.index, dense), merged)  # [*h, H, R, M]
+            dense = dense.scatter(-1, _merge_index(neighbors.index, dense), merged)  # [*h, H, R, M]
             out = out + (dense @ targets.values.to(dense.dtype)).transpose(-2, -3).reshape(out.shape)
         out = self.out(out.masked_fill(is_alone, 0.0).flatten(-2))
         return out.masked_fill(is_alone[..., 0, :], 0.0)
@@ -102,7 +102,7 @@ def _merge_rows(query: Float[Tensor, "*g S H d"], keys: Float[Tensor, "*h H M d"
     return query.reshape(*keys.shape[:-3], -1, *query.shape[-2:]).transpose(-2, -3)
 
 
-def _merged_index(index: Int64[Tensor, "*g S K"], dense: Float[Tensor, "*h H R M"]) -> Int64[Tensor, "*h H R K"]:
+def _merge_index(index: Int64[Tensor, "*g S K"], dense: Float[Tensor, "*h H R M"]) -> Int64[Tensor, "*h H R K"]:
     """Neighbors of merged rows, without copies for the heads."""
     *lead, heads, rows, _ = dense.shape
     return index.reshape(*lead, 1, rows, index.shape[-1]).expand(*lead, heads, rows, index.shape[-1])
@@ -125,7 +125,7 @@ class FeedForward(nn.Module):
 
 
 class SelfLayer(nn.Module):
-    """Tokens attend to neighbors of their own kind."""
+    """Layer in which tokens attend to neighbors of the same type."""
 
     def __init__(self, dim: int, num_heads: int, dropout: float):
         super().__init__()
@@ -140,9 +140,9 @@ class SelfLayer(nn.Module):
         """Features after the layer, 0 for tokens that do not exist.
 
         Args:
-            x: features.
+            x: Features of the tokens.
             mask: True = the token exists.
-            neighbors: of each token.
+            neighbors: Neighbors of each token among the tokens.
         """
         normal = self.norm(x)
         x = x + self.dropout(self.attention(normal, [(self.attention.project(normal), neighbors)]))
@@ -150,7 +150,7 @@ class SelfLayer(nn.Module):
 
 
 class DecoderLayer(nn.Module):
-    """Tokens attend to neighbors of their own kind, then to neighbors of other kinds."""
+    """Layer in which tokens attend to neighbors of the same type, then to neighbors from other sources."""
 
     def __init__(self, dim: int, num_heads: int, dropout: float):
         super().__init__()
@@ -163,32 +163,32 @@ class DecoderLayer(nn.Module):
         self.feed_forward = FeedForward(dim, dropout)
 
     def project(self, targets: Float[Tensor, "*h M D"]) -> KeyValues:
-        """Keys and values of tokens of another kind."""
+        """Keys and values of tokens from another source."""
         return self.attention.project(self.target_norm(targets))
 
     def forward(
         self,
         x: Float[Tensor, "*g S D"],
         mask: Bool[Tensor, "*g S"],
-        own: Neighbors,
-        others: Sequence[tuple[KeyValues, Neighbors]],
+        neighbors: Neighbors,
+        sources: Sequence[tuple[KeyValues, Neighbors]],
     ) -> Float[Tensor, "*g S D"]:
         """Features after the layer, 0 for tokens that do not exist.
 
         Args:
-            x: features.
+            x: Features of the tokens.
             mask: True = the token exists.
-            own: neighbors of the tokens' own kind.
-            others: of other kinds, with what this layer's `project` made of them.
+            neighbors: Neighbors of each token among the tokens.
+            sources: Targets of other types, from this layer's `project`, and the tokens' neighbors among these.
         """
         normal = self.own_norm(x)
-        x = x + self.dropout(self.own_attention(normal, [(self.own_attention.project(normal), own)]))
-        x = x + self.dropout(self.attention(self.norm(x), others))
+        x = x + self.dropout(self.own_attention(normal, [(self.own_attention.project(normal), neighbors)]))
+        x = x + self.dropout(self.attention(self.norm(x), sources))
         return torch.where(mask[..., None], self.feed_forward(x), 0.0)
 
 
 class PolylineEncoder(nn.Module):
-    """One feature of a sequence: three times, each element sees itself and the maximum over all."""
+    """Encoder of a sequence in a single feature: three layers of each element and the maximum over all elements."""
 
     def __init__(self, dim: int, dropout: float):
         super().__init__()
@@ -199,22 +199,23 @@ class PolylineEncoder(nn.Module):
         """Features of sequences; 0 for those without elements.
 
         Args:
-            x: features of the elements.
+            x: Features of the elements, P per sequence.
             mask: True = the element exists.
         """
-        first, *rest = (cast(nn.Linear, layer) for layer in self.layers)
-        own = self.dropout(functional.relu(first(x)))  # [*g, P, D/2]
-        most = _masked_max(own, mask)
-        for layer in rest:
-            # The linear layer of [own, most] in two parts, so that the second is computed once for a sequence.
-            of_own, of_most = layer.weight.chunk(2, dim=-1)
-            hidden = functional.linear(own, of_own, layer.bias) + functional.linear(most, of_most)[..., None, :]
-            own = self.dropout(functional.relu(hidden))
-            most = _masked_max(own, mask)
-        # The maximum of [own, most] over the elements is most, twice.
-        return torch.cat([most, most], -1)
+        first, *further_layers = (cast(nn.Linear, layer) for layer in self.layers)
+        features = self.dropout(functional.relu(first(x)))  # [*g, P, D/2]
+        maximum = _masked_max(features, mask)
+        for layer in further_layers:
+            # The linear layer of [features, maximum] in two terms; the second is computed once for a sequence.
+            weight, maximum_weight = layer.weight.chunk(2, dim=-1)
+            hidden = functional.linear(features, weight, layer.bias)
+            hidden = hidden + functional.linear(maximum, maximum_weight)[..., None, :]
+            features = self.dropout(functional.relu(hidden))
+            maximum = _masked_max(features, mask)
+        # The maximum of [features, maximum] over the elements is the maximum, twice.
+        return torch.cat([maximum, maximum], -1)
 
 
 def _masked_max(x: Float[Tensor, "*g P C"], mask: Bool[Tensor, "*g P"]) -> Float[Tensor, "*g C"]:
-    # Values are not negative after ReLU, so 0 in place of what does not exist changes no maximum.
+    # Values are not negative after ReLU, so 0 for elements that do not exist changes no maximum.
     return torch.where(mask[..., None], x, 0.0).amax(-2)

@@ -1,4 +1,4 @@
-"""Motion of agents under their actions, and the two rules that end something: a destination reached, the map left.
+"""Motion of agents under their actions, and two rules: a destination is reached, the map is left.
 
 Shapes: B scenarios, N rollouts, A agents. Poses in the ego frame.
 """
@@ -34,16 +34,16 @@ def move(
     """Pose and motion (speed, acceleration, yaw rate) after 0.1 s.
 
     Args:
-        pose: before.
-        speed: before, negative backwards, m/s.
-        action: before tanh, as the network has it.
-        limit: of `max_action`.
+        pose: Poses before the step.
+        speed: Speeds before the step, negative backwards, m/s.
+        action: Actions before tanh, as the network returns.
+        limit: Largest actions of the agents, from `max_action`.
     """
     acceleration, yaw_rate = (limit * action.tanh()).unbind(-1)
     # Midpoint rule: speed and heading in the middle of the step.
-    way = (speed + acceleration * (STEP_S / 2)) * STEP_S
+    distance = (speed + acceleration * (STEP_S / 2)) * STEP_S
     heading = pose[..., 2]
-    position = pose[..., :2] + way[..., None] * heading_vector(heading + yaw_rate * (STEP_S / 2))
+    position = pose[..., :2] + distance[..., None] * heading_vector(heading + yaw_rate * (STEP_S / 2))
     moved = torch.cat([position, (heading + yaw_rate * STEP_S)[..., None]], -1)
     return moved, torch.stack([speed + acceleration * STEP_S, acceleration, yaw_rate], -1)
 
@@ -54,30 +54,30 @@ def reaches_destination(
     """True = near a lane and in its direction, or near an edge.
 
     Args:
-        pose: of the agents.
-        destination: map token of each.
-        scene: its map.
+        pose: Poses of the agents.
+        destination: Map token of each agent's destination, at least 0.
+        scene: Scene with the map.
     """
     batch = torch.arange(len(pose), device=pose.device)[:, None, None]
     nodes, mask = scene.node_pose[batch, destination], scene.node_mask[batch, destination]  # [B, N, A, 20, ...]
     distance = (nodes[..., :2] - pose[..., None, :2]).norm(dim=-1)
-    along = (nodes[..., 2] - pose[..., None, 2]).cos() > math.cos(LANE_REACHED_RAD)
+    is_aligned = (nodes[..., 2] - pose[..., None, 2]).cos() > math.cos(LANE_REACHED_RAD)
     is_lane = scene.map_type[batch, destination] <= MapTokenType.BIKE_LANE  # [B, N, A]
 
-    def any_node(condition: Tensor) -> Tensor:
+    def has_node(condition: Tensor) -> Tensor:
         return (condition & mask).any(-1)
 
     # Distance and direction need not be those of the same node.
-    lane = any_node(distance < LANE_REACHED_M) & any_node(along)
-    return torch.where(is_lane, lane, any_node(distance < EDGE_REACHED_M))
+    lane = has_node(distance < LANE_REACHED_M) & has_node(is_aligned)
+    return torch.where(is_lane, lane, has_node(distance < EDGE_REACHED_M))
 
 
 def leaves_map(pose: Float[Tensor, "B N A 3"], scene: Scene) -> Bool[Tensor, "B N A"]:
     """True = outside of the map's bounding box.
 
     Args:
-        pose: of the agents.
-        scene: its map.
+        pose: Poses of the agents.
+        scene: Scene with the map; without a map no agent leaves.
     """
     x_min, x_max, y_min, y_max = scene.map_box[:, None, None].unbind(-1)
     x, y = pose[..., 0], pose[..., 1]

@@ -1,6 +1,6 @@
 """Pre-training of TrafficBots: closed-loop imitation of the log, in two passes.
 
-Agents follow their mean actions for 80 steps, some are put back onto the log at every step. The network's inputs
+Agents follow mean actions for 80 steps, some are put back onto the log at every step. The network's inputs
 carry no gradient, so the loss reaches an action u_t through the dynamics alone, and its gradient equals that of
 
     sum_t u_t(weights) * dL/du_t,
@@ -33,8 +33,8 @@ from rlftsim.policies.trafficbots.network import (
     history_windows,
 )
 from rlftsim.policies.trafficbots.scene import Scene, build_scene
-from rlftsim.policies.trafficbots.scoring import features_over_time
-from rlftsim.policies.trafficbots.state import Imposed, traffic_at_start, whole_history
+from rlftsim.policies.trafficbots.scoring import compute_features
+from rlftsim.policies.trafficbots.state import ImposedStates, join_history, start_traffic
 from rlftsim.rollout.policy import ImitationLoss
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import CURRENT_STEP, FUTURE_STEPS, HISTORY_STEPS, TOTAL_STEPS
@@ -44,12 +44,12 @@ POSITION_WEIGHT, HEADING_WEIGHT, SPEED_WEIGHT, PERSONALITY_WEIGHT = 0.1, 10.0, 0
 
 @dataclass(frozen=True, eq=False)
 class TrainingDraws:
-    """Everything random in an update."""
+    """All random values of an update."""
 
     noise: Float[Tensor, "B A 16"]
-    """Standard normal, of the personalities."""
+    """Standard normal noise of the personalities."""
     from_prior: bool
-    """True = personalities are the noise itself, not drawn from the posterior."""
+    """True = personalities are the noise, not drawn from the posterior."""
     forced: Bool[Tensor, "B A"]
     """True = the agent is put back onto the log at every step."""
     node_mask: Bool[Tensor, "B M 20"]
@@ -68,56 +68,50 @@ def imitation_loss(
     """Loss of an update, a sum of means over each scenario.
 
     Args:
-        network: in training mode inputs are hidden and agents forced by schedule; in evaluation mode nothing is hidden,
-            and the last of `forced_fractions` holds.
-        config: schedule of forcing, and probabilities.
-        batch: with futures.
-        trained: True = the agent counts; the others are context.
-        update: of pre-training, counted from 0.
+        network: Network with the weights. In training mode inputs are hidden and agents forced by schedule; in
+            evaluation mode no inputs are hidden, and the last of `forced_fractions` holds.
+        config: Settings with the schedule of forcing, and probabilities.
+        batch: Scenarios with logged futures.
+        trained: True = the agent counts; other agents are context.
+        update: Number of the update of pre-training from 0.
     """
     scene = build_scene(batch, TOTAL_STEPS, config.max_map_tokens)
     labels = np.full(trained.shape, NO_DESTINATION)
     for row, scenario in zip(labels, batch.scenarios):
-        own = destination_labels(scenario, config.max_map_tokens)
-        row[: len(own)] = own
-    # Beside rewards, in evaluation mode, the schedule of pre-training is at its end.
+        destinations = destination_labels(scenario, config.max_map_tokens)
+        row[: len(destinations)] = destinations
+    # Beside rewards, in evaluation mode, the schedule of pre-training has ended.
     stages = len(config.forced_fractions) - 1
     stage = min(update // config.forcing_updates, stages) if network.training else stages
     draws = draw_training(scene, config, config.forced_fractions[stage], hide=network.training)
     destination = torch.from_numpy(labels).to(trained.device)
-    return loss_of_scene(network, config, scene, destination, trained & scene.agent_mask, draws)
+    return compute_scene_loss(network, config, scene, destination, trained & scene.agent_mask, draws)
 
 
 def draw_training(scene: Scene, config: TrafficBotsConfig, fraction: float, *, hide: bool) -> TrainingDraws:
-    """Draw everything random of an update with torch's generator.
+    """Draw all random values of an update with torch's generator.
 
     Args:
-        scene: supplies sizes and device.
-        config: probabilities.
-        fraction: of agents that follow the log.
-        hide: hide some of the inputs.
+        scene: Scene with the sizes and the device of the draws.
+        config: Settings with the probabilities.
+        fraction: Fraction in [0, 1] of agents that follow the log.
+        hide: True hides some map nodes and history steps.
     """
-    agents = scene.agent_mask.shape
-
-    def uniform(*shape: int) -> Tensor:
-        # Always from the generator of the CPU, so that devices draw the same.
-        return torch.rand(*shape).to(scene.pose.device)
-
-    noise = torch.randn(*agents, LATENT_SIZE).to(scene.pose.device)
+    shape, device = scene.agent_mask.shape, scene.pose.device
+    # Always from the generator of the CPU, so that devices draw the same.
+    noise = torch.randn(*shape, LATENT_SIZE).to(device)
     from_prior = bool(torch.rand(()) < config.prior_probability)
-    forced = uniform(*agents) < fraction
+    forced = torch.rand(shape).to(device) < fraction
     node_mask, history_mask = scene.node_mask, scene.valid[..., :HISTORY_STEPS]
     if hide and config.input_drop:
         # The first node has the token's pose, the last step is the agent's.
-        kept_nodes = uniform(*node_mask.shape) >= config.input_drop
-        kept_nodes[..., 0] = True
-        kept_steps = uniform(*history_mask.shape) >= config.input_drop
-        kept_steps[..., -1] = True
-        node_mask, history_mask = node_mask & kept_nodes, history_mask & kept_steps
+        nodes, steps = (torch.rand(mask.shape).to(device) >= config.input_drop for mask in (node_mask, history_mask))
+        nodes[..., 0], steps[..., -1] = True, True
+        node_mask, history_mask = node_mask & nodes, history_mask & steps
     return TrainingDraws(noise, from_prior, forced, node_mask, history_mask)
 
 
-def loss_of_scene(
+def compute_scene_loss(
     network: TrafficBotsNetwork,
     config: TrafficBotsConfig,
     scene: Scene,
@@ -125,15 +119,15 @@ def loss_of_scene(
     trained: Bool[Tensor, "B A"],
     draws: TrainingDraws,
 ) -> ImitationLoss:
-    """Loss of a scene under given draws.
+    """Loss of a scene with random values that have been drawn.
 
     Args:
-        network: the weights.
-        config: KL that costs nothing, and size of a pass.
-        scene: with all 91 steps.
-        destination: label of each agent, negative = none.
-        trained: True = the agent counts.
-        draws: of `draw_training`.
+        network: Network with the weights.
+        config: Settings with `free_nats` and `steps_per_pass`.
+        scene: Scene with all 91 steps of the log.
+        destination: Label of each agent, a map token; negative = none.
+        trained: True = the agent counts; other agents are context.
+        draws: Random values, from `draw_training`.
     """
     # 1. Map, lights along the log, personality, destination: all with gradient.
     map_features = network.map(scene, draws.node_mask)
@@ -141,33 +135,26 @@ def loss_of_scene(
     mean = network.posterior(*_posterior_inputs(scene), scene, map_features)
     log_std = network.posterior.log_std
     personality = draws.noise if draws.from_prior else mean + log_std.exp() * draws.noise
-    given = network.conditioning(scene, map_features, personality[:, None], destination[:, None])
-    around = network.agents.context(map_features, light_features[:, CURRENT_STEP:])
+    conditioning = network.conditioning(scene, map_features, personality[:, None], destination[:, None])
+    context = network.agents.context(map_features, light_features[:, CURRENT_STEP:])
 
     # 2. Roll out without gradient, differentiate the dynamics, score with gradient.
-    rolled = _roll_out(network, scene, around, given, destination[:, None], draws.forced)
-    value, grad = _loss_of_actions(scene, rolled, trained)
-    features = features_over_time(
-        network, rolled.history, rolled.active, scene, around, given, steps_per_pass=config.steps_per_pass
+    rollout = _roll_out(network, scene, context, conditioning, destination[:, None], draws.forced)
+    value, grad = _differentiate_actions(scene, rollout, trained)
+    features = compute_features(
+        network, rollout.history, rollout.active, scene, context, conditioning, steps_per_pass=config.steps_per_pass
     )  # [B, T, 1, A, D]
     actions = network.mean_actions(features, scene).movedim(1, 3)  # [B, 1, A, T, 2]
-    gradient_of_actions = (actions * grad).sum()
-    # The value of the imitation loss with the gradient of the sum.
-    imitation = value + (gradient_of_actions - gradient_of_actions.detach())
+    surrogate = (actions * grad).sum()
 
-    # 3. Terms of what is drawn once, for agents that are simulated at all.
-    taking_part = trained & rolled.alive.any(-1)[:, 0]
-    kl = personality_kl(mean, log_std, config.free_nats)
-    personality_loss = _mean_by_scenario(kl, taking_part)
-    log_prob = network.destination_predictor(
-        history_windows(scene), scene, map_features, draws.history_mask
-    )  # [B, A, M]
-    chosen = -log_prob.gather(-1, destination.clamp(min=0)[..., None])[..., 0]
-    destination_loss = _mean_by_scenario(chosen, taking_part & (destination >= 0) & chosen.isfinite())
+    # 3. Terms of values that are drawn once, for agents that are simulated at all.
+    counts = trained & rollout.alive.any(-1)[:, 0]
+    log_prob = network.destination_predictor(history_windows(scene), scene, map_features, draws.history_mask)
+    nll = -log_prob.gather(-1, destination.clamp(min=0)[..., None])[..., 0]  # [B, A]
     losses = {
-        "imitation_loss": imitation,
-        "personality_loss": personality_loss,
-        "destination_loss": destination_loss,
+        "imitation_loss": value + (surrogate - surrogate.detach()),  # value of the loss, gradient of the sum
+        "personality_loss": _average_by_scenario(personality_kl(mean, log_std, config.free_nats), counts),
+        "destination_loss": _average_by_scenario(nll, counts & (destination >= 0) & nll.isfinite()),
         "light_loss": light_loss,
     }
     sums = {name: value.detach() for name, value in losses.items()}
@@ -180,12 +167,12 @@ def personality_kl(
 ) -> Float[Tensor, "*g"]:
     """KL balancing of the posterior and the prior N(0, I), each at least `free_nats`.
 
-    The prior has no weights, so that its part is a constant, kept because the public loss has it.
+    The prior has no weights, so that the first term is a constant, as in the public loss.
 
     Args:
-        mean: of the posterior.
-        log_std: of the posterior.
-        free_nats: KL that costs no more.
+        mean: Means of the posterior.
+        log_std: Logarithms of the posterior's standard deviations.
+        free_nats: KL in nats below which the loss stays constant.
     """
     kl = (0.5 * ((2 * log_std).exp() + mean.square() - 1) - log_std).sum(-1)
     return kl.detach().clamp(min=free_nats) + PERSONALITY_WEIGHT * kl.clamp(min=free_nats)
@@ -197,10 +184,10 @@ def imitation_terms(
     """Weighted losses of position, heading and speed.
 
     Args:
-        pose: simulated.
-        speed: simulated, m/s.
-        logged_pose: of the same step.
-        logged_speed: of the same step, m/s.
+        pose: Simulated poses, ego frame.
+        speed: Simulated speeds, m/s.
+        logged_pose: Logged poses of the same steps, ego frame.
+        logged_speed: Logged speeds of the same steps, m/s.
     """
     position = smooth_l1_loss(pose[..., :2], logged_pose[..., :2], reduction="none").sum(-1)
     heading = 0.5 * (1 - (pose[..., 2] - logged_pose[..., 2]).cos())
@@ -209,7 +196,7 @@ def imitation_terms(
 
 
 @dataclass(frozen=True, eq=False)
-class _RolledOut:
+class _Rollout:
     """A closed-loop rollout along mean actions, N = 1."""
 
     history: Windows
@@ -218,63 +205,56 @@ class _RolledOut:
     alive: Bool[Tensor, "B 1 A T"]
     action: Float[Tensor, "B 1 A T 2"]
     forced: Bool[Tensor, "B 1 A T"]
-    """True = put onto the log after the decision."""
+    """True = the agent is put onto the log after the decision."""
 
 
 @torch.no_grad()
 def _roll_out(
     network: TrafficBotsNetwork,
     scene: Scene,
-    around: AgentContext,
-    given: AgentConditioning,
+    context: AgentContext,
+    conditioning: AgentConditioning,
     destination: Int64[Tensor, "B 1 A"],
     forced: Bool[Tensor, "B A"],
-) -> _RolledOut:
-    traffic = traffic_at_start(scene, destination)
-    before, actions, put = [], [], []
+) -> _Rollout:
+    traffic = start_traffic(scene, destination)
+    states, actions, imposed_masks = [], [], []
     for index in range(FUTURE_STEPS):
-        before.append(traffic)
-        windows, around_now = traffic.windows.as_one_decision(), around.steps(index, index + 1)
-        features = network.features(windows, scene, around_now, given, traffic.active[:, None])  # [B, 1, 1, A, D]
+        states.append(traffic)
+        windows, lights = traffic.windows.add_decision_axis(), context.select_steps(slice(index, index + 1))
+        features = network.features(windows, scene, lights, conditioning, traffic.active[:, None])  # [B, 1, 1, A, D]
         action = network.mean_actions(features, scene)[:, 0]
         step = CURRENT_STEP + index + 1
         logged = scene.valid[:, None, :, step]
-        imposed = Imposed(logged & forced[:, None], scene.pose[:, None, :, step], scene.motion[:, None, :, step])
-        traffic = traffic.after(action, scene, imposed, staying=logged)
+        imposed = ImposedStates(logged & forced[:, None], scene.pose[:, None, :, step], scene.motion[:, None, :, step])
+        traffic = traffic.advance(action, scene, imposed, staying=logged)
         actions.append(action)
-        put.append(imposed.mask)
-    return _RolledOut(
-        whole_history(before),
-        torch.stack([one.active for one in before], 3),
-        torch.stack([one.alive for one in before], 3),
-        torch.stack(actions, 3),
-        torch.stack(put, 3),
-    )
+        imposed_masks.append(imposed.mask)
+    values = ([state.active for state in states], [state.alive for state in states], actions, imposed_masks)
+    return _Rollout(join_history(states), *(torch.stack(tensors, 3) for tensors in values))
 
 
 @torch.enable_grad()
-def _loss_of_actions(
-    scene: Scene, rolled: _RolledOut, trained: Bool[Tensor, "B A"]
+def _differentiate_actions(
+    scene: Scene, rollout: _Rollout, trained: Bool[Tensor, "B A"]
 ) -> tuple[Float[Tensor, ""], Float[Tensor, "B 1 A T 2"]]:
-    """Imitation loss (a sum over scenarios of means), and its gradient with respect to the actions."""
-    action = rolled.action.detach().clone().requires_grad_(True)
+    """Imitation loss (a sum over scenarios of means), and the gradient with respect to the actions."""
+    action = rollout.action.detach().clone().requires_grad_(True)
     limit = max_action(scene.agent_class)[:, None]
     logged_pose, logged_motion = scene.pose[:, None], scene.motion[:, None]  # [B, 1, A, S, 3]
-    pose, speed = rolled.history.pose[..., CURRENT_STEP, :], rolled.history.motion[..., CURRENT_STEP, 0]
-    losses, counted = [], []
+    pose, speed = rollout.history.pose[..., CURRENT_STEP, :], rollout.history.motion[..., CURRENT_STEP, 0]
+    losses, masks = [], []
     for index in range(FUTURE_STEPS):
         step = CURRENT_STEP + index + 1
-        alive, forced = rolled.alive[..., index], rolled.forced[..., index]
+        alive, forced = rollout.alive[..., index], rollout.forced[..., index]
         pose, motion = move(pose, speed, torch.where(alive[..., None], action[..., index, :], 0.0), limit)
         speed = motion[..., 0]
-        terms = imitation_terms(pose, speed, logged_pose[..., step, :], logged_motion[..., step, 0])
-        losses.append(sum(terms))
-        counted.append(alive & scene.valid[:, None, :, step] & trained[:, None])
+        losses.append(sum(imitation_terms(pose, speed, logged_pose[..., step, :], logged_motion[..., step, 0])))
+        masks.append(alive & scene.valid[:, None, :, step] & trained[:, None])
         # The gradient does not pass a reset.
         pose = torch.where(forced[..., None], logged_pose[..., step, :], pose)
         speed = torch.where(forced, logged_motion[..., step, 0], speed)
-    mask = torch.stack(counted, -1)  # [B, 1, A, T]
-    loss = _mean_by_scenario(torch.stack(losses, -1), mask)
+    loss = _average_by_scenario(torch.stack(losses, -1), torch.stack(masks, -1))  # of [B, 1, A, T]
     (grad,) = torch.autograd.grad(loss, action)
     return loss.detach(), grad
 
@@ -292,17 +272,17 @@ def _lights_along_log(
     log_prob = torch.log_softmax(network.next_light_logits(features), -1)
     target = scene.light_state[:, :, 1:].transpose(1, 2)[..., None]  # [B, 90, L, 1]
     loss = -log_prob.gather(-1, target)[..., 0]
-    return features, _mean_by_scenario(loss, scene.light_mask[:, None].expand_as(loss))
+    return features, _average_by_scenario(loss, scene.light_mask[:, None].expand_as(loss))
 
 
 def _posterior_inputs(scene: Scene) -> tuple[Windows, Int64[Tensor, "B 1 L 19"]]:
     """Every fifth step of the log: agents [B, 1, 1, A, 19] and lights."""
-    every = slice(0, TOTAL_STEPS, POSTERIOR_STRIDE)
-    windows = Windows(*(v[:, None, None, :, every] for v in (scene.valid, scene.pose, scene.motion)))
-    return windows, scene.light_state[:, None, :, every]
+    steps = slice(0, TOTAL_STEPS, POSTERIOR_STRIDE)
+    windows = Windows(scene.valid, scene.pose, scene.motion).apply(lambda v: v[:, None, None, :, steps])
+    return windows, scene.light_state[:, None, :, steps]
 
 
-def _mean_by_scenario(values: Float[Tensor, "B *g"], mask: Bool[Tensor, "B *g"]) -> Float[Tensor, ""]:
-    """Sum over scenarios of the means of what counts in each; 0 where nothing does."""
+def _average_by_scenario(values: Float[Tensor, "B *g"], mask: Bool[Tensor, "B *g"]) -> Float[Tensor, ""]:
+    """Sum over scenarios of the means of masked values; 0 for a scenario without such values."""
     total = torch.where(mask, values, 0.0).flatten(1).sum(1)
     return (total / mask.flatten(1).sum(1).clamp(min=1)).sum()

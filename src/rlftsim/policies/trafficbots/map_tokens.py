@@ -7,7 +7,7 @@ Shapes: M map tokens, L light tokens, S logged steps. The rules are those of Tra
 
 import itertools
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import IntEnum
 
 import numpy as np
@@ -17,17 +17,17 @@ from rlftsim.scenario.derived import cached_on_scenario
 from rlftsim.scenario.types import CURRENT_STEP, HISTORY_STEPS, LightState, MapFeatureType, Scenario
 
 NUM_NODES = 20
-"""Nodes (segments) of a token, at most."""
+"""Largest number of nodes (segments) of a token."""
 MIN_NODES = 4
 """Shorter pieces are dropped."""
 MAP_MARGIN_M, HEIGHT_MARGIN_M = 500.0, 6.0
 """Tokens farther than this from the agents that matter are dropped."""
-MIN_TOKENS_NEAR = 10
-"""With fewer tokens within the margins, map and tracks do not fit together, and all tokens are kept."""
+MIN_TOKENS_IN_MARGIN = 10
+"""With fewer tokens within the margins, map and tracks do not fit together, and all tokens stay."""
 
 
 class MapTokenType(IntEnum):
-    """Kind of map token, the order of the network's input."""
+    """Type of a map token, in the order of the network's input."""
 
     FREEWAY = 0
     STREET = 1
@@ -45,57 +45,51 @@ class MapTokenType(IntEnum):
 VEHICLE_LANES = (MapTokenType.FREEWAY, MapTokenType.STREET, MapTokenType.STOP_SIGN_LANE)
 
 _Feature = MapFeatureType
-_TYPE_OF_FEATURE = {
-    _Feature.LANE_UNDEFINED: MapTokenType.STREET,
-    _Feature.LANE_FREEWAY: MapTokenType.FREEWAY,
-    _Feature.LANE_SURFACE_STREET: MapTokenType.STREET,
-    _Feature.LANE_BIKE: MapTokenType.BIKE_LANE,
-    _Feature.EDGE_UNKNOWN: MapTokenType.EDGE_BOUNDARY,
-    _Feature.EDGE_BOUNDARY: MapTokenType.EDGE_BOUNDARY,
-    _Feature.EDGE_MEDIAN: MapTokenType.EDGE_MEDIAN,
-    _Feature.LINE_UNKNOWN: MapTokenType.LINE_DOUBLE,
-    _Feature.LINE_BROKEN_SINGLE_WHITE: MapTokenType.LINE_BROKEN,
-    _Feature.LINE_BROKEN_SINGLE_YELLOW: MapTokenType.LINE_BROKEN,
-    _Feature.LINE_BROKEN_DOUBLE_YELLOW: MapTokenType.LINE_BROKEN,
-    _Feature.LINE_SOLID_SINGLE_WHITE: MapTokenType.LINE_SOLID,
-    _Feature.LINE_SOLID_SINGLE_YELLOW: MapTokenType.LINE_SOLID,
-    _Feature.LINE_SOLID_DOUBLE_WHITE: MapTokenType.LINE_DOUBLE,
-    _Feature.LINE_SOLID_DOUBLE_YELLOW: MapTokenType.LINE_DOUBLE,
-    _Feature.LINE_PASSING_DOUBLE_YELLOW: MapTokenType.LINE_DOUBLE,
-    _Feature.SPEED_BUMP: MapTokenType.BUMP_OR_DRIVEWAY,
-    _Feature.DRIVEWAY: MapTokenType.BUMP_OR_DRIVEWAY,
-    _Feature.CROSSWALK: MapTokenType.CROSSWALK,
+_FEATURE_TYPES = {
+    MapTokenType.FREEWAY: (_Feature.LANE_FREEWAY,),
+    MapTokenType.STREET: (_Feature.LANE_UNDEFINED, _Feature.LANE_SURFACE_STREET),
+    MapTokenType.BIKE_LANE: (_Feature.LANE_BIKE,),
+    MapTokenType.EDGE_BOUNDARY: (_Feature.EDGE_UNKNOWN, _Feature.EDGE_BOUNDARY),
+    MapTokenType.EDGE_MEDIAN: (_Feature.EDGE_MEDIAN,),
+    MapTokenType.LINE_BROKEN: (
+        *(_Feature.LINE_BROKEN_SINGLE_WHITE, _Feature.LINE_BROKEN_SINGLE_YELLOW, _Feature.LINE_BROKEN_DOUBLE_YELLOW),
+    ),
+    MapTokenType.LINE_SOLID: (_Feature.LINE_SOLID_SINGLE_WHITE, _Feature.LINE_SOLID_SINGLE_YELLOW),
+    MapTokenType.LINE_DOUBLE: (
+        *(_Feature.LINE_UNKNOWN, _Feature.LINE_SOLID_DOUBLE_WHITE, _Feature.LINE_SOLID_DOUBLE_YELLOW),
+        _Feature.LINE_PASSING_DOUBLE_YELLOW,
+    ),
+    MapTokenType.BUMP_OR_DRIVEWAY: (_Feature.SPEED_BUMP, _Feature.DRIVEWAY),
+    MapTokenType.CROSSWALK: (_Feature.CROSSWALK,),
 }
+_TOKEN_TYPES = {feature: token for token, features in _FEATURE_TYPES.items() for feature in features}
 _POLYGONS = (_Feature.SPEED_BUMP, _Feature.DRIVEWAY, _Feature.CROSSWALK)
 
-# Unknown, stop, caution, go, flashing: the order of the network's input.
-_STATE_OF_LIGHT = {
-    LightState.UNKNOWN: 0,
-    LightState.ARROW_STOP: 1,
-    LightState.STOP: 1,
-    LightState.ARROW_CAUTION: 2,
-    LightState.CAUTION: 2,
-    LightState.ARROW_GO: 3,
-    LightState.GO: 3,
-    LightState.FLASHING_STOP: 4,
-    LightState.FLASHING_CAUTION: 4,
-}
+_LIGHTS = (
+    (LightState.UNKNOWN,),
+    (LightState.ARROW_STOP, LightState.STOP),
+    (LightState.ARROW_CAUTION, LightState.CAUTION),
+    (LightState.ARROW_GO, LightState.GO),
+    (LightState.FLASHING_STOP, LightState.FLASHING_CAUTION),
+)
+"""Unknown, stop, caution, go, flashing: the order of the network's input."""
+_LIGHT_STATES = {light: state for state, lights in enumerate(_LIGHTS) for light in lights}
 UNKNOWN_LIGHT, NUM_LIGHT_STATES = 0, 5
 
 
 @dataclass(frozen=True, eq=False)
-class MapPieces:
-    """Map tokens of one scenario."""
+class MapTokens:
+    """Map tokens of a scenario, each a piece of a map feature."""
 
     position: Float64[np.ndarray, "M 20 3"]
-    """Start of each segment; zeros past the last one."""
+    """Start of each segment; zeros past the last segment."""
     direction: Float64[np.ndarray, "M 20 3"]
     """From the start of each segment to its end, m."""
     node_mask: Bool[np.ndarray, "M 20"]
     type: Int64[np.ndarray, "M"]
     """A `MapTokenType`."""
     feature_id: Int64[np.ndarray, "M"]
-    """Of the map feature that the piece is cut from."""
+    """Id of the map feature that the token is cut from."""
 
     def __len__(self) -> int:
         return len(self.type)
@@ -103,7 +97,7 @@ class MapPieces:
 
 @dataclass(frozen=True, eq=False)
 class LightTokens:
-    """Lights of one scenario, a token for each piece of their lanes, by lane id."""
+    """Lights of a scenario, a token for each piece of the lights' lanes, by lane id."""
 
     token: Int64[np.ndarray, "L"]
     """Index of the map token."""
@@ -122,8 +116,8 @@ def to_ego_frame(points: np.ndarray, pose: Float64[np.ndarray, "3"]) -> np.ndarr
     """Points of the world frame in the ego frame; z stays.
 
     Args:
-        points: [..., 2 or 3], m.
-        pose: of `ego_pose`.
+        points: Points [..., 2 or 3] of the world frame, m.
+        pose: Origin of the ego frame, from `ego_pose`.
     """
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     x, y = points[..., 0] - pose[0], points[..., 1] - pose[1]
@@ -131,22 +125,22 @@ def to_ego_frame(points: np.ndarray, pose: Float64[np.ndarray, "3"]) -> np.ndarr
 
 
 @cached_on_scenario
-def map_pieces(scenario: Scenario, max_tokens: int | None = 1024) -> MapPieces:
+def tokenize_map(scenario: Scenario, max_tokens: int | None = 1024) -> MapTokens:
     """Map tokens of a scenario, in file order.
 
     Args:
-        scenario: any; without a map there are none.
-        max_tokens: where there are more, those far from the agents that matter go first; None = no limit.
+        scenario: Scenario with or without a map; without a map there are no tokens.
+        max_tokens: Largest number of tokens; tokens far from the agents that matter go first. None = no limit.
     """
     features, pose = scenario.map_features, ego_pose(scenario)
     stop_sign_lanes = set(features.topology.stop_sign_lanes[:, 1].tolist())
     positions, directions, types, ids = [], [], [], []
     for index, (feature_id, feature_type) in enumerate(zip(features.feature_id, features.feature_type)):
-        kind = _TYPE_OF_FEATURE.get(MapFeatureType(feature_type))
-        if kind is None:  # a stop sign
+        token_type = _TOKEN_TYPES.get(MapFeatureType(feature_type))
+        if token_type is None:  # a stop sign
             continue
-        if kind in (MapTokenType.FREEWAY, MapTokenType.STREET) and int(feature_id) in stop_sign_lanes:
-            kind = MapTokenType.STOP_SIGN_LANE
+        if token_type in (MapTokenType.FREEWAY, MapTokenType.STREET) and int(feature_id) in stop_sign_lanes:
+            token_type = MapTokenType.STOP_SIGN_LANE
         if feature_type in _POLYGONS:
             lines = sides_of_polygon(features.polygon(index))
         else:
@@ -154,31 +148,24 @@ def map_pieces(scenario: Scenario, max_tokens: int | None = 1024) -> MapPieces:
             lines = [features.polyline(index)[::2].astype(np.float64)]
         for line in lines:
             line = to_ego_frame(line, pose)
-            for piece in cut_line(len(line) - 1):
-                if len(piece) >= MIN_NODES:
-                    positions.append(line[piece])
-                    directions.append(line[piece + 1] - line[piece])
-                    types.append(int(kind))
+            for segments in cut_line(len(line) - 1):
+                if len(segments) >= MIN_NODES:
+                    positions.append(line[segments])
+                    directions.append(line[segments + 1] - line[segments])
+                    types.append(int(token_type))
                     ids.append(int(feature_id))
     counts = np.array([len(p) for p in positions], np.int64)
     mask = np.arange(NUM_NODES) < counts[:, None]  # [M, 20]
-    pieces = MapPieces(
-        position=_fill(mask, positions),
-        direction=_fill(mask, directions),
-        node_mask=mask,
-        type=np.array(types, np.int64),
-        feature_id=np.array(ids, np.int64),
-    )
-    kept = _near_agents(pieces, _positions_that_matter(scenario), max_tokens)
-    return MapPieces(
-        pieces.position[kept], pieces.direction[kept], mask[kept], pieces.type[kept], pieces.feature_id[kept]
-    )
+    types, ids = np.array(types, np.int64), np.array(ids, np.int64)
+    tokens = MapTokens(_pad_nodes(mask, positions), _pad_nodes(mask, directions), mask, types, ids)
+    index = _select_tokens(tokens, _find_relevant_positions(scenario), max_tokens)
+    return MapTokens(**{field.name: getattr(tokens, field.name)[index] for field in fields(tokens)})
 
 
 def cut_line(num_segments: int) -> Iterator[Int64[np.ndarray, "_"]]:
-    """Indices of the segments of each piece of a line: nearly equal pieces of at most 20."""
-    num_pieces = max(num_segments, 0) // NUM_NODES + 1
-    starts = [k * num_segments // num_pieces for k in range(num_pieces + 1)]
+    """Indices of the segments of each token of a line: nearly equal numbers of at most 20."""
+    num_tokens = max(num_segments, 0) // NUM_NODES + 1
+    starts = [k * num_segments // num_tokens for k in range(num_tokens + 1)]
     return (np.arange(start, end) for start, end in itertools.pairwise(starts))
 
 
@@ -186,7 +173,7 @@ def sides_of_polygon(polygon: Float64[np.ndarray, "n 3"]) -> list[Float64[np.nda
     """The two longer sides of a polygon taken as four corners, each in both directions, a point every meter.
 
     Args:
-        polygon: points in order. Fewer than three, or four that coincide, have no sides.
+        polygon: Points in order, m. Fewer than three, or four that coincide, have no sides.
     """
     if len(polygon) < 3:
         return []
@@ -202,26 +189,26 @@ def sides_of_polygon(polygon: Float64[np.ndarray, "n 3"]) -> list[Float64[np.nda
 
 
 @cached_on_scenario
-def light_tokens(scenario: Scenario, max_tokens: int | None = 1024, *, of_history: bool = True) -> LightTokens:
+def tokenize_lights(scenario: Scenario, max_tokens: int | None = 1024, *, of_history: bool = True) -> LightTokens:
     """Light tokens of a scenario.
 
     Args:
-        scenario: any.
-        max_tokens: of `map_pieces`.
-        of_history: leave out lights that were not observed up to the current step, as a simulation must.
+        scenario: Scenario with or without lights and a map.
+        max_tokens: Largest number of map tokens, as in `tokenize_map`.
+        of_history: True leaves out lights that were not observed up to the current step, as a simulation must.
     """
-    lights, pieces = scenario.lights, map_pieces(scenario, max_tokens)
+    lights, map_tokens = scenario.lights, tokenize_map(scenario, max_tokens)
     tokens, observed, states = [], [], []
     for lane in np.unique(lights.lane_id):
-        own = (lights.lane_id == lane) & (lights.step < scenario.num_steps)
-        seen, state = np.zeros(scenario.num_steps, bool), np.full(scenario.num_steps, UNKNOWN_LIGHT)
-        seen[lights.step[own]] = True
-        state[lights.step[own]] = [_STATE_OF_LIGHT[LightState(s)] for s in lights.state[own]]
-        if not seen[: HISTORY_STEPS if of_history else None].any():
+        is_of_lane = (lights.lane_id == lane) & (lights.step < scenario.num_steps)
+        is_observed, state = np.zeros(scenario.num_steps, bool), np.full(scenario.num_steps, UNKNOWN_LIGHT)
+        is_observed[lights.step[is_of_lane]] = True
+        state[lights.step[is_of_lane]] = [_LIGHT_STATES[LightState(s)] for s in lights.state[is_of_lane]]
+        if not is_observed[: HISTORY_STEPS if of_history else None].any():
             continue
-        for token in np.flatnonzero(pieces.feature_id == lane):
+        for token in np.flatnonzero(map_tokens.feature_id == lane):
             tokens.append(token)
-            observed.append(seen)
+            observed.append(is_observed)
             states.append(state)
     shape = (len(tokens), scenario.num_steps)
     return LightTokens(
@@ -229,43 +216,43 @@ def light_tokens(scenario: Scenario, max_tokens: int | None = 1024, *, of_histor
     )
 
 
-def _fill(mask: Bool[np.ndarray, "M 20"], pieces: list[np.ndarray]) -> Float64[np.ndarray, "M 20 3"]:
-    filled = np.zeros((*mask.shape, 3))
-    filled[mask] = np.concatenate([np.zeros((0, 3)), *pieces])
-    return filled
+def _pad_nodes(mask: Bool[np.ndarray, "M 20"], nodes: list[np.ndarray]) -> Float64[np.ndarray, "M 20 3"]:
+    padded = np.zeros((*mask.shape, 3))
+    padded[mask] = np.concatenate([np.zeros((0, 3)), *nodes])
+    return padded
 
 
-def _positions_that_matter(scenario: Scenario) -> Float64[np.ndarray, "n 3"]:
+def _find_relevant_positions(scenario: Scenario) -> Float64[np.ndarray, "n 3"]:
     """Positions in the history of the ego, the objects of interest and the tracks to predict, ego frame."""
     tracks = scenario.tracks
     matters = np.isin(tracks.object_id, scenario.objects_of_interest)
     matters[scenario.ego_index] = True
     matters[scenario.tracks_to_predict] = True
-    known = tracks.valid[:, :HISTORY_STEPS] & matters[:, None]
-    if not known.any():
+    is_logged = tracks.valid[:, :HISTORY_STEPS] & matters[:, None]
+    if not is_logged.any():
         return np.zeros((1, 3))  # the frame's origin, where the ego would be
-    return to_ego_frame(tracks.position[:, :HISTORY_STEPS][known].astype(np.float64), ego_pose(scenario))
+    return to_ego_frame(tracks.position[:, :HISTORY_STEPS][is_logged].astype(np.float64), ego_pose(scenario))
 
 
-def _near_agents(
-    pieces: MapPieces, agents: Float64[np.ndarray, "n 3"], max_tokens: int | None
+def _select_tokens(
+    tokens: MapTokens, agents: Float64[np.ndarray, "n 3"], max_tokens: int | None
 ) -> Int64[np.ndarray, "m"]:
-    """Indices of the tokens to keep."""
+    """Indices of the tokens near agents."""
     # 1. Some node inside of the agents' bounding box, grown by the margins.
     low, high = agents.min(0), agents.max(0)
     margin = np.maximum(high - low, (MAP_MARGIN_M, MAP_MARGIN_M, HEIGHT_MARGIN_M))
-    above = ((pieces.position > low - margin) & pieces.node_mask[..., None]).any(1)  # [M, 3]
-    below = ((pieces.position < high + margin) & pieces.node_mask[..., None]).any(1)
-    kept = (above & below).all(-1)
-    if kept.sum() < MIN_TOKENS_NEAR:
-        kept[:] = True
-    # 2. Still too many: in file order, those whose ends are both beyond a radius that is halved again and again.
+    above = ((tokens.position > low - margin) & tokens.node_mask[..., None]).any(1)  # [M, 3]
+    below = ((tokens.position < high + margin) & tokens.node_mask[..., None]).any(1)
+    is_selected = (above & below).all(-1)
+    if is_selected.sum() < MIN_TOKENS_IN_MARGIN:
+        is_selected[:] = True
+    # 2. Still too many: in file order, tokens with both ends beyond a radius that is halved again and again.
     radius = MAP_MARGIN_M
-    while max_tokens is not None and kept.sum() > max_tokens:
-        last = pieces.node_mask.sum(1) - 1
-        ends = np.stack([pieces.position[:, 0], pieces.position[np.arange(len(pieces)), last]], 1)  # [M, 2, 3]
+    while max_tokens is not None and is_selected.sum() > max_tokens:
+        last = tokens.node_mask.sum(1) - 1
+        ends = np.stack([tokens.position[:, 0], tokens.position[np.arange(len(tokens)), last]], 1)  # [M, 2, 3]
         distance = np.linalg.norm(ends[:, :, None] - agents, axis=-1).min((1, 2))
-        far = np.flatnonzero(kept & (distance >= radius))
-        kept[far[: kept.sum() - max_tokens]] = False
+        distant_tokens = np.flatnonzero(is_selected & (distance >= radius))
+        is_selected[distant_tokens[: is_selected.sum() - max_tokens]] = False
         radius /= 2
-    return np.flatnonzero(kept)
+    return np.flatnonzero(is_selected)

@@ -5,7 +5,8 @@ Source: Zhang et al., "TrafficBots V1.5", 2024 (arXiv 2406.10898).
 Shapes: B scenarios, T decisions, N rollouts, A agents, W steps of a window, M map tokens, L lights, D width.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
 from functools import partial
 from itertools import pairwise
 from typing import cast
@@ -29,36 +30,33 @@ POSTERIOR_WINDOW = len(range(0, TOTAL_STEPS, POSTERIOR_STRIDE))
 LIGHT_LOGIT_LIMIT = 3.0
 NUM_CLASSES, NUM_GEOMETRY, NUM_MOTION = 3, 7, 3
 RING_M = 1e-3
-"""A point of a token this near to the token's origin has no direction from there."""
+"""Distance from a token's origin within which a point has no direction."""
 NEVER = -torch.inf
 
 
-def mlp(*sizes: int, dropout: float = 0.0, end_activation: bool = False, norm: bool = False) -> nn.Sequential:
+def mlp(*sizes: int, end_activation: bool = False, norm: bool = False) -> nn.Sequential:
     """Linear layers with ReLU between them.
 
     Args:
-        sizes: of the input and of each layer's output.
-        dropout: after each activation.
-        end_activation: also after the last layer.
-        norm: layer norm before each activation.
+        sizes: Widths of the input and of each layer's output.
+        end_activation: True puts an activation after the last layer, too.
+        norm: True puts a layer norm before each activation.
     """
     layers: list[nn.Module] = []
-    for k, (before, after) in enumerate(pairwise(sizes)):
-        layers.append(nn.Linear(before, after))
+    for k, (in_size, out_size) in enumerate(pairwise(sizes)):
+        layers.append(nn.Linear(in_size, out_size))
         if k < len(sizes) - 2 or end_activation:
-            layers += [nn.LayerNorm(after)] if norm else []
-            layers += [nn.ReLU()]
-            layers += [nn.Dropout(dropout)] if dropout else []
+            layers += [nn.LayerNorm(out_size), nn.ReLU()] if norm else [nn.ReLU()]
     return nn.Sequential(*layers)
 
 
 def decoder_layers(layers: nn.ModuleList) -> list[DecoderLayer]:
-    """The layers of a list, with their type."""
+    """The layers of a list, typed."""
     return [cast(DecoderLayer, layer) for layer in layers]
 
 
 class MapEncoder(nn.Module):
-    """Features of map tokens."""
+    """Encoder of map tokens."""
 
     def __init__(self, config: TrafficBotsConfig):
         super().__init__()
@@ -74,14 +72,14 @@ class MapEncoder(nn.Module):
         """Features of all map tokens, 0 for padding.
 
         Args:
-            scene: its map.
-            node_mask: True = the node is looked at.
+            scene: Scene with the map.
+            node_mask: True = the node is looked at; imitation hides some.
         """
         config = self.config
-        kind = functional.one_hot(scene.map_type, len(MapTokenType)).to(scene.map_pose)[..., None, :]  # [B, M, 1, 11]
-        place = torch.eye(NUM_NODES, device=kind.device)
+        map_type = functional.one_hot(scene.map_type, len(MapTokenType)).to(scene.map_pose)[..., None, :]
+        node_index = torch.eye(NUM_NODES, device=map_type.device)
         shape = scene.node_mask.shape
-        attributes = torch.cat([kind.expand(*shape, -1), place.expand(*shape, -1)], -1)  # [B, M, 20, 31]
+        attributes = torch.cat([v.expand(*shape, -1) for v in (map_type, node_index)], -1)  # [B, M, 20, 31]
         geometry = segment_features(relative_pose(scene.node_pose, scene.map_pose[..., None, :]))
         x = self.polyline(torch.cat([self.nodes(attributes), geometry], -1), node_mask)
         neighbors = find_neighbors(
@@ -94,35 +92,35 @@ class MapEncoder(nn.Module):
 
 
 def segment_features(pose: Float[Tensor, "*g 3"]) -> Float[Tensor, "*g 7"]:
-    """Seven numbers of a segment of 1 m: where it is seen from the origin, and where it leads.
+    """Seven numbers of a segment of 1 m: distance and bearing from the origin, and direction.
 
     Args:
-        pose: start and direction.
+        pose: Start and direction of each segment, relative to the origin.
     """
     start, towards = pose[..., :2], torch.stack([pose[..., 2].cos(), pose[..., 2].sin()], -1)
-    along = -(start * towards).sum(-1, keepdim=True).clamp(-1, 0)  # [*g, 1] of the point nearest to the origin
-    nearest = start + along * towards
+    offset = -(start * towards).sum(-1, keepdim=True).clamp(-1, 0)  # [*g, 1] of the point nearest to the origin
+    nearest = start + offset * towards
     distance = nearest.norm(dim=-1, keepdim=True)
     bearing = torch.where(distance < RING_M, 0.0, nearest / distance.clamp(min=RING_M))
-    rest = (start + towards - nearest).norm(dim=-1, keepdim=True)
-    return torch.cat([distance, bearing, towards, torch.ones_like(distance), rest], -1)
+    remaining_length = (start + towards - nearest).norm(dim=-1, keepdim=True)
+    return torch.cat([distance, bearing, towards, torch.ones_like(distance), remaining_length], -1)
 
 
 @dataclass(frozen=True, eq=False)
 class LightNeighborhoods:
-    """Lights and their neighbors."""
+    """Lights and the neighbors of lights."""
 
     base: Float[Tensor, "B L D"]
     """Feature of each light's map token."""
     mask: Bool[Tensor, "B L"]
-    own: Neighbors
+    lights: Neighbors
     map: Neighbors
     map_tokens: tuple[KeyValues, ...]
-    """By layer."""
+    """Keys and values of the map, by layer."""
 
 
 class LightEncoder(nn.Module):
-    """Features of lights, given their states in a window and the map around them."""
+    """Encoder of lights, from the states in a window and the map in the neighborhood."""
 
     def __init__(self, config: TrafficBotsConfig, window: int):
         super().__init__()
@@ -136,11 +134,11 @@ class LightEncoder(nn.Module):
         )
 
     def neighborhoods(self, scene: Scene, map_features: Float[Tensor, "B M D"]) -> LightNeighborhoods:
-        """The part that the states of lights do not change, computed once.
+        """Values that the states of lights do not change, computed once.
 
         Args:
-            scene: its lights and map.
-            map_features: lights do not train them.
+            scene: Scene with lights and map.
+            map_features: Features from `MapEncoder`; receive no gradient from lights.
         """
         config, map_features = self.config, map_features.detach()
         lights = scene.light_pose
@@ -148,49 +146,56 @@ class LightEncoder(nn.Module):
         return LightNeighborhoods(
             base=map_features.gather(1, scene.light_token[..., None].expand(-1, -1, config.dim)),
             mask=scene.light_mask,
-            own=find(lights, lights, scene.light_mask),
+            lights=find(lights, lights, scene.light_mask),
             map=find(lights, scene.map_pose, scene.map_mask),
             map_tokens=tuple(layer.project(map_features) for layer in decoder_layers(self.layers)),
         )
 
     def forward(
-        self, state: Int64[Tensor, "B T L W"], around: LightNeighborhoods, step_mask: Bool[Tensor, "T W"] | None = None
+        self,
+        state: Int64[Tensor, "B T L W"],
+        neighborhoods: LightNeighborhoods,
+        step_mask: Bool[Tensor, "T W"] | None = None,
     ) -> Float[Tensor, "B T L D"]:
         """Features of all lights at T decisions, 0 for padding.
 
         Args:
-            state: the window's states, the newest last.
-            around: of `neighborhoods`.
-            step_mask: True = the step of the window exists; None = all do.
+            state: States of the lights in each window, the newest last.
+            neighborhoods: Result of `neighborhoods` for the same scene.
+            step_mask: True = the step of the window exists; None = all steps exist.
         """
-        num_decisions = state.shape[1]
-        place = torch.eye(self.window, device=state.device).expand(*state.shape, -1)
-        attributes = torch.cat([functional.one_hot(state, NUM_LIGHT_STATES).to(around.base), place], -1)
-        mask = around.mask[:, None].expand(state.shape[:3])  # [B, T, L]
-        x = self.states(attributes) + around.base[:, None, :, None]
+        base, num_decisions = neighborhoods.base, state.shape[1]
+        step_index = torch.eye(self.window, device=state.device).expand(*state.shape, -1)
+        attributes = torch.cat([functional.one_hot(state, NUM_LIGHT_STATES).to(base), step_index], -1)
+        mask = neighborhoods.mask[:, None].expand(state.shape[:3])  # [B, T, L]
+        x = self.states(attributes) + base[:, None, :, None]
         steps = mask[..., None].expand(state.shape)
         x = self.polyline(x, steps if step_mask is None else steps & step_mask[:, None])
-        own, around_map = around.own.over_time(num_decisions), around.map.over_time(num_decisions)
-        for layer, map_tokens in zip(self.layers, around.map_tokens):
-            x = layer(x, mask, own, [(map_tokens, around_map)])
+        lights, map_neighbors = (n.over_time(num_decisions) for n in (neighborhoods.lights, neighborhoods.map))
+        for layer, map_tokens in zip(self.layers, neighborhoods.map_tokens):
+            x = layer(x, mask, lights, [(map_tokens, map_neighbors)])
         return x
 
 
 @dataclass(frozen=True, eq=False)
 class Windows:
-    """Input of the network about agents at some decisions: their last steps, the newest last."""
+    """Last steps of agents, the newest last: the network's input about agents."""
 
     valid: Bool[Tensor, "*g A W"]
     pose: Float[Tensor, "*g A W 3"]
     motion: Float[Tensor, "*g A W 3"]
 
-    def as_one_decision(self) -> "Windows":
-        """Windows [B, N, A, W] as those of a single decision [B, 1, N, A, W]."""
-        return Windows(self.valid[:, None], self.pose[:, None], self.motion[:, None])
+    def apply(self, function: Callable[[Tensor], Tensor]) -> "Windows":
+        """Windows with a function applied to each tensor, such as a selection along the common axes."""
+        return Windows(function(self.valid), function(self.pose), function(self.motion))
+
+    def add_decision_axis(self) -> "Windows":
+        """Windows [B, N, A, W] as windows of a single decision [B, 1, N, A, W]."""
+        return self.apply(lambda v: v[:, None])
 
     @property
     def token_mask(self) -> Bool[Tensor, "*g A"]:
-        """True = there is a valid step, so the agent is seen by the others."""
+        """True = there is a valid step, so that other agents attend to this one."""
         return self.valid.any(-1)
 
     @property
@@ -201,8 +206,13 @@ class Windows:
         return self.pose.gather(-2, last[..., None, None].expand(*last.shape, 1, 3))[..., 0, :]
 
 
+def join_windows(windows: Sequence[Windows]) -> Windows:
+    """Windows [B, N, A, W] joined along the steps."""
+    return Windows(*(torch.cat([getattr(w, f.name) for w in windows], 3) for f in fields(Windows)))
+
+
 class WindowEncoder(nn.Module):
-    """One feature of each agent's window."""
+    """Encoder of each agent's window in a single feature."""
 
     def __init__(self, dim: int, window: int, dropout: float):
         super().__init__()
@@ -216,13 +226,13 @@ class WindowEncoder(nn.Module):
         """Features of windows, 0 for those without a valid step.
 
         Args:
-            windows: of agents.
-            agents: size and class (one-hot) of each.
-            step_mask: steps to look at; None = all valid ones.
+            windows: Windows of the agents.
+            agents: Size and class (one-hot) of each agent, from `agent_attributes`.
+            step_mask: Steps to look at; None = all valid steps.
         """
         shape = windows.valid.shape
-        place = torch.eye(self.window, device=windows.pose.device).expand(*shape, -1)
-        attributes = torch.cat([agents[..., None, :].expand(*shape, -1), windows.motion, place], -1)
+        step_index = torch.eye(self.window, device=windows.pose.device).expand(*shape, -1)
+        attributes = torch.cat([agents[..., None, :].expand(*shape, -1), windows.motion, step_index], -1)
         hidden = self.steps(attributes)  # [*g, A, W, D/2]
         relative = relative_pose(windows.pose, windows.token_pose[..., None, :])
         x = torch.cat([hidden, pose_embedding(relative, hidden.shape[-1]).to(hidden.dtype)], -1)
@@ -231,7 +241,7 @@ class WindowEncoder(nn.Module):
 
 def history_windows(scene: Scene) -> Windows:
     """Windows [B, A, 11] of the agents up to the current step."""
-    return Windows(scene.valid[..., :WINDOW], scene.pose[..., :WINDOW, :], scene.motion[..., :WINDOW, :])
+    return Windows(scene.valid, scene.pose, scene.motion).apply(lambda v: v[:, :, :WINDOW])
 
 
 def agent_attributes(scene: Scene) -> Float[Tensor, "B A 6"]:
@@ -244,17 +254,17 @@ class AgentContext:
     """Map and lights as keys and values of an agent encoder, by layer."""
 
     map_tokens: tuple[KeyValues, ...]
-    """[B, H, M, d] each."""
+    """Keys and values [B, H, M, d]."""
     light_tokens: tuple[KeyValues, ...]
-    """[B, T, H, L, d] each."""
+    """Keys and values [B, T, H, L, d]."""
 
-    def steps(self, start: int, stop: int) -> "AgentContext":
-        """The same with the lights of some decisions."""
-        return AgentContext(self.map_tokens, tuple(one.steps(start, stop) for one in self.light_tokens))
+    def select_steps(self, steps: slice) -> "AgentContext":
+        """The same context with the lights of a range of decisions."""
+        return AgentContext(self.map_tokens, tuple(lights.select_steps(steps) for lights in self.light_tokens))
 
 
 class AgentEncoder(nn.Module):
-    """Features of agents, given their windows, each other, the map and the lights."""
+    """Encoder of agents, from the agents' windows, the map and the lights."""
 
     def __init__(self, config: TrafficBotsConfig, window: int, dropout: float):
         super().__init__()
@@ -268,38 +278,37 @@ class AgentEncoder(nn.Module):
         """Keys and values of map and lights for each layer, computed once for all rollouts.
 
         Args:
-            map_features: of `MapEncoder`.
-            light_features: of `LightEncoder`.
+            map_features: Features of the map tokens, from `MapEncoder`.
+            light_features: Features of the lights at T decisions, from `LightEncoder`.
         """
-        return AgentContext(
-            tuple(layer.project(map_features) for layer in decoder_layers(self.layers)),
-            tuple(layer.project(light_features) for layer in decoder_layers(self.layers)),
-        )
+        layers = decoder_layers(self.layers)
+        map_tokens, light_tokens = ([layer.project(f) for layer in layers] for f in (map_features, light_features))
+        return AgentContext(tuple(map_tokens), tuple(light_tokens))
 
-    def forward(self, windows: Windows, scene: Scene, around: AgentContext) -> Float[Tensor, "B T N A D"]:
-        """Features of all agents at T decisions of N rollouts, 0 for those without a valid step in their window.
+    def forward(self, windows: Windows, scene: Scene, context: AgentContext) -> Float[Tensor, "B T N A D"]:
+        """Features of all agents at T decisions of N rollouts, 0 for agents without a valid step in the window.
 
         Args:
-            windows: [B, T, N, A, W].
-            scene: poses of map and lights, sizes and classes of agents.
-            around: of `context`, for the same decisions.
+            windows: Windows [B, T, N, A, W] of the agents.
+            scene: Scene with poses of map and lights, sizes and classes of agents.
+            context: Result of `context` for the same T decisions.
         """
         config, mask, pose = self.config, windows.token_mask, windows.token_pose
         num_decisions = mask.shape[1]
         find = partial(find_neighbors, pose, radius_m=config.radius_m, size=config.dim)
-        of_map = find(scene.map_pose, scene.map_mask, count=config.agent_map_neighbors)
+        map_neighbors = find(scene.map_pose, scene.map_mask, count=config.agent_map_neighbors)
         lights = scene.light_pose[:, None].expand(-1, num_decisions, -1, -1)
         light_mask = scene.light_mask[:, None].expand(-1, num_decisions, -1)
-        of_lights = find(lights, light_mask, count=config.agent_light_neighbors)
-        own = find(pose, mask, count=config.agent_neighbors)
+        light_neighbors = find(lights, light_mask, count=config.agent_light_neighbors)
+        agent_neighbors = find(pose, mask, count=config.agent_neighbors)
         x = self.windows(windows, agent_attributes(scene)[:, None, None])
-        for layer, map_tokens, light_tokens in zip(self.layers, around.map_tokens, around.light_tokens):
-            x = layer(x, mask, own, [(map_tokens, of_map), (light_tokens, of_lights)])
+        for layer, map_tokens, light_tokens in zip(self.layers, context.map_tokens, context.light_tokens):
+            x = layer(x, mask, agent_neighbors, [(map_tokens, map_neighbors), (light_tokens, light_neighbors)])
         return x
 
 
 class Conditioning(nn.Module):
-    """Adds what an agent is given, its destination or its personality, to its feature."""
+    """Layers that add an agent's destination or personality to the agent's feature."""
 
     def __init__(self, size: int, dim: int):
         super().__init__()
@@ -307,22 +316,22 @@ class Conditioning(nn.Module):
         self.joint = mlp(2 * dim, dim, dim, dim, end_activation=True)
 
     def forward(
-        self, x: Float[Tensor, "*g D"], given: Float[Tensor, "*#g C"], mask: Bool[Tensor, "*#g"] | None = None
+        self, x: Float[Tensor, "*g D"], condition: Float[Tensor, "*#g C"], mask: Bool[Tensor, "*#g"] | None = None
     ) -> Float[Tensor, "*g D"]:
         """Features after conditioning.
 
         Args:
-            x: features.
-            given: what they are conditioned on.
-            mask: False = nothing is given, the feature passes unchanged; None = True for all.
+            x: Features of the agents.
+            condition: Values that the features are conditioned on, C per agent.
+            mask: False = no condition, the feature passes unchanged; None = True for all agents.
         """
-        hidden = self.given(given).expand_as(x)
-        more = self.joint(torch.cat([x, hidden.to(x.dtype)], -1))
-        return x + (more if mask is None else torch.where(mask[..., None], more, 0.0))
+        hidden = self.given(condition).expand_as(x)
+        change = self.joint(torch.cat([x, hidden.to(x.dtype)], -1))
+        return x + (change if mask is None else torch.where(mask[..., None], change, 0.0))
 
 
 class DestinationPredictor(nn.Module):
-    """Probabilities of the map tokens to be the destination of an agent."""
+    """Predictor of the map token that is an agent's destination."""
 
     def __init__(self, config: TrafficBotsConfig):
         super().__init__()
@@ -342,46 +351,42 @@ class DestinationPredictor(nn.Module):
         All are -inf for an agent that has no destination at all.
 
         Args:
-            windows: history of the agents [B, A, W].
-            scene: its map and agents.
-            map_features: of `MapEncoder`; the predictor does not train them.
-            step_mask: steps to look at; None = all valid ones.
+            windows: History [B, A, W] of the agents.
+            scene: Scene with map and agents.
+            map_features: Features from `MapEncoder`; receive no gradient from the predictor.
+            step_mask: Steps to look at; None = all valid steps.
         """
         agents = self.windows(windows, agent_attributes(scene), step_mask)  # [B, A, D]
         relative = relative_pose(scene.map_pose[:, None], windows.token_pose[:, :, None])  # [B, A, M, 3]
-        # The first layer of [agent, map token, relative pose] in three parts: only the last is one of pairs.
-        first, *rest = self.pairs
+        # The first layer of [agent, map token, relative pose] in three terms: only the last is computed per pair.
+        first, *further_layers = self.pairs
         assert isinstance(first, nn.Linear)
-        of_agent, of_map, of_pose = first.weight.chunk(3, dim=-1)
-        x = functional.linear(pose_embedding(relative, agents.shape[-1]), of_pose, first.bias)
-        x = (
-            x
-            + functional.linear(agents, of_agent)[:, :, None]
-            + functional.linear(map_features.detach(), of_map)[:, None]
-        )
-        for layer in rest:
+        agent_weight, map_weight, pose_weight = first.weight.chunk(3, dim=-1)
+        x = functional.linear(pose_embedding(relative, agents.shape[-1]), pose_weight, first.bias)
+        x = x + functional.linear(agents, agent_weight)[:, :, None]
+        x = x + functional.linear(map_features.detach(), map_weight)[:, None]
+        for layer in further_layers:
             x = layer(x)
-        logits = at_least_float32(x[..., 0]).masked_fill(~admissible(scene), NEVER)
-        none = logits.isneginf().all(-1, keepdim=True)
-        return torch.log_softmax(logits.masked_fill(none, 0.0), -1).masked_fill(none, NEVER)
+        logits = at_least_float32(x[..., 0]).masked_fill(~mask_destinations(scene), NEVER)
+        has_no_token = logits.isneginf().all(-1, keepdim=True)
+        return torch.log_softmax(logits.masked_fill(has_no_token, 0.0), -1).masked_fill(has_no_token, NEVER)
 
 
-def admissible(scene: Scene) -> Bool[Tensor, "B A M"]:
-    """True = a map token that agents of this class may be on their way to."""
-    kind = MapTokenType
-    edges, bikes = (kind.EDGE_BOUNDARY,), (kind.BIKE_LANE,)
-    table = torch.zeros(NUM_CLASSES, len(kind), dtype=torch.bool, device=scene.map_type.device)
-    for row, types in zip(table, ((*VEHICLE_LANES, *edges), edges, (*bikes, *edges))):
+def mask_destinations(scene: Scene) -> Bool[Tensor, "B A M"]:
+    """True = a map token that agents of this class may be heading for."""
+    edge, bike_lane = MapTokenType.EDGE_BOUNDARY, MapTokenType.BIKE_LANE
+    table = torch.zeros(NUM_CLASSES, len(MapTokenType), dtype=torch.bool, device=scene.map_type.device)
+    for row, types in zip(table, ((*VEHICLE_LANES, edge), (edge,), (bike_lane, edge))):
         row[list(types)] = True
-    of_class = table[scene.agent_class]  # [B, A, 11]
-    index = scene.map_type[:, None].expand(-1, of_class.shape[1], -1)
-    return of_class.gather(-1, index) & scene.map_mask[:, None]
+    by_type = table[scene.agent_class]  # [B, A, 11]
+    index = scene.map_type[:, None].expand(-1, by_type.shape[1], -1)
+    return by_type.gather(-1, index) & scene.map_mask[:, None]
 
 
 class ActionHead(nn.Module):
     """Means of the actions before tanh, by a network for each class: vehicles, pedestrians, cyclists.
 
-    Acceleration and yaw rate have a last layer each, so that one can be trained without the other.
+    Acceleration and yaw rate have separate last layers, so that either can be trained alone.
     """
 
     def __init__(self, dim: int):
@@ -394,8 +399,8 @@ class ActionHead(nn.Module):
         """Means of acceleration and yaw rate, in float32 or better.
 
         Args:
-            x: features of agents.
-            agent_class: of each.
+            x: Features of the agents.
+            agent_class: Class of each agent, 0 to 2.
         """
         by_class = []
         for features, acceleration, yaw_rate in zip(self.features, self.acceleration, self.yaw_rate):
@@ -407,7 +412,7 @@ class ActionHead(nn.Module):
 
 
 class Posterior(nn.Module):
-    """Personality of each agent, given its whole log; used in pre-training only."""
+    """Encoder of each agent's personality from the whole log; used in pre-training only."""
 
     def __init__(self, config: TrafficBotsConfig):
         super().__init__()
@@ -426,19 +431,19 @@ class Posterior(nn.Module):
         """Means of a diagonal Gaussian whose log standard deviations are `log_std`.
 
         Args:
-            windows: [B, 1, 1, A, 19], every fifth step of the log.
-            light_state: of the same steps.
-            scene: map, sizes and classes.
-            map_features: of `MapEncoder`; agents train them, lights do not.
+            windows: Windows [B, 1, 1, A, 19] of every fifth step of the log.
+            light_state: States of the lights at the same steps.
+            scene: Scene with map, sizes and classes.
+            map_features: Features from `MapEncoder`; receive gradient from agents, none from lights.
         """
         lights = self.lights(light_state, self.lights.neighborhoods(scene, map_features))
-        around = self.agents.context(map_features, lights)
-        return at_least_float32(self.mean(self.agents(windows, scene, around)[:, 0, 0]))
+        context = self.agents.context(map_features, lights)
+        return at_least_float32(self.mean(self.agents(windows, scene, context)[:, 0, 0]))
 
 
 @dataclass(frozen=True, eq=False)
 class AgentConditioning:
-    """Values that the agents of N rollouts get once."""
+    """Values that are drawn once for the agents of N rollouts."""
 
     personality: Float[Tensor, "B N A 16"]
     destination_feature: Float[Tensor, "B N A D"]
@@ -475,10 +480,10 @@ class TrafficBotsNetwork(nn.Module):
         """Personalities and destinations of agents, as the features are conditioned on them.
 
         Args:
-            scene: its map.
-            map_features: of `MapEncoder`; they are not trained from here.
-            personality: of each agent.
-            destination: map token of each agent, negative = none.
+            scene: Scene with the map.
+            map_features: Features from `MapEncoder`; receive no gradient from here.
+            personality: Personality of each agent, 16 numbers.
+            destination: Map token of each agent, negative = none.
         """
         token = destination.clamp(min=0)
         rows = torch.arange(len(token), device=token.device)[:, None, None]
@@ -487,7 +492,7 @@ class TrafficBotsNetwork(nn.Module):
         return AgentConditioning(personality, projected[rows, token], scene.map_pose[rows, token])
 
     def next_light_logits(self, light_features: Float[Tensor, "*g D"]) -> Float[Tensor, "*g 5"]:
-        """Logits of a light's next state; they do not train the features."""
+        """Logits of a light's next state; the features receive no gradient."""
         logits = at_least_float32(self.light_state(light_features.detach()))
         return logits.clamp(-LIGHT_LOGIT_LIMIT, LIGHT_LOGIT_LIMIT)
 
@@ -495,31 +500,30 @@ class TrafficBotsNetwork(nn.Module):
         self,
         windows: Windows,
         scene: Scene,
-        around: AgentContext,
-        given: AgentConditioning,
+        context: AgentContext,
+        conditioning: AgentConditioning,
         active: Bool[Tensor, "B T N A"],
     ) -> Float[Tensor, "B T N A D"]:
         """Features of agents that `mean_actions` decides by.
 
         Args:
-            windows: [B, T, N, A, 11].
-            scene: map, lights, sizes and classes.
-            around: map and lights at the same decisions.
-            given: personality and destination of each agent.
-            active: True = the agent is still on its way to its destination.
+            windows: Windows [B, T, N, A, 11] of the agents.
+            scene: Scene with map, lights, sizes and classes.
+            context: Map, and lights at the same T decisions.
+            conditioning: Personality and destination of each agent.
+            active: True = the agent has not reached the destination yet.
         """
-        x = self.agents(windows, scene, around)
-        now = windows.pose[..., -1, :]
-        relative = relative_pose(given.destination_pose[:, None], now)  # [B, T, N, A, 3]
+        x = self.agents(windows, scene, context)
+        relative = relative_pose(conditioning.destination_pose[:, None], windows.pose[..., -1, :])  # [B, T, N, A, 3]
         pose = self.destination_pose(pose_embedding(relative, x.shape[-1]))
-        x = self.add_destination(x, given.destination_feature[:, None] + pose, active)
-        return self.add_personality(x, given.personality[:, None])
+        x = self.add_destination(x, conditioning.destination_feature[:, None] + pose, active)
+        return self.add_personality(x, conditioning.personality[:, None])
 
     def mean_actions(self, features: Float[Tensor, "B T N A D"], scene: Scene) -> Float[Tensor, "B T N A 2"]:
         """Means of the actions before tanh, in float32 or better: what an agent does without exploration noise.
 
         Args:
-            features: of `features`.
-            scene: classes of agents.
+            features: Features of the agents, from `features`.
+            scene: Scene with the classes of agents.
         """
         return self.actions(features, scene.agent_class[:, None, None])

@@ -24,14 +24,14 @@ from rlftsim.policies.trafficbots.imitation import imitation_loss
 from rlftsim.policies.trafficbots.model import TrafficBotsModel
 from rlftsim.policies.trafficbots.network import NUM_CLASSES, history_windows
 from rlftsim.policies.trafficbots.scene import build_scene
-from rlftsim.policies.trafficbots.scoring import features_over_time
+from rlftsim.policies.trafficbots.scoring import compute_features
 from rlftsim.policies.trafficbots.state import (
     Memo,
     TrafficBotsContext,
     TrafficBotsState,
-    imposed_after,
-    traffic_at_start,
-    whole_history,
+    compute_imposed_states,
+    join_history,
+    start_traffic,
 )
 from rlftsim.rollout.policy import DecisionDistribution, ImitationLoss
 from rlftsim.rollout.types import AgentStates, Rollouts
@@ -42,8 +42,8 @@ from rlftsim.scenario.types import HISTORY_STEPS
 class TrafficBotsPolicy(TrafficBotsModel):
     """Continuous-action traffic model of all agents of a scenario.
 
-    It holds weights, and no state of a simulation. At temperature 0 it takes the mean action, as in the public code:
-    rollouts then differ by personality and destination alone.
+    The policy holds weights, and no state of a simulation. At temperature 0 agents take the mean action, as in the
+    public code: rollouts then differ by personality and destination alone.
     """
 
     steps_per_decision = 1
@@ -71,10 +71,10 @@ class TrafficBotsPolicy(TrafficBotsModel):
         """The current step, N times, with a personality and a destination for each agent.
 
         Args:
-            context: of `encode`.
-            num_rollouts: N.
-            goals: ignored.
-            noise: uniform in [0, 1).
+            context: Context of the scenarios, from `encode`.
+            num_rollouts: Number N of simulations of each scenario.
+            goals: Goals of agents, ignored: TrafficBots draws destinations.
+            noise: Uniform numbers in [0, 1): 16 for the personality, the last for the destination.
         """
         scene = context.scene
         with torch.no_grad():
@@ -89,27 +89,27 @@ class TrafficBotsPolicy(TrafficBotsModel):
         return self.start(context, torch.cat([personality, index], -1).to(log_prob.dtype))
 
     def start(self, context: TrafficBotsContext, draws: Float[Tensor, "B N A 17"]) -> TrafficBotsState:
-        """The current step, with given personalities and destinations.
+        """The current step, with personalities and destinations that have been drawn.
 
         Args:
-            context: of `encode`.
-            draws: personality (16 numbers) and map token of the destination, -1 = none.
+            context: Context of the scenarios, from `encode`.
+            draws: Personality (16 numbers) and map token of the destination, -1 = none.
         """
         personality, destination = draws[..., :LATENT_SIZE], draws[..., LATENT_SIZE].long()
-        given = self.network.conditioning(context.scene, context.map_features, personality, destination)
-        return TrafficBotsState(traffic_at_start(context.scene, destination), given, draws)
+        conditioning = self.network.conditioning(context.scene, context.map_features, personality, destination)
+        return TrafficBotsState(start_traffic(context.scene, destination), conditioning, draws)
 
     def decide(self, context: TrafficBotsContext, state: TrafficBotsState) -> GaussianDistribution:
         """Distributions [B, N, A] of the next action.
 
         Args:
-            context: of `encode`.
-            state: before the decision. Its memo is filled.
+            context: Context of the scenarios, from `encode`.
+            state: State before the decision; the memo in it is filled.
         """
-        mean, residual, continues = self._mean(context, state), None, state.continues
-        if state.before is not None and state.decision is not None:
-            residual = state.decision - self._mean(context, state.before)
-        return self._distribution(context, mean, residual, continues, state.traffic.alive)
+        mean, residual = self._compute_mean(context, state), None
+        if state.previous is not None and state.decision is not None:
+            residual = state.decision - self._compute_mean(context, state.previous)
+        return self._distribution(context, mean, residual, state.continues, state.traffic.alive)
 
     def advance(
         self,
@@ -121,21 +121,21 @@ class TrafficBotsPolicy(TrafficBotsModel):
         """State after 0.1 s of the chosen actions.
 
         Args:
-            context: of `encode`.
-            state: before the decision.
-            decision: actions before tanh.
-            forced: states imposed from outside, of a single step.
+            context: Context of the scenarios, from `encode`.
+            state: State before the decision.
+            decision: Actions before tanh: acceleration and yaw rate.
+            forced: States of a single step imposed from outside; None = no agent is forced.
         """
-        scene, now = context.scene, state.traffic
-        imposed, continues = None, now.alive
+        scene, traffic = context.scene, state.traffic
+        imposed, continues, windows = None, traffic.alive, traffic.windows
         if forced is not None:
-            last = scene.to_batch_frame(now.windows.pose[..., -1, :]) if state.poses is None else state.poses[..., 0, :]
-            imposed = imposed_after(last, now.windows.motion[..., -1, 0], forced, scene)
+            last = scene.to_batch_frame(windows.pose[..., -1, :]) if state.poses is None else state.poses[..., 0, :]
+            imposed = compute_imposed_states(last, windows.motion[..., -1, 0], forced, scene)
             continues = continues & ~imposed.mask
-        traffic = now.after(decision, scene, imposed)
+        traffic = traffic.advance(decision, scene, imposed)
         poses = scene.to_batch_frame(traffic.windows.pose[..., -1, :])
         if forced is not None:
-            # Exactly where it says, not there and back.
+            # Exactly the imposed poses, not to the ego frame and back.
             pose = torch.cat([forced.position[..., 0, :], forced.heading], -1)
             poses = torch.where(forced.valid, pose, poses)
         return replace(
@@ -143,7 +143,7 @@ class TrafficBotsPolicy(TrafficBotsModel):
             traffic=traffic,
             poses=poses[..., None, :],
             num_decisions=state.num_decisions + 1,
-            before=replace(state, before=None, decision=None),
+            previous=replace(state, previous=None, decision=None),
             decision=decision,
             continues=continues,
             memo=Memo(),
@@ -153,26 +153,26 @@ class TrafficBotsPolicy(TrafficBotsModel):
         """Distributions [B, N, A, T] along rollouts, in parallel over time.
 
         Args:
-            context: of `encode`.
-            rollouts: of the same scenarios.
+            context: Context of the scenarios, from `encode`.
+            rollouts: Rollouts of the same scenarios.
         """
         replay = self._replay(context, rollouts)
-        return self._scored(context, replay, rollouts.decision, self._features(context, replay))
+        return self._score_states(context, replay, rollouts.decision, self._compute_features(context, replay))
 
     def encode_like(self, scenarios: ScenarioBatch, context: Any) -> TrafficBotsContext:
-        """`encode(scenarios)`, with map and lights taken over from a context of a model that sees alike.
+        """`encode(scenarios)`, with map and lights taken over from a model with the same features of both.
 
         Args:
-            scenarios: of the context.
-            context: of any policy, whose weights are still those that made it.
+            scenarios: Scenarios that `context` was encoded from, in the same order.
+            context: Context from any policy whose weights have not been changed since; None = nothing to take over.
         """
-        if not isinstance(context, TrafficBotsContext) or not self.sees_as(context.model):
+        if not isinstance(context, TrafficBotsContext) or not self.shares_scene_features(context.model):
             return self.encode(scenarios)
-        around = self.network.agents.context(context.map_features, context.light_features)
-        record = context.record if self.has_features_of(context.model) else None
-        return replace(context, around=around, model=self, record=record)
+        agent_context = self.network.agents.context(context.map_features, context.light_features)
+        record = context.record if self.shares_agent_features(context.model) else None
+        return replace(context, agent_context=agent_context, model=self, record=record)
 
-    def score_both(
+    def score_with_reference(
         self, context: TrafficBotsContext, rollouts: Rollouts, reference: Any, ref_context: Any, ref_rollouts: Rollouts
     ) -> tuple[GaussianDistribution, DecisionDistribution]:
         """Distributions along rollouts of this policy and, without gradient, of a reference.
@@ -181,22 +181,22 @@ class TrafficBotsPolicy(TrafficBotsModel):
         context has a record of.
 
         Args:
-            context: of this policy.
-            rollouts: of the same scenarios.
-            reference: any policy.
-            ref_context: of the reference.
-            ref_rollouts: the same rollouts, maybe with goals, which are ignored.
+            context: Context of the scenarios under this policy.
+            rollouts: Rollouts of the same scenarios.
+            reference: Policy of any class, scored without gradient.
+            ref_context: Context of the scenarios under the reference.
+            ref_rollouts: The same rollouts, maybe with goals, which TrafficBots ignores.
         """
-        if not self.has_features_of(reference):
+        if not self.shares_agent_features(reference):
             dist = self.score(context, rollouts)
             with torch.no_grad():
                 return dist, reference.score(ref_context, ref_rollouts)
         replay = self._replay(context, rollouts)
         with torch.no_grad():
-            features = None if context.record is None else context.record.along(replay)
-            features = self._features(context, replay) if features is None else features
-            ref_dist = reference._scored(ref_context, replay, rollouts.decision, features)
-        return self._scored(context, replay, rollouts.decision, features), ref_dist
+            features = None if context.record is None else context.record.find_features(replay)
+            features = self._compute_features(context, replay) if features is None else features
+            ref_dist = reference._score_states(ref_context, replay, rollouts.decision, features)
+        return self._score_states(context, replay, rollouts.decision, features), ref_dist
 
     # ---- pre-training -------------------------------------------------------------------------------------------
 
@@ -204,13 +204,13 @@ class TrafficBotsPolicy(TrafficBotsModel):
         """Loss of closed-loop imitation.
 
         Args:
-            scenarios: with their futures.
-            trained: True = the agent counts; the others are context.
-            update: counted from 0; in training mode the fraction of agents that follow the log falls with it.
+            scenarios: Scenarios with logged futures.
+            trained: True = the agent counts; other agents are context.
+            update: Number of the update from 0; in training mode the fraction of agents that follow the log falls.
         """
         return imitation_loss(self.network, self.config, scenarios, trained, update)
 
-    # ---- parts ----------------------------------------------------------------------------------------------------
+    # ---- states, means and distributions -------------------------------------------------------------------------
 
     def _replay(self, context: TrafficBotsContext, rollouts: Rollouts) -> list[TrafficBotsState]:
         """States before each of T decisions, without the network."""
@@ -219,40 +219,42 @@ class TrafficBotsPolicy(TrafficBotsModel):
         with torch.no_grad():
             for index in range(rollouts.decision.shape[3] - 1):
                 forced = rollouts.forced and rollouts.forced.steps(index, index + 1)
-                before = replace(states[-1], before=None)
-                states.append(self.advance(context, before, rollouts.decision[:, :, :, index], forced))
+                state = replace(states[-1], previous=None)
+                states.append(self.advance(context, state, rollouts.decision[:, :, :, index], forced))
         return states
 
-    def _features(self, context: TrafficBotsContext, states: list[TrafficBotsState]) -> Float[Tensor, "B T N A D"]:
+    def _compute_features(
+        self, context: TrafficBotsContext, states: list[TrafficBotsState]
+    ) -> Float[Tensor, "B T N A D"]:
         """Features of agents in each of T states."""
-        return features_over_time(
-            self.network, whole_history([one.traffic for one in states]),
-            torch.stack([one.traffic.active for one in states], 3), context.scene, context.around, states[0].given,
-            steps_per_pass=self.config.steps_per_pass,
+        traffic = [state.traffic for state in states]
+        return compute_features(
+            self.network, join_history(traffic), torch.stack([t.active for t in traffic], 3), context.scene,
+            context.agent_context, states[0].conditioning, steps_per_pass=self.config.steps_per_pass,
         )  # fmt: skip
 
-    def _scored(
+    def _score_states(
         self,
         context: TrafficBotsContext,
         states: list[TrafficBotsState],
         decision: Float[Tensor, "B N A T 2"],
         features: Float[Tensor, "B T N A D"],
     ) -> GaussianDistribution:
-        """Distributions around the means of T decisions, whose noise the means of the decisions before are part of."""
+        """Distributions around the means of T decisions; the noise goes on from the decisions before."""
         mean = self.network.mean_actions(features, context.scene).movedim(1, 3)  # [B, N, A, T, 2]
-        alive = torch.stack([one.traffic.alive for one in states], 3)  # [B, N, A, T]
+        alive = torch.stack([state.traffic.alive for state in states], 3)  # [B, N, A, T]
         residual = torch.cat([torch.zeros_like(mean[:, :, :, :1]), (decision - mean)[:, :, :, :-1]], 3)
-        goes_on = [torch.zeros_like(alive[..., 0]), *(s.continues for s in states if s.continues is not None)]
-        return self._distribution(context, mean, residual, torch.stack(goes_on, 3), alive)
+        continues = [torch.zeros_like(alive[..., 0]), *(s.continues for s in states if s.continues is not None)]
+        return self._distribution(context, mean, residual, torch.stack(continues, 3), alive)
 
-    def _mean(self, context: TrafficBotsContext, state: TrafficBotsState) -> Float[Tensor, "B N A 2"]:
-        """Mean actions in a state, from its memo after the first call."""
-        mean = state.memo.mean
+    def _compute_mean(self, context: TrafficBotsContext, state: TrafficBotsState) -> Float[Tensor, "B N A 2"]:
+        """Mean actions in a state, from the state's memo after the first call."""
+        mean, scene = state.memo.mean, context.scene
         if mean is None:
-            traffic, index = state.traffic, state.num_decisions
-            windows, around = traffic.windows.as_one_decision(), context.around.steps(index, index + 1)
-            features = self.network.features(windows, context.scene, around, state.given, traffic.active[:, None])
-            state.memo.mean = mean = self.network.mean_actions(features, context.scene)[:, 0]
+            windows, active = state.traffic.windows.add_decision_axis(), state.traffic.active[:, None]
+            agent_context = context.agent_context.select_steps(slice(state.num_decisions, state.num_decisions + 1))
+            features = self.network.features(windows, scene, agent_context, state.conditioning, active)
+            state.memo.mean = mean = self.network.mean_actions(features, scene)[:, 0]
             if context.record is not None:
                 context.record.add(state, features)
         return mean

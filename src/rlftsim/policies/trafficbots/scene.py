@@ -13,7 +13,8 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from rlftsim.geometry import rotate, wrap_angle
-from rlftsim.policies.trafficbots.map_tokens import ego_pose, light_tokens, map_pieces
+from rlftsim.policies.trafficbots.map_tokens import ego_pose, tokenize_lights, tokenize_map
+from rlftsim.policies.trafficbots.poses import relative_pose
 from rlftsim.policies.trafficbots.tracks import agent_motions
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import Scenario
@@ -60,7 +61,7 @@ class Scene:
         return self.map_pose.gather(1, self.light_token[..., None].expand(-1, -1, 3))
 
     def to(self, device: torch.device) -> "Scene":
-        """The same scene on another device."""
+        """The same scene on a device."""
         return Scene(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
 
     def to_batch_frame(self, pose: Float[Tensor, "B N A 3"]) -> Float[Tensor, "B N A 3"]:
@@ -71,20 +72,17 @@ class Scene:
 
     def to_ego_frame(self, pose: Float[Tensor, "B N A 3"]) -> Float[Tensor, "B N A 3"]:
         """Poses of the batch's frame in the ego frame."""
-        origin = self.origin[:, None, None]
-        position = rotate(pose[..., :2] - origin[..., :2], -origin[..., 2])
-        return torch.cat([position, (pose[..., 2] - origin[..., 2])[..., None]], -1)
+        return relative_pose(pose, self.origin[:, None, None])
 
 
 def build_scene(batch: ScenarioBatch, num_steps: int, max_map_tokens: int | None) -> Scene:
     """Scene of a batch, on its device.
 
     Args:
-        batch: scenarios with at least `num_steps` logged steps.
-        num_steps: steps of agents and lights to look at: 11 = history, 91 = everything.
-        max_map_tokens: see `map_tokens.map_pieces`.
+        batch: Scenarios with at least `num_steps` logged steps.
+        num_steps: Number S of steps of agents and lights: 11 = history, 91 = the whole log.
+        max_map_tokens: Largest number of map tokens of a scenario; tokens far from the evaluated agents go first.
     """
-    num_agents = batch.agent_mask.shape[1]
     rows = [
         _rows(scenario, num_steps, max_map_tokens, origin)
         for scenario, origin in zip(batch.scenarios, batch.origin.cpu().numpy())
@@ -92,7 +90,7 @@ def build_scene(batch: ScenarioBatch, num_steps: int, max_map_tokens: int | None
     pad = {name: max(1, *(len(row[name]) for row in rows)) for name in ("node_mask", "light_token")}
     counts = {name: pad["node_mask"] for name in ("node_pose", "node_mask", "map_type")}
     counts |= {name: pad["light_token"] for name in ("light_token", "light_mask", "light_state")}
-    counts |= {name: num_agents for name in ("size", "valid", "pose", "motion")}
+    counts |= {name: batch.agent_mask.shape[1] for name in ("size", "valid", "pose", "motion")}
     stacked = {name: _stack([row[name] for row in rows], counts.get(name)) for name in rows[0]}
     scene = Scene(**stacked, agent_mask=batch.agent_mask, agent_class=class_of_type(batch.object_type))
     return scene.to(batch.device)
@@ -109,21 +107,20 @@ def _stack(arrays: Sequence[np.ndarray], count: int | None) -> Tensor:
 def _rows(
     scenario: Scenario, num_steps: int, max_map_tokens: int | None, batch_origin: Float[np.ndarray, "2"]
 ) -> dict[str, np.ndarray]:
-    """One scenario's part of each field that `build_scene` pads, float64."""
-    pieces, lights = map_pieces(scenario, max_map_tokens), light_tokens(scenario, max_map_tokens)
+    """Rows of a scenario in each field that `build_scene` pads, float64."""
+    tokens, lights = tokenize_map(scenario, max_map_tokens), tokenize_lights(scenario, max_map_tokens)
     motions, origin = agent_motions(scenario, num_steps), ego_pose(scenario)
-    heading = np.arctan2(pieces.direction[..., 1], pieces.direction[..., 0])  # [M, 20]
-    state = lights.state[:, :num_steps]
-    nodes = pieces.position[pieces.node_mask]
+    heading = np.arctan2(tokens.direction[..., 1], tokens.direction[..., 0])  # [M, 20]
+    nodes = tokens.position[tokens.node_mask]
     low, high = (nodes.min(0), nodes.max(0)) if len(nodes) else (np.full(3, -np.inf), np.full(3, np.inf))
     return {
-        "node_pose": np.concatenate([pieces.position[..., :2], heading[..., None]], -1),
-        "node_mask": pieces.node_mask,
-        "map_type": pieces.type,
+        "node_pose": np.concatenate([tokens.position[..., :2], heading[..., None]], -1),
+        "node_mask": tokens.node_mask,
+        "map_type": tokens.type,
         "map_box": np.array([low[0], high[0], low[1], high[1]]),
         "light_token": lights.token,
         "light_mask": np.ones(len(lights.token), bool),
-        "light_state": state,
+        "light_state": lights.state[:, :num_steps],
         "size": motions.size,
         "valid": motions.valid,
         "pose": np.concatenate([motions.position[..., :2], motions.heading[..., None]], -1),

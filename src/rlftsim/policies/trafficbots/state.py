@@ -1,4 +1,4 @@
-"""Values that a TrafficBots policy hands around: the context of a scene and the state of running simulations.
+"""Values of a TrafficBots policy: the context of a scene and the state of running simulations.
 
 Shapes: B scenarios, N rollouts, A agents, T decisions, M map tokens, W = 11 steps of a window, D width.
 """
@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from rlftsim.geometry import heading_vector, wrap_angle
 from rlftsim.policies.trafficbots.dynamics import leaves_map, max_action, move, reaches_destination
-from rlftsim.policies.trafficbots.network import AgentConditioning, AgentContext, Windows, history_windows
+from rlftsim.policies.trafficbots.network import AgentConditioning, AgentContext, Windows, history_windows, join_windows
 from rlftsim.policies.trafficbots.scene import Scene
 from rlftsim.rollout.types import AgentStates
 from rlftsim.scenario.types import STEP_S
@@ -20,19 +20,19 @@ from rlftsim.scenario.types import STEP_S
 
 @dataclass(eq=False)
 class Record:
-    """Features of agents along rollouts as they were made, so that scoring need not compute them again."""
+    """Features of agents along the last rollouts, so that scoring need not compute the features again."""
 
     draws: Float[Tensor, "B N A 17"] | None = None
     poses: list[Float[Tensor, "B N A 3"]] = field(default_factory=list)
-    """Before each decision."""
+    """Poses before each decision."""
     features: list[Float[Tensor, "B 1 N A D"]] = field(default_factory=list)
 
     def add(self, state: "TrafficBotsState", features: Float[Tensor, "B 1 N A D"]) -> None:
-        """Add the next decision of the rollouts whose first one was added last; a first one begins anew.
+        """Add the next decision of the recorded rollouts; a first decision begins a new record.
 
         Args:
-            state: before the decision.
-            features: of the agents in it.
+            state: State before the decision; ignored if it belongs to other rollouts.
+            features: Features of the agents in this state.
         """
         if state.num_decisions == 0:
             self.draws, self.poses, self.features = state.draws, [], []
@@ -40,8 +40,8 @@ class Record:
             self.poses.append(state.traffic.windows.pose[..., -1, :].clone())  # a view would keep the window
             self.features.append(features)
 
-    def along(self, states: Sequence["TrafficBotsState"]) -> Float[Tensor, "B T N A D"] | None:
-        """Features at T decisions, if these states are the recorded ones."""
+    def find_features(self, states: Sequence["TrafficBotsState"]) -> Float[Tensor, "B T N A D"] | None:
+        """Features at T decisions; None unless the states are those of the record."""
         if self.draws is None or len(self.poses) != len(states) or not torch.equal(self.draws, states[0].draws):
             return None
         for pose, state in zip(self.poses, states):
@@ -52,136 +52,122 @@ class Record:
 
 @dataclass(frozen=True, eq=False)
 class TrafficBotsContext:
-    """Everything about a scene that agents do not change."""
+    """Values of a scene that agents do not change."""
 
     scene: Scene
     map_features: Float[Tensor, "B M D"]
     light_features: Float[Tensor, "B T L D"]
-    """Of all 80 decisions."""
-    around: AgentContext
+    """Features at all 80 decisions."""
+    agent_context: AgentContext
     """Map, and lights at all decisions."""
     model: nn.Module
-    """The model that made it."""
+    """The model that encoded the scene."""
     record: Record | None = field(default=None, repr=False)
-    """Of the last rollouts, where only the layers behind the agents' features are trained."""
+    """Record of the last rollouts, where only the layers behind the agents' features are trained."""
 
 
 @dataclass(frozen=True, eq=False)
-class Imposed:
-    """States that agents are put into whatever they decided, ego frame."""
+class ImposedStates:
+    """States that agents are put into whatever was decided, ego frame."""
 
     mask: Bool[Tensor, "B N A"]
     pose: Float[Tensor, "B N A 3"]
     motion: Float[Tensor, "B N A 3"]
 
 
-def imposed_after(
+def compute_imposed_states(
     last: Float[Tensor, "B N A 3"], last_speed: Float[Tensor, "B N A"], forced: AgentStates, scene: Scene
-) -> Imposed:
-    """Forced poses, with the motion that leads to them from the last ones.
+) -> ImposedStates:
+    """Forced poses, with the motion from the last poses to the forced ones.
 
     Args:
-        last: poses before, frame of the batch.
-        last_speed: m/s.
-        forced: states 0.1 s later, of a single step, frame of the batch.
-        scene: has the ego frame.
+        last: Poses before the step, frame of the batch.
+        last_speed: Speeds before the step, m/s, negative backwards.
+        forced: States 0.1 s later, of a single step, frame of the batch.
+        scene: Scene that has the ego frame.
     """
     mask = forced.valid[..., 0]
     pose = torch.where(mask[..., None], torch.cat([forced.position[..., 0, :], forced.heading], -1), last)
     # In the frame of the batch: a tenth of a millimeter of rounding would be 0.01 m/s².
-    way = pose[..., :2] - last[..., :2]
-    speed = (way * heading_vector(pose[..., 2])).sum(-1) / STEP_S
+    offset = pose[..., :2] - last[..., :2]
+    speed = (offset * heading_vector(pose[..., 2])).sum(-1) / STEP_S
     yaw_rate = wrap_angle(pose[..., 2] - last[..., 2]) / STEP_S
     motion = torch.stack([speed, (speed - last_speed) / STEP_S, yaw_rate], -1)
-    return Imposed(mask, scene.to_ego_frame(pose), motion)
+    return ImposedStates(mask, scene.to_ego_frame(pose), motion)
 
 
 @dataclass(frozen=True, eq=False)
 class Traffic:
-    """Agents of running simulations: their windows, and what has ended."""
+    """Agents of running simulations."""
 
     windows: Windows
-    """[B, N, A, W]. An agent that has ended goes on in them, marked as not valid."""
+    """[B, N, A, W]. An agent that has ended goes on, marked as not valid."""
     alive: Bool[Tensor, "B N A"]
-    """False = padding, or has left the map: it goes on straight ahead and decides nothing until it is put somewhere."""
+    """False = padding, or an agent that has left the map: goes on straight ahead until put onto the map again."""
     destination: Int64[Tensor, "B N A"]
     active: Bool[Tensor, "B N A"]
     """False = there is no destination, or it has been reached."""
 
-    def after(
+    def advance(
         self,
         action: Float[Tensor, "B N A 2"],
         scene: Scene,
-        imposed: Imposed | None = None,
+        imposed: ImposedStates | None = None,
         staying: Bool[Tensor, "B N A"] | None = None,
     ) -> "Traffic":
         """Agents after 0.1 s.
 
         Args:
-            action: before tanh.
-            scene: map and classes.
-            imposed: agents that are put somewhere.
-            staying: agents that do not end where they leave the map, besides those that are put somewhere.
+            action: Actions before tanh; those of agents that have ended do not count.
+            scene: Scene with map and agent classes.
+            imposed: States of agents that are put somewhere; None = no agent is.
+            staying: True = the agent does not end where it leaves the map; None = only imposed agents stay.
         """
-        now = self.windows
+        windows = self.windows
         action = torch.where(self.alive[..., None], action, 0.0)
-        pose, motion = move(
-            now.pose[..., -1, :], now.motion[..., -1, 0], action, max_action(scene.agent_class)[:, None]
-        )
-        # Both rules look at the pose that the action leads to, also where another one is imposed.
-        # One that has left the map may be put back onto it, and has reached nothing meanwhile.
+        limit = max_action(scene.agent_class)[:, None]
+        pose, motion = move(windows.pose[..., -1, :], windows.motion[..., -1, 0], action, limit)
+        # Both rules look at the pose that the action leads to, also where another pose is imposed.
+        # An agent that has left the map may be put back onto it, and has reached nothing meanwhile.
         reached = self.alive & reaches_destination(pose, self.destination.clamp(min=0), scene)
         ended = leaves_map(pose, scene)
-        for kept in (staying, None if imposed is None else imposed.mask):
-            ended = ended if kept is None else ended & ~kept
+        ended = ended if staying is None else ended & ~staying
         alive = self.alive & ~ended
         if imposed is not None:
-            alive = alive | (imposed.mask & scene.agent_mask[:, None])  # also one that had left the map before
+            alive = alive | (imposed.mask & scene.agent_mask[:, None])  # also an agent that had left the map before
             pose = torch.where(imposed.mask[..., None], imposed.pose, pose)
             motion = torch.where(imposed.mask[..., None], imposed.motion, motion)
-        windows = Windows(
-            torch.cat([now.valid[..., 1:], alive[..., None]], -1),
-            torch.cat([now.pose[..., 1:, :], pose[..., None, :]], -2),
-            torch.cat([now.motion[..., 1:, :], motion[..., None, :]], -2),
-        )
+        step = Windows(alive, pose, motion).apply(lambda v: v[:, :, :, None])
+        windows = join_windows([windows.apply(lambda v: v[:, :, :, 1:]), step])
         return replace(self, windows=windows, alive=alive, active=self.active & ~reached)
 
 
-def traffic_at_start(scene: Scene, destination: Int64[Tensor, "B N A"]) -> Traffic:
+def start_traffic(scene: Scene, destination: Int64[Tensor, "B N A"]) -> Traffic:
     """Agents at the current step, after 10 steps of history.
 
     Args:
-        scene: with its history.
-        destination: map token of each agent; negative = none.
+        scene: Scene with the history of the agents.
+        destination: Map token of each agent's destination; negative = none.
     """
-
-    def repeated(v: Tensor) -> Tensor:
-        return v[:, None].expand(-1, destination.shape[1], *v.shape[1:])
-
-    history = history_windows(scene)
-    windows = Windows(repeated(history.valid), repeated(history.pose), repeated(history.motion))
+    windows = history_windows(scene).apply(lambda v: v[:, None].expand(-1, destination.shape[1], *v.shape[1:]))
     # A destination may have been reached in the history.
     active = destination >= 0
     for step in range(1, windows.valid.shape[-1]):
-        there = reaches_destination(windows.pose[..., step, :], destination.clamp(min=0), scene)
-        active = active & ~(there & windows.valid[..., step - 1] & windows.valid[..., step])
+        is_reached = reaches_destination(windows.pose[..., step, :], destination.clamp(min=0), scene)
+        active = active & ~(is_reached & windows.valid[..., step - 1] & windows.valid[..., step])
     alive = scene.agent_mask[:, None] & windows.valid[..., -1]
     return Traffic(windows, alive, destination, active)
 
 
-def whole_history(traffic: Sequence[Traffic]) -> Windows:
-    """Agents [B, N, A, 10 + T] over all steps of their windows at T decisions in a row."""
-    first, later = traffic[0].windows, [one.windows for one in traffic[1:]]
-    return Windows(
-        torch.cat([first.valid, *(w.valid[..., -1:] for w in later)], 3),
-        torch.cat([first.pose, *(w.pose[..., -1:, :] for w in later)], 3),
-        torch.cat([first.motion, *(w.motion[..., -1:, :] for w in later)], 3),
-    )
+def join_history(traffic: Sequence[Traffic]) -> Windows:
+    """Agents [B, N, A, 10 + T] over all steps of the windows at T decisions in a row."""
+    last_steps = [later.windows.apply(lambda v: v[:, :, :, -1:]) for later in traffic[1:]]
+    return join_windows([traffic[0].windows, *last_steps])
 
 
 @dataclass(eq=False)
 class Memo:
-    """The network's result in a state, so that it is computed once."""
+    """The network's result in a state, computed once."""
 
     mean: Float[Tensor, "B N A 2"] | None = None
 
@@ -191,16 +177,16 @@ class TrafficBotsState:
     """State of N simulations of each scene."""
 
     traffic: Traffic
-    given: AgentConditioning
+    conditioning: AgentConditioning
     draws: Float[Tensor, "B N A 17"]
     """Personality (16 numbers) and index of the destination, -1 where there is none."""
     num_decisions: int = 0
     poses: Float[Tensor, "B N A 1 3"] | None = None
-    """In the frame of the batch."""
-    before: "TrafficBotsState | None" = None
-    """State before the last decision: the noise of a decision depends on that of the one before."""
+    """Poses in the frame of the batch."""
+    previous: "TrafficBotsState | None" = None
+    """State before the last decision: the noise of a decision depends on the noise of the decision before."""
     decision: Float[Tensor, "B N A 2"] | None = None
-    """The last one."""
+    """The last decision."""
     continues: Bool[Tensor, "B N A"] | None = None
-    """True = the agent did what it decided, so that its noise goes on from there."""
+    """True = the agent moved as decided, so that the noise goes on from this decision."""
     memo: Memo = field(default_factory=Memo, repr=False)

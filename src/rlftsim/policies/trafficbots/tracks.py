@@ -1,4 +1,4 @@
-"""Logged agents as TrafficBots sees them: gaps filled, speed with a sign, acceleration and yaw rate by differences.
+"""Logged agents as input of TrafficBots: gaps filled, speed with a sign, acceleration and yaw rate by differences.
 
 Frame: ego, float64. Shapes: A simulated agents, S steps.
 """
@@ -33,31 +33,32 @@ def agent_motions(scenario: Scenario, num_steps: int) -> AgentMotions:
     """Motions of the simulated agents over the first steps of the log; later steps are not looked at.
 
     Args:
-        scenario: with at least this many steps.
-        num_steps: 11 = history, 91 = everything.
+        scenario: Scenario with at least `num_steps` logged steps.
+        num_steps: Number S of steps: 11 = history, 91 = the whole log.
     """
-    tracks, chosen, pose = scenario.tracks, scenario.simulated_indices, ego_pose(scenario)
-    logged = tracks.valid[chosen, :num_steps]  # [A, S]
-    position = to_ego_frame(tracks.position[chosen, :num_steps].astype(np.float64), pose)
-    heading = tracks.heading[chosen, :num_steps].astype(np.float64) - pose[2]
-    velocity = tracks.velocity[chosen, :num_steps].astype(np.float64)
-    along = (velocity * np.stack([np.cos(heading + pose[2]), np.sin(heading + pose[2])], -1)).sum(-1)
-    speed = np.sign(along) * np.linalg.norm(velocity, axis=-1)
+    tracks, indices, pose = scenario.tracks, scenario.simulated_indices, ego_pose(scenario)
+    logged = tracks.valid[indices, :num_steps]  # [A, S]
+    values = (tracks.position, tracks.heading, tracks.velocity, tracks.size)
+    position, heading, velocity, size = (v[indices, :num_steps].astype(np.float64) for v in values)
+    position, heading = to_ego_frame(position, pose), heading - pose[2]
+    forward = (velocity * np.stack([np.cos(heading + pose[2]), np.sin(heading + pose[2])], -1)).sum(-1)
+    speed = np.sign(forward) * np.linalg.norm(velocity, axis=-1)
     states = np.concatenate([position, heading[..., None], speed[..., None]], -1)  # [A, S, 5]
     filled, valid = np.zeros_like(states), np.zeros_like(logged)
     rates = np.zeros((*logged.shape, 2))  # acceleration, yaw rate
     steps = np.arange(num_steps)
-    for agent, own in enumerate(logged):
-        known = np.flatnonzero(own)
-        span = slice(known[0], known[-1] + 1)
-        values = states[agent, known]
+    for agent, is_logged in enumerate(logged):
+        logged_steps = np.flatnonzero(is_logged)
+        start, stop = logged_steps[0], logged_steps[-1] + 1
+        values = states[agent, logged_steps]
         values[:, 3] = np.unwrap(values[:, 3])
-        filled[agent, span] = np.stack([np.interp(steps[span], known, column) for column in values.T], -1)
-        valid[agent, span] = True
-        # Speed and heading differ from one step to the next; nothing is known before the first one.
-        rates[agent, known[0] + 1 : known[-1] + 1] = np.diff(filled[agent, span][:, [4, 3]], axis=0) / STEP_S
+        columns = [np.interp(steps[start:stop], logged_steps, column) for column in values.T]
+        filled[agent, start:stop] = np.stack(columns, -1)
+        valid[agent, start:stop] = True
+        # Speed and heading differ from step to step; the first step has no step before.
+        rates[agent, start + 1 : stop] = np.diff(filled[agent, start:stop][:, [4, 3]], axis=0) / STEP_S
     # Not a product with `logged`: values of steps that are not valid may be NaN.
-    size = np.where(logged[..., None], tracks.size[chosen, :num_steps].astype(np.float64), 0.0)
+    size = np.where(logged[..., None], size, 0.0)
     return AgentMotions(
         position=filled[..., :3],
         heading=filled[..., 3],

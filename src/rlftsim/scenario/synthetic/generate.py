@@ -1,4 +1,4 @@
-"""Make a data set of synthetic scenarios: one street network after another, each in its own process."""
+"""Make a data set of synthetic scenarios: a shard for each street network, several networks at a time."""
 
 import json
 import tempfile
@@ -6,17 +6,17 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import islice
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
 
 from rlftsim.errors import ConfigError, DataError, RlftsimError
-from rlftsim.jobs.documents import read_json
 from rlftsim.jobs.files import remove_temporaries_below, write_text
-from rlftsim.jobs.folder import check_folder
-from rlftsim.jobs.lease import Lease
-from rlftsim.jobs.progress import progress_bar
-from rlftsim.jobs.runner import Advance, Runner, on_this_machine, require_begun, require_finished
+from rlftsim.jobs.folder import Lease, check_folder, find_differences
+from rlftsim.jobs.items import WholeFiles, run_items
+from rlftsim.jobs.processes import Advance
+from rlftsim.jobs.runner import Runner, check_begun, choose_runner
 from rlftsim.scenario.dataset import (
     INCOMPLETE,
     MANIFEST,
@@ -34,8 +34,8 @@ from rlftsim.scenario.types import Scenario
 
 GENERATOR_VERSION = 1
 LICENSE_NOTE = "CC0-1.0: synthetic scenarios, no rights reserved."
-KINDS = ("city", "quiet", "city", "freeway", "city", "city", "quiet", "city")
-"""Kinds of the networks in turn; a freeway gives half as many scenarios as the others."""
+NETWORK_TYPES = ("city", "quiet", "city", "freeway", "city", "city", "quiet", "city")
+"""Types of the networks in turn; a freeway gives half as many scenarios as the others."""
 MAX_ATTEMPTS = 6
 
 
@@ -66,55 +66,57 @@ class SyntheticRequest:
 
 @dataclass(frozen=True)
 class NetworkTask:
-    """One network: split and number of its scenarios, and its seed."""
+    """A network: split and number of the scenarios, and the seed."""
 
     split: str
     index: int
-    kind: str
+    network_type: str
     num_scenarios: int
     seed: tuple[int, ...]
 
     @property
     def shard_name(self) -> str:
-        """File of its scenarios."""
+        """File of the scenarios."""
         return f"{self.split}_{self.index:05d}.arrow"
 
 
 def plan_networks(request: SyntheticRequest) -> list[NetworkTask]:
-    """Networks of all splits; no two splits share one, because the seed of a network contains its split."""
+    """Networks of all splits; no two splits share a network, because the seed of a network contains the split."""
     tasks = []
     for split_number, (split, fraction) in enumerate(request.fractions.items()):
         total = round(request.num_scenarios * fraction)
         count = max(1, round(total / request.scenarios_per_network))
-        kinds = [KINDS[k % len(KINDS)] for k in range(count)]
-        weights = np.array([0.5 if kind == "freeway" else 1.0 for kind in kinds])
+        types = [NETWORK_TYPES[k % len(NETWORK_TYPES)] for k in range(count)]
+        weights = np.array([0.5 if network_type == "freeway" else 1.0 for network_type in types])
         # cumulated and rounded, so that the numbers add up to the total
         bounds = np.rint(np.append(0.0, np.cumsum(weights)) / weights.sum() * total).astype(int)
         tasks += [
-            NetworkTask(split, k, kinds[k], int(bounds[k + 1] - bounds[k]), (request.seed, split_number, k))
+            NetworkTask(split, k, types[k], int(bounds[k + 1] - bounds[k]), (request.seed, split_number, k))
             for k in range(count)
         ]
     return tasks
 
 
 def generate_scenarios(task: NetworkTask) -> Iterator[Scenario]:
-    """Scenarios of a task. If one network does not yield enough, another one is drawn from the next seed.
+    """Scenarios of a task. If a network does not yield enough, a new network is drawn from the next seed.
 
     Raises:
-        RlftsimError: not enough after `MAX_ATTEMPTS` networks.
+        RlftsimError: Not enough after `MAX_ATTEMPTS` networks.
     """
     missing = task.num_scenarios
     for attempt in range(MAX_ATTEMPTS):
         seed = (*task.seed, attempt)
         # SUMO's files are large: they are removed with the network
         with tempfile.TemporaryDirectory(prefix="rlftsim_synthetic_") as name:
-            world = simulate_world(task.kind, seed, Path(name))
+            world = simulate_world(task.network_type, seed, Path(name))
         for scenario in islice(cut_scenarios(world, np.random.default_rng((*seed, 1))), missing):
             missing -= 1
             yield scenario
         if missing == 0:
             return
-    raise RlftsimError(f"{MAX_ATTEMPTS} {task.kind} networks of seed {task.seed} gave {missing} scenarios too few")
+    raise RlftsimError(
+        f"{MAX_ATTEMPTS} {task.network_type} networks of seed {task.seed} gave {missing} scenarios too few"
+    )
 
 
 def generate(
@@ -133,29 +135,29 @@ def generate(
     An interrupted run goes on where it stopped when called again with the same arguments.
 
     Args:
-        destination: folder of the data set; new, empty, or left unfinished by the same call.
-        num_scenarios: in all splits together.
-        seed: source of all networks.
-        jobs: networks made at the same time; does not change the result.
-        runner: does the work in place of such processes, see `rlftsim.jobs.runner`.
-        splits: fraction of the scenarios by split, which share no network; None = 80 % training, 20 % validation.
-        scenarios_per_network: scenarios cut from one city; a freeway gives half as many.
-        show_progress: False draws no progress bar.
+        destination: Folder of the data set; new, empty, or left unfinished by the same call.
+        num_scenarios: Number of scenarios in all splits together.
+        seed: Seed of all networks and of the traffic on them.
+        jobs: Number of networks made at the same time; does not change the result.
+        runner: Runner of the work in place of such processes, see `rlftsim.jobs.runner`.
+        splits: Fraction of the scenarios by split, which share no network; None = 80 % training, 20 % validation.
+        scenarios_per_network: Number of scenarios cut from a city; a freeway gives half as many.
+        show_progress: False prints neither progress nor the time left.
 
     Returns:
-        The manifest written; its `provenance` holds the arguments, the versions and the license.
+        The manifest written, with the arguments, the versions and the license as `provenance`.
 
     Raises:
         ConfigError: SUMO or shapely is not installed, or an argument is out of range.
-        DataError: the folder holds something else, or scenarios of other arguments, or another driver is at work.
+        DataError: The folder holds other contents, or scenarios of other arguments, or another driver is at work.
         Unfinished: `runner` is a share, which is done, while others are not.
     """
     request = SyntheticRequest(num_scenarios, seed, scenarios_per_network, splits)
     folder = Path(destination)
     check_folder(folder, "data set")
     tasks = plan_networks(request)
-    runner = runner or on_this_machine(jobs, len(tasks))
-    require_begun(runner, folder)
+    runner = runner or choose_runner(jobs, len(tasks))
+    check_begun(runner, folder)
     if not sumo.is_available():
         raise ConfigError(sumo.INSTALL_HINT)
 
@@ -166,7 +168,7 @@ def generate(
         "sumo_version": sumo.sumo_version(),
         "arguments": {**asdict(request), "splits": dict(request.fractions)},
         "license": "CC0-1.0",
-        "networks": [{"shard": task.shard_name, "kind": task.kind, "seed": list(task.seed)} for task in tasks],
+        "networks": [{"shard": task.shard_name, "kind": task.network_type, "seed": list(task.seed)} for task in tasks],
     }
     if (folder / MANIFEST).exists() and not (folder / INCOMPLETE).exists():
         manifest = read_manifest(folder)
@@ -175,7 +177,7 @@ def generate(
         return manifest
     marker = folder / INCOMPLETE
     if marker.exists():
-        if read_json(marker, "choose another folder, or delete this one") != provenance:
+        if find_differences(marker, provenance, "choose another folder, or delete this one"):
             raise DataError(f"{folder} was begun with another seed, other arguments or versions: choose another folder")
     else:
         # not what other shares of the same run make in this moment
@@ -184,18 +186,13 @@ def generate(
         write_text(marker, json.dumps(provenance, indent=1))
 
     # 2. Make the shards that are not there yet.
-    paths = [folder / SHARDS / task.shard_name for task in tasks]
-    with Lease(folder / SHARDS / ".lock", runner, "makes scenarios in") as lease:
-        own = runner.own(tasks)
-        todo = [task for task in own if not (folder / SHARDS / task.shard_name).exists()]
-        total, left = (sum(task.num_scenarios for task in some) for some in (own, todo))
-        with progress_bar("synthetic scenarios", total, total - left, show=show_progress) as advance:
-            runner.run(
-                partial(_write_shard, folder=folder), todo, advance=advance, name_of=lambda task: task.shard_name
-            )
-        lease.finish("synthetic scenarios")
-        num_missing = sum(not path.exists() for path in paths)
-        require_finished(runner, num_missing, len(tasks), "synthetic scenarios")
+    shards = folder / SHARDS
+    with Lease(shards / ".lock", runner, "makes scenarios in") as lease:
+        paths = run_items(
+            "synthetic scenarios", tasks, partial(_write_shard, shards), lease=lease, runner=runner,
+            format=WholeFiles(shards, attrgetter("shard_name"), attrgetter("num_scenarios")),
+            show_progress=show_progress,
+        )  # fmt: skip
         remove_temporaries_below(folder)  # of processes that were killed
 
         # 3. Index and manifest.
@@ -206,11 +203,11 @@ def generate(
     return manifest
 
 
-def _write_shard(task: NetworkTask, advance: Advance, is_stopped: Callable[[], bool], *, folder: Path) -> None:
+def _write_shard(folder: Path, task: NetworkTask, advance: Advance, is_stopped: Callable[[], bool]) -> None:
     """Write the scenarios of a task, unless the run is being stopped."""
     if is_stopped():
         return
-    writer = ShardWriter(folder / SHARDS / task.shard_name)
+    writer = ShardWriter(folder / task.shard_name)
     try:
         for scenario in generate_scenarios(task):
             writer.add(scenario, task.split)

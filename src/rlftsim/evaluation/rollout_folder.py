@@ -1,0 +1,156 @@
+"""Folder of rollouts: a file for each scenario, and the description that keeps two models out of it.
+
+An interrupted simulation goes on where it was stopped; files that are damaged or cut off are made again.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from rlftsim.errors import ConfigError, DataError
+from rlftsim.evaluation.rollout_files import find_rollouts, read_states
+from rlftsim.goals.goals_file import GoalsFile
+from rlftsim.goals.placement import goals_of_batch
+from rlftsim.jobs.documents import read_json
+from rlftsim.jobs.files import remove_temporaries_below
+from rlftsim.jobs.folder import Lease, check_folder, write_identity
+from rlftsim.jobs.items import WholeFiles, run_items
+from rlftsim.jobs.processes import Advance
+from rlftsim.jobs.progress import log
+from rlftsim.jobs.runner import Runner
+from rlftsim.rollout.files import write_rollouts
+from rlftsim.rollout.fingerprint import fingerprint_policy
+from rlftsim.rollout.policy import Policy, Sampling, get_device
+from rlftsim.rollout.simulate import simulate
+from rlftsim.scenario.batch import collate
+from rlftsim.scenario.dataset import ScenarioDataset
+
+ABOUT = "rollouts.json"
+"""Model and settings of the rollouts in a folder."""
+
+
+@dataclass(frozen=True, eq=False)
+class Simulation:
+    """Rollouts that are to be made; is handed to other processes."""
+
+    policy: Policy
+    scenarios: ScenarioDataset
+    num_rollouts: int
+    seed: int = 0
+    sampling: Sampling = Sampling()  # noqa: RUF009 (frozen)
+    goals: GoalsFile = GoalsFile(())  # noqa: RUF009 (frozen)
+
+    def describe(self, model: str) -> dict[str, Any]:
+        """Values on which the rollouts depend, as JSON has them, and the name of the model, which may change."""
+        identity = {
+            "model": model,
+            "policy": fingerprint_policy(self.policy),
+            "data": self.scenarios.fingerprint,
+            "seed": self.seed,
+            "num_rollouts": self.num_rollouts,
+            "sampling": asdict(self.sampling),
+        }
+        entries = [[goal.scenario_id, goal.agent_id, goal.x, goal.y] for goal in self.goals.goals]
+        return identity | ({"goals": entries} if entries else {})
+
+
+def simulate_folder(
+    simulation: Simulation, scenario_ids: Sequence[str], out: Path, *, model: str, runner: Runner
+) -> list[Path]:
+    """Simulate the scenarios that have no whole file yet; returns the files of all.
+
+    Args:
+        simulation: Policy, data and settings, which must be those of the rollouts that are in the folder.
+        scenario_ids: Ids of the scenarios, in the order of the work.
+        out: Folder of the files `<scenario id>.npz` and of the description, made if missing.
+        model: Name of the model, for people who read the description.
+        runner: Runner of the work; changes no result.
+
+    Raises:
+        ConfigError: The folder holds rollouts of another model or other settings.
+        DataError: A damaged description, or a folder of another type of result.
+        NotYetError: Another driver is at work in the folder.
+        SetAside, Unfinished: See `run_items`.
+    """
+    identity, rollouts = (
+        simulation.describe(model),
+        _RolloutFiles(out, "{}.npz".format, num_rollouts=simulation.num_rollouts),
+    )
+    check_folder(out, "set of rollouts")
+    _check_identity(out, identity)  # before the folder gets a lock file
+    with Lease(out / ".lock", runner, "works in") as lease:
+        _check_identity(out, identity, is_alone=lease.is_alone)
+        write_identity(out / ABOUT, identity)
+        _check_identity(out, identity, is_alone=lease.is_alone)  # another share may have begun at the same moment
+        task = partial(_simulate_scenario, simulation, out)
+        paths = run_items("simulate", scenario_ids, task, format=rollouts, lease=lease, runner=runner)
+        remove_temporaries_below(out)  # of processes that were killed
+        lease.remove()
+    return paths
+
+
+@dataclass(frozen=True, eq=False)
+class _RolloutFiles(WholeFiles[str]):
+    """Rollouts by scenario id, see `rollout.files`."""
+
+    num_rollouts: int = 1
+
+    def is_finished(self, item: str) -> bool:
+        """True for a file whose arrays have the right checksums, types and shapes; a warning names any other file."""
+        path = self.read(item)
+        if path is None:
+            return False
+        cause = f"it holds other rollouts than {self.num_rollouts} of its scenario"
+        try:
+            states = [read_states(entry) for entry in find_rollouts(path) if entry.scenario_id == item]
+            if [len(rollouts.x) for rollouts in states] == [self.num_rollouts]:
+                return True
+        except DataError as error:
+            cause = str(error).removeprefix(f"{path} ").rstrip(".")
+        log.warning(f"{path} is simulated again: {cause}.")
+        return False
+
+
+def _simulate_scenario(
+    simulation: Simulation, out: Path, scenario_id: str, advance: Advance, is_stopped: Callable[[], bool]
+) -> None:
+    """Write the rollouts of a scenario, unless the work is being stopped."""
+    if is_stopped():
+        return
+    batch = collate([simulation.scenarios.by_id(scenario_id)]).to(get_device(simulation.policy))
+    entries = simulation.goals.of_scenario(scenario_id)
+    rollouts = simulate(
+        simulation.policy, batch, num_rollouts=simulation.num_rollouts, seed=simulation.seed,
+        sampling=simulation.sampling, goals=goals_of_batch(entries, batch) if entries else None,
+    )  # fmt: skip
+    write_rollouts(out, batch, rollouts)
+    advance(1)
+
+
+def _check_identity(folder: Path, identity: Mapping[str, Any], *, is_alone: bool = True) -> None:
+    """Check that a folder holds no rollouts but those of a description.
+
+    Args:
+        folder: Folder of the rollouts; may be missing.
+        identity: Description of the work, by the names of its settings.
+        is_alone: False where other shares may be at work, whose description stands before their first rollouts do.
+
+    Raises:
+        ConfigError: Rollouts of another model or other settings, or a share that makes such.
+        DataError: A damaged description.
+    """
+    path = folder / ABOUT
+    rollouts = sorted(folder.glob("*.npz"))
+    way_out = "name another --out"
+    if rollouts and not path.exists():
+        raise ConfigError(f"{folder} holds {rollouts[0].name} but no {ABOUT}, so their model is unknown: {way_out}.")
+    stored = read_json(path, way_out) if path.exists() else identity
+    names = [name for name in {**identity, **stored} if name != "model"]
+    differences = [name for name in names if stored.get(name) != identity.get(name)]
+    if differences and (rollouts or not is_alone):
+        begun = "holds" if rollouts else "was begun by a share for"
+        raise ConfigError(
+            f"{folder} {begun} rollouts of {stored.get('model')} with another {', '.join(differences)}: {way_out}."
+        )

@@ -1,0 +1,165 @@
+"""Lists of independent items whose results are kept in files: only what an earlier call left undone is done now.
+
+It does not matter where an item is done, nor how often: the same item always writes the same file, whole or not at all.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar, Generic, Literal, TypeVar
+
+from rlftsim.jobs.folder import Lease
+from rlftsim.jobs.processes import Advance, Task
+from rlftsim.jobs.progress import progress_bar
+from rlftsim.jobs.runner import Runner, check_finished
+from rlftsim.jobs.threads import one_thread
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+"""Result of an item, as the work on the item returns it."""
+Stored = TypeVar("Stored")
+"""Contents of a file, as they are read back."""
+
+
+class ResultFormat(ABC, Generic[Item, Stored]):
+    """Files that hold the results of items, one file each."""
+
+    @abstractmethod
+    def read(self, item: Item) -> Stored | None:
+        """Stored result of an item; None for a missing or damaged file, or one of other work."""
+
+    def is_finished(self, item: Item) -> bool:
+        """True if an item need not be done (again)."""
+        return self.read(item) is not None
+
+    def count_units(self, item: Item) -> int:
+        """Units of progress that an item stands for."""
+        return 1
+
+    def describe(self, item: Item) -> str:
+        """Name of an item in messages and in the log of finished items."""
+        return str(item)
+
+
+@dataclass(frozen=True, eq=False)
+class WholeFiles(ResultFormat[Item, Path]):
+    """A file for each item, which is there when it is whole; the file itself is the result."""
+
+    folder: Path
+    name: Callable[[Item], str]
+    """Name of an item's file, also in messages."""
+    units: Callable[[Item], int] | None = None
+    """Units of progress that an item stands for; None = each item for a single unit."""
+
+    def read(self, item: Item) -> Path | None:
+        """The file of an item, see `ResultFormat`."""
+        path = self.folder / self.name(item)
+        return path if path.exists() else None
+
+    def count_units(self, item: Item) -> int:
+        """Value of `units`, see `ResultFormat`."""
+        return self.units(item) if self.units else 1
+
+    def describe(self, item: Item) -> str:
+        """Name of the file, see `ResultFormat`."""
+        return self.name(item)
+
+
+class GroupFormat(ResultFormat[range, Stored], Generic[Stored, Result]):
+    """Files with the results of several scenarios each. Handed to other processes, so a format can be pickled."""
+
+    items_per_file: ClassVar[int] = 1
+    """Scenarios in a file: for each process, what an interruption loses at most."""
+
+    @abstractmethod
+    def write(self, item: range, results: Sequence[Result]) -> None:
+        """Write the file of a group, whole or not at all.
+
+        Args:
+            item: Positions of the scenarios of the group.
+            results: Results of these scenarios, in the same order.
+        """
+
+    def count_units(self, item: range) -> int:
+        """Number of scenarios, see `ResultFormat`."""
+        return len(item)
+
+    def describe(self, item: range) -> str:
+        """First and last position, see `ResultFormat`."""
+        return f"scenarios {item.start} to {item.stop - 1}"
+
+
+def group_positions(num_items: int, items_per_file: int) -> list[range]:
+    """Positions from 0 to a number in groups for a file each, the last of which may be smaller."""
+    positions = range(num_items)
+    return [positions[start : start + items_per_file] for start in range(0, num_items, items_per_file)]
+
+
+def group_task(work: Callable[[int], Result], format: GroupFormat[Any, Result]) -> Task:
+    """Task that does the scenarios of a group one after another and writes the file of the group.
+
+    Args:
+        work: Function from the position of a scenario to the result; must be picklable for other processes.
+        format: Files of the groups.
+    """
+    return partial(_do_group, work, format)
+
+
+def _do_group(
+    work: Callable[[int], Any],
+    format: GroupFormat[Any, Any],
+    group: range,
+    advance: Advance,
+    is_stopped: Callable[[], bool],
+) -> None:
+    results = []
+    for position in group:
+        # another process failed, or Ctrl-C: an unfinished group leaves no file
+        if is_stopped():
+            return
+        results.append(work(position))
+        advance(1)
+    format.write(group, results)
+
+
+def run_items(
+    title: str,
+    items: Sequence[Item],
+    task: Task,
+    *,
+    format: ResultFormat[Item, Stored],
+    lease: Lease,
+    runner: Runner,
+    unit: Literal["things", "bytes"] = "things",
+    show_progress: bool = True,
+) -> list[Stored]:
+    """Results of all items, in their order, once all are done; the lease is then this process's alone.
+
+    Args:
+        title: Name of the work, in front of the progress bar and at the beginning of messages.
+        items: Items over all shares, the finished ones included.
+        task: Work on an item, which writes the file; the returned value is the result, and None reads the file back.
+        format: Files of the results, in a folder that all processes see.
+        lease: Lock on that folder, which the shares of a run hold together.
+        runner: Runner of the items that are left; changes no result.
+        unit: Unit of the numbers beside the progress bar.
+        show_progress: False prints neither progress nor the time left.
+
+    Raises:
+        SetAside: Items that ended their process again and again; all others are done.
+        Unfinished: The runner is a share, which is done, while others are not.
+        NotYetError: Results are missing that other processes should have made, or that vanished meanwhile.
+    """
+    selected = runner.select(range(len(items)))
+    pending = [number for number in selected if not format.is_finished(items[number])]
+    total, num_pending = (sum(format.count_units(items[n]) for n in numbers) for numbers in (selected, pending))
+    with progress_bar(title, total, total - num_pending, unit=unit, show=show_progress) as advance, one_thread():
+        made = runner.run(task, [items[n] for n in pending], advance=advance, describe=format.describe)
+    lease.finish(title)
+    # Read back even what was just written: a resumed and an uninterrupted call go the same way from here.
+    results = {number: result for number, result in zip(pending, made) if result is not None}
+    stored = [results[number] if number in results else format.read(item) for number, item in enumerate(items)]
+    check_finished(runner, sum(result is None for result in stored), len(items), title)
+    return [result for result in stored if result is not None]
