@@ -215,7 +215,7 @@ def catk(job: Job) -> Repeat:
     from torch.nn.functional import cross_entropy
 
     from rlftsim.training.catk import CatkConfig, roll_out_closest  # where older versions have it, too
-    from rlftsim.training.closed_loop import predict_along
+    from rlftsim.training.closed_loop import predict_targets
     from rlftsim.training.freezing import freeze_untrained
 
     policy, scenarios, config = tiny(job).requires_grad_(True).train(), near_scenarios(job), CatkConfig()
@@ -228,7 +228,7 @@ def catk(job: Job) -> Repeat:
         batch = fresh(scenarios, job.device)
         context = policy.encode(batch)
         targeted = roll_out_closest(policy, batch, num_candidates=config.num_candidates, context=context)
-        predicted = predict_along(policy, context, targeted, trained(batch))
+        predicted = predict_targets(policy, context, targeted, trained(batch))
         logits, target = predicted.logits[predicted.target_mask], predicted.target[predicted.target_mask]
         cross_entropy(logits, target, label_smoothing=config.label_smoothing).backward()
         torch.nn.utils.clip_grad_norm_(weights, config.gradient_clip)

@@ -78,7 +78,7 @@ def test_an_interrupted_experiment_does_what_is_missing(done, data, tmp_path, mo
     true_training = training.train_policy
 
     def killed(policy, scenarios, out, config, **rest):
-        if config.reward == "rloo":
+        if getattr(config, "reward", None) == "rloo":
             raise KeyboardInterrupt
         return true_training(policy, scenarios, out, config, **rest)
 

@@ -19,9 +19,9 @@ from rlftsim.training.batches import balance_by_cost, check_scored, micro_batche
 COSTS = st.lists(st.floats(0.1, 100.0), min_size=1, max_size=24)
 
 
-@given(costs=COSTS, num_parts=st.integers(1, 6))
-def test_parts_hold_everything_once_and_cost_about_the_same(costs, num_parts):
-    parts = balance_by_cost(costs, num_parts)
+@given(costs=COSTS, num_groups=st.integers(1, 6))
+def test_parts_hold_everything_once_and_cost_about_the_same(costs, num_groups):
+    parts = balance_by_cost(costs, num_groups)
     assert sorted(i for share in parts for i in share) == list(range(len(costs)))
     spent = [sum(costs[i] for i in share) for share in parts]
     assert max(spent) - min(spent) <= max(costs) + 1e-6  # less than the most expensive scenario

@@ -13,7 +13,7 @@ from rlftsim.errors import ConfigError
 from rlftsim.policies.calibrated.policy import CalibratedPolicy
 from rlftsim.rollout.fingerprint import fingerprint_policy
 from rlftsim.training.calibrate import FEATURES, CalibrateConfig, CalibrationLearner
-from rlftsim.training.constraints import CONSTRAINTS, Constraint, against_others
+from rlftsim.training.constraints import CONSTRAINTS, Constraint, subtract_baseline
 from rlftsim.training.natural_step import best_length, natural_direction, t_value
 from rlftsim.training.run import train_policy
 
@@ -72,7 +72,7 @@ def test_the_credit_of_mloo_against_the_others_estimates_the_gain_of_the_whole_g
         values = VALUES[0, group]
         without = (values.sum() - values) / 2
         mloo = (without.mean() - without)[None, :, None]  # as rewards.mloo
-        gradient += float(p[group].prod() * (against_others(mloo)[0, :, 0] * score[group]).sum())
+        gradient += float(p[group].prod() * (subtract_baseline(mloo)[0, :, 0] * score[group]).sum())
     # without one of N the mean moves by 1 / (N - 1) in place of 1 / N
     assert gradient == pytest.approx(3 / 2 * (expected(1e-4) - expected(-1e-4)) / 2e-4, rel=1e-5)
 

@@ -12,7 +12,7 @@ from torch import nn
 from rlftsim._api.sources import policy_of, require_name
 from rlftsim.errors import ConfigError
 from rlftsim.recipes.base import Recipe
-from rlftsim.recipes.card import model_card, with_cards_of
+from rlftsim.recipes.card import append_cards, model_card
 from rlftsim.recipes.registry import RECIPES, recipe_by_name
 from rlftsim.recipes.train import describe_method, prepare_policy
 from rlftsim.rollout.policy import Policy, get_device
@@ -178,4 +178,4 @@ def _card(what: str, scenarios: Scenarios, start: Policy | Name | None = None) -
     if isinstance(scenarios, ScenarioDataset):
         return model_card(what, scenarios.folder, len(scenarios), name)
     card = f"# Traffic model, {what}\n\n* trained on {len(scenarios)} scenarios handed over in Python\n"
-    return with_cards_of(card, [] if name is None else [name])
+    return append_cards(card, [] if name is None else [name])

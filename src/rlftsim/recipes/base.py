@@ -137,5 +137,5 @@ class Recipe:
 
 def section_names(recipe: Recipe) -> tuple[str, ...]:
     """Names of the sections of a recipe: the known ones in the order of their use, then its own."""
-    present = [one.name for one in fields(recipe) if is_dataclass(getattr(recipe, one.name))]
+    present = [entry.name for entry in fields(recipe) if is_dataclass(getattr(recipe, entry.name))]
     return tuple(sorted(present, key=lambda name: SECTIONS.index(name) if name in SECTIONS else len(SECTIONS)))

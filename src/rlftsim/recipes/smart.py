@@ -95,8 +95,10 @@ class SmartRecipe(Recipe):
                 "each class of this model has a head of its own, whose places other tokens cannot take: leave "
                 "--vocabulary out."
             )
-        own = policy.vocabulary
-        further = self.new_policy(own if vocabulary is None else align_vocabulary(vocabulary, own, keep=keep))
+        base_vocabulary = policy.vocabulary
+        further = self.new_policy(
+            base_vocabulary if vocabulary is None else align_vocabulary(vocabulary, base_vocabulary, keep=keep)
+        )
         load_strictly(further, policy.state_dict(), source="the model to train further")
         return further
 

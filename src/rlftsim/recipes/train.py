@@ -86,8 +86,8 @@ def pretrain_policy(
     Raises:
         CheckpointError: `out` holds a run with other settings.
     """
-    what = "pre-trained" if start is None else f"pre-trained further from {start}"
-    card = model_card(what, training.folder, len(training), start)
+    description = "pre-trained" if start is None else f"pre-trained further from {start}"
+    card = model_card(description, training.folder, len(training), start)
     if isinstance(policy, nn.Module):
         policy.requires_grad_(True)  # weights of a loaded policy are frozen
     return train_policy(policy, training, out, config, held_out=held_out, card=card)
@@ -125,8 +125,8 @@ def finetune_model(
         torch.manual_seed(config.seed)  # of the weights that encode goals; the base model brings the others
         policy = policy.with_goal_conditioning(conditioning.encoding, logit_bias=conditioning.logit_bias)
 
-    what = f"fine-tuned ({describe_method(config)}{conditioning or ''}) from {base}"
-    card = model_card(what, training.folder, len(training), base)
+    description = f"fine-tuned ({describe_method(config)}{conditioning or ''}) from {base}"
+    card = model_card(description, training.folder, len(training), base)
     policy = prepare_policy(policy, config)
     return train_policy(policy, training, out, config, held_out=held_out, card=card)
 
@@ -164,18 +164,18 @@ def start_from_shorter_run(out: Path, epochs: float) -> None:
         epochs: length of the run to begin.
     """
 
-    def epochs_of(path: Path) -> float:
+    def parse_epochs(path: Path) -> float:
         return float(path.name.removesuffix("-epochs"))
 
     finished = [path for path in out.parent.glob("*-epochs") if (path / "model").exists()]
-    shorter = [path for path in finished if epochs_of(path) < epochs]
+    shorter = [path for path in finished if parse_epochs(path) < epochs]
     if out.exists() or not shorter:
         return
     # Copied under another name first: a copy that is interrupted must not look like a run.
-    found, copied = max(shorter, key=epochs_of), out.with_name(f".partial-{out.name}")
-    shutil.rmtree(copied, ignore_errors=True)
-    shutil.copytree(found / "checkpoints", copied / "checkpoints")
+    longest, copy = max(shorter, key=parse_epochs), out.with_name(f".partial-{out.name}")
+    shutil.rmtree(copy, ignore_errors=True)
+    shutil.copytree(longest / "checkpoints", copy / "checkpoints")
     # with its settings, so that one of other settings is refused rather than continued
     for name in ("config.json", "metrics.jsonl"):
-        shutil.copy(found / name, copied / name)
-    copied.rename(out)
+        shutil.copy(longest / name, copy / name)
+    copy.rename(out)

@@ -34,7 +34,7 @@ from rlftsim.rollout.simulate import simulate
 from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import Scenarios
-from rlftsim.training.constraints import CONSTRAINTS, against_others
+from rlftsim.training.constraints import CONSTRAINTS, subtract_baseline
 from rlftsim.training.data import batch_with_futures
 from rlftsim.training.method import Learner, Method, UpdateReport, UpdateScenarios, check_trainable
 from rlftsim.training.natural_step import best_length, natural_direction, t_value
@@ -99,9 +99,9 @@ class CalibrateConfig:
             raise ConfigError(f"held_back is a fraction between 0 and 1, got {self.held_back}.")
         if not self.lengths or min(self.lengths) <= 0:
             raise ConfigError(f"lengths are numbers above 0, at least one, got {self.lengths}.")
-        unknown = [name for name in self.constraints if name not in CONSTRAINTS]
-        if unknown:
-            raise ConfigError(f"no constraint {unknown[0]!r}: there are {', '.join(CONSTRAINTS)}.")
+        unexpected = [name for name in self.constraints if name not in CONSTRAINTS]
+        if unexpected:
+            raise ConfigError(f"no constraint {unexpected[0]!r}: there are {', '.join(CONSTRAINTS)}.")
         metric_by_name(self.metric)
         object.__setattr__(self, "reward", write_reward(parse_reward(self.reward)))
 
@@ -127,9 +127,9 @@ class CalibrateConfig:
         if num_scenarios < 2:
             raise ConfigError("calibration needs at least 2 scenarios: one for the direction and one for its length.")
         key = derive_seed(self.seed, "calibrate") % 2**32
-        chosen = np.random.default_rng(key).permutation(num_scenarios)[: self.num_scenarios].tolist()
-        num_held = min(max(round(self.held_back * len(chosen)), 1), len(chosen) - 1)
-        return chosen[num_held:], chosen[:num_held]
+        selected = np.random.default_rng(key).permutation(num_scenarios)[: self.num_scenarios].tolist()
+        num_held_back = min(max(round(self.held_back * len(selected)), 1), len(selected) - 1)
+        return selected[num_held_back:], selected[:num_held_back]
 
     def tasks(self, num_scenarios: int) -> list[tuple[int | None, list[int]]]:
         """Batches of the run in their order: which length they try (0 = none of it; None = they find the direction),
@@ -138,9 +138,9 @@ class CalibrateConfig:
         Args:
             num_scenarios: In the data set.
         """
-        fitted, held = self.split(num_scenarios)
-        stages: list[tuple[int | None, int]] = [(None, len(fitted))]
-        stages += [(index, len(held)) for index in range(len(self.lengths) + 1)]
+        fitted_ids, held_back_ids = self.split(num_scenarios)
+        stages: list[tuple[int | None, int]] = [(None, len(fitted_ids))]
+        stages += [(index, len(held_back_ids)) for index in range(len(self.lengths) + 1)]
         return [
             (stage, list(range(first, min(first + self.batch_size, count))))
             for stage, count in stages
@@ -199,14 +199,14 @@ class Statistics(nn.Module):
     scores: Tensor
     """[1 + lengths, scenario held back, score]: as in `SCORES` of the learner."""
 
-    def __init__(self, num_fitted: int, num_held: int, config: CalibrateConfig):
+    def __init__(self, num_fitted: int, num_held_back: int, config: CalibrateConfig):
         super().__init__()
         width, num_credits = len(config.features), 1 + len(SUB_SCORES) + len(config.constraints)
         self.register_buffer("gradients", torch.zeros(num_fitted, num_credits, width, dtype=torch.float64))
         self.register_buffer("fisher", torch.zeros(width, width, dtype=torch.float64))
         self.register_buffer("counts", torch.zeros(3, dtype=torch.float64))
-        num_scores = len(MEASURED) + len(CONSTRAINTS) + 2
-        self.register_buffer("scores", torch.zeros(1 + len(config.lengths), num_held, num_scores, dtype=torch.float64))
+        shape = 1 + len(config.lengths), num_held_back, len(MEASURED) + len(CONSTRAINTS) + 2
+        self.register_buffer("scores", torch.zeros(shape, dtype=torch.float64))
 
 
 @dataclass(eq=False, kw_only=True)
@@ -216,9 +216,9 @@ class CalibrationLearner(Learner):
     scenarios: Scenarios
 
     def __post_init__(self) -> None:
-        self.fitted, self.held = self.config.split(len(self.scenarios))
+        self.fitted_ids, self.held_back_ids = self.config.split(len(self.scenarios))
         self.tasks = self.config.tasks(len(self.scenarios))
-        self.statistics = Statistics(len(self.fitted), len(self.held), self.config)
+        self.statistics = Statistics(len(self.fitted_ids), len(self.held_back_ids), self.config)
         self.start = self.policy.eta.detach().clone()
         self.names = (*MEASURED, *CONSTRAINTS, "kl", "num_decisions")
 
@@ -238,15 +238,15 @@ class CalibrationLearner(Learner):
         Args:
             fabric: Processes, each of which measures a part of them.
         """
-        stage, places = self.tasks[self.update]
+        stage, positions = self.tasks[self.update]
         # Row by row and added to zeros, so that no number depends on the processes.
-        own = places[fabric.global_rank :: fabric.world_size]
+        process_positions = positions[fabric.global_rank :: fabric.world_size]
         size = max(self.config.micro_batch_size // num_sharing_memory(fabric), 1)
-        parts = [own[first : first + size] for first in range(0, len(own), size)]
+        batches = [process_positions[first : first + size] for first in range(0, len(process_positions), size)]
         if stage is None:
-            values = self._find_gradients(places, parts, fabric)
+            values = self._find_gradients(positions, batches, fabric)
         else:
-            values = self._try_length(stage, places, parts, fabric)
+            values = self._try_length(stage, positions, batches, fabric)
         self.finish_update(is_good=True)
         return UpdateReport(values, self._note(stage, values))
 
@@ -285,8 +285,8 @@ class CalibrationLearner(Learner):
                 "t": t_value(gradients[:, 0, index]),
                 "rmm": float(step[index] * gradients[:, 0, index].mean()),
                 **{
-                    score: float(step[index] * gradients[:, 1 + place, index].mean())
-                    for place, score in enumerate(SUB_SCORES)
+                    score: float(step[index] * gradients[:, 1 + position, index].mean())
+                    for position, score in enumerate(SUB_SCORES)
                 },
             }
             for index, name in enumerate(self.config.features)
@@ -306,7 +306,7 @@ class CalibrationLearner(Learner):
         return eta, {
             "reward": self.config.reward,
             "constraints": list(self.config.constraints),
-            "num_scenarios": [len(self.fitted), len(self.held)],
+            "num_scenarios": [len(self.fitted_ids), len(self.held_back_ids)],
             "num_rollouts": self.config.num_rollouts,
             "length": length,
             "base": {name: float(np.nanmean(scores[name][0])) for name in self.names[:-2]},
@@ -316,10 +316,10 @@ class CalibrationLearner(Learner):
 
     # ---- what is measured -------------------------------------------------------------------------------------------
 
-    def _find_gradients(self, places: list[int], parts: list[list[int]], fabric: Fabric) -> dict[str, float]:
+    def _find_gradients(self, positions: list[int], batches: list[list[int]], fabric: Fabric) -> dict[str, float]:
         """Gradients and Fisher matrix of some scenarios, into the statistics."""
         statistics, device = self.statistics, fabric.device
-        measured = [(part, *self._measure_credits(part, fabric)) for part in parts]
+        measured = [(batch_positions, *self._measure_credits(batch_positions, fabric)) for batch_positions in batches]
         counts = torch.zeros(3, dtype=torch.float64, device=device)
         for _, batch, _, credits, decisions, _ in measured:
             earned = credits[0][batch.evaluated_mask[:, None].expand_as(credits[0])]
@@ -328,58 +328,65 @@ class CalibrationLearner(Learner):
             )
         statistics.counts += all_reduce_sum(counts, fabric).cpu()
         limit = self.config.clip * math.sqrt(float(statistics.counts[2] / statistics.counts[1].clamp(min=1)))
-        rows = torch.zeros(len(places), *statistics.gradients.shape[1:], dtype=torch.float64, device=device)
+        rows = torch.zeros(len(positions), *statistics.gradients.shape[1:], dtype=torch.float64, device=device)
         fisher = torch.zeros_like(statistics.fisher, device=device)
         rmm = torch.zeros(2, dtype=torch.float64, device=device)
-        for part, _, score, credits, _, realism in measured:
+        for batch_positions, _, score, credits, _, realism in measured:
             credits = torch.cat([credits[:1].clamp(-limit, limit), credits[1:]])  # [credit, B, N, A]
-            found = torch.einsum("cbna,bnak->bck", credits, score)
-            rows[[places.index(place) for place in part]] = found
+            gradients = torch.einsum("cbna,bnak->bck", credits, score)
+            rows[[positions.index(position) for position in batch_positions]] = gradients
             flat = score.flatten(0, 2)
             fisher += flat.T @ flat
             rmm += torch.stack([realism.meta_metric.double().nansum(), realism.meta_metric.isfinite().sum()])
-        statistics.gradients[places] = all_reduce_sum(rows, fabric).cpu()
+        statistics.gradients[positions] = all_reduce_sum(rows, fabric).cpu()
         statistics.fisher += all_reduce_sum(fisher, fabric).cpu()
         total, count = all_reduce_sum(rmm, fabric).tolist()
         return {"rmm": total / max(count, 1.0), "credit_std": limit / self.config.clip}
 
     def _measure_credits(
-        self, part: list[int], fabric: Fabric
+        self, batch_positions: list[int], fabric: Fabric
     ) -> tuple[ScenarioBatch, Tensor, Tensor, Tensor, RealismResult]:
         """Batch, score function [B, N, A, K], credits [credit, B, N, A], decisions [B], realism."""
-        batch = batch_with_futures(self.scenarios, [self.fitted[place] for place in part]).to(fabric.device)
+        batch = self._load(batch_positions, self.fitted_ids, fabric)
         rollouts, recorder = self._simulate(batch, "direction", fabric)
         realism, agents = self._score(batch, rollouts)
         rewards = compute_rewards(parse_reward(self.config.reward), realism, rollouts, batch, agents, credit_mixing=0.0)
         decides = rollouts.decision_mask.any(-1)  # [B, N, A]
-        own = [rewards.by_agent.double(), *(agents.sub_scores[name].double() for name in SUB_SCORES)]
+        shares = [rewards.by_agent.double(), *(agents.sub_scores[name].double() for name in SUB_SCORES)]
         # A leave-one-out reward is centered on all rollouts: on the others it is larger by N / (N - 1).
-        credits = [against_others(values) for values in own]
+        credits = [subtract_baseline(values) for values in shares]
         for name in self.config.constraints:
             constraint = CONSTRAINTS[name]
-            credits.append(constraint.credit(constraint.parts(batch, rollouts, agents).double()))
+            credits.append(constraint.credit(constraint.shares(batch, rollouts, agents).double()))
         stacked = torch.stack([torch.where(decides, values.nan_to_num(), 0.0) for values in credits])
         return batch, recorder.score.double(), stacked, rollouts.decision_mask.flatten(1).sum(1), realism
 
-    def _try_length(self, stage: int, places: list[int], parts: list[list[int]], fabric: Fabric) -> dict[str, float]:
+    def _try_length(
+        self, stage: int, positions: list[int], batches: list[list[int]], fabric: Fabric
+    ) -> dict[str, float]:
         """Scores of some of the scenarios held back with a length of the step, into the statistics."""
         length = (0.0, *self.config.lengths)[stage]
         with torch.no_grad():
             self.policy.eta.copy_(self.start + torch.from_numpy(length * self.direction).to(self.start))
-        rows = torch.zeros(len(places), len(self.names), dtype=torch.float64, device=fabric.device)
-        for part in parts:
-            batch = batch_with_futures(self.scenarios, [self.held[place] for place in part]).to(fabric.device)
+        rows = torch.zeros(len(positions), len(self.names), dtype=torch.float64, device=fabric.device)
+        for batch_positions in batches:
+            batch = self._load(batch_positions, self.held_back_ids, fabric)
             rollouts, recorder = self._simulate(batch, "length", fabric)
             realism, agents = self._score(batch, rollouts)
             values = {name: getattr(realism, "meta_metric" if name == "rmm" else name) for name in MEASURED}
-            values |= {name: one.value(one.parts(batch, rollouts, agents)) for name, one in CONSTRAINTS.items()}
+            values |= {name: rule.value(rule.shares(batch, rollouts, agents)) for name, rule in CONSTRAINTS.items()}
             values |= {"kl": recorder.kl, "num_decisions": rollouts.decision_mask.flatten(1).sum(1)}
-            rows[[places.index(place) for place in part]] = torch.stack([values[n].double() for n in self.names], -1)
+            rows[[positions.index(position) for position in batch_positions]] = torch.stack(
+                [values[n].double() for n in self.names], -1
+            )
         rows = all_reduce_sum(rows, fabric).cpu()
-        self.statistics.scores[stage, places] = rows
+        self.statistics.scores[stage, positions] = rows
         means = dict(zip(self.names, rows.nanmean(0).tolist()))
         kl = means.pop("kl") / max(means.pop("num_decisions"), 1.0)
         return {"length": length, **means, "kl": kl}
+
+    def _load(self, positions: list[int], ids: list[int], fabric: Fabric) -> ScenarioBatch:
+        return batch_with_futures(self.scenarios, [ids[position] for position in positions]).to(fabric.device)
 
     def _simulate(self, batch: ScenarioBatch, purpose: str, fabric: Fabric) -> tuple[Rollouts, "_Recorder"]:
         recorder = _Recorder(needs_score=purpose == "direction")

@@ -27,8 +27,8 @@ from rlftsim.rollout.noise import derive_seed
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import Scenarios
 from rlftsim.training.catk_rollouts import DEFAULT_NUM_CANDIDATES, Choice, Targets, roll_out_closest
-from rlftsim.training.closed_loop import predict_along
-from rlftsim.training.freezing import TrainedParts, freeze_untrained
+from rlftsim.training.closed_loop import predict_targets
+from rlftsim.training.freezing import TrainedModules, freeze_untrained
 from rlftsim.training.goals import GoalConfig, check_goals, choose_goals
 from rlftsim.training.imitation import ImitationConfig, ImitationMethod, Imitator, Prediction
 from rlftsim.training.method import check_trainable
@@ -55,7 +55,7 @@ class CatkConfig(ImitationConfig):
     """Policy that rolls out: the present one, or as it was when the epoch began."""
     max_distance_lengths: float | None = None
     """A decision from farther off the log than so many lengths of its class's box does not count. None = all count."""
-    trained: TrainedParts = "decoder"
+    trained: TrainedModules = "decoder"
     """The parts a policy names for fine-tuning, its last layers, its goal encoder, or everything."""
     goal_probability: float = 0.0
     """Probability of an agent to have its logged endpoint as a goal; for a goal-conditioned policy."""
@@ -118,7 +118,7 @@ class CatkMethod(ImitationMethod[CatkConfig]):
         )  # fmt: skip
         # Autocast keeps weights that it has cast, and those cast in the rollout have no gradient.
         torch.clear_autocast_cache()
-        return predict_along(model, context, targeted, trained)
+        return predict_targets(model, context, targeted, trained)
 
 
 class RoadMethod(CatkMethod):

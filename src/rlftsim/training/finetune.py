@@ -20,7 +20,7 @@ from rlftsim.training.experience import (
     count_decisions,
     describe,
     hold_speed,
-    missing_rate_of,
+    missing_rate_name,
     sample_rollouts,
 )
 from rlftsim.training.finetune_config import FinetuneConfig
@@ -28,8 +28,8 @@ from rlftsim.training.freezing import (
     check_entropy,
     freeze_untrained,
     parameter_groups,
+    select_trained_modules,
     set_learning_rate,
-    trained_parts,
 )
 from rlftsim.training.goals import StoredGoals, check_goals
 from rlftsim.training.hindsight import accumulate_hindsight
@@ -52,7 +52,7 @@ class RewardMethod(Method[FinetuneConfig]):
     def start(self, policy: Any, scenarios: Scenarios, settings: FinetuneConfig, fabric: Fabric) -> RewardLearner:
         """Check the policy, open augmented goals, and `prepare`."""
         check_trainable(policy, scenarios, "rewards", is_imitated=settings.imitation_weight > 0, is_rewarded=True)
-        trained_parts(policy, settings.trained)
+        select_trained_modules(policy, settings.trained)
         check_goals(policy, settings.goals.probability)
         augmented = settings.goals.open_augmented(scenarios)
         if settings.entropy_bonus:
@@ -67,7 +67,7 @@ class RewardMethod(Method[FinetuneConfig]):
         if learner.update == 1 and (values["reward_zero_rate"] == 1 or values["gradient_norm"] == 0):
             alarms.append(f"no reward reached a trained weight (RMM {values['rmm']:.3f})")
         for term in parse_reward(config.reward):
-            rate = values[missing_rate_of(term)]
+            rate = values[missing_rate_name(term)]
             if rate and term.name not in learner.warned_terms:
                 learner.warned_terms.add(term.name)
                 count = round(rate * config.batch_size)
@@ -126,17 +126,18 @@ def update_policy(
     """
     clock = UpdateClock(fabric.device)
     experiences: list[Experience] = []
-    own = local_rollouts(config.batch_size, config.num_rollouts, fabric)
-    for part in batch.split(max(config.micro_batch_size // num_sharing_memory(fabric), 1)):
+    rollout_ids = local_rollouts(config.batch_size, config.num_rollouts, fabric)
+    for micro_batch in batch.split(max(config.micro_batch_size // num_sharing_memory(fabric), 1)):
         # 1. Sample N rollouts of each scenario under this update's goals, without gradient.
         context, rollouts = sample_rollouts(
-            learner.policy, part, config.goals, learner.augmented_goals,
-            num_rollouts=config.num_rollouts, own=own, seed=config.seed, update=learner.update, fabric=fabric,
+            learner.policy, micro_batch, config.goals, learner.augmented_goals,
+            num_rollouts=config.num_rollouts, rollout_ids=rollout_ids,
+            seed=config.seed, update=learner.update, fabric=fabric,
         )  # fmt: skip
         clock.lap("rollout")
         # 2. Measure their realism and the reward that each rollout, or each agent in it, earns.
-        realism, rewards = compute_reward(part, rollouts, config)
-        experiences.append(Experience(part, rollouts, realism, rewards, context, own))
+        realism, rewards = compute_reward(micro_batch, rollouts, config)
+        experiences.append(Experience(micro_batch, rollouts, realism, rewards, context, rollout_ids))
         clock.lap("reward")
     speed = {}
     if config.hold_speed:  # over the whole batch, so not by part

@@ -25,7 +25,7 @@ from rlftsim.rollout.types import Rollouts
 from rlftsim.scenario.batch import ScenarioBatch
 from rlftsim.scenario.types import Scenarios
 from rlftsim.tokens.vocabulary import class_of_type
-from rlftsim.training.closed_loop import TargetedRollouts, predict_along
+from rlftsim.training.closed_loop import TargetedRollouts, predict_targets
 from rlftsim.training.freezing import freeze_untrained
 from rlftsim.training.goals import not_conditioned
 from rlftsim.training.imitation import ImitationConfig, ImitationMethod, Imitator, Prediction
@@ -92,7 +92,7 @@ class GcslMethod(ImitationMethod[GcslConfig]):
         class_id = class_of_type(batch.object_type)
         # The targets are the decisions themselves, which were sampled without goals.
         targeted = TargetedRollouts(relabelled, rollouts.decision, rollouts.decision_mask, class_id)
-        return predict_along(model, context, targeted, trained)
+        return predict_targets(model, context, targeted, trained)
 
 
 def relabel_with_endpoints(rollouts: Rollouts) -> Rollouts:

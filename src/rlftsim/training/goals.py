@@ -110,9 +110,9 @@ def choose_goals(batch: ScenarioBatch, config: GoalConfig, augmented: StoredGoal
     u = draw_noise(batch, range(1), seed=seed, purpose="goals", per_agent=2)  # [B, 1, A, 2], uniform
     goals = logged_goals(batch)
     if augmented is not None:
-        others = augmented.of_batch(batch)
+        augmented_goals = augmented.of_batch(batch)
         # One draw for a whole scenario, that of its first agent: endpoints of the log and of a rollout do not mix.
-        use_others = others.goal_mask.any(-1, keepdim=True) & (u[:, :, :1, 1] < config.augmented_probability)
-        goals = others.where(use_others.expand_as(goals.goal_mask), goals)
+        is_augmented = augmented_goals.goal_mask.any(-1, keepdim=True) & (u[:, :, :1, 1] < config.augmented_probability)
+        goals = augmented_goals.where(is_augmented.expand_as(goals.goal_mask), goals)
     # Noise in [0, 1): with probability 1 every agent that has a logged endpoint gets it as its goal.
     return goals.only(u[..., 0] < config.probability)

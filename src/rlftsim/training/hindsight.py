@@ -111,16 +111,16 @@ def accumulate_hindsight(
     # The gradient is divided by the mean ratio of the whole batch, which is known in the end only: so it is gathered
     # apart from the gradient of the first pass, and added to it when it has its scale.
     parameters = [p for p in policy.parameters() if p.requires_grad]
-    before = [p.grad for p in parameters]
+    first_gradients = [p.grad for p in parameters]
     for parameter in parameters:
         parameter.grad = None
     sums = torch.zeros(2, device=fabric.device, dtype=torch.float64)  # ratios, agents
     relabelled = relabel_with_hindsight(experiences, reward)
-    for part, old_log_probs in zip(relabelled, first_pass.agent_log_prob):
-        for (rollouts, earned), old in zip(part.slices(rollouts_per_pass), old_log_probs):
+    for experience, old_log_probs in zip(relabelled, first_pass.agent_log_prob):
+        for (rollouts, earned), old in zip(experience.slices(rollouts_per_pass), old_log_probs):
             mask, decides = rollouts.decision_mask, rollouts.decision_mask.any(-1)  # [B, n, A, L], [B, n, A]
             with fabric.autocast():
-                dist = policy.score(encode_like(policy, part.batch, part.context), rollouts)
+                dist = policy.score(encode_like(policy, experience.batch, experience.context), rollouts)
             log_prob = dist.log_prob(rollouts.decision)  # [B, n, A, L]
             ratio = importance_ratio(agent_log_prob(log_prob, mask, "sum"), old)  # [B, n, A]
             by_agent = agent_log_prob(log_prob, mask, terms.config.log_prob_reduction)
@@ -129,7 +129,7 @@ def accumulate_hindsight(
             sums += torch.stack([ratio[decides].sum(), decides.sum()])
     total, count = all_reduce_sum(sums, fabric).tolist()
     mean = total / max(count, 1.0)
-    for parameter, gradient in zip(parameters, before):
+    for parameter, gradient in zip(parameters, first_gradients):
         if parameter.grad is not None:
             parameter.grad *= weight / max(mean, 1e-6)
         if gradient is not None:

@@ -33,11 +33,11 @@ def natural_direction(
     metric = fisher[np.ix_(is_used, is_used)]
     metric = metric + RIDGE * np.diag(np.diag(metric))
     free = np.linalg.solve(metric, gradient[is_used]) if is_used.any() else step[is_used]
-    held = fixed[:, is_used]
-    if held.any():
+    constrained = fixed[:, is_used]
+    if constrained.any():
         # in the metric of the KL, so that the step changes as little as it has to
-        across = np.linalg.solve(metric, held.T)  # [K, C]
-        free = free - across @ np.linalg.lstsq(held @ across, held @ free, rcond=1e-10)[0]
+        across = np.linalg.solve(metric, constrained.T)  # [K, C]
+        free = free - across @ np.linalg.lstsq(constrained @ across, constrained @ free, rcond=1e-10)[0]
     square = free @ metric @ free
     # what projection leaves of a gradient that lies along the constraints is rounding
     if square > 1e-20 * max(gradient @ gradient, 1e-300):

@@ -189,9 +189,9 @@ def local_indices(
         ConfigError: the processes cannot divide the scenarios, nor their rollouts, evenly.
     """
     sharing = _num_sharing_scenario(len(items), num_rollouts, fabric)
-    parts = balance_by_cost([1.0] * len(items) if costs is None else costs, fabric.world_size // sharing)
+    groups = balance_by_cost([1.0] * len(items) if costs is None else costs, fabric.world_size // sharing)
     # The first part has the most expensive scenario, and rank 0 has more to do than others: it adds, logs and writes.
-    return [items[place] for place in parts[-1 - fabric.global_rank // sharing]]
+    return [items[index] for index in groups[-1 - fabric.global_rank // sharing]]
 
 
 def local_rollouts(num_items: int, num_rollouts: int, fabric: Fabric) -> range:
@@ -216,10 +216,10 @@ def _num_sharing_scenario(num_items: int, num_rollouts: int, fabric: Fabric) -> 
         return 1
     possible = [num_items * count for count in range(2, num_rollouts + 1) if num_rollouts % count == 0]
     if fabric.world_size not in possible:
-        more = f", or to {' or '.join(map(str, possible))}, which divide the rollouts of a scenario" if possible else ""
+        hint = f", or to {' or '.join(map(str, possible))}, which divide the rollouts of a scenario" if possible else ""
         raise ConfigError(
             f"a batch of {num_items} scenarios cannot be spread over {fabric.world_size} processes: raise batch_size, "
-            f"or set device.processes to {num_items} at most{more}."
+            f"or set device.processes to {num_items} at most{hint}."
         )
     return fabric.world_size // num_items
 
@@ -252,13 +252,13 @@ def all_gather(tensors: Mapping[str, Tensor], fabric: Fabric) -> list[dict[str, 
     """
     file = io.BytesIO()
     torch.save({name: tensor.contiguous() for name, tensor in tensors.items()}, file)
-    own = torch.frombuffer(file.getbuffer(), dtype=torch.uint8).to(fabric.device)
+    message = torch.frombuffer(file.getbuffer(), dtype=torch.uint8).to(fabric.device)
     sizes = torch.zeros(fabric.world_size, dtype=torch.int64, device=fabric.device)
-    sizes[fabric.global_rank] = len(own)
+    sizes[fabric.global_rank] = len(message)
     sizes = all_reduce_sum(sizes, fabric)
     # A sum is all that every kind of `Fabric` has: each process has a row of its own, and the others add zeros to it.
     rows = torch.zeros(fabric.world_size, int(sizes.max()), dtype=torch.uint8, device=fabric.device)
-    rows[fabric.global_rank, : len(own)] = own
+    rows[fabric.global_rank, : len(message)] = message
     rows = all_reduce_sum(rows, fabric).cpu().numpy()
     files = (io.BytesIO(row[:size].tobytes()) for row, size in zip(rows, sizes.tolist()))
     return [torch.load(file, map_location=fabric.device, weights_only=True) for file in files]
@@ -284,5 +284,5 @@ def all_reduce_gradients(parameters: Iterable[nn.Parameter], fabric: Fabric) -> 
     if not gradients:
         return
     total = all_reduce_sum(torch.cat([g.flatten() for g in gradients]), fabric)
-    for gradient, part in zip(gradients, total.split([g.numel() for g in gradients])):
-        gradient.copy_(part.view_as(gradient))
+    for gradient, flat in zip(gradients, total.split([g.numel() for g in gradients])):
+        gradient.copy_(flat.view_as(gradient))

@@ -141,15 +141,15 @@ def accumulate_gradients(
                 # Encoded anew for every slice: each slice's graph is freed by its own backward pass.
                 context = encode_like(policy, experience.batch, experience.context)
                 dist, ref_dist = score_with_reference(policy, context, rollouts, reference, ref_context, ref_rollouts)
-            found = compute_statistics(dist, rollouts.decision, ref_dist)  # [B, n, A, L] each
-            kl, entropy = masked_sum(found.kl, mask), masked_sum(found.entropy, mask)
-            by_agent = agent_log_prob(found.log_prob, mask, terms.config.log_prob_reduction)  # [B, n, A]
+            statistics = compute_statistics(dist, rollouts.decision, ref_dist)  # [B, n, A, L] each
+            kl, entropy = masked_sum(statistics.kl, mask), masked_sum(statistics.entropy, mask)
+            by_agent = agent_log_prob(statistics.log_prob, mask, terms.config.log_prob_reduction)  # [B, n, A]
             loss = policy_gradient_loss(reward, by_agent, terms.num_scenarios)
             loss = loss + (terms.beta * kl - terms.config.entropy_bonus * entropy) / num_decisions
             # Every slice adds its part; nothing is divided by the number of slices.
             fabric.backward(loss)
             sums += torch.stack([kl.detach(), entropy.detach()])
-            log_prob = found.log_prob.detach()
+            log_prob = statistics.log_prob.detach()
             gaps.append(torch.where(mask, log_prob - rollouts.log_prob, 0.0).abs().max())
             by_experience[-1].append(agent_log_prob(log_prob, mask, "sum"))
     kl_sum, entropy_sum = all_reduce_sum(sums, fabric).tolist()

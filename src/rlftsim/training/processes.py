@@ -56,25 +56,25 @@ def linked_processes(work: Callable[[Fabric], object], config: DeviceConfig) -> 
         )
     context = multiprocessing.get_context("fork")
     links: list[Connection] = []
-    helpers: list[BaseProcess] = []
+    workers: list[BaseProcess] = []
     try:
         with ctrl_c_blocked():
             for rank in range(1, processes):
-                link, theirs = Pipe()
+                link, remote_link = Pipe()
                 links.append(link)
-                process = LinkedProcess(fabric, rank, processes, [theirs])
-                helpers.append(context.Process(target=_help, args=(work, process, links), daemon=True))
+                process = LinkedProcess(fabric, rank, processes, [remote_link])
+                workers.append(context.Process(target=_help, args=(work, process, links), daemon=True))
                 with warnings.catch_warnings():
                     # Of forking beside threads, from Python 3.12 on. A helper uses none of the parent's.
                     warnings.simplefilter("ignore", DeprecationWarning)
-                    helpers[-1].start()
+                    workers[-1].start()
                 # Only the helper holds it from here on: its end is the end of the pipe.
-                theirs.close()
+                remote_link.close()
         yield LinkedProcess(fabric, 0, processes, links)
     finally:
-        for helper in helpers:
-            helper.kill()  # they write no files, so none is left half-written
-            helper.join()
+        for worker in workers:
+            worker.kill()  # they write no files, so none is left half-written
+            worker.join()
 
 
 def _help(work: Callable[[Fabric], object], process: "LinkedProcess", inherited: Sequence[Connection]) -> None:

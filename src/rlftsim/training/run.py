@@ -21,7 +21,7 @@ from rlftsim.jobs.interruption import ctrl_c_waits
 from rlftsim.jobs.progress import log, progress_bar
 from rlftsim.jobs.runner import Inline
 from rlftsim.scenario.types import Scenario, Scenarios
-from rlftsim.training.checkpoint import Progress, newest_checkpoint, read_checkpoint, update_of, write_checkpoint
+from rlftsim.training.checkpoint import Progress, newest_checkpoint, parse_update, read_checkpoint, write_checkpoint
 from rlftsim.training.data import share_cache
 from rlftsim.training.method import Learner, Method, TrainingSettings, UpdateReport, UpdateScenarios, find_method
 from rlftsim.training.parallel import Fabric, all_reduce_sum, num_sharing_memory
@@ -195,10 +195,10 @@ class TrainingRun:
             CheckpointError: The checkpoint is damaged, or a longer run was begun in the folder.
         """
         learner, newest = self._learner, newest_checkpoint(self.folder.checkpoints)
-        if newest and update_of(newest) > self.num_updates:
+        if newest and parse_update(newest) > self.num_updates:
             shorter = f" The model of the shorter one is {self.folder.model}." if self.folder.has_model else ""
             raise CheckpointError(
-                f"{self.folder.path}: a longer run was stopped here behind update {update_of(newest)}, this one has "
+                f"{self.folder.path}: a longer run was stopped here behind update {parse_update(newest)}, this one has "
                 f"{self.num_updates} updates: raise epochs again to go on with it, or name another --out.{shorter}"
             )
         if newest:
@@ -234,7 +234,7 @@ class TrainingRun:
         except KeyboardInterrupt as stop:
             newest = newest_checkpoint(self.folder.checkpoints)
             # The command line says what the same command does next.
-            stop.args = (f"continues behind update {update_of(newest)}" if newest else "starts anew",)
+            stop.args = (f"continues behind update {parse_update(newest)}" if newest else "starts anew",)
             raise
 
     def finish_update(self, report: UpdateReport, *, is_last: bool) -> None:

@@ -118,11 +118,11 @@ def validate(model: nn.Module, scenarios: Scenarios, config: ValidationConfig, f
     # A copy, so that neither the mode nor a cache of the model in training changes.
     frozen: Any = copy.deepcopy(model).eval().requires_grad_(False)
     # Dealt out in turn: the same scenarios in total for any number of processes.
-    own = config.choose(len(scenarios))[fabric.global_rank :: fabric.world_size]
+    selected = config.choose(len(scenarios))[fabric.global_rank :: fabric.world_size]
     sums = torch.zeros(3, len(WATCHED), dtype=torch.float64, device=fabric.device)  # count, sum, sum of squares
     map_use = MapUse.zero(fabric.device) if predicts_tokens(frozen) else None
-    for first in range(0, len(own), config.scenarios_per_pass):
-        batch = batch_with_futures(scenarios, own[first : first + config.scenarios_per_pass]).to(fabric.device)
+    for first in range(0, len(selected), config.scenarios_per_pass):
+        batch = batch_with_futures(scenarios, selected[first : first + config.scenarios_per_pass]).to(fabric.device)
         with fabric.autocast():
             rollouts = simulate(
                 frozen, batch, num_rollouts=config.num_rollouts, seed=config.seed, sampling=Sampling(top_k=config.top_k)
