@@ -88,7 +88,7 @@ class Recipe:
         """The policy that `rlftsim pretrain --init-from` trains: an existing one, with this recipe's `free_fields`.
 
         Args:
-            policy: the existing one.
+            policy: Existing policy, whose weights training starts from.
             vocabulary: tokens in place of its own; None = it keeps them.
             keep: classes whose tokens stay its own all the same, see `align_vocabulary`.
 

@@ -15,7 +15,7 @@ def model_card(training: str, data: Path, num_scenarios: int, start: str | os.Pa
     """Markdown card of a model trained on a data set.
 
     Args:
-        what: how the model was trained, e.g. "pre-trained".
+        training: Words for the kind of training, such as "pre-trained".
         data: folder of the data set; its license note is passed on.
         num_scenarios: number of training scenarios.
         start: model that training started from; its card is passed on, too.
@@ -37,7 +37,7 @@ def append_cards(card: str, models: Iterable[str | os.PathLike]) -> str:
     """A card followed by those of the models that a model was made from: the terms of their data hold for it, too.
 
     Args:
-        card: of the new model.
+        card: Text of the new model's card, in Markdown.
         models: shipped models, model folders or runs.
     """
     cards = {str(model): read_card(model) for model in models}

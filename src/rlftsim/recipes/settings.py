@@ -122,7 +122,7 @@ def flag_words(name: str, value: Any, *, is_switch: bool) -> list[str]:
 
     Args:
         name: dotted name, e.g. "finetune.kl.target".
-        value: as JSON has it: a number, a text, true, false, null or a list.
+        value: Value in JSON: a number, a text, true, false, null or a list.
         is_switch: True = written `--name` or `--no-name`, without a value.
     """
     group, dot, last = name.replace("_", "-").rpartition(".")

@@ -81,7 +81,7 @@ class SmartRecipe(Recipe):
         """A policy with the sizes of this recipe and the weights of an existing one.
 
         Args:
-            policy: the existing one.
+            policy: Existing SMART policy, whose weights training starts from.
             vocabulary: tokens in place of its own, see `align_vocabulary`; None = it keeps them.
             keep: classes whose tokens stay its own all the same.
 

@@ -72,9 +72,9 @@ class TrafficBotsRecipe(Recipe):
         """A policy with the sizes of this recipe and the weights of an existing one.
 
         Args:
-            policy: the existing one.
-            vocabulary: refused.
-            keep: not used.
+            policy: Existing TrafficBots policy, whose weights training starts from.
+            vocabulary: None, since the model has no tokens; anything else is refused.
+            keep: Classes whose tokens would stay; without effect here.
 
         Raises:
             CheckpointError: the weights are of other sizes.

@@ -53,8 +53,8 @@ def find_vocabulary(training: ScenarioDataset, config: TokensConfig, path: Path,
     """The vocabulary in a file; built from the training scenarios where the file is missing or of another origin.
 
     Args:
-        training: scenarios to build it from.
-        config: settings of the clustering.
+        training: Training scenarios, whose motions are clustered.
+        config: Settings of the clustering, such as the number of tokens.
         path: file to read, or to write.
         origin: text that says what it was built from; stored with it.
     """
@@ -77,8 +77,8 @@ def pretrain_policy(
 
     Args:
         policy: such as `recipe.new_policy(vocabulary)`; trained in place.
-        training: training scenarios.
-        config: settings.
+        training: Training scenarios of one data set, with their futures.
+        config: Settings of pre-training; a stored run resumes only with equal ones.
         out: folder of the run. A run that was stopped there is resumed, a finished one is not repeated.
         start: name of the model whose weights the policy has, for the card; None = they are fresh.
         held_out: scenarios for validation, see `config.validation`.
@@ -106,7 +106,7 @@ def finetune_model(
 
     Args:
         base: model folder, or the folder of a run.
-        training: training scenarios.
+        training: Training scenarios of one data set, with their futures.
         config: settings: `FinetuneConfig` for a reward, `CatkConfig` for CAT-K, `GcslConfig` for imitation of the
             model's own rollouts, relabelled with their endpoints as goals.
         out: folder of the run. A run that was stopped there is resumed, a finished one is not repeated; with a reward

@@ -94,7 +94,7 @@ class Running:
         """The means with one more update.
 
         Args:
-            value: of the statistic in that update.
+            value: Value of the statistic in that update; not counted where not finite.
             config: number of first updates and window.
         """
         if not math.isfinite(value):
@@ -118,7 +118,7 @@ class Alarms:
 
         Args:
             logged: metrics of the update, by name.
-            config: the thresholds.
+            config: Thresholds of the alarms, and the lengths of both means in updates.
 
         Returns:
             The level of every alarm, and messages of those that are raised by this update.

@@ -45,7 +45,7 @@ def check_scored(scenarios: Scenarios) -> None:
     """Check before a run begins that the metric, and so a reward, is defined for each scenario.
 
     Args:
-        scenarios: to be rewarded in.
+        scenarios: Training scenarios that a method scores rollouts of.
 
     Raises:
         DataError: some have no logged future or no evaluated agent; the first is named.
@@ -67,8 +67,8 @@ def balance_by_cost(costs: Sequence[float] | Float[np.ndarray, "n"], num_groups:
     The most expensive place goes first, each to the part that is cheapest so far; equal costs are dealt out in turn.
 
     Args:
-        costs: of each place.
-        num_parts: some stay empty if there are fewer places.
+        costs: Cost of each item, in any unit.
+        num_groups: Number of groups; some stay empty where items are fewer.
     """
     groups: list[list[int]] = [[] for _ in range(num_groups)]
     spent = np.zeros(num_groups)
@@ -86,10 +86,10 @@ def micro_batches(
     """Scenarios cut into pieces of similar size, the most expensive first, so that running out of memory shows at once.
 
     Args:
-        items: scenario indices.
-        costs: of all scenarios.
-        max_count: scenarios of a piece at most.
-        max_cost: of a piece's scenarios together, at most; one that costs more is a piece of its own. None = no limit.
+        items: Indices of the scenarios in the data set.
+        costs: Costs [n] of all scenarios of the data set, thousands of map points.
+        max_count: Scenarios of a batch at most.
+        max_cost: Summed cost of a batch at most; a scenario that costs more is a batch by itself. None = no limit.
     """
     budget = np.inf if max_cost is None else max_cost
     batches: list[list[int]] = []

@@ -119,7 +119,7 @@ class CalibrateConfig:
         """Scenarios for the direction, and those held back for its length.
 
         Args:
-            num_scenarios: In the data set.
+            num_scenarios: Number of scenarios in the data set, at least 2.
 
         Raises:
             ConfigError: Fewer than two.
@@ -136,7 +136,7 @@ class CalibrateConfig:
         and positions in the list of those scenarios.
 
         Args:
-            num_scenarios: In the data set.
+            num_scenarios: Number of scenarios in the data set, at least 2.
         """
         fitted_ids, held_back_ids = self.split(num_scenarios)
         stages: list[tuple[int | None, int]] = [(None, len(fitted_ids))]

@@ -61,14 +61,14 @@ def roll_out_closest(
     Args:
         policy: decides for every agent.
         batch: scenarios with their future.
-        num_candidates: K.
+        num_candidates: Number K of candidate tokens of each decision, at least 1.
         choice: see `Choice`.
         targets: see `Targets`.
         max_distance_lengths: see `CatkConfig`.
-        num_rollouts: N.
-        seed: of what else is random in the policy, and of samples.
+        num_rollouts: Number N of rollouts of each scenario.
+        seed: Seed of the samples and of what else is random in the policy.
         context: `policy.encode(batch)`, if it has been computed.
-        goals: of the agents, see `simulate`.
+        goals: Goals of the agents, as `simulate` takes them; None = goal-free.
         catk_compat: round where the public code rounds, see `tokens.catk_compat`.
 
     Returns:

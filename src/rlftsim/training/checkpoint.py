@@ -86,9 +86,9 @@ def read_checkpoint(path: Path, modules: dict[str, nn.Module], optimizer: Optimi
     """Load weights and moments in place.
 
     Args:
-        path: of the checkpoint.
-        modules: as they were given to `write_checkpoint`.
-        optimizer: of the same parameters in the same order; keeps its own learning rate.
+        path: Folder of the checkpoint, named after its update.
+        modules: Modules by the names that `write_checkpoint` got; weights are loaded in place.
+        optimizer: Optimizer with the same parameters in the same order; the learning rate stays.
 
     Returns:
         The position of the run.

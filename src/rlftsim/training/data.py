@@ -30,8 +30,8 @@ def batch_with_futures(
     """Batch of some scenarios.
 
     Args:
-        scenarios: to choose from.
-        indices: of the chosen ones.
+        scenarios: Training scenarios, which the indices count.
+        indices: Indices of the scenarios of the batch, in its order.
         context_radius_m: leave out steps farther from the ego, see `within_reach`; None = leave out nothing.
         mirror: indices of those that are seen mirrored.
 
@@ -57,7 +57,7 @@ def within_reach(scenario: Scenario, radius_m: float) -> Scenario:
     nothing is left out.
 
     Args:
-        scenario: with any number of steps.
+        scenario: Scenario with any number of logged steps.
         radius_m: 3-D distance.
 
     Returns:
@@ -86,11 +86,11 @@ def trained_agents(
     batch.
 
     Args:
-        batch: with its future.
+        batch: Scenarios with their logged futures.
         update: counted from 0.
         radius_m: distance from the ego at the current step up to which the others are taken.
-        limit: of a scenario; None = all.
-        seed: of the run.
+        limit: Largest number of trained agents in a scenario; None = no limit.
+        seed: Seed of the run; equal seeds, equal choices.
     """
     interest = torch.zeros_like(batch.agent_mask)  # [B, A]
     for row, scenario, ids in zip(interest, batch.scenarios, batch.object_id):
@@ -122,9 +122,9 @@ def mirrored_of_update(update: int, indices: Sequence[int], probability: float, 
 
     Args:
         update: counted from 0.
-        indices: of the scenarios.
-        probability: of each to be mirrored.
-        seed: of the run.
+        indices: Indices of the scenarios of the update.
+        probability: Chance in [0, 1] that a scenario is mirrored.
+        seed: Seed of the run; equal seeds, equal choices.
     """
     return {i for i in indices if np.random.default_rng(derive_seed(seed, "mirror", update, i)).random() < probability}
 
@@ -135,8 +135,8 @@ def scenarios_of_update(update: int, batch_size: int, num_scenarios: int, seed: 
     Args:
         update: counted from 0.
         batch_size: scenarios per update over all processes.
-        num_scenarios: in the data set.
-        seed: of the run.
+        num_scenarios: Number of scenarios in the data set.
+        seed: Seed of the run; equal seeds, equal choices.
     """
     # Positions in the endless sequence of epochs after epochs.
     positions = range(update * batch_size, (update + 1) * batch_size)

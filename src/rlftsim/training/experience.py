@@ -69,12 +69,12 @@ def sample_rollouts(
     Args:
         policy: decides for all agents.
         batch: scenarios with their futures.
-        goals: probabilities of goals.
+        goals: Settings of goals: probability of an agent to have one.
         augmented: goals beside the logged endpoints, if there are any.
         num_rollouts: N, of each scenario.
-        own: those of them that this process simulates; the others come from the processes that have the same scenarios.
-        seed: of the run.
-        update: counted from 0; with the seed it determines goals and rollouts.
+        rollout_ids: Rollouts that this process simulates; the rest comes from the processes with the same scenarios.
+        seed: Seed of the run; with `update` it determines goals and rollouts.
+        update: Number of the update, from 0.
         fabric: precision of the pass, and the processes.
     """
     batch_goals = choose_goals(batch, goals, augmented, seed=derive_seed(seed, "goals", update))
@@ -116,7 +116,7 @@ def compute_reward(batch: ScenarioBatch, rollouts: Rollouts, config: FinetuneCon
 
     Args:
         batch: scenarios with their futures.
-        rollouts: N of each.
+        rollouts: N rollouts of each scenario, in the frame of the batch.
         config: reward, metric and credit assignment.
     """
     metric = metric_by_name(config.metric)
@@ -135,8 +135,8 @@ def hold_speed(experiences: Sequence[Experience], fabric: Fabric) -> tuple[list[
     metric rewards driving slowly.
 
     Args:
-        experiences: of this process.
-        fabric: the processes.
+        experiences: Rollouts of this process with their rewards, an entry per micro batch.
+        fabric: Processes of the run, over which sums are added.
 
     Returns:
         The experiences with other rewards by agent, and the slope that was removed, reward per m/s.
@@ -166,8 +166,8 @@ def count_decisions(experiences: Sequence[Experience], fabric: Fabric) -> tuple[
     """Number of scenarios and of decisions in the whole batch, those of other processes included.
 
     Args:
-        experiences: of this process.
-        fabric: the processes.
+        experiences: Rollouts of this process with their rewards, an entry per micro batch.
+        fabric: Processes of the run, over which sums are added.
     """
     totals = torch.zeros(2, device=fabric.device, dtype=torch.float64)
     for experience in experiences:
@@ -189,8 +189,8 @@ def describe(experiences: Sequence[Experience], fabric: Fabric) -> dict[str, flo
     A scenario without a finite value is left out of that mean.
 
     Args:
-        experiences: of this process.
-        fabric: the processes.
+        experiences: Rollouts of this process with their rewards, an entry per micro batch.
+        fabric: Processes of the run, over which sums are added.
     """
     metrics = [describe_scenarios(experience) for experience in experiences]
     values = torch.stack(
@@ -265,7 +265,7 @@ def compute_speed_gap(batch: ScenarioBatch, rollouts: Rollouts) -> Float[Tensor,
 
     Args:
         batch: scenarios with their logged tracks.
-        rollouts: N of each.
+        rollouts: N rollouts of each scenario, in the frame of the batch.
 
     Returns:
         NaN for a scenario with no logged future.
@@ -282,7 +282,7 @@ def simulated_speeds(
 
     Args:
         batch: scenarios with their logged tracks.
-        rollouts: N of each.
+        rollouts: N rollouts of each scenario, in the frame of the batch.
     """
     future, valid = slice(CURRENT_STEP + 1, None), batch.valid
     # A speed is the way of one step, so both of its ends have to be valid: [B, A, T].

@@ -85,10 +85,10 @@ def prepare(
     """Freeze the weights that are not trained, copy the reference, make the optimizer. Dropout is off from here on.
 
     Args:
-        policy: changed in place.
-        config: see its fields.
-        device: to train on.
-        augmented: goals beside the logged endpoints.
+        policy: Policy to train in place.
+        config: Settings of the run; a stored run resumes only with equal ones.
+        device: Device to train on; the policy moves there.
+        augmented: Stored goals beside the logged endpoints; None = endpoints alone.
     """
     # With dropout the scored distribution would not be the one that was sampled from.
     policy.to(device).eval()
@@ -116,10 +116,10 @@ def update_policy(
     """Make one update of the policy, as in RLFTSim, section 4.1.
 
     Args:
-        learner: changed in place.
+        learner: Policy, reference and counters, changed in place.
         batch: this process's scenarios of the update, with their futures.
-        config: see its fields.
-        fabric: processes and precision.
+        config: Settings of the run; a stored run resumes only with equal ones.
+        fabric: Processes of the run, and the precision of its passes.
 
     Returns:
         Metrics by the names of metrics.jsonl.

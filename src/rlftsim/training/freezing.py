@@ -20,7 +20,7 @@ def select_trained_modules(policy: nn.Module, trained: TrainedModules) -> tuple[
     """The parts of a policy that are trained.
 
     Args:
-        policy: any.
+        policy: Policy that may name its modules for fine-tuning.
         trained: "decoder" = the parts that the policy names in `fine_tuned_modules`, all of it where it names none.
             "head" = what it names in `head_modules`, its last layers. "goals" = the goal encoder only, so that agents
             without a goal go on deciding as before. "all" = everything.
@@ -50,7 +50,7 @@ def freeze_untrained(policy: nn.Module, trained: TrainedModules) -> None:
     """Require a gradient of the weights that are trained, and of no others.
 
     Args:
-        policy: changed in place.
+        policy: Policy whose weights are frozen or released in place.
         trained: see `select_trained_modules`.
 
     Raises:
@@ -67,8 +67,8 @@ def check_entropy(policy: nn.Module, scenario: Scenario, trained: TrainedModules
     """Refuse an entropy bonus for a policy whose entropy no trained weight moves, such as one with fixed noise.
 
     Args:
-        policy: left as it is.
-        scenario: to decide in once.
+        policy: Policy to try, of which a copy decides.
+        scenario: Scenario in which the policy decides once.
         trained: see `select_trained_modules`.
 
     Raises:
@@ -90,7 +90,7 @@ def parameter_groups(model: nn.Module, goal_scale: float) -> list[dict[str, Any]
     """The weights that require a gradient, as groups for an optimizer: the goal encoder apart from all others.
 
     Args:
-        model: after `freeze_untrained`.
+        model: Model whose untrained weights `freeze_untrained` has frozen.
         goal_scale: learning rate of the goal encoder over that of the others.
     """
     goal_weights = [p for module in _goal_modules(model) for p in module.parameters() if p.requires_grad]

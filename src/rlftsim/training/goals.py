@@ -76,8 +76,8 @@ def check_goals(policy: Policy, probability: float) -> None:
     """Refuse to train a policy with goals if it is not goal-conditioned.
 
     Args:
-        policy: to be trained.
-        probability: of an agent to have a goal; 0 = goal-free training, which any policy can do.
+        policy: Policy that a run is going to train.
+        probability: Probability of an agent to have a goal; 0 = goal-free training, which any policy can do.
 
     Raises:
         ConfigError: the policy is not goal-conditioned.
@@ -97,10 +97,10 @@ def choose_goals(batch: ScenarioBatch, config: GoalConfig, augmented: StoredGoal
     """Goals of a batch in one update, with N = 1: all rollouts of a scenario have the same.
 
     Args:
-        batch: with futures.
-        config: probabilities.
-        augmented: goals beside the logged endpoints.
-        seed: of the update; a scenario's goals depend on it and on the scenario, not on the rest of the batch.
+        batch: Scenarios with their logged futures.
+        config: Probabilities of goals and of augmented goals.
+        augmented: Stored goals beside the logged endpoints; None = endpoints alone.
+        seed: Seed of the update; the goals of a scenario do not depend on the rest of the batch.
 
     Returns:
         None where the fine-tuning is goal-free.

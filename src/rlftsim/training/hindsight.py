@@ -40,8 +40,8 @@ def relabel_with_hindsight(experiences: Sequence[Experience], terms: Sequence[Te
     its own part, because each agent's decisions have an importance ratio of their own.
 
     Args:
-        experiences: of this process.
-        terms: of the run's reward.
+        experiences: Rollouts of this process with their rewards, an entry per micro batch.
+        terms: Terms of the run's reward, of which those with goals count.
     """
     relabelled = []
     for experience in experiences:
@@ -60,8 +60,8 @@ def met_goals(rollouts: Rollouts, realism: RealismResult) -> Goals:
     """Endpoints of the most realistic rollout of each scenario, for the agents that have goals.
 
     Args:
-        rollouts: with goals, N of each scenario.
-        realism: of the same rollouts.
+        rollouts: Rollouts with goals, N of each scenario.
+        realism: Scores of the same rollouts, a row per scenario.
     """
     assert rollouts.goals is not None
     # All rollouts of a scenario have the same goals: the mask of the first one serves.
@@ -73,8 +73,8 @@ def importance_ratio(new: Float[Tensor, "B N A"], old: Float[Tensor, "B N A"]) -
     """Probability of each agent's decisions under new goals over that under old ones; clipped, without gradient.
 
     Args:
-        new: log-probability of all of an agent's decisions under the new goals.
-        old: under the goals they were sampled under.
+        new: Log-probability of all of an agent's decisions under the new goals, nats.
+        old: Log-probability under the goals at sampling, nats.
     """
     # Clipped from above only: a large ratio raises the variance, a small one merely drops an agent.
     return (new - old).detach().clamp(max=math.log(LARGEST_RATIO)).exp()
@@ -95,13 +95,13 @@ def accumulate_hindsight(
 
     Args:
         policy: scores the relabelled rollouts.
-        experiences: of this process.
+        experiences: Rollouts of this process with their rewards, an entry per micro batch.
         reward: terms of the run's reward.
         first_pass: has the log-probabilities under the old goals.
         terms: reduction and counts of the update.
-        fabric: precision and processes.
-        weight: of this gradient; 0 = nothing is done.
-        rollouts_per_pass: as in `accumulate_gradients`.
+        fabric: Precision of the passes, and processes that sums are added over.
+        weight: Weight of this gradient; 0 = no second pass.
+        rollouts_per_pass: Rollouts of a scenario that are scored at once, as in `accumulate_gradients`.
 
     Returns:
         Metrics: the mean importance ratio. Empty in a run without hindsight.

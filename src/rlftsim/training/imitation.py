@@ -243,7 +243,7 @@ def learning_rate(update: int, total: int, config: ImitationConfig) -> float:
     """Learning rate of an update: linear warm-up, then a cosine down to `final_lr_ratio` of the highest.
 
     Args:
-        update: counted from 0.
+        update: Number of the update, from 0.
         total: updates of the run.
         config: has the highest rate, the warm-up and the ratio.
     """
@@ -264,7 +264,7 @@ def update_imitator(
         learner: Model and settings, changed in place.
         scenarios: Scenarios of the update that this process works on.
         predict: Predictions of a batch for the agents that count, or their loss.
-        fabric: Precision and processes.
+        fabric: Precision of the passes, and processes that sums are added over.
     """
     config, update = learner.config, learner.update
     num_updates = config.num_updates(learner.num_scenarios)
@@ -317,10 +317,10 @@ def loss_along_log(
     """The model's own imitation loss, or its predictions of the next token along logged tracks.
 
     Args:
-        model: a PretrainablePolicy or an ImitatedPolicy; its own loss goes first.
-        batch: with its future.
+        model: PretrainablePolicy or ImitatedPolicy, whose own loss goes first.
+        batch: Scenarios with their logged futures.
         trained: True = the agent's predictions count.
-        update: counted from 0; what an own loss draws depends on it.
+        update: Number of the update, from 0; draws of an own loss depend on it.
     """
     own_loss = getattr(model, "imitation_loss", None)
     return model.teacher_forced(batch, trained) if own_loss is None else own_loss(batch, trained, update)
@@ -335,12 +335,12 @@ def accumulate_imitation(
     is known only when all have been made, so what was accumulated is scaled at the end.
 
     Args:
-        model: with zero gradients; see `loss_along_log`.
+        model: Model with zero gradients, as `loss_along_log` takes it.
         batches: this process's scenarios, with their futures; all agents with a future count.
-        weight: of the loss.
+        weight: Weight of the loss in the objective.
         fabric: precision, and the processes that the mean is over.
-        update: counted from 0.
-        seed: of what an own loss draws, which depends on it, the update and the process alone.
+        update: Number of the update, from 0.
+        seed: Seed of the draws of an own loss; with update and process it determines them.
 
     Returns:
         The mean loss, nats per prediction for policies over tokens.

@@ -64,8 +64,8 @@ def measure_map_use(policy: PretrainablePolicy, batch: ScenarioBatch) -> MapUse:
     """Cross-entropy of the logged vehicles' tokens, with the map and with the map 5 km away.
 
     Args:
-        policy: with a vocabulary, in evaluation mode.
-        batch: with its future, on the policy's device.
+        policy: Policy with a vocabulary, in evaluation mode.
+        batch: Scenarios with their futures, on the policy's device.
     """
     shifted = []
     for scenario in batch.scenarios:

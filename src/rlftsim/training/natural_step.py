@@ -20,7 +20,7 @@ def natural_direction(
     """Direction of the largest gain per KL, of those in which the predicted change of the fixed means is 0.
 
     Args:
-        gradient: Of the objective by the weights.
+        gradient: Gradient [K] of the objective by the weights.
         fisher: Covariance of the score function, per decision. A weight without any stays 0.
         fixed: Gradients of means that are to stay as they are.
         kl: Predicted KL of the result, ½ e·F e, nats per decision.

@@ -108,7 +108,7 @@ class DeviceConfig:
         """Processes of a run on this machine; the number that "auto" stands for.
 
         Args:
-            num_scenarios: in the data set.
+            num_scenarios: Number of scenarios in the data set; few are trained on by one process.
             batch_size: scenarios of an update; each process needs one.
             micro_batch_size: scenarios in memory at once, which the processes on a CPU share.
             begun_with: number of a run that is resumed.
@@ -180,10 +180,10 @@ def local_indices(
     """This process's part of a global batch. Of fewer scenarios than processes, several processes have the same one.
 
     Args:
-        items: scenario indices of the global batch.
-        fabric: the processes.
-        costs: of each item; the parts then cost about the same, else they are equally large.
-        num_rollouts: of each item, see `local_rollouts`.
+        items: Indices of the scenarios of the global batch.
+        fabric: Processes of the run, over which sums are added.
+        costs: Cost of each item, so that shares cost about the same; None = shares are equally large.
+        num_rollouts: Rollouts of each item, which processes in excess divide, see `local_rollouts`.
 
     Raises:
         ConfigError: the processes cannot divide the scenarios, nor their rollouts, evenly.
@@ -198,9 +198,9 @@ def local_rollouts(num_items: int, num_rollouts: int, fabric: Fabric) -> range:
     """Rollouts of its scenarios that this process simulates and scores: all, or a part where several share a scenario.
 
     Args:
-        num_items: scenarios of the global batch.
-        num_rollouts: of each.
-        fabric: the processes.
+        num_items: Number of scenarios in the global batch.
+        num_rollouts: Rollouts of each scenario.
+        fabric: Processes of the run, over which sums are added.
 
     Raises:
         ConfigError: as `local_indices`.
@@ -236,7 +236,7 @@ def all_reduce_sum(values: Tensor, fabric: Fabric) -> Tensor:
 
     Args:
         values: this process's summand; all processes have the same shape.
-        fabric: the processes.
+        fabric: Processes of the run, over which sums are added.
     """
     if fabric.world_size == 1:
         return values
@@ -247,8 +247,8 @@ def all_gather(tensors: Mapping[str, Tensor], fabric: Fabric) -> list[dict[str, 
     """The tensors of all processes, in the order of ranks, bit for bit and on this process's device.
 
     Args:
-        tensors: of this process; those of others may have other shapes.
-        fabric: the processes.
+        tensors: Tensors of this process by name; other processes may have other shapes.
+        fabric: Processes of the run, over which sums are added.
     """
     file = io.BytesIO()
     torch.save({name: tensor.contiguous() for name, tensor in tensors.items()}, file)
@@ -268,8 +268,8 @@ def all_reduce_gradients(parameters: Iterable[nn.Parameter], fabric: Fabric) -> 
     """Sum every gradient over all processes, in place, as one message.
 
     Args:
-        parameters: in the same order in every process; one that has no gradient here adds zero.
-        fabric: the processes.
+        parameters: Parameters in the same order in every process; without a gradient here a parameter adds zero.
+        fabric: Processes of the run, over which sums are added.
     """
     parameters = list(parameters)
     if fabric.world_size == 1:

@@ -76,7 +76,7 @@ def adapt_beta(beta: float, kl: float, config: KlConfig) -> float:
 
     Args:
         beta: strength during the update.
-        kl: of the update, nats per decision.
+        kl: KL of the update, nats per decision.
         config: target, horizon and bounds.
     """
     # Clipped, so that one wild update moves beta by at most 0.2 / horizon.
@@ -89,9 +89,9 @@ def sync_reference(reference: nn.Module, policy: nn.Module, alpha: float) -> Non
     """Move the reference's weights towards the policy's, in place: alpha * policy + (1 - alpha) * reference.
 
     Args:
-        reference: changed.
+        reference: Reference, moved in place towards the policy.
         policy: has the same parameters in the same order.
-        alpha: in [0, 1].
+        alpha: Weight of the policy, in [0, 1].
     """
     for old, new in zip(reference.parameters(), policy.parameters()):
         old.lerp_(new, alpha)

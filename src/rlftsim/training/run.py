@@ -157,7 +157,7 @@ class TrainingRun:
         out: Folder of the run.
         settings: Settings of the method, stored in the folder.
         learner: Fresh state, brought to that of the newest checkpoint by `resume`.
-        fabric: Device and processes.
+        fabric: Device and processes; only rank 0 writes files.
 
     Raises:
         CheckpointError: The folder belongs to a run with other settings or inputs.

@@ -147,7 +147,7 @@ class RunFolder:
     """Opens a run's folder for the first time or to resume. Only the process of rank 0 writes.
 
     Args:
-        path: created if missing.
+        path: Folder of the run, created if missing.
         config: a dataclass of settings.
         inputs: hashes of what the run starts from, see `describe_inputs`.
         writes: False in all processes but that of rank 0.
@@ -255,8 +255,8 @@ class RunFolder:
         """Add a line of metrics.
 
         Args:
-            update: updates done.
-            values: by name.
+            update: Number of updates done.
+            values: Metrics by name, numbers.
         """
         if not self._writes:
             return

@@ -64,8 +64,8 @@ class ValidationConfig:
         """True where a validation follows an update.
 
         Args:
-            update: updates done.
-            total: updates of the run.
+            update: Number of updates done.
+            total: Number of updates of the run.
         """
         return self.every > 0 and (update % self.every == 0 or update == total)
 
@@ -79,9 +79,9 @@ def check_validation(model: object, scenarios: Scenarios, config: ValidationConf
     """Refuse before a run what would end it at its first validation.
 
     Args:
-        model: in training.
-        scenarios: to validate on.
-        config: sampling.
+        model: Model in training, of which a copy simulates.
+        scenarios: Held-out scenarios, at least one.
+        config: Settings of the validation, of which sampling is tried.
 
     Raises:
         ConfigError: the model cannot simulate, or not with this sampling, or there is no scenario.
@@ -101,9 +101,9 @@ def validate(model: nn.Module, scenarios: Scenarios, config: ValidationConfig, f
 
     Args:
         model: a policy; left as it is, training mode included.
-        scenarios: to choose from, with their futures.
+        scenarios: Held-out scenarios to select from, with their futures.
         config: number and choice of scenarios and rollouts.
-        fabric: the processes.
+        fabric: Processes of the run, over which sums are added.
 
     Returns:
         Means over scenarios (`WATCHED`), the 95 % interval of the meta-metric's mean (Student's t), for a model that
