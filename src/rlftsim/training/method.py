@@ -272,13 +272,13 @@ def method_by_name(name: str) -> Method[Any]:
     Raises:
         ConfigError: Unknown, with the nearest registered name; or no training method.
     """
-    method = METHODS.get(name)()
+    method = METHODS.get(name)
     missing = [member for member in ("settings", "title", "start", "update") if not hasattr(method, member)]
     if missing:
         raise ConfigError(
             f"method {name!r} has no {' and no '.join(missing)}: make it extend rlftsim.training.method.Method."
         )
-    return method
+    return method()
 
 
 def find_method(settings: object) -> Method[Any] | None:
